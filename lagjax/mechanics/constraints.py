@@ -1,0 +1,183 @@
+"""Constraints at three levels: position, velocity, acceleration.
+
+A holonomic constraint `g(t, q) = 0` is differentiated twice, a velocity constraint `phi(t, q, v) = 0`
+once (index reduction); both end as a linear equation for the acceleration,
+
+    A a = gamma,        holonomic:    A = ∂g/∂q,    gamma = -(d/dt)² g with a = 0
+                        velocity:     A = ∂phi/∂v,  gamma = -∂phi/∂t - (∂phi/∂q) v
+
+and the force that keeps it is `Aᵀ λ` (for a velocity constraint, Chetaev's rule). Total derivatives along
+the motion are Jacobian-vector products along `(1, v)`; no second-derivative array is ever formed.
+
+Source: Goldstein, *Classical Mechanics*, §1.3 and §2.4; Hairer & Wanner, *Solving ODEs II*, §VII.1.
+"""
+
+from collections.abc import Callable
+from typing import ClassVar, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+
+class Holonomic(eqx.Module):
+    """Constrain positions: `g(t, q, params) = 0`.
+
+    >>> import jax.numpy as jnp
+    >>> Holonomic(lambda t, q, params: q["x"] ** 2 + q["y"] ** 2 - params["length"] ** 2)
+    Holonomic(<lambda>)
+
+    **Arguments:** `g(t, q, params)` -> scalar or (m,), smooth, with ∂g/∂q of full rank where it vanishes.
+    Its multiplier λ has the shape of `g` and `[energy]/[g]`; λ > 0 pushes along +∂g/∂q.
+    """
+
+    g: Callable
+    kind: ClassVar[str] = "holonomic"
+
+    def __check_init__(self):
+        _check_callable(self.g, "Holonomic", "g(t, q, params)")
+
+    def __repr__(self):
+        return f"Holonomic({getattr(self.g, '__name__', 'g')})"
+
+
+class Nonholonomic(eqx.Module):
+    """Constrain velocities: `phi(t, q, v, params) = 0`, linear in v or not, integrable or not.
+
+    >>> Nonholonomic(lambda t, q, v, params: v["x"] - params["radius"] * v["angle"])
+    Nonholonomic(<lambda>)
+
+    **Arguments:** `phi(t, q, v, params)` -> scalar or (m,), smooth, with ∂phi/∂v of full rank where it
+    vanishes. Its multiplier μ has the shape of `phi` and `[energy]/([phi] [t])`; the force is `(∂phi/∂v)ᵀ μ`.
+    """
+
+    phi: Callable
+    kind: ClassVar[str] = "velocity"
+
+    def __check_init__(self):
+        _check_callable(self.phi, "Nonholonomic", "phi(t, q, v, params)")
+
+    def __repr__(self):
+        return f"Nonholonomic({getattr(self.phi, '__name__', 'phi')})"
+
+
+class Rows(NamedTuple):
+    """All constraints of a system at one state, stacked: the linear equation `A a = gamma`."""
+
+    jacobian: Float[Array, "m n"]
+    gamma: Float[Array, " m"]
+
+
+def _check_callable(function, kind, signature):
+    if not callable(function):
+        raise TypeError(
+            f"{kind} needs a function {signature}, not {type(function).__name__}.\n"
+            f"Fix: lj.{kind}(f), with f defined as a function of these arguments."
+        )
+
+
+def shapes(system, t, q, v, params) -> dict[str, tuple[int, ...]]:
+    """The shape of each constraint's residual, by name, found without computing anything."""
+    found = {}
+    for name, constraint in system.constraints.items():
+        residual = eqx.filter_eval_shape(evaluate, constraint, t, q, v, params)
+        shape = getattr(residual, "shape", None)
+        if shape is None or len(shape) > 1:
+            raise ValueError(
+                f"constraint '{name}' must return a scalar or a vector, and returned "
+                f"{shape if shape is not None else type(residual).__name__}.\n"
+                "Fix: jnp.stack([...]) the equations into one vector, or name each one."
+            )
+        found[name] = shape
+    return found
+
+
+def split(system, stacked, t, q, v, params) -> dict[str, Array]:
+    """Undo the stacking: a vector over all constraint equations -> one array a name."""
+    parts, start = {}, 0
+    for name, shape in shapes(system, t, q, v, params).items():
+        size = shape[0] if shape else 1
+        parts[name] = stacked[start : start + size].reshape(shape)
+        start += size
+    return parts
+
+
+def position_residual(system, t, x, params, unflatten) -> Float[Array, " mh"]:
+    """`g(t, q)` of the holonomic constraints, stacked."""
+    return _stack([c.g(t, unflatten(x), params) for c in _holonomic(system)], x.dtype)
+
+
+def velocity_residual(system, t, x, u, params, unflatten) -> Float[Array, " m"]:
+    """`dg/dt` or `phi(t, q, v)` of each constraint, stacked in the order of their names."""
+    return _stack([_velocity_level(c, t, x, u, params, unflatten) for c in _all(system)], x.dtype)
+
+
+def acceleration_rows(system, t, x, u, params, unflatten) -> Rows:
+    """`A` and `gamma` of all constraints, in vector form."""
+
+    def velocity_level(t, x, u):
+        return velocity_residual(system, t, x, u, params, unflatten)
+
+    _, rate = jax.jvp(lambda t, x: velocity_level(t, x, u), (t, x), (jnp.ones_like(t), u))
+    return Rows(jax.jacfwd(velocity_level, argnums=2)(t, x, u), -rate)
+
+
+def position_jacobian(system, t, x, params, unflatten) -> Float[Array, "mh n"]:
+    """`∂g/∂q` of the holonomic constraints."""
+    return jax.jacfwd(lambda x: position_residual(system, t, x, params, unflatten))(x)
+
+
+def evaluate(constraint, t, q, v, params):
+    """The residual of one constraint, as it was written: `g` or `phi`."""
+    if isinstance(constraint, Holonomic):
+        return constraint.g(t, q, params)
+    return constraint.phi(t, q, v, params)
+
+
+def baumgarte_feedback(system, t, x, u, params, unflatten, rate):
+    """What Baumgarte adds to gamma: the constraint then obeys g'' + 2 rate g' + rate² g = 0, or phi' + rate phi = 0.
+
+    Source: Baumgarte, Comput. Methods Appl. Mech. Eng. 1 (1972) 1.
+    """
+    feedback = []
+    for constraint in _all(system):
+        velocity = jnp.atleast_1d(_velocity_level(constraint, t, x, u, params, unflatten))
+        if isinstance(constraint, Holonomic):
+            position = jnp.atleast_1d(constraint.g(t, unflatten(x), params))
+            feedback.append(-2 * rate * velocity - rate**2 * position)
+        else:
+            feedback.append(-rate * velocity)
+    return _stack(feedback, x.dtype)
+
+
+def holonomic_equations(system, t, q, v, params) -> np.ndarray:
+    """Which of the stacked equations constrain positions, (m,) booleans."""
+    kinds = [
+        np.full(int(np.prod(shape)), isinstance(system.constraints[name], Holonomic))
+        for name, shape in shapes(system, t, q, v, params).items()
+    ]
+    return np.concatenate(kinds) if kinds else np.zeros(0, bool)
+
+
+def _velocity_level(constraint, t, x, u, params, unflatten):
+    if isinstance(constraint, Holonomic):
+        return jax.jvp(
+            lambda t, x: constraint.g(t, unflatten(x), params), (t, x), (jnp.ones_like(t), u)
+        )[1]
+    return constraint.phi(t, unflatten(x), unflatten(u), params)
+
+
+def _all(system):
+    return list(system.constraints.values())
+
+
+def _holonomic(system):
+    return [c for c in _all(system) if isinstance(c, Holonomic)]
+
+
+def _stack(parts, dtype):
+    if not parts:
+        return jnp.zeros((0,), dtype)
+    return jnp.concatenate([jnp.atleast_1d(part).astype(dtype) for part in parts])

@@ -1,0 +1,127 @@
+"""Generalized coordinates: the user's pytree, its vector form, and its names.
+
+A state is any pytree of float arrays: a scalar, a vector, a dict, a NamedTuple. The equations of motion
+are solved in vector form, and every message speaks of the coordinate by the user's own name:
+
+    {"theta": scalar, "r": (2,)}  ->  vector (3,), names ["r[0]", "r[1]", "theta"]
+
+(JAX orders a dict by its keys.) This is the only place where the two forms meet.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float, PyTree
+
+
+class State(NamedTuple):
+    """A time, a position and a velocity, made of arrays of one dtype, with the parameters."""
+
+    t: Float[Array, ""]
+    q: PyTree[Float[Array, "..."]]
+    v: PyTree[Float[Array, "..."]]
+    params: PyTree
+
+
+def flatten(tree):
+    """The vector of all coordinates in `tree`, and the function that puts a vector back."""
+    return ravel_pytree(tree)
+
+
+def names(tree) -> list[str]:
+    """The name of each entry of `flatten(tree)[0]`, as the user would write it.
+
+    >>> names({"theta": 0.0, "r": [1.0, 2.0]})
+    ['r[0]', 'r[1]', 'theta']
+    """
+    found = []
+    for path, leaf in jtu.tree_flatten_with_path(tree)[0]:
+        stem = "".join(_key_name(key, first=i == 0) for i, key in enumerate(path))
+        for index in np.ndindex(np.shape(leaf)):
+            suffix = "[" + ", ".join(map(str, index)) + "]" if index else ""
+            found.append((stem or "q") + suffix)
+    return found
+
+
+def _key_name(key, first):
+    if isinstance(key, jtu.SequenceKey):
+        return f"q[{key.idx}]" if first else f"[{key.idx}]"
+    name = key.name if isinstance(key, jtu.GetAttrKey) else str(getattr(key, "key", key))
+    return name if first else f".{name}"
+
+
+def state(t, q, v, params) -> State:
+    """Check a state's shapes and dtypes and make arrays of it.
+
+    Python floats become arrays of the state's dtype, in `params` too: a float that stayed a Python
+    number would be compiled in, and each new value would compile again.
+
+    **Raises:** `TypeError` for an integer or complex coordinate; `ValueError` where `v` does not have the
+    structure and shapes of `q`, or `q` is empty.
+    """
+    q, v = jtu.tree_map(jnp.asarray, q), jtu.tree_map(jnp.asarray, v)
+    _check_floating(q, "q")
+    _check_floating(v, "v")
+    _check_alike(q, v)
+    if not jtu.tree_leaves(q):
+        raise ValueError("q has no coordinates: give at least one, such as q = {'theta': 0.1}.")
+    dtype = jnp.result_type(*jtu.tree_leaves((q, v)))
+    q, v = (jtu.tree_map(lambda x: x.astype(dtype), tree) for tree in (q, v))
+    return State(jnp.asarray(t, dtype), q, v, as_arrays(params, dtype))
+
+
+def as_arrays(tree, dtype):
+    """Make arrays of the Python floats and NumPy arrays in `tree`; leave the rest as it is."""
+
+    def convert(leaf):
+        if isinstance(leaf, float):
+            return jnp.asarray(leaf, dtype)
+        if isinstance(leaf, (np.ndarray, np.generic)):
+            return jnp.asarray(leaf)
+        return leaf
+
+    return jtu.tree_map(convert, tree)
+
+
+def is_traced(tree) -> bool:
+    """Whether JAX is tracing through `tree`, so that its values cannot be looked at."""
+    return any(isinstance(leaf, jax.core.Tracer) for leaf in jtu.tree_leaves(tree))
+
+
+def _check_floating(tree, which):
+    for path, leaf in jtu.tree_flatten_with_path(tree)[0]:
+        if not jnp.issubdtype(leaf.dtype, jnp.floating):
+            name = "".join(_key_name(key, first=i == 0) for i, key in enumerate(path)) or "q"
+            raise TypeError(
+                f"coordinate '{name}' of {which} is {leaf.dtype}, and the equations of motion need floats.\n"
+                f"Usual cause: a whole number written without its decimal point.\n"
+                f"Fix: write 1.0 instead of 1, or jnp.asarray(..., dtype=float)."
+            )
+
+
+def _check_alike(q, v):
+    q_structure, v_structure = jtu.tree_structure(q), jtu.tree_structure(v)
+    if q_structure != v_structure:
+        raise ValueError(
+            f"v must have the structure of q.\n  q: {q_structure}\n  v: {v_structure}\n"
+            "Usual cause: a coordinate missing from v, or another key.\n"
+            "Fix: start from v = jax.tree.map(jnp.zeros_like, q)."
+        )
+    for name, a, b in zip(_leaf_names(q), jtu.tree_leaves(q), jtu.tree_leaves(v)):
+        if a.shape != b.shape:
+            raise ValueError(
+                f"coordinate '{name}' has shape {a.shape} in q but {b.shape} in v.\n"
+                "Usual cause: a scalar beside an array of one entry.\n"
+                "Fix: give both the same shape, for instance v = jax.tree.map(jnp.zeros_like, q)."
+            )
+
+
+def _leaf_names(tree):
+    paths = jtu.tree_flatten_with_path(tree)[0]
+    return [
+        "".join(_key_name(key, first=i == 0) for i, key in enumerate(path)) or "q" for path, _ in paths
+    ]

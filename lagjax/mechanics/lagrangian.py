@@ -1,0 +1,176 @@
+"""What a Lagrangian says about one state: momentum, mass matrix, forcing, Jacobi integral.
+
+With `p = ∂L/∂v`, Lagrange's equations `dp/dt = ∂L/∂q + Q - ∂R/∂v` become linear in the acceleration a:
+
+    M a = F,    M = ∂²L/∂v∂v,    F = ∂L/∂q - ∂p/∂t - (∂p/∂q) v + Q - ∂R/∂v
+
+because `dp/dt = ∂p/∂t + (∂p/∂q) v + M a`. One linearization of `p(t, q, v)` gives all of it: pushed along
+`(1, v, 0)` the middle terms of F (Coriolis and gyroscopic terms live there), pushed along the unit
+velocities the columns of M. The mixed second derivatives are never formed as an array.
+
+Source: Goldstein, *Classical Mechanics*, Eq. (1.57), (1.70), (2.53).
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PyTree
+
+from lagjax.mechanics import coordinates
+
+
+class Linear(NamedTuple):
+    """The equation `M a = F` at one state, in vector form."""
+
+    mass: Float[Array, "n n"]
+    forcing: Float[Array, " n"]
+
+
+def mass_and_forcing(system, t, x, u, params, unflatten) -> Linear:
+    """M and F at the state with position vector `x` and velocity vector `u`."""
+
+    def lagrangian(t, x, u):
+        return system.lagrangian(t, unflatten(x), unflatten(u), params)
+
+    def momentum_and_gradient(t, x, u):
+        gradient, p = jax.grad(lagrangian, argnums=(1, 2))(t, x, u)
+        return p, gradient
+
+    _, push, gradient = jax.linearize(momentum_and_gradient, t, x, u, has_aux=True)
+    zero_t, zero = jnp.zeros_like(t), jnp.zeros_like(x)
+    # ∂p/∂t + (∂p/∂q) v: the part of dp/dt that does not involve the acceleration.
+    forcing = gradient - push(jnp.ones_like(t), u, zero)
+    if system.force is not None:
+        forcing = forcing + _force_vector(system, t, x, u, params, unflatten)
+    if system.dissipation is not None:
+        forcing = forcing - jax.grad(
+            lambda u: system.dissipation(t, unflatten(x), unflatten(u), params)
+        )(u)
+    if x.size == 1:
+        mass = push(zero_t, zero, jnp.ones_like(u))[None]
+    else:
+        # The columns of M by name of velocity; M is symmetric.
+        mass = jax.vmap(lambda e: push(zero_t, zero, e))(jnp.eye(x.size, dtype=x.dtype))
+    return Linear(mass.astype(x.dtype), forcing.astype(x.dtype))
+
+
+def check_scalar(system, t, q, v, params):
+    """Raise where L or R does not return one real number, or Q does not return forces like q."""
+    for role, function in (("L", system.lagrangian), ("dissipation", system.dissipation)):
+        if function is None:
+            continue
+        value = eqx.filter_eval_shape(function, t, q, v, params)
+        shape, dtype = getattr(value, "shape", None), getattr(value, "dtype", None)
+        if shape is None and isinstance(value, (int, float)):
+            continue
+        if shape != () or not jnp.issubdtype(dtype, jnp.floating):
+            got = f"shape {shape}, {dtype}" if shape is not None else f"a {type(value).__name__}"
+            raise ValueError(
+                f"{role}(t, q, v, params) must return one real number, and returned {got}.\n"
+                "Usual cause: energies of several bodies left unsummed, as in 0.5 * m * v**2 with v a vector.\n"
+                "Fix: 0.5 * m * jnp.sum(v**2), or jnp.dot(v, v)."
+            )
+    if system.force is not None:
+        force = eqx.filter_eval_shape(system.force, t, q, v, params)
+        expected = jax.tree.map(jnp.shape, q)
+        if jax.tree.map(jnp.shape, force) != expected:
+            raise ValueError(
+                f"force(t, q, v, params) must return one force a coordinate, like q.\n"
+                f"  q has shapes {expected}\n  the force has {jax.tree.map(jnp.shape, force)}\n"
+                "Fix: return the structure of q, with 0.0 where no force acts."
+            )
+
+
+def momentum(system, t, q, v, params) -> PyTree[Float[Array, "..."]]:
+    """Return the canonical momentum `p = ∂L/∂v`.
+
+    >>> import lagjax as lj
+    >>> free = lj.System(lambda t, q, v, params: 0.5 * params["m"] * v**2)
+    >>> print(momentum(free, 0.0, 0.0, 3.0, {"m": 2.0}))
+    6.0
+
+    **Arguments:** `t` scalar, `q` and `v` alike, `params` as L takes it.
+
+    **Returns:** p with the structure of `q`, `[L] [t]/[q]`.
+
+    **Raises:** `TypeError`, `ValueError` for a state of the wrong dtype or shape, or an L that is not scalar.
+
+    Source: Goldstein, Eq. (2.44).
+    """
+    s = _checked(system, t, q, v, params)
+    return _momentum(system, *s)
+
+
+def mass_matrix(system, t, q, v, params) -> Float[Array, "n n"]:
+    """Return the mass matrix `M = ∂²L/∂v∂v`.
+
+    >>> import lagjax as lj
+    >>> bead = lj.System(lambda t, q, v, params: 0.5 * params["m"] * v["angle"] ** 2 * params["radius"] ** 2)
+    >>> print(mass_matrix(bead, 0.0, {"angle": 0.0}, {"angle": 0.0}, {"m": 2.0, "radius": 3.0}))
+    [[18.]]
+
+    **Arguments:** as for `momentum`.
+
+    **Returns:** M (n, n), symmetric, rows and columns in the order of `jax.tree.leaves(q)`,
+    `[L] [t]²/([q][q])`. It may be singular or indefinite.
+
+    **Raises:** as for `momentum`.
+
+    Source: Goldstein, Eq. (1.71).
+    """
+    s = _checked(system, t, q, v, params)
+    return _mass_matrix(system, *s)
+
+
+def jacobi_integral(system, t, q, v, params) -> Float[Array, ""]:
+    """Return the Jacobi integral `h = v·p - L`.
+
+    It is constant where L does not depend on time, no force or dissipation acts and no constraint moves;
+    it equals T + V only for natural, time-independent coordinates.
+
+    >>> import lagjax as lj
+    >>> fall = lj.System(lambda t, q, v, params: 0.5 * v**2 - params["g"] * q)
+    >>> print(jacobi_integral(fall, 0.0, 1.0, 2.0, {"g": 10.0}))
+    12.0
+
+    **Arguments:** as for `momentum`.
+
+    **Returns:** h, scalar, `[L]`.
+
+    **Raises:** as for `momentum`.
+
+    Source: Goldstein, Eq. (2.53).
+    """
+    s = _checked(system, t, q, v, params)
+    return _jacobi_integral(system, *s)
+
+
+def _checked(system, t, q, v, params):
+    s = coordinates.state(t, q, v, params)
+    check_scalar(system, *s)
+    return s
+
+
+@eqx.filter_jit
+def _momentum(system, t, q, v, params):
+    return jax.grad(system.lagrangian, argnums=2)(t, q, v, params)
+
+
+@eqx.filter_jit
+def _mass_matrix(system, t, q, v, params):
+    x, unflatten = coordinates.flatten(q)
+    u, _ = coordinates.flatten(v)
+    return mass_and_forcing(system, t, x, u, params, unflatten).mass
+
+
+@eqx.filter_jit
+def _jacobi_integral(system, t, q, v, params):
+    value, p = jax.value_and_grad(system.lagrangian, argnums=2)(t, q, v, params)
+    return coordinates.flatten(v)[0] @ coordinates.flatten(p)[0] - value
+
+
+def _force_vector(system, t, x, u, params, unflatten):
+    force = system.force(t, unflatten(x), unflatten(u), params)
+    return coordinates.flatten(force)[0].astype(x.dtype)

@@ -1,0 +1,82 @@
+"""A mechanical system: a Lagrangian, its constraints, and the forces that no potential gives."""
+
+from collections.abc import Callable, Mapping
+
+import equinox as eqx
+
+from lagjax.mechanics.constraints import Holonomic, Nonholonomic
+
+
+class System(eqx.Module):
+    """Describe a mechanical system by its Lagrangian.
+
+    >>> import jax.numpy as jnp
+    >>> def pendulum(t, q, v, params):
+    ...     return 0.5 * v**2 + params["g"] / params["length"] * jnp.cos(q)
+    >>> System(pendulum)
+    System(pendulum)
+
+    **Arguments:**
+
+    - `lagrangian`: `L(t, q, v, params)` -> scalar, `[energy]` (any unit: L may be scaled). Any JAX
+      function: explicit time, velocity-dependent potentials and non-quadratic kinetic terms included.
+      `q` and `v` arrive in the structure of the initial state, `params` as it was given.
+    - `constraints`: by name, `Holonomic(g)` or `Nonholonomic(phi)`. The name is the key of its multiplier.
+    - `force`: `Q(t, q, v, params)` -> like `q`, the generalized force that L does not contain,
+      `[L]/[q]`. It does the work `Q·v` per unit of time.
+    - `dissipation`: Rayleigh's function `R(t, q, v, params)` -> scalar; its force is `-∂R/∂v`, so
+      `R = ½ c v²` gives `-c v`.
+
+    **Raises:** `TypeError` where one of these is not a function or a constraint has no kind.
+
+    Source: Goldstein, *Classical Mechanics*, §1.5 (Lagrange's equations with R, Eq. 1.70) and §2.4.
+    """
+
+    lagrangian: Callable
+    constraints: dict[str, Holonomic | Nonholonomic]
+    force: Callable | None
+    dissipation: Callable | None
+
+    def __init__(
+        self,
+        lagrangian: Callable,
+        constraints: Mapping[str, Holonomic | Nonholonomic] | None = None,
+        force: Callable | None = None,
+        dissipation: Callable | None = None,
+    ):
+        for role, function in (("lagrangian", lagrangian), ("force", force), ("dissipation", dissipation)):
+            if function is not None and not callable(function):
+                raise TypeError(
+                    f"{role} must be a function of (t, q, v, params), not {type(function).__name__}.\n"
+                    f"Fix: pass the function itself, {role}=f, not its value f(...)."
+                )
+        if constraints is not None and not isinstance(constraints, Mapping):
+            raise TypeError(
+                f"constraints must be given by name, not as {type(constraints).__name__}.\n"
+                'Fix: constraints={"rod": lj.Holonomic(g)}.'
+            )
+        for name, constraint in (constraints or {}).items():
+            if not isinstance(constraint, (Holonomic, Nonholonomic)):
+                raise TypeError(
+                    f"constraint '{name}' is {type(constraint).__name__}; its kind is missing.\n"
+                    f'Fix: "{name}": lj.Holonomic(g) for g(t, q, params) = 0, or '
+                    f"lj.Nonholonomic(phi) for phi(t, q, v, params) = 0."
+                )
+        self.lagrangian = lagrangian
+        self.constraints = dict(constraints or {})
+        self.force = force
+        self.dissipation = dissipation
+
+    def __repr__(self):
+        parts = [_name(self.lagrangian)]
+        if self.constraints:
+            parts.append("constraints: " + ", ".join(f"{k} ({c.kind})" for k, c in self.constraints.items()))
+        if self.force is not None:
+            parts.append(f"force: {_name(self.force)}")
+        if self.dissipation is not None:
+            parts.append(f"dissipation: {_name(self.dissipation)}")
+        return f"System({'; '.join(parts)})"
+
+
+def _name(function):
+    return getattr(function, "__name__", type(function).__name__)

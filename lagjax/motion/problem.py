@@ -1,0 +1,149 @@
+"""The questions that `integrate` asks of its arguments before it starts, in the user's words."""
+
+from typing import Any
+
+import diffrax
+import jax.numpy as jnp
+import numpy as np
+
+from lagjax.mechanics import constraints, coordinates
+from lagjax.mechanics.lagrangian import check_scalar
+from lagjax.mechanics.multipliers import describe, explain_failure
+from lagjax.mechanics.system import System
+from lagjax.motion.consistency import departures
+from lagjax.motion.trajectory import RESULTS
+
+# Tolerances that each dtype reaches with room to spare, and the tightest that is not below its round-off.
+DEFAULT_TOLERANCE = {np.dtype("float64"): 1e-9, np.dtype("float32"): 1e-5}
+ROUND_OFFS = 8
+
+
+def check_system(system: Any):
+    """Raise where `system` is not a `System`."""
+    if not isinstance(system, System):
+        raise TypeError(
+            f"the first argument must be a lj.System, not {type(system).__name__}.\n"
+            "Fix: system = lj.System(lagrangian)."
+        )
+
+
+def check_method(method: Any):
+    """Raise where `method` is not an instance of a diffrax solver."""
+    if isinstance(method, type) and issubclass(method, diffrax.AbstractSolver):
+        raise TypeError(
+            f"method must be a solver instance, and {method.__name__} is the class.\n"
+            f"Fix: method=diffrax.{method.__name__}()."
+        )
+    if not isinstance(method, diffrax.AbstractSolver):
+        raise TypeError(
+            f"method must be a diffrax solver, not {type(method).__name__}.\nFix: method=diffrax.Dopri8()."
+        )
+
+
+def check_drift(drift: Any, system: System) -> str:
+    """The drift control to use; raise where it is unknown."""
+    if drift is None:
+        return "project" if system.constraints else "none"
+    if drift not in ("project", "baumgarte", "none"):
+        raise ValueError(f'drift must be "project", "baumgarte" or "none", not {drift!r}.')
+    return drift if system.constraints else "none"
+
+
+def times(ts: Any, dtype):
+    """`ts` as an increasing vector of `dtype`, or an error."""
+    ts = jnp.asarray(ts)
+    if ts.ndim != 1 or ts.shape[0] < 2:
+        raise ValueError(
+            f"ts must be a vector of at least two times, and has shape {ts.shape}.\n"
+            "The motion starts at ts[0] with (q0, v0).\nFix: ts=jnp.linspace(0.0, 10.0, 101)."
+        )
+    ts = ts.astype(dtype)
+    if not coordinates.is_traced(ts):
+        if not np.all(np.isfinite(ts)):
+            raise ValueError("ts contains NaN or infinity.\nFix: give finite times.")
+        late = np.flatnonzero(np.diff(np.asarray(ts)) <= 0)
+        if late.size:
+            i = int(late[0])
+            raise ValueError(
+                f"ts must increase, and ts[{i + 1}] = {float(ts[i + 1]):.9g} follows ts[{i}] = {float(ts[i]):.9g}.\n"
+                "Usual cause: times in descending order, a repeated time, or times closer than "
+                f"{dtype} can tell apart.\n"
+                "Fix: ts=jnp.sort(ts). To run backwards, integrate L(-t, q, -v, params) forwards."
+            )
+    return ts
+
+
+def tolerance(value: Any, name: str, dtype):
+    """A tolerance as an array of `dtype`, or an error where that dtype cannot reach it."""
+    dtype = np.dtype(dtype)
+    if value is None:
+        return jnp.asarray(DEFAULT_TOLERANCE.get(dtype, 1e-2), dtype)
+    if coordinates.is_traced(value):
+        return value
+    value = float(value)
+    if not value >= 0:
+        raise ValueError(f"{name} must be a number >= 0, not {value}.")
+    floor = ROUND_OFFS * float(jnp.finfo(dtype).eps)
+    if name == "rtol" and value < floor:
+        remedy = (
+            'Fix: jax.config.update("jax_enable_x64", True) before the first array, '
+            if dtype == np.dtype("float32")
+            else "Fix: "
+        )
+        raise ValueError(
+            f"{name} = {value:.3g} is below what {dtype} can reach ({floor:.1g}).\n"
+            f"Usual cause: JAX works in float32 unless told otherwise.\n{remedy}or {name}={10 * floor:.0e} or more."
+        )
+    return jnp.asarray(value, dtype)
+
+
+def check_functions(system: System, s: coordinates.State):
+    """Raise where L, R, Q or a constraint returns something of the wrong shape."""
+    check_scalar(system, *s)
+    constraints.shapes(system, *s)
+
+
+def check_finite(s: coordinates.State):
+    """Raise where a coordinate or velocity of the initial state is not finite."""
+    for which, tree in (("q0", s.q), ("v0", s.v)):
+        values = np.asarray(coordinates.flatten(tree)[0])
+        for name, value in zip(coordinates.names(tree), values):
+            if not np.isfinite(value):
+                raise ValueError(f"coordinate '{name}' of {which} is {value}.\nFix: start from finite numbers.")
+
+
+def off_constraints(system: System, s: coordinates.State, rtol, atol) -> str:
+    """Say which constraints the initial state violates."""
+    check_finite(s)
+    return (
+        f"the initial state is off the constraints: {departures(system, s, rtol, atol)}, where 0 is asked.\n"
+        "Usual cause: a coordinate or velocity computed for other parameters, or rounded.\n"
+        "Fix: q0, v0 = lj.consistent_state(system, ts[0], q0, v0, params) for the nearest consistent state."
+    )
+
+
+def stopped_early(trajectory, max_steps) -> str:
+    """Say where and why an integration stopped before its last output."""
+    end, t0, t1 = trajectory.end, float(trajectory.t[0]), float(trajectory.t[-1])
+    share = 100 * (float(end.t) - t0) / (t1 - t0)
+    steps = {k: int(n) for k, n in trajectory.stats.items()}
+    what = (
+        f"the integration stopped at t = {float(end.t):.9g}, {share:.3g} % of the way to {t1:.6g}, after "
+        f"{steps['num_accepted_steps']} accepted and {steps['num_rejected_steps']} rejected steps"
+    )
+    reason = explain_failure(trajectory.system, coordinates.State(end.t, end.q, end.v, trajectory.params))
+    if reason:
+        return f"{what}: {reason}"
+    if bool(trajectory.result == RESULTS.max_steps_reached):
+        return (
+            f"{what}: max_steps = {max_steps} is used up. The last state is {describe(end.q)}.\n"
+            "Usual cause: a stiff system under an explicit method, or a span of very many periods.\n"
+            f"Fix: max_steps={4 * max_steps}, a looser rtol, or method=diffrax.Kvaerno5() where it is stiff."
+        )
+    return (
+        f"{what}: {RESULTS[trajectory.result]} The last state is {describe(end.q)}.\n"
+        "Usual cause: a singularity of the motion (a collision, a singular configuration), a jump in a force, "
+        "or NaN from L beyond that state.\n"
+        "Fix: stop before it with event=diffrax.Event(...), or look at lj.accelerations at trajectory.end "
+        "with throw=False."
+    )

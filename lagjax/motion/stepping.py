@@ -1,0 +1,110 @@
+"""Any diffrax solver, kept on the constraints and exact between its steps.
+
+`OnManifold` wraps a diffrax solver. After each step it returns the state to the constraint manifold, and
+its dense output is a step of the solver itself: the state at t inside a step from t0 is one step from t0
+to t. Outputs and event times therefore have the order of the method (Kvaerno5's own interpolant is cubic,
+Dopri8's is of order six) and satisfy the constraints, for one step's cost an output.
+"""
+
+from collections.abc import Callable
+
+import diffrax
+import equinox as eqx
+import jax.tree_util as jtu
+from jaxtyping import PyTree
+
+from lagjax.mechanics.system import System
+from lagjax.motion.consistency import to_manifold
+
+
+class OnManifold(diffrax.AbstractWrappedSolver):
+    """Wrap `solver`: project after each step (where `project`), and step for dense output.
+
+    What the dense output needs of the problem (`terms`, `params`) belongs to the solver, since diffrax hands
+    an interpolation only times and states.
+    """
+
+    solver: diffrax.AbstractSolver
+    system: System
+    terms: PyTree[diffrax.AbstractTerm]
+    params: PyTree
+    project: bool = eqx.field(static=True)
+
+    @property
+    def term_structure(self):
+        return self.solver.term_structure
+
+    @property
+    def term_compatible_contr_kwargs(self):
+        return self.solver.term_compatible_contr_kwargs
+
+    @property
+    def scan_kind(self):
+        return self.solver.scan_kind
+
+    @property
+    def root_finder(self):
+        return self.solver.root_finder
+
+    @property
+    def root_find_max_steps(self):
+        return self.solver.root_find_max_steps
+
+    @property
+    def interpolation_cls(self) -> Callable:
+        return self._between
+
+    def _between(self, *, t0, t1, y0):
+        return SteppedTo(t0=t0, t1=t1, y0=y0, solver=self)
+
+    def order(self, terms):
+        return self.solver.order(terms)
+
+    def strong_order(self, terms):
+        return self.solver.strong_order(terms)
+
+    def error_order(self, terms):
+        return self.solver.error_order(terms)
+
+    def init(self, terms, t0, t1, y0, args):
+        return self.solver.init(terms, t0, t1, y0, args)
+
+    def func(self, terms, t0, y0, args):
+        return self.solver.func(terms, t0, y0, args)
+
+    def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
+        # The projection moves the state, so a derivative kept from the last step's end is stale.
+        jumped = True if self.project else made_jump
+        y1, error, _, solver_state, result = self.solver.step(
+            terms, t0, t1, y0, args, solver_state, jumped
+        )
+        if self.project:
+            y1 = to_manifold(self.system, t1, *y1, args)
+        return y1, error, {"y0": y0}, solver_state, result
+
+
+class SteppedTo(diffrax.AbstractLocalInterpolation):
+    """The state inside a step, by one step of the solver from the step's start."""
+
+    t0: PyTree
+    t1: PyTree
+    y0: PyTree
+    solver: OnManifold
+
+    def evaluate(self, t0, t1=None, left=True):
+        if t1 is not None:
+            return jtu.tree_map(lambda b, a: b - a, self.evaluate(t1), self.evaluate(t0))
+        s = self.solver
+        state = s.init(s.terms, self.t0, self.t1, self.y0, s.params)
+        y, *_ = s.step(s.terms, self.t0, t0, self.y0, s.params, state, made_jump=False)
+        return y
+
+
+def forward_differentiable(method):
+    """A method whose stage loop can be differentiated forward even inside a reverse-mode solve.
+
+    An event time is an implicit function of the step, and its derivative needs ∂y/∂t forward.
+    """
+    if not isinstance(method, diffrax.AbstractRungeKutta) or method.scan_kind is not None:
+        return method
+    return eqx.tree_at(lambda s: s.scan_kind, method, "bounded", is_leaf=lambda x: x is None)

@@ -1,0 +1,219 @@
+"""The answer of an integration: times, states, multipliers, and how it went."""
+
+from typing import NamedTuple
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PyTree
+
+from lagjax import plot
+from lagjax.mechanics import coordinates
+from lagjax.mechanics.system import System
+from lagjax.motion.consistency import worst_residual
+
+
+class RESULTS(diffrax.RESULTS):
+    """How an integration ended: diffrax's results, and a start that could not be integrated."""
+
+    start_off_constraints = "The initial state does not satisfy the constraints."
+    start_not_finite = "L, the accelerations or the multipliers are not finite at the initial state."
+
+
+class Moment(NamedTuple):
+    """One instant of a motion."""
+
+    t: Float[Array, ""]
+    q: PyTree[Float[Array, "..."]]
+    v: PyTree[Float[Array, "..."]]
+    multipliers: dict[str, Array]
+
+
+class Static(NamedTuple):
+    """What of a trajectory is not an array: it must be hashable, so that JAX can carry it along."""
+
+    parts: tuple
+    structure: object
+    method: str
+
+
+class Trajectory(eqx.Module):
+    """A motion at the requested times. It prints its own quality and plots itself.
+
+    - `t` (T,): the times asked for.
+    - `q`, `v`: in the structure of the initial state, each leaf with a leading axis T. NaN after an event
+      or a failure ended the motion.
+    - `multipliers`: by constraint name, (T, *shape of the constraint), from the projected states.
+    - `end`: the last instant reached (`t`, `q`, `v`, `multipliers`): the event, where one ended the motion.
+    - `stats`: `num_steps`, `num_accepted_steps`, `num_rejected_steps`.
+    - `result`: a `RESULTS` item; `lj.RESULTS.successful`, `event_occurred`, or what went wrong.
+    - `params`, `system`: what was integrated. `tolerance`: (rtol, atol).
+
+    Under `vmap` every array has the batch's axes in front.
+    """
+
+    t: Float[Array, " T"]
+    q: PyTree[Float[Array, "T ..."]]
+    v: PyTree[Float[Array, "T ..."]]
+    multipliers: dict[str, Array]
+    end: Moment
+    stats: dict[str, Array]
+    result: RESULTS
+    tolerance: tuple[Array, Array]
+    arrays: PyTree
+    static: Static = eqx.field(static=True)
+
+    @property
+    def system(self) -> System:
+        return self._problem()[0]
+
+    @property
+    def params(self) -> PyTree:
+        return self._problem()[1]
+
+    def _problem(self):
+        static = jax.tree.unflatten(self.static.structure, self.static.parts)
+        return eqx.combine(self.arrays, static)
+
+    def jacobi_integral(self) -> Float[Array, " T"]:
+        """The Jacobi integral `v·p - L` at every output, (T,), `[L]`. Not for batched trajectories."""
+        return _jacobi_and_scale(self.system, self.t, self.q, self.v, self.params)[0]
+
+    def drift(self) -> Float[Array, ""]:
+        """The largest change of the Jacobi integral, relative to the largest `|v·p| + |L|`."""
+        h, scale = _jacobi_and_scale(self.system, self.t, self.q, self.v, self.params)
+        largest = jnp.nanmax(scale)
+        return jnp.nanmax(jnp.abs(h - h[0])) / jnp.where(largest > 0, largest, 1.0)
+
+    def residual(self) -> Float[Array, ""]:
+        """The worst constraint residual over all outputs, positions and velocities, relative."""
+        return _worst_residual(self.system, self.t, self.q, self.v, self.params)
+
+    def plot(self):
+        """Plot coordinates, velocities and multipliers against time; returns a matplotlib `Figure`.
+
+        **Raises:** `ImportError` without matplotlib; `ValueError` for a batched trajectory.
+        """
+        if self.t.ndim != 1:
+            raise ValueError(
+                f"this trajectory is a batch of shape {self.t.shape[:-1]}: plot one lane of it.\n"
+                "Fix: jax.tree.map(lambda x: x[0], traj).plot()"
+            )
+        panels = {"q": _curves(self.q), "v": _curves(self.v)}
+        if self.multipliers:
+            panels["multipliers"] = {
+                name + suffix: curve
+                for name, values in self.multipliers.items()
+                for suffix, curve in _columns(values)
+            }
+        return plot.time_series(np.asarray(self.t), panels)
+
+    def __repr__(self):
+        if coordinates.is_traced(self):
+            return f"Trajectory({self.static.method}, being traced, t: {self.t.shape})"
+        lanes = self.t.shape[:-1]
+        return "\n".join(_batch_lines(self, lanes) if lanes else _lines(self))
+
+
+def pack(system, params) -> tuple[PyTree, tuple, object]:
+    """Split (system, params) into arrays and hashable rest."""
+    arrays, static = eqx.partition((system, params), eqx.is_array)
+    parts, structure = jax.tree.flatten(static)
+    return arrays, tuple(parts), structure
+
+
+def message(result) -> str:
+    """A result in words."""
+    if bool(result == RESULTS.successful):
+        return "successful"
+    return RESULTS[result]
+
+
+def _lines(traj):
+    rows = [
+        ("method", f"{traj.static.method}, rtol {float(traj.tolerance[0]):.3g}, atol {float(traj.tolerance[1]):.3g}"),
+        ("result", message(traj.result) + _ended(traj)),
+        (
+            "steps",
+            f"{int(traj.stats['num_accepted_steps'])} accepted, {int(traj.stats['num_rejected_steps'])} rejected",
+        ),
+    ]
+    if traj.system.constraints:
+        rows.append(("worst constraint residual", f"{float(traj.residual()):.1e} (relative)"))
+    rows.append(("change of the Jacobi integral", f"{float(traj.drift()):.1e} (relative)"))
+    rows += _shape_rows(traj)
+    return ["Trajectory", *_aligned(rows)]
+
+
+def _batch_lines(traj, lanes):
+    values, counts = np.unique(np.asarray(traj.result._value), return_counts=True)
+    words = [f"{n} {message(RESULTS.promote(_item(traj.result, v)))}" for v, n in zip(values, counts)]
+    steps = np.asarray(traj.stats["num_steps"])
+    rows = [
+        ("method", traj.static.method),
+        ("lanes", " x ".join(map(str, lanes))),
+        ("results", "; ".join(words)),
+        ("steps a lane", f"{steps.min()} to {steps.max()}, {int(steps.sum())} in all"),
+        *_shape_rows(traj),
+    ]
+    return ["Trajectory, a batch", *_aligned(rows)]
+
+
+def _item(result, value):
+    return eqx.tree_at(lambda r: r._value, result, jnp.asarray(value))
+
+
+def _ended(traj):
+    last = float(traj.t[-1])
+    return "" if float(traj.end.t) >= last else f" (at t = {float(traj.end.t):.9g} of {last:.6g})"
+
+
+def _shape_rows(traj):
+    rows = [("outputs", f"{traj.t.shape[-1]} times, {traj.t.dtype}")]
+    for label, tree in (("q, v", traj.q), ("multipliers", traj.multipliers)):
+        leaves = jax.tree_util.tree_leaves_with_path(tree)
+        if leaves:
+            shown = [f"{jax.tree_util.keystr(p, simple=True, separator='.')} {x.shape}".strip() for p, x in leaves]
+            rows.append((label, ", ".join(shown)))
+    return rows
+
+
+def _aligned(rows):
+    width = max(len(label) for label, _ in rows)
+    return [f"  {label:<{width}}  {value}" for label, value in rows]
+
+
+def _curves(tree):
+    """One curve a coordinate, by the user's names."""
+    first = jax.tree.map(lambda x: np.asarray(x[0]), tree)
+    columns = np.stack([np.ravel(x) for x in _rows(tree)])
+    return dict(zip(coordinates.names(first), columns.T))
+
+
+def _rows(tree):
+    leaves = [np.asarray(x).reshape(len(x), -1) for x in jax.tree.leaves(tree)]
+    return np.concatenate(leaves, axis=1)
+
+
+def _columns(values):
+    values = np.asarray(values)
+    if values.ndim == 1:
+        return [("", values)]
+    return [(f"[{i}]", column) for i, column in enumerate(values.T)]
+
+
+@eqx.filter_jit
+def _jacobi_and_scale(system, t, q, v, params):
+    def at(t, q, v):
+        value, p = jax.value_and_grad(system.lagrangian, argnums=2)(t, q, v, params)
+        power = coordinates.flatten(v)[0] @ coordinates.flatten(p)[0]
+        return power - value, jnp.abs(power) + jnp.abs(value)
+
+    return jax.vmap(at)(t, q, v)
+
+
+@eqx.filter_jit
+def _worst_residual(system, t, q, v, params):
+    return worst_residual(system, t, q, v, params)

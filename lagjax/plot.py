@@ -1,0 +1,77 @@
+"""One look for every picture. Needs matplotlib (`pip install "lagjax[plot]"`)."""
+
+import numpy as np
+
+# Okabe & Ito's colours: distinct to colour-blind readers and in grey print, with a marker and dash each.
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+DASHES = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (8, 2)), (0, (1, 1)))
+MARKERS = ("o", "s", "^", "D", "v", "P", "X")
+
+
+def figure(rows=1, columns=1, size=(4.6, 3.2), **options):
+    """Make a figure of `rows` x `columns` axes, each of `size` inches; returns (figure, 2-D array of axes)."""
+    import_matplotlib()
+    from matplotlib.figure import Figure
+
+    fig = Figure(figsize=(size[0] * columns, size[1] * rows), layout="constrained", dpi=130)
+    axes = fig.subplots(rows, columns, squeeze=False, **options)
+    for axis in axes.flat:
+        axis.grid(True, linewidth=0.4, alpha=0.5)
+        axis.spines[["top", "right"]].set_visible(False)
+    return fig, axes
+
+
+def import_matplotlib():
+    """Import matplotlib, or say how to get it."""
+    try:
+        import matplotlib
+    except ImportError as error:
+        raise ImportError(
+            'plots need matplotlib, which is an optional extra.\nFix: pip install "lagjax[plot]"'
+        ) from error
+    return matplotlib
+
+
+def style(i: int) -> dict:
+    """Colour and dash of the i-th curve."""
+    return {"color": COLOURS[i % len(COLOURS)], "linestyle": DASHES[i % len(DASHES)]}
+
+
+def time_series(t, panels: dict[str, dict[str, np.ndarray]]):
+    """Draw curves against time, one panel a key of `panels`, one curve a name in it.
+
+    **Arguments:** `t` (T,); `panels` by axis label, curves (T,) by name.
+
+    **Returns:** a matplotlib `Figure`.
+    """
+    fig, axes = figure(len(panels), 1, size=(6.4, 2.2), sharex=True)
+    for axis, (label, curves) in zip(axes[:, 0], panels.items()):
+        for i, (name, values) in enumerate(curves.items()):
+            axis.plot(t, values, label=name, **style(i))
+        axis.set_ylabel(label)
+        if len(curves) > 1 or list(curves) != [label]:
+            axis.legend(fontsize=8, frameon=False, loc="center left", bbox_to_anchor=(1.0, 0.5))
+    axes[-1, 0].set_xlabel("t")
+    return fig
+
+
+def work_precision(title: str, curves: dict[str, tuple[np.ndarray, np.ndarray]]):
+    """Draw error against run time, one curve a method; returns a matplotlib `Figure`.
+
+    **Arguments:** `curves` by method: (run times in seconds, relative errors). Zero errors are left out.
+    """
+    fig, axes = figure()
+    axis = axes[0, 0]
+    for i, (method, (seconds, errors)) in enumerate(curves.items()):
+        shown = np.asarray(errors) > 0
+        axis.loglog(
+            1e3 * np.asarray(seconds)[shown],
+            np.asarray(errors)[shown],
+            marker=MARKERS[i % len(MARKERS)],
+            markersize=4,
+            label=method,
+            **style(i),
+        )
+    axis.set(xlabel="run time / ms (median)", ylabel="relative error", title=title)
+    axis.legend(fontsize=8, frameon=False)
+    return fig

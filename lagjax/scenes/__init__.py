@@ -1,0 +1,1 @@
+"""Worked systems: Lagrangian, parameters, initial state, exact results, source."""
