@@ -1,8 +1,49 @@
-"""lagjax"""
-from lagjax.mechanics.constraints import Holonomic as Holonomic, Nonholonomic as Nonholonomic
-from lagjax.mechanics.lagrangian import jacobi_integral as jacobi_integral, mass_matrix as mass_matrix, momentum as momentum
-from lagjax.mechanics.multipliers import accelerations as accelerations, constraint_force as constraint_force, constraint_residual as constraint_residual
-from lagjax.mechanics.system import System as System
-from lagjax.motion.consistency import consistent_state as consistent_state
-from lagjax.motion.integrate import integrate as integrate
-from lagjax.motion.trajectory import RESULTS as RESULTS, Trajectory as Trajectory
+"""lagjax: a differentiable Lagrangian integrator.
+
+Write a Lagrangian as a plain JAX function `L(t, q, v, params)`; everything else follows from it. The names
+below stand in the order of the physics. Worked systems are in `lagjax.scenes`.
+
+    M a = F + Aᵀ λ      M = ∂²L/∂v∂v,   F = ∂L/∂q - ∂p/∂t - (∂p/∂q) v + Q - ∂R/∂v,   p = ∂L/∂v
+    A a = gamma         A = ∂g/∂q (holonomic g = 0) or ∂phi/∂v (velocity constraint phi = 0)
+
+λ > 0 pushes along +∂g/∂q; `R = ½ c v²` gives the force `-c v`; `jacobi_integral` is `v·p - L`, which is
+T + V only for natural, time-independent coordinates.
+"""
+
+# A system: its Lagrangian and its constraints.
+from lagjax.mechanics.constraints import Holonomic, Nonholonomic
+from lagjax.mechanics.system import System
+
+# isort: split
+# One state: what the Lagrangian and the constraints say about it.
+from lagjax.mechanics.lagrangian import jacobi_integral, mass_matrix, momentum
+from lagjax.mechanics.multipliers import accelerations, constraint_force, constraint_residual
+from lagjax.motion.consistency import consistent_state
+
+# isort: split
+# Motion.
+from lagjax.motion.integrate import integrate
+from lagjax.motion.trajectory import RESULTS, Moment, Trajectory
+
+# isort: split
+# Error against run time.
+from lagjax.report import Run, work_precision
+
+__all__ = [
+    "System",
+    "Holonomic",
+    "Nonholonomic",
+    "momentum",
+    "mass_matrix",
+    "accelerations",
+    "jacobi_integral",
+    "constraint_residual",
+    "constraint_force",
+    "consistent_state",
+    "integrate",
+    "Trajectory",
+    "Moment",
+    "RESULTS",
+    "Run",
+    "work_precision",
+]

@@ -213,9 +213,7 @@ def _seconds(solve, tolerance):
 
 
 def _row(run, name, tolerance, trajectory, seconds, compile_seconds, judged):
-    ended_well = bool(
-        (trajectory.result == RESULTS.successful) | (trajectory.result == RESULTS.event_occurred)
-    )
+    ended_well = bool((trajectory.result == RESULTS.successful) | (trajectory.result == RESULTS.event_occurred))
     return Row(
         run=run.name,
         method=name,

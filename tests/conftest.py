@@ -1,7 +1,7 @@
 """Strict numerics for all tests: float64, no silent rank promotion, warnings are errors."""
 
 import jax
-import pytest
+
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")

@@ -163,9 +163,7 @@ def holonomic_equations(system, t, q, v, params) -> np.ndarray:
 
 def _velocity_level(constraint, t, x, u, params, unflatten):
     if isinstance(constraint, Holonomic):
-        return jax.jvp(
-            lambda t, x: constraint.g(t, unflatten(x), params), (t, x), (jnp.ones_like(t), u)
-        )[1]
+        return jax.jvp(lambda t, x: constraint.g(t, unflatten(x), params), (t, x), (jnp.ones_like(t), u))[1]
     return constraint.phi(t, unflatten(x), unflatten(u), params)
 
 

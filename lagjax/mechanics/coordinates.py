@@ -122,6 +122,4 @@ def _check_alike(q, v):
 
 def _leaf_names(tree):
     paths = jtu.tree_flatten_with_path(tree)[0]
-    return [
-        "".join(_key_name(key, first=i == 0) for i, key in enumerate(path)) or "q" for path, _ in paths
-    ]
+    return ["".join(_key_name(key, first=i == 0) for i, key in enumerate(path)) or "q" for path, _ in paths]

@@ -45,9 +45,7 @@ def mass_and_forcing(system, t, x, u, params, unflatten) -> Linear:
     if system.force is not None:
         forcing = forcing + _force_vector(system, t, x, u, params, unflatten)
     if system.dissipation is not None:
-        forcing = forcing - jax.grad(
-            lambda u: system.dissipation(t, unflatten(x), unflatten(u), params)
-        )(u)
+        forcing = forcing - jax.grad(lambda u: system.dissipation(t, unflatten(x), unflatten(u), params))(u)
     if x.size == 1:
         mass = push(zero_t, zero, jnp.ones_like(u))[None]
     else:

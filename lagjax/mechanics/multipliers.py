@@ -261,10 +261,7 @@ def _constraint_residual(system, t, q, v, params, level):
         u, _ = coordinates.flatten(v)
         stacked = constraints.velocity_residual(system, t, x, u, params, unflatten)
         return constraints.split(system, stacked, t, q, v, params)
-    return {
-        name: constraints.evaluate(constraint, t, q, v, params)
-        for name, constraint in system.constraints.items()
-    }
+    return {name: constraints.evaluate(constraint, t, q, v, params) for name, constraint in system.constraints.items()}
 
 
 def _leaves(tree):

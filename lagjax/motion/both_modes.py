@@ -52,9 +52,7 @@ def _solve_jvp(primals, tangents, *, solve):
 
     floats, rest = eqx.partition(y, eqx.is_inexact_array)
     shapes = tuple((leaf.shape, leaf.dtype) for leaf in jtu.tree_leaves(floats))
-    dy = _tangent_p.bind(
-        *leaves, *jtu.tree_leaves(dx), outputs=float_outputs, shapes=shapes, size=size
-    )
+    dy = _tangent_p.bind(*leaves, *jtu.tree_leaves(dx), outputs=float_outputs, shapes=shapes, size=size)
     dy = jtu.tree_unflatten(jtu.tree_structure(floats), dy)
     return y, eqx.combine(dy, jtu.tree_map(lambda _: None, rest))
 
@@ -84,9 +82,7 @@ def _tangent_jvp(primals, tangents, **params):
 
 def _tangent_transpose(cotangents, *operands, outputs, shapes, size):
     x, fixed, _ = _split(operands, size)
-    _, pullback = jax.vjp(
-        lambda *x: outputs(diffrax.RecursiveCheckpointAdjoint(), *x, *fixed), *x
-    )
+    _, pullback = jax.vjp(lambda *x: outputs(diffrax.RecursiveCheckpointAdjoint(), *x, *fixed), *x)
     dx = pullback([ad.instantiate_zeros(ct) for ct in cotangents])
     return [None] * (len(operands) - size) + list(dx)
 

@@ -115,9 +115,7 @@ def worst_residual(system, t, q, v, params):
 def level_size(size):
     """The largest coordinate and the largest velocity, in place of each: one zero sets no scale."""
     positions, velocities = jnp.split(size, 2)
-    return jnp.concatenate(
-        [jnp.full_like(positions, positions.max()), jnp.full_like(velocities, velocities.max())]
-    )
+    return jnp.concatenate([jnp.full_like(positions, positions.max()), jnp.full_like(velocities, velocities.max())])
 
 
 @eqx.filter_jit
@@ -143,13 +141,9 @@ def departures(system, s: coordinates.State, rtol, atol) -> str:
     residual, slope, size = (np.asarray(part) for part in residuals_and_slopes(system, *s))
     # NaN is a violation too.
     off = np.flatnonzero(~(np.abs(residual) <= slope @ (atol + rtol * np.asarray(level_size(size)))))
-    positions = [
-        name for name in equation_names(system, s) if _kind(system, name) == "holonomic"
-    ]
+    positions = [name for name in equation_names(system, s) if _kind(system, name) == "holonomic"]
     labels = [f"'{name}'" for name in positions]
-    labels += [
-        f"d/dt '{name}'" if name in positions else f"'{name}'" for name in equation_names(system, s)
-    ]
+    labels += [f"d/dt '{name}'" if name in positions else f"'{name}'" for name in equation_names(system, s)]
     return ", ".join(f"{labels[i]} = {residual[i]:.3g}" for i in off)
 
 

@@ -35,9 +35,7 @@ def check_method(method: Any):
             f"Fix: method=diffrax.{method.__name__}()."
         )
     if not isinstance(method, diffrax.AbstractSolver):
-        raise TypeError(
-            f"method must be a diffrax solver, not {type(method).__name__}.\nFix: method=diffrax.Dopri8()."
-        )
+        raise TypeError(f"method must be a diffrax solver, not {type(method).__name__}.\nFix: method=diffrax.Dopri8().")
 
 
 def check_drift(drift: Any, system: System) -> str:

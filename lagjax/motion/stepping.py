@@ -75,9 +75,7 @@ class OnManifold(diffrax.AbstractWrappedSolver):
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         # The projection moves the state, so a derivative kept from the last step's end is stale.
         jumped = True if self.project else made_jump
-        y1, error, _, solver_state, result = self.solver.step(
-            terms, t0, t1, y0, args, solver_state, jumped
-        )
+        y1, error, _, solver_state, result = self.solver.step(terms, t0, t1, y0, args, solver_state, jumped)
         if self.project:
             y1 = to_manifold(self.system, t1, *y1, args)
         return y1, error, {"y0": y0}, solver_state, result

@@ -104,9 +104,7 @@ class Trajectory(eqx.Module):
         panels = {"q": _curves(self.q), "v": _curves(self.v)}
         if self.multipliers:
             panels["multipliers"] = {
-                name + suffix: curve
-                for name, values in self.multipliers.items()
-                for suffix, curve in _columns(values)
+                name + suffix: curve for name, values in self.multipliers.items() for suffix, curve in _columns(values)
             }
         return plot.time_series(np.asarray(self.t), panels)
 
@@ -117,11 +115,11 @@ class Trajectory(eqx.Module):
         return "\n".join(_batch_lines(self, lanes) if lanes else _lines(self))
 
 
-def pack(system, params) -> tuple[PyTree, tuple, object]:
+def pack(system, params, method: str) -> tuple[PyTree, Static]:
     """Split (system, params) into arrays and hashable rest."""
     arrays, static = eqx.partition((system, params), eqx.is_array)
     parts, structure = jax.tree.flatten(static)
-    return arrays, tuple(parts), structure
+    return arrays, Static(tuple(parts), structure, method)
 
 
 def message(result) -> str:

@@ -1,1 +1,37 @@
-"""Worked systems: Lagrangian, parameters, initial state, exact results, source."""
+"""Worked systems: Lagrangian, parameters, initial state, exact results, source.
+
+Each module holds the Lagrangian as a reader of the source would write it, `PARAMS`, an initial state, the
+exact results that the tests and the main job compare with, and `MISPRINTS`: where the source is wrong and what
+is right. `SCENE` gathers them for `python -m lagjax`.
+"""
+
+from lagjax.scenes import (
+    bead_on_hoop,
+    cross_rails,
+    mass_distributions,
+    rolling_hoop,
+    sliding_wedge,
+    sphere_geodesic,
+)
+
+SCENES = {
+    module.SCENE.name: module.SCENE
+    for module in (
+        sphere_geodesic,
+        rolling_hoop,
+        bead_on_hoop,
+        mass_distributions,
+        sliding_wedge,
+        cross_rails,
+    )
+}
+
+__all__ = [
+    "SCENES",
+    "bead_on_hoop",
+    "cross_rails",
+    "mass_distributions",
+    "rolling_hoop",
+    "sliding_wedge",
+    "sphere_geodesic",
+]

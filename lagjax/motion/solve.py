@@ -1,0 +1,184 @@
+"""The compiled program behind `integrate`: start, diffrax's loop, outputs.
+
+Nothing here looks at values: a start that cannot be integrated becomes NaN at once, diffrax then stops within a
+few rejected steps, and the lane keeps the reason in its result.
+"""
+
+import importlib.util
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optimistix as optx
+from jaxtyping import Array, Float
+
+from lagjax.mechanics import coordinates
+from lagjax.mechanics.multipliers import equations_of_motion, linear_system, saddle_point_matrix
+from lagjax.motion.both_modes import solve_in_both_modes
+from lagjax.motion.consistency import level_size, residuals_and_slopes, to_manifold
+from lagjax.motion.stepping import OnManifold, forward_differentiable
+from lagjax.motion.trajectory import RESULTS, Moment, Trajectory, pack
+
+# A start may be off the constraints by this many tolerances; it is then moved onto them.
+START_TOLERANCES = 100.0
+# Baumgarte's feedback decays a violation by e this many times over the time span.
+BAUMGARTE_DECAYS = 50.0
+
+
+class Settings(eqx.Module):
+    """How to integrate: everything but the system, the state and the times."""
+
+    method: diffrax.AbstractSolver
+    controller: diffrax.AbstractStepSizeController | None
+    event: diffrax.Event | None
+    adjoint: diffrax.AbstractAdjoint | None
+    rtol: Float[Array, ""]
+    atol: Float[Array, ""]
+    dt0: Float[Array, ""] | None
+    max_steps: int | None = eqx.field(static=True)
+    drift: str = eqx.field(static=True)
+    progress: bool = eqx.field(static=True)
+
+
+@eqx.filter_jit
+def trajectory_of(system, q0, v0, params, ts, settings) -> tuple[Trajectory, Array]:
+    """The trajectory, and the matrix of its equations at the start (for a look at its rank)."""
+    # Derivatives flow to the floating arrays of these; the settings are constants.
+    x, rest = eqx.partition((system, q0, v0, params, ts), eqx.is_inexact_array)
+    fixed, static = eqx.partition((rest, settings), eqx.is_array)
+
+    def solved(x, fixed, adjoint):
+        rest, settings = eqx.combine(fixed, static)
+        return _solve(*eqx.combine(x, rest), settings, adjoint)
+
+    if settings.adjoint is None:
+        fields, matrix = solve_in_both_modes(solved, x, fixed)
+    else:
+        fields, matrix = solved(x, fixed, settings.adjoint)
+    arrays, described = pack(system, params, type(settings.method).__name__)
+    tolerance = (settings.rtol, settings.atol)
+    return Trajectory(t=ts, **fields, tolerance=tolerance, arrays=arrays, static=described), matrix
+
+
+def _solve(system, q0, v0, params, ts, settings, adjoint):
+    off_constraints = _off_constraints(system, ts[0], q0, v0, params, settings)
+    if settings.drift == "project":
+        q0, v0 = to_manifold(system, ts[0], q0, v0, params)
+    matrix, finite = _start_equations(system, ts[0], q0, v0, params)
+    y0 = jax.tree.map(lambda x: jnp.where(off_constraints | ~finite, jnp.nan, x), (q0, v0))
+    terms = diffrax.ODETerm(_vector_field(system, ts, settings.drift))
+    # BacksolveAdjoint integrates a larger state backwards: it takes the bare method, and no end beside the outputs.
+    bare = isinstance(adjoint, diffrax.BacksolveAdjoint)
+    at_ts, at_end = diffrax.SubSaveAt(ts=ts), diffrax.SubSaveAt(t1=True)
+    solution = diffrax.diffeqsolve(
+        terms,
+        settings.method if bare else _solver(system, terms, params, settings),
+        t0=ts[0],
+        t1=ts[-1],
+        dt0=settings.dt0,
+        y0=y0,
+        args=params,
+        saveat=diffrax.SaveAt(ts=ts) if bare else diffrax.SaveAt(subs=(at_ts, at_end)),
+        stepsize_controller=_controller(ts, settings),
+        adjoint=adjoint,
+        event=_located_event(settings.event, ts),
+        max_steps=settings.max_steps,
+        throw=False,
+        progress_meter=_progress_meter(settings.progress),
+    )
+    if bare:
+        reached_ts, outputs = solution.ts, solution.ys
+        end_t, end_y = jax.tree.map(lambda x: x[-1:], (reached_ts, outputs))
+    else:
+        (reached_ts, end_t), (outputs, end_y) = solution.ts, solution.ys
+
+    # What was not reached is evaluated at the start and masked afterwards: NaN times zero would poison gradients.
+    reached = jnp.isfinite(reached_ts)
+    outputs = jax.tree.map(lambda x, x0: jnp.where(_like(reached, x), x, x0), outputs, (q0, v0))
+    # One compiled evaluation for the outputs and the end together.
+    t, (q, v) = jax.tree.map(lambda x, last: jnp.concatenate([x, last]), (ts, outputs), (end_t, end_y))
+    everything = Moment(t, q, v, _multipliers(system, t, q, v, params))
+    end = jax.tree.map(lambda x: x[-1], everything)
+    _, q, v, multipliers = jax.tree.map(lambda x: jnp.where(_like(reached, x), x[:-1], jnp.nan), everything)
+
+    result = RESULTS.promote(solution.result)
+    result = RESULTS.where(finite, result, RESULTS.start_not_finite)
+    result = RESULTS.where(off_constraints, RESULTS.start_off_constraints, result)
+    stats = {name: jnp.asarray(count) for name, count in solution.stats.items() if name != "max_steps"}
+    return {"q": q, "v": v, "multipliers": multipliers, "end": end, "stats": stats, "result": result}, matrix
+
+
+def _vector_field(system, ts, drift):
+    """d(q, v)/dt = (v, a), on the user's pytrees."""
+    rate = BAUMGARTE_DECAYS / (ts[-1] - ts[0]) if drift == "baumgarte" else None
+
+    def field(t, y, params):
+        q, v = y
+        return v, equations_of_motion(system, t, q, v, params, rate)[0]
+
+    return field
+
+
+def _multipliers(system, t, q, v, params):
+    at = lambda t, q, v: equations_of_motion(system, t, q, v, params)[1]
+    return jax.vmap(at)(t, q, v) if system.constraints else {}
+
+
+def _off_constraints(system, t, q, v, params, settings):
+    if not system.constraints:
+        return jnp.asarray(False)
+    residual, slope, size = residuals_and_slopes(system, t, q, v, params)
+    allowed = START_TOLERANCES * (slope @ (settings.atol + settings.rtol * level_size(size)))
+    return ~jnp.all(jnp.abs(residual) <= allowed)
+
+
+def _start_equations(system, t, q, v, params):
+    """The matrix of the equations at the start, and whether all of them are finite."""
+    linear, rows, lagrangian = linear_system(system, t, q, v, params)
+    solution = equations_of_motion(system, t, q, v, params)
+    finite = jnp.all(jnp.isfinite(coordinates.flatten((solution, lagrangian))[0]))
+    return jax.lax.stop_gradient(saddle_point_matrix(linear.mass, rows.jacobian)), finite
+
+
+def _solver(system, terms, params, settings):
+    method = settings.method if settings.event is None else forward_differentiable(settings.method)
+    return OnManifold(method, system, terms, params, settings.drift == "project")
+
+
+def _controller(ts, settings):
+    if settings.controller is not None:
+        return settings.controller
+    # A step that small no longer moves t: the solution is singular there, or was NaN from the start.
+    dtmin = 16 * jnp.finfo(ts.dtype).eps * jnp.maximum(jnp.abs(ts[0]), jnp.abs(ts[-1]))
+    return diffrax.PIDController(rtol=settings.rtol, atol=settings.atol, dtmin=dtmin, force_dtmin=False)
+
+
+def _located_event(event, ts):
+    """Locate a real-valued event to round-off in t where the user names no root finder."""
+    if event is None or event.root_finder is not None:
+        return event
+    round_off = 4 * jnp.finfo(ts.dtype).eps
+
+    def small(condition):
+        # Bisection also asks |f| < atol, in the unit of t; only the sign of f is of interest here.
+        def scaled(t, y, args, **kwargs):
+            value = jnp.asarray(condition(t, y, args, **kwargs))
+            return value if value.dtype == bool else 1e-20 * value
+
+        return scaled
+
+    finder = optx.Bisection(rtol=round_off, atol=round_off * (ts[-1] - ts[0]))
+    return diffrax.Event(jax.tree.map(small, event.cond_fn, is_leaf=callable), finder, event.direction)
+
+
+def _progress_meter(progress):
+    if not progress:
+        return diffrax.NoProgressMeter()
+    if importlib.util.find_spec("tqdm") is None:
+        return diffrax.TextProgressMeter()
+    return diffrax.TqdmProgressMeter()
+
+
+def _like(mask, x):
+    return mask.reshape(mask.shape + (1,) * (x.ndim - 1))
