@@ -108,7 +108,7 @@ def worst_residual(system, t, q, v, params):
     """
     residual, slope, size = jax.vmap(lambda t, q, v: residuals_and_slopes(system, t, q, v, params))(t, q, v)
     # Outputs after an event or a failure are NaN and say nothing about the constraints.
-    scale = jnp.sum(slope * level_size(jnp.nanmax(size, axis=0)), axis=-1)
+    scale = slope @ level_size(jnp.nanmax(size, axis=0))
     return jnp.nanmax(jnp.abs(residual) / jnp.where(scale > 0, scale, 1.0))
 
 

@@ -95,7 +95,7 @@ def _solve(system, q0, v0, params, ts, settings, adjoint):
 
     # What was not reached is evaluated at the start and masked afterwards: NaN times zero would poison gradients.
     reached = jnp.isfinite(reached_ts)
-    outputs = jax.tree.map(lambda x, x0: jnp.where(_like(reached, x), x, x0), outputs, (q0, v0))
+    outputs = jax.tree.map(lambda x, x0: jnp.where(_like(reached, x), x, x0[None]), outputs, (q0, v0))
     # One compiled evaluation for the outputs and the end together.
     t, (q, v) = jax.tree.map(lambda x, last: jnp.concatenate([x, last]), (ts, outputs), (end_t, end_y))
     everything = Moment(t, q, v, _multipliers(system, t, q, v, params))

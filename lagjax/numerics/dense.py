@@ -66,8 +66,8 @@ def inverse(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
         candidates = jnp.where(row >= k, jnp.abs(work[:, k]), -1.0)
         pivot = jnp.argmax(candidates)
         top, best = work[k], work[pivot]
-        best = best / best[k]
-        work = jnp.where((row == pivot)[:, None], top, work)
+        best = (best / best[k])[None]
+        work = jnp.where((row == pivot)[:, None], top[None], work)
         factor = jnp.where(row == k, 0.0, work[:, k])
         work = jnp.where((row == k)[:, None], best, work - factor[:, None] * best)
     return work[:, n:]

@@ -1,0 +1,46 @@
+"""Pytrees of coordinates: names, order, dtypes."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from lagjax.mechanics import coordinates
+
+
+class Polar(NamedTuple):
+    """Two coordinates by attribute."""
+
+    r: float
+    theta: float
+
+
+@pytest.mark.parametrize(
+    ("tree", "names"),
+    [
+        (0.5, ["q"]),
+        (np.zeros(2), ["q[0]", "q[1]"]),
+        (np.zeros((2, 2)), ["q[0, 0]", "q[0, 1]", "q[1, 0]", "q[1, 1]"]),
+        ({"theta": 0.0, "r": np.zeros(2)}, ["r[0]", "r[1]", "theta"]),
+        (Polar(1.0, 2.0), ["r", "theta"]),
+        ([0.0, {"a": 1.0}], ["q[0]", "q[1].a"]),
+    ],
+)
+def test_names_follow_the_vector(tree, names):
+    """There is one name an entry of the vector, written as the user writes it."""
+    assert coordinates.names(tree) == names
+    assert coordinates.flatten(tree)[0].shape == (len(names),)
+
+
+def test_state_keeps_the_dtype():
+    """float32 coordinates stay float32, and Python floats in params follow them."""
+    s = coordinates.state(0.0, np.float32(1.0), np.float32(0.0), {"g": 9.8, "table": np.arange(3)})
+    assert s.q.dtype == s.t.dtype == s.params["g"].dtype == jnp.float32
+    assert s.params["table"].dtype == jnp.arange(3).dtype
+
+
+def test_python_numbers_that_are_not_floats_stay_static():
+    """An int or a string in params is left alone: it may choose a shape or a branch."""
+    params = coordinates.state(0.0, 1.0, 0.0, {"order": 3, "name": "a"}).params
+    assert params == {"order": 3, "name": "a"}
