@@ -77,7 +77,8 @@ def _tangent_shapes(*operands, outputs, shapes, size):
 
 def _tangent_jvp(primals, tangents, **params):
     tangents = tuple(None if isinstance(t, ad.Zero) else t for t in tangents)
-    return eqx.filter_jvp(partial(_tangent, **params), tuple(primals), tangents)
+    dy, ddy = eqx.filter_jvp(partial(_tangent, **params), tuple(primals), tangents)
+    return dy, [eqxi.materialise_zeros(a, b) for a, b in zip(dy, ddy)]
 
 
 def _tangent_transpose(cotangents, *operands, outputs, shapes, size):

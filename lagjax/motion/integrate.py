@@ -45,9 +45,9 @@ def integrate(
     >>> import jax.numpy as jnp
     >>> import lagjax as lj
     >>> fall = lj.System(lambda t, q, v, params: 0.5 * v**2 - params["g"] * q)
-    >>> traj = integrate(fall, 0.0, 3.0, {"g": 10.0}, ts=jnp.array([0.0, 0.2, 0.6]))
+    >>> traj = integrate(fall, 0.0, 3.0, {"g": 10.0}, ts=jnp.array([0.0, 0.2, 0.5]))
     >>> print(traj.q.round(9))
-    [0.  0.4 0. ]
+    [0.   0.4  0.25]
 
     **Main arguments:**
 
@@ -56,7 +56,8 @@ def integrate(
       that is off the constraints by no more than about the tolerance is moved onto them.
     - `params`: what the Lagrangian takes; gradients flow to its floating arrays.
     - `ts` (T,): increasing output times, `[t]`. Outputs are steps of the method, not interpolations.
-    - `rtol`, `atol`: tolerances of the local error of q and v. By default 1e-9 in float64, 1e-5 in float32.
+    - `rtol`, `atol`: tolerances of the local error of each coordinate and velocity. By default 1e-9 in float64,
+      1e-5 in float32.
 
     **Other arguments:**
 
@@ -94,6 +95,8 @@ def integrate(
     start = coordinates.state(t0, q0, v0, params)
     dtype = start.t.dtype
     problem.check_functions(system, start)
+    drift = problem.check_drift(drift, system)
+    problem.check_adjoint(adjoint, drift)
     settings = Settings(
         method=method,
         controller=stepsize_controller,
@@ -103,7 +106,7 @@ def integrate(
         atol=problem.tolerance(atol, "atol", dtype),
         dt0=None if dt0 is None else jnp.asarray(dt0, dtype),
         max_steps=max_steps,
-        drift=problem.check_drift(drift, system),
+        drift=drift,
         progress=progress,
     )
     ts = problem.times(ts, dtype)

@@ -28,7 +28,7 @@ def check_system(system: Any):
 
 
 def check_method(method: Any):
-    """Raise where `method` is not an instance of a diffrax solver."""
+    """Raise where `method` is not an instance of a diffrax solver for a whole state."""
     if isinstance(method, type) and issubclass(method, diffrax.AbstractSolver):
         raise TypeError(
             f"method must be a solver instance, and {method.__name__} is the class.\n"
@@ -36,6 +36,20 @@ def check_method(method: Any):
         )
     if not isinstance(method, diffrax.AbstractSolver):
         raise TypeError(f"method must be a diffrax solver, not {type(method).__name__}.\nFix: method=diffrax.Dopri8().")
+    if isinstance(method.term_structure, tuple):
+        raise TypeError(
+            f"{type(method).__name__} needs a vector field split in two, and the accelerations of a general "
+            "Lagrangian depend on q and v together.\nFix: method=diffrax.Dopri8(), or any method for one ODETerm."
+        )
+
+
+def check_adjoint(adjoint: Any, drift: str):
+    """Raise where an adjoint cannot follow the motion."""
+    if isinstance(adjoint, diffrax.BacksolveAdjoint) and drift == "project":
+        raise ValueError(
+            "BacksolveAdjoint integrates backwards without returning to the constraints, so its gradients would "
+            'be wrong.\nFix: leave adjoint out (both modes then work), or drift="none".'
+        )
 
 
 def check_drift(drift: Any, system: System) -> str:

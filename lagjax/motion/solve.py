@@ -1,7 +1,7 @@
 """The compiled program behind `integrate`: start, diffrax's loop, outputs.
 
-Nothing here looks at values: a start that cannot be integrated becomes NaN at once, diffrax then stops within a
-few rejected steps, and the lane keeps the reason in its result.
+Nothing here looks at values: a start that cannot be integrated is refused inside the program, which then ends
+within a few rejected steps, and the lane keeps the reason in its result.
 """
 
 import importlib.util
@@ -66,14 +66,15 @@ def _solve(system, q0, v0, params, ts, settings, adjoint):
     if settings.drift == "project":
         q0, v0 = to_manifold(system, ts[0], q0, v0, params)
     matrix, finite = _start_equations(system, ts[0], q0, v0, params)
-    y0 = jax.tree.map(lambda x: jnp.where(off_constraints | ~finite, jnp.nan, x), (q0, v0))
+    refused = off_constraints | ~finite
+    y0 = jax.tree.map(lambda x: jnp.where(refused, 0.0, x), (q0, v0))
     terms = diffrax.ODETerm(_vector_field(system, ts, settings.drift))
     # BacksolveAdjoint integrates a larger state backwards: it takes the bare method, and no end beside the outputs.
     bare = isinstance(adjoint, diffrax.BacksolveAdjoint)
     at_ts, at_end = diffrax.SubSaveAt(ts=ts), diffrax.SubSaveAt(t1=True)
     solution = diffrax.diffeqsolve(
         terms,
-        settings.method if bare else _solver(system, terms, params, settings),
+        settings.method if bare else _solver(system, terms, params, refused, settings, adjoint),
         t0=ts[0],
         t1=ts[-1],
         dt0=settings.dt0,
@@ -94,15 +95,16 @@ def _solve(system, q0, v0, params, ts, settings, adjoint):
         (reached_ts, end_t), (outputs, end_y) = solution.ts, solution.ys
 
     # What was not reached is evaluated at the start and masked afterwards: NaN times zero would poison gradients.
-    reached = jnp.isfinite(reached_ts)
+    reached = jnp.isfinite(reached_ts) & ~refused
     outputs = jax.tree.map(lambda x, x0: jnp.where(_like(reached, x), x, x0[None]), outputs, (q0, v0))
     # One compiled evaluation for the outputs and the end together.
     t, (q, v) = jax.tree.map(lambda x, last: jnp.concatenate([x, last]), (ts, outputs), (end_t, end_y))
     everything = Moment(t, q, v, _multipliers(system, t, q, v, params))
-    end = jax.tree.map(lambda x: x[-1], everything)
+    end = jax.tree.map(lambda x: jnp.where(refused, jnp.nan, x[-1]), everything)._replace(t=t[-1])
     _, q, v, multipliers = jax.tree.map(lambda x: jnp.where(_like(reached, x), x[:-1], jnp.nan), everything)
 
     result = RESULTS.promote(solution.result)
+    result = RESULTS.where(result == RESULTS.nonfinite_input, RESULTS.not_finite, result)
     result = RESULTS.where(finite, result, RESULTS.start_not_finite)
     result = RESULTS.where(off_constraints, RESULTS.start_off_constraints, result)
     stats = {name: jnp.asarray(count) for name, count in solution.stats.items() if name != "max_steps"}
@@ -141,9 +143,10 @@ def _start_equations(system, t, q, v, params):
     return jax.lax.stop_gradient(saddle_point_matrix(linear.mass, rows.jacobian)), finite
 
 
-def _solver(system, terms, params, settings):
-    method = settings.method if settings.event is None else forward_differentiable(settings.method)
-    return OnManifold(method, system, terms, params, settings.drift == "project")
+def _solver(system, terms, params, refused, settings, adjoint):
+    reverse = isinstance(adjoint, diffrax.RecursiveCheckpointAdjoint)
+    method = forward_differentiable(settings.method) if reverse else settings.method
+    return OnManifold(method, system, terms, params, refused, settings.drift == "project")
 
 
 def _controller(ts, settings):
@@ -151,7 +154,10 @@ def _controller(ts, settings):
         return settings.controller
     # A step that small no longer moves t: the solution is singular there, or was NaN from the start.
     dtmin = 16 * jnp.finfo(ts.dtype).eps * jnp.maximum(jnp.abs(ts[0]), jnp.abs(ts[-1]))
-    return diffrax.PIDController(rtol=settings.rtol, atol=settings.atol, dtmin=dtmin, force_dtmin=False)
+    # The largest error counts, not the mean: more coordinates should not loosen the tolerance of each.
+    return diffrax.PIDController(
+        rtol=settings.rtol, atol=settings.atol, norm=optx.max_norm, dtmin=dtmin, force_dtmin=False
+    )
 
 
 def _located_event(event, ts):

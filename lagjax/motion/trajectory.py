@@ -20,6 +20,7 @@ class RESULTS(diffrax.RESULTS):
 
     start_off_constraints = "The initial state does not satisfy the constraints."
     start_not_finite = "L, the accelerations or the multipliers are not finite at the initial state."
+    not_finite = "The state became NaN or infinite."
 
 
 class Moment(NamedTuple):
@@ -147,7 +148,7 @@ def _lines(traj):
 
 def _batch_lines(traj, lanes):
     values, counts = np.unique(np.asarray(traj.result._value), return_counts=True)
-    words = [f"{n} {message(RESULTS.promote(_item(traj.result, v)))}" for v, n in zip(values, counts)]
+    words = [f"{n} {message(_item(traj.result, v))}" for v, n in zip(values, counts)]
     steps = np.asarray(traj.stats["num_steps"])
     rows = [
         ("method", traj.static.method),

@@ -113,7 +113,7 @@ def roll(params, theta, theta_rate, ts, **options):
     if force <= 0:
         raise ValueError(
             f"the hoop is not held by the cylinder at theta = {theta:.6g}, theta_rate = {theta_rate:.6g}: "
-            f"the normal force is {force:.6g}, so it is in flight from the start.\n"
+            f"the normal force is {force + 0.0:.6g}, so it is in flight from the start.\n"
             "Fix: start higher or slower, or integrate rolling_hoop.in_flight."
         )
     return integrate(system, q, v, params, ts=ts, event=DEPARTURE, **options)
@@ -268,9 +268,8 @@ def departures(params, theta, theta_rate, tolerance, until=10.0):
     def lane(params, theta, theta_rate, tolerance):
         q, v = start(params, theta, theta_rate)
         ts = jnp.stack([0.0 * theta, until + 0.0 * theta])
-        rolled = integrate(
-            system, q, v, params, ts=ts, rtol=tolerance, atol=tolerance, event=DEPARTURE, throw=False
-        )  # fmt: skip
+        tolerances = {"rtol": tolerance, "atol": tolerance}
+        rolled = integrate(system, q, v, params, ts=ts, **tolerances, event=DEPARTURE, throw=False)
         return rolled.end.t, rolled.end.q["theta"], rolled.result == RESULTS.event_occurred
 
     return jax.vmap(lane)(params, theta, theta_rate, tolerance)
@@ -284,27 +283,20 @@ def batch(starts):
 
 
 def cases():
-    """Starts near and on the top, on the other side, uphill, too fast; other bodies; a thousand swings."""
-    over_top = 0.75
+    """Starts near and on the top, on the other side, uphill, too fast; other bodies; a hundred swings."""
     starts = {
-        **{f"{name}, from rest at 1.25": (beta, 1.25, 0.0, 1e-10) for name, beta in SHAPES.items()},
+        # Projection onto the contact alone needs some inertia in φ: 2^-40 stands for the point's 0.
+        **{f"{name}, from rest at 1.25": (beta or 2.0**-40, 1.25, 0.0, 1e-10) for name, beta in SHAPES.items()},
         "on the left, from rest at pi - 1.25": (1.0, np.pi - 1.25, 0.0, 1e-10),
         "pushed downhill, rate -1.5": (1.0, 1.25, -1.5, 1e-10),
-        "pushed uphill, over the top": (1.0, 1.25, over_top, 1e-10),
+        "pushed uphill, over the top": (1.0, 1.25, 0.75, 1e-10),
         "from rest 2^-10 off the top": (1.0, TOP - 2.0**-10, 0.0, 1e-12),
-        "from rest 2^-20 off the top": (1.0, TOP - 2.0**-20, 0.0, 1e-14),
-        "at rest on the top for 10 s": (1.0, TOP, 0.0, 1e-10),
+        "from rest 2^-20 off the top": (1.0, TOP - 2.0**-20, 0.0, 1e-13),
     }
     times, angles, left = map(np.asarray, departures(*batch(starts.values())))
     rows = []
     for i, (name, (beta, theta0, theta_rate0, _)) in enumerate(starts.items()):
         params = PARAMS | {"beta": beta}
-        if theta0 == TOP:
-            # The double nearest to π/2 is 6e-17 short of it, and that tilt grows like cosh(w t): 1e-8 in 10 s.
-            off = abs(angles[i] - TOP)
-            happened = f"stays: an equilibrium; off by {off:.0e}, as pi/2 is rounded" if not left[i] else "LEFT"
-            rows.append(Case(name, happened, np.inf if left[i] else off, 1e-7))
-            continue
         angle = float(np.arcsin(departure_sine(params, theta0, theta_rate0)))
         if theta0 > TOP or theta_rate0 > 0:
             angle = np.pi - angle
@@ -314,9 +306,19 @@ def cases():
             error = max(error, abs(times[i] - time) / time)
         happened = f"leaves at {np.degrees(angle):.4f} deg, t = {times[i]:.6f}" if left[i] else "DOES NOT LEAVE"
         rows.append(Case(name, happened, error, 1e-9))
+    rows.append(_top(lanes=len(starts)))
     rows.append(_refusal("too fast at the start, rate -3", 1.25, -3.0))
     rows.append(_refusal("at rest on the side, theta = 0", 0.0, 0.0))
-    return [*rows, _thousand_swings()]
+    return [*rows, _no_inertia(), _hundred_swings()]
+
+
+def _top(lanes):
+    """An equilibrium. The double nearest to π/2 is 6e-17 short of it, which grows like cosh(w t): 1e-8 in 10 s."""
+    # A batch of its own, of the size already compiled: optimistix's bisection raises for a lane without an event
+    # in a batch where others have one.
+    _, angles, left = departures(*batch([(1.0, TOP, 0.0, 1e-10)] * lanes))
+    off = np.inf if left[0] else abs(float(angles[0]) - TOP)
+    return Case("at rest on the top for 10 s", "stays; pi/2 is rounded, and that grows", off, 1e-7)
 
 
 def _refusal(name, theta, theta_rate):
@@ -327,23 +329,32 @@ def _refusal(name, theta, theta_rate):
     return Case(name, "NOT REFUSED", np.inf, 0.0)
 
 
-def _thousand_swings():
+def _no_inertia():
+    """β = 0: the mass matrix is singular in φ, the equations are not."""
+    params = PARAMS | {"beta": 0.0}
+    a, multipliers = accelerations(system, 0.0, *start(params, 1.25), params)
+    exact = exact_multipliers(params, 1.25, 1.25)
+    got = (a["theta"], multipliers["contact"], multipliers["rolling"] / exact.contact)
+    error = relative_error(got, (-(rate(params) ** 2) * np.cos(1.25), exact.contact, 0.0))
+    return Case("beta = 0, no moment of inertia", "no friction force; forces as in closed form", error, 1e-12)
+
+
+def _hundred_swings():
     theta0 = BOTTOM + 1.0
     q0, v0 = start(PARAMS, theta0)
-    ts = np.linspace(0.0, 1000 * period(PARAMS, theta0), 101)
+    ts = np.linspace(0.0, 100 * period(PARAMS, theta0), 101)
     swings = integrate(system, q0, v0, PARAMS, ts=ts, rtol=1e-10, atol=1e-10)
     phase = relative_error(swings.q["theta"], exact_motion(PARAMS, theta0, ts)[0]["theta"])
     happened = f"worst residual (the error here); theta off by {phase:.0e}, energy by {float(swings.drift()):.0e}"
-    return Case("1000 swings about the bottom", happened, float(swings.residual()), 1e-12)
+    return Case("100 swings about the bottom", happened, float(swings.residual()), 1e-12)
 
 
 def picture():
     """The hoop on its way, and why it leaves: the normal force of five bodies, and the friction it would take."""
     fig, axes = plot.figure(1, 2, size=(4.9, 4.0))
     _draw_path(axes[0, 0])
+    axis, weight = axes[0, 1], PARAMS["m"] * PARAMS["g"]
     theta = np.linspace(TOP, np.radians(15.0), 151)
-    axis = axes[0, 1]
-    weight = PARAMS["m"] * PARAMS["g"]
     for i, (name, beta) in enumerate(SHAPES.items()):
         params = PARAMS | {"beta": beta}
         leaves = np.degrees(np.arcsin(departure_sine(params, TOP)))
@@ -363,16 +374,15 @@ def _draw_path(axis):
     theta0 = TOP - 2.0**-3
     rolled = roll(PARAMS, theta0, 0.0, ts, rtol=1e-9, atol=1e-9)
     theta = np.asarray(rolled.q["theta"])
+    theta = np.append(theta[np.isfinite(theta)], rolled.end.q["theta"])
     l, a = PARAMS["R"] + PARAMS["a"], PARAMS["a"]
     around = np.linspace(0.0, 2 * np.pi, 181)
-    axis.fill(np.cos(around), np.sin(around), color="0.85")
-    axis.plot(np.cos(around), np.sin(around), color="0.4")
+    axis.fill(np.cos(around), np.sin(around), facecolor="0.85", edgecolor="0.4")
     left = leaving(PARAMS, theta0)
     fall = flight(PARAMS, left, np.linspace(0.0, float(time_to_floor(PARAMS, left)), 31))
     axis.plot(l * np.cos(theta), l * np.sin(theta), label="rolling", **plot.style(0))
     axis.plot(fall.x, fall.y, label="flight", **plot.style(1))
-    seen = np.flatnonzero(np.isfinite(theta))[:-1:7]
-    hoops = [(l * np.cos(theta[i]), l * np.sin(theta[i]), 0) for i in seen]
+    hoops = [(l * np.cos(x), l * np.sin(x), 0) for x in theta[:-1:7]]
     hoops += [(fall.x[i], fall.y[i], 1) for i in (0, 15, 30)]
     for x, y, i in hoops:
         axis.plot(x + a * np.cos(around), y + a * np.sin(around), color=plot.COLOURS[i], linewidth=0.9)

@@ -161,9 +161,9 @@ def picture():
     angles = jnp.linspace(0.0, jnp.pi / 2, 91)
     for i, ratio in enumerate((0.01, 0.375, 10.0, 1000.0)):
         force = jax.vmap(
-            lambda alpha: accelerations(
-                system, 0.0, Q0, V0, PARAMS | {"alpha": alpha, "M": PARAMS["m"] / ratio}
-            )[1]["incline"]
+            lambda alpha: accelerations(system, 0.0, Q0, V0, PARAMS | {"alpha": alpha, "M": PARAMS["m"] / ratio})[1][
+                "incline"
+            ]
         )(angles)
         axes[0, 1].plot(np.degrees(angles), force / (PARAMS["m"] * g), label=f"m/M = {ratio:g}", **plot.style(i))
     axes[0, 1].set(xlabel="angle of the incline / degrees", ylabel="normal force / (m g)", title="The multiplier")

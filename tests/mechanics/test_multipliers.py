@@ -66,7 +66,11 @@ def test_velocity_constraint_with_time_and_position():
     """∂phi/∂t and (∂phi/∂q) v of a velocity constraint count: v_y = x t."""
     driven = Nonholonomic(lambda t, q, v, params: v[1] - q[0] * t)
     a, _ = accelerations(
-        System(plane_particle, {"driven": driven}), 2.0, np.array([0.5, 0.0]), np.array([3.0, 1.0]), {"m": 1.0, "g": 1.0}
+        System(plane_particle, {"driven": driven}),
+        2.0,
+        np.array([0.5, 0.0]),
+        np.array([3.0, 1.0]),
+        {"m": 1.0, "g": 1.0},
     )
     np.testing.assert_allclose(a, [0.0, 0.5 + 3.0 * 2.0], rtol=1e-13)
 

@@ -1,0 +1,199 @@
+"""Bad input gets an error in the user's words: what happened, the usual cause, the fix."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import lagjax as lj
+from tests.systems import HORIZONTAL, PARAMS, TS, pendulum, rod_pendulum
+
+sphere = lj.System(lambda t, q, v, params: 0.5 * (v["psi"] ** 2 + jnp.sin(q["psi"]) ** 2 * v["theta"] ** 2))
+
+
+def refusal(kind, *parts):
+    """Expect an error whose message holds all `parts` and a fix."""
+    pattern = "(?s)" + "".join(f"(?=.*{part})" for part in (*parts, "Fix:"))
+    return pytest.raises(kind, match=pattern)
+
+
+def test_wrong_structure():
+    """v without one of q's coordinates."""
+    with refusal(ValueError, "structure of q", "theta"):
+        lj.integrate(sphere, {"psi": 1.0, "theta": 0.0}, {"psi": 0.0}, ts=TS)
+
+
+def test_wrong_shape():
+    """v of another shape than q, by name."""
+    with refusal(ValueError, "'y'", r"\(2,\)"):
+        lj.integrate(rod_pendulum, {"x": 1.0, "y": np.zeros(2)}, {"x": 0.0, "y": 0.0}, PARAMS, ts=TS)
+
+
+def test_lagrangian_not_scalar():
+    """Energies left unsummed."""
+    with refusal(ValueError, "one real number", r"\(2,\)", "jnp.sum"):
+        lj.integrate(lj.System(lambda t, q, v, params: 0.5 * v**2), np.zeros(2), np.zeros(2), ts=TS)
+
+
+def test_force_of_another_structure():
+    """A force that does not look like q."""
+    system = lj.System(lambda t, q, v, params: 0.5 * v**2, force=lambda t, q, v, params: jnp.zeros(3))
+    with refusal(ValueError, "like q"):
+        lj.integrate(system, 0.0, 1.0, ts=TS)
+
+
+def test_integer_state():
+    """A whole number written without its decimal point, by name."""
+    with refusal(TypeError, "'psi' of q is int", "1.0 instead of 1"):
+        lj.integrate(sphere, {"psi": 1, "theta": 0.0}, {"psi": 0.0, "theta": 1.0}, ts=TS)
+
+
+def test_float32_out_of_reach():
+    """A tolerance below float32's round-off, with the switch to float64."""
+    with refusal(ValueError, "rtol = 1e-09", "float32", "jax_enable_x64"):
+        lj.integrate(pendulum, np.float32(1.0), np.float32(0.0), PARAMS, ts=TS, rtol=1e-9)
+
+
+def test_tolerance_out_of_reach_in_float64():
+    """Even float64 has an end."""
+    with refusal(ValueError, "rtol = 1e-17", "float64"):
+        lj.integrate(pendulum, 1.0, 0.0, PARAMS, ts=TS, rtol=1e-17)
+
+
+def test_nan_from_the_lagrangian():
+    """L is NaN at the start, though its derivatives are finite: log of a negative number."""
+    system = lj.System(lambda t, q, v, params: 0.5 * v**2 + jnp.log(q))
+    with refusal(ValueError, "L is nan", "q = -1"):
+        lj.integrate(system, -1.0, 1.0, ts=TS)
+
+
+def test_nan_in_a_derivative():
+    """L is finite and its derivative is not: sqrt at zero, by coordinate."""
+    system = lj.System(lambda t, q, v, params: 0.5 * (v["a"] ** 2 + v["b"] ** 2) - jnp.sqrt(q["b"]))
+    with refusal(ValueError, "coordinate 'b'", "sqrt"):
+        lj.integrate(system, {"a": 1.0, "b": 0.0}, {"a": 0.0, "b": 0.0}, ts=TS)
+
+
+def test_nan_in_the_start():
+    """A NaN coordinate, by name."""
+    with refusal(ValueError, "'theta' of v0 is nan"):
+        lj.integrate(sphere, {"psi": 1.0, "theta": 0.0}, {"psi": 0.0, "theta": np.nan}, ts=TS)
+
+
+def test_pole():
+    """Polar coordinates at the pole: the azimuth's mass vanishes."""
+    for act in (
+        lambda q, v: lj.integrate(sphere, q, v, ts=TS),
+        lambda q, v: lj.accelerations(sphere, 0.0, q, v, None),
+    ):
+        with refusal(ValueError, "singular in coordinate 'theta'", "Cartesian"):
+            act({"psi": 0.0, "theta": 0.0}, {"psi": 1.0, "theta": 0.0})
+
+
+def test_missing_velocity():
+    """A coordinate without kinetic energy."""
+    system = lj.System(lambda t, q, v, params: 0.5 * v["a"] ** 2 - q["b"] ** 2)
+    with refusal(ValueError, "singular in coordinate 'b'"):
+        lj.integrate(system, {"a": 1.0, "b": 0.5}, {"a": 0.0, "b": 0.0}, ts=TS)
+
+
+def test_constraint_given_twice():
+    """Dependent constraints, one of them a multiple of the other, are named and not solved at random."""
+    first = rod_pendulum.constraints["rod"]
+    again = lj.Holonomic(lambda t, q, params: 0.3 * first.g(t, q, params))
+    system = lj.System(rod_pendulum.lagrangian, {"rod": first, "again": again})
+    with refusal(ValueError, "constraint '(again|rod)' does not act independently"):
+        lj.integrate(system, *HORIZONTAL, PARAMS, ts=TS)
+
+
+def test_start_off_the_constraint():
+    """An inconsistent start: positions and velocities, with the remedy; `consistent_state` cures it."""
+    q0, v0 = {"x": 1.3, "y": 0.1}, {"x": 0.2, "y": -1.0}
+    with refusal(ValueError, "off the constraints", "'rod' = 0.138", "d/dt 'rod'", "consistent_state"):
+        lj.integrate(rod_pendulum, q0, v0, PARAMS, ts=TS)
+    traj = lj.integrate(rod_pendulum, *lj.consistent_state(rod_pendulum, 0.0, q0, v0, PARAMS), PARAMS, ts=TS)
+    assert float(traj.residual()) < 1e-14
+
+
+def test_unreachable_constraint():
+    """No consistent state exists: the error gives the residual by name."""
+    system = lj.System(rod_pendulum.lagrangian, {"ghost": lj.Holonomic(lambda t, q, params: q["x"] ** 2 + 1.0)})
+    with refusal(ValueError, "no consistent state", "'ghost'"):
+        lj.consistent_state(system, 0.0, {"x": 1.0, "y": 0.0}, {"x": 0.0, "y": 0.0}, PARAMS)
+
+
+@pytest.mark.parametrize(
+    ("ts", "words"),
+    [
+        ([0.0, 1.0, 0.5], r"ts\[2\] = 0.5 follows ts\[1\] = 1"),
+        ([1.0, 0.0], "must increase"),
+        ([0.0, 1.0, 1.0], "must increase"),
+        ([0.0], "at least two times"),
+        (3.0, "at least two times"),
+    ],
+)
+def test_times(ts, words):
+    """ts that does not increase, or is no vector."""
+    with refusal(ValueError, words):
+        lj.integrate(pendulum, 1.0, 0.0, PARAMS, ts=ts)
+
+
+def test_solver_class():
+    """The class instead of an instance."""
+    with refusal(TypeError, "Tsit5 is the class", r"diffrax.Tsit5\(\)"):
+        lj.integrate(pendulum, 1.0, 0.0, PARAMS, ts=TS, method=diffrax.Tsit5)
+
+
+def test_solver_for_split_fields():
+    """A method that needs a separable field."""
+    with refusal(TypeError, "SemiImplicitEuler", "split in two"):
+        lj.integrate(pendulum, 1.0, 0.0, PARAMS, ts=TS, method=diffrax.SemiImplicitEuler())
+
+
+def test_adjoint_that_leaves_the_constraints():
+    """BacksolveAdjoint on a constrained system would be silently wrong."""
+    with refusal(ValueError, "BacksolveAdjoint"):
+        lj.integrate(rod_pendulum, *HORIZONTAL, PARAMS, ts=TS, adjoint=diffrax.BacksolveAdjoint())
+
+
+def test_max_steps():
+    """Where it stopped, after how many steps, and three ways out."""
+    with refusal(RuntimeError, "stopped at t = 0", "max_steps = 5", "max_steps=20"):
+        lj.integrate(pendulum, 1.0, 0.0, PARAMS, ts=TS, max_steps=5)
+
+
+def test_singularity_on_the_way():
+    """A fall into the centre ends with the state where it happened, not with max_steps."""
+    kepler = lj.System(lambda t, q, v, params: 0.5 * v**2 + 1 / q)
+    with refusal(RuntimeError, "stopped at t = 1.1107", "(singularity|not finite|L is)"):
+        lj.integrate(kepler, 1.0, 0.0, ts=np.array([0.0, 2.0]))
+
+
+def test_not_a_system():
+    """The Lagrangian itself in place of the system."""
+    with refusal(TypeError, "lj.System"):
+        lj.integrate(pendulum.lagrangian, 1.0, 0.0, PARAMS, ts=TS)
+
+
+def test_called_lagrangian_and_bare_constraint():
+    """System refuses a value for a function and a constraint without its kind."""
+    with refusal(TypeError, "lagrangian must be a function"):
+        lj.System(3.0)
+    with refusal(TypeError, "'rod'", "lj.Holonomic"):
+        lj.System(pendulum.lagrangian, {"rod": lambda t, q, params: q})
+
+
+def test_unknown_drift():
+    """A misspelt option."""
+    with pytest.raises(ValueError, match="drift"):
+        lj.integrate(rod_pendulum, *HORIZONTAL, PARAMS, ts=TS, drift="projct")
+
+
+def test_failure_under_jit_is_not_silent():
+    """Inside jit a failed integration raises at run time; with throw=False it carries its result."""
+    run = jax.jit(lambda q0, throw: lj.integrate(
+        pendulum, q0, 0.0, PARAMS, ts=TS, throw=throw).result, static_argnums=1)  # fmt: skip
+    with pytest.raises(RuntimeError, match="not finite"):
+        jax.block_until_ready(run(jnp.nan, True))
+    assert bool(run(jnp.nan, False) == lj.RESULTS.start_not_finite)

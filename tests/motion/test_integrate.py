@@ -1,0 +1,247 @@
+"""The front door: orders, constraints, derivatives, lanes, events, float32."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import lagjax as lj
+from tests.systems import HORIZONTAL, PARAMS, TS, pendulum, pendulum_lagrangian, rod_pendulum
+
+# Swinging hard, from 2 rad at 3 rad/s: nonlinear, and no symmetry that would raise an order.
+SWING = (2.0, 3.0)
+ROD_SWING = (
+    {"x": 1.25 * np.sin(2.0), "y": -1.25 * np.cos(2.0)},
+    {"x": 3.75 * np.cos(2.0), "y": 3.75 * np.sin(2.0)},
+)
+SWING_TS = np.array([0.0, 0.26, 0.77, 1.01])
+
+
+def angle_of(traj):
+    """The pendulum's angle from its Cartesian trajectory."""
+    return jnp.arctan2(traj.q["x"], -traj.q["y"])
+
+
+@pytest.fixture(scope="module")
+def exact():
+    """The pendulum by its angle at 1e-13, checked against SciPy in `test_against_scipy`."""
+    return lj.integrate(pendulum, *SWING, PARAMS, ts=SWING_TS, rtol=1e-13, atol=1e-13)
+
+
+def test_against_scipy(exact):
+    """The angle agrees with SciPy's DOP853 on the hand-derived equation."""
+    integrate = pytest.importorskip("scipy.integrate")
+    k = PARAMS["g"] / PARAMS["l"]
+    solution = integrate.solve_ivp(
+        lambda t, y: [y[1], -k * np.sin(y[0])], (0, 1.01), SWING, "DOP853", SWING_TS, rtol=1e-13, atol=1e-13
+    )
+    np.testing.assert_allclose(exact.q, solution.y[0], atol=2e-12)
+    np.testing.assert_allclose(exact.v, solution.y[1], atol=1e-11)
+
+
+def orders(method, steps, system, q0, v0, error):
+    """Observed orders between successive step counts, all sizes through one compiled program."""
+
+    @jax.jit
+    def error_at(dt0):
+        return error(
+            lj.integrate(
+                system, q0, v0, PARAMS, ts=SWING_TS, method=method, dt0=dt0,
+                stepsize_controller=diffrax.ConstantStepSize(), throw=False,
+            )
+        )  # fmt: skip
+
+    errors, steps = np.array([float(error_at(1.0 / n)) for n in steps]), np.array(steps)
+    return np.log(errors[:-1] / errors[1:]) / np.log(steps[1:] / steps[:-1])
+
+
+@pytest.mark.parametrize(
+    ("method", "order", "steps"),
+    [(diffrax.Bosh3(), 3, (40, 80, 160)), (diffrax.Tsit5(), 5, (20, 40, 80)), (diffrax.Dopri8(), 8, (8, 12, 18))],
+)
+@pytest.mark.parametrize("constrained", [False, True])
+def test_order(exact, method, order, steps, constrained):
+    """Each method keeps its order, free and constrained, at outputs that fall between its steps.
+
+    The band excludes the neighbouring orders. It is wider above: returning to the constraint takes part of the
+    error away with it, and Tsit5 settles at 5.5 there.
+    """
+    if constrained:
+        error = lambda traj: jnp.max(jnp.abs(jnp.sin(angle_of(traj) - exact.q)))
+        measured = orders(method, steps, rod_pendulum, *ROD_SWING, error)
+    else:
+        measured = orders(method, steps, pendulum, *SWING, lambda traj: jnp.max(jnp.abs(traj.q - exact.q)))
+    assert np.all((order - 0.35 < measured) & (measured < order + 0.65)), measured
+
+
+def test_outputs_are_better_than_an_interpolant(exact):
+    """Kvaerno5's own interpolant is cubic: at the same steps, outputs between them are 10 times worse than ours."""
+    k = PARAMS["g"] / PARAMS["l"]
+    by_diffrax = diffrax.diffeqsolve(
+        diffrax.ODETerm(lambda t, y, args: (y[1], -k * jnp.sin(y[0]))),
+        diffrax.Kvaerno5(), 0.0, 1.01, None, SWING, saveat=diffrax.SaveAt(ts=SWING_TS),
+        stepsize_controller=diffrax.PIDController(rtol=1e-6, atol=1e-6),
+    ).ys[0]  # fmt: skip
+    by_steps = lj.integrate(pendulum, *SWING, PARAMS, ts=SWING_TS, method=diffrax.Kvaerno5(), rtol=1e-6, atol=1e-6).q
+    between = slice(1, 3)
+    ours, theirs = (np.abs(q - exact.q)[between] for q in (by_steps, by_diffrax))
+    assert np.all(10 * ours < theirs), (ours, theirs)
+
+
+def test_constraints_hold_at_every_output():
+    """Position and velocity residuals are at round-off at a loose tolerance; without projection they drift."""
+    run = lambda drift: lj.integrate(
+        rod_pendulum, *HORIZONTAL, PARAMS, ts=np.linspace(0, 5, 41), rtol=1e-6, atol=1e-6, drift=drift
+    )
+    projected, free, fed_back = run("project"), run("none"), run("baumgarte")
+    assert float(projected.residual()) < 1e-14
+    assert float(free.residual()) > 1e-8
+    assert float(fed_back.residual()) < float(free.residual())
+
+
+def test_multipliers_belong_to_the_projected_states():
+    """λ at every output is the tension of the state there: -3 g cos(angle) / (2 l) for a release at 90 degrees."""
+    traj = lj.integrate(rod_pendulum, *HORIZONTAL, PARAMS, ts=TS, rtol=1e-11, atol=1e-11)
+    np.testing.assert_allclose(
+        traj.multipliers["rod"], 3 * PARAMS["g"] * traj.q["y"] / PARAMS["l"] / (2 * PARAMS["l"]), atol=1e-9
+    )
+
+
+def test_gradients_in_both_modes():
+    """d(final state, multiplier)/d(start, params), forward and reverse, jitted or not, match a central difference."""
+
+    def outcome(x):
+        traj = lj.integrate(
+            rod_pendulum, {"x": x["l"], "y": 0.0}, {"x": 0.0, "y": x["vy"]}, {"g": x["g"], "l": x["l"]},
+            ts=np.array([0.0, 0.75]), rtol=1e-10, atol=1e-10,
+        )  # fmt: skip
+        return jnp.stack([traj.q["x"][-1], traj.multipliers["rod"][-1]])
+
+    x = {"g": 9.8125, "l": 1.25, "vy": -0.5}
+    outcome = jax.jit(outcome)
+    forward, reverse = jax.jacfwd(outcome)(x), jax.jacrev(outcome)(x)
+    step = 2.0**-13
+    for name in x:
+        # Fourth-order difference: its error (1e-13) and the integration's (1e-10 / step) are both below 1e-6.
+        at = lambda k: outcome(x | {name: x[name] + k * step})
+        difference = (8 * (at(1) - at(-1)) - (at(2) - at(-2))) / (12 * step)
+        np.testing.assert_allclose(forward[name], difference, rtol=1e-6, atol=1e-6)
+        np.testing.assert_allclose(reverse[name], forward[name], rtol=1e-9, atol=1e-10)
+
+
+def test_second_derivative_forward():
+    """Forward over forward agrees with a central difference of first derivatives."""
+    final = lambda k: lj.integrate(
+        pendulum, 1.0, 0.0, {"g": k, "l": 1.25}, ts=np.array([0.0, 0.5]), rtol=1e-11, atol=1e-11
+    ).q[-1]
+    slope = jax.jit(jax.jacfwd(final))
+    second = jax.jacfwd(jax.jacfwd(final))(9.8125)
+    step = 1e-3
+    np.testing.assert_allclose(second, (slope(9.8125 + step) - slope(9.8125 - step)) / (2 * step), rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    "adjoint", [diffrax.ForwardMode(), diffrax.RecursiveCheckpointAdjoint(), diffrax.BacksolveAdjoint()]
+)
+def test_diffrax_adjoints_are_accepted(adjoint):
+    """Each adjoint gives the gradient that the default gives."""
+    mode = jax.jacfwd if isinstance(adjoint, diffrax.ForwardMode) else jax.grad
+    final = lambda g, adjoint: lj.integrate(
+        pendulum, 1.0, 0.0, {"g": g, "l": 1.25}, ts=np.array([0.0, 0.5]), rtol=1e-10, atol=1e-10, adjoint=adjoint
+    ).q[-1]
+    np.testing.assert_allclose(mode(final)(9.8125, adjoint), jax.jacfwd(final)(9.8125, None), rtol=1e-7)
+
+
+def test_lanes_agree_with_single_runs_and_keep_their_own_failure():
+    """vmap gives each lane its own result; a lane with NaN parameters fails alone, with its reason."""
+    lengths = jnp.array([0.5, 1.25, jnp.nan, 2.0])
+    run = lambda l: lj.integrate(pendulum, 1.0, 0.0, {"g": 9.8125, "l": l}, ts=TS, throw=False)
+    batch = jax.vmap(run)(lengths)
+    alone = run(1.25)
+    np.testing.assert_allclose(batch.q[1], alone.q, rtol=1e-9)
+    assert int(batch.stats["num_steps"][1]) == int(alone.stats["num_steps"])
+    good = np.asarray(batch.result == lj.RESULTS.successful)
+    assert good.tolist() == [True, True, False, True]
+    assert bool((batch.result == lj.RESULTS.start_not_finite)[2])
+    assert np.all(np.isnan(batch.q[2]))
+    assert "3 successful" in repr(batch) and "not finite" in repr(batch)
+
+
+def test_event_is_located_by_the_method():
+    """The rod pendulum passes the vertical at its quarter period, 1e-9 from the elliptic integral, and NaN follows."""
+    special = pytest.importorskip("scipy.special")
+    quarter = special.ellipk(0.5) * np.sqrt(PARAMS["l"] / PARAMS["g"])
+    event = diffrax.Event(lambda t, y, params, **kwargs: y[0]["x"])
+    traj = lj.integrate(
+        rod_pendulum, *HORIZONTAL, PARAMS, ts=np.array([0.0, 0.25, 2.0]), rtol=1e-11, atol=1e-11, event=event
+    )
+    assert abs(float(traj.end.t) - quarter) < 1e-9 * quarter
+    assert float(traj.end.q["x"]) == pytest.approx(0.0, abs=1e-14)
+    np.testing.assert_allclose(traj.end.multipliers["rod"], -3 * PARAMS["g"] / PARAMS["l"] / 2, rtol=1e-9)
+    assert np.isfinite(traj.q["x"]).tolist() == [True, True, False]
+    assert bool(traj.result == lj.RESULTS.event_occurred)
+
+
+@pytest.mark.slow
+def test_event_time_gradient():
+    """d(quarter period)/dl = T/(2 l), forward and reverse, through the event."""
+    event = diffrax.Event(lambda t, y, params, **kwargs: y[0])
+    time_of = lambda l: (
+        lj.integrate(
+            pendulum,
+            np.pi / 2,
+            0.0,
+            {"g": 9.8125, "l": l},
+            ts=np.array([0.0, 2.0]),
+            rtol=1e-11,
+            atol=1e-11,
+            event=event,
+        ).end.t
+    )
+    expected = float(time_of(1.25)) / 2.5
+    np.testing.assert_allclose(jax.jacfwd(time_of)(1.25), expected, rtol=1e-7)
+    np.testing.assert_allclose(jax.grad(time_of)(1.25), expected, rtol=1e-7)
+
+
+def test_float32_says_what_it_is():
+    """float32 runs in float32 at its own default tolerance, keeps the constraint to its round-off and says so."""
+    single = lambda tree: jax.tree.map(np.float32, tree)
+    traj = lj.integrate(rod_pendulum, *single(HORIZONTAL), single(PARAMS), ts=TS)
+    assert traj.q["x"].dtype == traj.t.dtype == traj.multipliers["rod"].dtype == jnp.float32
+    assert float(traj.residual()) < 1e-6
+    assert "float32" in repr(traj) and "rtol 1e-05" in repr(traj)
+    np.testing.assert_allclose(
+        traj.q["x"], 1.25 * np.sin(lj.integrate(pendulum, np.pi / 2, 0.0, PARAMS, ts=TS).q), atol=1e-3
+    )
+
+
+def test_one_compilation_for_all_tolerances_states_and_parameters():
+    """New numbers do not compile again: L is traced in the first call only."""
+    traced = []
+
+    def counted(t, q, v, params):
+        traced.append(1)
+        return pendulum_lagrangian(t, q, v, params)
+
+    system = lj.System(counted)
+    for i, tolerance in enumerate((1e-6, 1e-7, 1e-8)):
+        lj.integrate(system, 1.0 + i, 0.0, {"g": 9.0 + i, "l": 1.25}, ts=TS + i, rtol=tolerance, atol=tolerance)
+        if i == 0:
+            # Two traces a call find shapes; the rest is compilation.
+            after_first, traced[:] = len(traced), []
+    assert len(traced) <= 4 < after_first
+
+
+def test_dissipation_and_force_in_motion():
+    """A driven, damped oscillator follows its exact solution."""
+    system = lj.System(
+        lambda t, q, v, params: 0.5 * v**2 - 0.5 * 4.0 * q**2,
+        force=lambda t, q, v, params: jnp.cos(3 * t),
+        dissipation=lambda t, q, v, params: 0.5 * 0.5 * v**2,
+    )
+    # Steady state: amplitude and phase of 1/(4 - 9 + 1.5 i).
+    response = 1 / (4 - 9 + 1.5j)
+    ts = np.array([0.0, 1.0, 5.0])
+    traj = lj.integrate(system, response.real, (3j * response).real, ts=ts, rtol=1e-11, atol=1e-11)
+    np.testing.assert_allclose(traj.q, (response * np.exp(3j * ts)).real, atol=1e-9)

@@ -1,0 +1,342 @@
+"""The bead on the rotating hoop: closed forms, measured periods, the motor's torque, gradients."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy import special
+
+from lagjax.mechanics.constraints import Holonomic
+from lagjax.mechanics.lagrangian import jacobi_integral, momentum
+from lagjax.mechanics.multipliers import accelerations
+from lagjax.mechanics.system import System
+from lagjax.motion.integrate import integrate
+from lagjax.report import relative_error
+from lagjax.scenes import bead_on_hoop as scene
+from tests.references import keys, reference
+
+SLOW, FAST, CRITICAL = scene.PARAMS | {"omega": 2.5}, scene.PARAMS, scene.CRITICAL
+STATE = (1.25, -2.0)
+
+# Periods by (params, the point of release at rest); measured as well as evaluated.
+PERIODS = {
+    **{f"s3.w=2.5.T(psi_m={psi})": (SLOW, psi) for psi in (0.5, 1.0, 2.0, 3.0)},
+    "s3.w=0.T(psi_m=1.0)": (SLOW | {"omega": 0.0}, 1.0),
+    "s3.w=6.T_cross_bottom(psi_m=2.5)": (FAST, 2.5),
+    **{f"s3.crit(g=12,a=.75,w=4).T(psi_m={psi})": (CRITICAL, psi) for psi in (1.0, 0.125, 0.0009765625)},
+    **{f"s3.w=6.T_alpha(turning {psi})": (FAST, psi) for psi in (1.0, 0.5, 0.0009765625)},
+}
+TURNING = {f"s3.w=6.other_turning({psi})": psi for psi in (1.0, 0.5, 0.0009765625)}
+OUTER = reference("s3.w=6.other_turning(1.0)")
+# Motions by (params, point of release, time): the keys of ψ, and of ψ̇ where there is one.
+MOTIONS = {
+    "s3.w=2.5.psi(t=1.0;start rest 1.0)": (SLOW, 1.0, 1.0, "s3.w=2.5.psidot(t=1.0;start rest 1.0)"),
+    "s3.w=2.5.psi(t=3.0;start rest 2.0)": (SLOW, 2.0, 3.0, "s3.w=2.5.psidot(t=3.0;start rest 2.0)"),
+    "s3.w=6.psi(t=1.25;start rest 2.5)": (FAST, 2.5, 1.25, "s3.w=6.psidot(t=1.25;start rest 2.5)"),
+    "s3.w=6.psi(t=0.3;start rest at outer turning of 1.0)": (FAST, OUTER, 0.3, None),
+    "s3.w=6.psi(1.25;rest 1.0)": (FAST, 1.0, 1.25, "s3.w=6.psidot(1.25;rest 1.0)"),
+}
+ROTATIONS = {"s3.w=2.5.T_rot(H=64)": SLOW, "s3.w=6.0.T_rot(H=64)": FAST}
+HOMOCLINIC = "s3.w=6.homoclinic psi(0.5)"
+WORK = "s3.w=6.work_of_motor(0..1.25)"
+
+
+def _work(psi, psi_rate):
+    """The motor's work from rest at ψ = 1: E(t) - E(0)."""
+    return scene.balance(FAST, psi, psi_rate).E - scene.balance(FAST, 1.0, 0.0).E
+
+
+def _single_evaluations():
+    """Every key of the section, from a closed form."""
+    state = scene.balance(FAST, *STATE)
+    slow, fast = scene.small_motion(SLOW), scene.small_motion(FAST)
+    values = {
+        "s3.omega0": scene.natural_rate(FAST),
+        "s3.w=2.5.Omega_bottom": scene.frequency(slow.bottom),
+        # The pendulum of length a with this frequency: g' = a Ω².
+        "s3.w=2.5.g_prime": SLOW["a"] * slow.bottom,
+        "s3.w=2.5.top_growth": scene.growth(slow.top),
+        "s3.w=6.alpha": scene.equilibrium_angle(FAST),
+        "s3.w=6.Omega_alpha": scene.frequency(fast.alpha),
+        "s3.w=6.bottom_growth": scene.growth(fast.bottom),
+        "s3.w=6.top_growth": scene.growth(fast.top),
+        "s3.crit.T*psi_m/(1/w0) limit": 4 * jnp.sqrt(2.0) * 0.5 * jnp.pi / scene.agm(1.0, jnp.sqrt(0.5)),
+        "s3.w=6.homoclinic_outer": scene.other_turning_point(FAST, 0.0),
+        HOMOCLINIC: scene.homoclinic_motion(FAST, 0.5)[0],
+        "s3.H_separatrix_top": 2 * FAST["g"] / FAST["a"],
+        "s3.state.E": state.E,
+        "s3.state.h": state.h,
+        "s3.state.Lz": state.L_z,
+        "s3.state.p_psi": state.p_psi,
+        "s3.state.torque": state.torque,
+        "s3.state.power": state.power,
+        "s3.state.N_r": state.radial,
+        "s3.state.N_perp": state.sideways,
+        "s3.state.psidd": accelerations(scene.system, 0.0, *STATE, FAST)[0],
+        "s3.alpha at w^2=w0^2(1+2^-30)": scene.tilt(2.0**-30),
+        "s3.alpha at w^2=w0^2(1+2^-50)": scene.tilt(2.0**-50),
+        WORK: _work(*scene.exact_motion(FAST, 1.0, 1.25)),
+    }
+    for omega in (100.0, 1e6):
+        params = FAST | {"omega": omega}
+        values[f"s3.w={omega}.pi/2-alpha"] = scene.short_of_horizontal(params)
+        values[f"s3.w={omega}.w-Omega"] = scene.lag_behind_hoop(params)
+    for key, (params, psi) in PERIODS.items():
+        values[key] = scene.exact_period(params, psi)
+    for key, psi in TURNING.items():
+        values[key] = scene.other_turning_point(FAST, psi)
+    for key, (params, psi, t, rate_key) in MOTIONS.items():
+        values[key], rate = scene.exact_motion(params, psi, t)
+        if rate_key:
+            values[rate_key] = rate
+    for key, params in ROTATIONS.items():
+        values[key] = scene.rotation_period(params, 64.0)
+    return values
+
+
+def _stacked(params_list):
+    return jax.tree.map(lambda *x: jnp.array(x), *params_list)
+
+
+@jax.jit
+def _lanes(params, psi, psi_rate, ends, tolerance=1e-10):
+    """Final ψ and ψ̇ of a batch of motions of the bead."""
+
+    def lane(params, psi, psi_rate, end):
+        ts = jnp.stack([jnp.zeros_like(end), end])
+        return integrate(scene.system, psi, psi_rate, params, ts=ts, rtol=tolerance, atol=tolerance).end
+
+    end = jax.vmap(lane)(params, psi, psi_rate, ends)
+    return end.q, end.v
+
+
+def test_every_reference_value():
+    """Each key of the section agrees with its closed form to 1e-12, and none is left out."""
+    values = _single_evaluations()
+    assert set(values) == set(keys("s3"))
+    for key, value in values.items():
+        assert float(value) == pytest.approx(reference(key), rel=1e-12, abs=0), key
+
+
+def test_misprints_are_seen():
+    """The source's p_ψ for L_z, its harmonic motion at ω = ω0 and its bead in the center all miss."""
+    psi_acceleration = accelerations(scene.system, 0.0, *STATE, FAST)[0]
+    _, rate = jax.jvp(lambda *y: scene.balance(FAST, *y), STATE, (STATE[1], float(psi_acceleration)))
+    torque = reference("s3.state.torque")
+    assert float(rate.L_z) == pytest.approx(torque, rel=1e-12)
+    assert abs(float(rate.p_psi) - torque) > 0.5 * abs(torque)
+    # Not harmonic: the period goes as one over the amplitude.
+    assert float(scene.exact_period(CRITICAL, 2.0**-10) / scene.exact_period(CRITICAL, 2.0**-11)) == pytest.approx(0.5)
+    assert float(scene.frequency(scene.small_motion(CRITICAL).bottom)) == 0.0
+    # On the rim: the distance from the axis is a sin α, which tends to a, not to 0.
+    assert float(jnp.sin(scene.equilibrium_angle(FAST | {"omega": 1e6}))) == pytest.approx(1.0)
+
+
+def test_jacobi_functions_against_scipy():
+    """sn, cn, dn and K agree with scipy's, also for m near 1 by the complement, and for m < 0."""
+    m1 = np.array([0.5, 1e-3, 1.0, 1e-12, 1e-30])
+    u = np.linspace(-3.0, 3.0, 13)[:, None]
+    got = scene.jacobi_elliptic(u, (1 - m1)[None], m1[None])
+    expected = special.ellipj(u, (1 - m1)[None])[:3]
+    for a, b in zip(got, expected):
+        np.testing.assert_allclose(a, b, rtol=1e-11, atol=1e-14)
+    np.testing.assert_allclose(0.5 * np.pi / scene.agm(1.0, np.sqrt(m1)), special.ellipkm1(m1), rtol=1e-15)
+    # dn(u | -n) = 1 / dn(√(1 + n) u | n / (1 + n))
+    negative = scene.jacobi_elliptic(u[:, 0], -3.0, 4.0)[2]
+    np.testing.assert_allclose(negative, 1 / special.ellipj(2 * u[:, 0], 0.75)[2], rtol=1e-13)
+
+
+def test_exact_motion_obeys_equation_13():
+    """The closed form is a solution: ψ̈ = sin ψ (ω² cos ψ - ω0²) in each regime; a term less is seen."""
+    for params, psi in ((SLOW, 2.0), (FAST, 1.0), (FAST, OUTER), (FAST, 2.5), (CRITICAL, 1.0)):
+        t = jnp.linspace(0.1, 2.0, 5)
+        at = lambda t: scene.exact_motion(params, psi, t)
+        (angle, rate), (slope, second) = jax.jvp(at, (t,), (jnp.ones_like(t),))
+        np.testing.assert_allclose(slope, rate, rtol=1e-9, atol=1e-11)
+        right = jax.vmap(lambda q, v: accelerations(scene.system, 0.0, q, v, params)[0])(angle, rate)
+        np.testing.assert_allclose(second, right, rtol=1e-9, atol=1e-9)
+        assert np.max(np.abs(second + params["g"] / params["a"] * jnp.sin(angle))) > 0.1
+
+
+def test_measured_periods():
+    """Periods measured by an event on ψ̇ at tolerance 1e-10 are those of the elliptic integrals to 1e-9, but for one."""
+    params = _stacked([params for params, _ in PERIODS.values()])
+    psi = jnp.array([psi for _, psi in PERIODS.values()])
+    exact = np.array([reference(key) for key in PERIODS])
+    end = jax.jit(jax.vmap(lambda p, psi, longest: scene.swing(p, psi, longest).end))(params, psi, 0.75 * exact)
+    error = dict(zip(PERIODS, np.abs(2 * end.t / exact - 1)))
+    # Of this amplitude, 2^-10, the absolute tolerance of 1e-10 is 1e-7; cases() has it to 2e-11 at 1e-12.
+    assert error.pop("s3.crit(g=12,a=.75,w=4).T(psi_m=0.0009765625)") < 1e-8
+    assert max(error.values()) < 1e-9, error
+    turned = dict(zip(PERIODS, np.asarray(end.q)))
+    for key, start in TURNING.items():
+        measured = turned[f"s3.w=6.T_alpha(turning {start})"]
+        assert float(measured) == pytest.approx(reference(key), rel=1e-9), key
+    # Twin: half the small-amplitude period, which a bead released at 1.0 does not have.
+    assert abs(float(2 * end.t[1]) * reference("s3.w=2.5.Omega_bottom") / (2 * np.pi) - 1) > 1e-3
+
+
+def test_integrated_motions():
+    """ψ, ψ̇, the motor's work, the homoclinic orbit and the period of rotation are reached to 1e-9 at 1e-10."""
+    lanes = [(params, psi, 0.0, t) for params, psi, t, _ in MOTIONS.values()]
+    lanes += [(FAST, reference("s3.w=6.homoclinic_outer"), 0.0, 0.5)]
+    for key, params in ROTATIONS.items():
+        lanes.append((params, 0.0, np.sqrt(64.0 + 2 * params["g"] / params["a"]), reference(key)))
+    params, psi, psi_rate, ends = zip(*lanes)
+    q, v = _lanes(_stacked(params), jnp.array(psi), jnp.array(psi_rate), jnp.array(ends))
+    for i, (key, (*_, rate_key)) in enumerate(MOTIONS.items()):
+        assert float(q[i]) == pytest.approx(reference(key), rel=1e-9), key
+        if rate_key:
+            assert float(v[i]) == pytest.approx(reference(rate_key), rel=1e-9), rate_key
+    last = len(MOTIONS)
+    assert float(_work(q[last - 1], v[last - 1])) == pytest.approx(reference(WORK), rel=1e-9)
+    assert float(q[last]) == pytest.approx(reference(HOMOCLINIC), rel=1e-9)
+    # A full turn after one period: what is missing, over the rate, is the error of the period.
+    late = (2 * np.pi - q[last + 1 :]) / v[last + 1 :] / jnp.array(ends)[last + 1 :]
+    assert np.max(np.abs(late)) < 1e-9
+
+
+def test_torque_is_the_multiplier():
+    """The motor's multiplier is τ = 2 m a² ω sin ψ cos ψ ψ̇ = dL_z/dt and ω τ = dE/dt; a flipped sign is seen."""
+    rng = np.random.default_rng(3)
+    for psi, psi_rate, omega in rng.uniform(-3.0, 3.0, (6, 3)):
+        params = FAST | {"omega": omega}
+        q, v = {"psi": psi, "theta": 0.5 * omega}, {"psi": psi_rate, "theta": omega}
+        a, multipliers = accelerations(scene.driven_system, 0.5, q, v, params)
+        state = scene.balance(params, psi, psi_rate)
+        assert float(multipliers["motor"]) == pytest.approx(float(state.torque), rel=1e-12)
+        _, rate = jax.jvp(lambda *y: scene.balance(params, *y), (psi, psi_rate), (psi_rate, float(a["psi"])))
+        assert float(rate.L_z) == pytest.approx(float(multipliers["motor"]), rel=1e-11)
+        assert float(rate.E) == pytest.approx(float(omega * multipliers["motor"]), rel=1e-11)
+        assert abs(float(rate.E + omega * multipliers["motor"])) > 0.1 * abs(float(rate.E))
+        assert abs(float(rate.h)) < 1e-12
+        # L_z of the hoop at the angle θ is the momentum of θ; E - ω L_z is the Jacobi integral of ψ alone.
+        assert float(momentum(scene.driven_system, 0.5, q, v, params)["theta"]) == pytest.approx(float(state.L_z))
+        assert float(jacobi_integral(scene.system, 0.0, psi, psi_rate, params)) == pytest.approx(float(state.h))
+
+
+def test_normal_forces_are_multipliers():
+    """In spherical coordinates with r = a as a constraint, its multiplier is N_r, and the motor's a sin ψ N_perp."""
+
+    def lagrangian(t, q, v, params):
+        speed_squared = v["r"] ** 2 + (q["r"] * v["psi"]) ** 2 + (q["r"] * jnp.sin(q["psi"]) * v["theta"]) ** 2
+        return 0.5 * params["m"] * speed_squared + params["m"] * params["g"] * q["r"] * jnp.cos(q["psi"])
+
+    hoop = Holonomic(lambda t, q, params: q["r"] - params["a"])
+    free = System(lagrangian, constraints={"hoop": hoop, "motor": Holonomic(scene.motor)})
+    psi, psi_rate = STATE
+    q, v = {"r": 0.75, "psi": psi, "theta": 0.0}, {"r": 0.0, "psi": psi_rate, "theta": 6.0}
+    _, multipliers = accelerations(free, 0.0, q, v, FAST)
+    assert float(multipliers["hoop"]) == pytest.approx(reference("s3.state.N_r"), rel=1e-12)
+    sideways = float(multipliers["motor"]) / (FAST["a"] * np.sin(psi))
+    assert sideways == pytest.approx(reference("s3.state.N_perp"), rel=1e-12)
+
+
+def test_speed_zero_amplitude_and_reversal():
+    """At ω = ω0 nothing is NaN; below it α = 0 with a zero gradient; ω < 0 changes only τ, L_z and N_perp."""
+    squares = scene.small_motion(CRITICAL)
+    assert (float(squares.bottom), float(squares.alpha)) == (0.0, 0.0)
+    assert float(scene.equilibrium_angle(CRITICAL)) == 0.0
+    assert float(jax.grad(lambda w: scene.equilibrium_angle(SLOW | {"omega": w}))(2.5)) == 0.0
+    assert float(scene.equilibrium_angle(FAST | {"g": 0.0})) == pytest.approx(np.pi / 2)
+    state, mirrored = scene.balance(FAST, *STATE), scene.balance(FAST | {"omega": -6.0}, *STATE)
+    for name in state._fields:
+        sign = -1 if name in ("torque", "L_z", "sideways") else 1
+        assert float(getattr(mirrored, name)) == sign * float(getattr(state, name)), name
+
+
+def test_pitchfork_over_speeds():
+    """One vmap over ω through the pitchfork: beads with friction settle at 0 below ω0 and at ±α above it."""
+    speeds = scene.natural_rate(FAST) * jnp.array([0.2, 0.6, 0.85, 1.2, 1.6, 2.4])
+    starts = jnp.array([0.5, -0.5, 0.5, -0.5, 0.5, -0.5])
+    over = jax.jit(
+        jax.vmap(lambda omega, psi: scene.settled(FAST | {"omega": omega, "b": 2.0}, psi, jnp.asarray(100.0)))
+    )
+    ends = over(speeds, starts)
+    branch = jax.vmap(lambda omega: scene.equilibrium_angle(FAST | {"omega": omega}))(speeds)
+    np.testing.assert_allclose(ends, jnp.sign(starts) * branch, atol=1e-8)
+    # Twin: above ω0 none stays at the bottom.
+    assert np.all(np.abs(ends[3:]) > 0.5)
+
+
+NATURAL_PERIOD = reference("s3.w=2.5.T(psi_m=1.0)")
+
+
+def _driven(periods, tolerance):
+    """The driven bead at the given numbers of natural periods."""
+    ts, tolerance = NATURAL_PERIOD * jnp.asarray(periods), jnp.asarray(tolerance)
+    start = scene.driven_start(SLOW, 1.0)
+    return integrate(scene.driven_system, *start, SLOW, ts=ts, rtol=tolerance, atol=tolerance)
+
+
+def test_constraint_holds_for_twenty_periods():
+    """The hoop's angle stays on ω t to 1e-12, and h = E - ω L_z is kept, where E itself is not."""
+    trajectory = _driven(np.linspace(0.0, 20.3, 11), 1e-10)
+    assert float(trajectory.residual()) <= 1e-12
+    state = scene.balance(SLOW, trajectory.q["psi"], trajectory.v["psi"])
+    assert np.ptp(state.h) < 1e-9 * np.max(np.abs(state.h))
+    assert np.ptp(state.E) > 0.05 * np.max(np.abs(state.E))
+
+
+@pytest.mark.slow
+def test_constraint_holds_for_a_thousand_periods():
+    """After 1,000 natural periods the residual is at most 1e-12, the phase of the bead right to 1e-6."""
+    trajectory = _driven(np.linspace(0.0, 1000.3, 11), 1e-12)
+    assert float(trajectory.residual()) <= 1e-12
+    got = trajectory.q["psi"], trajectory.v["psi"]
+    assert relative_error(got, scene.exact_motion(SLOW, 1.0, trajectory.t)) < 1e-6
+
+
+def _exact_final(params):
+    """ψ, ψ̇ and the motor's torque at t = 1.25."""
+    psi, psi_rate = scene.exact_motion(params, 1.0, 1.25)
+    return jnp.stack([psi, psi_rate, scene.balance(params, psi, psi_rate).torque])
+
+
+def _final(params):
+    """ψ and ψ̇ at t = 1.25, by integration."""
+    ts = jnp.array([0.0, 1.25])
+    end = integrate(scene.system, 1.0, 0.0, params, ts=ts, rtol=1e-10, atol=1e-10).end
+    return jnp.stack([end.q, end.v])
+
+
+def _driven_final(params):
+    """The same of the driven bead, and the motor's multiplier."""
+    start, ts = scene.driven_start(params, 1.0), jnp.array([0.0, 1.25])
+    end = integrate(scene.driven_system, *start, params, ts=ts, rtol=1e-10, atol=1e-10).end
+    return jnp.stack([end.q["psi"], end.v["psi"], end.multipliers["motor"]])
+
+
+def _check_gradient(derivative, function):
+    """Compare a derivative in m, a, g, ω with that of Jacobi's functions; return the latter."""
+    params = jax.tree.map(jnp.asarray, FAST)
+    got = jax.jit(derivative(function))(params)
+    exact = jax.jacfwd(_exact_final)(params)
+    largest = max(float(jnp.max(jnp.abs(column))) for column in exact.values())
+    for name, column in exact.items():
+        # The state does not depend on m: its zero is held to the size of the other columns.
+        expected = column[: got[name].size]
+        np.testing.assert_allclose(got[name], expected, rtol=1e-6, atol=1e-9 * largest, err_msg=name)
+    return exact
+
+
+def test_reverse_gradient_of_state():
+    """The final ψ and ψ̇, in reverse mode in m, a, g and ω, agree with the elliptic functions' gradient to 1e-6."""
+    _check_gradient(jax.jacrev, _final)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("derivative", [jax.jacfwd, jax.jacrev])
+def test_gradient_of_torque(derivative):
+    """So do the driven bead's state and the motor's torque, in both modes; the torque's explicit ω is in it."""
+    exact = _check_gradient(derivative, _driven_final)
+    # Twin: the gradient through the state alone is another.
+    explicit = _exact_final(FAST)[2] / FAST["omega"]
+    assert abs(float(explicit)) > 1e-3 * abs(float(exact["omega"][2]))
+
+
+def test_scene_cases_pass():
+    """Every extreme case of the scene is within what it allows, and every misprint is one line."""
+    for case in scene.cases():
+        assert case.passed, case
+    assert all("\n" not in line for line in scene.MISPRINTS)

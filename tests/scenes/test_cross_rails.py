@@ -1,0 +1,321 @@
+"""The carriage on the rotating rails: two frames, modes and stability, the books of energy, gradients."""
+
+import jax
+import jax.numpy as jnp
+import mpmath
+import numpy as np
+import pytest
+
+from lagjax.mechanics.lagrangian import jacobi_integral, momentum
+from lagjax.mechanics.multipliers import accelerations
+from lagjax.mechanics.system import System
+from lagjax.motion.integrate import integrate
+from lagjax.report import relative_error
+from lagjax.scenes import cross_rails as scene
+from tests.references import keys, reference
+
+PARAMS, Q0, V0 = scene.PARAMS, scene.Q0, scene.V0
+AT = {
+    "2.5": PARAMS,
+    "5": PARAMS | {"omega": 5.0},
+    "8": PARAMS | {"omega": 8.0},
+    "critical": PARAMS | {"omega": float(np.sqrt(40.0))},
+}
+ISOTROPIC = PARAMS | {"K": 8.0, "omega": 3.0}
+
+
+def _state_values(stem, params, q, v):
+    """The keys of one instant of a motion."""
+    books = scene.balance(params, q, v)
+    return {
+        **{f"{stem}.{name}({{t}})": value for name, value in (("R", q["R"]), ("r", q["r"]))},
+        **{f"{stem}.{name}dot({{t}})": value for name, value in (("R", v["R"]), ("r", v["r"]))},
+        f"{stem}.E({{t}})": books.E,
+        f"{stem}.dEdt({{t}})": books.power,
+    }
+
+
+def _motion_values(motion):
+    """The keys of all instants, from `motion(params, t)` in the rotating coordinates."""
+    values = {}
+    for speed in ("2.5", "8"):
+        for t in (1.0, 10.0):
+            found = _state_values(f"s6.w={speed}", AT[speed], *motion(AT[speed], t))
+            values |= {key.format(t=f"t={t:g}"): value for key, value in found.items()}
+    q, v = motion(AT["critical"], 1.0)
+    values |= {f"s6.w^2=K/m.{name}(t=1)": q[name] for name in q}
+    return values | {f"s6.w^2=K/m.{name}dot(t=1)": v[name] for name in v}
+
+
+def _single_evaluations():
+    """Every key of the section, from a closed form."""
+    values = _motion_values(lambda params, t: scene.exact_motion(params, Q0, V0, t))
+    for speed in ("2.5", "8"):
+        books = scene.balance(AT[speed], Q0, V0)
+        values |= {
+            f"s6.w={speed}.E(0)": books.E,
+            f"s6.w={speed}.hprime": books.h,
+            f"s6.w={speed}.Lz(0)": books.L_z,
+            f"s6.w={speed}.dEdt(0)": books.power,
+        }
+    for speed in ("2.5", "5", "8"):
+        squares = scene.mode_squares(AT[speed])
+        values[f"s6.w={speed}.R_eq"] = scene.equilibrium_length(AT[speed])
+        values[f"s6.w={speed}.Omega_fast"] = jnp.sqrt(squares.fast)
+        if speed == "5":
+            values["s6.w=5.growth_rate"] = jnp.sqrt(-squares.slow)
+        else:
+            values[f"s6.w={speed}.Omega_slow"] = jnp.sqrt(squares.slow)
+    isotropic = scene.mode_squares(ISOTROPIC)
+    values["s6.isotropic(k/m=16,w=3).fast"] = jnp.sqrt(isotropic.fast)
+    values["s6.isotropic.slow"] = jnp.sqrt(isotropic.slow)
+    names = ("s6.strip.max_growth", "s6.strip.max_growth_at_w")
+    values |= dict(zip(names, scene.strongest_growth(PARAMS)))
+    values |= dict(zip(("s6.critical_speed_low", "s6.critical_speed_high"), scene.critical_speeds(PARAMS)))
+    names = ("s6.w^2=K/m.secular_R_accel", "s6.w^2=K/m.secular_r_rate")
+    return values | dict(zip(names, scene.escape(PARAMS)))
+
+
+def seed_lagrangian(t, q, v, params):
+    """The Lagrangian whose equations are the source's printed ones: Coriolis with the factor 1."""
+    omega = params["omega"]
+    half = 0.5 * params["m"] * omega * (q["R"] * v["r"] - q["r"] * v["R"])
+    return scene.rotating_lagrangian(t, q, v, params) - half
+
+
+seed_system = System(seed_lagrangian)
+
+
+def _solve(system, q0, v0, params, ts, tolerance):
+    ts, tolerance = jnp.asarray(ts), jnp.asarray(tolerance)
+    return integrate(system, q0, v0, params, ts=ts, rtol=tolerance, atol=tolerance)
+
+
+def test_every_reference_value():
+    """Each key of the section agrees with its closed form to 1e-12, and none is left out."""
+    values = _single_evaluations()
+    assert set(values) == set(keys("s6"))
+    for key, value in values.items():
+        assert float(value) == pytest.approx(reference(key), rel=1e-12, abs=0), key
+
+
+# Eleven periods of the fast mode add up to 1.1e-9 and 1.7e-9 at tolerance 1e-10: local errors, not round-off.
+OVER_AT_1E_10 = {"s6.w=2.5.rdot(t=10)", "s6.w=8.dEdt(t=10)"}
+
+
+def _integrated_errors(tolerance):
+    ts = [0.0, 1.0, 10.0]
+    runs = {params["omega"]: _solve(scene.rotating_system, Q0, V0, params, ts, tolerance) for params in AT.values()}
+
+    def motion(params, t):
+        trajectory = runs[params["omega"]]
+        return jax.tree.map(lambda x: x[ts.index(t)], (trajectory.q, trajectory.v))
+
+    return {key: abs(float(value) / reference(key) - 1) for key, value in _motion_values(motion).items()}
+
+
+def test_integrated_motions():
+    """Every state, energy and power after 1 s and 10 s is reached to 1e-9: at tolerance 1e-10, but two at 3e-11."""
+    errors = _integrated_errors(1e-10)
+    assert max(error for key, error in errors.items() if key not in OVER_AT_1E_10) < 1e-9
+    assert max(errors[key] for key in OVER_AT_1E_10) < 2e-9
+    assert max(_integrated_errors(3e-11).values()) < 1e-9
+
+
+def test_exact_motion_is_the_matrix_exponential():
+    """Sylvester's formula agrees with the exponential of the augmented 5 x 5 matrix at all kinds of speed."""
+    for omega in (0.0, 2.5, 4.0, 4.0 + 2.0**-30, 5.0, float(np.sqrt(40.0)), 8.0, -3.0):
+        for K in (20.0, 8.0):
+            params = PARAMS | {"omega": omega, "K": K}
+            kappa, Kappa = params["k"] / params["m"], K / params["m"]
+            matrix = mpmath.matrix(
+                [
+                    [0, 0, 1, 0, 0],
+                    [0, 0, 0, 1, 0],
+                    [mpmath.mpf(omega) ** 2 - Kappa, 0, 0, 2 * omega, Kappa * params["R0"]],
+                    [0, mpmath.mpf(omega) ** 2 - kappa, -2 * omega, 0, 0],
+                    [0, 0, 0, 0, 0],
+                ]
+            )
+            with mpmath.workdps(40):
+                z = mpmath.expm(3 * matrix) * mpmath.matrix([1, 0.125, 0.25, -0.5, 1])
+            q, v = scene.exact_motion(params, Q0, V0, 3.0)
+            got = np.array([q["R"], q["r"], v["R"], v["r"]])
+            expected = np.array([float(x) for x in z[:4]])
+            assert np.max(np.abs(got - expected)) < 1e-12 * np.max(np.abs(expected)), (omega, K)
+
+
+def test_frames_agree_after_a_hundred_turns():
+    """x, y and R, r, integrated apart for 100 turns at 5e-13, are the same motion to 1e-9; factor 1 is another."""
+    ts = np.linspace(0.0, 100 * 2 * np.pi / PARAMS["omega"], 11)
+    lab = _solve(scene.lab_system, *scene.to_lab(PARAMS, 0.0, Q0, V0), PARAMS, ts, 5e-13)
+    rotating = _solve(scene.rotating_system, Q0, V0, PARAMS, ts, 5e-13)
+    wrong = _solve(seed_system, Q0, V0, PARAMS, ts, 5e-13)
+    in_lab = (lab.q, lab.v)
+    assert relative_error(in_lab, scene.to_lab(PARAMS, lab.t, rotating.q, rotating.v)) < 1e-9
+    assert relative_error((rotating.q, rotating.v), scene.exact_motion(PARAMS, Q0, V0, ts)) < 1e-9
+    back = scene.to_rotating(PARAMS, lab.t, *scene.to_lab(PARAMS, lab.t, rotating.q, rotating.v))
+    assert relative_error(back, (rotating.q, rotating.v)) < 1e-12
+    assert relative_error(in_lab, scene.to_lab(PARAMS, lab.t, wrong.q, wrong.v)) > 0.1
+    # What cannot see it: the factor-1 equations keep h' as well as the right ones do.
+    for trajectory in (rotating, wrong):
+        h = scene.balance(PARAMS, trajectory.q, trajectory.v).h
+        assert np.ptp(h) < 1e-10 * np.max(np.abs(h))
+    # E is the energy function of the lab form, and changes.
+    state = scene.balance(PARAMS, *scene.to_rotating(PARAMS, lab.t, *in_lab))
+    np.testing.assert_allclose(lab.jacobi_integral(), state.E, rtol=1e-11)
+    assert np.ptp(state.E) > 0.1 * np.max(state.E)
+
+
+def test_books_balance_at_random_states():
+    """dL_z/dt = τ, dE/dt = ωτ, dh'/dt = 0, h' = E - ωL_z; the factor-1 equations fail the first two, not the third."""
+    rng = np.random.default_rng(6)
+    for _ in range(4):
+        R, r, R_rate, r_rate, omega = rng.uniform(-2.0, 2.0, 5)
+        params = PARAMS | {"omega": omega}
+        q, v = {"R": R, "r": r}, {"R": R_rate, "r": r_rate}
+        books = scene.balance(params, q, v)
+        assert float(books.h) == pytest.approx(float(books.E - omega * books.L_z), rel=1e-12)
+        assert float(books.h) == pytest.approx(float(jacobi_integral(scene.rotating_system, 0.0, q, v, params)))
+        for system, right in ((scene.rotating_system, True), (seed_system, False)):
+            a, _ = accelerations(system, 0.0, q, v, params)
+            _, rate = jax.jvp(lambda q, v: scene.balance(params, q, v), (q, v), (v, a))
+            scale = abs(float(books.power)) + abs(float(books.torque))
+            assert abs(float(rate.h)) < 1e-12 * scale
+            assert (abs(float(rate.L_z - books.torque)) < 1e-12 * scale) == right
+            assert (abs(float(rate.E - books.power)) < 1e-12 * scale) == right
+
+
+def test_lab_lagrangian_and_printed_kinetic_energy():
+    """The two forms of L are one function of the motion, m included; T without m is seen."""
+    t, params = 0.7, PARAMS
+    q, v = scene.to_lab(params, t, Q0, V0)
+    L = scene.rotating_lagrangian(t, Q0, V0, params)
+    assert float(scene.lab_lagrangian(t, q, v, params)) == pytest.approx(float(L), rel=1e-13)
+    T = 0.5 * params["m"] * (v["x"] ** 2 + v["y"] ** 2)
+    assert abs(float(T / params["m"] - T)) > 0.1 * abs(float(L))
+    p = momentum(scene.rotating_system, t, Q0, V0, params)
+    assert float(Q0["R"] * p["r"] - Q0["r"] * p["R"]) == pytest.approx(reference("s6.w=2.5.Lz(0)"), rel=1e-14)
+
+
+def test_equations_and_equilibrium():
+    """The accelerations have the factor 2; R_eq is a solution, longer than R0 below K/m, and beyond the axis above."""
+    for params in (PARAMS, AT["8"]):
+        omega, m = params["omega"], params["m"]
+        a, _ = accelerations(scene.rotating_system, 0.0, Q0, V0, params)
+        rest, _ = accelerations(scene.rotating_system, 0.0, Q0, {"R": 0.0, "r": 0.0}, params)
+        assert float(a["R"] - rest["R"]) == pytest.approx(2 * omega * V0["r"], rel=1e-12)
+        assert float(a["r"] - rest["r"]) == pytest.approx(-2 * omega * V0["R"], rel=1e-12)
+        length = float(scene.equilibrium_length(params))
+        at, _ = accelerations(scene.rotating_system, 0.0, {"R": length, "r": 0.0}, {"R": 0.0, "r": 0.0}, params)
+        assert abs(float(at["R"])) < 1e-12 * params["K"] / m and float(at["r"]) == 0.0
+    assert float(scene.equilibrium_length(PARAMS)) > PARAMS["R0"]
+    assert float(scene.equilibrium_length(AT["8"])) < 0.0
+
+
+def test_no_turning_and_backward_turning():
+    """At ω = 0 the springs swing apart and h' = E; -ω mirrors r and L_z, which +ω does not."""
+    still = PARAMS | {"omega": 0.0}
+    q, _ = scene.exact_motion(still, Q0, V0, 1.5)
+    fast, slow = np.sqrt(40.0), 4.0
+    assert float(q["R"]) == pytest.approx(0.75 + 0.25 * np.cos(fast * 1.5) + 0.25 * np.sin(fast * 1.5) / fast)
+    assert float(q["r"]) == pytest.approx(0.125 * np.cos(slow * 1.5) - 0.5 * np.sin(slow * 1.5) / slow)
+    books = scene.balance(still, Q0, V0)
+    assert float(books.h) == float(books.E)
+    mirror = {"R": 1.0, "r": -1.0}
+    flip = lambda state: jax.tree.map(lambda x, sign: sign * x, state, mirror)
+    forward = scene.exact_motion(PARAMS, Q0, V0, 1.5)
+    for omega, right in ((-2.5, True), (2.5, False)):
+        backward = scene.exact_motion(PARAMS | {"omega": omega}, flip(Q0), flip(V0), 1.5)
+        assert (relative_error(tuple(map(flip, backward)), forward) < 1e-13) == right
+
+
+def test_modes_and_verdict():
+    """Modes are the eigenvalues of the linear equations, the verdict their growth; factor 1 gives other modes."""
+    rng = np.random.default_rng(7)
+    for m, K, k, omega in rng.uniform(0.2, 5.0, (40, 4)):
+        params = PARAMS | {"m": m, "K": K, "k": k, "omega": omega}
+        block = np.array([[omega**2 - K / m, 0.0], [0.0, omega**2 - k / m]])
+        turn = np.array([[0.0, 2 * omega], [-2 * omega, 0.0]])
+        modes = np.linalg.eigvals(np.block([[np.zeros((2, 2)), np.eye(2)], [block, turn]]))
+        squares = scene.mode_squares(params)
+        expected = sorted(np.real(-(modes**2)))
+        np.testing.assert_allclose(expected[::3], [squares.slow, squares.fast], rtol=1e-8, atol=1e-10)
+        assert bool(scene.is_stable(params)) == (np.max(modes.real) < 1e-6)
+        wrong = np.linalg.eigvals(np.block([[np.zeros((2, 2)), np.eye(2)], [block, 0.5 * turn]]))
+        assert np.min(np.abs(wrong[:, None] ** 2 + float(squares.fast))) > 1e-3
+    # The strongest growth is a maximum over ω.
+    rate, speed = scene.strongest_growth(PARAMS)
+    near = jnp.sqrt(-scene.mode_squares(PARAMS | {"omega": speed * jnp.array([0.99, 1.0, 1.01])}).slow)
+    assert float(near[1]) == pytest.approx(float(rate), rel=1e-12)
+    assert float(jnp.max(near)) == float(near[1])
+
+
+def test_slow_mode_near_a_critical_speed():
+    """Next to ω² = k/m the slow mode keeps its digits; the difference of half sum and root has lost them."""
+    for step in (-(2.0**-44), 2.0**-44):
+        params = PARAMS | {"omega": 4.0 * (1 + step)}
+        with mpmath.workdps(60):
+            squared = mpmath.mpf(params["omega"]) ** 2
+            half_sum, product = 28 + squared, (16 - squared) * (40 - squared)
+            exact = float(half_sum - mpmath.sqrt(half_sum**2 - product))
+        assert float(scene.mode_squares(params).slow) == pytest.approx(exact, rel=1e-12)
+        half_sum = 28 + params["omega"] ** 2
+        by_difference = half_sum - np.sqrt(half_sum**2 - (16 - params["omega"] ** 2) * (40 - params["omega"] ** 2))
+        assert abs(by_difference / exact - 1) > 1e-6
+
+
+def test_escape_at_the_critical_speed():
+    """At ω² = K/m the mean motion of the exact solution is ½ a t² and b t, with a and b as in closed form."""
+    t = jnp.array([2e4, 4e4])
+    q, _ = scene.exact_motion(AT["critical"], Q0, V0, t)
+    a, b = scene.escape(PARAMS)
+    second = 2 * (q["R"][1] - 2 * q["R"][0]) / (t[1] ** 2 - 2 * t[0] ** 2)
+    # The oscillation left over is of order one in 1e9.
+    assert float(second) == pytest.approx(float(a), rel=1e-6)
+    assert float((q["r"][1] - q["r"][0]) / (t[1] - t[0])) == pytest.approx(float(b), rel=1e-4)
+
+
+def _final(params):
+    """The state after 1 s, by integration."""
+    end = integrate(scene.rotating_system, Q0, V0, params, ts=jnp.array([0.0, 1.0]), rtol=1e-10, atol=1e-10).end
+    return jnp.stack([end.q["R"], end.q["r"], end.v["R"], end.v["r"]])
+
+
+def _check_gradient(derivative):
+    """Compare the derivative of the final state in m, K, k, R0, ω with that of the matrix exponential."""
+    params = jax.tree.map(jnp.asarray, PARAMS)
+    got = jax.jit(derivative(_final))(params)
+    of_exact = jax.jacfwd(lambda params: scene.exact_motion(params, Q0, V0, 1.0))
+    for turning, right in ((params, True), (params | {"omega": -params["omega"]}, False)):
+        exact = of_exact(turning)
+        for name in PARAMS:
+            expected = jnp.stack([exact[i][x][name] for i in (0, 1) for x in ("R", "r")])
+            # Twin: the gradient of the mirrored motion.
+            assert bool(jnp.allclose(got[name], expected, rtol=1e-6, atol=0)) == right, name
+
+
+def test_reverse_gradient():
+    """The final state, in reverse mode in m, K, k, R0 and ω, has the matrix exponential's gradient to 1e-6."""
+    _check_gradient(jax.jacrev)
+
+
+@pytest.mark.slow
+def test_forward_gradient():
+    """So it has in forward mode."""
+    _check_gradient(jax.jacfwd)
+
+
+def test_exact_gradient_at_critical_speeds():
+    """The exact motion is smooth in ω through the critical speed k/m: its derivative is the difference quotient's."""
+    at = lambda omega: scene.exact_motion(PARAMS | {"omega": omega}, Q0, V0, 1.0)[0]["r"]
+    slope = float(jax.grad(at)(4.0))
+    step = 2.0**-14
+    assert float(at(4.0 + step) - at(4.0 - step)) / (2 * step) == pytest.approx(slope, rel=1e-6)
+
+
+def test_scene_cases_pass():
+    """Every extreme case of the scene is within what it allows, and every misprint is one line."""
+    for case in scene.cases():
+        assert case.passed, case
+    assert all("\n" not in line for line in scene.MISPRINTS)

@@ -1,0 +1,222 @@
+"""Geodesics on the sphere, in both forms, against great circles and the reference values of source §1."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from lagjax.mechanics.lagrangian import jacobi_integral, mass_matrix
+from lagjax.mechanics.multipliers import accelerations
+from lagjax.motion.integrate import integrate
+from lagjax.scenes import sphere_geodesic as geodesic
+from tests.references import keys, reference, reference_inputs
+
+PARAMS, R = geodesic.PARAMS, geodesic.PARAMS["R"]
+PAIRS = [key.removesuffix(".inputs") for key in keys("s1") if key.endswith(".inputs")]
+NAMES = {
+    "A": "A",
+    "B": "B",
+    "clairaut_cos_i": "clairaut",
+    "mid_colat": "mid_colatitude",
+    "mid_az": "mid_azimuth",
+    "vertex_colat": "vertex_colatitude",
+    "vertex_az": "vertex_azimuth",
+}
+
+
+def ends_of(pair):
+    """ψ₁, θ₁, ψ₂, θ₂ of a pair of points in the references."""
+    return tuple(reference_inputs(pair + ".inputs"))
+
+
+def single_evaluations():
+    """Every key, with the value that the scene gives; the inputs are used, not checked."""
+    got = {}
+    for pair in PAIRS:
+        circle = geodesic.great_circle(*ends_of(pair))
+        got[pair + ".length"] = geodesic.distance(PARAMS, *ends_of(pair))
+        # Meridians have no A and B; the vertex is listed for one pair only.
+        got |= {f"{pair}.{key}": getattr(circle, name) for key, name in NAMES.items() if f"{pair}.{key}" in keys(pair)}
+    circle = geodesic.great_circle(*ends_of("s1.generic"))
+    got["s1.generic.A2+B2"] = circle.A**2 + circle.B**2
+    along = geodesic.exact_over_azimuth(circle.A, circle.B, 1.25)
+    got["s1.generic.psi_at_theta=1.25"], got["s1.generic.dpsi/dtheta_at_1.25"] = along
+    near = ends_of("s1.near_pole")
+    got["s1.near_pole.planar_limit"] = 2 * R * near[0] * np.sin(0.5)
+    major = 2 * np.pi - geodesic.great_circle(*ends_of("s1.dtheta>pi")).angle
+    got["s1.dtheta>pi.major_arc_length"] = R * major
+    got["s1.dtheta>pi.second_variation_coeff"] = geodesic.second_variation(major)
+    return got
+
+
+def test_great_circles_match_the_references():
+    """Plane, length, middle and vertex to 1e-12 for all pairs: no input is too ill-conditioned for the formulas."""
+    for key, value in single_evaluations().items():
+        assert float(value) == pytest.approx(reference(key), rel=1e-12, abs=0), key
+
+
+def test_every_key_is_checked():
+    """No key of §1 is left out: what is not compared is an input."""
+    assert set(single_evaluations()) | {pair + ".inputs" for pair in PAIRS} == set(keys("s1"))
+
+
+@pytest.mark.parametrize("pair", ["s1.tiny_sep", "s1.near_pole", "s1.near_antipodal_1e-12"])
+def test_textbook_formulas_lose_what_ours_keep(pair):
+    """arccos(p₁·p₂) has no digit of a short length, and p₁ × p₂ from rounded points none of a near-antipodal plane."""
+    psi1, theta1, psi2, theta2 = ends_of(pair)
+    one, two = (np.asarray(geodesic.cartesian({"R": 1.0}, *p)) for p in ((psi1, theta1), (psi2, theta2)))
+    normal = np.cross(one, two)
+    by_arccos = R * np.arccos(min(one @ two, 1.0)) / reference(pair + ".length") - 1
+    by_cross = -normal[0] / normal[2] / reference(pair + ".A") - 1
+    assert max(abs(by_arccos), abs(by_cross)) > 1e-3
+
+
+@pytest.mark.parametrize(
+    "ends",
+    [(1.0, 0.5, 1.0, 0.5), (1.0, 0.5, 1.0, 0.5 + 2 * np.pi), (0.0, 0.25, 0.0, 2.0)],
+)
+def test_coincident_points_have_no_plane(ends):
+    """The same point twice, once around, or the pole under two azimuths: length zero, no plane."""
+    with pytest.raises(ValueError, match="coincide: the plane.*not determined"):
+        geodesic.great_circle(*ends)
+    assert float(geodesic.distance(PARAMS, *ends)) < 1e-14
+
+
+@pytest.mark.parametrize("ends", [(0.0, 0.0, np.pi, 1.0), (0.75, 0.25, np.pi - 0.75, 0.25 + np.pi)])
+def test_antipodal_points_have_no_plane(ends):
+    """Antipodal points to round-off: length π R, no plane."""
+    with pytest.raises(ValueError, match="are antipodal: the plane.*not determined"):
+        geodesic.great_circle(*ends)
+    assert float(geodesic.distance(PARAMS, *ends)) == pytest.approx(np.pi * R, rel=1e-15)
+
+
+def test_the_source_is_wrong_where_said():
+    """A² + B² = tan²i may exceed one, and the misprinted first line is not Lagrange's equation of f."""
+    steep = geodesic.great_circle(*ends_of("s1.steep(incl>45: A2+B2>1)"))
+    assert float(steep.A**2 + steep.B**2) == pytest.approx(1 / float(steep.clairaut) ** 2 - 1, rel=1e-12)
+    assert steep.A**2 + steep.B**2 > 1
+    assert len(geodesic.MISPRINTS) == 6
+
+
+def test_lagranges_equation_of_the_arc_length():
+    """ψ'' sin²ψ = 2 ψ'² sin ψ cos ψ + sin³ψ cos ψ, M = sin²ψ/f³ and h = -cos i at random states, from L alone."""
+    rng = np.random.default_rng(1)
+    for psi, slope in zip(rng.uniform(0.2, 2.9, 8), rng.normal(size=8)):
+        s, c = np.sin(psi), np.cos(psi)
+        f = np.hypot(s, slope)
+        state = (geodesic.over_azimuth, 0.0, psi, slope, PARAMS)
+        a = float(accelerations(*state)[0])
+        assert a == pytest.approx((2 * slope**2 * s * c + s**3 * c) / s**2, rel=1e-11)
+        assert a != pytest.approx((2 * slope**2 * s * c - s**3 * c) / s**2, rel=1e-3)
+        assert float(mass_matrix(*state)[0, 0]) == pytest.approx(s**2 / f**3, rel=1e-12)
+        assert float(jacobi_integral(*state)) == pytest.approx(-(s**2) / f, rel=1e-12)
+
+
+def test_over_the_azimuth():
+    """ψ(θ), ψ'(θ) and Clairaut's constant to 1e-9 along the generic arc; another plane is told apart."""
+    run, _ = geodesic.runs()
+    ts = np.array([run.ts[0], 1.25, run.ts[-1]])
+    got = integrate(geodesic.over_azimuth, run.q0, run.v0, PARAMS, ts=ts, rtol=1e-10, atol=1e-10)
+    assert float(got.q[1]) == pytest.approx(reference("s1.generic.psi_at_theta=1.25"), rel=1e-9)
+    assert float(got.v[1]) == pytest.approx(reference("s1.generic.dpsi/dtheta_at_1.25"), rel=1e-9)
+    assert float(got.q[2]) == pytest.approx(ends_of("s1.generic")[2], rel=1e-9)
+    assert np.allclose(got.jacobi_integral(), -reference("s1.generic.clairaut_cos_i"), rtol=1e-10)
+    other = geodesic.exact_over_azimuth(reference("s1.generic.A"), -reference("s1.generic.B"), ts)[0]
+    assert not np.allclose(got.q, other, rtol=1e-2)
+
+
+def test_embedded_path_and_multiplier():
+    """Once around over both poles: r, dr/ds and λ = -1/(2R²) to 1e-9, residual below 1e-12."""
+    _, run = geodesic.runs()
+    got = integrate(geodesic.embedded, run.q0, run.v0, PARAMS, ts=run.ts, rtol=1e-10, atol=1e-10)
+    assert run.error(got) <= 1e-9
+    assert np.allclose(got.multipliers["sphere"], geodesic.exact_multiplier(PARAMS), rtol=1e-9)
+    # With the constraint's own sign turned, or |r| for |r|², λ would be +1/(2R²) or -1/R.
+    assert not np.allclose(got.multipliers["sphere"], -1 / R, rtol=1e-3)
+    assert float(got.residual()) <= 1e-12
+    # Over the pole the azimuth jumps by π: the path is smooth in r all the same.
+    assert float(np.min(got.q[:, 2])) < -0.9 * R < 0.8 * R < float(got.q[0, 2])
+
+
+@pytest.mark.slow
+def test_cases():
+    """All cases hold: both forms at poles, on meridians, for close and nearly antipodal points; 1,000 turns."""
+    cases = {case.name: case for case in geodesic.cases()}
+    assert len(cases) == 21
+    for case in cases.values():
+        assert case.passed, case
+    assert "'q'" in cases["from the pole, over azimuth"].happened
+    assert not geodesic._undetermined("", geodesic.ENDS).passed
+
+
+def test_a_thousand_turns():
+    """1,000 turns leave the sphere by less than 1e-12, and the phase is off by no more than tolerances add up to."""
+    case = geodesic._thousand_turns()
+    assert case.error <= 1e-12
+    q0, v0 = geodesic.start_towards(PARAMS, *geodesic.ENDS)
+    ts = np.array([0.0, 2000 * np.pi * R])
+    path = integrate(geodesic.embedded, q0, v0, PARAMS, ts=ts, rtol=1e-10, atol=1e-10, drift="none")
+    assert float(path.residual()) > 1e-12
+
+
+def test_the_major_arc_is_a_saddle():
+    """More than half a turn: displaced sideways it gets shorter, by the second variation; the minor arc longer."""
+    major = reference("s1.dtheta>pi.major_arc_length") / R
+    second = jax.jit(jax.hessian(lambda x: geodesic.varied_length(major, x)))(0.0)
+    assert float(second) == pytest.approx(reference("s1.dtheta>pi.second_variation_coeff"), rel=1e-12)
+    assert geodesic.varied_length(major, 0.1) < major - 0.005
+    assert geodesic.varied_length(2 * np.pi - major, 0.1) > 2 * np.pi - major + 0.005
+    assert float(geodesic.varied_length(np.pi, 0.1)) == pytest.approx(np.pi, abs=1e-4)
+
+
+@pytest.mark.parametrize("mode", [jax.jacrev, pytest.param(jax.jacfwd, marks=pytest.mark.slow)])
+def test_gradients_over_the_azimuth(mode):
+    """∂ψ(1)/∂(ψ, ψ')(0) against the exact one to 1e-6."""
+    ends = np.array([0.0, 1.0])
+
+    def colatitude(state):
+        return integrate(geodesic.over_azimuth, state[0], state[1], PARAMS, ts=ends, rtol=1e-10, atol=1e-10).q[-1]
+
+    def exact(state, sign=-1):
+        # At θ = 0: A = cot ψ, B = -ψ' / sin²ψ.
+        A, B = 1 / jnp.tan(state[0]), sign * state[1] / jnp.sin(state[0]) ** 2
+        return geodesic.exact_over_azimuth(A, B, 1.0)[0]
+
+    state = jnp.array([0.875, 0.5])
+    got = jax.jit(mode(colatitude))(state)
+    assert np.allclose(got, jax.grad(exact)(state), rtol=1e-6, atol=0)
+    assert not np.allclose(got, jax.grad(exact)(state, 1), rtol=1e-2, atol=0)
+
+
+@pytest.mark.slow
+def test_gradients_embedded():
+    """∂(r, λ)/∂R after s = 3, forward and in reverse, against the exact one to 1e-6."""
+    unit, towards = (np.asarray(x) for x in geodesic.start_towards({"R": 1.0}, *geodesic.ENDS))
+    ts = np.array([0.0, 3.0])
+
+    def final(R):
+        got = integrate(geodesic.embedded, R * unit, towards, {"R": R}, ts=ts, rtol=1e-10, atol=1e-10)
+        return jnp.append(got.q[-1], got.multipliers["sphere"][-1])
+
+    def exact(R):
+        q = R * unit * jnp.cos(3.0 / R) + R * towards * jnp.sin(3.0 / R)
+        return jnp.append(q, geodesic.exact_multiplier({"R": R}))
+
+    expected = jax.jacfwd(exact)(R)
+    for mode in (jax.jacfwd, jax.jacrev):
+        got = jax.jit(mode(final))(R)
+        assert np.allclose(got, expected, rtol=1e-6, atol=0)
+        # A start that is held while R grows would have another gradient.
+        assert not np.allclose(got[:3], unit * np.cos(3.0 / R), rtol=1e-2, atol=0)
+
+
+def test_the_distance_has_the_exact_gradient():
+    """∂l/∂(ψ₁, θ₁, ψ₂, θ₂) is R times the unit tangents' components, by Clairaut's constant."""
+    psi1, theta1, psi2, theta2 = ends = ends_of("s1.generic")
+    got = jax.grad(lambda ends: geodesic.distance(PARAMS, *ends))(jnp.array(ends))
+    circle = geodesic.great_circle(*ends)
+    # dl/dθ = R cos i, and dl/dψ = R ψ'/f, along the path at either end.
+    slopes = [geodesic.exact_over_azimuth(circle.A, circle.B, theta)[1] for theta in (theta1, theta2)]
+    along = [R * s / np.hypot(s, np.sin(psi)) for s, psi in zip(slopes, (psi1, psi2))]
+    cos_i = R * circle.clairaut
+    assert np.allclose(got, jnp.stack([-along[0], -cos_i, along[1], cos_i]), rtol=1e-12)

@@ -1,0 +1,140 @@
+"""The house: layers, cycles, file sizes, docstrings, exports."""
+
+import ast
+import importlib
+import inspect
+import pkgutil
+from pathlib import Path
+
+import pytest
+
+import lagjax
+
+ROOT = Path(lagjax.__file__).parent
+FILES = sorted(ROOT.rglob("*.py"))
+# From the ground up: a module imports only from its own layer or from those before it.
+LAYERS = ("numerics", "mechanics", "plot", "motion", "report", "scenes")
+TOP = {"__init__", "__main__"}
+OPTIONAL = {"matplotlib"}
+
+
+def layer(module):
+    """The layer of a dotted module name, `lagjax.motion.solve` -> "motion"."""
+    parts = module.split(".")
+    return parts[1] if len(parts) > 1 else "__init__"
+
+
+def module_name(path):
+    """The dotted name of a file."""
+    parts = ("lagjax", *path.relative_to(ROOT).with_suffix("").parts)
+    return ".".join(part for part in parts if part != "__init__")
+
+
+def internal_imports(source):
+    """Every `lagjax.*` module that a source imports; names of modules imported from packages included."""
+    found = set()
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names if alias.name.split(".")[0] == "lagjax"}
+        elif isinstance(node, ast.ImportFrom) and node.module and node.module.split(".")[0] == "lagjax":
+            for alias in node.names:
+                inner = f"{node.module}.{alias.name}"
+                is_module = (ROOT.parent / Path(*inner.split("."))).with_suffix(".py").exists()
+                found.add(inner if is_module else node.module)
+    return found
+
+
+def upward_imports(name, source):
+    """The imports of a module that point up the house."""
+    if layer(name) in TOP:
+        return []
+    rank = LAYERS.index(layer(name))
+    return [target for target in internal_imports(source) if layer(target) in TOP or LAYERS.index(layer(target)) > rank]
+
+
+def nested_imports(source):
+    """Imports inside functions, but for optional extras."""
+    found = []
+    for function in ast.walk(ast.parse(source)):
+        if isinstance(function, (ast.FunctionDef, ast.AsyncFunctionDef)):
+            for node in ast.walk(function):
+                if isinstance(node, (ast.Import, ast.ImportFrom)):
+                    names = [node.module] if isinstance(node, ast.ImportFrom) else [a.name for a in node.names]
+                    found += [name for name in names if name.split(".")[0] not in OPTIONAL]
+    return found
+
+
+@pytest.mark.parametrize("path", FILES, ids=module_name)
+def test_imports_point_down(path):
+    """No module imports from a layer above its own, and none imports inside a function."""
+    source = path.read_text()
+    assert upward_imports(module_name(path), source) == []
+    assert nested_imports(source) == []
+
+
+def test_the_import_checks_can_fail():
+    """Twin: an upward import and an import inside a function are found."""
+    assert upward_imports("lagjax.mechanics.system", "from lagjax.motion import integrate") != []
+    assert upward_imports("lagjax.mechanics.system", "import lagjax") != []
+    assert nested_imports("def f():\n    import numpy") == ["numpy"]
+
+
+def test_no_import_cycles():
+    """The import graph has no cycle."""
+    graph = {module_name(path): internal_imports(path.read_text()) for path in FILES}
+    finished, open_ = set(), []
+
+    def visit(name):
+        assert name not in open_, f"cycle: {' -> '.join([*open_, name])}"
+        if name in finished or name not in graph:
+            return
+        open_.append(name)
+        for target in graph[name]:
+            visit(target)
+        finished.add(open_.pop())
+
+    for name in graph:
+        visit(name)
+
+
+@pytest.mark.parametrize("path", FILES, ids=module_name)
+def test_files_are_small(path):
+    """A file stays under 400 lines, the front door under 250."""
+    limit = 250 if path.name == "integrate.py" else 400
+    assert len(path.read_text().splitlines()) <= limit
+
+
+@pytest.mark.parametrize("path", FILES, ids=module_name)
+def test_modules_and_public_names_have_docstrings(path):
+    """Every module, and every public function and class in it, has a docstring."""
+    tree = ast.parse(path.read_text())
+    assert ast.get_docstring(tree)
+    for node in tree.body:
+        if isinstance(node, (ast.FunctionDef, ast.ClassDef)) and not node.name.startswith("_"):
+            assert ast.get_docstring(node), f"{node.name} has no docstring"
+
+
+def test_exports():
+    """Each name in `__all__` exists, says what it is, and gives an example or its fields."""
+    for name in lagjax.__all__:
+        doc = inspect.getdoc(getattr(lagjax, name))
+        assert doc and len(doc.splitlines()) > 0, name
+    for name in ("momentum", "mass_matrix", "accelerations", "jacobi_integral", "integrate", "consistent_state"):
+        doc = inspect.getdoc(getattr(lagjax, name))
+        for part in (">>>", "**Returns:**", "**Raises:**", "Source:"):
+            assert part in doc, f"{name} lacks {part}"
+
+
+def test_import_computes_nothing():
+    """No module holds a JAX array at its top level, and importing changes no JAX setting."""
+    import jax
+
+    for info in pkgutil.walk_packages(lagjax.__path__, "lagjax."):
+        if info.name.endswith("__main__"):
+            continue
+        module = importlib.import_module(info.name)
+        arrays = [name for name, value in vars(module).items() if isinstance(value, jax.Array)]
+        assert arrays == [], f"{info.name}: {arrays}"
+    for path in FILES:
+        if path.name != "__main__.py":
+            assert "jax.config" not in path.read_text().replace('jax.config.update("jax_enable_x64", True) before', "")

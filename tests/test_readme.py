@@ -1,0 +1,42 @@
+"""The README's code runs and prints what it says; its two commands are two."""
+
+import re
+from pathlib import Path
+
+import jax
+import pytest
+
+README = (Path(__file__).parent.parent / "README.md").read_text()
+PYTHON_BLOCKS = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
+
+
+def claimed_and_printed(block, capsys):
+    """What a block prints, and what its comments say it prints."""
+    exec(compile(block, "README.md", "exec"), {})
+    printed = capsys.readouterr().out.split()
+    claimed = " ".join(re.findall(r"print\(.*\)\s*# (.*)", block)).split()
+    return claimed, printed
+
+
+@pytest.mark.parametrize("block", PYTHON_BLOCKS, ids=range(len(PYTHON_BLOCKS)))
+def test_python_blocks(block, capsys):
+    """Every printed number stands in the comment beside its print."""
+    assert jax.config.jax_enable_x64
+    claimed, printed = claimed_and_printed(block, capsys)
+    assert claimed == printed
+
+
+def test_the_block_check_can_fail(capsys):
+    """Twin: a wrong number in a comment is found."""
+    claimed, printed = claimed_and_printed("print(1 + 1)  # 3\n", capsys)
+    assert claimed != printed
+
+
+def test_size_and_commands():
+    """At most 150 lines, and exactly two commands between the markers that CI reads."""
+    assert len(README.splitlines()) <= 150
+    commands = [
+        line for line in README.split("<!-- commands -->")[1].split("<!-- end -->")[0].splitlines() if "venv" in line
+    ]
+    assert len(commands) == 2
+    assert all(command.startswith("python3 -m venv .venv && ") for command in commands)
