@@ -95,11 +95,11 @@ def vector(x, y, z):
 ORBITS = {
     "plane": (vector(0.5, -0.25, 1.5), vector(0.25, 0.5, 1.0), 1.0),
     "half plane": (vector(0.5, -0.5, 1.5), vector(0.25, 0.5, 1.0), 1.0),
-    "cylinder": (vector(1.5, -1.0, 0.25), vector(1.0, 1.5, 0.5), 4.0),
+    "cylinder": (vector(1.5, -1.0, 0.25), vector(1.25, 1.75, 0.5), 4.0),
     "finite cylinder": (vector(2.25, 0.5, 0.75), vector(-0.25, 1.125, 0.375), 4.0),
-    "elliptic cylinder": (vector(3.0, 1.5, 0.25), vector(-0.5, 1.0, 0.25), 4.0),
+    "elliptic cylinder": (vector(3.0, 1.5, 0.25), vector(-0.875, 2.0, 0.25), 4.0),
     "dumbbell": (vector(2.5, 0.5, 0.75), vector(-0.25, 1.25, 0.25), 4.0),
-    "helix": (vector(1.75, 0.5, 0.25), vector(-0.25, 2.5, 0.75), 4.0),
+    "helix": (vector(1.75, 0.5, 0.25), vector(-0.25, 2.5, 0.75), 2.0),
 }
 # An orbit that stays inside the elliptic cylinder.
 INSIDE = vector(0.75, 0.25, 0.0), vector(0.5, -0.5, 0.25)
@@ -313,8 +313,8 @@ def _helix_cases():
 
 def helix_orbit(params):
     """The generic orbit around the helix, 201 outputs."""
-    q0, v0, duration = ORBITS["helix"]
-    ts = np.linspace(0.0, 3 * duration, 201)
+    q0, v0, _ = ORBITS["helix"]
+    ts = np.linspace(0.0, 12.0, 201)
     return integrate(SYSTEMS["helix"], q0, v0, params, ts=ts, rtol=1e-10, atol=1e-10)
 
 

@@ -35,6 +35,7 @@ import numpy as np
 
 from lagjax import plot
 from lagjax.mechanics.constraints import Holonomic
+from lagjax.mechanics.multipliers import accelerations
 from lagjax.mechanics.system import System
 from lagjax.motion.integrate import integrate
 from lagjax.report import Case, Run, Scene, relative_error
@@ -320,7 +321,7 @@ def _undetermined(name, ends):
         great_circle(*ends)
     except ValueError as error:
         length, right = float(distance(PARAMS, *ends)), 0.0 if ends[0] == ends[2] else np.pi * PARAMS["R"]
-        reason = str(error).split(": ")[-1].split(".")[0]
+        reason = str(error).split("\n")[0].split(": ")[-1].rstrip(".")
         return Case(name, f"refused, {reason}; length {length:.6g}", relative_error(length, right), 1e-15)
     return Case(name, "NOT REFUSED", np.inf, 0.0)
 
@@ -328,7 +329,7 @@ def _undetermined(name, ends):
 def _at_the_pole():
     """Over the azimuth the mass matrix sin²ψ / f³ is zero at the pole."""
     try:
-        integrate(over_azimuth, 0.0, 1.0, PARAMS, ts=np.array([0.0, 1.0]))
+        accelerations(over_azimuth, 0.0, 0.0, 1.0, PARAMS)
     except ValueError as error:
         return Case("from the pole, over azimuth", "refused: " + str(error).split(":")[0], 0.0, 0.0)
     return Case("from the pole, over azimuth", "NOT REFUSED", np.inf, 0.0)

@@ -36,7 +36,7 @@ def solved():
 
 def named(a, multipliers, params):
     """The accelerations under the reference's names, with those along and across the incline."""
-    s, c = np.sin(params["alpha"]), np.cos(params["alpha"])
+    s = np.sin(params["alpha"])
     x, y, X, force = float(a["x"]), float(a["y"]), float(a["X"]), float(multipliers["incline"])
     return {"xdd": x, "ydd": y, "Xdd": X, "lambda": force, "ldd": y / s, "P_m/t": force * X * s}
 
