@@ -43,21 +43,13 @@ def to_manifold(system, t, q, v, params, iterations=ITERATIONS_AFTER_STEP):
     holonomic = constraints.holonomic_equations(system, t, q, v, params)
 
     if holonomic.any():
-        to_position = _position_map(lax.stop_gradient(mass), lax.stop_gradient(jacobian), to_displacement, holonomic)
+        # Positions move only in directions that the velocity constraints allow: a rolling body keeps rolling.
+        to_position = to_displacement[:, holonomic]
         for _ in range(iterations):
             x = x - to_position @ constraints.position_residual(system, t, x, params, unflatten)
     for _ in range(iterations):
         u = u - to_displacement @ constraints.velocity_residual(system, t, x, u, params, unflatten)
     return unflatten(x), unflatten(u)
-
-
-def _position_map(mass, jacobian, to_displacement, holonomic):
-    """M^-1 Aᵀ (A M^-1 Aᵀ)^-1 of the holonomic rows alone: velocity constraints do not hold positions."""
-    if holonomic.all():
-        return to_displacement
-    rows = jacobian[holonomic]
-    n = mass.shape[0]
-    return dense.inverse(saddle_point_matrix(mass, rows))[:n, n:]
 
 
 def consistent_state(system, t, q, v, params):

@@ -17,6 +17,7 @@ from lagjax.mechanics import coordinates
 from lagjax.mechanics.multipliers import equations_of_motion, linear_system, saddle_point_matrix
 from lagjax.motion.both_modes import solve_in_both_modes
 from lagjax.motion.consistency import level_size, residuals_and_slopes, to_manifold
+from lagjax.motion.sign_change import SignChange
 from lagjax.motion.stepping import OnManifold, forward_differentiable
 from lagjax.motion.trajectory import RESULTS, Moment, Trajectory, pack
 
@@ -161,21 +162,14 @@ def _controller(ts, settings):
 
 
 def _located_event(event, ts):
-    """Locate a real-valued event to round-off in t where the user names no root finder."""
-    if event is None or event.root_finder is not None:
-        return event
-    round_off = 4 * jnp.finfo(ts.dtype).eps
-
-    def small(condition):
-        # Bisection also asks |f| < atol, in the unit of t; only the sign of f is of interest here.
-        def scaled(t, y, args, **kwargs):
-            value = jnp.asarray(condition(t, y, args, **kwargs))
-            return value if value.dtype == bool else 1e-20 * value
-
-        return scaled
-
-    finder = optx.Bisection(rtol=round_off, atol=round_off * (ts[-1] - ts[0]))
-    return diffrax.Event(jax.tree.map(small, event.cond_fn, is_leaf=callable), finder, event.direction)
+    """The user's event, located to round-off in t where no root finder is named."""
+    if event is None:
+        return None
+    tolerance = 4 * jnp.finfo(ts.dtype).eps * jnp.maximum(jnp.abs(ts[0]), jnp.abs(ts[-1]))
+    finder = SignChange(rtol=0.0, atol=tolerance) if event.root_finder is None else event.root_finder
+    # diffrax passes `args` by keyword; by position the user may call it `params`.
+    by_position = lambda condition: lambda t, y, args, **kwargs: condition(t, y, args, **kwargs)
+    return diffrax.Event(jax.tree.map(by_position, event.cond_fn, is_leaf=callable), finder, event.direction)
 
 
 def _progress_meter(progress):

@@ -183,6 +183,22 @@ def test_event_is_located_by_the_method():
     assert bool(traj.result == lj.RESULTS.event_occurred)
 
 
+def test_lanes_with_and_without_an_event():
+    """A batch may mix lanes that reach the event, that do not, and that fail; a true-or-false condition works too."""
+    event = diffrax.Event({"bottom": lambda t, y, p, **kwargs: y[0], "late": lambda t, y, p, **kwargs: t > 1.5})
+    run = lambda q0, end: lj.integrate(
+        pendulum, q0, 0.0, PARAMS, ts=jnp.stack([jnp.zeros_like(end), end]), event=event, throw=False
+    )
+    batch = jax.jit(jax.vmap(run))(jnp.array([0.5, 0.5, jnp.nan, 3.14]), jnp.array([2.0, 0.25, 1.0, 2.0]))
+    results = [
+        batch.result == r for r in (lj.RESULTS.event_occurred, lj.RESULTS.successful, lj.RESULTS.start_not_finite)
+    ]
+    assert np.array(results).T.tolist() == [[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 0, 0]]
+    assert abs(float(batch.end.q[0])) < 1e-12
+    assert float(batch.end.t[1]) == 0.25
+    assert 1.5 < float(batch.end.t[3]) < 2.0
+
+
 @pytest.mark.slow
 def test_event_time_gradient():
     """d(quarter period)/dl = T/(2 l), forward and reverse, through the event."""
