@@ -130,6 +130,7 @@ def test_gradients_in_both_modes():
         np.testing.assert_allclose(reverse[name], forward[name], rtol=1e-9, atol=1e-10)
 
 
+@pytest.mark.slow
 def test_second_derivative_forward():
     """Forward over forward agrees with a central difference of first derivatives."""
     final = lambda k: lj.integrate(

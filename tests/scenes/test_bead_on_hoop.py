@@ -320,6 +320,7 @@ def _check_gradient(derivative, function):
     return exact
 
 
+@pytest.mark.slow
 def test_reverse_gradient_of_state():
     """The final ψ and ψ̇, in reverse mode in m, a, g and ω, agree with the elliptic functions' gradient to 1e-6."""
     _check_gradient(jax.jacrev, _final)

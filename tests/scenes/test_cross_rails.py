@@ -295,15 +295,15 @@ def _check_gradient(derivative):
             assert bool(jnp.allclose(got[name], expected, rtol=1e-6, atol=0)) == right, name
 
 
-def test_reverse_gradient():
-    """The final state, in reverse mode in m, K, k, R0 and ω, has the matrix exponential's gradient to 1e-6."""
-    _check_gradient(jax.jacrev)
+def test_forward_gradient():
+    """The final state, in forward mode in m, K, k, R0 and ω, has the matrix exponential's gradient to 1e-6."""
+    _check_gradient(jax.jacfwd)
 
 
 @pytest.mark.slow
-def test_forward_gradient():
-    """So it has in forward mode."""
-    _check_gradient(jax.jacfwd)
+def test_reverse_gradient():
+    """So it has in reverse mode."""
+    _check_gradient(jax.jacrev)
 
 
 def test_exact_gradient_at_critical_speeds():
