@@ -60,7 +60,7 @@ def work_precision(title: str, curves: dict[str, tuple[np.ndarray, np.ndarray]])
 
     **Arguments:** `curves` by method: (run times in seconds, relative errors). Zero errors are left out.
     """
-    fig, axes = figure()
+    fig, axes = figure(size=(7.2, 3.6))
     axis = axes[0, 0]
     for i, (method, (seconds, errors)) in enumerate(curves.items()):
         shown = np.asarray(errors) > 0
@@ -73,5 +73,5 @@ def work_precision(title: str, curves: dict[str, tuple[np.ndarray, np.ndarray]])
             **style(i),
         )
     axis.set(xlabel="run time / ms (median)", ylabel="relative error", title=title)
-    axis.legend(fontsize=8, frameon=False)
+    axis.legend(fontsize=8, frameon=False, loc="center left", bbox_to_anchor=(1.0, 0.5))
     return fig
