@@ -1,9 +1,9 @@
 """What does lagjax cost on top of diffrax?
 
 The bead on a rotating hoop, 100 periods at 1e-9: diffrax with the acceleration derived by hand against lagjax with
-automatic derivatives, its checks and its outputs; and the Cartesian pendulum, where lagjax returns to the rod after every
-step and diffrax, given the hand-derived tension, drifts. Both in one process, in turn, medians after warm-up; compile
-time apart.
+automatic derivatives, its checks and its outputs; and the Cartesian pendulum, where lagjax returns to the rod after
+every step and diffrax, given the hand-derived tension, drifts. Both in one process, in turn, medians after warm-up;
+compile time apart.
 
     python benchmarks/against_diffrax.py [--json FILE]
 """

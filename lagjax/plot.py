@@ -1,5 +1,7 @@
 """One look for every picture. Needs matplotlib (`pip install "lagjax[plot]"`)."""
 
+import io
+
 import numpy as np
 
 # Okabe & Ito's colours: distinct to colour-blind readers and in grey print, with a marker and dash each.
@@ -14,11 +16,19 @@ def figure(rows=1, columns=1, size=(4.6, 3.2), **options):
     from matplotlib.figure import Figure
 
     fig = Figure(figsize=(size[0] * columns, size[1] * rows), layout="constrained", dpi=130)
+    # Shown once as a cell's value, without pyplot and the figures that it keeps open.
+    fig._repr_png_ = lambda: _png(fig)
     axes = fig.subplots(rows, columns, squeeze=False, **options)
     for axis in axes.flat:
         axis.grid(True, linewidth=0.4, alpha=0.5)
         axis.spines[["top", "right"]].set_visible(False)
     return fig, axes
+
+
+def _png(fig):
+    buffer = io.BytesIO()
+    fig.savefig(buffer, format="png")
+    return buffer.getvalue()
 
 
 def import_matplotlib():
@@ -48,8 +58,9 @@ def time_series(t, panels: dict[str, dict[str, np.ndarray]]):
     for axis, (label, curves) in zip(axes[:, 0], panels.items()):
         for i, (name, values) in enumerate(curves.items()):
             axis.plot(t, values, label=name, **style(i))
-        axis.set_ylabel(label)
-        if len(curves) > 1 or list(curves) != [label]:
+        only = next(iter(curves))
+        axis.set_ylabel(label if len(curves) > 1 or only == "q" else f"{label}: {only}")
+        if len(curves) > 1:
             axis.legend(fontsize=8, frameon=False, loc="center left", bbox_to_anchor=(1.0, 0.5))
     axes[-1, 0].set_xlabel("t")
     return fig

@@ -1,0 +1,34 @@
+"""The notebooks run, and the hosted copies are those that were run."""
+
+import json
+from pathlib import Path
+
+import matplotlib
+import pytest
+
+matplotlib.use("agg")
+FOLDER = Path(__file__).parent.parent / "notebooks"
+SCRIPTS = sorted(FOLDER.glob("*.py"))
+
+
+def cells(script):
+    """The source of each cell of a percent script."""
+    blocks = script.read_text().split("\n# %%")[1:]
+    return [block.split("\n", 1)[1].strip() for block in blocks]
+
+
+@pytest.mark.parametrize("script", SCRIPTS, ids=lambda path: path.stem)
+def test_runs(script):
+    """Every cell runs, the asserts of the last one included."""
+    exec(compile(script.read_text(), script.name, "exec"), {})
+
+
+@pytest.mark.parametrize("script", SCRIPTS, ids=lambda path: path.stem)
+def test_hosted_copy_is_current_and_small(script):
+    """The .ipynb has the script's code, outputs to show, and at most 300 kB."""
+    path = script.with_suffix(".ipynb")
+    assert path.stat().st_size <= 300_000
+    notebook = json.loads(path.read_text())
+    code = ["".join(cell["source"]) for cell in notebook["cells"] if cell["cell_type"] == "code"]
+    assert code == [cell for cell in cells(script) if not cell.startswith("# ")]
+    assert any(cell.get("outputs") for cell in notebook["cells"])
