@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import ArrayLike, PyTree
 
 from lagjax.mechanics import coordinates
+from lagjax.mechanics.closures import lift
 from lagjax.mechanics.multipliers import explain_failure, explain_singular
 from lagjax.mechanics.system import System
 from lagjax.motion import problem
@@ -97,6 +98,7 @@ def integrate(
     start = coordinates.state(t0, q0, v0, params)
     dtype = start.t.dtype
     problem.check_functions(system, start)
+    system = lift(system, start)
     drift = problem.check_drift(drift, system)
     problem.check_adjoint(adjoint, drift)
     settings = Settings(

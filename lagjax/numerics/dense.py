@@ -33,17 +33,24 @@ def solve(matrix: Float[Array, "n n"], rhs: Float[Array, " n"]) -> Float[Array, 
 
     **Returns:** x, shape (n,), `[rhs]/[matrix]`.
     """
+    return _solution(matrix, rhs)[0]
+
+
+def _solution(matrix, rhs):
+    """x, and the map from a right-hand side to its solution without refinement."""
     if rhs.shape[0] == 1:
-        return rhs / matrix[0]
-    return refined(inverse(matrix), matrix, rhs)
+        return rhs / matrix[0], lambda b: b / matrix[0]
+    inverted = inverse(matrix)
+    return refined(inverted, matrix, rhs), lambda b: inverted @ b
 
 
+# x comes from the same code with and without a derivative: JAX's batching of custom rules under `jit` relies on the
+# batch axis of both being in one place.
 @solve.defjvp
 def _solve_jvp(primals, tangents):
     (matrix, rhs), (d_matrix, d_rhs) = primals, tangents
-    inverted = inverse(matrix)
-    x = refined(inverted, matrix, rhs)
-    return x, inverted @ (d_rhs - d_matrix @ x)
+    x, solve_for = _solution(matrix, rhs)
+    return x, solve_for(d_rhs - d_matrix @ x)
 
 
 def refined(inverted, matrix, rhs):

@@ -169,6 +169,28 @@ def test_lanes_agree_with_single_runs_and_keep_their_own_failure():
     assert "3 successful" in repr(batch) and "not finite" in repr(batch)
 
 
+def test_gradient_of_a_batch():
+    """The gradient of a sum over lanes is the sum of the lanes' gradients, with shared and with batched inputs."""
+    final = jax.jit(lambda g, start: lj.integrate(
+        pendulum, start, 0.0, {"g": g, "l": 1.25}, ts=np.array([0.0, 0.5]), rtol=1e-10, atol=1e-10, throw=False
+    ).q[-1])  # fmt: skip
+    starts = jnp.array([0.5, 1.0, 2.0])
+    total = lambda g: jnp.sum(jax.vmap(lambda start: final(g * start, start))(starts))
+    slopes = jax.vmap(jax.jacfwd(final), in_axes=(0, 0))(9.8125 * starts, starts)
+    np.testing.assert_allclose(jax.grad(total)(9.8125), jnp.sum(slopes * starts), rtol=1e-9)
+
+
+@pytest.mark.parametrize("transform", [jax.jacfwd, jax.grad, lambda f: jax.jit(jax.grad(f))])
+def test_gradient_by_a_closed_over_value(transform):
+    """A value that L closes over has its derivative too; before it was lifted, jit(grad) gave zero in silence."""
+
+    def final(k):
+        oscillator = lj.System(lambda t, q, v, params: 0.5 * v**2 - 0.5 * k * q**2)
+        return lj.integrate(oscillator, 1.0, 0.0, ts=np.array([0.0, 1.0]), rtol=1e-10, atol=1e-10).q[-1]
+
+    np.testing.assert_allclose(transform(final)(4.0), -np.sin(2.0) / 4.0, rtol=1e-8)
+
+
 def test_event_is_located_by_the_method():
     """The rod pendulum passes the vertical at its quarter period, 1e-9 from the elliptic integral, and NaN follows."""
     special = pytest.importorskip("scipy.special")

@@ -64,3 +64,14 @@ def test_lanes():
     matrices, rhs = rng.normal(size=(7, 4, 4)), rng.normal(size=(7, 4))
     expected = [np.linalg.solve(k, b) for k, b in zip(matrices, rhs)]
     np.testing.assert_allclose(jax.vmap(dense.solve)(matrices, rhs), expected, rtol=1e-11)
+
+
+@pytest.mark.parametrize("n", [1, 2, dense.ELIMINATE_UP_TO + 1])
+def test_reverse_mode_of_jitted_lanes(n):
+    """Reverse mode through vmap through jit agrees with the lanes one by one."""
+    rng = np.random.default_rng(n)
+    matrices, rhs = rng.normal(size=(3, n, n)), rng.normal(size=n)
+    of_lanes = lambda scales: jnp.sum(jax.vmap(lambda k, s: solve(k, s * rhs))(matrices, scales))
+    of_one = jax.grad(lambda s, k: jnp.sum(dense.solve(k, s * rhs)))
+    expected = [of_one(s, k) for s, k in zip((1.0, 2.0, 3.0), matrices)]
+    np.testing.assert_allclose(jax.grad(of_lanes)(jnp.arange(1.0, 4.0)), expected, rtol=1e-12)

@@ -1,0 +1,57 @@
+"""Values that a user's function closes over, made explicit where JAX is tracing them.
+
+Parameters belong in `params`. A Lagrangian that closes over one still works as long as it is a number; while it is
+being differentiated or batched, a solve with a derivative rule of its own would not see it and return a zero
+gradient in silence. `lift` turns such values into arrays that the system carries, where every derivative finds them.
+"""
+
+import types
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+from jaxtyping import Array
+
+from lagjax.mechanics.constraints import Holonomic, Nonholonomic
+from lagjax.mechanics.coordinates import State
+from lagjax.mechanics.system import System
+
+
+class Lifted(eqx.Module):
+    """A function with the values that it closed over beside it."""
+
+    function: Callable
+    values: list[Array]
+
+    def __call__(self, *args):
+        return self.function(*args, *self.values)
+
+
+def lift(system: System, s: State) -> System:
+    """The system with traced closed-over values lifted; the same object where there are none."""
+    of_state, of_position = (s.t, s.q, s.v, s.params), (s.t, s.q, s.params)
+    functions = {
+        "lagrangian": _lift(system.lagrangian, of_state),
+        "force": _lift(system.force, of_state),
+        "dissipation": _lift(system.dissipation, of_state),
+    }
+    constraints = {
+        name: Holonomic(_lift(c.g, of_position)) if isinstance(c, Holonomic) else Nonholonomic(_lift(c.phi, of_state))
+        for name, c in system.constraints.items()
+    }
+    lifted = System(constraints=constraints, **functions)
+    return lifted if any(isinstance(f, Lifted) for f in jax.tree.leaves(lifted, is_leaf=_is_lifted)) else system
+
+
+def _lift(function, args):
+    if function is None or (isinstance(function, types.FunctionType) and function.__closure__ is None):
+        return function
+    arrays, static = eqx.partition(args, eqx.is_array)
+    converted, values = jax.closure_convert(lambda arrays: function(*eqx.combine(arrays, static)), arrays)
+    if not values:
+        return function
+    return Lifted(lambda *args: converted(eqx.filter(args[: len(static)], eqx.is_array), *args[len(static) :]), values)
+
+
+def _is_lifted(node):
+    return isinstance(node, Lifted)
