@@ -17,6 +17,7 @@ def cells(script):
     return [block.split("\n", 1)[1].strip() for block in blocks]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("script", SCRIPTS, ids=lambda path: path.stem)
 def test_runs(script):
     """Every cell runs, the asserts of the last one included."""

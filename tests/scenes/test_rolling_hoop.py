@@ -212,7 +212,8 @@ def exact_final(params):
     return jnp.stack([theta, hoop.exact_multipliers(params, theta, 1.25).contact])
 
 
-@pytest.mark.parametrize("mode", [jax.jacfwd, pytest.param(jax.jacrev, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("mode", [jax.jacfwd, jax.jacrev])
 def test_gradients(mode):
     """∂(θ, λ)/∂(m, R, a, g, β) at t = 0.5 against the exact one to 1e-6."""
     ts = np.array([0.0, 0.5])

@@ -1,0 +1,75 @@
+"""The main job: tables, pictures, numbers, exit status."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from lagjax import __main__ as job
+from lagjax import plot, report
+from tests.systems import PARAMS, pendulum
+
+TS = np.array([0.0, 0.5])
+
+
+def swing(error):
+    """A run whose error is prescribed."""
+    return report.Run("swing", pendulum, PARAMS, 1.0, 0.0, TS, lambda trajectory: error, "a given number")
+
+
+SCENE = report.Scene(
+    name="tiny",
+    title="A tiny scene",
+    source="nowhere",
+    misprints=("prints 1 for 2.",),
+    runs=lambda: [swing(1e-12)],
+    cases=lambda: [report.Case("easy", "went well", 0.0, 0.0)],
+    picture=lambda: plot.figure()[0],
+)
+
+
+@pytest.fixture
+def run(monkeypatch, tmp_path, capsys):
+    """Run the job on one scene; returns the exit status, what was printed, and the folder."""
+
+    def with_scene(scene, *options):
+        monkeypatch.setattr(job, "SCENES", {"tiny": scene})
+        status = job.main(["--quick", "-o", str(tmp_path), *options])
+        return status, capsys.readouterr().out, tmp_path
+
+    return with_scene
+
+
+def test_tables_pictures_and_numbers(run):
+    """Both tables are printed, the pictures and the numbers written, and the status is 0."""
+    status, printed, folder = run(SCENE, "tiny")
+    assert status == 0
+    for part in ("tol", "error", "compile/s", "Dopri8", "1e-10", "easy", "went well", "prints 1 for 2."):
+        assert part in printed, part
+    assert {path.name for path in folder.iterdir()} == {"tiny.png", "tiny_work_precision.png", "report.json"}
+    rows = json.loads((folder / "report.json").read_text())["scenes"]["tiny"]["runs"]
+    assert [row["tolerance"] for row in rows] == [1e-6, 1e-10]
+    assert all(row["seconds"] > 0 and row["steps"] > 0 for row in rows)
+
+
+@pytest.mark.parametrize(
+    ("scene", "named"),
+    [
+        (replace(SCENE, runs=lambda: [swing(1e-8)]), "tiny: swing"),
+        (replace(SCENE, runs=lambda: [swing(float("nan"))]), "tiny: swing"),
+        (replace(SCENE, cases=lambda: [report.Case("hard", "went wrong", 1.0, 0.1)]), "tiny: hard"),
+    ],
+)
+def test_a_miss_is_named_and_fails(run, scene, named):
+    """An error that is too large, or NaN, in a run or a case: exit status 1 and its name."""
+    status, printed, _ = run(scene)
+    assert status == 1
+    assert f"MISSED  {named}" in printed
+
+
+def test_unknown_scene(run, capsys):
+    """A misspelt scene lists those that exist."""
+    with pytest.raises(SystemExit):
+        run(SCENE, "tinny")
+    assert "no scene named tinny; there are: tiny" in capsys.readouterr().err
