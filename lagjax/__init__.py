@@ -29,6 +29,10 @@ from lagjax.motion.trajectory import RESULTS, Moment, Trajectory
 # Error against run time.
 from lagjax.report import Run, work_precision
 
+# isort: split
+# Worked systems.
+from lagjax import scenes
+
 __all__ = [
     "System",
     "Holonomic",
@@ -46,4 +50,5 @@ __all__ = [
     "RESULTS",
     "Run",
     "work_precision",
+    "scenes",
 ]

@@ -41,7 +41,7 @@ def main(arguments=None) -> int:
         _progress(f"scene {i + 1} of {len(options.scenes)}: {name}")
         scene = SCENES[name]
         rows, cases = _run_scene(scene, options.quick)
-        _draw(scene, rows, folder, options.quick)
+        _draw(scene, rows, folder, with_picture=not options.quick)
         _progress("")
         _print_scene(scene, rows, cases)
         missed += [f"{name}: {row.run}, error {row.error:.1e} > {row.required:.0e}" for row in rows if not row.passed]
@@ -62,7 +62,11 @@ def _parse(arguments):
     )
     parser.add_argument("scenes", nargs="*", metavar="SCENE", help=f"which scenes; all by default: {', '.join(SCENES)}")
     parser.add_argument("-o", "--output", default="lagjax-report", help="folder for pictures and numbers")
-    parser.add_argument("--quick", action="store_true", help="one method, two tolerances; under a minute")
+    parser.add_argument(
+        "--quick",
+        action="store_true",
+        help="one run a scene, one method, two tolerances, no scene pictures; under a minute",
+    )
     options = parser.parse_args(arguments)
     unknown = [name for name in options.scenes if name not in SCENES]
     if unknown:
@@ -81,7 +85,7 @@ def _run_scene(scene, quick):
     return rows, scene.cases()
 
 
-def _draw(scene, rows, folder, quick):
+def _draw(scene, rows, folder, with_picture):
     _progress(f"{scene.name}: pictures")
     try:
         plot.import_matplotlib()
@@ -94,7 +98,8 @@ def _draw(scene, rows, folder, quick):
         seconds.append(row.seconds)
         errors.append(row.error)
     plot.work_precision(scene.title, curves).savefig(folder / f"{scene.name}_work_precision.png")
-    scene.picture().savefig(folder / f"{scene.name}.png")
+    if with_picture:
+        scene.picture().savefig(folder / f"{scene.name}.png")
 
 
 def _print_scene(scene, rows, cases):

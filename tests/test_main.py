@@ -35,14 +35,15 @@ def run(monkeypatch, tmp_path, capsys):
 
     def with_scene(scene, *options):
         monkeypatch.setattr(job, "SCENES", {"tiny": scene})
-        status = job.main(["--quick", "-o", str(tmp_path), *options])
+        status = job.main(["-o", str(tmp_path), *options])
         return status, capsys.readouterr().out, tmp_path
 
     return with_scene
 
 
-def test_tables_pictures_and_numbers(run):
+def test_tables_pictures_and_numbers(run, monkeypatch):
     """Both tables are printed, the pictures and the numbers written, and the status is 0."""
+    monkeypatch.setattr(job, "FULL", job.QUICK)
     status, printed, folder = run(SCENE, "tiny")
     assert status == 0
     for part in ("tol", "error", "compile/s", "Dopri8", "1e-10", "easy", "went well", "prints 1 for 2."):
@@ -63,7 +64,8 @@ def test_tables_pictures_and_numbers(run):
 )
 def test_a_miss_is_named_and_fails(run, scene, named):
     """An error that is too large, or NaN, in a run or a case: exit status 1 and its name."""
-    status, printed, _ = run(scene)
+    status, printed, folder = run(scene, "--quick")
+    assert {path.name for path in folder.iterdir()} == {"tiny_work_precision.png", "report.json"}
     assert status == 1
     assert f"MISSED  {named}" in printed
 

@@ -108,6 +108,7 @@ def test_multipliers_belong_to_the_projected_states():
     )
 
 
+@pytest.mark.slow
 def test_gradients_in_both_modes():
     """d(final state, multiplier)/d(start, params), forward and reverse, jitted or not, match a central difference."""
 
