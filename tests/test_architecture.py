@@ -39,8 +39,8 @@ def internal_imports(source):
         elif isinstance(node, ast.ImportFrom) and node.module and node.module.split(".")[0] == "lagjax":
             for alias in node.names:
                 inner = f"{node.module}.{alias.name}"
-                is_module = (ROOT.parent / Path(*inner.split("."))).with_suffix(".py").exists()
-                found.add(inner if is_module else node.module)
+                path = ROOT.parent / Path(*inner.split("."))
+                found.add(inner if path.is_dir() or path.with_suffix(".py").exists() else node.module)
     return found
 
 
