@@ -53,7 +53,9 @@ def to_manifold(system, t, q, v, params, iterations=ITERATIONS_AFTER_STEP):
 
 
 def consistent_state(system, t, q, v, params):
-    """Return the nearest state that satisfies the constraints, in the metric of the mass matrix.
+    """Return a state near the given one that satisfies the constraints, by steps shortest in the mass matrix's metric.
+
+    Each Newton step is the shortest one; together they lead to the nearest state up to the square of the distance.
 
     >>> import lagjax as lj
     >>> rod = lj.Holonomic(lambda t, q, params: q["x"] ** 2 + q["y"] ** 2 - params["length"] ** 2)
@@ -66,7 +68,8 @@ def consistent_state(system, t, q, v, params):
 
     **Arguments:** `t` scalar, `q` and `v` alike, `params` as the system takes it.
 
-    **Returns:** (q, v) in the same structure. Differentiable in all arguments.
+    **Returns:** (q, v) in the same structure. Its derivative is that of the shortest step: exact from a state that is
+    consistent already, and up to the distance from one that is not.
 
     **Raises:** `ValueError` where no consistent state is reached, with the residual by constraint name
     (not while JAX is tracing); as `accelerations` for a state of the wrong shape or dtype.

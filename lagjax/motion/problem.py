@@ -130,7 +130,7 @@ def off_constraints(system: System, s: coordinates.State, rtol, atol) -> str:
     return (
         f"the initial state is off the constraints: {departures(system, s, rtol, atol)}, where 0 is asked.\n"
         "Usual cause: a coordinate or velocity computed for other parameters, or rounded.\n"
-        "Fix: q0, v0 = lj.consistent_state(system, ts[0], q0, v0, params) for the nearest consistent state."
+        "Fix: q0, v0 = lj.consistent_state(system, ts[0], q0, v0, params) for a consistent state near it."
     )
 
 
