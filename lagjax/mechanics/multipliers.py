@@ -59,9 +59,8 @@ def accelerations(system, t, q, v, params) -> tuple[PyTree[Array], dict[str, Arr
     check_scalar(system, *s)
     a, multipliers = equations_of_motion(system, *s)
     if not coordinates.is_traced((a, multipliers)):
-        solution = np.concatenate([np.ravel(x) for x in [*_leaves(a), *multipliers.values()]])
-        if not np.all(np.isfinite(solution)):
-            raise ValueError(explain_failure(system, s))
+        if not np.all(np.isfinite(coordinates.flatten((a, multipliers))[0])):
+            raise ValueError(explain_failure(system, s) or f"the accelerations are not finite {_where(s)}.")
     return a, multipliers
 
 
@@ -262,7 +261,3 @@ def _constraint_residual(system, t, q, v, params, level):
         stacked = constraints.velocity_residual(system, t, x, u, params, unflatten)
         return constraints.split(system, stacked, t, q, v, params)
     return {name: constraints.evaluate(constraint, t, q, v, params) for name, constraint in system.constraints.items()}
-
-
-def _leaves(tree):
-    return [coordinates.flatten(tree)[0]]
