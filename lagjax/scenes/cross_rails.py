@@ -1,4 +1,4 @@
-"""A carriage on rotating cross-rails, on two springs (Goldstein, Exercise 2-21; source §6).
+"""A carriage on rotating cross-rails, on two springs (source §6).
 
 The rails turn with ω. R and r are the carriage's coordinates along them, the first spring (K, rest length R0) along R,
 the second (k, rest length zero) along r; x = R cos ωt - r sin ωt, y = R sin ωt + r cos ωt in the laboratory:
@@ -361,7 +361,7 @@ def _draw_map(axis):
 SCENE = Scene(
     name="cross_rails",
     title="A carriage on rotating cross-rails",
-    source="Goldstein, Classical Mechanics, Exercise 2-21; source document §6, Eq. (15)",
+    source="source document §6, Eq. (15); a problem of Goldstein, Classical Mechanics, chapter 2",
     misprints=MISPRINTS,
     runs=runs,
     cases=cases,
