@@ -104,7 +104,10 @@ def _draw(scene, rows, folder, with_picture):
 
 def _print_scene(scene, rows, cases):
     print(f"{scene.title}\n{'=' * len(scene.title)}\n{scene.source}\n")
-    print(report.work_precision_table(rows), end="\n\n")
+    print(report.work_precision_table(rows))
+    for run, measured in dict.fromkeys((row.run, row.measured) for row in rows):
+        print(f"error of '{run}': {measured}")
+    print()
     print(report.case_table(cases), end="\n\n")
     print("Where the source is wrong:")
     print("\n".join(f"- {line}" for line in scene.misprints), end="\n\n", flush=True)

@@ -88,6 +88,7 @@ class Row:
     """One line of a work-precision table."""
 
     run: str
+    measured: str
     method: str
     tolerance: float
     error: float
@@ -216,6 +217,7 @@ def _row(run, name, tolerance, trajectory, seconds, compile_seconds, judged):
     ended_well = bool((trajectory.result == RESULTS.successful) | (trajectory.result == RESULTS.event_occurred))
     return Row(
         run=run.name,
+        measured=run.measured,
         method=name,
         tolerance=tolerance,
         error=run.error(trajectory) if ended_well else float("inf"),

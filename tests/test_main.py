@@ -46,7 +46,17 @@ def test_tables_pictures_and_numbers(run, monkeypatch):
     monkeypatch.setattr(job, "FULL", job.QUICK)
     status, printed, folder = run(SCENE, "tiny")
     assert status == 0
-    for part in ("tol", "error", "compile/s", "Dopri8", "1e-10", "easy", "went well", "prints 1 for 2."):
+    for part in (
+        "tol",
+        "error",
+        "compile/s",
+        "Dopri8",
+        "1e-10",
+        "easy",
+        "went well",
+        "prints 1 for 2.",
+        "a given number",
+    ):
         assert part in printed, part
     assert {path.name for path in folder.iterdir()} == {"tiny.png", "tiny_work_precision.png", "report.json"}
     rows = json.loads((folder / "report.json").read_text())["scenes"]["tiny"]["runs"]

@@ -124,11 +124,6 @@ def acceleration_rows(system, t, x, u, params, unflatten) -> Rows:
     return Rows(jax.jacfwd(velocity_level, argnums=2)(t, x, u), -rate)
 
 
-def position_jacobian(system, t, x, params, unflatten) -> Float[Array, "mh n"]:
-    """`∂g/∂q` of the holonomic constraints."""
-    return jax.jacfwd(lambda x: position_residual(system, t, x, params, unflatten))(x)
-
-
 def evaluate(constraint, t, q, v, params):
     """The residual of one constraint, as it was written: `g` or `phi`."""
     if isinstance(constraint, Holonomic):

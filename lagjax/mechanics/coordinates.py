@@ -40,11 +40,14 @@ def names(tree) -> list[str]:
     """
     found = []
     for path, leaf in jtu.tree_flatten_with_path(tree)[0]:
-        stem = "".join(_key_name(key, first=i == 0) for i, key in enumerate(path))
         for index in np.ndindex(np.shape(leaf)):
             suffix = "[" + ", ".join(map(str, index)) + "]" if index else ""
-            found.append((stem or "q") + suffix)
+            found.append(_path_name(path) + suffix)
     return found
+
+
+def _path_name(path):
+    return "".join(_key_name(key, first=i == 0) for i, key in enumerate(path)) or "q"
 
 
 def _key_name(key, first):
@@ -95,9 +98,9 @@ def is_traced(tree) -> bool:
 def _check_floating(tree, which):
     for path, leaf in jtu.tree_flatten_with_path(tree)[0]:
         if not jnp.issubdtype(leaf.dtype, jnp.floating):
-            name = "".join(_key_name(key, first=i == 0) for i, key in enumerate(path)) or "q"
             raise TypeError(
-                f"coordinate '{name}' of {which} is {leaf.dtype}, and the equations of motion need floats.\n"
+                f"coordinate '{_path_name(path)}' of {which} is {leaf.dtype}, "
+                "and the equations of motion need floats.\n"
                 f"Usual cause: a whole number written without its decimal point.\n"
                 f"Fix: write 1.0 instead of 1, or jnp.asarray(..., dtype=float)."
             )
@@ -111,15 +114,10 @@ def _check_alike(q, v):
             "Usual cause: a coordinate missing from v, or another key.\n"
             "Fix: start from v = jax.tree.map(jnp.zeros_like, q)."
         )
-    for name, a, b in zip(_leaf_names(q), jtu.tree_leaves(q), jtu.tree_leaves(v)):
+    for (path, a), b in zip(jtu.tree_flatten_with_path(q)[0], jtu.tree_leaves(v)):
         if a.shape != b.shape:
             raise ValueError(
-                f"coordinate '{name}' has shape {a.shape} in q but {b.shape} in v.\n"
+                f"coordinate '{_path_name(path)}' has shape {a.shape} in q but {b.shape} in v.\n"
                 "Usual cause: a scalar beside an array of one entry.\n"
                 "Fix: give both the same shape, for instance v = jax.tree.map(jnp.zeros_like, q)."
             )
-
-
-def _leaf_names(tree):
-    paths = jtu.tree_flatten_with_path(tree)[0]
-    return ["".join(_key_name(key, first=i == 0) for i, key in enumerate(path)) or "q" for path, _ in paths]

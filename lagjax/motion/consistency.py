@@ -120,8 +120,9 @@ def residuals_and_slopes(system, t, q, v, params):
     u, _ = coordinates.flatten(v)
     position = constraints.position_residual(system, t, x, params, unflatten)
     velocity = constraints.velocity_residual(system, t, x, u, params, unflatten)
-    slope_x = constraints.position_jacobian(system, t, x, params, unflatten)
     slope_u = constraints.acceleration_rows(system, t, x, u, params, unflatten).jacobian
+    # ∂(dg/dt)/∂v = ∂g/∂q: the holonomic rows serve both levels.
+    slope_x = slope_u[constraints.holonomic_equations(system, t, q, v, params)]
     slope = jnp.block(
         [
             [slope_x, jnp.zeros((position.size, u.size), x.dtype)],
@@ -136,14 +137,10 @@ def departures(system, s: coordinates.State, rtol, atol) -> str:
     residual, slope, size = (np.asarray(part) for part in residuals_and_slopes(system, *s))
     # NaN is a violation too.
     off = np.flatnonzero(~(np.abs(residual) <= slope @ (atol + rtol * np.asarray(level_size(size)))))
-    positions = [name for name in equation_names(system, s) if _kind(system, name) == "holonomic"]
-    labels = [f"'{name}'" for name in positions]
-    labels += [f"d/dt '{name}'" if name in positions else f"'{name}'" for name in equation_names(system, s)]
+    equations = list(zip(equation_names(system, s), constraints.holonomic_equations(system, *s)))
+    labels = [f"'{name}'" for name, holonomic in equations if holonomic]
+    labels += [f"d/dt '{name}'" if holonomic else f"'{name}'" for name, holonomic in equations]
     return ", ".join(f"{labels[i]} = {residual[i]:.3g}" for i in off)
-
-
-def _kind(system, equation):
-    return system.constraints[equation.split("[")[0]].kind
 
 
 @eqx.filter_jit

@@ -116,6 +116,13 @@ def test_start_off_the_constraint():
     assert float(traj.residual()) < 1e-14
 
 
+def test_a_constraint_may_have_any_name():
+    """A name with a bracket in it is not taken for an index."""
+    system = lj.System(rod_pendulum.lagrangian, {"rod[left]": rod_pendulum.constraints["rod"]})
+    with refusal(ValueError, r"d/dt 'rod\[left\]' = 1"):
+        lj.integrate(system, {"x": 1.25, "y": 0.0}, {"x": 0.4, "y": 0.0}, PARAMS, ts=TS)
+
+
 def test_unreachable_constraint():
     """No consistent state exists: the error gives the residual by name."""
     system = lj.System(rod_pendulum.lagrangian, {"ghost": lj.Holonomic(lambda t, q, params: q["x"] ** 2 + 1.0)})
