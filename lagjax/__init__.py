@@ -18,7 +18,7 @@ from lagjax.mechanics.system import System
 # One state: what the Lagrangian and the constraints say about it.
 from lagjax.mechanics.lagrangian import jacobi_integral, mass_matrix, momentum
 from lagjax.mechanics.multipliers import accelerations, constraint_force, constraint_residual
-from lagjax.motion.consistency import consistent_state
+from lagjax.motion.consistent_state import consistent_state
 
 # isort: split
 # Motion.

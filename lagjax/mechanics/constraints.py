@@ -94,6 +94,11 @@ def shapes(system, t, q, v, params) -> dict[str, tuple[int, ...]]:
     return found
 
 
+def count(system, t, q, v, params) -> int:
+    """How many constraint equations there are."""
+    return sum(int(np.prod(shape)) for shape in shapes(system, t, q, v, params).values())
+
+
 def split(system, stacked, t, q, v, params) -> dict[str, Array]:
     """Undo the stacking: a vector over all constraint equations -> one array a name."""
     parts, start = {}, 0
@@ -114,14 +119,17 @@ def velocity_residual(system, t, x, u, params, unflatten) -> Float[Array, " m"]:
     return _stack([_velocity_level(c, t, x, u, params, unflatten) for c in _all(system)], x.dtype)
 
 
+def jacobian(system, t, x, u, params, unflatten) -> Float[Array, "m n"]:
+    """`A` of all constraints, in vector form."""
+    return jax.jacfwd(lambda u: velocity_residual(system, t, x, u, params, unflatten))(u)
+
+
 def acceleration_rows(system, t, x, u, params, unflatten) -> Rows:
     """`A` and `gamma` of all constraints, in vector form."""
 
-    def velocity_level(t, x, u):
-        return velocity_residual(system, t, x, u, params, unflatten)
-
-    _, rate = jax.jvp(lambda t, x: velocity_level(t, x, u), (t, x), (jnp.ones_like(t), u))
-    return Rows(jax.jacfwd(velocity_level, argnums=2)(t, x, u), -rate)
+    at = lambda t, x: velocity_residual(system, t, x, u, params, unflatten)
+    _, rate = jax.jvp(at, (t, x), (jnp.ones_like(t), u))
+    return Rows(jacobian(system, t, x, u, params, unflatten), -rate)
 
 
 def evaluate(constraint, t, q, v, params):

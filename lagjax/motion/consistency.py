@@ -11,88 +11,97 @@ massless coordinate (M singular) is no obstacle. Positions are moved only where 
 Source: Hairer, Lubich & Wanner, *Geometric Numerical Integration*, §IV.4 and §VII.1.2.
 """
 
+from collections.abc import Callable
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jaxtyping import Array, Bool, PyTree
 
 from lagjax.mechanics import constraints, coordinates
-from lagjax.mechanics.lagrangian import check_scalar, mass_and_forcing
-from lagjax.mechanics.multipliers import describe, equation_names, saddle_point_matrix
+from lagjax.mechanics.diagnosis import equation_names
+from lagjax.mechanics.lagrangian import mass_and_forcing
+from lagjax.mechanics.saddle_point import saddle_point_matrix
 from lagjax.numerics import dense
+from lagjax.numerics.rank import independent_rows
 
-# After a step the state is off by its local error e. With the matrix kept, each iteration multiplies the
-# residual by a number of the size of e: three reach round-off from e = 1e-4.
-ITERATIONS_AFTER_STEP = 3
-NEWTON_FROM_AFAR = 30
+# With the matrix kept, an iteration multiplies the residual by about the first one: one is enough from 1e-8 of the
+# size of the state, and a crude fixed step of 0.1 takes eight.
+ITERATIONS = 12
+ONE_IS_ENOUGH_BELOW = 1e-8
+
+
+class Projected(eqx.Module):
+    """A state returned to the constraints, and whether it satisfies them to the tolerance."""
+
+    q: PyTree[Array]
+    v: PyTree[Array]
+    holds: Bool[Array, ""]
 
 
 @eqx.filter_jit
-def to_manifold(system, t, q, v, params, iterations=ITERATIONS_AFTER_STEP):
+def to_manifold(system, t, q, v, params, rtol, atol) -> Projected:
     """The nearest state that satisfies all constraints, for a state near it: Newton with a fixed matrix.
 
-    The matrix is not differentiated: where the residual vanishes its derivative does not count.
+    It holds where a displacement of `atol + rtol |y|` makes up for what is left of each residual, also of those
+    constraints that depend on others.
     """
     x, unflatten = coordinates.flatten(q)
     u, _ = coordinates.flatten(v)
     mass = mass_and_forcing(system, t, x, u, params, unflatten).mass
-    jacobian = constraints.acceleration_rows(system, t, x, u, params, unflatten).jacobian
-    inverted = lax.stop_gradient(dense.inverse(saddle_point_matrix(mass, jacobian)))
-    to_displacement = inverted[: x.size, x.size :]
-    holonomic = constraints.holonomic_equations(system, t, q, v, params)
+    jacobian = constraints.jacobian(system, t, x, u, params, unflatten)
+    inverted = dense.inverse(saddle_point_matrix(mass, jacobian, independent_rows(jacobian)))
+    # The matrix is not differentiated: where the residual vanishes its derivative does not count.
+    to_displacement, slope = lax.stop_gradient((inverted[: x.size, x.size :], jnp.sum(jnp.abs(jacobian), axis=1)))
+    allowed = lambda y: atol + rtol * jnp.max(jnp.abs(y))
+    live, holds = (system, t, params), jnp.asarray(True)
+    fixed = stopped(live)
 
+    holonomic = constraints.holonomic_equations(system, t, q, v, params)
     if holonomic.any():
         # Positions move only in directions that the velocity constraints allow: a rolling body keeps rolling.
-        to_position = to_displacement[:, holonomic]
-        for _ in range(iterations):
-            x = x - to_position @ constraints.position_residual(system, t, x, params, unflatten)
-    for _ in range(iterations):
-        u = u - to_displacement @ constraints.velocity_residual(system, t, x, u, params, unflatten)
-    return unflatten(x), unflatten(u)
+        position_residual = lambda problem, x: constraints.position_residual(*problem[:2], x, problem[2], unflatten)
+        x = _newton(position_residual, live, x, to_displacement[:, holonomic], slope[holonomic])
+        holds = jnp.all(jnp.abs(position_residual(fixed, x)) <= slope[holonomic] * allowed(x))
+
+    def velocity_residual(problem_and_x, u):
+        (system, t, params), x = problem_and_x
+        return constraints.velocity_residual(system, t, x, u, params, unflatten)
+
+    u = _newton(velocity_residual, (live, x), u, to_displacement, slope)
+    holds &= jnp.all(jnp.abs(velocity_residual((fixed, x), u)) <= slope * allowed(u))
+    return Projected(unflatten(x), unflatten(u), lax.stop_gradient(holds))
 
 
-def consistent_state(system, t, q, v, params):
-    """Return a state near the given one that satisfies the constraints, by steps shortest in the mass matrix's metric.
+def _newton(residual: Callable, problem: PyTree, y, to_displacement, slope):
+    """Iterate `y - D residual(problem, y)`; the last iteration alone is differentiated, enough where r vanishes."""
+    fixed, start = stopped((problem, y))
 
-    Each Newton step is the shortest one; together they lead to the nearest state up to the square of the distance.
+    def size(r):
+        return jnp.max(jnp.abs(r) / jnp.where(slope > 0, slope, 1.0))
 
-    >>> import lagjax as lj
-    >>> rod = lj.Holonomic(lambda t, q, params: q["x"] ** 2 + q["y"] ** 2 - params["length"] ** 2)
-    >>> pendulum = lj.System(lambda t, q, v, params: 0.5 * (v["x"] ** 2 + v["y"] ** 2), {"rod": rod})
-    >>> q, v = consistent_state(
-    ...     pendulum, 0.0, {"x": 6.0, "y": 8.0}, {"x": 1.0, "y": 0.0}, {"length": 5.0}
-    ... )
-    >>> print(q["x"].round(6), q["y"].round(6))
-    3.0 4.0
+    def unfinished(state):
+        i, y, r = state
+        return (i < ITERATIONS) & (size(r) > ONE_IS_ENOUGH_BELOW * jnp.maximum(jnp.max(jnp.abs(y)), first))
 
-    **Arguments:** `t` scalar, `q` and `v` alike, `params` as the system takes it.
+    def iterate(state):
+        i, y, r = state
+        y = y - to_displacement @ r
+        return i + 1, y, residual(fixed, y)
 
-    **Returns:** (q, v) in the same structure. Its derivative is that of the shortest step: exact from a state that is
-    consistent already, and up to the distance from one that is not.
+    r = residual(fixed, start)
+    first = size(r)
+    _, near, _ = lax.while_loop(unfinished, iterate, (0, start, r))
+    # The value of `near`, the derivative of y.
+    y = near + (y - start)
+    return y - to_displacement @ residual(problem, y)
 
-    **Raises:** `ValueError` where no consistent state is reached, with the residual by constraint name
-    (not while JAX is tracing); as `accelerations` for a state of the wrong shape or dtype.
 
-    Source: Hairer, Lubich & Wanner, *Geometric Numerical Integration*, Eq. (IV.4.3).
-    """
-    s = coordinates.state(t, q, v, params)
-    check_scalar(system, *s)
-    if not system.constraints:
-        return s.q, s.v
-    q, v = _consistent_state(system, *s)
-    if not coordinates.is_traced((q, v)):
-        round_off = 1e3 * float(jnp.finfo(s.t.dtype).eps)
-        found = coordinates.State(s.t, q, v, s.params)
-        excess = departures(system, found, rtol=round_off, atol=round_off)
-        if excess:
-            raise ValueError(
-                f"no consistent state was found near q = {describe(s.q)}: after {NEWTON_FROM_AFAR} Newton "
-                f"iterations constraint {excess}.\n"
-                "Usual cause: constraints that contradict each other, or a start too far from the manifold.\n"
-                "Fix: start nearer, or check each constraint with lj.constraint_residual(system, t, q, v, params)."
-            )
-    return q, v
+def stopped(tree):
+    """`tree` without derivatives."""
+    return jax.tree.map(lambda leaf: lax.stop_gradient(leaf) if eqx.is_array(leaf) else leaf, tree)
 
 
 def worst_residual(system, t, q, v, params):
@@ -113,6 +122,12 @@ def level_size(size):
     return jnp.concatenate([jnp.full_like(positions, positions.max()), jnp.full_like(velocities, velocities.max())])
 
 
+def within(system, t, q, v, params, rtol, atol) -> Bool[Array, ""]:
+    """Whether a displacement of `atol + rtol |y|` makes up for every residual, of positions and velocities."""
+    residual, slope, size = residuals_and_slopes(system, t, q, v, params)
+    return jnp.all(jnp.abs(residual) <= slope @ (atol + rtol * level_size(size)))
+
+
 @eqx.filter_jit
 def residuals_and_slopes(system, t, q, v, params):
     """`(r, |J|, |y|)`: residuals of both levels, their slopes in `y = (q, v)`, and the sizes of y."""
@@ -120,7 +135,7 @@ def residuals_and_slopes(system, t, q, v, params):
     u, _ = coordinates.flatten(v)
     position = constraints.position_residual(system, t, x, params, unflatten)
     velocity = constraints.velocity_residual(system, t, x, u, params, unflatten)
-    slope_u = constraints.acceleration_rows(system, t, x, u, params, unflatten).jacobian
+    slope_u = constraints.jacobian(system, t, x, u, params, unflatten)
     # ∂(dg/dt)/∂v = ∂g/∂q: the holonomic rows serve both levels.
     slope_x = slope_u[constraints.holonomic_equations(system, t, q, v, params)]
     slope = jnp.block(
@@ -141,11 +156,3 @@ def departures(system, s: coordinates.State, rtol, atol) -> str:
     labels = [f"'{name}'" for name, holonomic in equations if holonomic]
     labels += [f"d/dt '{name}'" if holonomic else f"'{name}'" for name, holonomic in equations]
     return ", ".join(f"{labels[i]} = {residual[i]:.3g}" for i in off)
-
-
-@eqx.filter_jit
-def _consistent_state(system, t, q, v, params):
-    def newton_step(state, _):
-        return to_manifold(system, t, *state, params, iterations=1), None
-
-    return lax.scan(newton_step, (q, v), length=NEWTON_FROM_AFAR)[0]

@@ -15,7 +15,7 @@ from jaxtyping import ArrayLike, PyTree
 
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.closures import lift
-from lagjax.mechanics.multipliers import explain_failure, explain_singular
+from lagjax.mechanics.diagnosis import explain_failure, explain_singular
 from lagjax.mechanics.system import System
 from lagjax.motion import problem
 from lagjax.motion.solve import START_TOLERANCES, Settings, trajectory_of
@@ -130,7 +130,7 @@ def _raise_failure(trajectory, matrix, start, settings):
         if bool(trajectory.result == RESULTS.start_off_constraints):
             tolerances = (START_TOLERANCES * float(tol) for tol in trajectory.tolerance)
             raise ValueError(problem.off_constraints(system, start, *tolerances))
-        if bool(trajectory.result == RESULTS.start_not_finite):
+        if bool((trajectory.result == RESULTS.start_not_finite) | (trajectory.result == RESULTS.contradictory)):
             problem.check_finite(start)
             raise ValueError(explain_failure(system, start) or message(trajectory.result))
         raise RuntimeError(problem.stopped_early(trajectory, settings.max_steps))

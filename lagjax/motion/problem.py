@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax.mechanics import constraints, coordinates
+from lagjax.mechanics.diagnosis import describe, explain_failure
 from lagjax.mechanics.lagrangian import check_scalar
-from lagjax.mechanics.multipliers import describe, explain_failure
 from lagjax.mechanics.system import System
 from lagjax.motion.consistency import departures
 from lagjax.motion.trajectory import RESULTS

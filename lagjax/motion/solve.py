@@ -14,11 +14,11 @@ import optimistix as optx
 from jaxtyping import Array, Float
 
 from lagjax.mechanics import coordinates
-from lagjax.mechanics.multipliers import equations_of_motion, linear_system, saddle_point_matrix
+from lagjax.mechanics.saddle_point import equations_of_motion, examined
 from lagjax.motion.both_modes import solve_in_both_modes
-from lagjax.motion.consistency import level_size, residuals_and_slopes, to_manifold
+from lagjax.motion.consistency import stopped, to_manifold, within
 from lagjax.motion.sign_change import SignChange
-from lagjax.motion.stepping import OnManifold, forward_differentiable
+from lagjax.motion.stepping import OnManifold, Stages, forward_differentiable
 from lagjax.motion.trajectory import RESULTS, Moment, Trajectory, pack
 
 # A start may be off the constraints by this many tolerances; it is then moved onto them.
@@ -65,9 +65,13 @@ def trajectory_of(system, q0, v0, params, ts, settings) -> tuple[Trajectory, Arr
 def _solve(system, q0, v0, params, ts, settings, adjoint):
     off_constraints = _off_constraints(system, ts[0], q0, v0, params, settings)
     if settings.drift == "project":
-        q0, v0 = to_manifold(system, ts[0], q0, v0, params)
-    matrix, finite = _start_equations(system, ts[0], q0, v0, params)
-    refused = off_constraints | ~finite
+        projected = to_manifold(system, ts[0], q0, v0, params, settings.rtol, settings.atol)
+        q0, v0 = projected.q, projected.v
+        off_constraints = off_constraints | ~projected.holds
+    start = stopped(examined(system, ts[0], q0, v0, params))
+    finite = jnp.all(jnp.isfinite(coordinates.flatten((start.a, start.multipliers, start.lagrangian))[0]))
+    contradictory = jnp.any(start.contradictory)
+    refused = off_constraints | contradictory | ~finite
     y0 = jax.tree.map(lambda x: jnp.where(refused, 0.0, x), (q0, v0))
     terms = diffrax.ODETerm(_vector_field(system, ts, settings.drift))
     # BacksolveAdjoint integrates a larger state backwards: it takes the bare method, and no end beside the outputs.
@@ -107,18 +111,20 @@ def _solve(system, q0, v0, params, ts, settings, adjoint):
     result = RESULTS.promote(solution.result)
     result = RESULTS.where(result == RESULTS.nonfinite_input, RESULTS.not_finite, result)
     result = RESULTS.where(finite, result, RESULTS.start_not_finite)
+    result = RESULTS.where(contradictory, RESULTS.contradictory, result)
     result = RESULTS.where(off_constraints, RESULTS.start_off_constraints, result)
     stats = {name: jnp.asarray(count) for name, count in solution.stats.items() if name != "max_steps"}
-    return {"q": q, "v": v, "multipliers": multipliers, "end": end, "stats": stats, "result": result}, matrix
+    return {"q": q, "v": v, "multipliers": multipliers, "end": end, "stats": stats, "result": result}, start.matrix
 
 
 def _vector_field(system, ts, drift):
     """d(q, v)/dt = (v, a), on the user's pytrees."""
     rate = BAUMGARTE_DECAYS / (ts[-1] - ts[0]) if drift == "baumgarte" else None
 
-    def field(t, y, params):
+    def field(t, y, args):
         q, v = y
-        return v, equations_of_motion(system, t, q, v, params, rate)[0]
+        params, independent = args if isinstance(args, Stages) else (args, None)
+        return v, equations_of_motion(system, t, q, v, params, rate, independent)[0]
 
     return field
 
@@ -131,23 +137,14 @@ def _multipliers(system, t, q, v, params):
 def _off_constraints(system, t, q, v, params, settings):
     if not system.constraints:
         return jnp.asarray(False)
-    residual, slope, size = residuals_and_slopes(system, t, q, v, params)
-    allowed = START_TOLERANCES * (slope @ (settings.atol + settings.rtol * level_size(size)))
-    return ~jnp.all(jnp.abs(residual) <= allowed)
-
-
-def _start_equations(system, t, q, v, params):
-    """The matrix of the equations at the start, and whether all of them are finite."""
-    linear, rows, lagrangian = linear_system(system, t, q, v, params)
-    solution = equations_of_motion(system, t, q, v, params)
-    finite = jnp.all(jnp.isfinite(coordinates.flatten((solution, lagrangian))[0]))
-    return jax.lax.stop_gradient(saddle_point_matrix(linear.mass, rows.jacobian)), finite
+    return ~within(system, t, q, v, params, START_TOLERANCES * settings.rtol, START_TOLERANCES * settings.atol)
 
 
 def _solver(system, terms, params, refused, settings, adjoint):
     reverse = isinstance(adjoint, diffrax.RecursiveCheckpointAdjoint)
     method = forward_differentiable(settings.method) if reverse else settings.method
-    return OnManifold(method, system, terms, params, refused, settings.drift == "project")
+    project = settings.drift == "project"
+    return OnManifold(method, system, terms, params, refused, settings.rtol, settings.atol, project)
 
 
 def _controller(ts, settings):

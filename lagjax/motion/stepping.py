@@ -7,20 +7,33 @@ Dopri8's is of order six) and satisfy the constraints, for one step's cost an ou
 """
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import diffrax
 import equinox as eqx
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jaxtyping import Array, Bool, PyTree
+from jaxtyping import Array, Bool, Float, PyTree
 
+from lagjax.mechanics.saddle_point import independent_equations
 from lagjax.mechanics.system import System
 from lagjax.motion.consistency import to_manifold
+
+# Without projection a state drifts off its constraints, and dependent ones then disagree by that much.
+DEPENDENT_BELOW_WHILE_DRIFTING = 1e-3
+
+
+class Stages(NamedTuple):
+    """What the vector field gets in the stages of one step: the constraint equations to solve with do not change."""
+
+    params: PyTree
+    independent: Bool[Array, " m"] | None
 
 
 class OnManifold(diffrax.AbstractWrappedSolver):
     """Wrap `solver`: project after each step (where `project`), and step for dense output.
 
+    A step that cannot be returned to the constraints is rejected; with a fixed step the solve ends there.
     What the dense output needs of the problem (`terms`, `params`) belongs to the solver, since diffrax hands
     an interpolation only times and states. Where `refused`, every step is NaN, and so is rejected: the solve ends
     within a few steps at the smallest step size.
@@ -31,6 +44,8 @@ class OnManifold(diffrax.AbstractWrappedSolver):
     terms: PyTree[diffrax.AbstractTerm]
     params: PyTree
     refused: Bool[Array, ""]
+    rtol: Float[Array, ""]
+    atol: Float[Array, ""]
     project: bool = eqx.field(static=True)
 
     @property
@@ -70,20 +85,29 @@ class OnManifold(diffrax.AbstractWrappedSolver):
         return self.solver.error_order(terms)
 
     def init(self, terms, t0, t1, y0, args):
-        return self.solver.init(terms, t0, t1, y0, args)
+        return self.solver.init(terms, t0, t1, y0, self._stages(t0, y0, args))
 
     def func(self, terms, t0, y0, args):
         # Only used to choose the first step, which has to be finite even where the motion is refused.
-        return jtu.tree_map(lambda f: jnp.where(self.refused, 0.0, f), self.solver.func(terms, t0, y0, args))
+        rate = self.solver.func(terms, t0, y0, self._stages(t0, y0, args))
+        return jtu.tree_map(lambda f: jnp.where(self.refused, 0.0, f), rate)
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         # The projection moves the state, so a derivative kept from the last step's end is stale.
         jumped = True if self.project else made_jump
-        y1, error, _, solver_state, result = self.solver.step(terms, t0, t1, y0, args, solver_state, jumped)
+        stages = self._stages(t0, y0, args)
+        y1, error, _, solver_state, result = self.solver.step(terms, t0, t1, y0, stages, solver_state, jumped)
         if self.project:
-            y1 = to_manifold(self.system, t1, *y1, args)
+            projected = to_manifold(self.system, t1, *y1, args, self.rtol, self.atol)
+            y1 = (projected.q, projected.v)
+            error = jtu.tree_map(lambda x: jnp.where(projected.holds, x, jnp.inf), error)
+            result = diffrax.RESULTS.where(projected.holds, result, diffrax.RESULTS.nonlinear_divergence)
         y1, error = jtu.tree_map(lambda x: jnp.where(self.refused, jnp.nan, x), (y1, error))
         return y1, error, {"y0": y0}, solver_state, _unless_not_finite(y0, result)
+
+    def _stages(self, t, y, params):
+        threshold = None if self.project else DEPENDENT_BELOW_WHILE_DRIFTING
+        return Stages(params, independent_equations(self.system, t, *y, params, threshold))
 
 
 class SteppedTo(diffrax.AbstractLocalInterpolation):

@@ -19,6 +19,7 @@ class RESULTS(diffrax.RESULTS):
     """How an integration ended: diffrax's results, and a start that could not be integrated."""
 
     start_off_constraints = "The initial state does not satisfy the constraints."
+    contradictory = "Constraints that depend on each other ask for different accelerations at the initial state."
     start_not_finite = "L, the accelerations or the multipliers are not finite at the initial state."
     not_finite = "The state became NaN or infinite."
 

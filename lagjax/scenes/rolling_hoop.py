@@ -40,7 +40,8 @@ from scipy import special
 
 from lagjax import plot
 from lagjax.mechanics.constraints import Holonomic, Nonholonomic
-from lagjax.mechanics.multipliers import accelerations, equations_of_motion
+from lagjax.mechanics.multipliers import accelerations
+from lagjax.mechanics.saddle_point import equations_of_motion
 from lagjax.mechanics.system import System
 from lagjax.motion.integrate import integrate
 from lagjax.motion.trajectory import RESULTS

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax import System, accelerations, jacobi_integral, mass_matrix, momentum
-from lagjax.mechanics.multipliers import equations_of_motion
+from lagjax.mechanics.saddle_point import equations_of_motion
 
 rng = np.random.default_rng(20)
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import lagjax as lj
-from lagjax.mechanics.multipliers import equations_of_motion
+from lagjax.mechanics.saddle_point import equations_of_motion
 from lagjax.scenes import sliding_wedge as wedge
 from tests.references import keys, reference
 

@@ -1,0 +1,142 @@
+"""What is wrong with a state, in the user's names: the coordinate or the constraint, the usual cause, the fix.
+
+Everything here looks at values, and so happens outside compiled programs.
+"""
+
+import numpy as np
+
+from lagjax.mechanics import constraints, coordinates
+from lagjax.mechanics.saddle_point import Examined, combinations, examined
+from lagjax.numerics.rank import independent_rows
+
+# Below this ratio of singular values, after scaling, the saddle-point matrix counts as singular.
+SINGULAR_BELOW = {np.dtype("float64"): 1e-13, np.dtype("float32"): 1e-6}
+# A row counts as part of a combination where it makes up more than this share of it.
+SHARE = 1e-6
+
+
+def explain_failure(system, s: coordinates.State) -> str | None:
+    """Say in the user's names why the equations fail at a state; None where they do not."""
+    found = examined(system, *s)
+    linear, rows, lagrangian = found.linear, found.rows, found.lagrangian
+    names = coordinates.names(s.q)
+    place = where(s)
+    if not np.isfinite(lagrangian):
+        return (
+            f"L is {float(lagrangian)} {place}.\n"
+            "Usual cause: a division by zero, a root or logarithm of a negative number, or NaN in params.\n"
+            "Fix: evaluate lagrangian(t, q, v, params) there, term by term."
+        )
+    for what, values in (("mass matrix", linear.mass), ("force", linear.forcing)):
+        if not np.all(np.isfinite(values)):
+            bad = np.argwhere(~np.isfinite(np.asarray(values)))[0]
+            return (
+                f"L is finite but the {what} of coordinate '{names[bad[0]]}' is not, {place}.\n"
+                "Usual cause: a derivative that does not exist there, as of sqrt at 0 or arccos at 1, "
+                "also behind a jnp.where whose other branch is taken.\n"
+                "Fix: make the argument safe before the function: jnp.sqrt(jnp.where(x > 0, x, 1.0))."
+            )
+    equations = equation_names(system, s)
+    for what, values in (("derivative", rows.jacobian), ("second derivative", rows.gamma)):
+        if not np.all(np.isfinite(values)):
+            bad = np.argwhere(~np.isfinite(np.asarray(values)))[0]
+            return (
+                f"the {what} of constraint '{equations[bad[0]]}' is not finite {place}.\n"
+                "Usual cause: a distance written with sqrt, which has no derivative at zero.\n"
+                "Fix: constrain the square of the distance."
+            )
+    return explain_singular(np.asarray(found.matrix), system, s) or explain_contradiction(found, system, s)
+
+
+def equation_names(system, s: coordinates.State) -> list[str]:
+    """The name of each constraint equation, in the order in which they are stacked."""
+    return [
+        name + (f"[{i}]" if shape else "")
+        for name, shape in constraints.shapes(system, *s).items()
+        for i in range(shape[0] if shape else 1)
+    ]
+
+
+def describe(tree) -> str:
+    """A pytree of numbers on one line, six digits each."""
+    values = coordinates.flatten(tree)[0]
+    pairs = [f"{name} = {float(x):.6g}" for name, x in zip(coordinates.names(tree), values)]
+    shown = pairs if len(pairs) <= 6 else [*pairs[:6], "..."]
+    return "(" + ", ".join(shown) + ")"
+
+
+def explain_singular(matrix, system, s: coordinates.State) -> str | None:
+    """Name the coordinate or constraint in which a saddle-point matrix is singular; None if it is not."""
+    for i in np.flatnonzero(~np.any(matrix, axis=1)):
+        return _singular_message(i, system, s)
+    _, values, right = np.linalg.svd(_equilibrate(matrix))
+    if values[-1] > SINGULAR_BELOW[matrix.dtype] * values[0]:
+        return None
+    return _singular_message(int(np.argmax(np.abs(right[-1]))), system, s)
+
+
+def explain_contradiction(found: Examined, system, s: coordinates.State) -> str | None:
+    """Name dependent constraints that ask for different accelerations; None where there are none."""
+    against = np.flatnonzero(found.contradictory)
+    if not against.size:
+        return None
+    names = equation_names(system, s)
+    groups = {group[0]: group for group in dependencies(found.rows.jacobian, names)}
+    involved = groups[names[against[0]]]
+    return (
+        f"constraints {listed(involved)} contradict each other {where(s)}: they restrict the same motion, and no "
+        "acceleration satisfies all of them.\n"
+        "Usual cause: one motion prescribed twice, by functions of time or with parameters that differ.\n"
+        f"Fix: remove '{involved[0]}', or let it ask for what the others ask for."
+    )
+
+
+def dependencies(jacobian, names) -> list[tuple[str, ...]]:
+    """Each dependent constraint equation, followed by those that it is a combination of, by name."""
+    independent = independent_rows(jacobian)
+    size = np.linalg.norm(jacobian, axis=1)
+    share = np.abs(combinations(jacobian, independent)) * size[None, :]
+    groups = []
+    for i in np.flatnonzero(~np.asarray(independent)):
+        others = np.flatnonzero(share[i] > SHARE * size[i])
+        groups.append((names[i], *(names[j] for j in others)))
+    return groups
+
+
+def listed(names) -> str:
+    """Names in quotes, the last after "and"."""
+    quoted = [f"'{name}'" for name in names]
+    return quoted[0] if len(quoted) == 1 else ", ".join(quoted[:-1]) + f" and {quoted[-1]}"
+
+
+def _equilibrate(matrix):
+    """Scale rows and columns alike until each row's largest entry is near one (Ruiz)."""
+    scaled = matrix.copy()
+    for _ in range(20):
+        scale = 1 / np.sqrt(np.max(np.abs(scaled), axis=1))
+        scaled = scale[:, None] * scaled * scale[None, :]
+    return scaled
+
+
+def _singular_message(i, system, s):
+    names, equations = coordinates.names(s.q), equation_names(system, s)
+    n, place = len(names), where(s)
+    if i < n:
+        return (
+            f"the mass matrix is singular in coordinate '{names[i]}' {place}: its acceleration is not "
+            "determined.\nUsual cause: a coordinate singularity (an azimuth at the pole), a coordinate "
+            "whose velocity is missing from L, or a zero mass.\n"
+            f"Fix: leave the singular point (or use Cartesian coordinates with a constraint), or give "
+            f"'{names[i]}' a kinetic energy or a constraint that determines it."
+        )
+    return (
+        f"constraint '{equations[i - n]}' does not act independently of the others {place}: its multiplier is "
+        "not determined.\nUsual cause: a constraint given twice or implied by the others, or one whose "
+        "derivative vanishes there.\n"
+        f"Fix: remove '{equations[i - n]}', or write it so that its derivative does not vanish."
+    )
+
+
+def where(s: coordinates.State) -> str:
+    """The state on one line, as it ends an error message."""
+    return f"at t = {float(s.t):.6g}, q = {describe(s.q)}, v = {describe(s.v)}"

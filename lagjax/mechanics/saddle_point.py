@@ -1,0 +1,158 @@
+"""The saddle-point system: accelerations and multipliers of one state.
+
+Lagrange's equations with constraints and the constraints at acceleration level,
+
+    M a = F + Aᵀ λ,    A a = gamma,
+
+are one symmetric linear system in (a, -λ):
+
+    [M  Aᵀ] [ a]   [  F  ]
+    [A  0 ] [-λ] = [gamma]
+
+It is regular where M is definite on the directions that the constraints leave free and the rows of A
+are independent. M itself may be singular (a massless wedge) or indefinite. Without constraints only
+`M a = F` is compiled.
+
+**Redundant constraints.** Where rows depend on others (a loop closed twice, a door on three hinges), a is
+still unique, and λ is not: any λ + n with Aᵀ n = 0 exerts the same force. A largest set of independent rows
+is chosen and the others are left out of the solve, which stays regular: their rows and columns become those of
+the unit matrix. With every row a combination of the chosen ones, A = C A_chosen, the force fixes only
+Cᵀ λ = λ_chosen, and the shortest such λ is `C (Cᵀ C)⁻¹ λ_chosen`.
+
+The choice is made where the constraints hold. Away from there, as in the stages of a step, dependent rows
+disagree by as much as the state is off, and solving with all of them would divide that by itself.
+
+Source: Goldstein, Eq. (2.24)-(2.27); Hairer & Wanner, *Solving ODEs II*, Eq. (VII.1.46); García de Jalón &
+Gutiérrez-López, Multibody Syst. Dyn. 30 (2013) 311 (uniqueness of a, minimum-norm λ).
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, PyTree
+
+from lagjax.mechanics import constraints, coordinates
+from lagjax.mechanics.lagrangian import Linear, mass_and_forcing
+from lagjax.numerics import dense
+from lagjax.numerics.rank import DEPENDENT_BELOW, equilibrated, independent_rows
+
+
+# Jitted, so that JAX traces L once for all the places of a compiled trajectory that need accelerations.
+@eqx.filter_jit
+def equations_of_motion(system, t, q, v, params, baumgarte_rate=None, independent=None):
+    """The accelerations, like q, and the multipliers by name.
+
+    `independent` (m,) says which constraint equations to solve with; chosen at this state if None.
+    """
+    x, unflatten = coordinates.flatten(q)
+    u, _ = coordinates.flatten(v)
+    linear = mass_and_forcing(system, t, x, u, params, unflatten)
+    if not system.constraints:
+        return unflatten(dense.solve(linear.mass, linear.forcing)), {}
+    jacobian, gamma = constraints.acceleration_rows(system, t, x, u, params, unflatten)
+    if baumgarte_rate is not None:
+        gamma = gamma + constraints.baumgarte_feedback(system, t, x, u, params, unflatten, baumgarte_rate)
+    independent = independent_rows(jacobian) if independent is None else independent
+    a, multipliers = saddle_point(linear.mass, jacobian, linear.forcing, gamma, independent)
+    return unflatten(a), constraints.split(system, multipliers, t, q, v, params)
+
+
+@eqx.filter_jit
+def independent_equations(system, t, q, v, params, dependent_below=None) -> Bool[Array, " m"] | None:
+    """Which constraint equations to solve with near a state; None where one or none leaves no choice."""
+    if constraints.count(system, t, q, v, params) < 2:
+        return None
+    x, unflatten = coordinates.flatten(q)
+    u, _ = coordinates.flatten(v)
+    return independent_rows(constraints.jacobian(system, t, x, u, params, unflatten), dependent_below)
+
+
+def saddle_point(mass, jacobian, forcing, gamma, independent):
+    """Solve `M a - Aᵀ λ = F`, `A a = gamma` for a and the shortest λ, with the independent rows of A."""
+    n = mass.shape[0]
+    if jacobian.shape[0] > 1:
+        gamma = jnp.where(independent, gamma, 0.0)
+    solution = dense.solve(saddle_point_matrix(mass, jacobian, independent), jnp.concatenate([forcing, gamma]))
+    return solution[:n], minimum_norm(jacobian, -solution[n:], independent)
+
+
+def saddle_point_matrix(mass, jacobian, independent):
+    """`[[M, Aᵀ], [A, 0]]`, with the rows and columns of dependent constraints replaced by those of the unit matrix."""
+    if jacobian.shape[0] > 1:
+        jacobian = jnp.where(independent[:, None], jacobian, 0.0)
+        corner = jnp.diag(jnp.where(independent, 0.0, 1.0).astype(mass.dtype))
+    else:
+        corner = jnp.zeros((jacobian.shape[0], jacobian.shape[0]), mass.dtype)
+    return jnp.block([[mass, jacobian.T], [jacobian, corner]])
+
+
+def minimum_norm(jacobian, multipliers, independent):
+    """The shortest multipliers that exert the force of `multipliers`, which are zero on dependent rows."""
+    if jacobian.shape[0] < 2:
+        return multipliers
+    combined = combinations(jacobian, independent)
+    gram = combined.T @ combined + jnp.diag(jnp.where(independent, 0.0, 1.0))
+    shortest = combined @ dense.solve(gram, multipliers)
+    # Without dependent rows the two agree; this keeps the last digit.
+    return jnp.where(jnp.all(independent), multipliers, shortest)
+
+
+def combinations(jacobian: Float[Array, "m n"], independent: Bool[Array, " m"]) -> Float[Array, "m m"]:
+    """C with `A = C A_chosen`: each row of A as a combination of the independent ones; differentiable.
+
+    Least squares on rows of length one; columns of dependent rows are zero.
+    """
+    rows, size = equilibrated(jacobian)
+    chosen = jnp.where(independent[:, None], rows, 0.0)
+    gram = chosen @ chosen.T + jnp.diag(jnp.where(independent, 0.0, 1.0))
+    coefficients = jax.vmap(dense.solve, in_axes=(None, 0))(gram, rows @ chosen.T)
+    scaled = coefficients * size[:, None] / jnp.where(size > 0, size, 1.0)[None, :]
+    unit = jnp.eye(size.size, dtype=jacobian.dtype)
+    return jnp.where(independent[:, None], unit, scaled)
+
+
+class Examined(NamedTuple):
+    """A solution of the equations beside what tells whether to believe it."""
+
+    a: PyTree[Array]
+    multipliers: dict[str, Array]
+    linear: Linear
+    rows: constraints.Rows
+    lagrangian: Float[Array, ""]
+    matrix: Float[Array, "k k"]
+    contradictory: Bool[Array, " m"]
+
+
+@eqx.filter_jit
+def examined(system, t, q, v, params) -> Examined:
+    """Solve the equations at one state, and keep their matrix and which dependent constraints disagree."""
+    x, unflatten = coordinates.flatten(q)
+    u, _ = coordinates.flatten(v)
+    linear = mass_and_forcing(system, t, x, u, params, unflatten)
+    rows = constraints.acceleration_rows(system, t, x, u, params, unflatten)
+    independent = independent_rows(rows.jacobian)
+    a, multipliers = saddle_point(linear.mass, rows.jacobian, linear.forcing, rows.gamma, independent)
+    against = _contradictory(linear, rows, independent, a, multipliers, x, u)
+    matrix = saddle_point_matrix(linear.mass, rows.jacobian, independent)
+    lagrangian = jnp.asarray(system.lagrangian(t, q, v, params))
+    return Examined(
+        unflatten(a), constraints.split(system, multipliers, t, q, v, params), linear, rows, lagrangian, matrix, against
+    )
+
+
+def _contradictory(linear, rows, independent, a, multipliers, x, u):
+    """Which dependent equations ask for another acceleration than those that they depend on."""
+    jacobian, gamma = rows
+    disagreement = jnp.abs(jacobian @ a - gamma)
+    terms = jnp.abs(jacobian) @ jnp.abs(a) + jnp.abs(gamma)
+    # In equilibrium and in uniform motion all these terms are round-off, of accelerations of these sizes:
+    forces = jnp.abs(linear.forcing) + jnp.abs(jacobian).T @ jnp.abs(multipliers)
+    inertia = jnp.max(jnp.abs(linear.mass), axis=1)
+    by_force = jnp.max(jnp.where(inertia > 0, forces / jnp.where(inertia > 0, inertia, 1.0), 0.0))
+    extent = jnp.max(jnp.abs(x))
+    by_velocity = jnp.max(jnp.abs(u)) ** 2 / jnp.where(extent > 0, extent, 1.0)
+    round_off = 1e4 * jnp.finfo(x.dtype).eps * (by_force + by_velocity) * jnp.sum(jnp.abs(jacobian), axis=1)
+    return ~independent & (disagreement > DEPENDENT_BELOW[np.dtype(x.dtype)] * terms + round_off)

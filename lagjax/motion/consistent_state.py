@@ -1,0 +1,179 @@
+"""The nearest state that satisfies the constraints, from any distance, with chosen coordinates held.
+
+Nearest in the metric of the mass matrix M of the given state: the stationary point of
+
+    ½ (x - x0)ᵀ M (x - x0) + μᵀ g(t, x)        then        ½ (u - u0)ᵀ M (u - u0) + νᵀ phi(t, x, u)
+
+for positions x and velocities u; `g` and `phi` are called `r(y)` below. Held coordinates leave the problem: their rows
+and columns become those of the unit matrix.
+
+Newton's method for a stationary point finds whichever is near, a farthest point as well as a nearest. So a
+state that satisfies the constraints is looked for first, by steps shortest in M; it is its own nearest point, with
+μ = 0. From there the target is moved to x0 in stages, and the stationary point followed.
+
+Source: Nocedal & Wright, *Numerical Optimization*, §18.1 (Newton-KKT) and §11.3 (continuation).
+"""
+
+from collections.abc import Callable, Iterable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from lagjax.mechanics import constraints, coordinates
+from lagjax.mechanics.diagnosis import describe, listed
+from lagjax.mechanics.lagrangian import check_scalar, mass_and_forcing
+from lagjax.mechanics.saddle_point import saddle_point_matrix
+from lagjax.motion.consistency import departures, stopped, within
+from lagjax.numerics import dense
+from lagjax.numerics.rank import DEPENDENT_BELOW, independent_rows
+
+TO_REACH = 40
+STAGES, PER_STAGE = 16, 3
+
+
+def consistent_state(system, t, q, v, params, hold: str | Iterable[str] = ()):
+    """Return the state nearest to the given one, in the mass matrix's metric, that satisfies the constraints.
+
+    >>> import lagjax as lj
+    >>> rod = lj.Holonomic(lambda t, q, params: q["x"] ** 2 + q["y"] ** 2 - params["length"] ** 2)
+    >>> pendulum = lj.System(lambda t, q, v, params: 0.5 * (v["x"] ** 2 + v["y"] ** 2), {"rod": rod})
+    >>> q, v = consistent_state(
+    ...     pendulum, 0.0, {"x": 6.0, "y": 8.0}, {"x": 1.0, "y": 0.0}, {"length": 5.0}
+    ... )
+    >>> print(q["x"].round(6), q["y"].round(6))
+    3.0 4.0
+    >>> q, v = consistent_state(
+    ...     pendulum, 0.0, {"x": 3.0, "y": 1.0}, {"x": 4.0, "y": 0.0}, {"length": 5.0}, hold="x"
+    ... )
+    >>> print(q["y"].round(6), v["y"].round(6))
+    4.0 -3.0
+
+    **Arguments:** `t` scalar, `q` and `v` alike, `params` as the system takes it; `hold`, the names of coordinates that
+    keep the values given for them and for their velocities, such as `"x"`, `"r[0]"`, or `"r"` for all of a vector.
+
+    **Returns:** (q, v) in the same structure, differentiable in the state, `t` and `params`.
+
+    **Raises:**
+
+    - `ValueError` where no consistent state is reached, with the residual by constraint name (while JAX is tracing the
+      values are NaN instead).
+    - `ValueError` for a name in `hold` that is no coordinate.
+    - `TypeError`, `ValueError` for a state of the wrong shape or dtype.
+
+    Source: Hairer, Lubich & Wanner, *Geometric Numerical Integration*, Eq. (IV.4.3).
+    """
+    s = coordinates.state(t, q, v, params)
+    check_scalar(system, *s)
+    free = _free(s, hold)
+    if not system.constraints:
+        return s.q, s.v
+    q, v, reached = _consistent_state(system, *s, jnp.asarray(free))
+    if coordinates.is_traced((q, v)):
+        return jax.tree.map(lambda x: jnp.where(reached, x, jnp.nan), (q, v))
+    if not reached:
+        raise ValueError(_unreachable(system, s, q, v, np.asarray(coordinates.names(s.q))[~free]))
+    return q, v
+
+
+def _free(s, hold):
+    """Which coordinates may move, (n,) booleans."""
+    names = coordinates.names(s.q)
+    hold = {hold} if isinstance(hold, str) else set(hold)
+    held = np.array([name in hold or name.split("[")[0] in hold for name in names])
+    unknown = hold - set(names) - {name.split("[")[0] for name in names}
+    if unknown:
+        raise ValueError(
+            f"hold names {listed(sorted(map(str, unknown)))}, and the coordinates are {listed(names)}.\n"
+            "Fix: hold the coordinates by these names."
+        )
+    return ~held
+
+
+def _unreachable(system, s, q, v, held):
+    found = coordinates.State(s.t, q, v, s.params)
+    tolerance = _round_off(s.t)
+    among = f" with {listed(held)} held" if len(held) else ""
+    return (
+        f"no consistent state was found near q = {describe(s.q)}{among}: at the best one constraint "
+        f"{departures(system, found, tolerance, tolerance)}.\n"
+        "Usual cause: constraints that contradict each other, too much held, or a start too far from the manifold.\n"
+        "Fix: hold less, start nearer, or check each constraint with lj.constraint_residual(system, t, q, v, params)."
+    )
+
+
+def _round_off(t):
+    return 1e3 * float(jnp.finfo(t.dtype).eps)
+
+
+@eqx.filter_jit
+def _consistent_state(system, t, q, v, params, free):
+    x0, unflatten = coordinates.flatten(q)
+    u0, _ = coordinates.flatten(v)
+    metric = mass_and_forcing(system, t, x0, u0, params, unflatten).mass
+    x, u, live = x0, u0, (system, t, params)
+    if constraints.holonomic_equations(system, t, q, v, params).any():
+        position = lambda problem, x: constraints.position_residual(*problem[:2], x, problem[2], unflatten)
+        x = _nearest(position, live, x0, metric, free)
+
+    def velocity(problem_and_x, u):
+        (system, t, params), x = problem_and_x
+        return constraints.velocity_residual(system, t, x, u, params, unflatten)
+
+    u = _nearest(velocity, (live, x), u0, metric, free)
+    q, v = unflatten(x), unflatten(u)
+    tolerance = _round_off(t)
+    return q, v, within(system, t, q, v, params, tolerance, tolerance)
+
+
+def _nearest(residual: Callable, problem, y0, metric, free):
+    """The stationary point of `½ (y - y0)ᵀ M (y - y0) + μᵀ r(y)` near y0."""
+    metric = jnp.where(free[:, None] & free[None, :], metric, jnp.diag(jnp.where(free, 0.0, 1.0)))
+    n, fixed, fixed_metric, start = y0.size, stopped(problem), *stopped((metric, y0))
+
+    def rows_at(problem, y):
+        return jnp.where(free[None, :], jax.jacfwd(lambda y: residual(problem, y))(y), 0.0)
+
+    def shortest_step(y, dependent_below):
+        rows = rows_at(fixed, y)
+        independent = independent_rows(rows, dependent_below)
+        inverted = dense.inverse(saddle_point_matrix(fixed_metric, rows, independent))
+        return y - inverted[:n, n:] @ residual(fixed, y), None
+
+    # Off the manifold dependent rows disagree by about the distance, which is not known to begin with.
+    thresholds = jnp.maximum(0.1 * 0.25 ** jnp.arange(TO_REACH), DEPENDENT_BELOW[np.dtype(y0.dtype)])
+    reached, _ = lax.scan(shortest_step, start, thresholds.astype(y0.dtype))
+
+    def newton_matrix(y, multipliers):
+        curvature = jax.jacfwd(lambda y: multipliers @ rows_at(fixed, y))(y)
+        curvature = jnp.where(free[:, None] & free[None, :], curvature, 0.0)
+        rows = rows_at(fixed, y)
+        return saddle_point_matrix(fixed_metric + curvature, rows, independent_rows(rows))
+
+    def equations(problem, metric, target, y, multipliers):
+        force = metric @ (y - target) + multipliers @ rows_at(problem, y)
+        return jnp.concatenate([force, residual(problem, y)])
+
+    def follow(state, share):
+        target = reached + share * (start - reached)
+        for _ in range(PER_STAGE):
+            y, multipliers = state
+            independent = independent_rows(rows_at(fixed, y))
+            left = equations(fixed, fixed_metric, target, y, multipliers)
+            left = left.at[n:].set(jnp.where(independent, left[n:], 0.0))
+            step = dense.solve(newton_matrix(y, multipliers), left)
+            state = y - step[:n], jnp.where(independent, multipliers - step[n:], 0.0)
+        return state, None
+
+    zero = jnp.zeros_like(residual(fixed, start))
+    shares = (jnp.arange(STAGES, dtype=y0.dtype) + 1) / STAGES
+    (y, multipliers), _ = lax.scan(follow, (reached, zero), shares)
+    # Where the path to the nearest point is lost, the one reached by shortest steps still satisfies the constraints.
+    found = jnp.all(jnp.isfinite(y))
+    y, multipliers = jnp.where(found, y, reached), jnp.where(found, multipliers, zero)
+    # One Newton step more, with its derivatives by everything: the implicit function theorem.
+    inverted = lax.stop_gradient(dense.inverse(newton_matrix(y, multipliers)))
+    y, multipliers = stopped((y, multipliers))
+    return y - (inverted @ equations(problem, metric, y0, y, multipliers))[:n]
