@@ -19,6 +19,7 @@ from lagjax.mechanics.system import System
 from lagjax.mechanics.lagrangian import jacobi_integral, mass_matrix, momentum
 from lagjax.mechanics.multipliers import accelerations, constraint_force, constraint_residual
 from lagjax.motion.consistent_state import consistent_state
+from lagjax.motion.explanation import Explanation, explain
 
 # isort: split
 # Motion.
@@ -44,6 +45,8 @@ __all__ = [
     "constraint_residual",
     "constraint_force",
     "consistent_state",
+    "explain",
+    "Explanation",
     "integrate",
     "Trajectory",
     "Moment",

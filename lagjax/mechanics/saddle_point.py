@@ -37,7 +37,7 @@ from jaxtyping import Array, Bool, Float, PyTree
 from lagjax.mechanics import constraints, coordinates
 from lagjax.mechanics.lagrangian import Linear, mass_and_forcing
 from lagjax.numerics import dense
-from lagjax.numerics.rank import DEPENDENT_BELOW, equilibrated, independent_rows
+from lagjax.numerics.rank import DEPENDENT_BELOW, independent_rows, unit_rows
 
 
 # Jitted, so that JAX traces L once for all the places of a compiled trajectory that need accelerations.
@@ -105,7 +105,7 @@ def combinations(jacobian: Float[Array, "m n"], independent: Bool[Array, " m"]) 
 
     Least squares on rows of length one; columns of dependent rows are zero.
     """
-    rows, size = equilibrated(jacobian)
+    rows, size = unit_rows(jacobian)
     chosen = jnp.where(independent[:, None], rows, 0.0)
     gram = chosen @ chosen.T + jnp.diag(jnp.where(independent, 0.0, 1.0))
     coefficients = jax.vmap(dense.solve, in_axes=(None, 0))(gram, rows @ chosen.T)

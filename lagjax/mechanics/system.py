@@ -63,7 +63,8 @@ class System(eqx.Module):
                     f"lj.Nonholonomic(phi) for phi(t, q, v, params) = 0."
                 )
         self.lagrangian = lagrangian
-        self.constraints = dict(constraints or {})
+        # JAX sorts a dict whenever it passes through a transformation; the order of equations must not depend on that.
+        self.constraints = dict(sorted((constraints or {}).items()))
         self.force = force
         self.dissipation = dissipation
 

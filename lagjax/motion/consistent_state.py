@@ -32,6 +32,8 @@ from lagjax.numerics.rank import DEPENDENT_BELOW, independent_rows
 
 TO_REACH = 40
 STAGES, PER_STAGE = 16, 3
+# A step of full length may overshoot far from the manifold: the best of these is taken.
+FRACTIONS = np.array([1.0, 0.5, 0.2, 0.05])
 
 
 def consistent_state(system, t, q, v, params, hold: str | Iterable[str] = ()):
@@ -136,11 +138,18 @@ def _nearest(residual: Callable, problem, y0, metric, free):
     def rows_at(problem, y):
         return jnp.where(free[None, :], jax.jacfwd(lambda y: residual(problem, y))(y), 0.0)
 
-    def shortest_step(y, dependent_below):
+    def displacement_map(y, dependent_below=None):
         rows = rows_at(fixed, y)
         independent = independent_rows(rows, dependent_below)
         inverted = dense.inverse(saddle_point_matrix(fixed_metric, rows, independent))
-        return y - inverted[:n, n:] @ residual(fixed, y), None
+        return inverted[:n, n:], jnp.sum(jnp.abs(rows), axis=1)
+
+    def shortest_step(y, dependent_below):
+        to_displacement, slope = displacement_map(y, dependent_below)
+        step = to_displacement @ residual(fixed, y)
+        trials = y[None] - FRACTIONS.astype(y.dtype)[:, None] * step[None]
+        left = jax.vmap(lambda y: jnp.max(jnp.abs(residual(fixed, y)) / jnp.where(slope > 0, slope, 1.0)))(trials)
+        return trials[jnp.argmin(jnp.where(jnp.isfinite(left), left, jnp.inf))], None
 
     # Off the manifold dependent rows disagree by about the distance, which is not known to begin with.
     thresholds = jnp.maximum(0.1 * 0.25 ** jnp.arange(TO_REACH), DEPENDENT_BELOW[np.dtype(y0.dtype)])
@@ -170,10 +179,16 @@ def _nearest(residual: Callable, problem, y0, metric, free):
     zero = jnp.zeros_like(residual(fixed, start))
     shares = (jnp.arange(STAGES, dtype=y0.dtype) + 1) / STAGES
     (y, multipliers), _ = lax.scan(follow, (reached, zero), shares)
-    # Where the path to the nearest point is lost, the one reached by shortest steps still satisfies the constraints.
     found = jnp.all(jnp.isfinite(y))
     y, multipliers = jnp.where(found, y, reached), jnp.where(found, multipliers, zero)
-    # One Newton step more, with its derivatives by everything: the implicit function theorem.
+    # The nearest point, with its derivatives by everything: one Newton step more, by the implicit function theorem.
     inverted = lax.stop_gradient(dense.inverse(newton_matrix(y, multipliers)))
-    y, multipliers = stopped((y, multipliers))
-    return y - (inverted @ equations(problem, metric, y0, y, multipliers))[:n]
+    y, multipliers, reached = stopped((y, multipliers, reached))
+    nearest = y - (inverted @ equations(problem, metric, y0, y, multipliers))[:n]
+    # Where the path to it was lost, the point reached by shortest steps, with the derivatives of a step.
+    near = reached + (y0 - start)
+    near = near - lax.stop_gradient(displacement_map(reached)[0]) @ residual(problem, near)
+    length = lambda y: (y - start) @ fixed_metric @ (y - start)
+    off = jnp.max(jnp.abs(residual(fixed, nearest)))
+    kept = (off <= jnp.sqrt(jnp.finfo(y0.dtype).eps)) & (length(nearest) <= length(near) * (1 + 1e-6))
+    return jnp.where(kept, nearest, near)

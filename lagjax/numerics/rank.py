@@ -24,20 +24,22 @@ def independent_rows(rows: Float[Array, "m n"], dependent_below=None) -> Bool[Ar
 
     >>> import jax.numpy as jnp
     >>> print(independent_rows(jnp.array([[1.0, 0.0], [2.0, 0.0], [1.0, 1.0]])))
-    [False  True  True]
+    [ True False  True]
 
     Rows that are zero or not finite are kept: what is solved with them is then singular or not finite, and says so.
 
     **Arguments:** `rows` (m, n), a floating dtype; `dependent_below`, the largest sine of a dependent row, by default
-    `DEPENDENT_BELOW` of the dtype. Scaling rows or columns does not change the answer.
+    `DEPENDENT_BELOW` of the dtype. Scaling rows does not change the answer; columns are compared as they are, since
+    scaling one up that is all round-off would make any rows independent.
 
     **Returns:** (m,) booleans. It has no derivative.
     """
     count, dtype = rows.shape[0], np.dtype(rows.dtype)
     if count < 2:
         return jnp.ones(count, bool)
-    rest, size = equilibrated(lax.stop_gradient(rows))
+    rest, size = unit_rows(lax.stop_gradient(rows))
     ordinary = jnp.isfinite(size) & (size > 0)
+    rest = jnp.where(ordinary[:, None], rest, 0.0)
     least = (DEPENDENT_BELOW[dtype] if dependent_below is None else dependent_below) ** 2
 
     def take_farthest(_, state):
@@ -58,13 +60,10 @@ def independent_rows(rows: Float[Array, "m n"], dependent_below=None) -> Bool[Ar
     return state[1] | ~ordinary
 
 
-def equilibrated(rows: Float[Array, "m n"]) -> tuple[Float[Array, "m n"], Float[Array, " m"]]:
-    """Scale columns to a largest entry of one, then rows to length one; and the factor that divided each row."""
-    largest = jnp.max(jnp.abs(rows), axis=1, keepdims=True)
-    column = jnp.max(jnp.abs(rows) / jnp.where(largest > 0, largest, 1.0), axis=0, keepdims=True)
-    scaled = rows / jnp.where(column > 0, column, 1.0)
+def unit_rows(rows: Float[Array, "m n"]) -> tuple[Float[Array, "m n"], Float[Array, " m"]]:
+    """Rows scaled to length one, zero rows left as they are; and their lengths."""
     # Through the largest entry, so that squares neither overflow nor vanish.
-    largest = jnp.max(jnp.abs(scaled), axis=1, keepdims=True)
-    shape = scaled / jnp.where(largest > 0, largest, 1.0)
-    size = largest[:, 0] * jnp.sqrt(jnp.sum(shape**2, axis=1))
-    return scaled / jnp.where(size > 0, size, 1.0)[:, None], size
+    largest = jnp.max(jnp.abs(rows), axis=1)
+    shape = rows / jnp.where(largest > 0, largest, 1.0)[:, None]
+    length = largest * jnp.sqrt(jnp.sum(shape**2, axis=1))
+    return rows / jnp.where(length > 0, length, 1.0)[:, None], length

@@ -1,0 +1,140 @@
+"""`explain`: what a system amounts to at one state, in words and numbers."""
+
+from dataclasses import dataclass
+
+import jax.numpy as jnp
+import numpy as np
+
+from lagjax.mechanics import constraints, coordinates
+from lagjax.mechanics.constraints import Holonomic
+from lagjax.mechanics.diagnosis import dependencies, describe, equation_names, explain_failure, listed
+from lagjax.mechanics.lagrangian import check_scalar
+from lagjax.mechanics.saddle_point import examined
+from lagjax.mechanics.system import System
+from lagjax.motion.consistency import departures, to_manifold, within
+from lagjax.numerics.rank import independent_rows
+
+# A state is taken for one on the constraints that was rounded, and moved there, where it is this near.
+ROUNDED = 1e-4
+
+
+@dataclass(frozen=True, repr=False)
+class Explanation:
+    """What a system amounts to at one state; it prints itself.
+
+    - `coordinates`: their names; `equations`: the name of each constraint equation.
+    - `degrees_of_freedom`: velocities left free, coordinates less independent constraint equations.
+    - `position_freedoms`: positions left free; more than the former where velocities alone are constrained.
+    - `dependent`: each dependent equation, followed by those that it is a combination of.
+    - `mass_matrix`: its definiteness in words; `problem`: why the equations fail there, or None.
+    """
+
+    coordinates: tuple[str, ...]
+    equations: tuple[str, ...]
+    degrees_of_freedom: int
+    position_freedoms: int
+    dependent: tuple[tuple[str, ...], ...]
+    mass_matrix: str
+    problem: str | None
+    rows: tuple[tuple[str, str], ...]
+
+    def __repr__(self):
+        width = max(len(label) for label, _ in self.rows)
+        return "\n".join(["System", *(f"  {label:<{width}}  {text}" for label, text in self.rows)])
+
+
+def explain(system: System, q, v, params=None, *, t=0.0) -> Explanation:
+    """Say what a system amounts to at a state: freedoms, dependent constraints, mass matrix, problems.
+
+    >>> import lagjax as lj
+    >>> rod = lj.Holonomic(lambda t, q, params: q["x"] ** 2 + q["y"] ** 2 - 1.0)
+    >>> again = lj.Holonomic(lambda t, q, params: 2.0 * (q["x"] ** 2 + q["y"] ** 2) - 2.0)
+    >>> free = lambda t, q, v, params: 0.5 * (v["x"] ** 2 + v["y"] ** 2)
+    >>> twice = lj.System(free, constraints={"rod": rod, "again": again})
+    >>> explain(twice, {"x": 1.0, "y": 0.0}, {"x": 0.0, "y": 1.0})
+    System
+      at                  t = 0, q = (x = 1, y = 0), v = (x = 0, y = 1)
+      coordinates         2: x, y
+      constraints         'again' (position), 'rod' (position)
+      equations           2, of which 1 independent
+      dependent           'rod' restricts the same motion as 'again'; their multipliers are the shortest
+      degrees of freedom  1
+      mass matrix         positive definite
+
+    **Arguments:** `q` and `v` alike, `params` as the system takes it, `t` scalar. A state near the constraints is
+    moved onto them first: dependent constraints agree only there.
+
+    **Returns:** an `Explanation`.
+
+    **Raises:** `TypeError`, `ValueError` for a state of the wrong shape or dtype, or an L that is not scalar.
+
+    Source: García de Jalón & Bayo, *Kinematic and Dynamic Simulation of Multibody Systems*, §3.2 (rank and freedoms).
+    """
+    s = coordinates.state(t, q, v, params)
+    check_scalar(system, *s)
+    off = ""
+    if system.constraints:
+        s, off = _on_the_constraints(system, s)
+    found = examined(system, *s)
+    names, equations = coordinates.names(s.q), equation_names(system, s)
+    jacobian = found.rows.jacobian
+    holonomic = constraints.holonomic_equations(system, *s)
+    independent = int(independent_rows(jacobian).sum())
+    groups = tuple(dependencies(jacobian, equations)) if independent < len(equations) else ()
+    problem = explain_failure(system, s)
+    mass = _definiteness(np.asarray(found.linear.mass), names)
+
+    rows = [("at", f"t = {float(s.t):.6g}, q = {describe(s.q)}, v = {describe(s.v)}")]
+    rows.append(("coordinates", f"{len(names)}: {', '.join(names)}"))
+    if equations:
+        kinds = {name: "position" if isinstance(c, Holonomic) else "velocity" for name, c in system.constraints.items()}
+        rows.append(("constraints", ", ".join(f"'{name}' ({kind})" for name, kind in kinds.items())))
+        rows.append(("equations", f"{len(equations)}, of which {independent} independent"))
+    rows += [("dependent", _in_words(group)) for group in groups]
+    if off:
+        rows.append(("off the constraints", off))
+    rows.append(("degrees of freedom", f"{len(names) - independent}"))
+    rows.append(("mass matrix", mass))
+    rows += [(name, "yes") for name in ("force", "dissipation") if getattr(system, name) is not None]
+    if problem:
+        rows.append(("problem", problem.replace("\n", "\n    ")))
+    return Explanation(
+        coordinates=tuple(names),
+        equations=tuple(equations),
+        degrees_of_freedom=len(names) - independent,
+        position_freedoms=len(names) - int(independent_rows(jacobian[holonomic]).sum()),
+        dependent=groups,
+        mass_matrix=mass,
+        problem=problem,
+        rows=tuple(rows),
+    )
+
+
+def _on_the_constraints(system, s):
+    """The state, moved onto the constraints where it is near; and what it violates where it is not."""
+    tolerance = jnp.asarray(ROUNDED, s.t.dtype)
+    if within(system, *s, tolerance, tolerance):
+        moved = to_manifold(system, *s, tolerance, tolerance)
+        return s._replace(q=moved.q, v=moved.v), ""
+    return s, departures(system, s, ROUNDED, ROUNDED)
+
+
+def _in_words(group):
+    dependent, *others = group
+    if not others:
+        return f"'{dependent}' restricts nothing"
+    return f"'{dependent}' restricts the same motion as {listed(others)}; their multipliers are the shortest"
+
+
+def _definiteness(mass, names):
+    scale = np.sqrt(np.abs(np.diag(mass)))
+    scale = np.where(scale > 0, scale, 1.0)
+    if not np.all(np.isfinite(mass)):
+        return "not finite"
+    values, vectors = np.linalg.eigh(mass / np.outer(scale, scale))
+    zero = np.abs(values) <= 1e3 * np.finfo(mass.dtype).eps * np.max(np.abs(values), initial=0.0)
+    negative = int(np.sum(values[~zero] < 0))
+    if zero.any():
+        massless = sorted({names[int(np.argmax(np.abs(vector)))] for vector in vectors.T[zero]})
+        return f"singular in {listed(massless)}"
+    return f"indefinite, {negative} of {len(values)} directions negative" if negative else "positive definite"

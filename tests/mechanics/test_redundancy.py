@@ -1,0 +1,155 @@
+"""Redundant constraints: the same accelerations, the shortest multipliers, finite derivatives; contradictions named."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import lagjax as lj
+from tests.systems import PARAMS, cartesian_lagrangian, rod, rod_pendulum
+
+STATE = (
+    0.0,
+    {"x": 1.25 * np.sin(2.0), "y": -1.25 * np.cos(2.0)},
+    {"x": 3.75 * np.cos(2.0), "y": 3.75 * np.sin(2.0)},
+    PARAMS,
+)
+
+
+def twice(factor):
+    """The rod given once more, in another scale."""
+    again = lj.Holonomic(lambda t, q, params: factor * rod(t, q, params))
+    return lj.System(cartesian_lagrangian, {"rod": lj.Holonomic(rod), "again": again})
+
+
+def door_lagrangian(t, q, v, params):
+    """A door: four points of its plate, each of a quarter of its mass, in a field that is not along the hinge line."""
+    return 0.5 * jnp.sum(v["corner"] ** 2) + jnp.sum(q["corner"] @ params["field"])
+
+
+def hinges(t, q, params):
+    """The plate's lower and upper inner corner, and a third hinge halfway up, each held in all three directions."""
+    lower, upper = q["corner"][0], q["corner"][1]
+    return jnp.concatenate(
+        [lower, upper - jnp.array([0.0, 0.0, 2.0]), 0.5 * (lower + upper) - jnp.array([0.0, 0.0, 1.0])]
+    )
+
+
+def rigid(t, q, params):
+    """The plate's fourth corner from the other three, and all six distances between corners: three would do."""
+    corner = q["corner"]
+    rectangle = corner[3] - corner[1] - corner[2] + corner[0]
+    pairs = [(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)]
+    lengths = [2.0, 1.0, np.sqrt(5.0), np.sqrt(5.0), 1.0, 2.0]
+    distances = jnp.stack([jnp.sum((corner[i] - corner[j]) ** 2) - l**2 for (i, j), l in zip(pairs, lengths)])
+    return jnp.concatenate([rectangle, distances])
+
+
+door = lj.System(door_lagrangian, {"hinges": lj.Holonomic(hinges), "rigid": lj.Holonomic(rigid)})
+ANGLE, RATE = 0.4, 1.5
+OUTWARD, ALONG = np.array([np.cos(ANGLE), np.sin(ANGLE), 0.0]), np.array([-np.sin(ANGLE), np.cos(ANGLE), 0.0])
+AXIS = np.array([0.0, 0.0, 2.0])
+DOOR_STATE = (
+    0.0,
+    {"corner": np.stack([0 * AXIS, AXIS, OUTWARD, AXIS + OUTWARD])},
+    {"corner": RATE * np.stack([0 * AXIS, 0 * AXIS, ALONG, ALONG])},
+    {"field": np.array([0.25, -0.5, -1.0])},
+)
+
+
+@pytest.mark.parametrize("factor", [1.0, -3.0, 1e5])
+def test_constraint_given_twice(factor):
+    """The accelerations are those of the rod given once, and the multipliers the shortest that exert its force."""
+    a, multipliers = lj.accelerations(twice(factor), *STATE)
+    a_once, once = lj.accelerations(rod_pendulum, *STATE)
+    for name in a:
+        np.testing.assert_allclose(a[name], a_once[name], rtol=1e-13)
+    share = once["rod"] / (1 + factor**2)
+    np.testing.assert_allclose(multipliers["rod"], share, rtol=1e-12)
+    np.testing.assert_allclose(multipliers["again"], factor * share, rtol=1e-12)
+
+
+def test_door_on_three_hinges():
+    """A plate with 18 equations of which 11 are independent turns about its hinge line as its one-angle equation says.
+
+    Multipliers: the least-squares solution of Aᵀ λ = M a - F by NumPy's pseudo-inverse.
+    """
+    a, multipliers = lj.accelerations(door, *DOOR_STATE)
+    # Two corners at radius 1: 2 phi'' = the two forces along the direction of turning.
+    turning = DOOR_STATE[3]["field"] @ ALONG
+    np.testing.assert_allclose(a["corner"][2], turning * ALONG - RATE**2 * OUTWARD, atol=1e-12)
+    np.testing.assert_allclose(a["corner"][:2], 0.0, atol=1e-12)
+    x = DOOR_STATE[1]["corner"].ravel()
+    unstack = lambda x: {"corner": x.reshape(4, 3)}
+    rows = np.concatenate([jax.jacobian(lambda x: g(0.0, unstack(x), None))(x) for g in (hinges, rigid)])
+    assert np.linalg.matrix_rank(rows, 1e-9) == 11
+    forces = np.ravel(a["corner"]) - np.tile(DOOR_STATE[3]["field"], 4)
+    shortest = np.linalg.pinv(rows.T, 1e-9) @ forces
+    np.testing.assert_allclose(np.concatenate([multipliers["hinges"], multipliers["rigid"]]), shortest, atol=1e-11)
+
+
+def test_report_names_dependent_constraints_and_counts_freedoms():
+    """`explain`: the door has one degree of freedom and seven dependent equations; the rod given twice names both."""
+    report = lj.explain(door, *DOOR_STATE[1:])
+    assert report.degrees_of_freedom == report.position_freedoms == 1
+    assert len(report.dependent) == 7
+    assert "18, of which 11 independent" in repr(report)
+    pair = lj.explain(twice(2.0), *STATE[1:])
+    assert pair.degrees_of_freedom == 1
+    assert set(pair.dependent[0]) == {"rod", "again"}
+    assert lj.explain(rod_pendulum, *STATE[1:]).dependent == ()
+
+
+def test_report_of_a_rounded_state():
+    """A state typed with six digits has the same freedoms: it is moved onto the constraints first."""
+    rounded = {"corner": np.round(DOOR_STATE[1]["corner"], 6)}
+    assert lj.explain(door, rounded, DOOR_STATE[2], DOOR_STATE[3]).degrees_of_freedom == 1
+
+
+@pytest.mark.parametrize("mode", [jax.jacfwd, jax.jacrev])
+def test_derivatives_of_shared_multipliers(mode):
+    """Accelerations and shortest multipliers have the derivatives of their closed forms, in lanes too."""
+
+    def outcome(x):
+        q = {"x": x["l"] * jnp.sin(x["angle"]), "y": -x["l"] * jnp.cos(x["angle"])}
+        v = {"x": x["l"] * x["rate"] * jnp.cos(x["angle"]), "y": x["l"] * x["rate"] * jnp.sin(x["angle"])}
+        again = lj.Holonomic(lambda t, q, params: params["factor"] * rod(t, q, params))
+        system = lj.System(cartesian_lagrangian, {"rod": lj.Holonomic(rod), "again": again})
+        a, multipliers = lj.accelerations(system, 0.0, q, v, {"g": 9.8125, "l": x["l"], "factor": x["factor"]})
+        tangential = jnp.cos(x["angle"]) * a["x"] + jnp.sin(x["angle"]) * a["y"]
+        return jnp.stack([tangential, multipliers["rod"], multipliers["again"]])
+
+    def exact(x):
+        tension = x["l"] * x["rate"] ** 2 + 9.8125 * jnp.cos(x["angle"])
+        share = -tension / (2 * x["l"] * (1 + x["factor"] ** 2))
+        return jnp.stack([-9.8125 * jnp.sin(x["angle"]), share, x["factor"] * share])
+
+    lanes = {name: jnp.array(values) for name, values in
+             {"l": [1.25, 0.5], "angle": [2.0, 0.3], "rate": [3.0, -1.0], "factor": [0.5, -2.0]}.items()}  # fmt: skip
+    got, expected = jax.vmap(mode(outcome))(lanes), jax.vmap(jax.jacfwd(exact))(lanes)
+    for name in lanes:
+        np.testing.assert_allclose(got[name], expected[name], atol=1e-11)
+
+
+def test_contradictory_accelerations_are_named():
+    """One coordinate driven by two motions that agree in position and velocity only: no acceleration satisfies both."""
+    drive = lambda rate: lj.Holonomic(lambda t, q, params: q["x"] - 0.5 * rate * t**2)
+    system = lj.System(cartesian_lagrangian, {"slow": drive(1.0), "fast": drive(2.0)})
+    at_rest = {"x": 0.0, "y": 0.0}
+    with pytest.raises(ValueError, match="(?s)'slow' and 'fast' contradict each other.*Fix:"):
+        lj.accelerations(system, 0.0, at_rest, at_rest, PARAMS)
+    with pytest.raises(ValueError, match="(?s)'slow' and 'fast' contradict each other.*Fix:"):
+        lj.integrate(system, at_rest, at_rest, PARAMS, ts=[0.0, 1.0])
+    traced = jax.jit(lambda x: lj.accelerations(system, 0.0, {"x": x, "y": 0.0}, at_rest, PARAMS))(0.0)
+    assert np.isnan(traced[0]["x"])
+    agreeing = lj.System(cartesian_lagrangian, {"slow": drive(1.0), "fast": drive(1.0)})
+    assert float(lj.accelerations(agreeing, 0.0, at_rest, at_rest, PARAMS)[0]["x"]) == pytest.approx(1.0, rel=1e-15)
+
+
+def test_equilibrium_is_no_contradiction():
+    """At rest in equilibrium all accelerations are round-off; that does not count as disagreement."""
+    hanging = {"x": 0.0, "y": -1.25}
+    a, multipliers = lj.accelerations(twice(0.3), 0.0, hanging, {"x": 0.0, "y": 0.0}, PARAMS)
+    assert abs(float(a["y"])) < 1e-14
+    total = float(multipliers["rod"] + 0.3 * multipliers["again"])
+    assert total == pytest.approx(-PARAMS["g"] / 2.5, rel=1e-13)

@@ -1,0 +1,134 @@
+"""The nearest consistent state: nearest, with coordinates held, differentiable, and honest where there is none."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import lagjax as lj
+
+rng = np.random.default_rng(5)
+MASSES = np.array([2.0, 0.5])
+
+
+def lagrangian(t, q, v, params):
+    """A particle whose inertia differs along its two axes: its metric is not Euclid's."""
+    return 0.5 * (params["m"][0] * v["x"] ** 2 + params["m"][1] * v["y"] ** 2)
+
+
+def ellipse(t, q, params):
+    """An ellipse whose long axis grows with time."""
+    return (q["x"] / (params["a"] + t)) ** 2 + q["y"] ** 2 - 1.0
+
+
+on_ellipse = lj.System(lagrangian, {"ellipse": lj.Holonomic(ellipse)})
+PARAMS = {"m": MASSES, "a": 1.5}
+FAR = (0.5, {"x": 3.0, "y": 2.0}, {"x": 1.0, "y": -2.0})
+
+
+def nearest_by_angle(t, q, v, params):
+    """The same point from the ellipse's angle, by Newton on d(distance²)/d(angle) = 0, and its velocity by hand."""
+    a = params["a"] + t
+    point = lambda angle: jnp.stack([a * jnp.cos(angle), jnp.sin(angle)])
+    given = jnp.stack([q["x"], q["y"]])
+    slope = jax.grad(lambda angle: 0.5 * jnp.sum(params["m"] * (point(angle) - given) ** 2))
+    angle = jnp.arctan2(q["y"], q["x"] / a)
+    for _ in range(20):
+        angle = angle - slope(angle) / jax.grad(slope)(angle)
+    x, y = point(angle)
+    # phi = normal . u + dg/dt; the shortest correction of u lies along the normal over the masses.
+    normal, rate = jnp.stack([2 * x / a**2, 2 * y]), -2 * x**2 / a**3
+    u = jnp.stack([v["x"], v["y"]])
+    correction = (normal @ u + rate) / (normal @ (normal / params["m"]))
+    return jnp.stack([x, y, *(u - correction * normal / params["m"])])
+
+
+def flat(state):
+    """(q, v) as one vector."""
+    q, v = state
+    return jnp.stack([q["x"], q["y"], v["x"], v["y"]])
+
+
+def test_nearest_in_the_metric_of_the_masses():
+    """From far away the nearest point of a moving ellipse is found, 1e-12 from its one-angle solution.
+
+    The nearest in Euclid's metric is elsewhere: the masses count.
+    """
+    found = flat(lj.consistent_state(on_ellipse, *FAR, PARAMS))
+    np.testing.assert_allclose(found, nearest_by_angle(*FAR, PARAMS), atol=1e-12)
+    euclidean = nearest_by_angle(*FAR, PARAMS | {"m": np.ones(2)})
+    assert np.max(np.abs(found - euclidean)) > 0.05
+
+
+@pytest.mark.parametrize("mode", [jax.jacfwd, jax.jacrev])
+def test_derivatives_by_everything(mode):
+    """Its derivatives by time, state and parameters are those of the one-angle solution, also from far off."""
+    ours = lambda t, q, v, params: flat(lj.consistent_state(on_ellipse, t, q, v, params))
+    got = mode(ours, argnums=(0, 1, 2, 3))(*FAR, PARAMS)
+    expected = jax.jacfwd(nearest_by_angle, argnums=(0, 1, 2, 3))(*FAR, PARAMS)
+    assert jax.tree.structure(got) == jax.tree.structure(expected)
+    for a, b in zip(jax.tree.leaves(got), jax.tree.leaves(expected)):
+        np.testing.assert_allclose(a, b, atol=1e-10)
+
+
+def crank_slider_constraints(t, q, params):
+    """A crank of length 1 and a rod of length 2.5 that ends on the x axis."""
+    return jnp.stack(
+        [jnp.cos(q["crank"]) + 2.5 * jnp.cos(q["rod"]) - q["slider"], jnp.sin(q["crank"]) + 2.5 * jnp.sin(q["rod"])]
+    )
+
+
+crank_slider = lj.System(
+    lambda t, q, v, params: 0.5 * (v["crank"] ** 2 + 3 * v["rod"] ** 2 + 2 * v["slider"] ** 2),
+    {"joint": lj.Holonomic(crank_slider_constraints)},
+)
+
+
+def test_held_coordinates_keep_position_and_velocity():
+    """With the crank's angle and speed held, rod and slider follow from the closed form of the mechanism."""
+    guess = {"crank": 0.7, "rod": -0.2, "slider": 3.0}
+    q, v = lj.consistent_state(crank_slider, 0.0, guess, {"crank": 2.0, "rod": 0.0, "slider": 0.0}, None, hold="crank")
+    assert (float(q["crank"]), float(v["crank"])) == (0.7, 2.0)
+    rod = -np.arcsin(np.sin(0.7) / 2.5)
+    rod_rate = -2.0 * np.cos(0.7) / (2.5 * np.cos(rod))
+    expected = (rod, np.cos(0.7) + 2.5 * np.cos(rod), rod_rate, -2 * np.sin(0.7) - 2.5 * np.sin(rod) * rod_rate)
+    np.testing.assert_allclose([q["rod"], q["slider"], v["rod"], v["slider"]], expected, atol=1e-13)
+
+
+def test_random_starts_reach_the_manifold_in_lanes():
+    """From random guesses of a crank-slider all lanes end on the constraints, nearly all at a stationary distance."""
+    guesses = {name: jnp.asarray(rng.uniform(-3, 3, 200)) for name in ("crank", "rod", "slider")}
+    rates = {name: jnp.asarray(rng.normal(size=200)) for name in guesses}
+    solve = jax.jit(jax.vmap(lambda q, v: lj.consistent_state(crank_slider, 0.0, q, v, None)))
+    q, v = solve(guesses, rates)
+    residual = jax.vmap(lambda q: crank_slider_constraints(0.0, q, None))(q)
+    np.testing.assert_allclose(residual, 0.0, atol=1e-13)
+    masses = {"crank": 1.0, "rod": 3.0, "slider": 2.0}
+    pull = {name: masses[name] * (q[name] - guesses[name]) for name in masses}
+    # Stationary: no pull along the one free direction (1, rod', slider') of the mechanism.
+    rod_rate = -jnp.cos(q["crank"]) / (2.5 * jnp.cos(q["rod"]))
+    slider_rate = -jnp.sin(q["crank"]) - 2.5 * jnp.sin(q["rod"]) * rod_rate
+    along = pull["crank"] + rod_rate * pull["rod"] + slider_rate * pull["slider"]
+    assert np.mean(np.abs(along) < 1e-10) > 0.95
+
+
+def test_unreachable_is_an_error_with_the_residual_by_name():
+    """A coordinate held where the constraint cannot be met, a contradiction, and a wrong name: each says so."""
+    state = {"x": 3.0, "y": 0.5}, {"x": 0.0, "y": 0.0}
+    with pytest.raises(ValueError, match=r"(?s)'x' held.*'ellipse' = [\d.]+.*Fix:"):
+        lj.consistent_state(on_ellipse, 0.0, *state, PARAMS, hold="x")
+    with pytest.raises(ValueError, match="(?s)hold names 'z'.*'x' and 'y'"):
+        lj.consistent_state(on_ellipse, 0.0, *state, PARAMS, hold=["x", "z"])
+    walls = {
+        name: lj.Holonomic(lambda t, q, params, at=at: q["x"] - at) for name, at in (("left", 0.0), ("right", 1.0))
+    }
+    with pytest.raises(ValueError, match="(?s)'left' = .*'right' = |'right' = |'left' = "):
+        lj.consistent_state(lj.System(lagrangian, walls), 0.0, *state, PARAMS)
+
+
+def test_redundant_constraints_are_no_obstacle():
+    """An ellipse given twice leads to the same point."""
+    again = lj.Holonomic(lambda t, q, params: 2.0 * ellipse(t, q, params))
+    twice = lj.System(lagrangian, {"ellipse": lj.Holonomic(ellipse), "again": again})
+    found = flat(lj.consistent_state(twice, *FAR, PARAMS))
+    np.testing.assert_allclose(found, nearest_by_angle(*FAR, PARAMS), atol=1e-12)
