@@ -46,7 +46,7 @@ def to_manifold(system, t, q, v, params, rtol, atol) -> Projected:
     """The nearest state that satisfies all constraints, for a state near it: Newton with a fixed matrix.
 
     It holds where a displacement of `atol + rtol |y|` makes up for what is left of each residual, also of those
-    constraints that depend on others.
+    constraints that depend on others; `rtol` and `atol` are one number, or one for q and one for v.
     """
     x, unflatten = coordinates.flatten(q)
     u, _ = coordinates.flatten(v)
@@ -55,7 +55,7 @@ def to_manifold(system, t, q, v, params, rtol, atol) -> Projected:
     inverted = dense.inverse(saddle_point_matrix(mass, jacobian, independent_rows(jacobian)))
     # The matrix is not differentiated: where the residual vanishes its derivative does not count.
     to_displacement, slope = lax.stop_gradient((inverted[: x.size, x.size :], jnp.sum(jnp.abs(jacobian), axis=1)))
-    allowed = lambda y: atol + rtol * jnp.max(jnp.abs(y))
+    of_q, of_v = _allowed(jnp.abs(jnp.concatenate([x, u])), rtol, atol)
     live, holds = (system, t, params), jnp.asarray(True)
     fixed = stopped(live)
 
@@ -64,14 +64,14 @@ def to_manifold(system, t, q, v, params, rtol, atol) -> Projected:
         # Positions move only in directions that the velocity constraints allow: a rolling body keeps rolling.
         position_residual = lambda problem, x: constraints.position_residual(*problem[:2], x, problem[2], unflatten)
         x = _newton(position_residual, live, x, to_displacement[:, holonomic], slope[holonomic])
-        holds = jnp.all(jnp.abs(position_residual(fixed, x)) <= slope[holonomic] * allowed(x))
+        holds = jnp.all(jnp.abs(position_residual(fixed, x)) <= slope[holonomic] * of_q)
 
     def velocity_residual(problem_and_x, u):
         (system, t, params), x = problem_and_x
         return constraints.velocity_residual(system, t, x, u, params, unflatten)
 
     u = _newton(velocity_residual, (live, x), u, to_displacement, slope)
-    holds &= jnp.all(jnp.abs(velocity_residual((fixed, x), u)) <= slope * allowed(u))
+    holds &= jnp.all(jnp.abs(velocity_residual((fixed, x), u)) <= slope * of_v)
     return Projected(unflatten(x), unflatten(u), lax.stop_gradient(holds))
 
 
@@ -125,7 +125,13 @@ def level_size(size):
 def within(system, t, q, v, params, rtol, atol) -> Bool[Array, ""]:
     """Whether a displacement of `atol + rtol |y|` makes up for every residual, of positions and velocities."""
     residual, slope, size = residuals_and_slopes(system, t, q, v, params)
-    return jnp.all(jnp.abs(residual) <= slope @ (atol + rtol * level_size(size)))
+    return jnp.all(jnp.abs(residual) <= slope @ jnp.repeat(_allowed(size, rtol, atol), size.size // 2))
+
+
+def _allowed(size, rtol, atol):
+    """The displacement that counts as none, of coordinates and of velocities, for a state of these sizes."""
+    largest = jnp.max(size.reshape(2, -1), axis=1)
+    return jnp.broadcast_to(atol, 2) + jnp.broadcast_to(rtol, 2) * largest
 
 
 @eqx.filter_jit
@@ -150,8 +156,9 @@ def residuals_and_slopes(system, t, q, v, params):
 def departures(system, s: coordinates.State, rtol, atol) -> str:
     """Name the constraints that a state violates by more than a displacement `atol + rtol |y|`; else ''."""
     residual, slope, size = (np.asarray(part) for part in residuals_and_slopes(system, *s))
+    allowed = np.repeat(np.asarray(_allowed(size, rtol, atol)), size.size // 2)
     # NaN is a violation too.
-    off = np.flatnonzero(~(np.abs(residual) <= slope @ (atol + rtol * np.asarray(level_size(size)))))
+    off = np.flatnonzero(~(np.abs(residual) <= slope @ allowed))
     equations = list(zip(equation_names(system, s), constraints.holonomic_equations(system, *s)))
     labels = [f"'{name}'" for name, holonomic in equations if holonomic]
     labels += [f"d/dt '{name}'" if holonomic else f"'{name}'" for name, holonomic in equations]

@@ -29,8 +29,8 @@ def integrate(
     params: PyTree = None,
     *,
     ts: ArrayLike | Sequence[float],
-    rtol: ArrayLike | None = None,
-    atol: ArrayLike | None = None,
+    rtol: ArrayLike | tuple[ArrayLike, ArrayLike] | None = None,
+    atol: ArrayLike | tuple[ArrayLike, ArrayLike] | None = None,
     method: diffrax.AbstractSolver | None = None,
     stepsize_controller: diffrax.AbstractStepSizeController | None = None,
     dt0: ArrayLike | None = None,
@@ -57,8 +57,9 @@ def integrate(
       that is off the constraints by no more than about the tolerance is moved onto them.
     - `params`: what the Lagrangian takes; gradients flow to its floating arrays.
     - `ts` (T,): increasing output times, `[t]`. Outputs are steps of the method, not interpolations.
-    - `rtol`, `atol`: tolerances of the local error of each coordinate and velocity. By default 1e-9 in float64,
-      1e-5 in float32.
+    - `rtol`, `atol`: tolerances of the local error of each coordinate and velocity; by default 1e-9 in float64, 1e-5
+      in float32. A pair is one for coordinates, `[q]`, and one for velocities, `[q]/[t]`. Of an angle (a coordinate
+      that is seen through sines and cosines alone) at most one turn counts as its size.
 
     **Other arguments:**
 
@@ -109,6 +110,7 @@ def integrate(
         rtol=problem.tolerance(rtol, "rtol", dtype),
         atol=problem.tolerance(atol, "atol", dtype),
         dt0=None if dt0 is None else jnp.asarray(dt0, dtype),
+        apart=bool(np.ndim(rtol) or np.ndim(atol)),
         max_steps=max_steps,
         drift=drift,
         progress=progress,
@@ -128,7 +130,7 @@ def _raise_failure(trajectory, matrix, start, settings):
     system = trajectory.system
     if not ended_well:
         if bool(trajectory.result == RESULTS.start_off_constraints):
-            tolerances = (START_TOLERANCES * float(tol) for tol in trajectory.tolerance)
+            tolerances = (START_TOLERANCES * np.asarray(tol) for tol in trajectory.tolerance)
             raise ValueError(problem.off_constraints(system, start, *tolerances))
         if bool((trajectory.result == RESULTS.start_not_finite) | (trajectory.result == RESULTS.contradictory)):
             problem.check_finite(start)

@@ -86,13 +86,20 @@ def times(ts: Any, dtype):
 
 
 def tolerance(value: Any, name: str, dtype):
-    """A tolerance as an array of `dtype`, or an error where that dtype cannot reach it."""
+    """A tolerance for coordinates and one for velocities, (2,) of `dtype`, or an error where it cannot be reached."""
     dtype = np.dtype(dtype)
-    if value is None:
-        return jnp.asarray(DEFAULT_TOLERANCE.get(dtype, 1e-2), dtype)
-    if coordinates.is_traced(value):
-        return value
-    value = float(value)
+    value = DEFAULT_TOLERANCE.get(dtype, 1e-2) if value is None else value
+    if np.ndim(value) and np.shape(value) != (2,):
+        raise ValueError(
+            f"{name} must be one number, or two: for coordinates and for velocities. Its shape is {np.shape(value)}.\n"
+            f"Fix: {name}=1e-9, or {name}=(1e-9, 1e-6)."
+        )
+    if not coordinates.is_traced(value):
+        _check_tolerance(np.min(np.asarray(value, float)), name, dtype)
+    return jnp.broadcast_to(jnp.asarray(value, dtype), 2)
+
+
+def _check_tolerance(value, name, dtype):
     if not value >= 0:
         raise ValueError(f"{name} must be a number >= 0, not {value}.")
     floor = ROUND_OFFS * float(jnp.finfo(dtype).eps)
@@ -106,7 +113,6 @@ def tolerance(value: Any, name: str, dtype):
             f"{name} = {value:.3g} is below what {dtype} can reach ({floor:.1g}).\n"
             f"Usual cause: JAX works in float32 unless told otherwise.\n{remedy}or {name}={10 * floor:.0e} or more."
         )
-    return jnp.asarray(value, dtype)
 
 
 def check_functions(system: System, s: coordinates.State):

@@ -14,11 +14,13 @@ import optimistix as optx
 from jaxtyping import Array, Float
 
 from lagjax.mechanics import coordinates
+from lagjax.mechanics.coordinates import State
 from lagjax.mechanics.saddle_point import equations_of_motion, examined
+from lagjax.mechanics.structure import angles
 from lagjax.motion.both_modes import solve_in_both_modes
 from lagjax.motion.consistency import stopped, to_manifold, within
 from lagjax.motion.sign_change import SignChange
-from lagjax.motion.stepping import OnManifold, Stages, forward_differentiable
+from lagjax.motion.stepping import OnManifold, Stages, Tolerances, forward_differentiable
 from lagjax.motion.trajectory import RESULTS, Moment, Trajectory, pack
 
 # A start may be off the constraints by this many tolerances; it is then moved onto them.
@@ -34,9 +36,10 @@ class Settings(eqx.Module):
     controller: diffrax.AbstractStepSizeController | None
     event: diffrax.Event | None
     adjoint: diffrax.AbstractAdjoint | None
-    rtol: Float[Array, ""]
-    atol: Float[Array, ""]
+    rtol: Float[Array, " 2"]
+    atol: Float[Array, " 2"]
     dt0: Float[Array, ""] | None
+    apart: bool = eqx.field(static=True)
     max_steps: int | None = eqx.field(static=True)
     drift: str = eqx.field(static=True)
     progress: bool = eqx.field(static=True)
@@ -79,7 +82,7 @@ def _solve(system, q0, v0, params, ts, settings, adjoint):
     at_ts, at_end = diffrax.SubSaveAt(ts=ts), diffrax.SubSaveAt(t1=True)
     solution = diffrax.diffeqsolve(
         terms,
-        settings.method if bare else _solver(system, terms, params, refused, settings, adjoint),
+        settings.method if bare else _solver(system, terms, State(ts[0], q0, v0, params), refused, settings, adjoint),
         t0=ts[0],
         t1=ts[-1],
         dt0=settings.dt0,
@@ -140,11 +143,20 @@ def _off_constraints(system, t, q, v, params, settings):
     return ~within(system, t, q, v, params, START_TOLERANCES * settings.rtol, START_TOLERANCES * settings.atol)
 
 
-def _solver(system, terms, params, refused, settings, adjoint):
+def _solver(system, terms, start, refused, settings, adjoint):
     reverse = isinstance(adjoint, diffrax.RecursiveCheckpointAdjoint)
-    method = forward_differentiable(settings.method) if reverse else settings.method
-    project = settings.drift == "project"
-    return OnManifold(method, system, terms, params, refused, settings.rtol, settings.atol, project)
+    angle = tuple(jax.tree.leaves(angles(system, *start)))
+    return OnManifold(
+        solver=forward_differentiable(settings.method) if reverse else settings.method,
+        system=system,
+        terms=terms,
+        params=start.params,
+        refused=refused,
+        tolerances=Tolerances(settings.rtol, settings.atol),
+        angles=angle,
+        weigh=settings.controller is None and (settings.apart or any(angle)),
+        project=settings.drift == "project",
+    )
 
 
 def _controller(ts, settings):
@@ -154,7 +166,7 @@ def _controller(ts, settings):
     dtmin = 16 * jnp.finfo(ts.dtype).eps * jnp.maximum(jnp.abs(ts[0]), jnp.abs(ts[-1]))
     # The largest error counts, not the mean: more coordinates should not loosen the tolerance of each.
     return diffrax.PIDController(
-        rtol=settings.rtol, atol=settings.atol, norm=optx.max_norm, dtmin=dtmin, force_dtmin=False
+        rtol=settings.rtol[0], atol=settings.atol[0], norm=optx.max_norm, dtmin=dtmin, force_dtmin=False
     )
 
 

@@ -13,6 +13,7 @@ import diffrax
 import equinox as eqx
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
 from lagjax.mechanics.saddle_point import independent_equations
@@ -21,6 +22,17 @@ from lagjax.motion.consistency import to_manifold
 
 # Without projection a state drifts off its constraints, and dependent ones then disagree by that much.
 DEPENDENT_BELOW_WHILE_DRIFTING = 1e-3
+
+
+# Of the size of an angle no more counts than this: relative to a thousand turns, a tolerance would mean nothing.
+TURN = 2 * np.pi
+
+
+class Tolerances(NamedTuple):
+    """Tolerances of coordinates and of velocities, each (2,)."""
+
+    rtol: Float[Array, " 2"]
+    atol: Float[Array, " 2"]
 
 
 class Stages(NamedTuple):
@@ -33,10 +45,9 @@ class Stages(NamedTuple):
 class OnManifold(diffrax.AbstractWrappedSolver):
     """Wrap `solver`: project after each step (where `project`), and step for dense output.
 
-    A step that cannot be returned to the constraints is rejected; with a fixed step the solve ends there.
-    What the dense output needs of the problem (`terms`, `params`) belongs to the solver, since diffrax hands
-    an interpolation only times and states. Where `refused`, every step is NaN, and so is rejected: the solve ends
-    within a few steps at the smallest step size.
+    A step that cannot be returned to the constraints is rejected; with a fixed step the solve ends there. `weigh`
+    rescales the error for a controller that knows one tolerance: coordinates and velocities are judged by their own, and
+    the `angles` among the leaves of q by no more than a turn.
     """
 
     solver: diffrax.AbstractSolver
@@ -44,8 +55,9 @@ class OnManifold(diffrax.AbstractWrappedSolver):
     terms: PyTree[diffrax.AbstractTerm]
     params: PyTree
     refused: Bool[Array, ""]
-    rtol: Float[Array, ""]
-    atol: Float[Array, ""]
+    tolerances: Tolerances
+    angles: tuple[bool, ...] = eqx.field(static=True)
+    weigh: bool = eqx.field(static=True)
     project: bool = eqx.field(static=True)
 
     @property
@@ -97,13 +109,29 @@ class OnManifold(diffrax.AbstractWrappedSolver):
         jumped = True if self.project else made_jump
         stages = self._stages(t0, y0, args)
         y1, error, _, solver_state, result = self.solver.step(terms, t0, t1, y0, stages, solver_state, jumped)
+        if self.weigh and error is not None:
+            error = self._weighed(y0, y1, error)
         if self.project:
-            projected = to_manifold(self.system, t1, *y1, args, self.rtol, self.atol)
+            projected = to_manifold(self.system, t1, *y1, args, *self.tolerances)
             y1 = (projected.q, projected.v)
             error = jtu.tree_map(lambda x: jnp.where(projected.holds, x, jnp.inf), error)
             result = diffrax.RESULTS.where(projected.holds, result, diffrax.RESULTS.nonlinear_divergence)
         y1, error = jtu.tree_map(lambda x: jnp.where(self.refused, jnp.nan, x), (y1, error))
         return y1, error, {"y0": y0}, solver_state, _unless_not_finite(y0, result)
+
+    def _weighed(self, y0, y1, error):
+        (rtol_q, rtol_v), (atol_q, atol_v) = self.tolerances
+
+        def weighed(a, b, error, rtol, atol, angle):
+            size = jnp.maximum(jnp.abs(a), jnp.abs(b))
+            counted = jnp.minimum(size, TURN) if angle else size
+            own = atol + rtol * counted
+            return error * (atol_q + rtol_q * size) / jnp.where(own > 0, own, 1.0)
+
+        (q0, v0), (q1, v1), (dq, dv) = y0, y1, error
+        angles = jtu.tree_unflatten(jtu.tree_structure(q0), self.angles)
+        dq = jtu.tree_map(lambda a, b, e, angle: weighed(a, b, e, rtol_q, atol_q, angle), q0, q1, dq, angles)
+        return dq, jtu.tree_map(lambda a, b, e: weighed(a, b, e, rtol_v, atol_v, False), v0, v1, dv)
 
     def _stages(self, t, y, params):
         threshold = None if self.project else DEPENDENT_BELOW_WHILE_DRIFTING

@@ -51,7 +51,8 @@ class Trajectory(eqx.Module):
     - `end`: the last instant reached (`t`, `q`, `v`, `multipliers`): the event, where one ended the motion.
     - `stats`: `num_steps`, `num_accepted_steps`, `num_rejected_steps`.
     - `result`: a `RESULTS` item; `lj.RESULTS.successful`, `event_occurred`, or what went wrong.
-    - `params`, `system`: what was integrated. `tolerance`: (rtol, atol).
+    - `params`, `system`: what was integrated. `tolerance`: (rtol, atol), each (2,):
+      for coordinates and for velocities.
 
     Under `vmap` every array has the batch's axes in front.
     """
@@ -133,7 +134,7 @@ def message(result) -> str:
 
 def _lines(traj):
     rows = [
-        ("method", f"{traj.static.method}, rtol {float(traj.tolerance[0]):.3g}, atol {float(traj.tolerance[1]):.3g}"),
+        ("method", f"{traj.static.method}, rtol {_pair(traj.tolerance[0])}, atol {_pair(traj.tolerance[1])}"),
         ("result", message(traj.result) + _ended(traj)),
         (
             "steps",
@@ -145,6 +146,11 @@ def _lines(traj):
     rows.append(("change of the Jacobi integral", f"{float(traj.drift()):.1e} (relative)"))
     rows += _shape_rows(traj)
     return ["Trajectory", *_aligned(rows)]
+
+
+def _pair(tolerance):
+    of_q, of_v = (f"{float(value):.3g}" for value in tolerance)
+    return of_q if of_q == of_v else f"{of_q} (q), {of_v} (v)"
 
 
 def _batch_lines(traj, lanes):
