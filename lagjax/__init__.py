@@ -24,7 +24,7 @@ from lagjax.motion.explanation import Explanation, explain
 # isort: split
 # Motion.
 from lagjax.motion.integrate import integrate
-from lagjax.motion.trajectory import RESULTS, Moment, Trajectory
+from lagjax.motion.trajectory import RESULTS, AccuracyWarning, Moment, Trajectory
 
 # isort: split
 # Error against run time.
@@ -51,6 +51,7 @@ __all__ = [
     "Trajectory",
     "Moment",
     "RESULTS",
+    "AccuracyWarning",
     "Run",
     "work_precision",
     "scenes",

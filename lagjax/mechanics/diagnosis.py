@@ -6,11 +6,9 @@ Everything here looks at values, and so happens outside compiled programs.
 import numpy as np
 
 from lagjax.mechanics import constraints, coordinates
-from lagjax.mechanics.saddle_point import Examined, combinations, examined
+from lagjax.mechanics.saddle_point import SINGULAR_BELOW, Examined, combinations, examined
 from lagjax.numerics.rank import independent_rows
 
-# Below this ratio of singular values, after scaling, the saddle-point matrix counts as singular.
-SINGULAR_BELOW = {np.dtype("float64"): 1e-13, np.dtype("float32"): 1e-6}
 # A row counts as part of a combination where it makes up more than this share of it.
 SHARE = 1e-6
 

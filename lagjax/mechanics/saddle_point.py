@@ -39,6 +39,9 @@ from lagjax.mechanics.lagrangian import Linear, mass_and_forcing
 from lagjax.numerics import dense
 from lagjax.numerics.rank import DEPENDENT_BELOW, independent_rows, unit_rows
 
+# Below this reciprocal condition, after scaling, the matrix counts as singular.
+SINGULAR_BELOW = {np.dtype("float64"): 1e-13, np.dtype("float32"): 1e-6}
+
 
 # Jitted, so that JAX traces L once for all the places of a compiled trajectory that need accelerations.
 @eqx.filter_jit

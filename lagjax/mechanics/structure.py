@@ -39,26 +39,45 @@ PERIODIC = {"sin", "cos"}
 
 def angles(system, t, q, v, params) -> PyTree[bool]:
     """Which leaves of q are angles, in the structure of q."""
-    functions = [lambda t, q, v, params: system.lagrangian(t, q, v, params)]
-    functions += [f for f in (system.force, system.dissipation) if f is not None]
+    leaves, structure = jtu.tree_flatten(q)
+    found = []
+    for i in range(len(leaves)):
+        kinds = {
+            _dependence(f, (t, q, v, params), lambda args, i=i: jtu.tree_leaves(args[1])[i]) for f in _seen(system)
+        }
+        found.append(kinds - {Depends.NOT} == {Depends.PERIODICALLY})
+    return jtu.tree_unflatten(structure, found)
+
+
+def conserves_jacobi_integral(system, t, q, v, params) -> bool:
+    """Whether the Jacobi integral is known to be constant: no explicit time, no force, only positions constrained."""
+    if system.force is not None or system.dissipation is not None:
+        return False
+    if not all(isinstance(c, Holonomic) for c in system.constraints.values()):
+        return False
+    of_time = [_dependence(f, (t, q, v, params), lambda args: args[0]) for f in _seen(system)]
+    return all(kind == Depends.NOT for kind in of_time)
+
+
+def _seen(system):
+    """All functions that the motion depends on, of (t, q, v, params)."""
+    functions = [system.lagrangian, system.force, system.dissipation]
     for c in system.constraints.values():
         functions.append((lambda t, q, v, params, g=c.g: g(t, q, params)) if isinstance(c, Holonomic) else c.phi)
-    leaves, structure = jtu.tree_flatten(q)
-    seen = [[_dependence(f, i, leaves, structure, (t, v, params)) for f in functions] for i in range(len(leaves))]
-    return jtu.tree_unflatten(structure, [set(kinds) - {Depends.NOT} == {Depends.PERIODICALLY} for kinds in seen])
+    return [f for f in functions if f is not None]
 
 
-def _dependence(function, i, leaves, structure, rest):
-    """How the outputs of a function of (t, q, v, params) depend on the i-th leaf of q."""
-    arrays, static = eqx.partition(rest, eqx.is_array)
+def _dependence(function, args, leaf_of):
+    """How the outputs of a function of (t, q, v, params) depend on one leaf of these."""
+    arrays, static = eqx.partition(args, eqx.is_array)
 
-    def of_leaf(leaf, others, arrays):
-        t, v, params = eqx.combine(arrays, static)
-        q = jtu.tree_unflatten(structure, [*others[:i], leaf, *others[i:]])
-        return eqx.filter(function(t, q, v, params), eqx.is_array)
+    def of_arrays(arrays):
+        return eqx.filter(function(*eqx.combine(arrays, static)), eqx.is_array)
 
-    jaxpr = jax.make_jaxpr(of_leaf)(leaves[i], leaves[:i] + leaves[i + 1 :], arrays).jaxpr
-    kinds = [Depends.LINEARLY] + [Depends.NOT] * (len(jaxpr.invars) - 1)
+    jaxpr = jax.make_jaxpr(of_arrays)(arrays).jaxpr
+    count, structure = len(jaxpr.invars), jtu.tree_structure(arrays)
+    chosen = leaf_of(jtu.tree_unflatten(structure, range(count)))
+    kinds = [Depends.LINEARLY if i == chosen else Depends.NOT for i in range(count)]
     return max(_walk(jaxpr, kinds), default=Depends.NOT)
 
 

@@ -15,7 +15,7 @@ from jaxtyping import ArrayLike, PyTree
 
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.closures import lift
-from lagjax.mechanics.diagnosis import explain_failure, explain_singular
+from lagjax.mechanics.diagnosis import explain_failure
 from lagjax.mechanics.system import System
 from lagjax.motion import problem
 from lagjax.motion.solve import START_TOLERANCES, Settings, trajectory_of
@@ -87,8 +87,9 @@ def integrate(
       tolerance below the dtype's reach.
     - `ValueError` for a start off the constraints, or one where L or its equations are singular or not finite.
     - `RuntimeError` where the integration stops early: `max_steps` reached, or a step size that collapsed.
+    - Warns (`lj.AccuracyWarning`) where the Jacobi integral must be constant and changed by 1000 tolerances.
 
-    Order and accuracy: those of `method`; `tests/motion/test_integrate.py` measures them.
+    Order and accuracy: those of `method`; `tests/motion/test_orders.py` measures them.
 
     Source: Hairer & Wanner, *Solving ODEs II*, §VII.2 (projection); Kidger, arXiv:2202.02435 (diffrax).
     """
@@ -116,14 +117,14 @@ def integrate(
         progress=progress,
     )
     ts = problem.times(ts, dtype)
-    trajectory, matrix = trajectory_of(system, start.q, start.v, start.params, ts, settings)
+    trajectory, drift = trajectory_of(system, start.q, start.v, start.params, ts, settings)
     if throw:
-        trajectory = _raise_failure(trajectory, matrix, start._replace(t=ts[0]), settings)
+        trajectory = _raise_failure(trajectory, drift, start._replace(t=ts[0]), settings)
     return trajectory
 
 
-def _raise_failure(trajectory, matrix, start, settings):
-    """Raise in the user's words; while tracing, at run time with the result's own message."""
+def _raise_failure(trajectory, drift, start, settings):
+    """Raise or warn in the user's words; while tracing, at run time with the result's own message."""
     ended_well = (trajectory.result == RESULTS.successful) | (trajectory.result == RESULTS.event_occurred)
     if coordinates.is_traced(trajectory):
         return trajectory.result.error_if(trajectory, ~ended_well)
@@ -132,11 +133,9 @@ def _raise_failure(trajectory, matrix, start, settings):
         if bool(trajectory.result == RESULTS.start_off_constraints):
             tolerances = (START_TOLERANCES * np.asarray(tol) for tol in trajectory.tolerance)
             raise ValueError(problem.off_constraints(system, start, *tolerances))
-        if bool((trajectory.result == RESULTS.start_not_finite) | (trajectory.result == RESULTS.contradictory)):
+        if any(bool(trajectory.result == result) for result in problem.REFUSED):
             problem.check_finite(start)
             raise ValueError(explain_failure(system, start) or message(trajectory.result))
         raise RuntimeError(problem.stopped_early(trajectory, settings.max_steps))
-    singular = explain_singular(np.asarray(matrix), system, start)
-    if singular:
-        raise ValueError(singular)
+    problem.warn_of_drift(float(drift), trajectory)
     return trajectory

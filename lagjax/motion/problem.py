@@ -1,5 +1,6 @@
 """The questions that `integrate` asks of its arguments before it starts, in the user's words."""
 
+import warnings
 from typing import Any
 
 import diffrax
@@ -9,13 +10,18 @@ import numpy as np
 from lagjax.mechanics import constraints, coordinates
 from lagjax.mechanics.diagnosis import describe, explain_failure
 from lagjax.mechanics.lagrangian import check_scalar
+from lagjax.mechanics.saddle_point import equations_of_motion
 from lagjax.mechanics.system import System
 from lagjax.motion.consistency import departures
-from lagjax.motion.trajectory import RESULTS
+from lagjax.motion.trajectory import RESULTS, AccuracyWarning
 
 # Tolerances that each dtype reaches with room to spare, and the tightest that is not below its round-off.
 DEFAULT_TOLERANCE = {np.dtype("float64"): 1e-9, np.dtype("float32"): 1e-5}
 ROUND_OFFS = 8
+# Starts that cannot be integrated, whose reason is in the equations.
+REFUSED = (RESULTS.start_not_finite, RESULTS.start_singular, RESULTS.contradictory)
+# A motion of a hundred periods changes the Jacobi integral by ten to a hundred tolerances.
+DRIFT_TOLERANCES = 1e3
 
 
 def check_system(system: Any):
@@ -36,9 +42,9 @@ def check_method(method: Any):
         )
     if not isinstance(method, diffrax.AbstractSolver):
         raise TypeError(f"method must be a diffrax solver, not {type(method).__name__}.\nFix: method=diffrax.Dopri8().")
-    if isinstance(method.term_structure, tuple):
+    if method.term_structure is not diffrax.AbstractTerm:
         raise TypeError(
-            f"{type(method).__name__} needs a vector field split in two, and the accelerations of a general "
+            f"{type(method).__name__} needs a vector field of a special form, and the accelerations of a general "
             "Lagrangian depend on q and v together.\nFix: method=diffrax.Dopri8(), or any method for one ODETerm."
         )
 
@@ -140,6 +146,22 @@ def off_constraints(system: System, s: coordinates.State, rtol, atol) -> str:
     )
 
 
+def warn_of_drift(drift, trajectory):
+    """Warn where a conserved Jacobi integral changed much more than the tolerance."""
+    rtol = float(trajectory.tolerance[0][0])
+    if drift > DRIFT_TOLERANCES * rtol:
+        span, steps = float(trajectory.end.t - trajectory.t[0]), int(trajectory.stats["num_accepted_steps"])
+        warnings.warn(
+            f"the Jacobi integral, which is constant for this system, changed by {drift:.1g} of its size over a time "
+            f"of {span:.6g} ({steps} steps): {drift / rtol:.0e} times rtol = {rtol:.1g}.\n"
+            "Usual cause: a span of very many periods, over which small errors add up, an unstable motion, or "
+            "round-off (float32, or a tolerance near its limit).\n"
+            "Fix: a tighter rtol and atol (in float64), a method of higher order, or a shorter span.",
+            AccuracyWarning,
+            stacklevel=4,
+        )
+
+
 def stopped_early(trajectory, max_steps) -> str:
     """Say where and why an integration stopped before its last output."""
     end, t0, t1 = trajectory.end, float(trajectory.t[0]), float(trajectory.t[-1])
@@ -158,10 +180,28 @@ def stopped_early(trajectory, max_steps) -> str:
             "Usual cause: a stiff system under an explicit method, or a span of very many periods.\n"
             f"Fix: max_steps={4 * max_steps}, a looser rtol, or method=diffrax.Kvaerno5() where it is stiff."
         )
+    if bool(trajectory.result == RESULTS.unsolved_step):
+        return (
+            f"{what}: {RESULTS[trajectory.result]} The last state is {describe(end.q)}.\n"
+            "Usual cause: a fixed step too long for the implicit method's root finder, or for the return to the "
+            "constraints.\n"
+            "Fix: a smaller dt0, or leave stepsize_controller out: steps that fail are then taken again, shorter."
+        )
     return (
-        f"{what}: {RESULTS[trajectory.result]} The last state is {describe(end.q)}.\n"
+        f"{what}: {RESULTS[trajectory.result]} The last state is {describe(end.q)}{_fastest(trajectory)}.\n"
         "Usual cause: a singularity of the motion (a collision, a singular configuration), a jump in a force, "
         "or NaN from L beyond that state.\n"
         "Fix: stop before it with event=diffrax.Event(...), or look at lj.accelerations at trajectory.end "
         "with throw=False."
     )
+
+
+def _fastest(trajectory):
+    """The coordinate whose acceleration is largest at the end: that of a collision or a coordinate singularity."""
+    end = trajectory.end
+    values = np.abs(coordinates.flatten(equations_of_motion(trajectory.system, *end[:3], trajectory.params)[0])[0])
+    names = coordinates.names(end.q)
+    if len(names) == 0 or not np.all(np.isfinite(values)):
+        return ""
+    i = int(np.argmax(values))
+    return f", and the largest acceleration that of '{names[i]}', {values[i]:.2g}"

@@ -10,18 +10,20 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float
 
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.coordinates import State
-from lagjax.mechanics.saddle_point import equations_of_motion, examined
-from lagjax.mechanics.structure import angles
+from lagjax.mechanics.saddle_point import SINGULAR_BELOW, equations_of_motion, examined
+from lagjax.mechanics.structure import angles, conserves_jacobi_integral
 from lagjax.motion.both_modes import solve_in_both_modes
 from lagjax.motion.consistency import stopped, to_manifold, within
 from lagjax.motion.sign_change import SignChange
 from lagjax.motion.stepping import OnManifold, Stages, Tolerances, forward_differentiable
-from lagjax.motion.trajectory import RESULTS, Moment, Trajectory, pack
+from lagjax.motion.trajectory import RESULTS, Moment, Trajectory, pack, worst_drift
+from lagjax.numerics import dense
 
 # A start may be off the constraints by this many tolerances; it is then moved onto them.
 START_TOLERANCES = 100.0
@@ -46,8 +48,8 @@ class Settings(eqx.Module):
 
 
 @eqx.filter_jit
-def trajectory_of(system, q0, v0, params, ts, settings) -> tuple[Trajectory, Array]:
-    """The trajectory, and the matrix of its equations at the start (for a look at its rank)."""
+def trajectory_of(system, q0, v0, params, ts, settings) -> tuple[Trajectory, Float[Array, ""]]:
+    """The trajectory, and the worst relative change of a Jacobi integral that must be constant (else 0)."""
     # Derivatives flow to the floating arrays of these; the settings are constants.
     x, rest = eqx.partition((system, q0, v0, params, ts), eqx.is_inexact_array)
     fixed, static = eqx.partition((rest, settings), eqx.is_array)
@@ -57,12 +59,12 @@ def trajectory_of(system, q0, v0, params, ts, settings) -> tuple[Trajectory, Arr
         return _solve(*eqx.combine(x, rest), settings, adjoint)
 
     if settings.adjoint is None:
-        fields, matrix = solve_in_both_modes(solved, x, fixed)
+        fields, drift = solve_in_both_modes(solved, x, fixed)
     else:
-        fields, matrix = solved(x, fixed, settings.adjoint)
+        fields, drift = solved(x, fixed, settings.adjoint)
     arrays, described = pack(system, params, type(settings.method).__name__)
     tolerance = (settings.rtol, settings.atol)
-    return Trajectory(t=ts, **fields, tolerance=tolerance, arrays=arrays, static=described), matrix
+    return Trajectory(t=ts, **fields, tolerance=tolerance, arrays=arrays, static=described), drift
 
 
 def _solve(system, q0, v0, params, ts, settings, adjoint):
@@ -70,11 +72,13 @@ def _solve(system, q0, v0, params, ts, settings, adjoint):
     if settings.drift == "project":
         projected = to_manifold(system, ts[0], q0, v0, params, settings.rtol, settings.atol)
         q0, v0 = projected.q, projected.v
-        off_constraints = off_constraints | ~projected.holds
     start = stopped(examined(system, ts[0], q0, v0, params))
     finite = jnp.all(jnp.isfinite(coordinates.flatten((start.a, start.multipliers, start.lagrangian))[0]))
+    singular = dense.reciprocal_condition(start.matrix) <= SINGULAR_BELOW[np.dtype(ts.dtype)]
     contradictory = jnp.any(start.contradictory)
-    refused = off_constraints | contradictory | ~finite
+    if settings.drift == "project":
+        off_constraints = off_constraints | (finite & ~singular & ~projected.holds)
+    refused = off_constraints | contradictory | singular | ~finite
     y0 = jax.tree.map(lambda x: jnp.where(refused, 0.0, x), (q0, v0))
     terms = diffrax.ODETerm(_vector_field(system, ts, settings.drift))
     # BacksolveAdjoint integrates a larger state backwards: it takes the bare method, and no end beside the outputs.
@@ -111,13 +115,23 @@ def _solve(system, q0, v0, params, ts, settings, adjoint):
     end = jax.tree.map(lambda x: jnp.where(refused, jnp.nan, x[-1]), everything)._replace(t=t[-1])
     _, q, v, multipliers = jax.tree.map(lambda x: jnp.where(_like(reached, x), x[:-1], jnp.nan), everything)
 
+    drift = jnp.zeros_like(t[0])
+    if conserves_jacobi_integral(system, ts[0], q0, v0, params):
+        drift = worst_drift(system, *stopped((t, everything.q, everything.v, params)))
     result = RESULTS.promote(solution.result)
     result = RESULTS.where(result == RESULTS.nonfinite_input, RESULTS.not_finite, result)
+    result = RESULTS.where(result == RESULTS.nonlinear_divergence, RESULTS.unsolved_step, result)
+    # An output is a step of its own, and can fail where the steps of the solve did not.
+    all_reached = jnp.all(jnp.isfinite(coordinates.flatten(outputs)[0]))
+    ended_well = (result == RESULTS.successful) | (result == RESULTS.event_occurred)
+    result = RESULTS.where(ended_well & ~all_reached, RESULTS.unsolved_step, result)
+    result = RESULTS.where(singular, RESULTS.start_singular, result)
     result = RESULTS.where(finite, result, RESULTS.start_not_finite)
     result = RESULTS.where(contradictory, RESULTS.contradictory, result)
     result = RESULTS.where(off_constraints, RESULTS.start_off_constraints, result)
     stats = {name: jnp.asarray(count) for name, count in solution.stats.items() if name != "max_steps"}
-    return {"q": q, "v": v, "multipliers": multipliers, "end": end, "stats": stats, "result": result}, start.matrix
+    fields = {"q": q, "v": v, "multipliers": multipliers, "end": end, "stats": stats, "result": result}
+    return fields, drift
 
 
 def _vector_field(system, ts, drift):

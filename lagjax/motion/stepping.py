@@ -46,8 +46,12 @@ class OnManifold(diffrax.AbstractWrappedSolver):
     """Wrap `solver`: project after each step (where `project`), and step for dense output.
 
     A step that cannot be returned to the constraints is rejected; with a fixed step the solve ends there. `weigh`
-    rescales the error for a controller that knows one tolerance: coordinates and velocities are judged by their own, and
-    the `angles` among the leaves of q by no more than a turn.
+    rescales the error for a controller that knows one tolerance: coordinates and velocities are judged each by their
+    own, and the `angles` among the leaves of q by no more than a turn.
+
+    What the dense output needs of the problem (`terms`, `params`) belongs to the solver, since diffrax hands
+    an interpolation only times and states. Where `refused`, every step is NaN, and so is rejected: the solve ends
+    within a few steps at the smallest step size.
     """
 
     solver: diffrax.AbstractSolver
@@ -151,8 +155,8 @@ class SteppedTo(diffrax.AbstractLocalInterpolation):
             return jtu.tree_map(lambda b, a: b - a, self.evaluate(t1), self.evaluate(t0))
         s = self.solver
         state = s.init(s.terms, self.t0, self.t1, self.y0, s.params)
-        y, *_ = s.step(s.terms, self.t0, t0, self.y0, s.params, state, made_jump=False)
-        return y
+        y, _, _, _, result = s.step(s.terms, self.t0, t0, self.y0, s.params, state, made_jump=False)
+        return jtu.tree_map(lambda x: jnp.where(result == diffrax.RESULTS.successful, x, jnp.nan), y)
 
 
 def _unless_not_finite(y0, result):

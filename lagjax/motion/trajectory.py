@@ -21,7 +21,13 @@ class RESULTS(diffrax.RESULTS):
     start_off_constraints = "The initial state does not satisfy the constraints."
     contradictory = "Constraints that depend on each other ask for different accelerations at the initial state."
     start_not_finite = "L, the accelerations or the multipliers are not finite at the initial state."
+    start_singular = "The accelerations are not determined at the initial state: the equations are singular there."
     not_finite = "The state became NaN or infinite."
+    unsolved_step = "The equations of a step were not solved, or its end could not be returned to the constraints."
+
+
+class AccuracyWarning(UserWarning):
+    """A motion was computed, and shows by itself that it is less accurate than its tolerance suggests."""
 
 
 class Moment(NamedTuple):
@@ -82,13 +88,11 @@ class Trajectory(eqx.Module):
 
     def jacobi_integral(self) -> Float[Array, " T"]:
         """The Jacobi integral `v·p - L` at every output, (T,), `[L]`. Not for batched trajectories."""
-        return _jacobi_and_scale(self.system, self.t, self.q, self.v, self.params)[0]
+        return jacobi_and_scale(self.system, self.t, self.q, self.v, self.params)[0]
 
     def drift(self) -> Float[Array, ""]:
         """The largest change of the Jacobi integral, relative to the largest `|v·p| + |L|`."""
-        h, scale = _jacobi_and_scale(self.system, self.t, self.q, self.v, self.params)
-        largest = jnp.nanmax(scale)
-        return jnp.nanmax(jnp.abs(h - h[0])) / jnp.where(largest > 0, largest, 1.0)
+        return worst_drift(self.system, self.t, self.q, self.v, self.params)
 
     def residual(self) -> Float[Array, ""]:
         """The worst constraint residual over all outputs, positions and velocities, relative."""
@@ -116,6 +120,25 @@ class Trajectory(eqx.Module):
             return f"Trajectory({self.static.method}, being traced, t: {self.t.shape})"
         lanes = self.t.shape[:-1]
         return "\n".join(_batch_lines(self, lanes) if lanes else _lines(self))
+
+
+@eqx.filter_jit
+def jacobi_and_scale(system, t, q, v, params):
+    """The Jacobi integral at each of a batch of states, and the size of its terms `|v·p| + |L|`."""
+
+    def at(t, q, v):
+        value, p = jax.value_and_grad(system.lagrangian, argnums=2)(t, q, v, params)
+        power = coordinates.flatten(v)[0] @ coordinates.flatten(p)[0]
+        return power - value, jnp.abs(power) + jnp.abs(value)
+
+    return jax.vmap(at)(t, q, v)
+
+
+def worst_drift(system, t, q, v, params):
+    """The largest change of the Jacobi integral from the first state on, relative to its largest terms."""
+    h, scale = jacobi_and_scale(system, t, q, v, params)
+    largest = jnp.nanmax(scale)
+    return jnp.nanmax(jnp.abs(h - h[0])) / jnp.where(largest > 0, largest, 1.0)
 
 
 def pack(system, params, method: str) -> tuple[PyTree, Static]:
@@ -208,16 +231,6 @@ def _columns(values):
     if values.ndim == 1:
         return [("", values)]
     return [(f"[{i}]", column) for i, column in enumerate(values.T)]
-
-
-@eqx.filter_jit
-def _jacobi_and_scale(system, t, q, v, params):
-    def at(t, q, v):
-        value, p = jax.value_and_grad(system.lagrangian, argnums=2)(t, q, v, params)
-        power = coordinates.flatten(v)[0] @ coordinates.flatten(p)[0]
-        return power - value, jnp.abs(power) + jnp.abs(value)
-
-    return jax.vmap(at)(t, q, v)
 
 
 @eqx.filter_jit

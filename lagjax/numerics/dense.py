@@ -16,6 +16,7 @@ Differentiation never passes through the pivoting: `dx = K^-1 (db - dK x)`, tran
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Float
 
 ELIMINATE_UP_TO = 6
@@ -78,3 +79,19 @@ def inverse(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
         factor = jnp.where(row == k, 0.0, work[:, k])
         work = jnp.where((row == k)[:, None], best, work - factor[:, None] * best)
     return work[:, n:]
+
+
+def reciprocal_condition(matrix: Float[Array, "n n"]) -> Float[Array, ""]:
+    """`1/(|K| |K^-1|)` in the maximum norm, of a symmetric matrix scaled by rows and columns alike; 0 if singular.
+
+    The scaling brings every row's largest entry near one (Ruiz), so that units do not count as ill-conditioning.
+    """
+
+    def rescaled(_, matrix):
+        largest = jnp.max(jnp.abs(matrix), axis=1)
+        scale = 1 / jnp.sqrt(jnp.where(largest > 0, largest, 1.0))
+        return scale[:, None] * matrix * scale[None, :]
+
+    scaled = lax.fori_loop(0, 20, rescaled, matrix)
+    product = jnp.max(jnp.abs(scaled)) * jnp.max(jnp.abs(inverse(scaled)))
+    return jnp.where(jnp.isfinite(product), 1 / product, 0.0)

@@ -6,7 +6,7 @@ import pytest
 
 import lagjax as lj
 from lagjax.mechanics import coordinates
-from lagjax.mechanics.structure import angles
+from lagjax.mechanics.structure import angles, conserves_jacobi_integral
 
 free = lambda t, q, v, params: 0.5 * (v["a"] ** 2 + v["b"] ** 2)
 
@@ -51,3 +51,18 @@ def test_vectors_of_angles():
     assert angles(lj.System(chain), *s) is True
     mixed = lambda t, q, v, params: 0.5 * v @ v + jnp.cos(q[0]) - q[1] ** 2
     assert angles(lj.System(mixed), *s) is False
+
+
+def test_conserved_jacobi_integral():
+    """Explicit time in L or a constraint, a force, dissipation or a velocity constraint each take it away."""
+    s = coordinates.state(0.0, {"a": 0.1, "b": 0.2}, {"a": 0.0, "b": 0.0}, {"k": 1.0})
+    known = lambda **parts: conserves_jacobi_integral(lj.System(**({"lagrangian": free} | parts)), *s)
+    fixed, moving = (lj.Holonomic(lambda t, q, params, rate=rate: q["a"] - q["b"] * (1 + rate * t)) for rate in (0, 1))
+    assert known() and known(constraints={"fixed": lj.Holonomic(lambda t, q, params: q["a"] - q["b"])})
+    assert not known(lagrangian=lambda t, q, v, params: free(t, q, v, params) * jnp.cos(t))
+    assert not known(constraints={"moving": moving})
+    assert not known(constraints={"rolling": lj.Nonholonomic(lambda t, q, v, params: v["a"] - v["b"])})
+    assert not known(force=lambda t, q, v, params: v)
+    assert not known(dissipation=lambda t, q, v, params: v["a"] ** 2)
+    # Time enters the expression but multiplies zero: not seen as constant, which errs on the safe side.
+    assert not known(constraints={"fixed": fixed})

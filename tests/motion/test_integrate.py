@@ -11,16 +11,7 @@ from tests.systems import HORIZONTAL, PARAMS, TS, pendulum, pendulum_lagrangian,
 
 # Swinging hard, from 2 rad at 3 rad/s: nonlinear, and no symmetry that would raise an order.
 SWING = (2.0, 3.0)
-ROD_SWING = (
-    {"x": 1.25 * np.sin(2.0), "y": -1.25 * np.cos(2.0)},
-    {"x": 3.75 * np.cos(2.0), "y": 3.75 * np.sin(2.0)},
-)
 SWING_TS = np.array([0.0, 0.26, 0.77, 1.01])
-
-
-def angle_of(traj):
-    """The pendulum's angle from its Cartesian trajectory."""
-    return jnp.arctan2(traj.q["x"], -traj.q["y"])
 
 
 @pytest.fixture(scope="module")
@@ -38,41 +29,6 @@ def test_against_scipy(exact):
     )
     np.testing.assert_allclose(exact.q, solution.y[0], atol=2e-12)
     np.testing.assert_allclose(exact.v, solution.y[1], atol=1e-11)
-
-
-def orders(method, steps, system, q0, v0, error):
-    """Observed orders between successive step counts, all sizes through one compiled program."""
-
-    @jax.jit
-    def error_at(dt0):
-        return error(
-            lj.integrate(
-                system, q0, v0, PARAMS, ts=SWING_TS, method=method, dt0=dt0,
-                stepsize_controller=diffrax.ConstantStepSize(), throw=False,
-            )
-        )  # fmt: skip
-
-    errors, steps = np.array([float(error_at(1.0 / n)) for n in steps]), np.array(steps)
-    return np.log(errors[:-1] / errors[1:]) / np.log(steps[1:] / steps[:-1])
-
-
-@pytest.mark.parametrize(
-    ("method", "order", "steps"),
-    [(diffrax.Bosh3(), 3, (40, 80, 160)), (diffrax.Tsit5(), 5, (20, 40, 80)), (diffrax.Dopri8(), 8, (8, 12, 18))],
-)
-@pytest.mark.parametrize("constrained", [False, True])
-def test_order(exact, method, order, steps, constrained):
-    """Each method keeps its order, free and constrained, at outputs that fall between its steps.
-
-    The band excludes the neighbouring orders. It is wider above: returning to the constraint takes part of the
-    error away with it, and Tsit5 settles at 5.5 there.
-    """
-    if constrained:
-        error = lambda traj: jnp.max(jnp.abs(jnp.sin(angle_of(traj) - exact.q)))
-        measured = orders(method, steps, rod_pendulum, *ROD_SWING, error)
-    else:
-        measured = orders(method, steps, pendulum, *SWING, lambda traj: jnp.max(jnp.abs(traj.q - exact.q)))
-    assert np.all((order - 0.35 < measured) & (measured < order + 0.65)), measured
 
 
 def test_outputs_are_better_than_an_interpolant(exact):
