@@ -76,20 +76,50 @@ def independent_equations(system, t, q, v, params, dependent_below=None) -> Bool
 def saddle_point(mass, jacobian, forcing, gamma, independent):
     """Solve `M a - Aᵀ λ = F`, `A a = gamma` for a and the shortest λ, with the independent rows of A."""
     n = mass.shape[0]
-    if jacobian.shape[0] > 1:
-        gamma = jnp.where(independent, gamma, 0.0)
-    solution = dense.solve(saddle_point_matrix(mass, jacobian, independent), jnp.concatenate([forcing, gamma]))
-    return solution[:n], minimum_norm(jacobian, -solution[n:], independent)
+    known = jnp.concatenate([forcing, _pick(gamma, independent, n)])
+    solution = dense.solve(saddle_point_matrix(mass, jacobian, independent), known)
+    multipliers = _spread(-solution[n:], independent)
+    return solution[:n], minimum_norm(jacobian, multipliers, independent)
 
 
 def saddle_point_matrix(mass, jacobian, independent):
-    """`[[M, Aᵀ], [A, 0]]`, with the rows and columns of dependent constraints replaced by those of the unit matrix."""
-    if jacobian.shape[0] > 1:
-        jacobian = jnp.where(independent[:, None], jacobian, 0.0)
-        corner = jnp.diag(jnp.where(independent, 0.0, 1.0).astype(mass.dtype))
-    else:
-        corner = jnp.zeros((jacobian.shape[0], jacobian.shape[0]), mass.dtype)
-    return jnp.block([[mass, jacobian.T], [jacobian, corner]])
+    """`[[M, Aᵀ], [A, 0]]` with the independent rows of A; those of the unit matrix in place of the others."""
+    m, n = jacobian.shape
+    rows = _pick(jacobian, independent, n)
+    filled = _pick(jnp.ones_like(jacobian[:, 0]), independent, n) if m > 1 else jnp.ones(m, mass.dtype)
+    return jnp.block([[mass, rows.T], [rows, jnp.diag(1 - filled)]])
+
+
+def displacement_map(mass, jacobian, independent):
+    """The shortest displacement in the metric of M that changes the residuals by a given amount, (n, m)."""
+    n = mass.shape[0]
+    inverted = dense.inverse(saddle_point_matrix(mass, jacobian, independent))
+    return _spread(inverted[:n, n:], independent)
+
+
+def _pick(x, independent, n):
+    """The entries of x (m, ...) that belong to independent equations: min(m, n) rows, zero where there are fewer.
+
+    No more than n can be independent: with many redundant ones the system is smaller than it was written.
+    """
+    m = x.shape[0]
+    if m > n:
+        return jnp.tensordot(_places(independent, n, x.dtype), x, 1)
+    return x if m < 2 else jnp.where(independent.reshape(-1, *[1] * (x.ndim - 1)), x, 0.0)
+
+
+def _spread(x, independent):
+    """Undo `_pick` along the last axis of x: zeros where an equation was left out."""
+    m, picked = independent.size, x.shape[-1]
+    if m > picked:
+        return jnp.tensordot(x, _places(independent, picked, x.dtype), 1)
+    return x if m < 2 else jnp.where(independent if x.ndim == 1 else independent[None], x, 0.0)
+
+
+def _places(independent, n, dtype):
+    """The matrix of zeros and ones that puts the independent equations first, (n, m)."""
+    place = jnp.cumsum(independent) - 1
+    return (independent[None, :] & (place[None, :] == np.arange(n)[:, None])).astype(dtype)
 
 
 def minimum_norm(jacobian, multipliers, independent):

@@ -23,8 +23,7 @@ from jaxtyping import Array, Bool, PyTree
 from lagjax.mechanics import constraints, coordinates
 from lagjax.mechanics.diagnosis import equation_names
 from lagjax.mechanics.lagrangian import mass_and_forcing
-from lagjax.mechanics.saddle_point import saddle_point_matrix
-from lagjax.numerics import dense
+from lagjax.mechanics.saddle_point import displacement_map
 from lagjax.numerics.rank import independent_rows
 
 # With the matrix kept, an iteration multiplies the residual by about the first one: one is enough from 1e-8 of the
@@ -42,36 +41,39 @@ class Projected(eqx.Module):
 
 
 @eqx.filter_jit
-def to_manifold(system, t, q, v, params, rtol, atol) -> Projected:
+def to_manifold(system, t, q, v, params, rtol, atol, independent=None) -> Projected:
     """The nearest state that satisfies all constraints, for a state near it: Newton with a fixed matrix.
 
     It holds where a displacement of `atol + rtol |y|` makes up for what is left of each residual, also of those
-    constraints that depend on others; `rtol` and `atol` are one number, or one for q and one for v.
+    constraints that depend on others; `rtol` and `atol` are one number, or one for q and one for v. `independent`
+    says which equations to solve with; chosen at this state if None.
     """
     x, unflatten = coordinates.flatten(q)
     u, _ = coordinates.flatten(v)
     mass = mass_and_forcing(system, t, x, u, params, unflatten).mass
     jacobian = constraints.jacobian(system, t, x, u, params, unflatten)
-    inverted = dense.inverse(saddle_point_matrix(mass, jacobian, independent_rows(jacobian)))
+    independent = independent_rows(jacobian) if independent is None else independent
     # The matrix is not differentiated: where the residual vanishes its derivative does not count.
-    to_displacement, slope = lax.stop_gradient((inverted[: x.size, x.size :], jnp.sum(jnp.abs(jacobian), axis=1)))
+    to_displacement = lax.stop_gradient(displacement_map(mass, jacobian, independent))
+    slope = lax.stop_gradient(jnp.sum(jnp.abs(jacobian), axis=1))
     of_q, of_v = _allowed(jnp.abs(jnp.concatenate([x, u])), rtol, atol)
-    live, holds = (system, t, params), jnp.asarray(True)
+    live = (system, t, params)
     fixed = stopped(live)
 
     holonomic = constraints.holonomic_equations(system, t, q, v, params)
+    position_residual = lambda problem, x: constraints.position_residual(*problem[:2], x, problem[2], unflatten)
     if holonomic.any():
         # Positions move only in directions that the velocity constraints allow: a rolling body keeps rolling.
-        position_residual = lambda problem, x: constraints.position_residual(*problem[:2], x, problem[2], unflatten)
         x = _newton(position_residual, live, x, to_displacement[:, holonomic], slope[holonomic])
-        holds = jnp.all(jnp.abs(position_residual(fixed, x)) <= slope[holonomic] * of_q)
 
     def velocity_residual(problem_and_x, u):
         (system, t, params), x = problem_and_x
         return constraints.velocity_residual(system, t, x, u, params, unflatten)
 
     u = _newton(velocity_residual, (live, x), u, to_displacement, slope)
-    holds &= jnp.all(jnp.abs(velocity_residual((fixed, x), u)) <= slope * of_v)
+    left = jnp.concatenate([position_residual(fixed, x), velocity_residual((fixed, x), u)])
+    allowed = jnp.concatenate([slope[holonomic] * of_q, slope * of_v])
+    holds = jnp.all(jnp.abs(left) <= allowed)
     return Projected(unflatten(x), unflatten(u), lax.stop_gradient(holds))
 
 

@@ -25,7 +25,7 @@ from jax import lax
 from lagjax.mechanics import constraints, coordinates
 from lagjax.mechanics.diagnosis import describe, listed
 from lagjax.mechanics.lagrangian import check_scalar, mass_and_forcing
-from lagjax.mechanics.saddle_point import saddle_point_matrix
+from lagjax.mechanics.saddle_point import displacement_map, saddle_point_matrix
 from lagjax.motion.consistency import departures, stopped, within
 from lagjax.numerics import dense
 from lagjax.numerics.rank import DEPENDENT_BELOW, independent_rows
@@ -138,15 +138,13 @@ def _nearest(residual: Callable, problem, y0, metric, free):
     def rows_at(problem, y):
         return jnp.where(free[None, :], jax.jacfwd(lambda y: residual(problem, y))(y), 0.0)
 
-    def displacement_map(y, dependent_below=None):
+    def to_displacement(y, dependent_below=None):
         rows = rows_at(fixed, y)
-        independent = independent_rows(rows, dependent_below)
-        inverted = dense.inverse(saddle_point_matrix(fixed_metric, rows, independent))
-        return inverted[:n, n:], jnp.sum(jnp.abs(rows), axis=1)
+        return displacement_map(fixed_metric, rows, independent_rows(rows, dependent_below))
 
     def shortest_step(y, dependent_below):
-        to_displacement, slope = displacement_map(y, dependent_below)
-        step = to_displacement @ residual(fixed, y)
+        slope = jnp.sum(jnp.abs(rows_at(fixed, y)), axis=1)
+        step = to_displacement(y, dependent_below) @ residual(fixed, y)
         trials = y[None] - FRACTIONS.astype(y.dtype)[:, None] * step[None]
         left = jax.vmap(lambda y: jnp.max(jnp.abs(residual(fixed, y)) / jnp.where(slope > 0, slope, 1.0)))(trials)
         return trials[jnp.argmin(jnp.where(jnp.isfinite(left), left, jnp.inf))], None
@@ -187,7 +185,7 @@ def _nearest(residual: Callable, problem, y0, metric, free):
     nearest = y - (inverted @ equations(problem, metric, y0, y, multipliers))[:n]
     # Where the path to it was lost, the point reached by shortest steps, with the derivatives of a step.
     near = reached + (y0 - start)
-    near = near - lax.stop_gradient(displacement_map(reached)[0]) @ residual(problem, near)
+    near = near - lax.stop_gradient(to_displacement(reached)) @ residual(problem, near)
     length = lambda y: (y - start) @ fixed_metric @ (y - start)
     off = jnp.max(jnp.abs(residual(fixed, nearest)))
     kept = (off <= jnp.sqrt(jnp.finfo(y0.dtype).eps)) & (length(nearest) <= length(near) * (1 + 1e-6))
