@@ -24,6 +24,7 @@ from lagjax.motion.sign_change import SignChange
 from lagjax.motion.stepping import OnManifold, Stages, Tolerances, forward_differentiable
 from lagjax.motion.trajectory import RESULTS, Moment, Trajectory, pack, worst_drift
 from lagjax.numerics import dense
+from lagjax.numerics.simplified_newton import SimplifiedNewton
 
 # A start may be off the constraints by this many tolerances; it is then moved onto them.
 START_TOLERANCES = 100.0
@@ -83,6 +84,7 @@ def _solve(system, q0, v0, params, ts, settings, adjoint):
     terms = diffrax.ODETerm(_vector_field(system, ts, settings.drift))
     # BacksolveAdjoint integrates a larger state backwards: it takes the bare method, and no end beside the outputs.
     bare = isinstance(adjoint, diffrax.BacksolveAdjoint)
+    settings = eqx.tree_at(lambda s: s.method, settings, _with_root_finder(settings))
     at_ts, at_end = diffrax.SubSaveAt(ts=ts), diffrax.SubSaveAt(t1=True)
     solution = diffrax.diffeqsolve(
         terms,
@@ -155,6 +157,15 @@ def _off_constraints(system, t, q, v, params, settings):
     if not system.constraints:
         return jnp.asarray(False)
     return ~within(system, t, q, v, params, START_TOLERANCES * settings.rtol, START_TOLERANCES * settings.atol)
+
+
+def _with_root_finder(settings):
+    """An implicit method that was to take diffrax's own root finder gets ours, with the solve's tolerances."""
+    method = settings.method
+    if not isinstance(getattr(method, "root_finder", None), diffrax.VeryChord):
+        return method
+    finder = SimplifiedNewton(rtol=settings.rtol[0], atol=settings.atol[0])
+    return eqx.tree_at(lambda method: method.root_finder, method, finder)
 
 
 def _solver(system, terms, start, refused, settings, adjoint):

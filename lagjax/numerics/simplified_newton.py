@@ -1,0 +1,176 @@
+"""Simplified Newton iteration: one Jacobian, inverted once, for the iterations of an implicit step.
+
+    J (y_{k+1} - y_k) = -f(y_k),        theta_k = |y_{k+1} - y_k| / |y_k - y_{k-1}|
+
+The iteration contracts by about theta a time, so that what is still missing after iteration k is estimated by
+theta/(1 - theta) |y_{k+1} - y_k|. It has converged once that is below a small part of the tolerance which the step's
+error has to meet: a test of the residual would ask for less than round-off in stiff equations, where a residual is
+multiplied by the stiffness.
+
+Where theta is close to one or above, the Jacobian is computed anew. RADAU5 rejects the step there; but the direction of
+a stiff spring turns during a step, and theta then is of the size of (stiffness) x (angle), whatever the accuracy of the
+step: rejecting such steps ties h to (k omega)^(-1/3).
+
+Source: Hairer & Wanner, *Solving ODEs II*, §IV.8, (8.9)-(8.11).
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import equinox.internal as eqxi
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+import optimistix as optx
+from jax import lax
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Bool, Float, Int, PyTree
+
+from lagjax.numerics import dense
+
+
+class Inverse(eqx.Module):
+    """The inverse of a Jacobian, acting on residuals of the structure of the unknown."""
+
+    matrix: Float[Array, "n n"]
+
+    def __call__(self, residual: PyTree) -> PyTree:
+        """J^-1 times a residual."""
+        vector, unravel = ravel_pytree(residual)
+        return unravel(self.matrix @ vector)
+
+
+class Iteration(eqx.Module):
+    """Where the iteration stands: the last two corrections by one Jacobian, in units of the tolerance."""
+
+    inverse: Inverse
+    size: Float[Array, ""]
+    previous: Float[Array, ""]
+    count: Int[Array, ""]
+    stale: Bool[Array, ""]  # The next iteration computes the Jacobian anew,
+    renewed: Bool[Array, ""]  # and one has done so already.
+
+    @classmethod
+    def first(cls, inverse: Inverse) -> "Iteration":
+        """Before the first iteration, with a Jacobian that is inverted already."""
+        unknown = jnp.asarray(jnp.inf, inverse.matrix.dtype)
+        no = jnp.asarray(False)
+        return cls(inverse, unknown, unknown, jnp.asarray(0), no, no)
+
+    def rate(self):
+        """theta; infinite before there are two corrections."""
+        known = jnp.isfinite(self.previous)
+        return jnp.where(known, self.size / jnp.where(self.previous > 0, self.previous, 1.0), jnp.inf)
+
+
+class SimplifiedNewton(optx.AbstractRootFinder):
+    """Newton's iteration with a Jacobian that is kept while it contracts, stopped by its rate of convergence.
+
+    For the implicit methods of diffrax, with the tolerances of the step-size controller:
+
+    >>> import diffrax
+    >>> kvaerno = diffrax.Kvaerno5(root_finder=diffrax.with_stepsize_controller_tols(SimplifiedNewton)())
+
+    and with tolerances of its own where steps are constant: `SimplifiedNewton(rtol=1e-10, atol=1e-12)`.
+
+    **Fields:** `rtol`, `atol`: the tolerances of the step; `norm`: how a correction in units of the tolerance is
+    measured; `kappa`: which part of the tolerance the iteration may leave, by default Hairer's `min(0.03, sqrt(rtol))`;
+    `slow`: the rate above which the Jacobian is computed anew (infinite: never, as in RADAU5).
+
+    **Options** of a single solve: `init_state`, a state of another solve, whose Jacobian is used first; `offset`, added
+    to the unknown where its size sets the tolerance; `inverse_at`, from an unknown to the `Inverse` there.
+
+    Converges linearly, by a factor that is proportional to the change of the Jacobian;
+    `tests/numerics/test_radau.py` counts steps and compares with diffrax's own.
+
+    Source: Hairer & Wanner, *Solving ODEs II*, §IV.8, (8.9)-(8.11).
+    """
+
+    rtol: float
+    atol: float
+    norm: Callable[[PyTree], Array] = optx.max_norm
+    kappa: float | None = None
+    slow: float = eqx.field(static=True, default=0.3)
+
+    def init(self, fn, y, args, options, f_struct, aux_struct, tags) -> Iteration:
+        if "init_state" in options:
+            return options["init_state"]
+        return Iteration.first(_inverse_at(fn, y, args, options))
+
+    def step(self, fn, y, args, options, state, tags) -> tuple[PyTree, Iteration, Any]:
+        # Not a select under `vmap`: as long as no lane asks for it, no Jacobian is computed.
+        renew = lambda: jtu.tree_map(
+            lambda new, old: jnp.where(state.stale, new, old), _inverse_at(fn, y, args, options), state.inverse
+        )
+        inverse = lax.cond(eqxi.unvmap_any(state.stale), renew, lambda: state.inverse)
+        residual, aux = fn(y, args)
+        correction = inverse(residual)
+        new = jtu.tree_map(lambda y, d: y - d, y, correction)
+        whole = jtu.tree_map(jnp.add, new, options["offset"]) if "offset" in options else new
+        units = jtu.tree_map(lambda d, y: d / (self.atol + self.rtol * jnp.abs(y)), correction, whole)
+        size = self.norm(units).astype(state.size.dtype)
+        now = Iteration(
+            inverse, size, jnp.where(state.stale, jnp.inf, state.size), state.count + 1, stale=jnp.asarray(False),
+            renewed=state.renewed | state.stale,
+        )  # fmt: skip
+        stale = self._too_slow(now)
+        # A correction that is larger than the last one leads away: the new Jacobian is that of the point before it.
+        back = stale & ~now.renewed & ~(now.rate() < 1)
+        new = jtu.tree_map(lambda x, y: jnp.where(back, y, x), new, y)
+        return new, eqx.tree_at(lambda state: state.stale, now, stale), aux
+
+    def _converged(self, state):
+        rate, size = state.rate(), state.size
+        # A correction of a few round-offs no longer shrinks: theta is then noise.
+        round_off = 10 * jnp.finfo(size.dtype).eps / jnp.where(self.rtol > 0, self.rtol, 1.0)
+        kappa = jnp.minimum(0.03, jnp.sqrt(self.rtol)) if self.kappa is None else self.kappa
+        left = rate / jnp.where(rate < 1, 1 - rate, 1.0) * size
+        contracts = (rate < 1) & (left <= jnp.maximum(kappa, round_off))
+        return contracts | (jnp.isfinite(state.previous) & (size <= round_off)) | (size == 0)
+
+    def _too_slow(self, state):
+        known = jnp.isfinite(state.previous)
+        return ~self._converged(state) & ((known & ~(state.rate() <= self.slow)) | ~jnp.isfinite(state.size))
+
+    def terminate(self, fn, y, args, options, state, tags) -> tuple[Array, optx.RESULTS]:
+        converged = self._converged(state)
+        # A Jacobian that is only old is renewed first; Newton's own iteration may grow before it contracts.
+        grows = (jnp.isfinite(state.previous) & ~(state.rate() < 2)) | ~jnp.isfinite(state.size)
+        renewable = np.isfinite(self.slow)
+        diverged = ~converged & (state.count > 0) & grows & (state.renewed if renewable else True)
+        failure = optx.RESULTS.where(diverged, optx.RESULTS.nonlinear_divergence, optx.RESULTS.successful)
+        return converged | diverged, failure
+
+    def postprocess(self, fn, y, aux, args, options, state, tags, result):
+        # A failed step is thrown away, but its derivative is multiplied by zero: it has to be finite.
+        return jtu.tree_map(lambda x: jnp.where(jnp.isfinite(x), x, 0), y), aux, {}
+
+
+def _inverse_at(fn, y, args, options):
+    if "inverse_at" in options:
+        return options["inverse_at"](y)
+    vector, unravel = ravel_pytree(y)
+    return Inverse(dense.inverse(jax.jacfwd(lambda vector: ravel_pytree(fn(unravel(vector), args)[0])[0])(vector)))
+
+
+def with_tolerances(solver: diffrax.AbstractSolver, rtol, atol, norm=optx.max_norm) -> diffrax.AbstractSolver:
+    """Give a solver's root finder tolerances, where it was to take them from an adaptive step-size controller.
+
+    With constant steps there is no such controller, and diffrax refuses. Other solvers are returned as they are.
+
+    >>> import diffrax
+    >>> with_tolerances(diffrax.ImplicitEuler(), 1e-10, 1e-12).root_finder.rtol
+    1e-10
+    """
+    if not isinstance(solver, diffrax.AbstractImplicitSolver):
+        return solver
+    from_controller = diffrax.with_stepsize_controller_tols(SimplifiedNewton)().rtol
+    wanted = {"rtol": rtol, "atol": atol, "norm": norm}
+    missing = [name for name in wanted if getattr(solver.root_finder, name, None) is from_controller]
+    if not missing:
+        return solver
+    at = lambda solver: [getattr(solver.root_finder, name) for name in missing]
+    return eqx.tree_at(at, solver, [wanted[name] for name in missing])

@@ -1,0 +1,145 @@
+"""Where the default method ends, at three tolerances: within ten of them of the reference, on the constraints.
+
+Slow: each mechanism compiles its own program (4 to 12 s), used for all tolerances and parameters.
+"""
+
+import jax
+import numpy as np
+import pytest
+
+import lagjax as lj
+from lagjax.mechanisms import MECHANISMS, andrews, car_axis, driven_crank, fekete, n_four_bar
+from tests.mechanisms import published
+from tests.mechanisms.test_equations import stacked
+
+pytestmark = pytest.mark.slow
+
+TOLERANCES = (1e-6, 1e-8, 1e-10)
+WITHIN = 10.0
+# Measured and above ten tolerances; strict, so that an improvement shows. The ladder's errors are the problem's own
+# at the looser two: the one pendulum in its angle is off by 420 and 180 rtol there.
+MISSED = {
+    ("car_axis", 1e-6): "velocity 23 rtol: an oscillation of 45 rad/s, whose velocity error is 45 position errors",
+    ("n_four_bar", 1e-6): "position 17 rtol, velocity 67 rtol after ten singular positions",
+    ("n_four_bar", 1e-8): "position 14 rtol, velocity 57 rtol after ten singular positions",
+    ("n_four_bar", 1e-10): "position 530 rtol, velocity 2200 rtol after ten singular positions",
+}
+# No drive, no dissipation: the Jacobi integral stays.
+CONSERVATIVE = ("andrews", "bricard", "double_pendulum", "n_four_bar", "slider_crank")
+
+
+def run(mechanism, rtol, params=None, end=None):
+    """The trajectory to the mechanism's end, by the default method."""
+    ts = np.array([0.0, mechanism.end if end is None else end])
+    return lj.integrate(
+        mechanism.system, mechanism.q0, mechanism.v0, mechanism.params if params is None else params,
+        ts=ts, rtol=rtol, atol=rtol, max_steps=200_000,
+    )  # fmt: skip
+
+
+def relative_errors(traj, reference):
+    """Of the last positions and the last velocities, each relative to the largest; absolute where all rests."""
+    last = [stacked(jax.tree.map(lambda x: x[-1], part)) for part in (traj.q, traj.v)]
+    wanted = [np.ravel(part) if isinstance(part, np.ndarray) else stacked(part) for part in reference]
+    return np.array([np.max(np.abs(x - y)) / (np.max(np.abs(y)) or 1.0) for x, y in zip(last, wanted)])
+
+
+def reference_of(mechanism):
+    """The stored end; for Andrews' at 1e-10 the recomputed one, since the published one has nine digits."""
+    if mechanism is andrews.MECHANISM:
+        start = stacked(mechanism.q0), stacked(mechanism.v0)
+        return published.andrews_end(*start, mechanism.end, mechanism.params)
+    return mechanism.reference
+
+
+@pytest.mark.parametrize("rtol", TOLERANCES)
+@pytest.mark.parametrize("name", sorted(MECHANISMS))
+def test_end_state(name, rtol, request):
+    """Positions and velocities at the end are within ten tolerances; constraints hold to 1e-12; energy is kept."""
+    if (name, rtol) in MISSED:
+        request.applymarker(pytest.mark.xfail(strict=True, reason=MISSED[name, rtol]))
+    mechanism = MECHANISMS[name]
+    traj = run(mechanism, rtol)
+    assert float(traj.residual()) <= 1e-12
+    assert name not in CONSERVATIVE or float(traj.drift()) <= 10 * rtol
+    errors = relative_errors(traj, reference_of(mechanism)) / rtol
+    assert np.all(errors <= WITHIN), errors
+
+
+@pytest.mark.parametrize(
+    ("name", "parameter"),
+    [
+        ("andrews", "c0"),
+        ("bricard", "a"),
+        ("car_axis", "g"),
+        ("double_pendulum", "g"),
+        ("governor", "ball"),
+        ("slider_crank", "g"),
+    ],
+)
+def test_end_state_depends_on_the_parameters(name, parameter):
+    """Twin: one parameter off by a hundredth, and the end is missed by a thousand tolerances."""
+    mechanism = MECHANISMS[name]
+    traj = run(mechanism, 1e-8, mechanism.params | {parameter: 1.01 * mechanism.params[parameter]})
+    assert np.max(relative_errors(traj, mechanism.reference)) > 1e3 * 1e-8
+
+
+def test_andrews_published_end():
+    """At 1e-8, the end published for Andrews' mechanism is reached as well as the recomputed one."""
+    assert np.all(relative_errors(run(andrews.MECHANISM, 1e-8), andrews.MECHANISM.reference) <= WITHIN * 1e-8)
+
+
+@pytest.mark.parametrize(
+    ("module", "sign", "names", "digits"),
+    [(andrews, -1.0, ("loops",), 1e-6), (car_axis, 1.0, ("upright", "axle"), 1e-8)],
+)
+def test_multipliers_of_the_source(module, sign, names, digits):
+    """λ at the end is the source's: Andrews' (six good digits) with its sign reversed, the car axis's as it is."""
+    traj = run(module.MECHANISM, 1e-10)
+    ours = np.concatenate([np.ravel(traj.multipliers[name][-1]) for name in names])
+    theirs = np.array(module.SOURCE_MULTIPLIERS[-1] if module is andrews else module.SOURCE_MULTIPLIERS)
+    assert np.max(np.abs(ours - sign * theirs)) <= digits * np.max(np.abs(theirs))
+
+
+def test_andrews_multipliers_at_the_start():
+    """λ(0) is the source's with its sign reversed."""
+    traj = run(andrews.MECHANISM, 1e-10)
+    assert np.max(np.abs(np.asarray(traj.multipliers["loops"][0]) + andrews.SOURCE_MULTIPLIERS[0])) <= 1e-10
+
+
+@pytest.mark.parametrize("rtol", TOLERANCES)
+def test_ladder_before_it_lies_down(rtol):
+    """The chain of four-bars ends where the elliptic functions do, before the first singular position."""
+    mechanism = n_four_bar.MECHANISM
+    traj = run(mechanism, rtol, end=0.5)
+    assert float(traj.residual()) <= 1e-12
+    errors = relative_errors(traj, published.ladder_end(2, 0.5, mechanism.params)) / rtol
+    assert np.all(errors <= WITHIN), errors
+
+
+@pytest.mark.parametrize("rtol", [*TOLERANCES, 1e-12])
+def test_singular_position_is_passed_or_reported(rtol):
+    """Through the first singular position the end is right, or the integration says that it failed."""
+    mechanism = n_four_bar.MECHANISM
+    traj = lj.integrate(
+        mechanism.system, mechanism.q0, mechanism.v0, mechanism.params,
+        ts=np.array([0.0, 1.0]), rtol=rtol, atol=rtol, throw=False,
+    )  # fmt: skip
+    right = np.all(relative_errors(traj, published.ladder_end(2, 1.0, mechanism.params)) <= WITHIN * rtol)
+    assert right or not bool(traj.result == lj.RESULTS.successful)
+
+
+def test_motor_of_the_driven_crank():
+    """At all times the motion is the closed form's, and the drive's multiplier is the motor's torque."""
+    mechanism = driven_crank.MECHANISM
+    ts = np.linspace(0.0, mechanism.end, 33)
+    traj = lj.integrate(mechanism.system, mechanism.q0, mechanism.v0, mechanism.params, ts=ts, rtol=1e-8, atol=1e-8)
+    q, v, torque = driven_crank.exact(ts, mechanism.params)
+    for ours, exact in zip(jax.tree.leaves((traj.q, traj.v)), jax.tree.leaves((q, v))):
+        np.testing.assert_allclose(ours, exact, atol=1e-13 * np.max(np.abs(exact)))
+    np.testing.assert_allclose(traj.multipliers["motor"], torque, atol=1e-13 * np.max(np.abs(torque)))
+
+
+def test_fekete_multipliers():
+    """At rest every multiplier is -(N - 1)/4, whatever the arrangement."""
+    np.testing.assert_allclose(run(fekete.MECHANISM, 1e-10).multipliers["sphere"][-1], -19 / 4, rtol=1e-12)
