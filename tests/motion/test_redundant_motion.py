@@ -1,0 +1,98 @@
+"""Motion under redundant constraints: motion, derivatives and lanes are those of the system without them."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import lagjax as lj
+from tests.mechanics.test_redundancy import DOOR_STATE, RATE, door, twice
+from tests.systems import PARAMS, cartesian_lagrangian, rod, rod_pendulum
+
+TOLERANCE = 1e-10
+START = ({"x": 1.0, "y": 0.75}, {"x": -1.5, "y": 2.0})
+
+
+def test_pendulum_on_two_rods():
+    """A rod given twice moves the pendulum as one does, and the two share its force in the ratio of their scales."""
+    ts = np.linspace(0.0, 5.0, 6)
+    run = lambda system: lj.integrate(system, *START, PARAMS, ts=ts, rtol=TOLERANCE, atol=TOLERANCE)
+    one, two = run(rod_pendulum), run(twice(-0.5))
+    for name in one.q:
+        np.testing.assert_allclose(two.q[name], one.q[name], atol=1e-9)
+    np.testing.assert_allclose(two.multipliers["rod"], one.multipliers["rod"] / 1.25, rtol=1e-8)
+    np.testing.assert_allclose(two.multipliers["again"], -0.5 * two.multipliers["rod"], rtol=1e-12)
+    assert float(two.residual()) < 1e-15
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("drift", ["project", "baumgarte", "none"])
+def test_door_swings_like_its_angle(drift):
+    """A door with 18 equations of which 11 are independent follows its one-angle equation, whatever the drift control.
+
+    The equations depend on each other only where they hold: solved with all of them, the door would fly off.
+    """
+    field = DOOR_STATE[3]["field"]
+    by_angle = lj.System(lambda t, q, v, params: 0.5 * 2 * v**2 + 2 * (field[0] * jnp.cos(q) + field[1] * jnp.sin(q)))
+    ts = np.array([0.0, 2.0, 5.0])
+    tolerance = {"rtol": TOLERANCE, "atol": TOLERANCE}
+    angle = lj.integrate(by_angle, 0.4, RATE, ts=ts, **tolerance)
+    traj = lj.integrate(door, *DOOR_STATE[1:], ts=ts, drift=drift, **tolerance)
+    outward = traj.q["corner"][:, 2]
+    np.testing.assert_allclose(outward[:, 0], np.cos(angle.q), atol=1e-8)
+    np.testing.assert_allclose(outward[:, 1], np.sin(angle.q), atol=1e-8)
+    assert float(traj.residual()) < (1e-14 if drift == "project" else 1e-7)
+
+
+def outcome(system, x):
+    """The end of the pendulum on its rods, and the force that they exert together."""
+    q = {"x": 0.8 * x["l"], "y": 0.6 * x["l"]}
+    v = {"x": -0.6 * x["v"], "y": 0.8 * x["v"]}
+    traj = lj.integrate(
+        system, q, v, {"g": x["g"], "l": x["l"]}, ts=np.array([0.0, 0.75]), rtol=TOLERANCE, atol=TOLERANCE, throw=False
+    )
+    return jnp.stack([traj.q["x"][-1], sum(scale * traj.multipliers[name][-1] for name, scale in SCALES.items())])
+
+
+SCALES = {"rod": 1.0, "again": 3.0}
+two_rods = lj.System(
+    cartesian_lagrangian,
+    {"rod": lj.Holonomic(rod), "again": lj.Holonomic(lambda t, q, params: 3.0 * rod(t, q, params))},
+)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("mode", [jax.jacfwd, jax.jacrev])
+def test_derivatives_in_lanes(mode):
+    """Forward and reverse derivatives of end and force, in lanes, are those of the pendulum on one rod."""
+    lanes = {"g": jnp.array([9.8, 5.0]), "l": jnp.array([1.25, 2.0]), "v": jnp.array([2.5, -1.0])}
+    one = lambda x: jnp.stack(outcome_of_one(x))
+    got = jax.vmap(mode(lambda x: outcome(two_rods, x)))(lanes)
+    expected = jax.vmap(jax.jacfwd(one))(lanes)
+    for name in lanes:
+        assert np.all(np.isfinite(got[name]))
+        np.testing.assert_allclose(got[name], expected[name], atol=1e-7)
+
+
+def outcome_of_one(x):
+    """The pendulum in its angle: cos(angle) = x/l from the x axis, and the force that its rod exerts over 2 l."""
+    by_angle = lj.System(lambda t, q, v, params: 0.5 * params["l"] * v**2 - params["g"] * jnp.sin(q))
+    traj = lj.integrate(
+        by_angle, jnp.arctan2(0.6, 0.8), x["v"] / x["l"], {"g": x["g"], "l": x["l"]},
+        ts=np.array([0.0, 0.75]), rtol=1e-11, atol=1e-11, throw=False,
+    )  # fmt: skip
+    angle, rate = traj.q[-1], traj.v[-1]
+    inward = x["l"] * rate**2 - x["g"] * jnp.sin(angle)
+    return x["l"] * jnp.cos(angle), -inward / (2 * x["l"])
+
+
+def test_redundancy_that_ends_is_reported():
+    """Two rods of equal length agree; once one of them grows, no motion satisfies both, and that is said."""
+    grows = lj.Holonomic(lambda t, q, params: rod(t, q, params) - jnp.where(t > 0.5, (t - 0.5) ** 3, 0.0))
+    system = lj.System(cartesian_lagrangian, {"rod": lj.Holonomic(rod), "grows": grows})
+    with pytest.raises(RuntimeError, match="stopped at t = 0.5"):
+        lj.integrate(system, *START, PARAMS, ts=np.array([0.0, 1.0]))
+    fixed = {"stepsize_controller": diffrax.ConstantStepSize(), "dt0": 0.01}
+    with pytest.raises(RuntimeError, match="stopped at t = 0.5.*"):
+        lj.integrate(system, *START, PARAMS, ts=np.array([0.0, 1.0]), **fixed)
