@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 import lagjax as lj
-from lagjax.numerics.simplified_newton import SimplifiedNewton
 from tests.systems import HORIZONTAL, PARAMS, TS, pendulum, pendulum_lagrangian, rod_pendulum
 
 # Swinging hard, from 2 rad at 3 rad/s: nonlinear, and no symmetry that would raise an order.
@@ -30,20 +29,6 @@ def test_against_scipy(exact):
     )
     np.testing.assert_allclose(exact.q, solution.y[0], atol=2e-12)
     np.testing.assert_allclose(exact.v, solution.y[1], atol=1e-11)
-
-
-def test_outputs_are_better_than_an_interpolant(exact):
-    """Kvaerno5's own interpolant is cubic: at the same steps, outputs between them are 10 times worse than ours."""
-    k, finder = PARAMS["g"] / PARAMS["l"], SimplifiedNewton(rtol=1e-8, atol=1e-8)
-    by_diffrax = diffrax.diffeqsolve(
-        diffrax.ODETerm(lambda t, y, args: (y[1], -k * jnp.sin(y[0]))),
-        diffrax.Kvaerno5(root_finder=finder), 0.0, 1.01, None, SWING, saveat=diffrax.SaveAt(ts=SWING_TS),
-        stepsize_controller=diffrax.PIDController(rtol=1e-8, atol=1e-8),
-    ).ys[0]  # fmt: skip
-    by_steps = lj.integrate(pendulum, *SWING, PARAMS, ts=SWING_TS, method=diffrax.Kvaerno5(), rtol=1e-8, atol=1e-8).q
-    between = slice(1, 3)
-    ours, theirs = (np.abs(q - exact.q)[between] for q in (by_steps, by_diffrax))
-    assert np.all(10 * ours < theirs), (ours, theirs)
 
 
 def test_constraints_hold_at_every_output():
