@@ -25,6 +25,7 @@ from lagjax.motion.explanation import Explanation, explain
 # Motion.
 from lagjax.motion.integrate import integrate
 from lagjax.motion.trajectory import RESULTS, AccuracyWarning, Moment, Trajectory
+from lagjax.numerics.radau import Radau5
 
 # isort: split
 # Error against run time.
@@ -48,6 +49,7 @@ __all__ = [
     "explain",
     "Explanation",
     "integrate",
+    "Radau5",
     "Trajectory",
     "Moment",
     "RESULTS",

@@ -24,7 +24,7 @@ from lagjax.motion.sign_change import SignChange
 from lagjax.motion.stepping import OnManifold, Stages, Tolerances, forward_differentiable
 from lagjax.motion.trajectory import RESULTS, Moment, Trajectory, pack, worst_drift
 from lagjax.numerics import dense
-from lagjax.numerics.simplified_newton import SimplifiedNewton
+from lagjax.numerics.simplified_newton import SimplifiedNewton, with_tolerances
 
 # A start may be off the constraints by this many tolerances; it is then moved onto them.
 START_TOLERANCES = 100.0
@@ -160,12 +160,11 @@ def _off_constraints(system, t, q, v, params, settings):
 
 
 def _with_root_finder(settings):
-    """An implicit method that was to take diffrax's own root finder gets ours, with the solve's tolerances."""
-    method = settings.method
-    if not isinstance(getattr(method, "root_finder", None), diffrax.VeryChord):
-        return method
-    finder = SimplifiedNewton(rtol=settings.rtol[0], atol=settings.atol[0])
-    return eqx.tree_at(lambda method: method.root_finder, method, finder)
+    """An implicit method with diffrax's default root finder gets ours; all get the solve's tolerances."""
+    method, tolerances = settings.method, (settings.rtol[0], settings.atol[0])
+    if isinstance(getattr(method, "root_finder", None), diffrax.VeryChord):
+        return eqx.tree_at(lambda method: method.root_finder, method, SimplifiedNewton(*tolerances))
+    return with_tolerances(method, *tolerances)
 
 
 def _solver(system, terms, start, refused, settings, adjoint):
@@ -179,6 +178,7 @@ def _solver(system, terms, start, refused, settings, adjoint):
         refused=refused,
         tolerances=Tolerances(settings.rtol, settings.atol),
         angles=angle,
+        controlled=settings.controller is None,
         weigh=settings.controller is None and (settings.apart or any(angle)),
         project=settings.drift == "project",
     )

@@ -19,6 +19,7 @@ from jaxtyping import Array, Bool, Float, PyTree
 from lagjax.mechanics.saddle_point import independent_equations
 from lagjax.mechanics.system import System
 from lagjax.motion.consistency import to_manifold
+from lagjax.numerics.radau import Radau5
 
 # Without projection a state drifts off its constraints, and dependent ones then disagree by that much.
 DEPENDENT_BELOW_WHILE_DRIFTING = 1e-3
@@ -26,6 +27,8 @@ DEPENDENT_BELOW_WHILE_DRIFTING = 1e-3
 
 # Of the size of an angle no more counts than this: relative to a thousand turns, a tolerance would mean nothing.
 TURN = 2 * np.pi
+# An output is a shorter step than the accepted one that it lies in: its error should be smaller, not this much larger.
+OUTPUT_TOLERANCES = 100.0
 
 
 class Tolerances(NamedTuple):
@@ -45,8 +48,8 @@ class Stages(NamedTuple):
 class OnManifold(diffrax.AbstractWrappedSolver):
     """Wrap `solver`: project after each step (where `project`), and step for dense output.
 
-    A step that cannot be returned to the constraints is rejected; with a fixed step the solve ends there. `weigh`
-    rescales the error for a controller that knows one tolerance: coordinates and velocities are judged each by their
+    A step that cannot be returned to the constraints is rejected; with a fixed step the solve ends there. `controlled`
+    says that steps are chosen by the tolerances; `weigh` rescales the error for a controller that knows one tolerance: coordinates and velocities are judged each by their
     own, and the `angles` among the leaves of q by no more than a turn.
 
     What the dense output needs of the problem (`terms`, `params`) belongs to the solver, since diffrax hands
@@ -61,6 +64,7 @@ class OnManifold(diffrax.AbstractWrappedSolver):
     refused: Bool[Array, ""]
     tolerances: Tolerances
     angles: tuple[bool, ...] = eqx.field(static=True)
+    controlled: bool = eqx.field(static=True)
     weigh: bool = eqx.field(static=True)
     project: bool = eqx.field(static=True)
 
@@ -88,8 +92,8 @@ class OnManifold(diffrax.AbstractWrappedSolver):
     def interpolation_cls(self) -> Callable:
         return self._between
 
-    def _between(self, *, t0, t1, y0):
-        return SteppedTo(t0=t0, t1=t1, y0=y0, solver=self)
+    def _between(self, *, t0, t1, y0, state):
+        return SteppedTo(t0=t0, t1=t1, y0=y0, state=state, solver=self)
 
     def order(self, terms):
         return self.solver.order(terms)
@@ -121,7 +125,17 @@ class OnManifold(diffrax.AbstractWrappedSolver):
             error = jtu.tree_map(lambda x: jnp.where(projected.holds, x, jnp.inf), error)
             result = diffrax.RESULTS.where(projected.holds, result, diffrax.RESULTS.nonlinear_divergence)
         y1, error = jtu.tree_map(lambda x: jnp.where(self.refused, jnp.nan, x), (y1, error))
-        return y1, error, {"y0": y0}, solver_state, _unless_not_finite(y0, result)
+        # Newton's iteration for an output starts from the polynomial of the step that it lies in.
+        continued = solver_state if isinstance(self.solver, Radau5) else None
+        return y1, error, {"y0": y0, "state": continued}, solver_state, _unless_not_finite(y0, result)
+
+    def acceptable(self, y, error):
+        """Whether an output's error is not far above the tolerance; a step to it has not passed the controller."""
+        if error is None or not self.controlled:
+            return True
+        rtol, atol = self.tolerances.rtol[0], self.tolerances.atol[0]
+        within = lambda y, error: jnp.all(jnp.abs(error) <= OUTPUT_TOLERANCES * (atol + rtol * jnp.abs(y)))
+        return jnp.all(jnp.stack(jtu.tree_leaves(jtu.tree_map(within, y, error))))
 
     def _weighed(self, y0, y1, error):
         (rtol_q, rtol_v), (atol_q, atol_v) = self.tolerances
@@ -143,20 +157,22 @@ class OnManifold(diffrax.AbstractWrappedSolver):
 
 
 class SteppedTo(diffrax.AbstractLocalInterpolation):
-    """The state inside a step, by one step of the solver from the step's start."""
+    """The state inside a step, by one step of the solver from the step's start; NaN where that step fails."""
 
     t0: PyTree
     t1: PyTree
     y0: PyTree
+    state: PyTree
     solver: OnManifold
 
     def evaluate(self, t0, t1=None, left=True):
         if t1 is not None:
             return jtu.tree_map(lambda b, a: b - a, self.evaluate(t1), self.evaluate(t0))
         s = self.solver
-        state = s.init(s.terms, self.t0, self.t1, self.y0, s.params)
-        y, _, _, _, result = s.step(s.terms, self.t0, t0, self.y0, s.params, state, made_jump=False)
-        return jtu.tree_map(lambda x: jnp.where(result == diffrax.RESULTS.successful, x, jnp.nan), y)
+        state = s.init(s.terms, self.t0, self.t1, self.y0, s.params) if self.state is None else self.state
+        y, error, _, _, result = s.step(s.terms, self.t0, t0, self.y0, s.params, state, made_jump=False)
+        believed = (result == diffrax.RESULTS.successful) & s.acceptable(y, error)
+        return jtu.tree_map(lambda x: jnp.where(believed, x, jnp.nan), y)
 
 
 def _unless_not_finite(y0, result):

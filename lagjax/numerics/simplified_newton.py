@@ -31,6 +31,9 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from lagjax.numerics import dense
 
+# Two corrections in a row of this part of the tolerance: what remains is round-off.
+NOISE = 0.1
+
 
 class Inverse(eqx.Module):
     """The inverse of a Jacobian, acting on residuals of the structure of the unknown."""
@@ -47,6 +50,8 @@ class Iteration(eqx.Module):
     """Where the iteration stands: the last two corrections by one Jacobian, in units of the tolerance."""
 
     inverse: Inverse
+    here: bool = eqx.field(static=True)
+    start: PyTree
     size: Float[Array, ""]
     previous: Float[Array, ""]
     count: Int[Array, ""]
@@ -54,11 +59,11 @@ class Iteration(eqx.Module):
     renewed: Bool[Array, ""]  # and one has done so already.
 
     @classmethod
-    def first(cls, inverse: Inverse) -> "Iteration":
-        """Before the first iteration, with a Jacobian that is inverted already."""
+    def first(cls, inverse: Inverse, start: PyTree, here: bool = False) -> "Iteration":
+        """Before the first iteration, with a Jacobian that is inverted already: that at the start, where `here`."""
         unknown = jnp.asarray(jnp.inf, inverse.matrix.dtype)
         no = jnp.asarray(False)
-        return cls(inverse, unknown, unknown, jnp.asarray(0), no, no)
+        return cls(inverse, here, start, unknown, unknown, jnp.asarray(0), no, no)
 
     def rate(self):
         """theta; infinite before there are two corrections."""
@@ -77,8 +82,8 @@ class SimplifiedNewton(optx.AbstractRootFinder):
     and with tolerances of its own where steps are constant: `SimplifiedNewton(rtol=1e-10, atol=1e-12)`.
 
     **Fields:** `rtol`, `atol`: the tolerances of the step; `norm`: how a correction in units of the tolerance is
-    measured; `kappa`: which part of the tolerance the iteration may leave, by default Hairer's `min(0.03, sqrt(rtol))`;
-    `slow`: the rate above which the Jacobian is computed anew (infinite: never, as in RADAU5).
+    measured; `kappa`: which part of the tolerance the iteration may leave, by default `min(0.03, 0.3 rtol^(1/3))` as
+    in RADAU5; `slow`: the rate above which the Jacobian is computed anew (infinite: never, as in RADAU5).
 
     **Options** of a single solve: `init_state`, a state of another solve, whose Jacobian is used first; `offset`, added
     to the unknown where its size sets the tolerance; `inverse_at`, from an unknown to the `Inverse` there.
@@ -98,7 +103,7 @@ class SimplifiedNewton(optx.AbstractRootFinder):
     def init(self, fn, y, args, options, f_struct, aux_struct, tags) -> Iteration:
         if "init_state" in options:
             return options["init_state"]
-        return Iteration.first(_inverse_at(fn, y, args, options))
+        return Iteration.first(_inverse_at(fn, y, args, options), y, here=True)
 
     def step(self, fn, y, args, options, state, tags) -> tuple[PyTree, Iteration, Any]:
         # Not a select under `vmap`: as long as no lane asks for it, no Jacobian is computed.
@@ -112,24 +117,33 @@ class SimplifiedNewton(optx.AbstractRootFinder):
         whole = jtu.tree_map(jnp.add, new, options["offset"]) if "offset" in options else new
         units = jtu.tree_map(lambda d, y: d / (self.atol + self.rtol * jnp.abs(y)), correction, whole)
         size = self.norm(units).astype(state.size.dtype)
+        first = state.count == 0
         now = Iteration(
-            inverse, size, jnp.where(state.stale, jnp.inf, state.size), state.count + 1, stale=jnp.asarray(False),
+            inverse,
+            state.here,
+            # The Jacobian at the start would be no new one there: go on from the first correction instead.
+            start=jtu.tree_map(lambda y, old: jnp.where(first, y, old), new if state.here else y, state.start),
+            size=size,
+            previous=jnp.where(state.stale, jnp.inf, state.size),
+            count=state.count + 1,
+            stale=jnp.asarray(False),
             renewed=state.renewed | state.stale,
-        )  # fmt: skip
+        )
         stale = self._too_slow(now)
-        # A correction that is larger than the last one leads away: the new Jacobian is that of the point before it.
+        # A Jacobian from elsewhere may have led anywhere, and from there to another root: begin again.
         back = stale & ~now.renewed & ~(now.rate() < 1)
-        new = jtu.tree_map(lambda x, y: jnp.where(back, y, x), new, y)
+        new = jtu.tree_map(lambda x, start: jnp.where(back, start, x), new, now.start)
         return new, eqx.tree_at(lambda state: state.stale, now, stale), aux
 
     def _converged(self, state):
-        rate, size = state.rate(), state.size
-        # A correction of a few round-offs no longer shrinks: theta is then noise.
+        rate, size, previous = state.rate(), state.size, state.previous
         round_off = 10 * jnp.finfo(size.dtype).eps / jnp.where(self.rtol > 0, self.rtol, 1.0)
-        kappa = jnp.minimum(0.03, jnp.sqrt(self.rtol)) if self.kappa is None else self.kappa
+        kappa = jnp.minimum(0.03, 0.3 * jnp.cbrt(self.rtol)) if self.kappa is None else self.kappa
         left = rate / jnp.where(rate < 1, 1 - rate, 1.0) * size
         contracts = (rate < 1) & (left <= jnp.maximum(kappa, round_off))
-        return contracts | (jnp.isfinite(state.previous) & (size <= round_off)) | (size == 0)
+        # Small corrections by a new Jacobian that do not shrink are the round-off of a stiff residual.
+        noise = jnp.where(state.renewed, jnp.maximum(NOISE, round_off), round_off)
+        return contracts | ((previous <= noise) & (size <= noise)) | (size == 0)
 
     def _too_slow(self, state):
         known = jnp.isfinite(state.previous)
@@ -137,8 +151,8 @@ class SimplifiedNewton(optx.AbstractRootFinder):
 
     def terminate(self, fn, y, args, options, state, tags) -> tuple[Array, optx.RESULTS]:
         converged = self._converged(state)
-        # A Jacobian that is only old is renewed first; Newton's own iteration may grow before it contracts.
-        grows = (jnp.isfinite(state.previous) & ~(state.rate() < 2)) | ~jnp.isfinite(state.size)
+        # A Jacobian that is only old is renewed first. Beyond that, growth leads to another root as often as back.
+        grows = (jnp.isfinite(state.previous) & ~(state.rate() < 1)) | ~jnp.isfinite(state.size)
         renewable = np.isfinite(self.slow)
         diverged = ~converged & (state.count > 0) & grows & (state.renewed if renewable else True)
         failure = optx.RESULTS.where(diverged, optx.RESULTS.nonlinear_divergence, optx.RESULTS.successful)
