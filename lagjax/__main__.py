@@ -1,8 +1,9 @@
-"""`python -m lagjax`: every scene, checked, timed and drawn.
+"""`python -m lagjax`: every scene, checked, timed and drawn; then the stability report.
 
 For each scene: error against run time by method and tolerance, then what happened in stiff and extreme
-cases; work-precision diagrams and a picture as PNG, all numbers as JSON. The exit status is 1 where a scene
-misses its accuracy.
+cases; work-precision diagrams and a picture as PNG, all numbers as JSON. `python -m lagjax stability` prints the
+whole stability report, the main job a part of it. The exit status is 1 where a scene misses its accuracy, or a row
+of the stability report is silently wrong or not as it should be.
 """
 
 import argparse
@@ -16,8 +17,10 @@ from pathlib import Path
 import diffrax
 import jax
 
-from lagjax import plot, report
+from lagjax import plot, report, stability
 from lagjax.scenes import SCENES
+
+STABILITY = "stability"
 
 FULL = {
     "methods": {"Tsit5": diffrax.Tsit5(), "Dopri8": diffrax.Dopri8()},
@@ -38,6 +41,9 @@ def main(arguments=None) -> int:
     print(f"{_machine()}\n", flush=True)
     numbers, missed = {}, []
     for i, name in enumerate(options.scenes):
+        if name == STABILITY:
+            missed += _stability(options.tier, folder)
+            continue
         _progress(f"scene {i + 1} of {len(options.scenes)}: {name}")
         scene = SCENES[name]
         rows, cases = _run_scene(scene, options.quick)
@@ -49,7 +55,8 @@ def main(arguments=None) -> int:
             f"{name}: {case.name}, error {case.error:.1e} > {case.allowed:.0e}" for case in cases if not case.passed
         ]
         numbers[name] = {"runs": [asdict(row) for row in rows], "cases": [asdict(case) for case in cases]}
-    (folder / "report.json").write_text(json.dumps({"machine": _machine(), "scenes": numbers}, indent=1))
+    if numbers:
+        (folder / "report.json").write_text(json.dumps({"machine": _machine(), "scenes": numbers}, indent=1))
     print(f"{time.perf_counter() - started:.0f} s; pictures and numbers are in {folder}/")
     for line in missed:
         print(f"MISSED  {line}")
@@ -60,19 +67,46 @@ def _parse(arguments):
     parser = argparse.ArgumentParser(
         prog="python -m lagjax", description="Check, time and draw the scenes: error against run time."
     )
-    parser.add_argument("scenes", nargs="*", metavar="SCENE", help=f"which scenes; all by default: {', '.join(SCENES)}")
+    parser.add_argument(
+        "scenes",
+        nargs="*",
+        metavar="SCENE",
+        help=f"which scenes, or {STABILITY} for the whole stability report; by default all scenes and a part of it: "
+        f"{', '.join(SCENES)}",
+    )
     parser.add_argument("-o", "--output", default="lagjax-report", help="folder for pictures and numbers")
     parser.add_argument(
         "--quick",
         action="store_true",
-        help="one run a scene, one method, two tolerances, no scene pictures; under a minute",
+        help="one run a scene, one method, two tolerances, no scene pictures, few stability rows; under a minute",
     )
     options = parser.parse_args(arguments)
-    unknown = [name for name in options.scenes if name not in SCENES]
+    unknown = [name for name in options.scenes if name not in (*SCENES, STABILITY)]
     if unknown:
-        parser.error(f"no scene named {', '.join(unknown)}; there are: {', '.join(SCENES)}")
-    options.scenes = options.scenes or list(SCENES)
+        parser.error(f"no scene named {', '.join(unknown)}; there are: {', '.join(SCENES)}, and {STABILITY}")
+    asked = stability.FULL if options.scenes else stability.REDUCED
+    options.tier = stability.QUICK if options.quick else asked
+    options.scenes = options.scenes or [*SCENES, STABILITY]
     return options
+
+
+def _stability(tier, folder):
+    """The stability report; returns what is not as it should be."""
+    _progress("stability")
+    rows, outcomes = stability.trials(tier), []
+    for i, row in enumerate(rows):
+        _progress(f"stability, row {i + 1} of {len(rows)}")
+        outcomes.append(row.attempt())
+    _progress("")
+    title = "Stability: accurate, degraded with a warning, or refused with a reason"
+    print(f"{title}\n{'=' * len(title)}\n\n{stability.stability_table(outcomes)}\n", flush=True)
+    numbers = [asdict(outcome) | {"verdict": outcome.verdict} for outcome in outcomes]
+    (folder / "stability.json").write_text(json.dumps({"machine": _machine(), "rows": numbers}, indent=1))
+    return [
+        f"stability: {o.family}, {o.name}, {o.method}: {o.verdict}, error {o.error:.1e}"
+        for o in outcomes
+        if not o.passed
+    ]
 
 
 def _run_scene(scene, quick):

@@ -19,7 +19,7 @@ from jaxtyping import PyTree
 
 from lagjax.mechanics.system import System
 from lagjax.motion.integrate import integrate
-from lagjax.motion.trajectory import RESULTS, Trajectory, message
+from lagjax.motion.trajectory import Trajectory, ended_well, message
 
 # The tolerance at which a run must reach its `required` error, for the method named with it.
 JUDGED_AT = 1e-10
@@ -214,13 +214,12 @@ def _seconds(solve, tolerance):
 
 
 def _row(run, name, tolerance, trajectory, seconds, compile_seconds, judged):
-    ended_well = bool((trajectory.result == RESULTS.successful) | (trajectory.result == RESULTS.event_occurred))
     return Row(
         run=run.name,
         measured=run.measured,
         method=name,
         tolerance=tolerance,
-        error=run.error(trajectory) if ended_well else float("inf"),
+        error=run.error(trajectory) if bool(ended_well(trajectory.result)) else float("inf"),
         residual=float(trajectory.residual()) if run.system.constraints else None,
         drift=_drift(run, trajectory),
         steps=int(trajectory.stats["num_steps"]),

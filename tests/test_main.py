@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from lagjax import __main__ as job
-from lagjax import plot, report
+from lagjax import plot, report, stability
 from tests.systems import PARAMS, pendulum
 
 TS = np.array([0.0, 0.5])
@@ -35,6 +35,7 @@ def run(monkeypatch, tmp_path, capsys):
 
     def with_scene(scene, *options):
         monkeypatch.setattr(job, "SCENES", {"tiny": scene})
+        monkeypatch.setattr(stability, "trials", lambda tier: [])
         status = job.main(["-o", str(tmp_path), *options])
         return status, capsys.readouterr().out, tmp_path
 
@@ -75,7 +76,7 @@ def test_tables_pictures_and_numbers(run, monkeypatch):
 def test_a_miss_is_named_and_fails(run, scene, named):
     """An error that is too large, or NaN, in a run or a case: exit status 1 and its name."""
     status, printed, folder = run(scene, "--quick")
-    assert {path.name for path in folder.iterdir()} == {"tiny_work_precision.png", "report.json"}
+    assert {path.name for path in folder.iterdir()} == {"tiny_work_precision.png", "report.json", "stability.json"}
     assert status == 1
     assert f"MISSED  {named}" in printed
 
@@ -84,4 +85,4 @@ def test_unknown_scene(run, capsys):
     """A misspelt scene lists those that exist."""
     with pytest.raises(SystemExit):
         run(SCENE, "tinny")
-    assert "no scene named tinny; there are: tiny" in capsys.readouterr().err
+    assert "no scene named tinny; there are: tiny, and stability" in capsys.readouterr().err

@@ -7,7 +7,6 @@ import numpy as np
 
 from lagjax.mechanics import constraints, coordinates
 from lagjax.mechanics.saddle_point import SINGULAR_BELOW, Examined, combinations, examined
-from lagjax.numerics.rank import independent_rows
 
 # A row counts as part of a combination where it makes up more than this share of it.
 SHARE = 1e-6
@@ -79,19 +78,19 @@ def explain_contradiction(found: Examined, system, s: coordinates.State) -> str 
     if not against.size:
         return None
     names = equation_names(system, s)
-    groups = {group[0]: group for group in dependencies(found.rows.jacobian, names)}
+    groups = {group[0]: group for group in dependencies(found.rows.jacobian, found.independent, names)}
     involved = groups[names[against[0]]]
     return (
         f"constraints {listed(involved)} contradict each other {where(s)}: they restrict the same motion, and no "
         "acceleration satisfies all of them.\n"
-        "Usual cause: one motion prescribed twice, by functions of time or with parameters that differ.\n"
+        "Usual cause: one motion prescribed twice, with functions of time or parameters that differ, or a loop that "
+        "cannot close.\n"
         f"Fix: remove '{involved[0]}', or let it ask for what the others ask for."
     )
 
 
-def dependencies(jacobian, names) -> list[tuple[str, ...]]:
+def dependencies(jacobian, independent, names) -> list[tuple[str, ...]]:
     """Each dependent constraint equation, followed by those that it is a combination of, by name."""
-    independent = independent_rows(jacobian)
     size = np.linalg.norm(jacobian, axis=1)
     share = np.abs(combinations(jacobian, independent)) * size[None, :]
     groups = []

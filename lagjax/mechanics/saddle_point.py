@@ -41,6 +41,8 @@ from lagjax.numerics.rank import DEPENDENT_BELOW, independent_rows, unit_rows
 
 # Below this reciprocal condition, after scaling, the matrix counts as singular.
 SINGULAR_BELOW = {np.dtype("float64"): 1e-13, np.dtype("float32"): 1e-6}
+# A constraint whose derivative is this much smaller than near by has none: it is written as a square.
+VANISHES_BELOW = {np.dtype("float64"): 1e-10, np.dtype("float32"): 1e-4}
 
 
 # Jitted, so that JAX traces L once for all the places of a compiled trajectory that need accelerations.
@@ -154,6 +156,7 @@ class Examined(NamedTuple):
     multipliers: dict[str, Array]
     linear: Linear
     rows: constraints.Rows
+    independent: Bool[Array, " m"]
     lagrangian: Float[Array, ""]
     matrix: Float[Array, "k k"]
     contradictory: Bool[Array, " m"]
@@ -165,15 +168,37 @@ def examined(system, t, q, v, params) -> Examined:
     x, unflatten = coordinates.flatten(q)
     u, _ = coordinates.flatten(v)
     linear = mass_and_forcing(system, t, x, u, params, unflatten)
-    rows = constraints.acceleration_rows(system, t, x, u, params, unflatten)
+    rows = _without_vanishing(system, t, x, u, params, unflatten)
     independent = independent_rows(rows.jacobian)
     a, multipliers = saddle_point(linear.mass, rows.jacobian, linear.forcing, rows.gamma, independent)
     against = _contradictory(linear, rows, independent, a, multipliers, x, u)
     matrix = saddle_point_matrix(linear.mass, rows.jacobian, independent)
     lagrangian = jnp.asarray(system.lagrangian(t, q, v, params))
     return Examined(
-        unflatten(a), constraints.split(system, multipliers, t, q, v, params), linear, rows, lagrangian, matrix, against
+        a=unflatten(a),
+        multipliers=constraints.split(system, multipliers, t, q, v, params),
+        linear=linear,
+        rows=rows,
+        independent=independent,
+        lagrangian=lagrangian,
+        matrix=matrix,
+        contradictory=against,
     )
+
+
+def _without_vanishing(system, t, x, u, params, unflatten):
+    """The rows of all constraints, with those set to zero that are round-off: far larger a little way off."""
+    rows = constraints.acceleration_rows(system, t, x, u, params, unflatten)
+    if not rows.gamma.size:
+        return rows
+    # Off by a thousandth of the state, differently in each coordinate.
+    off = 1e-3 * jnp.cos(jnp.arange(x.size, dtype=x.dtype))
+    x, u = (y + off * jnp.where(jnp.max(jnp.abs(y)) > 0, jnp.max(jnp.abs(y)), 1.0) for y in (x, u))
+    nearby = constraints.jacobian(system, t, x, u, params, unflatten)
+    size = lambda rows: jnp.max(jnp.abs(rows), axis=1)
+    least = VANISHES_BELOW[np.dtype(x.dtype)]
+    vanishes = size(rows.jacobian) <= least * jnp.nan_to_num(size(nearby), posinf=0.0)
+    return rows._replace(jacobian=jnp.where(vanishes[:, None], 0.0, rows.jacobian))
 
 
 def _contradictory(linear, rows, independent, a, multipliers, x, u):

@@ -79,8 +79,8 @@ def explain(system: System, q, v, params=None, *, t=0.0) -> Explanation:
     names, equations = coordinates.names(s.q), equation_names(system, s)
     jacobian = found.rows.jacobian
     holonomic = constraints.holonomic_equations(system, *s)
-    independent = int(independent_rows(jacobian).sum())
-    groups = tuple(dependencies(jacobian, equations)) if independent < len(equations) else ()
+    independent = int(found.independent.sum())
+    groups = tuple(dependencies(jacobian, found.independent, equations)) if independent < len(equations) else ()
     problem = explain_failure(system, s)
     mass = _definiteness(np.asarray(found.linear.mass), names)
 

@@ -4,24 +4,25 @@ import warnings
 from typing import Any
 
 import diffrax
+import jax
 import jax.numpy as jnp
 import numpy as np
 
 from lagjax.mechanics import constraints, coordinates
+from lagjax.mechanics.coordinates import State
 from lagjax.mechanics.diagnosis import describe, explain_failure
 from lagjax.mechanics.lagrangian import check_scalar
 from lagjax.mechanics.saddle_point import equations_of_motion
 from lagjax.mechanics.system import System
 from lagjax.motion.consistency import departures
+from lagjax.motion.consistent_state import consistent_state
+from lagjax.motion.solve import ROUND_OFFS
 from lagjax.motion.trajectory import RESULTS, AccuracyWarning
 
-# Tolerances that each dtype reaches with room to spare, and the tightest that is not below its round-off.
+# Tolerances that each dtype reaches with room to spare.
 DEFAULT_TOLERANCE = {np.dtype("float64"): 1e-9, np.dtype("float32"): 1e-5}
-ROUND_OFFS = 8
 # Starts that cannot be integrated, whose reason is in the equations.
 REFUSED = (RESULTS.start_not_finite, RESULTS.start_singular, RESULTS.contradictory)
-# A motion of a hundred periods changes the Jacobi integral by ten to a hundred tolerances.
-DRIFT_TOLERANCES = 1e3
 
 
 def check_system(system: Any):
@@ -95,9 +96,10 @@ def tolerance(value: Any, name: str, dtype):
     """A tolerance for coordinates and one for velocities, (2,) of `dtype`, or an error where it cannot be reached."""
     dtype = np.dtype(dtype)
     value = DEFAULT_TOLERANCE.get(dtype, 1e-2) if value is None else value
-    if np.ndim(value) and np.shape(value) != (2,):
+    value = jnp.stack([jnp.asarray(x, dtype) for x in value]) if isinstance(value, (tuple, list)) else value
+    if jnp.ndim(value) and jnp.shape(value) != (2,):
         raise ValueError(
-            f"{name} must be one number, or two: for coordinates and for velocities. Its shape is {np.shape(value)}.\n"
+            f"{name} must be one number, or two: for coordinates and for velocities. Its shape is {jnp.shape(value)}.\n"
             f"Fix: {name}=1e-9, or {name}=(1e-9, 1e-6)."
         )
     if not coordinates.is_traced(value):
@@ -110,24 +112,22 @@ def _check_tolerance(value, name, dtype):
         raise ValueError(f"{name} must be a number >= 0, not {value}.")
     floor = ROUND_OFFS * float(jnp.finfo(dtype).eps)
     if name == "rtol" and value < floor:
-        remedy = (
-            'Fix: jax.config.update("jax_enable_x64", True) before the first array, '
-            if dtype == np.dtype("float32")
-            else "Fix: "
-        )
+        single = dtype == np.dtype("float32")
+        cause = "Usual cause: JAX works in float32 unless told otherwise.\n" if single else ""
+        remedy = 'jax.config.update("jax_enable_x64", True) before the first array, or ' if single else ""
         raise ValueError(
             f"{name} = {value:.3g} is below what {dtype} can reach ({floor:.1g}).\n"
-            f"Usual cause: JAX works in float32 unless told otherwise.\n{remedy}or {name}={10 * floor:.0e} or more."
+            f"{cause}Fix: {remedy}{name}={10 * floor:.0e} or more."
         )
 
 
-def check_functions(system: System, s: coordinates.State):
+def check_functions(system: System, s: State):
     """Raise where L, R, Q or a constraint returns something of the wrong shape."""
     check_scalar(system, *s)
     constraints.shapes(system, *s)
 
 
-def check_finite(s: coordinates.State):
+def check_finite(s: State):
     """Raise where a coordinate or velocity of the initial state is not finite."""
     for which, tree in (("q0", s.q), ("v0", s.v)):
         values = np.asarray(coordinates.flatten(tree)[0])
@@ -136,55 +136,64 @@ def check_finite(s: coordinates.State):
                 raise ValueError(f"coordinate '{name}' of {which} is {value}.\nFix: start from finite numbers.")
 
 
-def off_constraints(system: System, s: coordinates.State, rtol, atol) -> str:
+def off_constraints(system: System, s: State, rtol, atol) -> str:
     """Say which constraints the initial state violates."""
     check_finite(s)
+    violated = departures(system, s, rtol, atol)
+    if any(f"= {word}" in violated for word in ("nan", "inf", "-inf")):
+        return (
+            f"constraints are not finite at the initial state: {violated}.\n"
+            "Usual cause: NaN or infinity in params, or a constraint evaluated outside its domain.\n"
+            "Fix: look at lj.constraint_residual(system, ts[0], q0, v0, params), and at params."
+        )
     return (
-        f"the initial state is off the constraints: {departures(system, s, rtol, atol)}, where 0 is asked.\n"
+        f"the initial state is off the constraints: {violated}, where 0 is asked.\n"
         "Usual cause: a coordinate or velocity computed for other parameters, or rounded.\n"
         "Fix: q0, v0 = lj.consistent_state(system, ts[0], q0, v0, params) for a consistent state near it."
     )
 
 
-def warn_of_drift(drift, trajectory):
-    """Warn where a conserved Jacobi integral changed much more than the tolerance."""
-    rtol = float(trajectory.tolerance[0][0])
-    if drift > DRIFT_TOLERANCES * rtol:
-        span, steps = float(trajectory.end.t - trajectory.t[0]), int(trajectory.stats["num_accepted_steps"])
-        warnings.warn(
-            f"the Jacobi integral, which is constant for this system, changed by {drift:.1g} of its size over a time "
-            f"of {span:.6g} ({steps} steps): {drift / rtol:.0e} times rtol = {rtol:.1g}.\n"
-            "Usual cause: a span of very many periods, over which small errors add up, an unstable motion, or "
-            "round-off (float32, or a tolerance near its limit).\n"
-            "Fix: a tighter rtol and atol (in float64), a method of higher order, or a shorter span.",
-            AccuracyWarning,
-            stacklevel=4,
-        )
+def warn_of_drift(trajectory):
+    """Warn where something that must stay constant has changed by more than the tolerance lets expect."""
+    if float(trajectory.departure) <= 1:
+        return
+    drift, rtol = float(trajectory.drift()), float(trajectory.tolerance[0][0])
+    span, steps = float(trajectory.end.t - trajectory.t[0]), int(trajectory.stats["num_accepted_steps"])
+    off = f", and a constraint is off by {float(trajectory.residual()):.1g}" if trajectory.system.constraints else ""
+    warnings.warn(
+        f"over a time of {span:.6g} ({steps} steps) the Jacobi integral, which should stay, changed by {drift:.1g} of "
+        f"its size{off}, at rtol = {rtol:.1g}.\n"
+        "Usual cause: a span of very many periods, over which small errors add up, an unstable motion, steps that are "
+        "too long, or round-off (float32, or a tolerance near its limit).\n"
+        "Fix: a tighter rtol and atol (in float64), a method of higher order, or a shorter span.",
+        AccuracyWarning,
+        stacklevel=4,
+    )
 
 
-def stopped_early(trajectory, max_steps) -> str:
+def stopped_early(trajectory, settings) -> str:
     """Say where and why an integration stopped before its last output."""
     end, t0, t1 = trajectory.end, float(trajectory.t[0]), float(trajectory.t[-1])
     share = 100 * (float(end.t) - t0) / (t1 - t0)
-    steps = {k: int(n) for k, n in trajectory.stats.items()}
+    accepted, rejected = (int(trajectory.stats[f"num_{kind}_steps"]) for kind in ("accepted", "rejected"))
     what = (
         f"the integration stopped at t = {float(end.t):.9g}, {share:.3g} % of the way to {t1:.6g}, after "
-        f"{steps['num_accepted_steps']} accepted and {steps['num_rejected_steps']} rejected steps"
+        f"{accepted} accepted and {rejected} rejected steps"
     )
-    reason = explain_failure(trajectory.system, coordinates.State(end.t, end.q, end.v, trajectory.params))
+    reason = explain_failure(trajectory.system, State(end.t, end.q, end.v, trajectory.params)) or _beyond(trajectory)
     if reason:
         return f"{what}: {reason}"
-    if bool(trajectory.result == RESULTS.max_steps_reached):
+    if bool(trajectory.result == RESULTS.max_steps_reached) and rejected <= 10 * accepted:
         return (
-            f"{what}: max_steps = {max_steps} is used up. The last state is {describe(end.q)}.\n"
+            f"{what}: max_steps = {settings.max_steps} is used up. The last state is {describe(end.q)}.\n"
             "Usual cause: a stiff system under an explicit method, or a span of very many periods.\n"
-            f"Fix: max_steps={4 * max_steps}, a looser rtol, or method=diffrax.Kvaerno5() where it is stiff."
+            f"Fix: max_steps={4 * settings.max_steps}, a looser rtol, or method=lj.Radau5() where it is stiff."
         )
-    if bool(trajectory.result == RESULTS.unsolved_step):
+    if bool(trajectory.result == RESULTS.unsolved_step) and settings.controller is not None:
         return (
             f"{what}: {RESULTS[trajectory.result]} The last state is {describe(end.q)}.\n"
-            "Usual cause: a fixed step too long for the implicit method's root finder, or for the return to the "
-            "constraints.\n"
+            "Usual cause: a fixed step that is too long: for the method's stability, an implicit one's root finder, or "
+            "for the return to the constraints.\n"
             "Fix: a smaller dt0, or leave stepsize_controller out: steps that fail are then taken again, shorter."
         )
     return (
@@ -194,6 +203,23 @@ def stopped_early(trajectory, max_steps) -> str:
         "Fix: stop before it with event=diffrax.Event(...), or look at lj.accelerations at trajectory.end "
         "with throw=False."
     )
+
+
+def _beyond(trajectory):
+    """Whether the constraints can be met a little after the end; in words where they cannot."""
+    system, end = trajectory.system, trajectory.end
+    if not system.constraints:
+        return None
+    ahead = 1e-3 * (trajectory.t[-1] - trajectory.t[0])
+    q = jax.tree.map(lambda q, v: q + ahead * v, end.q, end.v)
+    try:
+        consistent_state(system, end.t + ahead, q, end.v, trajectory.params)
+    except ValueError as error:
+        return (
+            f"the constraints cannot be met a little later. {error}\n"
+            "(There: a loop that closes only so far, or one motion prescribed twice.)"
+        )
+    return None
 
 
 def _fastest(trajectory):

@@ -19,10 +19,10 @@ from lagjax.mechanics.coordinates import State
 from lagjax.mechanics.saddle_point import SINGULAR_BELOW, equations_of_motion, examined
 from lagjax.mechanics.structure import angles, conserves_jacobi_integral
 from lagjax.motion.both_modes import solve_in_both_modes
-from lagjax.motion.consistency import stopped, to_manifold, within
+from lagjax.motion.consistency import stopped, to_manifold, within, worst_residual
 from lagjax.motion.sign_change import SignChange
 from lagjax.motion.stepping import OnManifold, Stages, Tolerances, forward_differentiable
-from lagjax.motion.trajectory import RESULTS, Moment, Trajectory, pack, worst_drift
+from lagjax.motion.trajectory import RESULTS, Moment, Trajectory, ended_well, pack, worst_drift
 from lagjax.numerics import dense
 from lagjax.numerics.simplified_newton import SimplifiedNewton, with_tolerances
 
@@ -30,6 +30,18 @@ from lagjax.numerics.simplified_newton import SimplifiedNewton, with_tolerances
 START_TOLERANCES = 100.0
 # Baumgarte's feedback decays a violation by e this many times over the time span.
 BAUMGARTE_DECAYS = 50.0
+# A motion of a hundred periods changes the Jacobi integral by ten to a hundred tolerances.
+DRIFT_TOLERANCES = 1e3
+# The same change times the number of steps is about twenty times the phase that it shifts, in radians: a hundredth.
+PHASE_STEPS = 0.2
+# The tightest tolerance that is not below round-off.
+ROUND_OFFS = 8
+# What diffrax reports, in the words of a motion.
+TRANSLATED = {
+    "nonfinite_input": "not_finite",
+    "nonlinear_divergence": "unsolved_step",
+    "nonlinear_max_steps_reached": "unsolved_step",
+}
 
 
 class Settings(eqx.Module):
@@ -49,8 +61,8 @@ class Settings(eqx.Module):
 
 
 @eqx.filter_jit
-def trajectory_of(system, q0, v0, params, ts, settings) -> tuple[Trajectory, Float[Array, ""]]:
-    """The trajectory, and the worst relative change of a Jacobi integral that must be constant (else 0)."""
+def trajectory_of(system, q0, v0, params, ts, settings) -> Trajectory:
+    """The trajectory, whatever became of it."""
     # Derivatives flow to the floating arrays of these; the settings are constants.
     x, rest = eqx.partition((system, q0, v0, params, ts), eqx.is_inexact_array)
     fixed, static = eqx.partition((rest, settings), eqx.is_array)
@@ -60,12 +72,12 @@ def trajectory_of(system, q0, v0, params, ts, settings) -> tuple[Trajectory, Flo
         return _solve(*eqx.combine(x, rest), settings, adjoint)
 
     if settings.adjoint is None:
-        fields, drift = solve_in_both_modes(solved, x, fixed)
+        fields = solve_in_both_modes(solved, x, fixed)
     else:
-        fields, drift = solved(x, fixed, settings.adjoint)
+        fields = solved(x, fixed, settings.adjoint)
     arrays, described = pack(system, params, type(settings.method).__name__)
     tolerance = (settings.rtol, settings.atol)
-    return Trajectory(t=ts, **fields, tolerance=tolerance, arrays=arrays, static=described), drift
+    return Trajectory(t=ts, **fields, tolerance=tolerance, arrays=arrays, static=described)
 
 
 def _solve(system, q0, v0, params, ts, settings, adjoint):
@@ -79,7 +91,8 @@ def _solve(system, q0, v0, params, ts, settings, adjoint):
     contradictory = jnp.any(start.contradictory)
     if settings.drift == "project":
         off_constraints = off_constraints | (finite & ~singular & ~projected.holds)
-    refused = off_constraints | contradictory | singular | ~finite
+    too_small = settings.rtol[0] < ROUND_OFFS * jnp.finfo(ts.dtype).eps if settings.controller is None else False
+    refused = off_constraints | contradictory | singular | ~finite | too_small
     y0 = jax.tree.map(lambda x: jnp.where(refused, 0.0, x), (q0, v0))
     terms = diffrax.ODETerm(_vector_field(system, ts, settings.drift))
     # BacksolveAdjoint integrates a larger state backwards: it takes the bare method, and no end beside the outputs.
@@ -117,23 +130,47 @@ def _solve(system, q0, v0, params, ts, settings, adjoint):
     end = jax.tree.map(lambda x: jnp.where(refused, jnp.nan, x[-1]), everything)._replace(t=t[-1])
     _, q, v, multipliers = jax.tree.map(lambda x: jnp.where(_like(reached, x), x[:-1], jnp.nan), everything)
 
-    drift = jnp.zeros_like(t[0])
-    if conserves_jacobi_integral(system, ts[0], q0, v0, params):
-        drift = worst_drift(system, *stopped((t, everything.q, everything.v, params)))
     result = RESULTS.promote(solution.result)
-    result = RESULTS.where(result == RESULTS.nonfinite_input, RESULTS.not_finite, result)
-    result = RESULTS.where(result == RESULTS.nonlinear_divergence, RESULTS.unsolved_step, result)
+    for reported, ours in TRANSLATED.items():
+        result = RESULTS.where(result == getattr(RESULTS, reported), getattr(RESULTS, ours), result)
     # An output is a step of its own, and can fail where the steps of the solve did not.
     all_reached = jnp.all(jnp.isfinite(coordinates.flatten(outputs)[0]))
-    ended_well = (result == RESULTS.successful) | (result == RESULTS.event_occurred)
-    result = RESULTS.where(ended_well & ~all_reached, RESULTS.unsolved_step, result)
+    result = RESULTS.where(ended_well(result) & ~all_reached, RESULTS.unsolved_step, result)
     result = RESULTS.where(singular, RESULTS.start_singular, result)
     result = RESULTS.where(finite, result, RESULTS.start_not_finite)
     result = RESULTS.where(contradictory, RESULTS.contradictory, result)
     result = RESULTS.where(off_constraints, RESULTS.start_off_constraints, result)
+    result = RESULTS.where(too_small, RESULTS.tolerance_too_small, result)
     stats = {name: jnp.asarray(count) for name, count in solution.stats.items() if name != "max_steps"}
-    fields = {"q": q, "v": v, "multipliers": multipliers, "end": end, "stats": stats, "result": result}
-    return fields, drift
+    departure = _departure(system, stopped((t, everything.q, everything.v, params)), stats, settings)
+    return {
+        "q": q,
+        "v": v,
+        "multipliers": multipliers,
+        "end": end,
+        "stats": stats,
+        "departure": departure,
+        "result": result,
+    }
+
+
+def _departure(system, motion, stats, settings):
+    """How far what must stay constant has changed at the outputs, in units of what the tolerance lets expect.
+
+    An error of the Jacobi integral that grows steadily shifts the phase by about its size a radian, so that over very
+    many steps less of it is allowed. With steps that the tolerance does not choose, a tenth is.
+    """
+    t, q, v, params = motion
+    drift = residual = jnp.zeros_like(t[0])
+    if conserves_jacobi_integral(system, t[0], *jax.tree.map(lambda x: x[0], (q, v)), params):
+        drift = worst_drift(system, t, q, v, params)
+    if system.constraints and settings.drift != "project":
+        residual = worst_residual(system, t, q, v, params)
+    if settings.controller is not None:
+        return jnp.maximum(drift, residual) / 0.1
+    rtol = jnp.maximum(settings.rtol[0], jnp.finfo(t.dtype).eps)
+    phase = drift * stats["num_accepted_steps"] / PHASE_STEPS
+    return jnp.maximum(jnp.maximum(drift, residual) / (DRIFT_TOLERANCES * rtol), phase)
 
 
 def _vector_field(system, ts, drift):

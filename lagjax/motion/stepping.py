@@ -14,6 +14,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, PyTree
 
 from lagjax.mechanics.saddle_point import independent_equations
@@ -29,6 +30,11 @@ DEPENDENT_BELOW_WHILE_DRIFTING = 1e-3
 TURN = 2 * np.pi
 # An output is a shorter step than the accepted one that it lies in: its error should be smaller, not this much larger.
 OUTPUT_TOLERANCES = 100.0
+# With this share of a state as its error, a fixed step is beyond the method's stability.
+LOST = 0.3
+
+
+NOT_FINITE = diffrax.RESULTS.nonfinite_input
 
 
 class Tolerances(NamedTuple):
@@ -49,12 +55,12 @@ class OnManifold(diffrax.AbstractWrappedSolver):
     """Wrap `solver`: project after each step (where `project`), and step for dense output.
 
     A step that cannot be returned to the constraints is rejected; with a fixed step the solve ends there. `controlled`
-    says that steps are chosen by the tolerances; `weigh` rescales the error for a controller that knows one tolerance: coordinates and velocities are judged each by their
-    own, and the `angles` among the leaves of q by no more than a turn.
+    says that steps are chosen by the tolerances. `weigh` rescales the error for a controller that knows one tolerance:
+    coordinates and velocities are judged each by their own, and the `angles` among the leaves of q by at most a turn.
 
     What the dense output needs of the problem (`terms`, `params`) belongs to the solver, since diffrax hands
-    an interpolation only times and states. Where `refused`, every step is NaN, and so is rejected: the solve ends
-    within a few steps at the smallest step size.
+    an interpolation only times and states. Where `refused`, and where a step is not finite, its error is infinite: an
+    adaptive solve ends within a few steps at the smallest step size, one with fixed steps at once.
     """
 
     solver: diffrax.AbstractSolver
@@ -124,18 +130,27 @@ class OnManifold(diffrax.AbstractWrappedSolver):
             y1 = (projected.q, projected.v)
             error = jtu.tree_map(lambda x: jnp.where(projected.holds, x, jnp.inf), error)
             result = diffrax.RESULTS.where(projected.holds, result, diffrax.RESULTS.nonlinear_divergence)
-        y1, error = jtu.tree_map(lambda x: jnp.where(self.refused, jnp.nan, x), (y1, error))
+        # Infinite, a state would make its own error relative to it zero.
+        failed = self.refused | ~_all_finite((y1, error))
+        y1 = jtu.tree_map(lambda y1, y0: jnp.where(failed, y0, y1), y1, y0)
+        error = jtu.tree_map(lambda x: jnp.where(failed, jnp.inf, x), error)
+        result = diffrax.RESULTS.where(failed & (result == diffrax.RESULTS.successful), NOT_FINITE, result)
         # Newton's iteration for an output starts from the polynomial of the step that it lies in.
         continued = solver_state if isinstance(self.solver, Radau5) else None
-        return y1, error, {"y0": y0, "state": continued}, solver_state, _unless_not_finite(y0, result)
+        return y1, error, {"y0": y0, "state": continued}, solver_state, result
 
-    def acceptable(self, y, error):
-        """Whether an output's error is not far above the tolerance; a step to it has not passed the controller."""
-        if error is None or not self.controlled:
+    def acceptable(self, y0, y1, error):
+        """Whether an output's error is not far above the tolerance; a step to it has not passed the controller.
+
+        With fixed steps there is no tolerance; beyond a method's limit of stability the error is as large as the state.
+        """
+        if error is None:
             return True
-        rtol, atol = self.tolerances.rtol[0], self.tolerances.atol[0]
-        within = lambda y, error: jnp.all(jnp.abs(error) <= OUTPUT_TOLERANCES * (atol + rtol * jnp.abs(y)))
-        return jnp.all(jnp.stack(jtu.tree_leaves(jtu.tree_map(within, y, error))))
+        rtol, atol = (self.tolerances.rtol[0], self.tolerances.atol[0]) if self.controlled else (0.0, 0.0)
+        share = OUTPUT_TOLERANCES * rtol if self.controlled else LOST
+        largest = lambda tree: jnp.max(jnp.abs(ravel_pytree(tree)[0]))
+        of_parts = [largest(e) <= OUTPUT_TOLERANCES * atol + share * largest((a, b)) for a, b, e in zip(y0, y1, error)]
+        return of_parts[0] & of_parts[1]
 
     def _weighed(self, y0, y1, error):
         (rtol_q, rtol_v), (atol_q, atol_v) = self.tolerances
@@ -171,14 +186,13 @@ class SteppedTo(diffrax.AbstractLocalInterpolation):
         s = self.solver
         state = s.init(s.terms, self.t0, self.t1, self.y0, s.params) if self.state is None else self.state
         y, error, _, _, result = s.step(s.terms, self.t0, t0, self.y0, s.params, state, made_jump=False)
-        believed = (result == diffrax.RESULTS.successful) & s.acceptable(y, error)
+        believed = (result == diffrax.RESULTS.successful) & s.acceptable(self.y0, y, error)
         return jtu.tree_map(lambda x: jnp.where(believed, x, jnp.nan), y)
 
 
-def _unless_not_finite(y0, result):
-    """End the solve at a state that is NaN or infinite: no step leads back from it."""
-    finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in jtu.tree_leaves(y0)]))
-    return diffrax.RESULTS.where(finite, result, diffrax.RESULTS.nonfinite_input)
+def _all_finite(tree):
+    # One sum instead of a reduction a leaf: zero times NaN or infinity is NaN.
+    return sum(jnp.sum(0 * x) for x in jtu.tree_leaves(tree)) == 0
 
 
 def forward_differentiable(method):

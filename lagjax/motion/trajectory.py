@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Bool, Float, PyTree
 
 from lagjax import plot
 from lagjax.mechanics import coordinates
@@ -23,7 +23,11 @@ class RESULTS(diffrax.RESULTS):
     start_not_finite = "L, the accelerations or the multipliers are not finite at the initial state."
     start_singular = "The accelerations are not determined at the initial state: the equations are singular there."
     not_finite = "The state became NaN or infinite."
-    unsolved_step = "The equations of a step were not solved, or its end could not be returned to the constraints."
+    unsolved_step = (
+        "A step could not be solved, could not be returned to the constraints, or lost the state in its error."
+    )
+    tolerance_too_small = "The tolerance is below the round-off of the state's dtype."
+    drifted = "The motion was computed, but what must stay constant changed by more than 1000 tolerances."
 
 
 class AccuracyWarning(UserWarning):
@@ -56,6 +60,9 @@ class Trajectory(eqx.Module):
     - `multipliers`: by constraint name, (T, *shape of the constraint), from the projected states.
     - `end`: the last instant reached (`t`, `q`, `v`, `multipliers`): the event, where one ended the motion.
     - `stats`: `num_steps`, `num_accepted_steps`, `num_rejected_steps`.
+    - `departure`: how far the Jacobi integral, where it must be constant, and the constraints changed, in units of what
+      the tolerance lets expect; above 1 the motion is less accurate than that, and `integrate` warns. 0 where nothing
+      must stay.
     - `result`: a `RESULTS` item; `lj.RESULTS.successful`, `event_occurred`, or what went wrong.
     - `params`, `system`: what was integrated. `tolerance`: (rtol, atol), each (2,):
       for coordinates and for velocities.
@@ -69,6 +76,7 @@ class Trajectory(eqx.Module):
     multipliers: dict[str, Array]
     end: Moment
     stats: dict[str, Array]
+    departure: Float[Array, ""]
     result: RESULTS
     tolerance: tuple[Array, Array]
     arrays: PyTree
@@ -148,6 +156,11 @@ def pack(system, params, method: str) -> tuple[PyTree, Static]:
     return arrays, Static(tuple(parts), structure, method)
 
 
+def ended_well(result) -> Bool[Array, "..."]:
+    """Whether a motion was computed to its end or its event."""
+    return (result == RESULTS.successful) | (result == RESULTS.event_occurred)
+
+
 def message(result) -> str:
     """A result in words."""
     if bool(result == RESULTS.successful):
@@ -167,6 +180,8 @@ def _lines(traj):
     if traj.system.constraints:
         rows.append(("worst constraint residual", f"{float(traj.residual()):.1e} (relative)"))
     rows.append(("change of the Jacobi integral", f"{float(traj.drift()):.1e} (relative)"))
+    if float(traj.departure) > 1:
+        rows.append(("WARNING", f"drifted {float(traj.departure):.2g} times as far as the tolerance lets expect"))
     rows += _shape_rows(traj)
     return ["Trajectory", *_aligned(rows)]
 
@@ -179,11 +194,12 @@ def _pair(tolerance):
 def _batch_lines(traj, lanes):
     values, counts = np.unique(np.asarray(traj.result._value), return_counts=True)
     words = [f"{n} {message(_item(traj.result, v))}" for v, n in zip(values, counts)]
-    steps = np.asarray(traj.stats["num_steps"])
+    steps, drifted = np.asarray(traj.stats["num_steps"]), int(np.sum(np.asarray(traj.departure) > 1))
     rows = [
         ("method", traj.static.method),
         ("lanes", " x ".join(map(str, lanes))),
         ("results", "; ".join(words)),
+        *([("WARNING", f"{drifted} lanes drifted farther than the tolerance lets expect")] if drifted else []),
         ("steps a lane", f"{steps.min()} to {steps.max()}, {int(steps.sum())} in all"),
         *_shape_rows(traj),
     ]

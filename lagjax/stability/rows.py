@@ -1,0 +1,15 @@
+"""All rows of the stability report."""
+
+from lagjax.stability.constraints import redundant
+from lagjax.stability.geodesics import geodesics
+from lagjax.stability.hoop_and_wedge import bead, float32, separatrix, wedge
+from lagjax.stability.long import long
+from lagjax.stability.stiff import stable_steps, stiff
+from lagjax.stability.trial import FULL
+
+FAMILIES = (wedge, bead, separatrix, long, stiff, stable_steps, geodesics, float32, redundant)
+
+
+def trials(tier=FULL):
+    """The rows of a report: those of QUICK, of REDUCED, or of FULL."""
+    return [row for family in FAMILIES for row in family() if row.tier <= tier]

@@ -1,0 +1,235 @@
+"""One row of the stability report: a motion that is hard, its exact answer, and what the library made of it.
+
+A row is *accurate* where its error is a small multiple of the tolerance, *degraded* where the library warned, and
+*refused* where it raised. What is none of the three was *silently wrong*. A tolerance bounds what is lost a period, what
+is lost of the energy shifts the phase in all later periods, and a motion may amplify it; hence
+
+    allowed = PER_PERIOD · tolerance · periods · (1 + periods/1000) · amplification, and never above USELESS
+
+and ten times that for the derivative of the motion. Neither is chosen by what came out.
+"""
+
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import PyTree
+
+from lagjax.mechanics import coordinates
+from lagjax.mechanics.system import System
+from lagjax.motion.integrate import integrate
+from lagjax.motion.trajectory import Trajectory
+from lagjax.report import relative_error, table
+
+PER_PERIOD = 100.0
+# With fewer than two digits left nothing has been computed, whatever was asked.
+USELESS = 1e-2
+OF_DERIVATIVES = 10.0
+ACCURATE, DEGRADED, REFUSED, SILENTLY_WRONG = "accurate", "degraded", "refused", "SILENTLY WRONG"
+VERDICTS = (ACCURATE, DEGRADED, REFUSED, SILENTLY_WRONG)
+# Which rows belong to which report: each also has those of the ones before it.
+QUICK, REDUCED, FULL = 0, 1, 2
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of a row.
+
+    - `effort`: steps, accepted and rejected, or the largest stable step.
+    - `error`: relative, against the exact answer; infinite where there is no answer. `allowed`: of it.
+    - `residual`: of the constraints, None without constraints.
+    - `gradient`: relative error of the derivative of the motion, forward mode against the exact one; None where not
+      tried.
+    - `said`: the first sentence of what the library warned of or raised.
+    - `expected`: the verdict that the row should have, None where any honest one will do.
+    """
+
+    family: str
+    name: str
+    method: str
+    effort: str
+    error: float
+    allowed: float
+    residual: float | None = None
+    gradient: float | None = None
+    raised: bool = False
+    said: str = ""
+    expected: str | None = None
+
+    @property
+    def verdict(self) -> str:
+        """One of `VERDICTS`."""
+        if self.raised:
+            return REFUSED
+        if self.said:
+            return DEGRADED
+        right = self.error <= self.allowed and (self.gradient is None or self.gradient <= OF_DERIVATIVES * self.allowed)
+        return ACCURATE if right else SILENTLY_WRONG
+
+    @property
+    def passed(self) -> bool:
+        """Whether the row was honest, and came out as expected."""
+        return self.verdict != SILENTLY_WRONG and self.expected in (None, self.verdict)
+
+
+def zeros(tree):
+    """A direction that leaves `tree` alone."""
+    return jax.tree.map(lambda x: np.zeros(np.shape(x)), tree)
+
+
+def by_parameter(q0, v0, params, name, size=1.0):
+    """The direction along one parameter."""
+    return zeros(q0), zeros(v0), zeros(params) | {name: size}
+
+
+def _states(trajectory):
+    return trajectory.q, trajectory.v
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A motion to integrate and its exact answer.
+
+    - `exact(q0, v0, params, ts)`: what `observed(trajectory)` must be, differentiable; by default (q, v).
+    - `along`: (dq0, dv0, dparams), the direction of the derivative; None for no check of it.
+    - `tolerance`: what is asked. `options` of `integrate` beside it, such as an atol by size.
+    - `periods`, `amplification`: how long, and by how much the motion itself magnifies an error of its start.
+    """
+
+    family: str
+    name: str
+    system: System
+    q0: PyTree
+    v0: PyTree
+    params: PyTree
+    ts: np.ndarray
+    exact: Callable[..., PyTree] | None = None
+    along: tuple[PyTree, PyTree, PyTree] | None = None
+    tolerance: float = 1e-10
+    method: diffrax.AbstractSolver = field(default_factory=diffrax.Dopri8)
+    options: Mapping[str, Any] = field(default_factory=dict)
+    observed: Callable[[Trajectory], PyTree] = _states
+    periods: float = 1.0
+    amplification: float = 1.0
+    expected: str | None = ACCURATE
+    tier: int = FULL
+
+    @property
+    def allowed(self) -> float:
+        """The error that counts as accurate."""
+        periods = max(1.0, self.periods) * (1 + self.periods / 1000)
+        grown = PER_PERIOD * self.tolerance * periods * max(1.0, self.amplification)
+        return min(grown, USELESS)
+
+    def attempt(self) -> Outcome:
+        """Integrate as a user would, and compare."""
+        with warnings.catch_warnings(record=True) as heard:
+            warnings.simplefilter("always")
+            try:
+                trajectory = integrate(self.system, self.q0, self.v0, self.params, ts=self.ts, **self._options())
+            except (ValueError, RuntimeError) as error:
+                return self._outcome(raised=True, said=_first_sentence(error))
+        steps = f"{int(trajectory.stats['num_steps'])} steps"
+        said = "; ".join(_first_sentence(warning.message) for warning in heard)
+        residual = float(trajectory.residual()) if self.system.constraints else None
+        if self.exact is None:
+            return self._outcome(effort=steps, residual=residual, said=said)
+        error = relative_error(self.observed(trajectory), self.exact(*self._exactly()))
+        return self._outcome(effort=steps, error=error, residual=residual, said=said, gradient=self._gradient_error())
+
+    def _options(self):
+        return {"rtol": self.tolerance, "atol": self.tolerance, "method": self.method, **self.options}
+
+    def _outcome(self, effort="", error=float("inf"), **what):
+        return Outcome(
+            family=self.family, name=self.name, method=type(self.method).__name__, effort=effort, error=error,
+            allowed=self.allowed, expected=self.expected, **what,
+        )  # fmt: skip
+
+    def _exactly(self):
+        """The inputs as they were rounded to the motion's dtype, in double precision."""
+        start = coordinates.state(self.ts[0], self.q0, self.v0, self.params)
+        ts = np.asarray(self.ts).astype(start.t.dtype)
+        return jax.tree.map(lambda x: jnp.asarray(x, float), (start.q, start.v, start.params, ts))
+
+    def _gradient_error(self):
+        if self.along is None:
+            return None
+        *exactly, ts = self._exactly()
+        tangents = jax.tree.map(lambda x, dx: jnp.broadcast_to(jnp.asarray(dx, float), x.shape), exactly, [*self.along])
+        exact = jax.jvp(lambda *x: self.exact(*x, ts), tuple(exactly), tuple(tangents))[1]
+        start = coordinates.state(self.ts[0], self.q0, self.v0, self.params)
+        point, dtype = [start.q, start.v, start.params], start.t.dtype
+        tangents = jax.tree.map(lambda x, dx: dx.astype(x.dtype), point, tangents)
+        as_array = lambda x: np.asarray(x, dtype) if isinstance(x, (float, np.ndarray)) else x
+        options = jax.tree.map(as_array, self._options())
+        got = _derivative(self.system, point, tangents, np.asarray(self.ts, dtype), options, self.observed)
+        return relative_error(_gathered(got), _gathered(exact))
+
+
+@eqx.filter_jit
+def _derivative(system, point, tangents, ts, options, observed):
+    """The directional derivative of what is observed, in forward mode."""
+
+    def motion(q0, v0, params):
+        return observed(integrate(system, q0, v0, params, ts=ts, throw=False, **options))
+
+    return jax.jvp(motion, tuple(point), tuple(tangents))[1]
+
+
+def _gathered(tree):
+    """Coordinates together and velocities together: a derivative is measured by the largest of each."""
+    parts = tree if isinstance(tree, tuple) else (tree,)
+    return [np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(part)]) for part in parts]
+
+
+def _first_sentence(message):
+    return str(message).split("\n")[0]
+
+
+def stability_table(outcomes: Sequence[Outcome]) -> str:
+    """The report: one line an outcome, then the count of each verdict."""
+    header = ("", "method", "steps", "error", "allowed", "residual", "gradient", "verdict", "what the library said")
+    cells = [_cells(outcome) for outcome in outcomes]
+    # The last column is prose: keep it to the left.
+    width = max(len(row[-1]) for row in [header, *cells])
+    body = table((*header[:-1], header[-1].ljust(width)), [(*row[:-1], row[-1].ljust(width)) for row in cells])
+    counts = {verdict: sum(outcome.verdict == verdict for outcome in outcomes) for verdict in VERDICTS}
+    return "\n".join(
+        [
+            *(line.rstrip() for line in body.split("\n")),
+            "",
+            "error and gradient: relative, against the exact motion and its exact derivative; "
+            f"accurate: at most {PER_PERIOD:g} tolerances a period times the motion's own amplification, and "
+            f"{OF_DERIVATIVES:g} times that for the gradient",
+            ", ".join(f"{count} {verdict}" for verdict, count in counts.items()),
+        ]
+    )
+
+
+def _cells(outcome):
+    number = lambda x: "-" if x is None or not np.isfinite(x) else f"{x:.1e}"
+    verdict = outcome.verdict if outcome.passed else f"{outcome.verdict} (!)"
+    return (
+        f"{outcome.family}: {outcome.name}",
+        outcome.method,
+        outcome.effort or "-",
+        number(outcome.error),
+        f"{outcome.allowed:.0e}",
+        number(outcome.residual),
+        number(outcome.gradient),
+        verdict,
+        _short(outcome.said),
+    )
+
+
+def _short(text, longest=120):
+    """The beginning and the end, where the reason stands."""
+    half = (longest - 5) // 2
+    return text if len(text) <= longest else f"{text[:half]} ... {text[-half:]}"
