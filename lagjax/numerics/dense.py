@@ -87,6 +87,9 @@ def reciprocal_condition(matrix: Float[Array, "n n"]) -> Float[Array, ""]:
     The scaling brings every row's largest entry near one (Ruiz), so that units do not count as ill-conditioning.
     """
 
+    if matrix.shape[0] == 1:
+        return jnp.where(jnp.isfinite(matrix[0, 0]) & (matrix[0, 0] != 0), 1.0, 0.0)
+
     def rescaled(_, matrix):
         largest = jnp.max(jnp.abs(matrix), axis=1)
         scale = 1 / jnp.sqrt(jnp.where(largest > 0, largest, 1.0))

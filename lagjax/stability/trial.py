@@ -1,8 +1,8 @@
 """One row of the stability report: a motion that is hard, its exact answer, and what the library made of it.
 
 A row is *accurate* where its error is a small multiple of the tolerance, *degraded* where the library warned, and
-*refused* where it raised. What is none of the three was *silently wrong*. A tolerance bounds what is lost a period, what
-is lost of the energy shifts the phase in all later periods, and a motion may amplify it; hence
+*refused* where it raised. What is none of the three was *silently wrong*. A tolerance bounds what is lost a period;
+what is lost of the energy shifts the phase in all later periods; and a motion may amplify it. Hence
 
     allowed = PER_PERIOD · tolerance · periods · (1 + periods/1000) · amplification, and never above USELESS
 
@@ -206,7 +206,7 @@ def stability_table(outcomes: Sequence[Outcome]) -> str:
             *(line.rstrip() for line in body.split("\n")),
             "",
             "error and gradient: relative, against the exact motion and its exact derivative; "
-            f"accurate: at most {PER_PERIOD:g} tolerances a period times the motion's own amplification, and "
+            f"accurate: at most {PER_PERIOD:g} tolerances a period, more after thousands, times the motion's own amplification, and "
             f"{OF_DERIVATIVES:g} times that for the gradient",
             ", ".join(f"{count} {verdict}" for verdict, count in counts.items()),
         ]
