@@ -3,6 +3,7 @@
 import dataclasses
 
 import numpy as np
+import pytest
 
 from benchmarks import fails_safely
 
@@ -21,6 +22,7 @@ def test_names_are_different():
     assert len(fails_safely.FAMILIES) * fails_safely.COUNT >= 300
 
 
+@pytest.mark.slow
 def test_broken_systems_are_reported_and_healthy_ones_are_not():
     """Too few steps: reported alone by name and in lanes, and the twins are right to 100 tolerances."""
     broken, healthy = fails_safely.judge(few, np.random.default_rng(0), 3)

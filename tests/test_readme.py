@@ -18,6 +18,7 @@ def claimed_and_printed(block, capsys):
     return claimed, printed
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("block", PYTHON_BLOCKS, ids=range(len(PYTHON_BLOCKS)))
 def test_python_blocks(block, capsys):
     """Every printed number stands in the comment beside its print."""

@@ -206,8 +206,8 @@ def stability_table(outcomes: Sequence[Outcome]) -> str:
             *(line.rstrip() for line in body.split("\n")),
             "",
             "error and gradient: relative, against the exact motion and its exact derivative; "
-            f"accurate: at most {PER_PERIOD:g} tolerances a period, more after thousands, times the motion's own amplification, and "
-            f"{OF_DERIVATIVES:g} times that for the gradient",
+            f"accurate: at most {PER_PERIOD:g} tolerances a period, more after thousands, times the motion's own "
+            f"amplification, and {OF_DERIVATIVES:g} times that for the gradient",
             ", ".join(f"{count} {verdict}" for verdict, count in counts.items()),
         ]
     )

@@ -60,7 +60,7 @@ def test_nearest_in_the_metric_of_the_masses():
     assert np.max(np.abs(found - euclidean)) > 0.05
 
 
-@pytest.mark.parametrize("mode", [jax.jacfwd, jax.jacrev])
+@pytest.mark.parametrize("mode", [pytest.param(jax.jacfwd, marks=pytest.mark.slow), jax.jacrev])
 def test_derivatives_by_everything(mode):
     """Its derivatives by time, state and parameters are those of the one-angle solution, also from far off."""
     ours = lambda t, q, v, params: flat(lj.consistent_state(on_ellipse, t, q, v, params))
@@ -126,6 +126,7 @@ def test_unreachable_is_an_error_with_the_residual_by_name():
         lj.consistent_state(lj.System(lagrangian, walls), 0.0, *state, PARAMS)
 
 
+@pytest.mark.slow
 def test_redundant_constraints_are_no_obstacle():
     """An ellipse given twice leads to the same point."""
     again = lj.Holonomic(lambda t, q, params: 2.0 * ellipse(t, q, params))

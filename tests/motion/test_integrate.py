@@ -85,6 +85,7 @@ def test_second_derivative_forward():
     np.testing.assert_allclose(second, (slope(9.8125 + step) - slope(9.8125 - step)) / (2 * step), rtol=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "adjoint", [diffrax.ForwardMode(), diffrax.RecursiveCheckpointAdjoint(), diffrax.BacksolveAdjoint()]
 )
@@ -113,6 +114,7 @@ def test_lanes_agree_with_single_runs_and_keep_their_own_failure():
     assert "3 successful" in repr(batch) and "not finite" in repr(batch)
 
 
+@pytest.mark.slow
 def test_gradient_of_a_batch():
     """The gradient of a sum over lanes is the sum of the lanes' gradients, with shared and with batched inputs."""
     system = lj.System(lambda t, q, v, params: 0.5 * v**2 - 0.5 * params["k"] * q**2)
@@ -126,7 +128,14 @@ def test_gradient_of_a_batch():
     np.testing.assert_allclose(jax.grad(total)(4.0), exact, rtol=1e-8)
 
 
-@pytest.mark.parametrize("transform", [jax.jacfwd, jax.grad, lambda f: jax.jit(jax.grad(f))])
+@pytest.mark.parametrize(
+    "transform",
+    [
+        pytest.param(jax.jacfwd, marks=pytest.mark.slow),
+        pytest.param(jax.grad, marks=pytest.mark.slow),
+        lambda f: jax.jit(jax.grad(f)),
+    ],
+)
 def test_gradient_by_a_closed_over_value(transform):
     """A value that L closes over has its derivative too; before it was lifted, jit(grad) gave zero in silence."""
 

@@ -299,6 +299,7 @@ def cruise_run(params, ts, tol, **options):
     return traj.q, traj.v, traj.multipliers["cruise"]
 
 
+@pytest.mark.slow
 def test_cruise():
     """Kept at its speed, the particle turns downwards as a gudermannian; values, forward derivatives, residual."""
     ts = np.array([0.0, 0.5, 1.0, 2.0])

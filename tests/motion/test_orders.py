@@ -18,6 +18,7 @@ import optimistix as optx
 import pytest
 
 import lagjax as lj
+from lagjax.numerics.simplified_newton import SimplifiedNewton
 from tests.systems import DOUBLE_PARAMS, DOUBLE_SWING, double_pendulum, double_rods, rods_from_angles
 
 CLAIM = 0.35
@@ -102,9 +103,10 @@ NEWTON = optx.Newton(rtol=1e-10, atol=1e-12, norm=optx.max_norm)
 FAST = [
     (diffrax.Tsit5(), 5, (112, 160, 224)),
     (diffrax.Dopri8(), 8, (18, 22, 28)),
-    (diffrax.Kvaerno5(root_finder=NEWTON), 5, (28, 40, 56)),
 ]
 SLOW = [
+    (diffrax.Kvaerno5(root_finder=NEWTON), 5, (28, 40, 56)),
+    (lj.Radau5(root_finder=SimplifiedNewton(rtol=1e-12, atol=1e-12)), 5, (28, 40, 56)),
     (diffrax.Euler(), 1, (800, 1600, 3200)),
     (diffrax.ImplicitEuler(root_finder=NEWTON), 1, (800, 1600, 3200)),
     (diffrax.Heun(), 2, (100, 200, 400)),

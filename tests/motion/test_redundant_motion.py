@@ -14,6 +14,7 @@ TOLERANCE = 1e-10
 START = ({"x": 1.0, "y": 0.75}, {"x": -1.5, "y": 2.0})
 
 
+@pytest.mark.slow
 def test_pendulum_on_two_rods():
     """A rod given twice moves the pendulum as one does, and the two share its force in the ratio of their scales."""
     ts = np.linspace(0.0, 5.0, 6)
@@ -87,6 +88,7 @@ def outcome_of_one(x):
     return x["l"] * jnp.cos(angle), -inward / (2 * x["l"])
 
 
+@pytest.mark.slow
 def test_redundancy_that_ends_is_reported():
     """Two rods of equal length agree; once one of them grows, no motion satisfies both, and that is said."""
     grows = lj.Holonomic(lambda t, q, params: rod(t, q, params) - jnp.where(t > 0.5, (t - 0.5) ** 3, 0.0))

@@ -139,6 +139,7 @@ def test_exact_motion_is_the_matrix_exponential():
             assert np.max(np.abs(got - expected)) < 1e-12 * np.max(np.abs(expected)), (omega, K)
 
 
+@pytest.mark.slow
 def test_frames_agree_after_a_hundred_turns():
     """x, y and R, r, integrated apart for 100 turns at 5e-13, are the same motion to 1e-9; factor 1 is another."""
     ts = np.linspace(0.0, 100 * 2 * np.pi / PARAMS["omega"], 11)
@@ -289,6 +290,7 @@ def _check_gradient(derivative):
             assert bool(jnp.allclose(got[name], expected, rtol=1e-6, atol=0)) == right, name
 
 
+@pytest.mark.slow
 def test_forward_gradient():
     """The final state, in forward mode in m, K, k, R0 and ω, has the matrix exponential's gradient to 1e-6."""
     _check_gradient(jax.jacfwd)

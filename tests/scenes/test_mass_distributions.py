@@ -277,6 +277,7 @@ def test_screw_symmetry_of_the_potential():
         assert abs(potential(scene.vector(*moved, z + h * angle), params) - start) > 1e-2
 
 
+@pytest.mark.slow
 def test_bounce_through_the_plane():
     """The fall onto the kink takes a quarter of the period 4 w/(2πGσ), and ends with the speed w."""
     for speed in (2.0, 0.5):
@@ -333,7 +334,8 @@ def test_euler_integral():
             assert scene.drift(scene.euler_integral(params | {"M1": -2.0}, orbit.q, orbit.v)) > 1e-2
 
 
-@pytest.mark.parametrize("mode", [jax.jacfwd, pytest.param(jax.grad, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("mode", [jax.jacfwd, jax.grad])
 def test_gradient_of_the_final_state(mode):
     """A final state inside the ellipse by G, ρ, a, b: reverse and forward mode against the closed form."""
     params = jax.tree.map(jnp.asarray, scene.PARAMS["elliptic cylinder"])

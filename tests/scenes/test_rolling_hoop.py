@@ -104,6 +104,7 @@ def test_multipliers_from_the_lagrangian():
             assert float(a["theta"]) != pytest.approx(float(hoop.rate(params)) ** 2 * np.cos(theta), rel=1e-3)
 
 
+@pytest.mark.slow
 def test_motion_and_departure_when_integrated():
     """θ(0.5), θ̇(0.5), the time and angle of the departure to 1e-9, and NaN after it."""
     down, *_ = hoop.runs()

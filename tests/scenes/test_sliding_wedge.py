@@ -176,7 +176,8 @@ def exact_outcome(params):
     return jnp.stack([0.25 + 0.125 * c + (0.5 - 0.75 * c) * T + 0.5 * a.x * T**2, a.incline])
 
 
-@pytest.mark.parametrize("mode", [jax.jacfwd, pytest.param(jax.jacrev, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("mode", [jax.jacfwd, jax.jacrev])
 def test_gradients(mode):
     """Final position and normal force by m, M, α and g, forward and reverse, to 1e-6 of the exact gradient."""
     exact = jax.jacfwd(exact_outcome)(PARAMS)
