@@ -14,7 +14,7 @@ state that satisfies the constraints is looked for first, by steps shortest in M
 Source: Nocedal & Wright, *Numerical Optimization*, §18.1 (Newton-KKT) and §11.3 (continuation).
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 
 import equinox as eqx
 import jax
@@ -54,7 +54,8 @@ def consistent_state(system, t, q, v, params, hold: str | Iterable[str] = ()):
     4.0 -3.0
 
     **Arguments:** `t` scalar, `q` and `v` alike, `params` as the system takes it; `hold`, the names of coordinates that
-    keep the values given for them and for their velocities, such as `"x"`, `"r[0]"`, or `"r"` for all of a vector.
+    keep the values given for them and for their velocities: `"x"`, `["x", "r[0]"]`, `"r"` for all of a vector, or a
+    dict of true and false by name.
 
     **Returns:** (q, v) in the same structure, differentiable in the state, `t` and `params`.
 
@@ -83,6 +84,8 @@ def consistent_state(system, t, q, v, params, hold: str | Iterable[str] = ()):
 def _free(s, hold):
     """Which coordinates may move, (n,) booleans."""
     names = coordinates.names(s.q)
+    if isinstance(hold, Mapping):
+        hold = [name for name, held in hold.items() if held]
     hold = {hold} if isinstance(hold, str) else set(hold)
     held = np.array([name in hold or name.split("[")[0] in hold for name in names])
     unknown = hold - set(names) - {name.split("[")[0] for name in names}

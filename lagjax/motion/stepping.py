@@ -24,16 +24,12 @@ from lagjax.numerics.radau import Radau5
 
 # Without projection a state drifts off its constraints, and dependent ones then disagree by that much.
 DEPENDENT_BELOW_WHILE_DRIFTING = 1e-3
-
-
 # Of the size of an angle no more counts than this: relative to a thousand turns, a tolerance would mean nothing.
 TURN = 2 * np.pi
 # An output is a shorter step than the accepted one that it lies in: its error should be smaller, not this much larger.
 OUTPUT_TOLERANCES = 100.0
 # With this share of a state as its error, a fixed step is beyond the method's stability.
 LOST = 0.3
-
-
 NOT_FINITE = diffrax.RESULTS.nonfinite_input
 
 

@@ -89,24 +89,28 @@ def test_door_on_three_hinges():
 
 
 def test_report_names_dependent_constraints_and_counts_freedoms():
-    """`explain`: the door has one degree of freedom and seven dependent equations; the rod given twice names both."""
-    report = lj.explain(door, *DOOR_STATE[1:])
-    assert report.degrees_of_freedom == report.position_freedoms == 1
-    assert len(report.dependent) == 7
-    assert "18, of which 11 independent" in repr(report)
+    """`explain`: a pendulum on two rods has one degree of freedom, and both rods are named."""
     pair = lj.explain(twice(2.0), *STATE[1:])
     assert pair.degrees_of_freedom == 1
     assert set(pair.dependent[0]) == {"rod", "again"}
     assert lj.explain(rod_pendulum, *STATE[1:]).dependent == ()
 
 
+@pytest.mark.slow
 def test_report_of_a_rounded_state():
-    """A state typed with six digits has the same freedoms: it is moved onto the constraints first."""
+    """The door has one degree of freedom and seven dependent equations, also at a state typed with six digits.
+
+    Such a state is moved onto the constraints first.
+    """
+    report = lj.explain(door, *DOOR_STATE[1:])
+    assert report.degrees_of_freedom == report.position_freedoms == 1
+    assert len(report.dependent) == 7
+    assert "18, of which 11 independent" in repr(report)
     rounded = {"corner": np.round(DOOR_STATE[1]["corner"], 6)}
     assert lj.explain(door, rounded, DOOR_STATE[2], DOOR_STATE[3]).degrees_of_freedom == 1
 
 
-@pytest.mark.parametrize("mode", [jax.jacfwd, jax.jacrev])
+@pytest.mark.parametrize("mode", [pytest.param(jax.jacfwd, marks=pytest.mark.slow), jax.jacrev])
 def test_derivatives_of_shared_multipliers(mode):
     """Accelerations and shortest multipliers have the derivatives of their closed forms, in lanes too."""
 

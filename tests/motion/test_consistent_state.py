@@ -95,6 +95,7 @@ def test_held_coordinates_keep_position_and_velocity():
     np.testing.assert_allclose([q["rod"], q["slider"], v["rod"], v["slider"]], expected, atol=1e-13)
 
 
+@pytest.mark.slow
 def test_random_starts_reach_the_manifold_in_lanes():
     """From random guesses of a crank-slider all lanes end on the constraints, nearly all at a stationary distance."""
     guesses = {name: jnp.asarray(rng.uniform(-3, 3, 200)) for name in ("crank", "rod", "slider")}

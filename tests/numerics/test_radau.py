@@ -68,6 +68,7 @@ def predator(t, y, args):
     return {"rabbits": rabbits * (1.5 - foxes), "foxes": foxes * (rabbits - 1 + 0.5 * jnp.sin(3 * t))}
 
 
+@pytest.mark.slow
 def test_order():
     """Order 5 at the steps' ends; the twin is the order 4 that the same measurement finds of diffrax's interpolant."""
     integrate = pytest.importorskip("scipy.integrate")

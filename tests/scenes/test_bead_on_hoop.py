@@ -269,6 +269,7 @@ def _driven(periods, tolerance):
     return integrate(scene.driven_system, *start, SLOW, ts=ts, rtol=tolerance, atol=tolerance)
 
 
+@pytest.mark.slow
 def test_constraint_holds_for_twenty_periods():
     """The hoop's angle stays on ω t to 1e-12, and h = E - ω L_z is kept, where E itself is not."""
     trajectory = _driven(np.linspace(0.0, 20.3, 11), 1e-10)
