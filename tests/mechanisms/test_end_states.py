@@ -16,7 +16,7 @@ pytestmark = pytest.mark.slow
 
 TOLERANCES = (1e-6, 1e-8, 1e-10)
 WITHIN = 10.0
-# Measured and above ten tolerances; strict, so that an improvement shows. The ladder's errors are the problem's own
+# Measured and above ten tolerances. The ladder's errors are the problem's own
 # at the looser two: the one pendulum in its angle is off by 420 and 180 rtol there.
 MISSED = {
     ("car_axis", 1e-6): "velocity 23 rtol: an oscillation of 45 rad/s, whose velocity error is 45 position errors",
@@ -52,18 +52,21 @@ def reference_of(mechanism):
     return mechanism.reference
 
 
-@pytest.mark.parametrize("rtol", TOLERANCES)
 @pytest.mark.parametrize("name", sorted(MECHANISMS))
-def test_end_state(name, rtol, request):
-    """Positions and velocities at the end are within ten tolerances; constraints hold to 1e-12; energy is kept."""
-    if (name, rtol) in MISSED:
-        request.applymarker(pytest.mark.xfail(strict=True, reason=MISSED[name, rtol]))
-    mechanism = MECHANISMS[name]
-    traj = run(mechanism, rtol)
-    assert float(traj.residual()) <= 1e-12
-    assert name not in CONSERVATIVE or float(traj.drift()) <= 10 * rtol
-    errors = relative_errors(traj, reference_of(mechanism)) / rtol
-    assert np.all(errors <= WITHIN), errors
+def test_end_state(name):
+    """Positions and velocities at the end are within ten tolerances, or known to miss; constraints and energy hold.
+
+    A known miss that no longer misses fails too: it is then to be taken off the list.
+    """
+    mechanism, missed = MECHANISMS[name], {}
+    for rtol in TOLERANCES:
+        traj = run(mechanism, rtol)
+        assert float(traj.residual()) <= 1e-12
+        assert name not in CONSERVATIVE or float(traj.drift()) <= 10 * rtol
+        errors = relative_errors(traj, reference_of(mechanism)) / rtol
+        if not np.all(errors <= WITHIN):
+            missed[name, rtol] = errors
+    assert missed.keys() == {key for key in MISSED if key[0] == name}, missed
 
 
 @pytest.mark.parametrize(

@@ -28,7 +28,7 @@ def test_pendulum_on_two_rods():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("drift", ["project", "baumgarte", "none"])
+@pytest.mark.parametrize("drift", ["project", "none"])
 def test_door_swings_like_its_angle(drift):
     """A door with 18 equations of which 11 are independent follows its one-angle equation, whatever the drift control.
 
@@ -64,12 +64,11 @@ two_rods = lj.System(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("mode", [jax.jacfwd, jax.jacrev])
-def test_derivatives_in_lanes(mode):
-    """Forward and reverse derivatives of end and force, in lanes, are those of the pendulum on one rod."""
+def test_derivatives_in_lanes():
+    """Reverse derivatives of end and force, in lanes, are the forward ones of the pendulum in its angle."""
     lanes = {"g": jnp.array([9.8, 5.0]), "l": jnp.array([1.25, 2.0]), "v": jnp.array([2.5, -1.0])}
     one = lambda x: jnp.stack(outcome_of_one(x))
-    got = jax.vmap(mode(lambda x: outcome(two_rods, x)))(lanes)
+    got = jax.vmap(jax.jacrev(lambda x: outcome(two_rods, x)))(lanes)
     expected = jax.vmap(jax.jacfwd(one))(lanes)
     for name in lanes:
         assert np.all(np.isfinite(got[name]))
