@@ -34,6 +34,8 @@ BAUMGARTE_DECAYS = 50.0
 DRIFT_TOLERANCES = 1e3
 # The same change times the number of steps is about twenty times the phase that it shifts, in radians: a hundredth.
 PHASE_STEPS = 0.2
+# With fixed steps no tolerance says how much is expected.
+FIXED_STEPS_ALLOW = 1e-4
 # The tightest tolerance that is not below round-off.
 ROUND_OFFS = 8
 # What diffrax reports, in the words of a motion.
@@ -158,7 +160,7 @@ def _departure(system, motion, stats, settings):
     """How far what must stay constant has changed at the outputs, in units of what the tolerance lets expect.
 
     An error of the Jacobi integral that grows steadily shifts the phase by about its size a radian, so that over very
-    many steps less of it is allowed. With steps that the tolerance does not choose, a tenth is.
+    many steps less of it is allowed. With steps that the tolerance does not choose it counts for itself.
     """
     t, q, v, params = motion
     drift = residual = jnp.zeros_like(t[0])
@@ -167,7 +169,7 @@ def _departure(system, motion, stats, settings):
     if system.constraints and settings.drift != "project":
         residual = worst_residual(system, t, q, v, params)
     if settings.controller is not None:
-        return jnp.maximum(drift, residual) / 0.1
+        return jnp.maximum(drift, residual) / FIXED_STEPS_ALLOW
     rtol = jnp.maximum(settings.rtol[0], jnp.finfo(t.dtype).eps)
     phase = drift * stats["num_accepted_steps"] / PHASE_STEPS
     return jnp.maximum(jnp.maximum(drift, residual) / (DRIFT_TOLERANCES * rtol), phase)
