@@ -88,7 +88,7 @@ def integrate(
     - `ValueError` for a start off the constraints, or one where L or its equations are singular or not finite.
     - `RuntimeError` where the integration stops early: `max_steps` reached, or a step size that collapsed.
     - Warns (`lj.AccuracyWarning`) where the Jacobi integral must be constant and changed by 1000 tolerances, or by less
-      over thousands of steps, or by 1e-4 with fixed steps: where `departure` is above 1. In lanes look at that.
+      over thousands of steps, or by 1e-5 with fixed steps: where `departure` is above 1. In lanes look at that.
 
     Order and accuracy: those of `method`; `tests/motion/test_orders.py` measures them.
 

@@ -35,7 +35,7 @@ DRIFT_TOLERANCES = 1e3
 # The same change times the number of steps is about twenty times the phase that it shifts, in radians: a hundredth.
 PHASE_STEPS = 0.2
 # With fixed steps no tolerance says how much is expected.
-FIXED_STEPS_ALLOW = 1e-4
+FIXED_STEPS_ALLOW = 1e-5
 # The tightest tolerance that is not below round-off.
 ROUND_OFFS = 8
 # What diffrax reports, in the words of a motion.
