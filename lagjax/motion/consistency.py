@@ -41,18 +41,18 @@ class Projected(eqx.Module):
 
 
 @eqx.filter_jit
-def to_manifold(system, t, q, v, params, rtol, atol, independent=None) -> Projected:
+def to_manifold(system, t, q, v, params, rtol, atol) -> Projected:
     """The nearest state that satisfies all constraints, for a state near it: Newton with a fixed matrix.
 
     It holds where a displacement of `atol + rtol |y|` makes up for what is left of each residual, also of those
-    constraints that depend on others; `rtol` and `atol` are one number, or one for q and one for v. `independent`
-    says which equations to solve with; chosen at this state if None.
+    constraints that depend on others; `rtol` and `atol` are one number, or one for q and one for v.
     """
     x, unflatten = coordinates.flatten(q)
     u, _ = coordinates.flatten(v)
     mass = mass_and_forcing(system, t, x, u, params, unflatten).mass
     jacobian = constraints.jacobian(system, t, x, u, params, unflatten)
-    independent = independent_rows(jacobian) if independent is None else independent
+    # Chosen here and not at the step's start: the step may have come near a singular position.
+    independent = independent_rows(jacobian)
     # The matrix is not differentiated: where the residual vanishes its derivative does not count.
     to_displacement = lax.stop_gradient(displacement_map(mass, jacobian, independent))
     slope = lax.stop_gradient(jnp.sum(jnp.abs(jacobian), axis=1))

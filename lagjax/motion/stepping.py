@@ -122,7 +122,7 @@ class OnManifold(diffrax.AbstractWrappedSolver):
         if self.weigh and error is not None:
             error = self._weighed(y0, y1, error)
         if self.project:
-            projected = to_manifold(self.system, t1, *y1, args, *self.tolerances, stages.independent)
+            projected = to_manifold(self.system, t1, *y1, args, *self.tolerances)
             y1 = (projected.q, projected.v)
             error = jtu.tree_map(lambda x: jnp.where(projected.holds, x, jnp.inf), error)
             result = diffrax.RESULTS.where(projected.holds, result, diffrax.RESULTS.nonlinear_divergence)
