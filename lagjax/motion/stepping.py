@@ -11,16 +11,20 @@ from typing import NamedTuple
 
 import diffrax
 import equinox as eqx
+import equinox.internal as eqxi
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
+from jax import lax
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, PyTree
 
 from lagjax.mechanics.saddle_point import independent_equations
 from lagjax.mechanics.system import System
 from lagjax.motion.consistency import to_manifold
+from lagjax.numerics.one_function import called
 from lagjax.numerics.radau import Radau5
+from lagjax.numerics.runge_kutta import ExplicitRungeKutta
 
 # Without projection a state drifts off its constraints, and dependent ones then disagree by that much.
 DEPENDENT_BELOW_WHILE_DRIFTING = 1e-3
@@ -47,6 +51,15 @@ class Stages(NamedTuple):
     independent: Bool[Array, " m"] | None
 
 
+class Quick(eqx.Module):
+    """A step on equations that are written out, which may give NaN where the careful one does not."""
+
+    solver: ExplicitRungeKutta
+    terms: PyTree[diffrax.AbstractTerm]
+    project: Callable | None = eqx.field(static=True)
+    careful: bool = eqx.field(static=True)
+
+
 class OnManifold(diffrax.AbstractWrappedSolver):
     """Wrap `solver`: project after each step (where `project`), and step for dense output.
 
@@ -62,6 +75,7 @@ class OnManifold(diffrax.AbstractWrappedSolver):
     solver: diffrax.AbstractSolver
     system: System
     terms: PyTree[diffrax.AbstractTerm]
+    quick: Quick | None
     params: PyTree
     refused: Bool[Array, ""]
     tolerances: Tolerances
@@ -107,14 +121,53 @@ class OnManifold(diffrax.AbstractWrappedSolver):
         return self.solver.error_order(terms)
 
     def init(self, terms, t0, t1, y0, args):
+        if self.quick is not None:
+            return self.quick.solver.init(self.quick.terms, t0, t1, y0, args)
         return self.solver.init(terms, t0, t1, y0, self._stages(t0, y0, args))
 
     def func(self, terms, t0, y0, args):
         # Only used to choose the first step, which has to be finite even where the motion is refused.
-        rate = self.solver.func(terms, t0, y0, self._stages(t0, y0, args))
-        return jtu.tree_map(lambda f: jnp.where(self.refused, 0.0, f), rate)
+        if self.quick is not None:
+            rate = self.quick.terms.vf(t0, y0, args)
+        else:
+            rate = self.solver.func(terms, t0, y0, self._stages(t0, y0, args))
+        return jtu.tree_map(lambda f: jnp.where(self.refused | ~jnp.isfinite(f), 0.0, f), rate)
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
+        if self.quick is None:
+            y1, error, solver_state, result = self._careful_step(terms, t0, t1, y0, args, solver_state, made_jump)
+        else:
+            y1, error, solver_state, result = self._quick_step(t0, t1, y0, args, solver_state, made_jump)
+        # Infinite, a state would make its own error relative to it zero.
+        failed = self.refused | ~_all_finite((y1, error))
+        y1 = jtu.tree_map(lambda y1, y0: jnp.where(failed, y0, y1), y1, y0)
+        error = jtu.tree_map(lambda x: jnp.where(failed, jnp.inf, x), error)
+        result = diffrax.RESULTS.where(failed & (result == diffrax.RESULTS.successful), NOT_FINITE, result)
+        # Newton's iteration for an output starts from the polynomial of the step that it lies in.
+        continued = solver_state if isinstance(self.solver, Radau5) else None
+        return y1, error, {"y0": y0, "state": continued}, solver_state, result
+
+    def _quick_step(self, t0, t1, y0, args, solver_state, made_jump):
+        quick, project = self.quick, self.project
+        jumped = True if project else made_jump
+        y1, error, _, solver_state, result = quick.solver.step(quick.terms, t0, t1, y0, args, solver_state, jumped)
+        if project:
+            y1 = called(quick.project(self.system, t1, *y1, args))
+        if self.weigh:
+            error = self._weighed(y0, y1, error)
+        if not quick.careful:
+            return y1, error, solver_state, result
+        believed = _all_finite((y1, error))
+
+        def again():
+            state = self.solver.init(self.terms, t0, t1, y0, self._stages(t0, y0, args))
+            y1, error, _, result = self._careful_step(self.terms, t0, t1, y0, args, state, True)
+            return y1, error, quick.solver.init(quick.terms, t1, t1, y1, args), result
+
+        # A branch also in a batch, where it is taken for all lanes or none.
+        return lax.cond(eqxi.unvmap_all(believed), lambda: (y1, error, solver_state, result), again)
+
+    def _careful_step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         # The projection moves the state, so a derivative kept from the last step's end is stale.
         jumped = True if self.project else made_jump
         stages = self._stages(t0, y0, args)
@@ -126,14 +179,7 @@ class OnManifold(diffrax.AbstractWrappedSolver):
             y1 = (projected.q, projected.v)
             error = jtu.tree_map(lambda x: jnp.where(projected.holds, x, jnp.inf), error)
             result = diffrax.RESULTS.where(projected.holds, result, diffrax.RESULTS.nonlinear_divergence)
-        # Infinite, a state would make its own error relative to it zero.
-        failed = self.refused | ~_all_finite((y1, error))
-        y1 = jtu.tree_map(lambda y1, y0: jnp.where(failed, y0, y1), y1, y0)
-        error = jtu.tree_map(lambda x: jnp.where(failed, jnp.inf, x), error)
-        result = diffrax.RESULTS.where(failed & (result == diffrax.RESULTS.successful), NOT_FINITE, result)
-        # Newton's iteration for an output starts from the polynomial of the step that it lies in.
-        continued = solver_state if isinstance(self.solver, Radau5) else None
-        return y1, error, {"y0": y0, "state": continued}, solver_state, result
+        return y1, error, solver_state, result
 
     def acceptable(self, y0, y1, error):
         """Whether an output's error is not far above the tolerance; a step to it has not passed the controller.
