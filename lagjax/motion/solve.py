@@ -20,6 +20,7 @@ from lagjax.mechanics.coordinates import State
 from lagjax.mechanics.saddle_point import SINGULAR_BELOW, equations_of_motion, examined
 from lagjax.mechanics.written_out import in_numbers, is_small, write_out
 from lagjax.mechanics.structure import angles, conserves_jacobi_integral
+from lagjax.motion.arriving import Arriving
 from lagjax.motion.both_modes import solve_in_both_modes
 from lagjax.motion.consistency import stopped, to_manifold, within, worst_residual
 from lagjax.motion.sign_change import SignChange
@@ -78,7 +79,7 @@ def trajectory_of(system, q0, v0, params, ts, settings) -> Trajectory:
         return _solve_in_numbers(*eqx.combine(x, rest), settings, adjoint)
 
     if settings.adjoint is None:
-        fields = solve_in_both_modes(solved, x, fixed, partial(one_function, checked=True))
+        fields = solve_in_both_modes(solved, x, fixed, partial(one_function, checked=True, in_turn=True))
     else:
         fields = solved(x, fixed, settings.adjoint)
     arrays, described = pack(system, params, type(settings.method).__name__)
@@ -142,7 +143,7 @@ def _solve(system, q0, v0, params, ts, settings, adjoint, written):
         y0=y0,
         args=params,
         saveat=diffrax.SaveAt(ts=ts) if bare else diffrax.SaveAt(subs=(at_ts, at_end)),
-        stepsize_controller=_controller(ts, settings),
+        stepsize_controller=_controller(ts, settings, bare),
         adjoint=adjoint,
         event=_located_event(settings.event, ts),
         max_steps=settings.max_steps,
@@ -276,18 +277,25 @@ def _solver(system, terms, quick, start, refused, settings, adjoint):
         controlled=settings.controller is None,
         weigh=settings.controller is None and (settings.apart or any(angle)),
         project=settings.drift == "project",
+        arriving=_arriving(settings),
     )
 
 
-def _controller(ts, settings):
+def _arriving(settings):
+    # An event is looked for inside its step, and a controller of the user's chooses its steps itself.
+    return settings.controller is None and settings.event is None
+
+
+def _controller(ts, settings, bare):
     if settings.controller is not None:
         return settings.controller
     # A step that small no longer moves t: the solution is singular there, or was NaN from the start.
     dtmin = 16 * jnp.finfo(ts.dtype).eps * jnp.maximum(jnp.abs(ts[0]), jnp.abs(ts[-1]))
     # The largest error counts, not the mean: more coordinates should not loosen the tolerance of each.
-    return diffrax.PIDController(
+    controller = diffrax.PIDController(
         rtol=settings.rtol[0], atol=settings.atol[0], norm=optx.max_norm, dtmin=dtmin, force_dtmin=False
     )
+    return Arriving(controller, ts) if _arriving(settings) and not bare else controller
 
 
 def _located_event(event, ts):

@@ -66,6 +66,7 @@ class OnManifold(diffrax.AbstractWrappedSolver):
     A step that cannot be returned to the constraints is rejected; with a fixed step the solve ends there. `controlled`
     says that steps are chosen by the tolerances. `weigh` rescales the error for a controller that knows one tolerance:
     coordinates and velocities are judged each by their own, and the `angles` among the leaves of q by at most a turn.
+    `arriving` says that outputs are wanted at the ends of steps only.
 
     What the dense output needs of the problem (`terms`, `params`) belongs to the solver, since diffrax hands
     an interpolation only times and states. Where `refused`, and where a step is not finite, its error is infinite: an
@@ -83,6 +84,7 @@ class OnManifold(diffrax.AbstractWrappedSolver):
     controlled: bool = eqx.field(static=True)
     weigh: bool = eqx.field(static=True)
     project: bool = eqx.field(static=True)
+    arriving: bool = eqx.field(static=True)
 
     @property
     def term_structure(self):
@@ -108,7 +110,9 @@ class OnManifold(diffrax.AbstractWrappedSolver):
     def interpolation_cls(self) -> Callable:
         return self._between
 
-    def _between(self, *, t0, t1, y0, state):
+    def _between(self, *, t0, t1, y0, y1=None, state=None):
+        if self.arriving:
+            return Arrived(t0=t0, t1=t1, y0=y0, y1=y1)
         return SteppedTo(t0=t0, t1=t1, y0=y0, state=state, solver=self)
 
     def order(self, terms):
@@ -143,6 +147,8 @@ class OnManifold(diffrax.AbstractWrappedSolver):
         y1 = jtu.tree_map(lambda y1, y0: jnp.where(failed, y0, y1), y1, y0)
         error = jtu.tree_map(lambda x: jnp.where(failed, jnp.inf, x), error)
         result = diffrax.RESULTS.where(failed & (result == diffrax.RESULTS.successful), NOT_FINITE, result)
+        if self.arriving:
+            return y1, error, {"y0": y0, "y1": y1}, solver_state, result
         # Newton's iteration for an output starts from the polynomial of the step that it lies in.
         continued = solver_state if isinstance(self.solver, Radau5) else None
         return y1, error, {"y0": y0, "state": continued}, solver_state, result
@@ -211,6 +217,20 @@ class OnManifold(diffrax.AbstractWrappedSolver):
     def _stages(self, t, y, params):
         threshold = None if self.project else DEPENDENT_BELOW_WHILE_DRIFTING
         return Stages(params, independent_equations(self.system, t, *y, params, threshold))
+
+
+class Arrived(diffrax.AbstractLocalInterpolation):
+    """The state at an end of a step, where all outputs are: the first of them at the start."""
+
+    t0: PyTree
+    t1: PyTree
+    y0: PyTree
+    y1: PyTree
+
+    def evaluate(self, t0, t1=None, left=True):
+        if t1 is not None:
+            return jtu.tree_map(lambda b, a: b - a, self.evaluate(t1), self.evaluate(t0))
+        return jtu.tree_map(lambda y0, y1: jnp.where(t0 <= self.t0, y0, y1), self.y0, self.y1)
 
 
 class SteppedTo(diffrax.AbstractLocalInterpolation):

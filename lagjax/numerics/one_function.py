@@ -15,10 +15,13 @@ loops that its pass `small-while-loop-hoisting` has chosen. An XLA that does not
 """
 
 from collections.abc import Callable
+from functools import partial
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import jax.tree_util as jtu
+from jax import lax
 from jax.experimental.xla_metadata import set_xla_metadata
 from jax.extend.core import ClosedJaxpr, Jaxpr, Primitive, jaxpr_as_fun
 from jax.interpreters import ad, batching, mlir
@@ -47,7 +50,7 @@ WITH_BODIES = {
 }  # fmt: skip
 
 
-def one_function(function: Callable, *args, checked: bool = False):
+def one_function(function: Callable, *args, checked: bool = False, in_turn: bool = False):
     """`function(*args)`, compiled as one machine function where that is possible.
 
     >>> import jax.numpy as jnp
@@ -56,7 +59,8 @@ def one_function(function: Callable, *args, checked: bool = False):
 
     **Arguments:** pytrees, of which the arrays are passed and all else is compiled in; what `function` returns may
     contain anything too. It must not close over traced values. `checked` says that the checks of equinox
-    (`error_if`, calls of the host) in it are known to pass: they are left out.
+    (`error_if`, calls of the host) in it are known to pass: they are left out. In a batch on a CPU, with `in_turn`, the
+    function is called for one lane after the other.
 
     Derivatives and batches are those of the function itself; programs differentiated by JAX are not compiled so, and
     those who want it differentiate inside.
@@ -74,7 +78,7 @@ def one_function(function: Callable, *args, checked: bool = False):
     jaxpr, shapes = jax.make_jaxpr(of_leaves, return_shape=True)(*leaves)
     if checked:
         jaxpr = without_checks(jaxpr)
-    found = _one_function_p.bind(*leaves, jaxpr=jaxpr)
+    found = _one_function_p.bind(*leaves, jaxpr=jaxpr, in_turn=in_turn)
     return eqx.combine(jtu.tree_unflatten(jtu.tree_structure(shapes), found), rest[0])
 
 
@@ -143,11 +147,11 @@ def _calls_host(jaxpr):
     )
 
 
-def _plainly(*operands, jaxpr):
+def _plainly(*operands, jaxpr, **params):
     return jaxpr_as_fun(jaxpr)(*operands)
 
 
-def _marked(*operands, jaxpr):
+def _marked(*operands, jaxpr, **params):
     if not fits(jaxpr.jaxpr):
         return _plainly(*operands, jaxpr=jaxpr)
     # The mark of a result is put on what makes it: the call.
@@ -155,21 +159,64 @@ def _marked(*operands, jaxpr):
     return [set_xla_metadata(first, inlineable="false", xla_cpu_small_call="true"), *others]
 
 
-def _jvp(primals, tangents, *, jaxpr):
+def _jvp(evaluate, primals, tangents, **params):
     tangents = tuple(None if isinstance(t, ad.Zero) else t for t in tangents)
-    return eqx.filter_jvp(lambda *x: _plainly(*x, jaxpr=jaxpr), tuple(primals), tangents)
+    return eqx.filter_jvp(lambda *x: evaluate(*x, **params), tuple(primals), tangents)
 
 
-def _batched(operands, axes, *, jaxpr):
-    results = jax.vmap(lambda *x: _plainly(*x, jaxpr=jaxpr), axes)(*operands)
+def _batched(operands, axes, *, jaxpr, in_turn):
+    front = [x if axis is None else jnp.moveaxis(x, axis, 0) for x, axis in zip(operands, axes)]
+    lanes = next(x.shape[0] for x, axis in zip(front, axes) if axis is not None)
+    params = dict(jaxpr=jaxpr, batched=tuple(axis is not None for axis in axes), lanes=lanes)
+    results = _in_turn_p.bind(*front, **params) if in_turn else _lanes_together(*front, **params)
     return results, [0] * len(results)
 
 
-_one_function_p = Primitive("one_function")
-_one_function_p.multiple_results = True
-_one_function_p.def_impl(lambda *operands, jaxpr: jax.jit(lambda *x: _one_function_p.bind(*x, jaxpr=jaxpr))(*operands))
-_one_function_p.def_abstract_eval(lambda *operands, jaxpr: jaxpr.out_avals)
-ad.primitive_jvps[_one_function_p] = _jvp
-batching.primitive_batchers[_one_function_p] = _batched
-mlir.register_lowering(_one_function_p, mlir.lower_fun(_plainly, multiple_results=True))
-mlir.register_lowering(_one_function_p, mlir.lower_fun(_marked, multiple_results=True), platform="cpu")
+def _lanes_together(*operands, jaxpr, batched, lanes):
+    return jax.vmap(jaxpr_as_fun(jaxpr), [0 if b else None for b in batched])(*operands)
+
+
+def _lanes_in_turn(*operands, jaxpr, batched, lanes):
+    if not fits(jaxpr.jaxpr):
+        return _lanes_together(*operands, jaxpr=jaxpr, batched=batched, lanes=lanes)
+
+    def lane(mine):
+        mine = iter(mine)
+        return tuple(_marked(*(next(mine) if b else x for x, b in zip(operands, batched)), jaxpr=jaxpr))
+
+    return list(lax.map(lane, [x for x, b in zip(operands, batched) if b]))
+
+
+def _batched_again(operands, axes, *, jaxpr, batched, lanes):
+    more = next(x.shape[axis] for x, axis in zip(operands, axes) if axis is not None)
+    flat = []
+    for x, axis, b in zip(operands, axes, batched):
+        if axis is None and not b:
+            flat.append(x)
+            continue
+        x = jnp.broadcast_to(x, (more, *x.shape)) if axis is None else jnp.moveaxis(x, axis, 0)
+        x = x if b else jnp.broadcast_to(x[:, None], (more, lanes, *x.shape[1:]))
+        flat.append(x.reshape(more * lanes, *x.shape[2:]))
+    varied = tuple(b or axis is not None for b, axis in zip(batched, axes))
+    results = _in_turn_p.bind(*flat, jaxpr=jaxpr, batched=varied, lanes=more * lanes)
+    return [x.reshape(more, lanes, *x.shape[1:]) for x in results], [0] * len(results)
+
+
+def _lane_shapes(*operands, jaxpr, batched, lanes):
+    return [aval.update(shape=(lanes, *aval.shape)) for aval in jaxpr.out_avals]
+
+
+def _define(name, evaluate, on_cpu, shapes, batch):
+    primitive = Primitive(name)
+    primitive.multiple_results = True
+    primitive.def_impl(lambda *x, **params: jax.jit(lambda *x: primitive.bind(*x, **params))(*x))
+    primitive.def_abstract_eval(shapes)
+    ad.primitive_jvps[primitive] = partial(_jvp, evaluate)
+    batching.primitive_batchers[primitive] = batch
+    mlir.register_lowering(primitive, mlir.lower_fun(evaluate, multiple_results=True))
+    mlir.register_lowering(primitive, mlir.lower_fun(on_cpu, multiple_results=True), platform="cpu")
+    return primitive
+
+
+_one_function_p = _define("one_function", _plainly, _marked, lambda *x, jaxpr, in_turn: jaxpr.out_avals, _batched)
+_in_turn_p = _define("in_turn", _lanes_together, _lanes_in_turn, _lane_shapes, _batched_again)
