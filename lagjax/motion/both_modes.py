@@ -124,7 +124,9 @@ def _pull_by_pushing(x, fixed, wanted, cotangents, **params):
     sizes = [a.size if w else 0 for a, w in zip(x, wanted)]
     starts, total = np.cumsum([0, *sizes]), sum(sizes)
     axes = [
-        jnp.eye(total, a.size, -start, dtype=a.dtype).reshape(total, *a.shape) if w else jnp.zeros((total, *a.shape), a.dtype)
+        jnp.eye(total, a.size, -start, dtype=a.dtype).reshape(total, *a.shape)
+        if w
+        else jnp.zeros((total, *a.shape), a.dtype)
         for a, w, start in zip(x, wanted, starts)
     ]
     dy = _tangent_p.bind(*x, *fixed, *axes, many=True, **params)

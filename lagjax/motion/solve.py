@@ -18,7 +18,8 @@ from jaxtyping import Array, Float
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.coordinates import State
 from lagjax.mechanics.saddle_point import SINGULAR_BELOW, equations_of_motion, examined
-from lagjax.mechanics.written_out import in_numbers, is_small, write_out
+from lagjax.mechanics.in_numbers import Numbers, in_numbers
+from lagjax.mechanics.written_out import is_small, write_out
 from lagjax.mechanics.structure import angles, conserves_jacobi_integral
 from lagjax.motion.arriving import Arriving
 from lagjax.motion.both_modes import solve_in_both_modes
@@ -128,15 +129,18 @@ def _solve(system, q0, v0, params, ts, settings, adjoint, written):
     terms = diffrax.ODETerm(_vector_field(system, ts, settings.drift))
     quick = None
     if written is not None and settings.drift != "baumgarte":
-        field = diffrax.ODETerm(_written_field(written, system))
-        quick = Quick(settings.method, field, written.project, written.careful)
+        field = WrittenField(written.equations, written.equations.prepare(system, params))
+        prepared = written.project.prepare(system, params) if written.project else ()
+        quick = Quick(settings.method, diffrax.ODETerm(field), written.project, prepared, written.careful)
     # BacksolveAdjoint integrates a larger state backwards: it takes the bare method, and no end beside the outputs.
     bare = isinstance(adjoint, diffrax.BacksolveAdjoint)
     settings = eqx.tree_at(lambda s: s.method, settings, _with_root_finder(settings))
     at_ts, at_end = diffrax.SubSaveAt(ts=ts), diffrax.SubSaveAt(t1=True)
     solution = diffrax.diffeqsolve(
         terms if quick is None else quick.terms,
-        settings.method if bare else _solver(system, terms, quick, State(ts[0], q0, v0, params), refused, settings, adjoint),
+        settings.method
+        if bare
+        else _solver(system, terms, quick, State(ts[0], q0, v0, params), refused, settings, adjoint),
         t0=ts[0],
         t1=ts[-1],
         dt0=settings.dt0,
@@ -220,14 +224,15 @@ def _vector_field(system, ts, drift):
     return field
 
 
-def _written_field(written, system):
-    """The same from the equations written out."""
+class WrittenField(eqx.Module):
+    """The same from the equations written out, with what does not depend on the state computed before."""
 
-    def field(t, y, params):
+    equations: Numbers = eqx.field(static=True)
+    prepared: tuple
+
+    def __call__(self, t, y, params):
         q, v = y
-        return v, called(written.equations(system, t, q, v, params))[0]
-
-    return field
+        return v, called(self.equations.at(self.prepared, t, q, v))[0]
 
 
 def _event_in_numbers(event, unflatten):

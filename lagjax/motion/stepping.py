@@ -21,6 +21,7 @@ from jaxtyping import Array, Bool, Float, PyTree
 
 from lagjax.mechanics.saddle_point import independent_equations
 from lagjax.mechanics.system import System
+from lagjax.mechanics.in_numbers import Numbers
 from lagjax.motion.consistency import to_manifold
 from lagjax.numerics.one_function import called
 from lagjax.numerics.radau import Radau5
@@ -56,7 +57,8 @@ class Quick(eqx.Module):
 
     solver: ExplicitRungeKutta
     terms: PyTree[diffrax.AbstractTerm]
-    project: Callable | None = eqx.field(static=True)
+    project: Numbers | None = eqx.field(static=True)
+    prepared: tuple
     careful: bool = eqx.field(static=True)
 
 
@@ -158,7 +160,7 @@ class OnManifold(diffrax.AbstractWrappedSolver):
         jumped = True if project else made_jump
         y1, error, _, solver_state, result = quick.solver.step(quick.terms, t0, t1, y0, args, solver_state, jumped)
         if project:
-            y1 = called(quick.project(self.system, t1, *y1, args))
+            y1 = called(quick.project.at(quick.prepared, t1, *y1))
         if self.weigh:
             error = self._weighed(y0, y1, error)
         if not quick.careful:

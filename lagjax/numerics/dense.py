@@ -107,23 +107,26 @@ class Saddle:
 
     For programs that are written out (`scalars.py`), where the zeros of M and A cost nothing. `believed` says whether
     the answers are as accurate as with pivoting: M is definite (or every pivot the largest of its column), and no row of
-    A depends on those before it.
+    A depends on those before it. A `diagonal` M without A is divided by: what is singular gives NaN or infinity.
 
     Source: Golub & Van Loan, *Matrix Computations*, §4.1.2.
     """
 
-    def __init__(self, mass: Float[Array, "n n"], jacobian: Float[Array, "m n"]):
+    def __init__(self, mass: Float[Array, "n n"], jacobian: Float[Array, "m n"], diagonal: bool = False):
         self.n, self.m = n, m = mass.shape[0], jacobian.shape[0]
         entry = lambda i, j: mass[i, j] if i < n else jacobian[i - n, j] if j < n else jnp.zeros_like(mass[0, 0])
         self.matrix = matrix = [[entry(max(i, j), min(i, j)) for j in range(n + m)] for i in range(n + m)]
         work = [row[: i + 1] for i, row in enumerate(matrix)]
         self.lower, self.pivots = [[] for _ in work], []
         schur = []
-        positive = negative = largest = independent = True
+        positive = negative = largest = independent = nonzero = True
         for k in range(n + m):
             if k == n:
                 schur = [work[i][i] for i in range(n, n + m)]
             pivot = work[k][k]
+            # What is not believed is computed too, and must not put NaN into the derivatives of what is taken instead.
+            nonzero = nonzero & (pivot != 0)
+            pivot = pivot if diagonal else jnp.where(pivot != 0, pivot, 1.0)
             self.pivots.append(pivot)
             column = [work[i][k] for i in range(k + 1, n + m)]
             if k < n:
@@ -139,7 +142,7 @@ class Saddle:
                 for j in range(k + 1, i + 1):
                     work[i][j] = work[i][j] - factor * column[j - k - 1]
         definite = positive | negative
-        self.believed = (definite & independent) if m else (definite | largest)
+        self.believed = diagonal or nonzero & ((definite & independent) if m else (definite | largest))
 
     def solve(self, forcing: Float[Array, " n"], gamma: Float[Array, " m"], refine: bool = True):
         """a and λ of `M a - Aᵀ λ = F`, `A a = gamma`; with constraints, refined once."""

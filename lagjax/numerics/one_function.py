@@ -26,6 +26,8 @@ from jax.experimental.xla_metadata import set_xla_metadata
 from jax.extend.core import ClosedJaxpr, Jaxpr, Primitive, jaxpr_as_fun
 from jax.interpreters import ad, batching, mlir
 
+from lagjax.numerics.programs import bodies
+
 # Reductions and products above this become calls of a library.
 LARGE = 1024
 AT_ANY_SIZE = {
@@ -111,16 +113,6 @@ def _equation_fits(equation):
     return name in WITH_BODIES and all(fits(body) for body in bodies(equation))
 
 
-def bodies(equation) -> list[Jaxpr]:
-    """The programs inside a primitive: branches, loop bodies, called functions."""
-    found = []
-    for value in equation.params.values():
-        for item in value if isinstance(value, (tuple, list)) else (value,):
-            if isinstance(item, (ClosedJaxpr, Jaxpr)):
-                found.append(getattr(item, "jaxpr", item))
-    return found
-
-
 def without_checks(closed: ClosedJaxpr) -> ClosedJaxpr:
     """The program with each branch that calls the host replaced by the one beside it that does not."""
     if not _calls_host(closed.jaxpr):
@@ -154,9 +146,15 @@ def _plainly(*operands, jaxpr, **params):
 def _marked(*operands, jaxpr, **params):
     if not fits(jaxpr.jaxpr):
         return _plainly(*operands, jaxpr=jaxpr)
+
+    def function(*operands):
+        # XLA ends the process where an operand of such a call is never used, also one that it finds out not to need:
+        # each of them is a result too.
+        return *jaxpr_as_fun(jaxpr)(*operands), *map(jnp.copy, operands)
+
     # The mark of a result is put on what makes it: the call.
-    first, *others = jax.jit(jaxpr_as_fun(jaxpr))(*operands)
-    return [set_xla_metadata(first, inlineable="false", xla_cpu_small_call="true"), *others]
+    first, *others = jax.jit(function)(*operands)
+    return [set_xla_metadata(first, inlineable="false", xla_cpu_small_call="true"), *others][: len(jaxpr.out_avals)]
 
 
 def _jvp(evaluate, primals, tangents, **params):

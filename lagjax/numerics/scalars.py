@@ -14,7 +14,9 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import ClosedJaxpr, Literal, jaxpr_as_fun
+from jax.extend.core import ClosedJaxpr, Literal
+
+from lagjax.numerics.programs import evaluate
 
 LARGE = 256
 ELEMENTWISE = {
@@ -77,7 +79,7 @@ def _joined(value, aval):
     if not isinstance(value, np.ndarray):
         return value.array
     if value.shape == ():
-        return jnp.asarray(value[()], aval.dtype)
+        return value[()]
     entries = [jnp.asarray(x, aval.dtype) for x in value.reshape(-1)]
     return jnp.stack(entries).reshape(aval.shape) if entries else jnp.zeros(aval.shape, aval.dtype)
 
@@ -110,20 +112,9 @@ def _apply(equation, operands, jaxpr):
         found = MOVES[name](params, equation.outvars, *operands)
         if found is not None:
             return found
-    # As a program of this one equation, which JAX knows how to evaluate.
-    alone = jaxpr.replace(constvars=[], invars=_variables(equation), outvars=equation.outvars, eqns=[equation])
-    whole = [_joined(x, v.aval) for x, v in zip(operands, equation.invars) if not isinstance(v, Literal)]
-    seen, distinct = set(), []
-    for v, x in zip((v for v in equation.invars if not isinstance(v, Literal)), whole):
-        if v not in seen:
-            seen.add(v)
-            distinct.append(x)
-    results = jaxpr_as_fun(ClosedJaxpr(alone, ()))(*distinct)
+    whole = {v: _joined(x, v.aval) for x, v in zip(operands, equation.invars) if not isinstance(v, Literal)}
+    results = evaluate(jaxpr, equation, whole)
     return [_split(x) if _small(v.aval) else x for x, v in zip(map(_Value, results), equation.outvars)]
-
-
-def _variables(equation):
-    return list(dict.fromkeys(x for x in equation.invars if not isinstance(x, Literal)))
 
 
 def _programs(params):
@@ -291,6 +282,12 @@ def _product(params, variables, x, y):
     return [_filled(variables[0].aval.shape, entries)]
 
 
+def _unstacked(params, variables, x):
+    return [
+        _filled(v.aval.shape, list(part.reshape(-1))) for v, part in zip(variables, np.moveaxis(x, params["axis"], 0))
+    ]
+
+
 def _split_up(params, variables, x):
     return np.split(x, np.cumsum(params["sizes"])[:-1], params["axis"])
 
@@ -318,5 +315,11 @@ MOVES: dict[str, Callable] = {
     "slice": _sliced,
     "split": _split_up,
     "squeeze": lambda params, variables, x: [x.reshape(variables[0].aval.shape)],
+    "stack": lambda params, variables, *x: [
+        np.stack([y.reshape(1, -1) for y in x], 0).reshape(-1, *x[0].shape)
+        if params["axis"] == 0
+        else np.moveaxis(np.stack([np.atleast_1d(y) for y in x], 0), 0, params["axis"])
+    ],
+    "unstack": _unstacked,
     "transpose": lambda params, variables, x: [x.transpose(params["permutation"])],
 }
