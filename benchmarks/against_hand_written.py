@@ -94,18 +94,9 @@ def evaluations_in(function):
 def calls(case, params, right_hand_sides, batched):
     """The compiled loops, each a function of the number of evaluations."""
     state = lanes_of(case) if batched else jax.tree.map(jnp.asarray, [case.q0, case.v0])
-    whole = [as_one_function(loop(f)) for f in right_hand_sides]
+    whole = [lambda *inputs, f=f: one_function(loop(f), *inputs) for f in right_hand_sides]
     programs = [jax.jit(jax.vmap(f, (None, 0, 0, None)) if batched else f) for f in whole]
-    return [lambda count, program=program: program(count, *state, params)[0] for program in programs]
-
-
-def as_one_function(function):
-    """`one_function` of it, with the arguments among the results: XLA aborts where one of them is not used."""
-
-    def with_arguments(*arguments):
-        return function(*arguments), jax.tree.map(jnp.copy, arguments)
-
-    return lambda *arguments: one_function(with_arguments, *arguments)
+    return [lambda count, program=program: program(count, *state, params) for program in programs]
 
 
 def compared(case, batched):

@@ -2,7 +2,8 @@
 
 A speed is a ratio of two things measured in turn in one process, so that whatever else the machine does falls on both.
 Everything is called once before it is timed: compiling is not running. Medians are what is reported; minima stand
-beside them, for a machine that is never quite at rest.
+beside them, for a machine that is never quite at rest. On one that others use too, `--processor-time` counts the time
+in which the process ran, over all its threads.
 """
 
 import argparse
@@ -19,6 +20,9 @@ import numpy as np
 
 PACKAGES = ("lagjax", "jax", "diffrax", "numpy", "scipy", "numba", "heyoka", "casadi", "scikit-sundae", "mujoco")
 
+# What `in_turn` reads; `main` changes it where `--processor-time` asks.
+CLOCK = {"seconds": time.perf_counter}
+
 
 class Times(NamedTuple):
     """Median and least seconds of each function, in the order given, and all of them, (repeats, functions)."""
@@ -28,7 +32,7 @@ class Times(NamedTuple):
     turns: np.ndarray
 
     def ratio(self, of=0, to=1):
-        """The median of the turns' ratios, which a machine that is slow for a while leaves alone, and that of minima."""
+        """The median of the turns' ratios, which a machine slow for a while leaves alone, and the ratio of minima."""
         return float(np.median(self.turns[:, of] / self.turns[:, to])), self.minima[of] / self.minima[to]
 
 
@@ -47,10 +51,10 @@ def in_turn(*functions, repeats=15, shortest=0.0) -> Times:
 
 
 def _seconds(function, calls):
-    started = time.perf_counter()
+    started = CLOCK["seconds"]()
     for _ in range(calls):
         jax.block_until_ready(function())
-    return (time.perf_counter() - started) / calls
+    return (CLOCK["seconds"]() - started) / calls
 
 
 def compiled(function, *arguments):
@@ -92,8 +96,12 @@ def main(rows, doc, draw=None):
     parser.add_argument("--only", metavar="TEXT", default="", help="measure only the rows whose name contains it")
     if draw:
         parser.add_argument("--plot", metavar="FILE", help="draw what was measured")
+    parser.add_argument("--processor-time", action="store_true", help="not wall time; for a machine others use too")
     options = parser.parse_args()
-    print(f"{machine()}; " + ", ".join(f"{name} {version}" for name, version in versions().items()))
+    if options.processor_time:
+        CLOCK["seconds"] = time.process_time
+    clock = "processor time" if options.processor_time else "wall time"
+    print(f"{machine()}, {clock}; " + ", ".join(f"{name} {version}" for name, version in versions().items()))
     found = []
     for line in rows(lambda what: options.only.lower() in what.lower()):
         found.append(line)
@@ -101,7 +109,7 @@ def main(rows, doc, draw=None):
     if not found:
         parser.error(f"no row's name contains {options.only!r}")
     if options.json:
-        result = {"machine": machine(), "versions": versions(), "rows": found}
+        result = {"machine": machine(), "clock": clock, "versions": versions(), "rows": found}
         Path(options.json).write_text(json.dumps(result, indent=1) + "\n")
     if draw and options.plot:
         draw(options.plot)

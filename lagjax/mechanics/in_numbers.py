@@ -15,7 +15,7 @@ import numpy as np
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.constraints import Holonomic, Nonholonomic
 from lagjax.mechanics.system import System
-from lagjax.numerics.programs import needed, staged
+from lagjax.numerics.programs import length, needed, staged
 from lagjax.numerics.scalars import written_out
 
 
@@ -70,6 +70,11 @@ class Numbers:
         self.state_variables = [self.program.jaxpr.invars[i] for i in of_state]
         early, late = staged(self.program, of_problem, of_state)
         self._early, self._late = jax.jit(early), jax.jit(late)
+
+    @property
+    def length(self) -> int:
+        """How many operations it consists of."""
+        return length(self.program.jaxpr)
 
     def prepare(self, system, params) -> tuple:
         """What does not depend on the state."""

@@ -67,6 +67,8 @@ def _believed(system, t, q, v, params):
 def _quickly(system, t, q, v, params):
     """The same from the equations written out, where these suffice."""
     written = write_out(system, t, q, v, params)
+    if written is None:
+        return _believed(system, t, q, v, params)
     a, stacked = written.equations(system, t, q, v, params)
     solution = a, constraints.split(system, stacked, t, q, v, params)
     if not written.careful:

@@ -31,6 +31,8 @@ from lagjax.numerics import dense
 
 # Coordinates and constraint equations together: beyond, the code grows with their cube.
 UP_TO = 8
+# Operations of a program that takes long to compile, as of an L with tables in it.
+LONG = 2000
 # Two iterations are enough where the second one moves the state by less than this part of its size.
 SMALL_CORRECTION = 1e-7
 
@@ -52,13 +54,15 @@ def is_small(system, t, q, v, params) -> bool:
     return size + constraints.count(system, t, q, v, params) <= UP_TO
 
 
-def write_out(system, t, q, v, params) -> WrittenOut:
-    """The equations of a small system near a state, of which only shapes count."""
+def write_out(system, t, q, v, params) -> WrittenOut | None:
+    """The equations of a small system near a state, of which only shapes count; None where L makes them too long."""
     count = constraints.count(system, t, q, v, params)
     args = (system, t, q, v, params)
     diagonal = count == 0 and is_diagonal(*args)
-    project = Numbers(_projected, args) if count else None
-    return WrittenOut(Numbers(partial(_equations, diagonal), args), project, careful=not diagonal)
+    equations = Numbers(partial(_equations, diagonal), args)
+    if equations.length > LONG:
+        return None
+    return WrittenOut(equations, Numbers(_projected, args) if count else None, careful=not diagonal)
 
 
 def _equations(diagonal, system, t, q, v, params):

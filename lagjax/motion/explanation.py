@@ -10,7 +10,9 @@ from lagjax.mechanics.constraints import Holonomic
 from lagjax.mechanics.diagnosis import dependencies, describe, equation_names, explain_failure, listed
 from lagjax.mechanics.lagrangian import check_scalar
 from lagjax.mechanics.saddle_point import examined
+from lagjax.mechanics.structure import Structure, structure
 from lagjax.mechanics.system import System
+from lagjax.mechanics.written_out import is_small
 from lagjax.motion.consistency import departures, to_manifold, within
 from lagjax.numerics.rank import independent_rows
 
@@ -26,6 +28,7 @@ class Explanation:
     - `degrees_of_freedom`: velocities left free, coordinates less independent constraint equations.
     - `position_freedoms`: positions left free; more than the former where velocities alone are constrained.
     - `dependent`: each dependent equation, followed by those that it is a combination of.
+    - `structure`: what holds at every state, a `Structure`; None for large systems.
     - `mass_matrix`: its definiteness in words; `problem`: why the equations fail there, or None.
     """
 
@@ -35,6 +38,7 @@ class Explanation:
     position_freedoms: int
     dependent: tuple[tuple[str, ...], ...]
     mass_matrix: str
+    structure: Structure | None
     problem: str | None
     rows: tuple[tuple[str, str], ...]
 
@@ -59,7 +63,9 @@ def explain(system: System, q, v, params=None, *, t=0.0) -> Explanation:
       equations           2, of which 1 independent
       dependent           'rod' restricts the same motion as 'again'; their multipliers are the shortest
       degrees of freedom  1
-      mass matrix         positive definite
+      mass matrix         positive definite, diagonal, constant
+      cyclic in L         x, y
+      solved              2 accelerations and 2 multipliers by elimination without the zeros
 
     **Arguments:** `q` and `v` alike, `params` as the system takes it, `t` scalar. A state near the constraints is
     moved onto them first: dependent constraints agree only there.
@@ -94,8 +100,12 @@ def explain(system: System, q, v, params=None, *, t=0.0) -> Explanation:
     if off:
         rows.append(("off the constraints", off))
     rows.append(("degrees of freedom", f"{len(names) - independent}"))
-    rows.append(("mass matrix", mass))
+    found_structure = structure(system, *s)
+    rows.append(("mass matrix", mass if found_structure is None else f"{mass}, {_of_mass(found_structure)}"))
+    if found_structure is not None:
+        rows += _of_structure(found_structure)
     rows += [(name, "yes") for name in ("force", "dissipation") if getattr(system, name) is not None]
+    rows.append(("solved", _how_solved(system, s, found_structure)))
     if problem:
         rows.append(("problem", problem.replace("\n", "\n    ")))
     return Explanation(
@@ -105,6 +115,7 @@ def explain(system: System, q, v, params=None, *, t=0.0) -> Explanation:
         position_freedoms=len(names) - int(independent_rows(jacobian[holonomic]).sum()),
         dependent=groups,
         mass_matrix=mass,
+        structure=found_structure,
         problem=problem,
         rows=tuple(rows),
     )
@@ -124,6 +135,41 @@ def _in_words(group):
     if not others:
         return f"'{dependent}' restricts nothing"
     return f"'{dependent}' restricts the same motion as {listed(others)}; their multipliers are the shortest"
+
+
+def _of_mass(found):
+    shape = "diagonal" if all(len(block) == 1 for block in found.blocks) else "dense"
+    if shape == "dense" and len(found.blocks) > 1:
+        shape = "in blocks (" + "), (".join(", ".join(block) for block in found.blocks) + ")"
+    depends = f"depends on {', '.join(found.mass_depends_on)}" if found.mass_depends_on else "constant"
+    return f"{shape}, {depends}"
+
+
+def _of_structure(found):
+    rows = [("time", "explicit")] if found.explicit_time else []
+    if found.cyclic:
+        rows.append(("cyclic in L", ", ".join(found.cyclic)))
+    if found.linear_terms:
+        rows.append(("linear in velocity", f"L has such terms in {', '.join(found.linear_terms)} (gyroscopic forces)"))
+    for name, constraint in found.constraints.items():
+        words = [word for word, holds in (("linear", constraint.linear), ("moving", constraint.moving)) if holds]
+        rows += [(f"constraint '{name}'", ", ".join(words))] if words else []
+    return rows
+
+
+def _how_solved(system, s, found):
+    """What the compiled program does at each evaluation."""
+    n, m = coordinates.flatten(s.q)[0].size, constraints.count(system, *s)
+    if not is_small(system, *s):
+        return f"{n + m} equations by LAPACK"
+    if n == 1 and not m:
+        return "one division"
+    if m:
+        return f"{n} accelerations and {m} multiplier{'s' * (m > 1)} by elimination without the zeros"
+    once = " before the loop" if not found.mass_depends_on else ""
+    if all(len(block) == 1 for block in found.blocks):
+        return f"{n} divisions{once}"
+    return f"{n} equations by elimination without the zeros"
 
 
 def _definiteness(mass, names):

@@ -52,6 +52,10 @@ TRANSLATED = {
 }
 
 
+# The operations of a right-hand side that is copied to each of the stages; longer ones are compiled once, in a loop.
+UNROLL_UP_TO = 250
+
+
 class Settings(eqx.Module):
     """How to integrate: everything but the system, the state and the times."""
 
@@ -131,7 +135,8 @@ def _solve(system, q0, v0, params, ts, settings, adjoint, written):
     if written is not None and settings.drift != "baumgarte":
         field = WrittenField(written.equations, written.equations.prepare(system, params))
         prepared = written.project.prepare(system, params) if written.project else ()
-        quick = Quick(settings.method, diffrax.ODETerm(field), written.project, prepared, written.careful)
+        stages = settings.method if written.equations.length <= UNROLL_UP_TO else _in_a_loop(settings.method, adjoint)
+        quick = Quick(stages, diffrax.ODETerm(field), written.project, prepared, written.careful)
     # BacksolveAdjoint integrates a larger state backwards: it takes the bare method, and no end beside the outputs.
     bare = isinstance(adjoint, diffrax.BacksolveAdjoint)
     settings = eqx.tree_at(lambda s: s.method, settings, _with_root_finder(settings))
@@ -265,13 +270,9 @@ def _with_root_finder(settings):
 
 
 def _solver(system, terms, quick, start, refused, settings, adjoint):
-    reverse = isinstance(adjoint, diffrax.RecursiveCheckpointAdjoint)
     angle = tuple(jax.tree.leaves(angles(system, *start)))
-    method = settings.method
-    if isinstance(method, ExplicitRungeKutta):
-        method = eqx.tree_at(lambda s: s.scan_kind, method.shipped, "lax", is_leaf=lambda x: x is None)
     return OnManifold(
-        solver=forward_differentiable(method) if reverse else method,
+        solver=_in_a_loop(settings.method, adjoint),
         system=system,
         terms=terms,
         quick=quick,
@@ -284,6 +285,15 @@ def _solver(system, terms, quick, start, refused, settings, adjoint):
         project=settings.drift == "project",
         arriving=_arriving(settings),
     )
+
+
+def _in_a_loop(method, adjoint):
+    """The method with a loop over its stages, of the kind that the derivative needs."""
+    ours = isinstance(method, ExplicitRungeKutta)
+    method = method.shipped if ours else method
+    if isinstance(adjoint, diffrax.RecursiveCheckpointAdjoint):
+        return forward_differentiable(method)
+    return eqx.tree_at(lambda s: s.scan_kind, method, "lax", is_leaf=lambda x: x is None) if ours else method
 
 
 def _arriving(settings):

@@ -25,7 +25,6 @@ from lagjax.mechanics.in_numbers import Numbers
 from lagjax.motion.consistency import to_manifold
 from lagjax.numerics.one_function import called
 from lagjax.numerics.radau import Radau5
-from lagjax.numerics.runge_kutta import ExplicitRungeKutta
 
 # Without projection a state drifts off its constraints, and dependent ones then disagree by that much.
 DEPENDENT_BELOW_WHILE_DRIFTING = 1e-3
@@ -55,7 +54,7 @@ class Stages(NamedTuple):
 class Quick(eqx.Module):
     """A step on equations that are written out, which may give NaN where the careful one does not."""
 
-    solver: ExplicitRungeKutta
+    solver: diffrax.AbstractSolver
     terms: PyTree[diffrax.AbstractTerm]
     project: Numbers | None = eqx.field(static=True)
     prepared: tuple

@@ -16,6 +16,11 @@ def bodies(equation) -> list[Jaxpr]:
     return found
 
 
+def length(jaxpr: Jaxpr) -> int:
+    """How many operations a program consists of, those inside its loops and functions included."""
+    return sum(1 + sum(map(length, bodies(equation))) for equation in jaxpr.eqns)
+
+
 def variables(equation) -> list:
     """The distinct operands of an equation that are not written in it."""
     return list(dict.fromkeys(x for x in equation.invars if not isinstance(x, Literal)))

@@ -18,7 +18,7 @@ from jax.extend.core import ClosedJaxpr, Literal
 
 from lagjax.numerics.programs import evaluate
 
-LARGE = 256
+LARGE = 64
 ELEMENTWISE = {
     "abs", "acos", "acosh", "add", "add_any", "and", "asin", "asinh", "atan", "atan2", "atanh", "cbrt", "ceil", "clamp",
     "cos", "cosh", "convert_element_type", "digamma", "div", "eq", "erf", "erf_inv", "erfc", "exp", "exp2", "expm1",

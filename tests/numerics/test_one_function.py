@@ -1,0 +1,92 @@
+"""A program as one machine function: same results, same derivatives, and compiled so only where XLA can."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import lax
+
+from lagjax.numerics.one_function import fits, one_function, without_checks
+
+
+def grown(x, y):
+    """A loop of numbers whose length depends on them."""
+    return lax.while_loop(lambda s: s[0] < 100.0, lambda s: (1.5 * s[0] + s[1], jnp.sin(s[0]) + s[1]), (x, y))
+
+
+def entry(function, *args):
+    """The outermost part of a compiled program."""
+    text = jax.jit(function).lower(*args).compile().as_text()
+    return text[text.index("ENTRY") :]
+
+
+whole = lambda x, y: one_function(grown, x, y)
+TWO = (jnp.asarray(2.0), jnp.asarray(0.3))
+
+
+def test_same_results_and_derivatives():
+    """Value, forward derivative and batch are those of the function."""
+    np.testing.assert_array_equal(whole(*TWO), grown(*TWO))
+    forward = jax.jit(jax.jacfwd(whole))(*TWO)
+    np.testing.assert_allclose(forward, jax.jacfwd(grown)(*TWO), rtol=1e-14)
+    power = lambda x: one_function(lambda x: {"p": x**3}, x)["p"]
+    np.testing.assert_allclose(jax.grad(power)(TWO[0]), 12.0, rtol=1e-15)
+
+
+def test_lanes_in_turn():
+    """A batch, and a batch of batches, of lanes of different lengths."""
+    x, y = jnp.linspace(1.0, 50.0, 6), jnp.asarray(0.3)
+    in_turn = lambda x, y: one_function(grown, x, y, in_turn=True)
+    expected = jax.vmap(grown, (0, None))(x, y)
+    np.testing.assert_allclose(jax.jit(jax.vmap(in_turn, (0, None)))(x, y), expected, rtol=1e-14)
+    nested = jax.vmap(jax.vmap(in_turn, (0, None)), (None, 0))
+    found = jax.jit(nested)(x, jnp.array([0.3, 0.3]))
+    np.testing.assert_allclose(found[0][1], expected[0], rtol=1e-14)
+
+
+@pytest.mark.skipif(jax.default_backend() != "cpu", reason="one function is for CPUs")
+def test_compiled_as_one_call():
+    """The loop is inside the call that we marked; plainly compiled, or with a library call in it, it is not."""
+    marked = entry(whole, *TWO)
+    assert 'inlineable="false"' in marked and "xla_cpu_small_call" in marked and "while(" not in marked
+    assert 'inlineable="false"' not in entry(grown, *TWO)
+    solve = lambda a: one_function(lambda a: jnp.linalg.solve(a, a[0]), a)
+    assert 'inlineable="false"' not in entry(solve, jnp.eye(9))
+
+
+def test_operands_that_are_not_needed():
+    """One that is not used, and one that XLA finds out not to be: either would end the process if it were dropped."""
+    never = jax.jit(lambda x, y: one_function(lambda x, y: 2 * x, x, y))
+    found_out = jax.jit(lambda x, y: one_function(lambda x, y: jnp.where(jnp.asarray(1.0) > 0, 2 * x, y), x, y))
+    assert never(*TWO) == found_out(*TWO) == 4.0
+
+
+def test_checks_are_left_out_where_they_are_known_to_pass():
+    """`error_if` calls the host; without it the program fits, and gives the same."""
+
+    def checked(x):
+        return 3 * eqx.error_if(x, x < 0, "negative")
+
+    program = jax.make_jaxpr(checked)(TWO[0])
+    assert not fits(program.jaxpr) and fits(without_checks(program).jaxpr)
+    assert one_function(checked, TWO[0], checked=True) == 6.0
+    with pytest.raises(Exception, match="negative"):
+        jax.block_until_ready(jax.jit(lambda x: one_function(checked, x))(-TWO[0]))
+
+
+@pytest.mark.parametrize(
+    ("function", "expected"),
+    [
+        (lambda x: jnp.sort(x), False),
+        (lambda x: jnp.sum(jnp.outer(x, x) @ x), True),
+        (lambda x: jnp.sum(jnp.tile(x, 1000)), False),
+        (lambda x: x.at[2].set(1.0), True),
+        (lambda x: x.at[jnp.array([0, 2])].add(1.0), False),
+        (lambda x: jax.pure_callback(lambda x: x, x, x), False),
+        (lambda x: lax.scan(lambda c, x: (c + x, jnp.linalg.cholesky(jnp.eye(3) * c)), x[0], x)[1], False),
+    ],
+)
+def test_what_fits(function, expected):
+    """Library calls, large reductions and general scatters do not fit, also inside a loop."""
+    assert fits(jax.make_jaxpr(function)(jnp.arange(5.0)).jaxpr) is expected

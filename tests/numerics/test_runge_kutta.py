@@ -1,0 +1,81 @@
+"""Our explicit methods in plain diffrax: diffrax's own results, the claimed orders, and zeros that cost nothing."""
+
+from typing import ClassVar
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from lagjax import Dopri8, Tsit5
+
+ENDS = (0.0, 5.0)
+PAIRS = [(Tsit5(), diffrax.Tsit5()), (Dopri8(), diffrax.Dopri8())]
+name_of = lambda value: type(value).__name__
+
+
+def swing(t, y, args):
+    """A pendulum that is pushed, with its state as a pytree."""
+    return {"angle": y["rate"], "rate": -jnp.sin(y["angle"]) + 0.1 * jnp.cos(2 * t)}
+
+
+def solve(method, controller, ts=None, dt0=None):
+    """The pendulum from 1 rad."""
+    return diffrax.diffeqsolve(
+        diffrax.ODETerm(swing), method, *ENDS, dt0, {"angle": jnp.asarray(1.0), "rate": jnp.asarray(0.0)},
+        saveat=diffrax.SaveAt(t1=True) if ts is None else diffrax.SaveAt(ts=ts), stepsize_controller=controller,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(("ours", "shipped"), PAIRS, ids=name_of)
+def test_the_steps_of_diffrax(ours, shipped):
+    """The same steps, states and dense output as diffrax's implementation."""
+    # At constant steps: an error of the size of round-off, as in a first step, chooses them differently.
+    ts = jnp.linspace(*ENDS, 7)
+    a, b = (solve(method, diffrax.ConstantStepSize(), ts, dt0=0.3) for method in (ours, shipped))
+    assert a.stats["num_steps"] == b.stats["num_steps"]
+    np.testing.assert_allclose(a.ys["angle"], b.ys["angle"], rtol=1e-12)
+
+
+class Misprinted(Tsit5):
+    """Tsitouras' method with one weight of its third stage changed."""
+
+    tableau: ClassVar = diffrax.ButcherTableau(
+        c=diffrax.Tsit5.tableau.c,
+        b_sol=diffrax.Tsit5.tableau.b_sol,
+        b_error=diffrax.Tsit5.tableau.b_error,
+        a_lower=(
+            diffrax.Tsit5.tableau.a_lower[0],
+            diffrax.Tsit5.tableau.a_lower[1] + np.array([0.01, -0.01]),
+            *diffrax.Tsit5.tableau.a_lower[2:],
+        ),
+    )
+
+
+@pytest.fixture(scope="module")
+def exact():
+    """By another method at a far smaller error."""
+    integrate = pytest.importorskip("scipy.integrate")
+    field = lambda t, y: [y[1], -np.sin(y[0]) + 0.1 * np.cos(2 * t)]
+    return integrate.solve_ivp(field, ENDS, [1.0, 0.0], "DOP853", rtol=1e-13, atol=1e-15).y[0, -1]
+
+
+@pytest.mark.parametrize(
+    ("method", "steps", "order"), [(Tsit5(), (80, 160), 5), (Dopri8(), (10, 20), 8), (Misprinted(), (80, 160), 2)], ids=name_of
+)
+def test_order(exact, method, steps, order):
+    """The order on a nonlinear problem with explicit time; a misprint in the tableau loses it."""
+    run = jax.jit(lambda dt: solve(method, diffrax.ConstantStepSize(), dt0=dt).ys["angle"][-1])
+    errors = [abs(float(run(jnp.asarray(ENDS[1] / n))) - exact) for n in steps]
+    assert abs(np.log2(errors[0] / errors[1]) - order) < 0.75
+
+
+def test_zero_weights_cost_nothing():
+    """Prince and Dormand's tableau has 35 of its 91 weights at zero: a step multiplies by none of them."""
+    term, y = diffrax.ODETerm(lambda t, y, args: jnp.sin(y)), jnp.asarray(1.0)
+    step = lambda method: lambda y: method.step(term, 0.0, 0.1, y, None, None, True)[:2]
+    operations = [e.primitive.name for e in jax.make_jaxpr(step(Dopri8()))(y).jaxpr.eqns]
+    weights = [w for row in diffrax.Dopri8.tableau.a_lower for w in row]
+    used = sum(w != 0 for w in [*weights, *diffrax.Dopri8.tableau.b_sol, *diffrax.Dopri8.tableau.b_error])
+    assert used < operations.count("mul") <= used + 30

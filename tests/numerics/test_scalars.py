@@ -1,0 +1,84 @@
+"""Programs written out number by number: the same results with fewer operations."""
+
+from collections import Counter
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import lax
+
+from lagjax.numerics.programs import needed, staged
+from lagjax.numerics.scalars import written_out
+
+X = jnp.array([0.3, -1.2, 0.7, 2.0])
+MATRIX = jnp.arange(12.0).reshape(3, 4) / 7
+
+
+def numbers(function, *args):
+    """The written-out program."""
+    program = jax.make_jaxpr(function)(*args)
+    return jax.make_jaxpr(lambda *args: written_out(program, *args))(*args)
+
+
+def operations(program):
+    """How often each primitive stands in what the results depend on."""
+    return Counter(equation.primitive.name for equation in needed(program.jaxpr))
+
+
+@jax.custom_jvp
+def doubled(x):
+    """A function with a derivative rule of its own, which is not its derivative."""
+    return 2 * x
+
+
+doubled.defjvp(lambda primals, tangents: (doubled(*primals), 7 * tangents[0]))
+
+FUNCTIONS = {
+    "products": lambda x: MATRIX @ x + jnp.dot(x, x) + jnp.outer(x, x)[1, 2],
+    "einsum": lambda x: jnp.einsum("ij,j,kj->ik", MATRIX, x, MATRIX),
+    "moves": lambda x: jnp.concatenate([x[::-1], jnp.pad(x[1:3], (2, 1)), x.reshape(2, 2).T.reshape(-1), x[::2]]),
+    "stacks": lambda x: jnp.stack([x, 2 * x], axis=1) @ jnp.array([1.0, -1.0]),
+    "sums": lambda x: jnp.cumsum(x) + jnp.sum(MATRIX * x[None], axis=0) + jnp.mean(x),
+    "choices": lambda x: jnp.where(x > 0, x, jnp.sin(x)) * jnp.clip(x, -1, 1) + jnp.maximum(x, 0.5) ** 3,
+    "indices": lambda x: x[jnp.array([3, 0, 2])] + x[1] * x[-1] + jnp.take(x, 2),
+    "order": lambda x: jnp.sort(x) + jnp.argmax(x) + jnp.max(x),
+    "loops": lambda x: lax.scan(lambda c, y: (c + y, c * y), 0.0, x)[1] + lax.cond(x[0] > 0, jnp.sin, jnp.cos, x),
+    "norms": lambda x: x / jnp.linalg.norm(x) + jnp.cross(x[:3], x[1:])[0],
+    "rules": lambda x: doubled(x) + jax.nn.softplus(x),
+    "mixed": lambda x: jnp.diag(x) @ x + jnp.eye(4)[1] + jnp.where(jnp.eye(4) > 0, x, 0).sum(0),
+    "updates": lambda x: x.at[1].set(x[2]).at[2:].add(1.0),
+}
+
+
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_same_values_and_derivatives(name):
+    """The written-out program is the program, and so is its derivative."""
+    function = FUNCTIONS[name]
+    program = numbers(function, X)
+    out = lambda x: jax.core.eval_jaxpr(program.jaxpr, program.consts, x)[0]
+    np.testing.assert_allclose(out(X), function(X), rtol=1e-14, atol=1e-15)
+    np.testing.assert_allclose(jax.jacfwd(out)(X), jax.jacfwd(function)(X), rtol=1e-13, atol=1e-14)
+
+
+def test_zeros_and_ones_leave_no_trace():
+    """A diagonal product has one multiplication an entry that is neither; a full one all of them."""
+    diagonal = operations(numbers(lambda x: jnp.diag(jnp.array([2.0, 0.0, 1.0, 3.0])) @ x, X))
+    assert diagonal["mul"] == 2 and diagonal["add"] == 0
+    full = operations(numbers(lambda x: (MATRIX + 2) @ x, X))
+    assert full["mul"] == 12 and full["add"] == 9
+
+
+def test_two_stages():
+    """What does not depend on the second argument is computed first, and its inverse where it is divided by."""
+
+    def function(p, x):
+        return jnp.sin(p) * x / (p**2 + 1)
+
+    args = (jnp.asarray(0.7), jnp.asarray(1.3))
+    program = numbers(function, *args)
+    first, then = staged(program, [0], [1])
+    np.testing.assert_allclose(then(first(args[0]), args[1])[0], function(*args), rtol=1e-15)
+    late = jax.make_jaxpr(then)(first(args[0]), args[1])
+    assert Counter(e.primitive.name for e in late.jaxpr.eqns)["mul"] == 2
+    assert not {"sin", "div", "integer_pow"} & {e.primitive.name for e in late.jaxpr.eqns}
