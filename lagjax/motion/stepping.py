@@ -154,6 +154,8 @@ class OnManifold(diffrax.AbstractWrappedSolver):
         continued = solver_state if isinstance(self.solver, Radau5) else None
         return y1, error, {"y0": y0, "state": continued}, solver_state, result
 
+    # Jitted, so that it is traced once: diffrax traces the body of its loop three times.
+    @eqx.filter_jit
     def _quick_step(self, t0, t1, y0, args, solver_state, made_jump):
         quick, project = self.quick, self.project
         jumped = True if project else made_jump
