@@ -10,6 +10,7 @@ from lagjax.mechanics.constraints import Holonomic
 from lagjax.mechanics.diagnosis import dependencies, describe, equation_names, explain_failure, listed
 from lagjax.mechanics.lagrangian import check_scalar
 from lagjax.mechanics.saddle_point import examined
+from lagjax.mechanics.sparse_saddle_point import plan
 from lagjax.mechanics.system import System
 from lagjax.motion.consistency import departures, to_manifold, within
 from lagjax.numerics.rank import independent_rows
@@ -95,6 +96,8 @@ def explain(system: System, q, v, params=None, *, t=0.0) -> Explanation:
         rows.append(("off the constraints", off))
     rows.append(("degrees of freedom", f"{len(names) - independent}"))
     rows.append(("mass matrix", mass))
+    if (sparse := plan(system, *s)) is not None:
+        rows.append(("constraint solve", str(sparse)))
     rows += [(name, "yes") for name in ("force", "dissipation") if getattr(system, name) is not None]
     if problem:
         rows.append(("problem", problem.replace("\n", "\n    ")))
