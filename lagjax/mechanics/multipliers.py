@@ -13,7 +13,7 @@ from lagjax.mechanics import constraints, coordinates
 from lagjax.mechanics.diagnosis import explain_failure, explain_singular, where
 from lagjax.mechanics.lagrangian import check_scalar
 from lagjax.mechanics.saddle_point import examined, verdict
-from lagjax.mechanics.sparse_saddle_point import plan
+from lagjax.mechanics.sparse_plan import plan
 
 
 def accelerations(system, t, q, v, params) -> tuple[PyTree[Array], dict[str, Array]]:

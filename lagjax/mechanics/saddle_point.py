@@ -35,7 +35,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
-from lagjax.mechanics import constraints, coordinates, sparse_saddle_point
+from lagjax.mechanics import constraints, coordinates, sparse_plan, sparse_saddle_point
 from lagjax.mechanics.lagrangian import Linear, mass_and_forcing
 from lagjax.numerics import dense
 from lagjax.numerics.rank import DEPENDENT_BELOW, independent_rows, unit_rows
@@ -55,7 +55,7 @@ def equations_of_motion(system, t, q, v, params, baumgarte_rate=None, independen
     """
     x, unflatten = coordinates.flatten(q)
     u, _ = coordinates.flatten(v)
-    if (plan := sparse_saddle_point.plan(system, t, q, v, params)) is not None:
+    if (plan := sparse_plan.plan(system, t, q, v, params)) is not None:
         a, multipliers = sparse_saddle_point.accelerations(
             plan, system, t, x, u, params, unflatten, baumgarte_rate, independent
         )
@@ -78,7 +78,7 @@ def independent_equations(system, t, q, v, params, dependent_below=None) -> Bool
         return None
     x, unflatten = coordinates.flatten(q)
     u, _ = coordinates.flatten(v)
-    if (plan := sparse_saddle_point.plan(system, t, q, v, params)) is not None:
+    if (plan := sparse_plan.plan(system, t, q, v, params)) is not None:
         return sparse_saddle_point.independent(plan, system, t, x, u, params, unflatten, dependent_below)
     return independent_rows(constraints.jacobian(system, t, x, u, params, unflatten), dependent_below)
 
@@ -111,7 +111,7 @@ def row_sizes(system, t, q, v, params) -> Float[Array, " m"]:
     """`Σ_j |A_ij|` of each constraint equation."""
     x, unflatten = coordinates.flatten(q)
     u, _ = coordinates.flatten(v)
-    if (plan := sparse_saddle_point.plan(system, t, q, v, params)) is not None:
+    if (plan := sparse_plan.plan(system, t, q, v, params)) is not None:
         return sparse_saddle_point.row_sizes(plan, system, t, x, u, params, unflatten)
     return jnp.sum(jnp.abs(constraints.jacobian(system, t, x, u, params, unflatten)), axis=1)
 
@@ -128,7 +128,7 @@ def returning(system, t, q, v, params) -> Return:
     x, unflatten = coordinates.flatten(q)
     u, _ = coordinates.flatten(v)
     state = (system, t, x, u, params, unflatten)
-    if (plan := sparse_saddle_point.plan(system, t, q, v, params)) is not None:
+    if (plan := sparse_plan.plan(system, t, q, v, params)) is not None:
         kept = sparse_saddle_point.independent(plan, *state)
         displacement = sparse_saddle_point.displacement(plan, *state, kept)
         placed = lambda which, r: jnp.zeros(which.size, r.dtype).at[np.flatnonzero(which)].set(r)
@@ -192,13 +192,15 @@ def combinations(jacobian: Float[Array, "m n"], independent: Bool[Array, " m"]) 
 @eqx.filter_jit
 def verdict(system, t, q, v, params) -> sparse_saddle_point.Verdict:
     """Solve the equations at one state, and say whether the solution is to be believed."""
-    plan = sparse_saddle_point.plan(system, t, q, v, params)
+    plan = sparse_plan.plan(system, t, q, v, params)
     if plan is not None:
         x, unflatten = coordinates.flatten(q)
         u, _ = coordinates.flatten(v)
         least = VANISHES_BELOW[np.dtype(x.dtype)]
         found = sparse_saddle_point.verdict(plan, system, t, x, u, params, unflatten, least)
-        return found._replace(a=unflatten(found.a), multipliers=constraints.split(system, found.multipliers, t, q, v, params))
+        return found._replace(
+            a=unflatten(found.a), multipliers=constraints.split(system, found.multipliers, t, q, v, params)
+        )
     found = examined(system, t, q, v, params)
     finite = jnp.all(jnp.isfinite(coordinates.flatten((found.a, found.multipliers, found.lagrangian))[0]))
     singular = dense.reciprocal_condition(found.matrix) <= SINGULAR_BELOW[np.dtype(t.dtype)]

@@ -5,44 +5,35 @@
 M is taken apart into blocks that share no velocity (bodies, particles), and inverted block by block. S couples
 constraint equations that act on a common block, and is a band once they are ordered (`numerics/banded.py`). M, A and Aᵀ
 are functions, those that differentiate the user's, and S is found from the products with a few coloured vectors. Which
-entries can be other than zero is read off the jaxpr (`sparsity.py`) and holds at every state.
+entries can be other than zero is read off the jaxpr (`sparse_plan.py`) and holds at every state.
 
-One step of iterative refinement on the whole system follows. It carries what S, being a square, would lose, and the
-error that a vanishing mass makes: such a mass counts as small in M⁻¹. Where the refinement does not converge the answer is
-NaN: M is singular in a direction that no constraint determines, or S is not definite.
+One step of iterative refinement on the whole system follows. It mends what S, being a square, loses, and the error
+that a vanishing mass makes: such a mass counts as small in M⁻¹. Where the refinement does not converge the answer is
+NaN: S is singular, or far from definite.
 
-**Redundant constraints**, as in `saddle_point.py`: rows that depend on others are found by the pivots of G = A Aᵀ, which
-is a band as well, and left out; the shortest multipliers that exert the same force are their part outside the
-null space of Aᵀ, and hence of G. Applied to a vector, `mu (G + mu)⁻¹` keeps its part in that null space and makes the rest
-smaller by `mu` over an eigenvalue of G.
+**Redundant constraints**, as in `saddle_point.py`: rows that depend on others are found by the pivots of G = A Aᵀ,
+which is a band as well, and left out; the shortest multipliers that exert the same force are their part outside the
+null space of Aᵀ, and hence of G. Applied to a vector, `mu (G + mu)⁻¹` keeps its part in that null space and makes the
+rest smaller by `mu` over an eigenvalue of G.
 
 Source: as for `saddle_point.py`; Benzi, Golub & Liesen, Acta Numerica 14 (2005) 1, §5 (Schur complement).
 """
 
 from collections.abc import Callable
-from functools import lru_cache, partial
+from functools import partial
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
-import jax.tree_util as jtu
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
-from lagjax.mechanics import constraints, coordinates
+from lagjax.mechanics import constraints
 from lagjax.mechanics.lagrangian import forcing_and_inertia
-from lagjax.mechanics.sparsity import pattern
+from lagjax.mechanics.sparse_plan import Plan
 from lagjax.numerics import banded, dense
 
-# The banded solve is faster from six unknowns on (a chain of two: 2.4 microseconds against 4.8; of twelve: 4 against 24); the
-# dense one exchanges rows, which suits any mass matrix, and is kept where little is to be gained.
-UNKNOWNS_AT_LEAST = 24
-# Blocks of M are inverted by elimination up to this size.
-BLOCK_AT_MOST = dense.ELIMINATE_UP_TO
-# Of a band wider than this share of its rows little is left out.
-BAND_AT_MOST = 0.5
 # The sine of a dependent row; it is seen through its square, which round-off reaches sooner than in `rank.py`.
 DEPENDENT_BELOW = {np.dtype("float64"): 1e-5, np.dtype("float32"): 1e-2}
 # A vanishing mass counts as this much of the largest: small enough that one refinement makes up for it.
@@ -51,91 +42,6 @@ VANISHING_MASS = {np.dtype("float64"): 1e-8, np.dtype("float32"): 1e-4}
 CORRECTION_AT_MOST = 1e-4
 # `mu` relative to G, powers of `mu (G + mu)⁻¹`, and how often the part so found is taken away.
 NULL_SHIFT, NULL_POWER, NULL_ROUNDS = {np.dtype("float64"): 1e-9, np.dtype("float32"): 1e-4}, 3, 3
-
-
-class Plan(NamedTuple):
-    """What is known of a system before any value: blocks of M, colours of M and A, the band of S."""
-
-    members: Int[np.ndarray, "blocks size"]
-    place: Int[np.ndarray, " n"]
-    of_mass: banded.Colours
-    of_rows: banded.Colours
-    of_columns: banded.Colours
-    band: banded.Band | None
-
-    def __str__(self):
-        equations = 0 if self.band is None else len(self.band.order.rows)
-        by = f"mass matrix in blocks of {self.members.shape[1]}" if self.members.shape[1] > 1 else "mass matrix diagonal"
-        if not equations:
-            return by
-        return f"banded, half bandwidth {self.band.order.half_bandwidth}, {equations} equations; {by}"
-
-
-def plan(system, t, q, v, params) -> Plan | None:
-    """How to solve a system sparsely; None where the dense solve is as good. Only shapes and dtypes count."""
-    n = sum(x.size for x in jax.tree.leaves(q))
-    if n + constraints.count(system, t, q, v, params) < UNKNOWNS_AT_LEAST:
-        return None
-    leaves, structure = jtu.tree_flatten((system, t, q, v, params))
-    leaves = tuple(jax.ShapeDtypeStruct(x.shape, x.dtype) if eqx.is_array(x) else x for x in leaves)
-    try:
-        hash((structure, leaves))
-    except TypeError:
-        return _plan.__wrapped__(structure, leaves)
-    return _plan(structure, leaves)
-
-
-# The equations are traced at several places of one program.
-@lru_cache(maxsize=64)
-def _plan(structure, leaves) -> Plan | None:
-    arrays = [x if isinstance(x, jax.ShapeDtypeStruct) else None for x in leaves]
-
-    def at(arrays):
-        filled = [x if x is not None else leaf for x, leaf in zip(arrays, leaves)]
-        system, t, q, v, params = jtu.tree_unflatten(structure, filled)
-        return system, t, coordinates.flatten(q)[0], params, coordinates.flatten(v)[1]
-
-    def momentum(u, arrays):
-        system, t, x, params, unflatten = at(arrays)
-        return jax.grad(lambda u: system.lagrangian(t, unflatten(x), unflatten(u), params))(u)
-
-    def residual(u, arrays):
-        system, t, x, params, unflatten = at(arrays)
-        return constraints.velocity_residual(system, t, x, u, params, unflatten)
-
-    _, t, q, _, _ = jtu.tree_unflatten(structure, leaves)
-    u = jax.ShapeDtypeStruct((sum(x.size for x in jax.tree.leaves(q)),), t.dtype)
-    of_mass = pattern(momentum, u, arrays)
-    blocks = _blocks(of_mass | of_mass.T)
-    if max(map(len, blocks)) > BLOCK_AT_MOST:
-        return None
-    members = np.full((len(blocks), max(map(len, blocks))), u.size)
-    together = np.zeros((u.size, u.size), np.float32)
-    for k, block in enumerate(blocks):
-        members[k, : len(block)] = block
-        together[np.ix_(block, block)] = 1
-    of_rows = pattern(residual, u, arrays)
-    m, band = len(of_rows), None
-    if m:
-        rows = of_rows.astype(np.float32)
-        band = banded.band(rows @ together @ rows.T > 0)
-        if band.order.half_bandwidth > max(1, BAND_AT_MOST * m):
-            return None
-    where = np.flatnonzero(members.ravel() < u.size)
-    place = where[np.argsort(members.ravel()[where])]
-    return Plan(members, place, *map(banded.colours, (together > 0, of_rows, of_rows.T)), band)
-
-
-def _blocks(touches):
-    """The sets of velocities that M couples, directly or through others."""
-    left, blocks = set(range(len(touches))), []
-    while left:
-        block = [min(left)]
-        for i in block:
-            block += [j for j in np.flatnonzero(touches[i]).tolist() if j not in block]
-        blocks.append(sorted(block))
-        left -= set(block)
-    return blocks
 
 
 class Operators(NamedTuple):
@@ -149,7 +55,7 @@ class Operators(NamedTuple):
     kept: Bool[Array, " m"]
 
 
-def accelerations(plan, system, t, x, u, params, unflatten, baumgarte_rate=None, kept=None):
+def accelerations(plan: Plan, system, t, x, u, params, unflatten, baumgarte_rate=None, kept=None):
     """The accelerations and the stacked multipliers, in vector form; `kept` (m,) says which equations to solve with."""
     forcing, inertia = forcing_and_inertia(system, t, x, u, params, unflatten)
     if plan.band is None:
@@ -165,13 +71,13 @@ def accelerations(plan, system, t, x, u, params, unflatten, baumgarte_rate=None,
     return a, lax.cond(jnp.all(kept), lambda x: x, shortest, multipliers)
 
 
-def independent(plan, system, t, x, u, params, unflatten, dependent_below=None) -> Bool[Array, " m"]:
+def independent(plan: Plan, system, t, x, u, params, unflatten, dependent_below=None) -> Bool[Array, " m"]:
     """Which constraint equations to solve with; see `numerics.banded.independent`."""
     push, pull, _ = _rows(system, t, x, u, params, unflatten)
     return _independent(plan, push, pull, x.dtype, dependent_below)
 
 
-def displacement(plan, system, t, x, u, params, unflatten, kept) -> Callable:
+def displacement(plan: Plan, system, t, x, u, params, unflatten, kept) -> Callable:
     """The function from residuals to the shortest displacement in the metric of M that changes them by as much."""
     _, inertia = forcing_and_inertia(system, t, x, u, params, unflatten)
     push, pull, _ = _rows(system, t, x, u, params, unflatten)
@@ -185,7 +91,7 @@ def displacement(plan, system, t, x, u, params, unflatten, kept) -> Callable:
     return of_residual
 
 
-def row_sizes(plan, system, t, x, u, params, unflatten, norm=jnp.sum) -> Float[Array, " m"]:
+def row_sizes(plan: Plan, system, t, x, u, params, unflatten, norm=jnp.sum) -> Float[Array, " m"]:
     """`Σ_j |A_ij|` of each constraint equation, or another norm: columns of one colour share no row."""
     if plan.band is None:
         return jnp.zeros(0, x.dtype)
@@ -203,7 +109,7 @@ class Verdict(NamedTuple):
     contradictory: Bool[Array, ""]
 
 
-def verdict(plan, system, t, x, u, params, unflatten, vanishes_below) -> Verdict:
+def verdict(plan: Plan, system, t, x, u, params, unflatten, vanishes_below) -> Verdict:
     """Solve the equations at one state, and say whether they are finite, regular, and agree with each other.
 
     A row of A that is `vanishes_below` times what it is a little way off counts as none: the equations are singular.
@@ -237,7 +143,7 @@ def _undetermined(plan, operators, dtype):
     """Whether the constraints leave a direction free that has no mass: there what was added to M decides."""
     some = jnp.cos(jnp.arange(operators.added.size, dtype=dtype))
     moved, _ = _eliminated(plan, operators, dtype)(operators.added * some, jnp.zeros(operators.kept.size, dtype))
-    return jnp.max(jnp.abs(moved)) > CORRECTION_AT_MOST ** 0.5
+    return jnp.max(jnp.abs(moved)) > CORRECTION_AT_MOST**0.5
 
 
 def slightly_off(y):
@@ -278,7 +184,7 @@ def _rows(system, t, x, u, params, unflatten):
 
 def _mass_inverse(plan, inertia, x):
     """The product with M⁻¹, block by block, without derivatives; and what was added to the diagonal for it."""
-    n, (count, size) = x.size, plan.members.shape
+    n, size = x.size, plan.members.shape[1]
     products = lax.stop_gradient(banded.compressed(inertia, plan.of_mass, x.dtype))
     least = VANISHING_MASS[np.dtype(x.dtype)] * jnp.max(jnp.abs(products))
     if size == 1:

@@ -3,8 +3,8 @@
 Every intermediate value carries, entry by entry, the set of inputs that it depends on; a set is a Python integer, one
 bit an input. Primitives that work entry by entry unite the sets of their operands; those that move entries move the
 sets; sums and products of matrices unite what they sum. What is unknown here, a loop for instance, or an index that is
-not a constant, makes every entry of its results depend on all that its operands depend on. The pattern so found holds at
-every state: it may be too full, never too empty, as no value but that of a constant is ever looked at.
+not a constant, makes every entry of its results depend on all that its operands depend on. The pattern so found holds
+at every state: it may be too full, never too empty, as no value but that of a constant is ever looked at.
 
 The package asdex finds the same patterns; it brings numba and twelve thousand lines, and leaves unknown primitives to
 an error where here they are dense.
@@ -34,13 +34,15 @@ ENTRYWISE = {
     "add", "add_any", "sub", "mul", "div", "rem", "pow", "neg", "max", "min", "abs", "sign", "integer_pow", "square",
     "sqrt", "rsqrt", "cbrt", "exp", "exp2", "expm1", "log", "log1p", "logistic", "sin", "cos", "tan", "asin", "acos",
     "atan", "atan2", "sinh", "cosh", "tanh", "asinh", "acosh", "atanh", "erf", "erfc", "erf_inv", "lgamma", "digamma",
-    "floor", "ceil", "round", "is_finite", "clamp", "select_n", "convert_element_type", "copy", "copy_p", "stop_gradient",
-    "lt", "le", "gt", "ge", "eq", "ne", "and", "or", "not", "xor", "reduce_precision",
+    "floor", "ceil", "round", "is_finite", "clamp", "select_n", "convert_element_type", "copy", "copy_p",
+    "lt", "le", "gt", "ge", "eq", "ne", "and", "or", "not", "xor", "reduce_precision", "stop_gradient",
 }  # fmt: skip
 REDUCING = {"reduce_sum", "reduce_max", "reduce_min", "reduce_prod", "reduce_and", "reduce_or"}
 ACCUMULATING = {"cumsum", "cumprod", "cummax", "cummin", "cumlogsumexp"}
 # Primitives that stand for the jaxpr that they carry; others, such as a reduction, carry one for pairs of entries.
-CALLS = {"jit", "pjit", "closed_call", "core_call", "remat", "remat2", "checkpoint", "custom_jvp_call", "custom_vjp_call"}
+CALLS = {
+    "jit", "pjit", "closed_call", "core_call", "remat", "remat2", "checkpoint", "custom_jvp_call", "custom_vjp_call",
+}  # fmt: skip
 # What indices are made of.
 EVALUATED = {
     "add": np.add, "sub": np.subtract, "mul": np.multiply, "neg": np.negative, "max": np.maximum, "min": np.minimum,

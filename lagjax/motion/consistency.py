@@ -72,7 +72,7 @@ def to_manifold(system, t, q, v, params, rtol, atol) -> Projected:
 
 
 def _newton(residual: Callable, problem: PyTree, y, displacement, slope):
-    """Iterate `y - displacement(residual(problem, y))`; the last iteration alone is differentiated, enough where r vanishes."""
+    """Iterate `y - displacement(r(problem, y))`; only the last iteration is differentiated, enough where r vanishes."""
     fixed, start = stopped((problem, y))
 
     def size(r):

@@ -10,7 +10,7 @@ from lagjax.mechanics.constraints import Holonomic
 from lagjax.mechanics.diagnosis import dependencies, describe, equation_names, explain_failure, listed
 from lagjax.mechanics.lagrangian import check_scalar
 from lagjax.mechanics.saddle_point import examined
-from lagjax.mechanics.sparse_saddle_point import plan
+from lagjax.mechanics.sparse_plan import plan
 from lagjax.mechanics.system import System
 from lagjax.motion.consistency import departures, to_manifold, within
 from lagjax.numerics.rank import independent_rows

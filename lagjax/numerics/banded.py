@@ -28,6 +28,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from lagjax.numerics import dense
 
+
 class Order(NamedTuple):
     """An order of the rows, and how far from the diagonal it leaves the entries."""
 
@@ -41,7 +42,7 @@ def order(pattern: Bool[np.ndarray, "m m"]) -> Order:
     >>> import numpy as np
     >>> star = np.array([[1, 1, 1], [1, 1, 0], [1, 0, 1]], bool)
     >>> order(star)
-    Order(rows=array([2, 0, 1]), half_bandwidth=1)
+    Order(rows=array([1, 0, 2]), half_bandwidth=1)
     """
     neighbours = [np.flatnonzero(row) for row in pattern]
     degree = np.array([len(found) for found in neighbours])
