@@ -1,15 +1,15 @@
 """How do cost and compile time grow with the number of links?
 
-Chains of N links of one metre and one kilogram together, in Cartesian coordinates with one length constraint a link (open,
-hung at both ends, closed), a net of them, and the open chain in absolute angles. For each N
+Chains of N links of one metre and one kilogram together, in Cartesian coordinates with one length constraint a link
+(open, hung at both ends, closed), a net of them, and the open chain in absolute angles. For each N
 
 - one evaluation of the equations of motion, inside a compiled loop, microseconds;
-- one step of `lj.integrate` (Dopri8, fixed steps, with its projection), microseconds, beside the error of what must stay:
-  the energy, relative, and the worst constraint residual;
+- one step of `lj.integrate` (Dopri8, fixed steps, with its projection), microseconds, beside the error of what must
+  stay: the energy, relative, and the worst constraint residual;
 - the time to trace and compile that integration, seconds.
 
-and the exponent p of cost = N^p fitted from 16 to 256 links. Cartesian chains are compared with the same motion in angles.
-Each row is the median (least in a further column) of repeated runs in one process.
+and the exponent p of cost = N^p fitted from 16 to 256 links, to the least times. Cartesian chains are compared with the
+same motion in angles. Each row is the median (least in a further column) of repeated runs in one process.
 
     python benchmarks/chain_scaling.py [--json FILE] [--only TEXT]
 """
@@ -178,7 +178,7 @@ def of_scene(name, scene):
         case = scene(count)
         evaluate, (solve, seconds) = evaluations(*case), steps(*case)
         times = in_turn(evaluate, solve, repeats=REPEATS, shortest=2e-3)
-        (of_evaluation, of_solve), (least_evaluation, least_solve) = times
+        (of_evaluation, of_solve), (least_evaluation, least_solve) = times.medians, times.minima
         motion = solve()
         assert bool(motion.result == lj.RESULTS.successful), motion.result
         per = 1e6 / EVALUATIONS, 1e6 / STEPS

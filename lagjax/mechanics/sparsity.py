@@ -6,8 +6,7 @@ sets; sums and products of matrices unite what they sum. What is unknown here, a
 not a constant, makes every entry of its results depend on all that its operands depend on. The pattern so found holds
 at every state: it may be too full, never too empty, as no value but that of a constant is ever looked at.
 
-The package asdex finds the same patterns; it brings numba and twelve thousand lines, and leaves unknown primitives to
-an error where here they are dense.
+The package asdex finds the same patterns, as fast; it needs numba, and stops at a primitive that it does not know.
 """
 
 from collections.abc import Callable
