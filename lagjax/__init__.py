@@ -26,6 +26,7 @@ from lagjax.motion.explanation import Explanation, explain
 from lagjax.motion.integrate import integrate
 from lagjax.motion.trajectory import RESULTS, AccuracyWarning, Moment, Trajectory
 from lagjax.numerics.radau import Radau5
+from lagjax.numerics.runge_kutta import Dopri8, Tsit5
 
 # isort: split
 # Error against run time.
@@ -49,6 +50,8 @@ __all__ = [
     "explain",
     "Explanation",
     "integrate",
+    "Dopri8",
+    "Tsit5",
     "Radau5",
     "Trajectory",
     "Moment",

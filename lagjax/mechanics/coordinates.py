@@ -32,6 +32,12 @@ def flatten(tree):
     return ravel_pytree(tree)
 
 
+def numbers(tree) -> tuple:
+    """The coordinates one by one, in the order of `flatten(tree)[0]`."""
+    vector, _ = flatten(tree)
+    return tuple(vector[i] for i in range(vector.size))
+
+
 def names(tree) -> list[str]:
     """The name of each entry of `flatten(tree)[0]`, as the user would write it.
 

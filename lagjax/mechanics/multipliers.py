@@ -4,9 +4,11 @@ The equations and their solution are those of `saddle_point.py`.
 """
 
 import equinox as eqx
+import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, PyTree
 
 from lagjax.mechanics import constraints, coordinates
@@ -14,6 +16,7 @@ from lagjax.mechanics.diagnosis import explain_failure, explain_singular, where
 from lagjax.mechanics.lagrangian import check_scalar
 from lagjax.mechanics.saddle_point import examined, verdict
 from lagjax.mechanics.sparse_plan import plan
+from lagjax.mechanics.written_out import is_small, write_out
 
 
 def accelerations(system, t, q, v, params) -> tuple[PyTree[Array], dict[str, Array]]:
@@ -45,22 +48,41 @@ def accelerations(system, t, q, v, params) -> tuple[PyTree[Array], dict[str, Arr
     """
     s = coordinates.state(t, q, v, params)
     check_scalar(system, *s)
+    traced = coordinates.is_traced((s, eqx.filter(system, eqx.is_array)))
     if plan(system, *s) is not None:
         found = verdict(system, *s)
         believed = ~(found.singular | found.contradictory)
-        if coordinates.is_traced(found):
+        if traced:
             return jax.tree.map(lambda x: jnp.where(believed, x, jnp.nan), (found.a, found.multipliers))
         if found.finite and believed:
             return found.a, found.multipliers
+    if traced:
+        return _quickly(system, *s) if is_small(system, *s) else _believed(system, *s)
     found = examined(system, *s)
     solution = found.a, found.multipliers
-    if coordinates.is_traced(found):
-        believed = ~jnp.any(found.contradictory)
-        return jax.tree.map(lambda x: jnp.where(believed, x, jnp.nan), solution)
     finite = np.all(np.isfinite(coordinates.flatten((solution, found.lagrangian))[0]))
     if not finite or np.any(found.contradictory) or explain_singular(np.asarray(found.matrix), system, s):
         raise ValueError(explain_failure(system, s) or f"the accelerations are not finite {where(s)}.")
     return solution
+
+
+def _believed(system, t, q, v, params):
+    """The solution, NaN where constraints contradict each other."""
+    found = examined(system, t, q, v, params)
+    believed = ~jnp.any(found.contradictory)
+    return jax.tree.map(lambda x: jnp.where(believed, x, jnp.nan), (found.a, found.multipliers))
+
+
+def _quickly(system, t, q, v, params):
+    """The same from the equations written out, where these suffice."""
+    written = write_out(system, t, q, v, params)
+    a, stacked = written.equations(system, t, q, v, params)
+    solution = a, constraints.split(system, stacked, t, q, v, params)
+    if not written.careful:
+        return solution
+    sure = jnp.all(jnp.isfinite(coordinates.flatten(a)[0]))
+    # A branch also in a batch, where it is taken for all lanes or none.
+    return lax.cond(eqxi.unvmap_all(sure), lambda: solution, lambda: _believed(system, t, q, v, params))
 
 
 def constraint_force(system, t, q, v, params) -> dict[str, PyTree[Array]]:

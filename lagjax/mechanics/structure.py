@@ -1,5 +1,12 @@
 """What a scene is, read off its jaxpr: never from values, so that it holds at every state.
 
+`structure` says on what the mass matrix depends and which coordinates it couples, which coordinates are cyclic, whether
+time is explicit, whether L has terms linear in the velocities, and what is constant in the constraints. It looks at the
+programs of these written out number by number (`in_numbers.py`): an entry that is a zero there is zero everywhere, and
+one that no chain of operations connects with a coordinate does not depend on it. Of the packages for the sparsity of
+jaxprs, asdex finds the patterns, but neither what an entry depends on nor the program without its zeros, which the
+solver runs; one pass gives all three.
+
 A coordinate is an *angle* where L, R, Q and the constraints see it only through sines and cosines of expressions
 linear in it. Its size then means nothing: after a thousand turns an error counts as it did in the first.
 
@@ -8,14 +15,123 @@ periodic (made of sines and cosines), or anything else; what a primitive makes o
 """
 
 from enum import IntEnum
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.tree_util as jtu
+import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 from jaxtyping import PyTree
+from scipy.sparse.csgraph import connected_components
 
+from lagjax.mechanics import constraints, coordinates
 from lagjax.mechanics.constraints import Holonomic
+from lagjax.mechanics.constraints import evaluate as constraint_value
+from lagjax.mechanics.in_numbers import Numbers, in_numbers
+from lagjax.mechanics.lagrangian import mass_and_forcing
+from lagjax.numerics.programs import reached
+
+
+# Coordinates and equations together: of larger systems the programs are not written out.
+UP_TO = 24
+
+
+class ConstraintStructure(NamedTuple):
+    """Of one constraint: is it linear with constant coefficients (in q, or in v), does it depend on time."""
+
+    linear: bool
+    moving: bool
+
+
+class Structure(NamedTuple):
+    """What a system is at every state.
+
+    - `mass_depends_on`: "t", names of coordinates, "velocities"; empty where M is constant.
+    - `blocks`: the coordinates that M couples with each other, by name; one each where M is diagonal.
+    - `explicit_time`: whether L, R, Q or a constraint depends on t.
+    - `cyclic`: the coordinates that L does not contain.
+    - `linear_terms`: the coordinates in whose velocities L has linear terms (gyroscopic forces, or none at all where
+      they are a total derivative).
+    - `constraints`: a `ConstraintStructure` by name.
+    """
+
+    mass_depends_on: tuple[str, ...]
+    blocks: tuple[tuple[str, ...], ...]
+    explicit_time: bool
+    cyclic: tuple[str, ...]
+    linear_terms: tuple[str, ...]
+    constraints: dict[str, ConstraintStructure]
+
+
+def structure(system, t, q, v, params) -> Structure | None:
+    """The structure of a system, of whose state only names and shapes count; None where it is too large."""
+    names = coordinates.names(q)
+    if len(names) + constraints.count(system, t, q, v, params) > UP_TO:
+        return None
+    _, unflatten = coordinates.flatten(q)
+    system = in_numbers(system, unflatten)
+    args = (system, t, coordinates.numbers(q), coordinates.numbers(v), params)
+    n = len(names)
+    mass = Numbers(_mass, args)
+    nonzero = np.array([not is_zero(x) for x in mass.program.jaxpr.outvars]).reshape(n, n)
+    lagrangian = Numbers(lambda system, *state: system.lagrangian(*state), args)
+    linear = Numbers(_momentum_at_rest, args)
+    seen = [Numbers(lambda _, *state, f=f: f(*state), args) for f in _seen(system)]
+    return Structure(
+        mass_depends_on=_depends_on(mass, names),
+        blocks=_blocks(nonzero, names),
+        explicit_time=any("t" in _depends_on(f, names) for f in seen),
+        cyclic=tuple(name for name in names if name not in _depends_on(lagrangian, names)),
+        linear_terms=tuple(name for name, x in zip(names, linear.program.jaxpr.outvars) if not is_zero(x)),
+        constraints={name: _of_constraint(c, args, names) for name, c in system.constraints.items()},
+    )
+
+
+def is_diagonal(system, t, q, v, params) -> bool:
+    """Whether the mass matrix is known to be diagonal."""
+    x, _ = coordinates.flatten(q)
+    mass = Numbers(_mass, (system, t, q, v, params))
+    off = ~np.eye(x.size, dtype=bool).reshape(-1)
+    return all(is_zero(x) for x, outside in zip(mass.program.jaxpr.outvars, off) if outside)
+
+
+def is_zero(x) -> bool:
+    """Whether a result of a written-out program is a zero that is written in it."""
+    return isinstance(x, Literal) and x.val == 0
+
+
+def _mass(system, t, q, v, params):
+    x, unflatten = coordinates.flatten(q)
+    u, _ = coordinates.flatten(v)
+    mass = mass_and_forcing(system, t, x, u, params, unflatten).mass
+    return [mass[i, j] for i in range(x.size) for j in range(x.size)]
+
+
+def _momentum_at_rest(system, t, q, v, params):
+    at_rest = tuple(np.zeros(x.shape, x.dtype) for x in v)
+    return jax.grad(system.lagrangian, argnums=2)(t, q, at_rest, params)
+
+
+def _depends_on(numbers, names):
+    """The names on which any result depends: "t", coordinates, "velocities"."""
+    jaxpr, n = numbers.program.jaxpr, len(names)
+    depends = lambda inputs: any(not isinstance(x, Literal) and x in reached(jaxpr, inputs) for x in jaxpr.outvars)
+    t, *state = numbers.state_variables
+    found = [name for name, x in zip(["t", *names], [t, *state[:n]]) if depends([x])]
+    return tuple([*found, "velocities"] if depends(state[n:]) else found)
+
+
+def _blocks(nonzero, names):
+    count, label = connected_components(nonzero, directed=False)
+    return tuple(tuple(name for name, x in zip(names, label) if x == i) for i in range(count))
+
+
+def _of_constraint(constraint, args, names):
+    by = 1 if isinstance(constraint, Holonomic) else 2
+    value = Numbers(lambda _, *state: constraint_value(constraint, *state), args)
+    slope = Numbers(lambda _, *state: jax.jacfwd(lambda *s: constraint_value(constraint, *s), argnums=by)(*state), args)
+    return ConstraintStructure(linear=not _depends_on(slope, names), moving="t" in _depends_on(value, names))
 
 
 class Depends(IntEnum):

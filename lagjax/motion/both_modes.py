@@ -3,8 +3,8 @@
 diffrax offers one derivative a solve: `ForwardMode` or `RecursiveCheckpointAdjoint`. Which one is wanted is
 known only when JAX pushes tangents through (`jacfwd`, Levenberg-Marquardt) or transposes them (`grad`).
 The derivative of y = solve(x) is therefore bound as a linear map dx -> dy of its own: a primitive that is
-evaluated by forward mode and transposed by the checkpointed reverse mode. Undifferentiated, there is no
-trace of it in the compiled program. Differentiated, the plain solve runs beside the derivative's own;
+evaluated by forward mode and transposed by the checkpointed reverse mode; where few derivatives are asked for, by
+forward mode too, along each of them. Undifferentiated, there is no trace of it in the compiled program. Differentiated, the plain solve runs beside the derivative's own;
 naming an `adjoint` saves that one solve.
 
 Second derivatives work forward over forward (`jacfwd` of `jacfwd`).
@@ -19,29 +19,39 @@ import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import numpy as np
+from jax import lax
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 from jaxtyping import PyTree
 
+# Up to this many derivatives of one number, pushing all of them forward is cheaper than one pull back through the
+# checkpoints, to run and to compile.
+PUSH_UP_TO = 24
 
-def solve_in_both_modes(solve: Callable, x: PyTree, fixed: PyTree) -> PyTree:
+
+def _as_it_is(function, *args):
+    return function(*args)
+
+
+def solve_in_both_modes(solve: Callable, x: PyTree, fixed: PyTree, compiled: Callable = _as_it_is) -> PyTree:
     """`solve(x, fixed, adjoint)` for a diffrax adjoint, differentiable in both modes in `x`.
 
     All leaves of `x` are floating arrays, all leaves of `fixed` and of the result are arrays, and `solve`
-    closes over no traced value.
+    closes over no traced value. `compiled(function, *arrays)` evaluates the solve, and its derivatives.
     """
-    return _solve((x, fixed), solve=solve)
+    return _solve((x, fixed), solve=solve, compiled=compiled)
 
 
 @eqx.filter_custom_jvp
-def _solve(inputs, *, solve):
-    return solve(*inputs, diffrax.ForwardMode())
+def _solve(inputs, *, solve, compiled):
+    return compiled(lambda x, fixed: solve(x, fixed, diffrax.ForwardMode()), *inputs)
 
 
 @_solve.def_jvp
-def _solve_jvp(primals, tangents, *, solve):
+def _solve_jvp(primals, tangents, *, solve, compiled):
     ((x, fixed),), ((dx, _),) = primals, tangents
-    y = solve(x, fixed, diffrax.ForwardMode())
+    y = compiled(lambda x, fixed: solve(x, fixed, diffrax.ForwardMode()), x, fixed)
     dx = jtu.tree_map(eqxi.materialise_zeros, x, dx, is_leaf=lambda leaf: leaf is None)
     leaves, structure = jtu.tree_flatten((x, fixed))
     size = len(jtu.tree_leaves(x))
@@ -52,27 +62,33 @@ def _solve_jvp(primals, tangents, *, solve):
 
     floats, rest = eqx.partition(y, eqx.is_inexact_array)
     shapes = tuple((leaf.shape, leaf.dtype) for leaf in jtu.tree_leaves(floats))
-    dy = _tangent_p.bind(*leaves, *jtu.tree_leaves(dx), outputs=float_outputs, shapes=shapes, size=size)
+    params = dict(outputs=float_outputs, shapes=shapes, size=size, many=False, compiled=compiled)
+    dy = _tangent_p.bind(*leaves, *jtu.tree_leaves(dx), **params)
     dy = jtu.tree_unflatten(jtu.tree_structure(floats), dy)
     return y, eqx.combine(dy, jtu.tree_map(lambda _: None, rest))
 
 
 # The operands of the primitive are the leaves of x, of `fixed`, and of dx; `size` is the count of the
 # first and the last. `outputs(adjoint, *x, *fixed)` gives the floating leaves of the result; their `shapes`
-# are those of their tangents, and known without tracing.
+# are those of their tangents, and known without tracing. With `many`, each dx has a leading axis of directions,
+# and so has each result.
 
 
 def _split(operands, size):
-    return operands[:size], operands[size:-size], operands[-size:]
+    return tuple(operands[:size]), tuple(operands[size:-size]), tuple(operands[-size:])
 
 
-def _tangent(*operands, outputs, shapes, size):
-    x, fixed, dx = _split(operands, size)
-    return jax.jvp(lambda *x: outputs(diffrax.ForwardMode(), *x, *fixed), x, dx)[1]
+def _tangent(*operands, outputs, shapes, size, many, compiled):
+    def pushed(x, fixed, dx):
+        along = lambda dx: jax.jvp(lambda *x: outputs(diffrax.ForwardMode(), *x, *fixed), x, dx)[1]
+        return jax.vmap(along)(dx) if many else along(dx)
+
+    return compiled(pushed, *_split(operands, size))
 
 
-def _tangent_shapes(*operands, outputs, shapes, size):
-    return [jax.core.ShapedArray(shape, dtype) for shape, dtype in shapes]
+def _tangent_shapes(*operands, shapes, size, many, **params):
+    lead = operands[-1].shape[:1] if many else ()
+    return [jax.core.ShapedArray((*lead, *shape), dtype) for shape, dtype in shapes]
 
 
 def _tangent_jvp(primals, tangents, **params):
@@ -81,33 +97,82 @@ def _tangent_jvp(primals, tangents, **params):
     return dy, [eqxi.materialise_zeros(a, b) for a, b in zip(dy, ddy)]
 
 
-def _tangent_transpose(cotangents, *operands, outputs, shapes, size):
-    x, fixed, _ = _split(operands, size)
-    _, pullback = jax.vjp(lambda *x: outputs(diffrax.RecursiveCheckpointAdjoint(), *x, *fixed), *x)
-    dx = pullback([ad.instantiate_zeros(ct) for ct in cotangents])
-    return [None] * (len(operands) - size) + list(dx)
+def _tangent_transpose(cotangents, *operands, size, many, **params):
+    x, fixed, dx = _split(operands, size)
+    cotangents = [ad.instantiate_zeros(ct) for ct in cotangents]
+    wanted = [ad.is_undefined_primal(tangent) for tangent in dx]
+    pull = _pull_by_pushing if sum(a.size for a, w in zip(x, wanted) if w) <= PUSH_UP_TO else _pull
+    along = lambda cotangents: pull(x, fixed, wanted, cotangents, size=size, **params)
+    found = iter(jax.vmap(along)(cotangents) if many else along(cotangents))
+    return [None] * (len(operands) - size) + [next(found) if w else None for w in wanted]
 
 
-def _tangent_batched(operands, axes, *, outputs, shapes, size):
+def _pull(x, fixed, wanted, cotangents, *, outputs, compiled, **params):
+    def pulled(x, fixed, cotangents):
+        def of_wanted(*chosen):
+            chosen = iter(chosen)
+            every = [next(chosen) if w else a for a, w in zip(x, wanted)]
+            return outputs(diffrax.RecursiveCheckpointAdjoint(), *every, *fixed)
+
+        return jax.vjp(of_wanted, *[a for a, w in zip(x, wanted) if w])[1](cotangents)
+
+    return compiled(pulled, x, fixed, cotangents)
+
+
+def _pull_by_pushing(x, fixed, wanted, cotangents, **params):
+    """The derivatives along the axes of all that is wanted, and their products with the cotangents."""
+    sizes = [a.size if w else 0 for a, w in zip(x, wanted)]
+    starts, total = np.cumsum([0, *sizes]), sum(sizes)
+    axes = [
+        jnp.eye(total, a.size, -start, dtype=a.dtype).reshape(total, *a.shape)
+        if w
+        else jnp.zeros((total, *a.shape), a.dtype)
+        for a, w, start in zip(x, wanted, starts)
+    ]
+    dy = _tangent_p.bind(*x, *fixed, *axes, many=True, **params)
+    slopes = sum(jnp.sum((d * ct[None]).reshape(total, -1), axis=1) for d, ct in zip(dy, cotangents))
+    return [slopes[i : i + n].reshape(a.shape).astype(a.dtype) for i, n, a, w in zip(starts, sizes, x, wanted) if w]
+
+
+def _tangent_batched(operands, axes, *, outputs, shapes, size, many, compiled):
     lanes = next(x.shape[axis] for x, axis in zip(operands, axes) if axis is not None)
     front = [x if axis is None else jnp.moveaxis(x, axis, 0) for x, axis in zip(operands, axes)]
     x, fixed, dx = _split(front, size)
     batched_x, batched_fixed, batched_dx = _split([axis is not None for axis in axes], size)
-    # A tangent has the shape of its primal: where one of the two is batched, so is the other.
-    batched = [a or b for a, b in zip(batched_x, batched_dx)]
     widen = lambda leaves, have: [
-        leaf if here or not needed else jnp.broadcast_to(leaf, (lanes, *leaf.shape))
-        for leaf, here, needed in zip(leaves, have, batched)
+        leaf if here else jnp.broadcast_to(leaf, (lanes, *leaf.shape)) for leaf, here in zip(leaves, have)
     ]
-    x, dx = widen(x, batched_x), widen(dx, batched_dx)
-    in_axes = [0 if b else None for b in (*batched, *batched_fixed)]
+    params = dict(outputs=outputs, shapes=shapes, size=size, many=many, compiled=compiled)
+    if not any(batched_x + batched_fixed):
+        # Many directions at one point: the solve itself is not repeated.
+        dx = widen(dx, batched_dx)
+        if many:
+            dx = [d.reshape(-1, *d.shape[2:]) for d in dx]
+        dy = _tangent_p.bind(*x, *fixed, *dx, **{**params, "many": True})
+        dy = [d.reshape(lanes, -1, *d.shape[1:]) for d in dy] if many else dy
+        return dy, [0] * len(dy)
+    # Lanes: the same solve at many points, one direction each; a tangent has the shape of its primal.
+    dx = widen(dx, batched_dx)
+    if many:
+        # One direction after the other of each lane.
+        along = lambda dx: _lanes(x, fixed, dx, batched_x, batched_fixed, lanes, params)
+        dy = lax.map(along, [jnp.moveaxis(d, 1, 0) for d in dx])
+        dy = [jnp.moveaxis(d, 0, 1) for d in dy]
+    else:
+        dy = _lanes(x, fixed, dx, batched_x, batched_fixed, lanes, params)
+    return dy, [0] * len(dy)
+
+
+def _lanes(x, fixed, dx, batched_x, batched_fixed, lanes, params):
+    x = [a if here else jnp.broadcast_to(a, (lanes, *a.shape)) for a, here in zip(x, batched_x)]
+    in_axes = [0] * len(x) + [0 if here else None for here in batched_fixed]
+    outputs, shapes = params["outputs"], params["shapes"]
 
     def lane_outputs(adjoint, *operands):
         return jax.vmap(partial(outputs, adjoint), in_axes, axis_size=lanes)(*operands)
 
     shapes = tuple(((lanes, *shape), dtype) for shape, dtype in shapes)
-    dy = _tangent_p.bind(*x, *fixed, *dx, outputs=lane_outputs, shapes=shapes, size=size)
-    return dy, [0] * len(dy)
+    return _tangent_p.bind(*x, *fixed, *dx, **{**params, "outputs": lane_outputs, "shapes": shapes, "many": False})
 
 
 _tangent_p = Primitive("lagjax_trajectory_tangent")

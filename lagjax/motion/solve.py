@@ -5,6 +5,7 @@ within a few rejected steps, and the lane keeps the reason in its result.
 """
 
 import importlib.util
+from functools import partial
 
 import diffrax
 import equinox as eqx
@@ -16,12 +17,17 @@ from jaxtyping import Array, Float
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.coordinates import State
 from lagjax.mechanics.saddle_point import equations_of_motion, verdict
+from lagjax.mechanics.in_numbers import Numbers, in_numbers
+from lagjax.mechanics.written_out import is_small, write_out
 from lagjax.mechanics.structure import angles, conserves_jacobi_integral
+from lagjax.motion.arriving import Arriving
 from lagjax.motion.both_modes import solve_in_both_modes
 from lagjax.motion.consistency import stopped, to_manifold, within, worst_residual
 from lagjax.motion.sign_change import SignChange
-from lagjax.motion.stepping import OnManifold, Stages, Tolerances, forward_differentiable
+from lagjax.motion.stepping import OnManifold, Quick, Stages, Tolerances, forward_differentiable
 from lagjax.motion.trajectory import RESULTS, Moment, Trajectory, ended_well, pack, worst_drift
+from lagjax.numerics.one_function import called, one_function
+from lagjax.numerics.runge_kutta import ExplicitRungeKutta
 from lagjax.numerics.simplified_newton import SimplifiedNewton, with_tolerances
 
 # A start may be off the constraints by this many tolerances; it is then moved onto them.
@@ -69,10 +75,10 @@ def trajectory_of(system, q0, v0, params, ts, settings) -> Trajectory:
 
     def solved(x, fixed, adjoint):
         rest, settings = eqx.combine(fixed, static)
-        return _solve(*eqx.combine(x, rest), settings, adjoint)
+        return _solve_in_numbers(*eqx.combine(x, rest), settings, adjoint)
 
     if settings.adjoint is None:
-        fields = solve_in_both_modes(solved, x, fixed)
+        fields = solve_in_both_modes(solved, x, fixed, partial(one_function, checked=True, in_turn=True))
     else:
         fields = solved(x, fixed, settings.adjoint)
     arrays, described = pack(system, params, type(settings.method).__name__)
@@ -80,7 +86,31 @@ def trajectory_of(system, q0, v0, params, ts, settings) -> Trajectory:
     return Trajectory(t=ts, **fields, tolerance=tolerance, arrays=arrays, static=described)
 
 
-def _solve(system, q0, v0, params, ts, settings, adjoint):
+def _solve_in_numbers(system, q0, v0, params, ts, settings, adjoint):
+    """The solve, of a small system with the coordinates one by one."""
+    written = None
+    small = is_small(system, ts[0], q0, v0, params)
+    if isinstance(settings.method, ExplicitRungeKutta) and small:
+        _, unflatten = coordinates.flatten(q0)
+        system, q0, v0 = in_numbers(system, unflatten), coordinates.numbers(q0), coordinates.numbers(v0)
+        event = settings.event
+        if event is not None:
+            settings = eqx.tree_at(lambda s: s.event, settings, _event_in_numbers(event, unflatten))
+        written = write_out(system, ts[0], q0, v0, params)
+    fields = _solve(system, q0, v0, params, ts, settings, adjoint, written)
+    if written is None:
+        return fields
+    together = lambda tree: jax.vmap(lambda *x: unflatten(jnp.stack(x)))(*tree)
+    end = fields["end"]
+    one = lambda tree: unflatten(jnp.stack(tree))
+    return fields | {
+        "q": together(fields["q"]),
+        "v": together(fields["v"]),
+        "end": end._replace(q=one(end.q), v=one(end.v)),
+    }
+
+
+def _solve(system, q0, v0, params, ts, settings, adjoint, written):
     off_constraints = _off_constraints(system, ts[0], q0, v0, params, settings)
     if settings.drift == "project":
         projected = to_manifold(system, ts[0], q0, v0, params, settings.rtol, settings.atol)
@@ -93,20 +123,27 @@ def _solve(system, q0, v0, params, ts, settings, adjoint):
     refused = off_constraints | contradictory | singular | ~finite | too_small
     y0 = jax.tree.map(lambda x: jnp.where(refused, 0.0, x), (q0, v0))
     terms = diffrax.ODETerm(_vector_field(system, ts, settings.drift))
+    quick = None
+    if written is not None and settings.drift != "baumgarte":
+        field = WrittenField(written.equations, written.equations.prepare(system, params))
+        prepared = written.project.prepare(system, params) if written.project else ()
+        quick = Quick(settings.method, diffrax.ODETerm(field), written.project, prepared, written.careful)
     # BacksolveAdjoint integrates a larger state backwards: it takes the bare method, and no end beside the outputs.
     bare = isinstance(adjoint, diffrax.BacksolveAdjoint)
     settings = eqx.tree_at(lambda s: s.method, settings, _with_root_finder(settings))
     at_ts, at_end = diffrax.SubSaveAt(ts=ts), diffrax.SubSaveAt(t1=True)
     solution = diffrax.diffeqsolve(
-        terms,
-        settings.method if bare else _solver(system, terms, State(ts[0], q0, v0, params), refused, settings, adjoint),
+        terms if quick is None else quick.terms,
+        settings.method
+        if bare
+        else _solver(system, terms, quick, State(ts[0], q0, v0, params), refused, settings, adjoint),
         t0=ts[0],
         t1=ts[-1],
         dt0=settings.dt0,
         y0=y0,
         args=params,
         saveat=diffrax.SaveAt(ts=ts) if bare else diffrax.SaveAt(subs=(at_ts, at_end)),
-        stepsize_controller=_controller(ts, settings),
+        stepsize_controller=_controller(ts, settings, bare),
         adjoint=adjoint,
         event=_located_event(settings.event, ts),
         max_steps=settings.max_steps,
@@ -178,9 +215,30 @@ def _vector_field(system, ts, drift):
     def field(t, y, args):
         q, v = y
         params, independent = args if isinstance(args, Stages) else (args, None)
-        return v, equations_of_motion(system, t, q, v, params, rate, independent)[0]
+        return v, called(equations_of_motion(system, t, q, v, params, rate, independent))[0]
 
     return field
+
+
+class WrittenField(eqx.Module):
+    """The same from the equations written out, with what does not depend on the state computed before."""
+
+    equations: Numbers = eqx.field(static=True)
+    prepared: tuple
+
+    def __call__(self, t, y, params):
+        q, v = y
+        return v, called(self.equations.at(self.prepared, t, q, v))[0]
+
+
+def _event_in_numbers(event, unflatten):
+    def wrap(condition):
+        def of_numbers(t, y, *args, **kwargs):
+            return condition(t, tuple(unflatten(jnp.stack(x)) for x in y), *args, **kwargs)
+
+        return of_numbers
+
+    return diffrax.Event(jax.tree.map(wrap, event.cond_fn, is_leaf=callable), event.root_finder, event.direction)
 
 
 def _multipliers(system, t, q, v, params):
@@ -202,13 +260,17 @@ def _with_root_finder(settings):
     return with_tolerances(method, *tolerances)
 
 
-def _solver(system, terms, start, refused, settings, adjoint):
+def _solver(system, terms, quick, start, refused, settings, adjoint):
     reverse = isinstance(adjoint, diffrax.RecursiveCheckpointAdjoint)
     angle = tuple(jax.tree.leaves(angles(system, *start)))
+    method = settings.method
+    if isinstance(method, ExplicitRungeKutta):
+        method = eqx.tree_at(lambda s: s.scan_kind, method.shipped, "lax", is_leaf=lambda x: x is None)
     return OnManifold(
-        solver=forward_differentiable(settings.method) if reverse else settings.method,
+        solver=forward_differentiable(method) if reverse else method,
         system=system,
         terms=terms,
+        quick=quick,
         params=start.params,
         refused=refused,
         tolerances=Tolerances(settings.rtol, settings.atol),
@@ -216,18 +278,25 @@ def _solver(system, terms, start, refused, settings, adjoint):
         controlled=settings.controller is None,
         weigh=settings.controller is None and (settings.apart or any(angle)),
         project=settings.drift == "project",
+        arriving=_arriving(settings),
     )
 
 
-def _controller(ts, settings):
+def _arriving(settings):
+    # An event is looked for inside its step, and a controller of the user's chooses its steps itself.
+    return settings.controller is None and settings.event is None
+
+
+def _controller(ts, settings, bare):
     if settings.controller is not None:
         return settings.controller
     # A step that small no longer moves t: the solution is singular there, or was NaN from the start.
     dtmin = 16 * jnp.finfo(ts.dtype).eps * jnp.maximum(jnp.abs(ts[0]), jnp.abs(ts[-1]))
     # The largest error counts, not the mean: more coordinates should not loosen the tolerance of each.
-    return diffrax.PIDController(
+    controller = diffrax.PIDController(
         rtol=settings.rtol[0], atol=settings.atol[0], norm=optx.max_norm, dtmin=dtmin, force_dtmin=False
     )
+    return Arriving(controller, ts) if _arriving(settings) and not bare else controller
 
 
 def _located_event(event, ts):

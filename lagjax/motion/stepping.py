@@ -11,16 +11,21 @@ from typing import NamedTuple
 
 import diffrax
 import equinox as eqx
+import equinox.internal as eqxi
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
+from jax import lax
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, PyTree
 
 from lagjax.mechanics.saddle_point import independent_equations
 from lagjax.mechanics.system import System
+from lagjax.mechanics.in_numbers import Numbers
 from lagjax.motion.consistency import to_manifold
+from lagjax.numerics.one_function import called
 from lagjax.numerics.radau import Radau5
+from lagjax.numerics.runge_kutta import ExplicitRungeKutta
 
 # Without projection a state drifts off its constraints, and dependent ones then disagree by that much.
 DEPENDENT_BELOW_WHILE_DRIFTING = 1e-3
@@ -47,12 +52,23 @@ class Stages(NamedTuple):
     independent: Bool[Array, " m"] | None
 
 
+class Quick(eqx.Module):
+    """A step on equations that are written out, which may give NaN where the careful one does not."""
+
+    solver: ExplicitRungeKutta
+    terms: PyTree[diffrax.AbstractTerm]
+    project: Numbers | None = eqx.field(static=True)
+    prepared: tuple
+    careful: bool = eqx.field(static=True)
+
+
 class OnManifold(diffrax.AbstractWrappedSolver):
     """Wrap `solver`: project after each step (where `project`), and step for dense output.
 
     A step that cannot be returned to the constraints is rejected; with a fixed step the solve ends there. `controlled`
     says that steps are chosen by the tolerances. `weigh` rescales the error for a controller that knows one tolerance:
     coordinates and velocities are judged each by their own, and the `angles` among the leaves of q by at most a turn.
+    `arriving` says that outputs are wanted at the ends of steps only.
 
     What the dense output needs of the problem (`terms`, `params`) belongs to the solver, since diffrax hands
     an interpolation only times and states. Where `refused`, and where a step is not finite, its error is infinite: an
@@ -62,6 +78,7 @@ class OnManifold(diffrax.AbstractWrappedSolver):
     solver: diffrax.AbstractSolver
     system: System
     terms: PyTree[diffrax.AbstractTerm]
+    quick: Quick | None
     params: PyTree
     refused: Bool[Array, ""]
     tolerances: Tolerances
@@ -69,6 +86,7 @@ class OnManifold(diffrax.AbstractWrappedSolver):
     controlled: bool = eqx.field(static=True)
     weigh: bool = eqx.field(static=True)
     project: bool = eqx.field(static=True)
+    arriving: bool = eqx.field(static=True)
 
     @property
     def term_structure(self):
@@ -94,7 +112,9 @@ class OnManifold(diffrax.AbstractWrappedSolver):
     def interpolation_cls(self) -> Callable:
         return self._between
 
-    def _between(self, *, t0, t1, y0, state):
+    def _between(self, *, t0, t1, y0, y1=None, state=None):
+        if self.arriving:
+            return Arrived(t0=t0, t1=t1, y0=y0, y1=y1)
         return SteppedTo(t0=t0, t1=t1, y0=y0, state=state, solver=self)
 
     def order(self, terms):
@@ -107,14 +127,55 @@ class OnManifold(diffrax.AbstractWrappedSolver):
         return self.solver.error_order(terms)
 
     def init(self, terms, t0, t1, y0, args):
+        if self.quick is not None:
+            return self.quick.solver.init(self.quick.terms, t0, t1, y0, args)
         return self.solver.init(terms, t0, t1, y0, self._stages(t0, y0, args))
 
     def func(self, terms, t0, y0, args):
         # Only used to choose the first step, which has to be finite even where the motion is refused.
-        rate = self.solver.func(terms, t0, y0, self._stages(t0, y0, args))
-        return jtu.tree_map(lambda f: jnp.where(self.refused, 0.0, f), rate)
+        if self.quick is not None:
+            rate = self.quick.terms.vf(t0, y0, args)
+        else:
+            rate = self.solver.func(terms, t0, y0, self._stages(t0, y0, args))
+        return jtu.tree_map(lambda f: jnp.where(self.refused | ~jnp.isfinite(f), 0.0, f), rate)
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
+        if self.quick is None:
+            y1, error, solver_state, result = self._careful_step(terms, t0, t1, y0, args, solver_state, made_jump)
+        else:
+            y1, error, solver_state, result = self._quick_step(t0, t1, y0, args, solver_state, made_jump)
+        # Infinite, a state would make its own error relative to it zero.
+        failed = self.refused | ~_all_finite((y1, error))
+        y1 = jtu.tree_map(lambda y1, y0: jnp.where(failed, y0, y1), y1, y0)
+        error = jtu.tree_map(lambda x: jnp.where(failed, jnp.inf, x), error)
+        result = diffrax.RESULTS.where(failed & (result == diffrax.RESULTS.successful), NOT_FINITE, result)
+        if self.arriving:
+            return y1, error, {"y0": y0, "y1": y1}, solver_state, result
+        # Newton's iteration for an output starts from the polynomial of the step that it lies in.
+        continued = solver_state if isinstance(self.solver, Radau5) else None
+        return y1, error, {"y0": y0, "state": continued}, solver_state, result
+
+    def _quick_step(self, t0, t1, y0, args, solver_state, made_jump):
+        quick, project = self.quick, self.project
+        jumped = True if project else made_jump
+        y1, error, _, solver_state, result = quick.solver.step(quick.terms, t0, t1, y0, args, solver_state, jumped)
+        if project:
+            y1 = called(quick.project.at(quick.prepared, t1, *y1))
+        if self.weigh:
+            error = self._weighed(y0, y1, error)
+        if not quick.careful:
+            return y1, error, solver_state, result
+        believed = _all_finite((y1, error))
+
+        def again():
+            state = self.solver.init(self.terms, t0, t1, y0, self._stages(t0, y0, args))
+            y1, error, _, result = self._careful_step(self.terms, t0, t1, y0, args, state, True)
+            return y1, error, quick.solver.init(quick.terms, t1, t1, y1, args), result
+
+        # A branch also in a batch, where it is taken for all lanes or none.
+        return lax.cond(eqxi.unvmap_all(believed), lambda: (y1, error, solver_state, result), again)
+
+    def _careful_step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         # The projection moves the state, so a derivative kept from the last step's end is stale.
         jumped = True if self.project else made_jump
         stages = self._stages(t0, y0, args)
@@ -126,14 +187,7 @@ class OnManifold(diffrax.AbstractWrappedSolver):
             y1 = (projected.q, projected.v)
             error = jtu.tree_map(lambda x: jnp.where(projected.holds, x, jnp.inf), error)
             result = diffrax.RESULTS.where(projected.holds, result, diffrax.RESULTS.nonlinear_divergence)
-        # Infinite, a state would make its own error relative to it zero.
-        failed = self.refused | ~_all_finite((y1, error))
-        y1 = jtu.tree_map(lambda y1, y0: jnp.where(failed, y0, y1), y1, y0)
-        error = jtu.tree_map(lambda x: jnp.where(failed, jnp.inf, x), error)
-        result = diffrax.RESULTS.where(failed & (result == diffrax.RESULTS.successful), NOT_FINITE, result)
-        # Newton's iteration for an output starts from the polynomial of the step that it lies in.
-        continued = solver_state if isinstance(self.solver, Radau5) else None
-        return y1, error, {"y0": y0, "state": continued}, solver_state, result
+        return y1, error, solver_state, result
 
     def acceptable(self, y0, y1, error):
         """Whether an output's error is not far above the tolerance; a step to it has not passed the controller.
@@ -165,6 +219,20 @@ class OnManifold(diffrax.AbstractWrappedSolver):
     def _stages(self, t, y, params):
         threshold = None if self.project else DEPENDENT_BELOW_WHILE_DRIFTING
         return Stages(params, independent_equations(self.system, t, *y, params, threshold))
+
+
+class Arrived(diffrax.AbstractLocalInterpolation):
+    """The state at an end of a step, where all outputs are: the first of them at the start."""
+
+    t0: PyTree
+    t1: PyTree
+    y0: PyTree
+    y1: PyTree
+
+    def evaluate(self, t0, t1=None, left=True):
+        if t1 is not None:
+            return jtu.tree_map(lambda b, a: b - a, self.evaluate(t1), self.evaluate(t0))
+        return jtu.tree_map(lambda y0, y1: jnp.where(t0 <= self.t0, y0, y1), self.y0, self.y1)
 
 
 class SteppedTo(diffrax.AbstractLocalInterpolation):

@@ -20,6 +20,8 @@ from jax import lax
 from jaxtyping import Array, Float
 
 ELIMINATE_UP_TO = 6
+# The square of the sine of a row to the span of those before it.
+INDEPENDENT_ABOVE = 1e-10
 
 
 @jax.custom_jvp
@@ -98,3 +100,67 @@ def reciprocal_condition(matrix: Float[Array, "n n"]) -> Float[Array, ""]:
     scaled = lax.fori_loop(0, 20, rescaled, matrix)
     product = jnp.max(jnp.abs(scaled)) * jnp.max(jnp.abs(inverse(scaled)))
     return jnp.where(jnp.isfinite(product), 1 / product, 0.0)
+
+
+class Saddle:
+    """`[[M, Aᵀ], [A, 0]]` eliminated in the order in which it is written, one number at a time.
+
+    For programs that are written out (`scalars.py`), where the zeros of M and A cost nothing. `believed` says whether
+    the answers are as accurate as with pivoting: M is definite (or every pivot the largest of its column), and no row of
+    A depends on those before it. A `diagonal` M without A is divided by: what is singular gives NaN or infinity.
+
+    Source: Golub & Van Loan, *Matrix Computations*, §4.1.2.
+    """
+
+    def __init__(self, mass: Float[Array, "n n"], jacobian: Float[Array, "m n"], diagonal: bool = False):
+        self.n, self.m = n, m = mass.shape[0], jacobian.shape[0]
+        entry = lambda i, j: mass[i, j] if i < n else jacobian[i - n, j] if j < n else jnp.zeros_like(mass[0, 0])
+        self.matrix = matrix = [[entry(max(i, j), min(i, j)) for j in range(n + m)] for i in range(n + m)]
+        work = [row[: i + 1] for i, row in enumerate(matrix)]
+        self.lower, self.pivots = [[] for _ in work], []
+        schur = []
+        positive = negative = largest = independent = nonzero = True
+        for k in range(n + m):
+            if k == n:
+                schur = [work[i][i] for i in range(n, n + m)]
+            pivot = work[k][k]
+            # What is not believed is computed too, and must not put NaN into the derivatives of what is taken instead.
+            nonzero = nonzero & (pivot != 0)
+            pivot = pivot if diagonal else jnp.where(pivot != 0, pivot, 1.0)
+            self.pivots.append(pivot)
+            column = [work[i][k] for i in range(k + 1, n + m)]
+            if k < n:
+                positive, negative = positive & (pivot > 0), negative & (pivot < 0)
+                for x in column[: n - k - 1]:
+                    largest = largest & (jnp.abs(pivot) >= jnp.abs(x))
+            else:
+                positive, negative = positive & (pivot < 0), negative & (pivot > 0)
+                independent = independent & (jnp.abs(pivot) > INDEPENDENT_ABOVE * jnp.abs(schur[k - n]))
+            for i in range(k + 1, n + m):
+                factor = column[i - k - 1] / pivot
+                self.lower[i].append(factor)
+                for j in range(k + 1, i + 1):
+                    work[i][j] = work[i][j] - factor * column[j - k - 1]
+        definite = positive | negative
+        self.believed = diagonal or nonzero & ((definite & independent) if m else (definite | largest))
+
+    def solve(self, forcing: Float[Array, " n"], gamma: Float[Array, " m"], refine: bool = True):
+        """a and λ of `M a - Aᵀ λ = F`, `A a = gamma`; with constraints, refined once."""
+        known = [forcing[i] for i in range(self.n)] + [gamma[i] for i in range(self.m)]
+        x = self._substituted(known)
+        if self.m and refine:
+            left = [b - sum(k * y for k, y in zip(row, x)) for b, row in zip(known, self.matrix)]
+            x = [a + b for a, b in zip(x, self._substituted(left))]
+        stack = lambda entries: jnp.stack(entries) if entries else jnp.zeros(0, forcing.dtype)
+        return stack(x[: self.n]), stack([-y for y in x[self.n :]])
+
+    def _substituted(self, known):
+        y = list(known)
+        for i, row in enumerate(self.lower):
+            for j, factor in enumerate(row):
+                y[i] = y[i] - factor * y[j]
+        x = [b / pivot for b, pivot in zip(y, self.pivots)]
+        for i in reversed(range(len(x))):
+            for j in range(i):
+                x[j] = x[j] - self.lower[i][j] * x[i]
+        return x

@@ -1,0 +1,91 @@
+"""A system seen as numbers: coordinates one by one, programs as operations on single numbers.
+
+`in_numbers` gives the same system with a tuple of numbers in place of the user's q and v. `Numbers` traces a function of
+the system and its state, writes it out, and parts it in what depends on the parameters alone and the rest.
+"""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+
+from lagjax.mechanics import coordinates
+from lagjax.mechanics.constraints import Holonomic, Nonholonomic
+from lagjax.mechanics.system import System
+from lagjax.numerics.programs import needed, staged
+from lagjax.numerics.scalars import written_out
+
+
+class InNumbers(eqx.Module):
+    """A function of (t, q, v, params) or (t, q, params), taking each state as a tuple of numbers."""
+
+    function: Callable
+    unflatten: Callable = eqx.field(static=True)
+    returns_coordinates: bool = eqx.field(static=True, default=False)
+
+    def __call__(self, t, *states_and_params):
+        *states, params = states_and_params
+        result = self.function(t, *(self.unflatten(jnp.stack(state)) for state in states), params)
+        return coordinates.numbers(result) if self.returns_coordinates else result
+
+
+def in_numbers(system: System, unflatten: Callable) -> System:
+    """The same system, with a tuple of numbers for q and for v."""
+    wrap = lambda function, **kw: None if function is None else InNumbers(function, unflatten, **kw)
+    return System(
+        wrap(system.lagrangian),
+        {
+            name: Holonomic(wrap(c.g)) if isinstance(c, Holonomic) else Nonholonomic(wrap(c.phi))
+            for name, c in system.constraints.items()
+        },
+        force=wrap(system.force, returns_coordinates=True),
+        dissipation=wrap(system.dissipation),
+    )
+
+
+class Numbers:
+    """A function of (system, t, q, v, params), traced once and written out.
+
+    What depends on the system and the parameters alone is computed by `prepare`, once; `at` does the rest.
+    """
+
+    def __init__(self, function, args):
+        arrays, static = eqx.partition(args, eqx.is_array)
+        self.shapes = []
+
+        def of_leaves(*leaves):
+            args = eqx.combine(jtu.tree_unflatten(jtu.tree_structure(arrays), leaves), static)
+            result, shape = jtu.tree_flatten(function(*args))
+            self.shapes.append(shape)
+            return result
+
+        like = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in jtu.tree_leaves(arrays)]
+        program = jax.make_jaxpr(of_leaves)(*like)
+        full = jax.make_jaxpr(lambda *leaves: written_out(program, *leaves))(*like)
+        self.program = full.replace(jaxpr=full.jaxpr.replace(eqns=needed(full.jaxpr)))
+        of_problem, of_state = _leaves_of(arrays, (0, 4)), _leaves_of(arrays, (1, 2, 3))
+        self.state_variables = [self.program.jaxpr.invars[i] for i in of_state]
+        early, late = staged(self.program, of_problem, of_state)
+        self._early, self._late = jax.jit(early), jax.jit(late)
+
+    def prepare(self, system, params) -> tuple:
+        """What does not depend on the state."""
+        return tuple(self._early(*jtu.tree_leaves(eqx.filter((system, params), eqx.is_array))))
+
+    def at(self, prepared, t, q, v):
+        """The function's result at a state."""
+        return jtu.tree_unflatten(self.shapes[0], self._late(prepared, *jtu.tree_leaves((t, q, v))))
+
+    def __call__(self, system, t, q, v, params):
+        """The function's result."""
+        return self.at(self.prepare(system, params), t, q, v)
+
+
+def _leaves_of(arguments, places):
+    """Where the leaves of some of the arguments are among those of all."""
+    sizes = [len(jtu.tree_leaves(x)) for x in arguments]
+    starts = np.cumsum([0, *sizes])
+    return [i for place in places for i in range(starts[place], starts[place + 1])]

@@ -1,0 +1,103 @@
+"""The equations of a small system, written out number by number.
+
+Accelerations, multipliers and the return to the constraints of `saddle_point.py` and `consistency.py`, for systems of a
+few coordinates, as straight code on single numbers. The matrix
+
+    [M  Aᵀ] [ a]   [  F  ]
+    [A  0 ] [-λ] = [gamma]
+
+is eliminated in the order in which it is written, coordinates before constraints, so that its zeros, which are known
+before anything runs, cost nothing. That is as accurate as pivoting where M is definite; where it is not, where
+constraints depend on each other, and where a state is too far from the constraints to be returned in two iterations,
+the results are NaN: a caller then does it the careful way.
+
+Source: Golub & Van Loan, *Matrix Computations*, §4.1.2 (L D Lᵀ), §4.2.7 (without pivoting where definite).
+"""
+
+from functools import partial
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+from jax import lax
+from jaxtyping import Array
+
+from lagjax.mechanics import constraints, coordinates
+from lagjax.mechanics.in_numbers import Numbers
+from lagjax.mechanics.lagrangian import mass_and_forcing
+from lagjax.mechanics.structure import is_diagonal
+from lagjax.numerics import dense
+
+# Coordinates and constraint equations together: beyond, the code grows with their cube.
+UP_TO = 8
+# Two iterations are enough where the second one moves the state by less than this part of its size.
+SMALL_CORRECTION = 1e-7
+
+
+class WrittenOut(NamedTuple):
+    """`equations(system, t, q, v, params)` -> (a, multipliers stacked); `project(same)` -> (q, v).
+
+    `careful` says whether either may give NaN where the careful way does not.
+    """
+
+    equations: Numbers
+    project: Numbers | None
+    careful: bool
+
+
+def is_small(system, t, q, v, params) -> bool:
+    """Whether the equations of a system are to be written out."""
+    size = sum(leaf.size for leaf in jtu.tree_leaves(q))
+    return size + constraints.count(system, t, q, v, params) <= UP_TO
+
+
+def write_out(system, t, q, v, params) -> WrittenOut:
+    """The equations of a small system near a state, of which only shapes count."""
+    count = constraints.count(system, t, q, v, params)
+    args = (system, t, q, v, params)
+    diagonal = count == 0 and is_diagonal(*args)
+    project = Numbers(_projected, args) if count else None
+    return WrittenOut(Numbers(partial(_equations, diagonal), args), project, careful=not diagonal)
+
+
+def _equations(diagonal, system, t, q, v, params):
+    x, unflatten = coordinates.flatten(q)
+    u, _ = coordinates.flatten(v)
+    linear = mass_and_forcing(system, t, x, u, params, unflatten)
+    if x.size == 1 and not system.constraints:
+        return unflatten(linear.forcing / linear.mass[0]), jnp.zeros(0, x.dtype)
+    rows = constraints.acceleration_rows(system, t, x, u, params, unflatten)
+    solver = dense.Saddle(linear.mass, rows.jacobian, diagonal)
+    a, multipliers = solver.solve(linear.forcing, rows.gamma)
+    return unflatten(a if diagonal else jnp.where(solver.believed, a, jnp.nan)), multipliers
+
+
+def _projected(system, t, q, v, params):
+    x, unflatten = coordinates.flatten(q)
+    u, _ = coordinates.flatten(v)
+    mass = mass_and_forcing(system, t, x, u, params, unflatten).mass
+    jacobian = constraints.jacobian(system, t, x, u, params, unflatten)
+    # Where the residual vanishes, the derivative of the matrix does not count.
+    solver = dense.Saddle(*map(lax.stop_gradient, (mass, jacobian)))
+    holonomic = constraints.holonomic_equations(system, t, q, v, params)
+    still = jnp.zeros_like(x)
+    last_x = last_u = still
+    if holonomic.any():
+        for _ in range(2):
+            position = constraints.position_residual(system, t, x, params, unflatten)
+            wanted = jnp.zeros(holonomic.size, x.dtype).at[np.flatnonzero(holonomic)].set(-position)
+            last_x, _ = solver.solve(still, wanted, refine=False)
+            x = x + last_x
+    for _ in range(2):
+        last_u, _ = solver.solve(
+            still, -constraints.velocity_residual(system, t, x, u, params, unflatten), refine=False
+        )
+        u = u + last_u
+    near = solver.believed & _tiny(last_x, x) & _tiny(last_u, u)
+    return unflatten(jnp.where(near, x, jnp.nan)), unflatten(u)
+
+
+def _tiny(correction, y) -> Array:
+    largest = lambda z: jnp.sum(jnp.abs(z))
+    return largest(correction) <= SMALL_CORRECTION * largest(y) + 1e-300

@@ -1,0 +1,98 @@
+"""Explicit Runge-Kutta methods with their stages written out.
+
+    k_i = f(t + c_i h, y + h sum_j a_ij k_j),    y1 = y + h sum_i b_i k_i,    error = h sum_i e_i k_i
+
+diffrax runs the stages in a loop over a buffer of k. Here they are straight code on the leaves of y, in which zero
+coefficients leave no trace: with a state made of numbers XLA keeps all of it in registers. What a step costs on one
+coordinate is measured in `benchmarks/work_precision.py` and `benchmarks/against_peers.py`.
+
+The tableaus and the dense output are diffrax's.
+"""
+
+from collections.abc import Callable
+from typing import ClassVar
+
+import diffrax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+from equinox import AbstractClassVar
+
+
+class ExplicitRungeKutta(diffrax.AbstractAdaptiveSolver):
+    """An embedded explicit method for `diffrax.diffeqsolve`, with the tableau of its subclass.
+
+    `shipped` is diffrax's implementation of it, for vector fields that are too large to be written out for each stage.
+    """
+
+    tableau: AbstractClassVar[diffrax.ButcherTableau]
+    shipped: AbstractClassVar[diffrax.AbstractERK]
+    term_structure: ClassVar = diffrax.AbstractTerm
+
+    def func(self, terms, t0, y0, args):
+        """The vector field."""
+        return terms.vf(t0, y0, args)
+
+    def init(self, terms, t0, t1, y0, args):
+        """The first stage, where the last one of a step is the first of the next."""
+        return terms.vf(t0, y0, args) if self.tableau.fsal else None
+
+    def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
+        """One step, its error and all that the dense output needs."""
+        tableau, control = self.tableau, terms.contr(t0, t1)
+        first = solver_state
+        if first is None or made_jump is not False:
+            first = terms.vf(t0, y0, args)
+        increments, rate = [terms.prod(first, control)], first
+        for weights, c in zip(tableau.a_lower, tableau.c):
+            # Rounded differently, the last stage would not be at the time of the next step's first.
+            t = t1 if c == 1 else t0 + c * (t1 - t0)
+            rate = terms.vf(t, _sum(y0, weights, increments), args)
+            increments.append(terms.prod(rate, control))
+        y1 = _sum(y0, tableau.b_sol, increments)
+        error = _sum(None, tableau.b_error, increments)
+        stages = jtu.tree_map(lambda *k: jnp.stack(k), *increments)
+        return y1, error, {"y0": y0, "y1": y1, "k": stages}, rate if tableau.fsal else None, diffrax.RESULTS.successful
+
+
+def _sum(start, weights, increments):
+    """`start + sum_i weights_i increments_i`, leaf by leaf."""
+    chosen = [(float(w), k) for w, k in zip(weights, increments) if w != 0]
+    scales = np.array([w for w, _ in chosen])
+
+    def of_leaves(*leaves):
+        terms = [jnp.asarray(w, k.dtype) * k for w, k in zip(scales, leaves)]
+        return sum(terms[1:], terms[0])
+
+    total = jtu.tree_map(of_leaves, *(k for _, k in chosen))
+    return total if start is None else jtu.tree_map(jnp.add, start, total)
+
+
+class Tsit5(ExplicitRungeKutta):
+    """Tsitouras' method of order 5, with an embedded one of order 4: six evaluations a step.
+
+    Source: Tsitouras, Comput. Math. Appl. 62 (2011) 770.
+    """
+
+    shipped: ClassVar = diffrax.Tsit5()
+    tableau: ClassVar = diffrax.Tsit5.tableau
+    interpolation_cls: ClassVar[Callable] = diffrax.Tsit5.interpolation_cls
+
+    def order(self, terms):
+        """5."""
+        return 5
+
+
+class Dopri8(ExplicitRungeKutta):
+    """Prince and Dormand's method of order 8, with an embedded one of order 7: thirteen evaluations a step.
+
+    Source: Prince & Dormand, J. Comput. Appl. Math. 7 (1981) 67, RK8(7)13M.
+    """
+
+    shipped: ClassVar = diffrax.Dopri8()
+    tableau: ClassVar = diffrax.Dopri8.tableau
+    interpolation_cls: ClassVar[Callable] = diffrax.Dopri8.interpolation_cls
+
+    def order(self, terms):
+        """8."""
+        return 8

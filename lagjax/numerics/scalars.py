@@ -1,0 +1,325 @@
+"""Small arrays written out as numbers, with their zeros left out.
+
+The mechanics is written with vectors and matrices. On a few coordinates these are mostly zeros and ones: the rows of a
+unit matrix along which a momentum is pushed, a mass matrix with its diagonal alone. `written_out` takes a program apart
+into operations on single numbers: what is multiplied by a known zero is gone, what is a known one is not multiplied, and
+what is never used is not computed. XLA keeps the rest in registers.
+
+A known zero counts as zero whatever it multiplies, also infinity or NaN. Primitives that are not known here, control
+flow, and arrays of more than `LARGE` entries are left as they are.
+"""
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.extend.core import ClosedJaxpr, Literal
+
+from lagjax.numerics.programs import evaluate
+
+LARGE = 256
+ELEMENTWISE = {
+    "abs", "acos", "acosh", "add", "add_any", "and", "asin", "asinh", "atan", "atan2", "atanh", "cbrt", "ceil", "clamp",
+    "cos", "cosh", "convert_element_type", "digamma", "div", "eq", "erf", "erf_inv", "erfc", "exp", "exp2", "expm1",
+    "floor", "ge", "gt", "integer_pow", "is_finite", "le", "lgamma", "log", "log1p", "logistic", "lt", "max", "min", "mul",
+    "ne", "neg", "nextafter", "not", "or", "pow", "rem", "round", "rsqrt", "select_n", "sign", "sin", "sinh", "sqrt",
+    "square", "stop_gradient", "sub", "tan", "tanh", "xor",
+}  # fmt: skip
+CALLS = {"jit", "pjit", "closed_call", "core_call"}
+
+
+def written_out(closed: ClosedJaxpr, *args) -> list:
+    """Evaluate a program on its (flat) arguments, number by number.
+
+    >>> import jax, jax.numpy as jnp
+    >>> program = jax.make_jaxpr(lambda x: jnp.diag(jnp.array([2.0, 0.0])) @ x)(jnp.ones(2))
+    >>> print(jax.make_jaxpr(lambda x: written_out(program, x)[0][0])(jnp.ones(2)).jaxpr.eqns[-1].primitive)
+    mul
+    """
+    results = _evaluate(closed, [_split(x) if _small(x.aval) else x for x in map(_Value, args)])
+    return [_joined(x, aval) for x, aval in zip(results, closed.out_avals)]
+
+
+class _Value:
+    """A whole array, that looks like a variable of a program."""
+
+    def __init__(self, array):
+        self.array, self.aval = array, jax.typeof(array)
+
+
+def _small(aval):
+    return hasattr(aval, "shape") and aval.size <= LARGE and not jax.dtypes.issubdtype(aval.dtype, jax.dtypes.extended)
+
+
+def _split(value):
+    """The numbers of a whole array, in an array of objects."""
+    array = value.array
+    if isinstance(array, (np.ndarray, np.generic)) or not isinstance(array, jax.core.Tracer):
+        return _known(np.asarray(array))
+    if array.shape == ():
+        return _filled((), [array])
+    flat = array.reshape(-1)
+    return _filled(array.shape, [jax.lax.squeeze(jax.lax.slice(flat, (i,), (i + 1,)), (0,)) for i in range(array.size)])
+
+
+def _known(array):
+    return _filled(array.shape, list(array.reshape(-1)))
+
+
+def _filled(shape, entries):
+    result = np.empty(len(entries), object)
+    for i, entry in enumerate(entries):
+        result[i] = entry
+    return result.reshape(shape)
+
+
+def _joined(value, aval):
+    """The whole array of what is whole already or an array of numbers."""
+    if not isinstance(value, np.ndarray):
+        return value.array
+    if value.shape == ():
+        return value[()]
+    entries = [jnp.asarray(x, aval.dtype) for x in value.reshape(-1)]
+    return jnp.stack(entries).reshape(aval.shape) if entries else jnp.zeros(aval.shape, aval.dtype)
+
+
+def _evaluate(closed, args):
+    jaxpr = closed.jaxpr
+    values = dict(zip(jaxpr.invars, args))
+    for variable, constant in zip(jaxpr.constvars, closed.consts):
+        value = _Value(constant)
+        values[variable] = _split(value) if _small(variable.aval) else value
+
+    def read(x):
+        if isinstance(x, Literal):
+            return _known(np.asarray(x.val, x.aval.dtype))
+        return values[x]
+
+    for equation in jaxpr.eqns:
+        values.update(zip(equation.outvars, _apply(equation, [read(x) for x in equation.invars], jaxpr)))
+    return [read(x) for x in jaxpr.outvars]
+
+
+def _apply(equation, operands, jaxpr):
+    name, params = equation.primitive.name, equation.params
+    apart = all(isinstance(x, np.ndarray) for x in operands) and all(_small(x.aval) for x in equation.outvars)
+    if name in CALLS and len(_programs(params)) == 1:
+        return _evaluate(_programs(params)[0], operands)
+    if apart and name in ELEMENTWISE:
+        return [_elementwise(equation, operands)]
+    if apart and name in MOVES:
+        found = MOVES[name](params, equation.outvars, *operands)
+        if found is not None:
+            return found
+    whole = {v: _joined(x, v.aval) for x, v in zip(operands, equation.invars) if not isinstance(v, Literal)}
+    results = evaluate(jaxpr, equation, whole)
+    return [_split(x) if _small(v.aval) else x for x, v in zip(map(_Value, results), equation.outvars)]
+
+
+def _programs(params):
+    return [p for p in params.values() if isinstance(p, ClosedJaxpr)]
+
+
+def _elementwise(equation, operands):
+    (variable,) = equation.outvars
+    shape, dtype = variable.aval.shape, variable.aval.dtype
+    rows = [np.broadcast_to(x, shape).reshape(-1) for x in operands]
+    one = lambda *x: _simplified(equation, dtype, *x)
+    return _filled(shape, [one(*column) for column in zip(*rows)])
+
+
+def _is(x, number):
+    return isinstance(x, np.generic) and x == number
+
+
+def _simplified(equation, dtype, *x):
+    """One number by a primitive, computed at once where that is trivial."""
+    name = equation.primitive.name
+    if name in ("add", "add_any"):
+        return _add(*x)
+    if name == "sub" and _is(x[1], 0):
+        return x[0]
+    if name == "sub" and _is(x[0], 0):
+        return _negative(x[1])
+    if name == "mul":
+        return _multiply(*x)
+    if name == "neg":
+        return _negative(x[0])
+    if name == "div" and _is(x[1], 1):
+        return x[0]
+    if name == "div" and _is(x[0], 0):
+        return x[0]
+    if name == "select_n" and isinstance(x[0], np.generic):
+        return x[1 + int(x[0])]
+    if name == "select_n" and all(y is x[1] for y in x[2:]):
+        return x[1]
+    if name == "convert_element_type":
+        if isinstance(x[0], np.generic):
+            return np.asarray(x[0]).astype(dtype)[()]
+        if x[0].dtype == dtype and not getattr(x[0], "weak_type", False):
+            return x[0]
+    if name in KNOWN and all(isinstance(y, np.generic) for y in x):
+        return np.asarray(KNOWN[name](*x), dtype)[()]
+    return equation.primitive.bind(*x, **equation.params)
+
+
+KNOWN = {
+    "sub": np.subtract, "max": np.maximum, "min": np.minimum, "eq": np.equal, "ne": np.not_equal, "lt": np.less,
+    "le": np.less_equal, "gt": np.greater, "ge": np.greater_equal, "and": np.bitwise_and, "or": np.bitwise_or,
+    "not": np.invert, "abs": np.abs, "square": np.square, "div": lambda x, y: np.divide(x, y) if y != 0 else np.nan * x,
+}  # fmt: skip
+
+
+def _add(x, y):
+    if _is(x, 0):
+        return y
+    if _is(y, 0):
+        return x
+    if isinstance(x, np.generic) and isinstance(y, np.generic):
+        return x + y
+    return jax.lax.add(*_arrays(x, y))
+
+
+def _multiply(x, y):
+    for a, b in ((x, y), (y, x)):
+        if _is(a, 0):
+            return a
+        if _is(a, 1):
+            return b
+        if _is(a, -1):
+            return _negative(b)
+    if isinstance(x, np.generic) and isinstance(y, np.generic):
+        return x * y
+    return jax.lax.mul(*_arrays(x, y))
+
+
+def _negative(x):
+    return -x if isinstance(x, np.generic) else jax.lax.neg(x)
+
+
+def _arrays(x, y):
+    dtype = (y if isinstance(x, np.generic) else x).dtype
+    return tuple(np.asarray(z, dtype) if isinstance(z, np.generic) else z for z in (x, y))
+
+
+def _total(entries, zero):
+    total = zero
+    for entry in entries:
+        total = _add(total, entry)
+    return total
+
+
+def _zero(variables):
+    return np.zeros((), variables[0].aval.dtype)[()]
+
+
+def _broadcast(params, variables, x):
+    shape, places = params["shape"], params["broadcast_dimensions"]
+    widened = [1] * len(shape)
+    for place, size in zip(places, x.shape):
+        widened[place] = size
+    return [np.broadcast_to(x.reshape(widened), shape)]
+
+
+def _sliced(params, variables, x):
+    strides = params["strides"] or [1] * x.ndim
+    return [x[tuple(map(slice, params["start_indices"], params["limit_indices"], strides))]]
+
+
+def _dynamic_slice(params, variables, x, *starts):
+    if not all(isinstance(s[()], np.generic) for s in starts):
+        return None
+    sizes = params["slice_sizes"]
+    starts = [min(max(int(s[()]), 0), n - size) for s, n, size in zip(starts, x.shape, sizes)]
+    return [x[tuple(slice(s, s + size) for s, size in zip(starts, sizes))]]
+
+
+def _padded(params, variables, x, filling):
+    if any(inner or low < 0 or high < 0 for low, high, inner in params["padding_config"]):
+        return None
+    result = _filled(variables[0].aval.shape, [filling[()]] * variables[0].aval.size)
+    place = tuple(slice(low, low + n) for n, (low, _, _) in zip(x.shape, params["padding_config"]))
+    result[place] = x
+    return [result]
+
+
+def _sum(params, variables, x):
+    axes = params["axes"]
+    kept = [i for i in range(x.ndim) if i not in axes]
+    rows = x.transpose([*kept, *axes]).reshape([x.shape[i] for i in kept] + [-1])
+    shape = rows.shape[:-1]
+    rows = rows.reshape(-1, rows.shape[-1]) if rows.size else np.empty((int(np.prod(shape)), 0), object)
+    return [_filled(shape, [_total(row, _zero(variables)) for row in rows])]
+
+
+def _cumulative_sum(params, variables, x):
+    axis, result = params["axis"], x.copy()
+    if params["reverse"]:
+        return None
+    result = np.moveaxis(result, axis, 0)
+    for i in range(1, len(result)):
+        flat = [_add(a, b) for a, b in zip(result[i - 1].reshape(-1), result[i].reshape(-1))]
+        result[i] = _filled(result[i].shape, flat) if result[i : i + 1].ndim > 1 else flat[0]
+    return [np.moveaxis(result, 0, axis)]
+
+
+def _product(params, variables, x, y):
+    (contract_x, contract_y), (batch_x, batch_y) = params["dimension_numbers"]
+    free_x = [i for i in range(x.ndim) if i not in (*contract_x, *batch_x)]
+    free_y = [i for i in range(y.ndim) if i not in (*contract_y, *batch_y)]
+    sizes = lambda z, axes: int(np.prod([z.shape[i] for i in axes]))
+    inner, batch = sizes(x, contract_x), sizes(x, batch_x)
+    x = x.transpose([*batch_x, *free_x, *contract_x]).reshape(batch, -1, inner)
+    y = y.transpose([*batch_y, *free_y, *contract_y]).reshape(batch, -1, inner)
+    zero = _zero(variables)
+    entries = [
+        _total([_multiply(p, q) for p, q in zip(row, column)], zero)
+        for rows, columns in zip(x, y)
+        for row in rows
+        for column in columns
+    ]
+    return [_filled(variables[0].aval.shape, entries)]
+
+
+def _unstacked(params, variables, x):
+    return [
+        _filled(v.aval.shape, list(part.reshape(-1))) for v, part in zip(variables, np.moveaxis(x, params["axis"], 0))
+    ]
+
+
+def _split_up(params, variables, x):
+    return np.split(x, np.cumsum(params["sizes"])[:-1], params["axis"])
+
+
+def _counted(params, variables):
+    aval, axis = variables[0].aval, params["dimension"]
+    shape = [-1 if i == axis else 1 for i in range(len(aval.shape))]
+    return [_known(np.broadcast_to(np.arange(aval.shape[axis], dtype=aval.dtype).reshape(shape), aval.shape))]
+
+
+MOVES: dict[str, Callable] = {
+    "broadcast_in_dim": _broadcast,
+    "concatenate": lambda params, variables, *x: [np.concatenate(x, params["dimension"])],
+    "copy": lambda params, variables, x: [x],
+    "copy_p": lambda params, variables, x: [x],
+    "cumsum": _cumulative_sum,
+    "dot_general": _product,
+    "dynamic_slice": _dynamic_slice,
+    "expand_dims": lambda params, variables, x: [x.reshape(variables[0].aval.shape)],
+    "iota": _counted,
+    "pad": _padded,
+    "reduce_sum": _sum,
+    "reshape": lambda params, variables, x: [x.reshape(variables[0].aval.shape)],
+    "rev": lambda params, variables, x: [np.flip(x, params["dimensions"])],
+    "slice": _sliced,
+    "split": _split_up,
+    "squeeze": lambda params, variables, x: [x.reshape(variables[0].aval.shape)],
+    "stack": lambda params, variables, *x: [
+        np.stack([y.reshape(1, -1) for y in x], 0).reshape(-1, *x[0].shape)
+        if params["axis"] == 0
+        else np.moveaxis(np.stack([np.atleast_1d(y) for y in x], 0), 0, params["axis"])
+    ],
+    "unstack": _unstacked,
+    "transpose": lambda params, variables, x: [x.transpose(params["permutation"])],
+}

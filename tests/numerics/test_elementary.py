@@ -1,0 +1,232 @@
+"""Sine and cosine by arithmetic: a unit in the last place, everywhere; and functions rewritten to use them."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import mpmath
+import numpy as np
+import pytest
+from jax import lax
+
+from lagjax.numerics import elementary
+from lagjax.numerics.elementary import ARITHMETIC, sincos, unguarded, vectorised
+
+rng = np.random.default_rng(19)
+LIMIT = ARITHMETIC[np.dtype("float64")].limit
+WORST = 0.85  # units in the last place; the C library's worst here is 0.55
+
+
+def neighbours(x):
+    """Numbers, those next to them, and all of them negated."""
+    x = np.concatenate([np.nextafter(x, -np.inf, dtype=x.dtype), x, np.nextafter(x, np.inf, dtype=x.dtype)])
+    return np.concatenate([x, -x])
+
+
+def multiples(of, up_to, count, dtype):
+    """The floating numbers next to multiples of an angle: the first few hundred, and some up to the limit."""
+    with mpmath.workprec(200):
+        angle = of(mpmath.pi)
+        ks = np.unique(np.concatenate([np.arange(1, 200), rng.integers(1, int(up_to / float(angle)), count)]))
+        return neighbours(np.array([float(int(k) * angle) for k in ks]).astype(dtype))
+
+
+ARGUMENTS = {
+    "one turn": lambda: rng.uniform(-7, 7, 4000),
+    "the whole range": lambda: rng.uniform(-LIMIT, LIMIT, 4000),
+    "every exponent": lambda: 10 ** rng.uniform(-307, 5, 4000) * rng.choice([-1, 1], 4000),
+    "multiples of pi/2": lambda: multiples(lambda pi: pi / 2, LIMIT, 1500, float),
+    "odd multiples of pi/4": lambda: multiples(lambda pi: pi / 4, LIMIT, 1500, float),
+    "next to what is special": lambda: neighbours(np.array([0.0, 1e-320, 1e-300, 2.0**-27, 1e-5, LIMIT - 1e-9])),
+}
+
+
+def ulps(found, exact, x):
+    """The largest error in units in the last place of the exact value, which mpmath knows to 100 bits more."""
+    with mpmath.workprec(160):
+        values = [exact(mpmath.mpf(float(a))) for a in x]
+        units = np.spacing(np.abs(np.array([float(v) for v in values])))
+        errors = [abs(mpmath.mpf(float(f)) - v) / mpmath.mpf(u) for f, v, u in zip(found, values, units)]
+        return float(max(errors))
+
+
+def fused(x):
+    """Sine and cosine compiled as one program, in which XLA may contract products and sums."""
+    return jax.jit(lambda x: elementary._by_arithmetic(x))(x)
+
+
+def apart(x):
+    """Sine and cosine with every operation rounded by itself."""
+    return elementary._by_arithmetic(jnp.asarray(x))
+
+
+@pytest.mark.parametrize("arguments", ARGUMENTS)
+def test_error_is_below_a_unit_in_the_last_place(arguments):
+    """Against mpmath, contracted by the compiler or not; and the public function takes this path."""
+    x = ARGUMENTS[arguments]()
+    x = x[np.abs(x) <= LIMIT]
+    for pair in (fused, apart, sincos):
+        for found, exact in zip(pair(x), (mpmath.sin, mpmath.cos)):
+            assert ulps(np.asarray(found), exact, x) < WORST
+
+
+@pytest.mark.parametrize("parts", [1, 2])
+def test_fewer_parts_are_found_out(parts, monkeypatch):
+    """Twin: with pi/2 in fewer parts the same arguments show errors of more than a unit."""
+    ours = ARITHMETIC[np.dtype("float64")]
+    rest = float(np.pi / 2) if parts == 1 else ours.parts[1]
+    kept = (rest, 0.0) if parts == 1 else (ours.parts[0], rest)
+    monkeypatch.setitem(ARITHMETIC, np.dtype("float64"), ours._replace(parts=kept))
+    x = multiples(lambda pi: pi / 2, LIMIT, 200, float)
+    assert max(ulps(np.asarray(found), exact, x) for found, exact in zip(fused(x), (mpmath.sin, mpmath.cos))) > 100
+
+
+def test_beyond_the_limit_the_library_takes_over():
+    """One large argument sends all of them to jnp.sin, to the last bit; whatever its size."""
+    large = np.concatenate([10 ** rng.uniform(5.001, 308, 500), [1e300, 5.319372648326541e255]])
+    mixed = np.append(rng.uniform(-3, 3, 20), 2 * LIMIT)
+    for x in (large, -large, mixed):
+        for found, library in zip(jax.jit(sincos)(x), (jnp.sin, jnp.cos)):
+            assert np.array_equal(found, library(x))
+    assert ulps(np.asarray(sincos(large)[0]), mpmath.sin, large) < WORST
+    # Twin: the arithmetic is of no use there.
+    assert not np.allclose(fused(large)[0], np.sin(large))
+
+
+def test_what_is_not_an_ordinary_number():
+    """Infinities and NaN give NaN; zeros keep their sign, and subnormal numbers are their own sines."""
+    for pair in (jax.jit(sincos), fused):
+        assert np.all(np.isnan(pair(np.array([np.inf, -np.inf, np.nan]))))
+        small = np.array([0.0, -0.0, 5e-324, -1e-310])
+        sine, cosine = pair(small)
+        assert np.array_equal(sine, small) and np.array_equal(np.signbit(sine), np.signbit(small))
+        assert np.array_equal(cosine, np.ones(4))
+
+
+def test_float32():
+    """A unit in the last place in single precision too, next to every multiple of pi/2 and within the range."""
+    limit = ARITHMETIC[np.dtype("float32")].limit
+    every = multiples(lambda pi: pi / 4, limit, 20000, np.float32)
+    drawn = [rng.uniform(-limit, limit, 100000), 10 ** rng.uniform(-37, 3, 100000)]
+    x = np.concatenate([every, *drawn]).astype(np.float32)
+    x = x[np.abs(x) <= limit]
+    for pair in (fused, apart, sincos):
+        for found, exact in zip(pair(x), (np.sin, np.cos)):
+            assert found.dtype == np.float32
+            exact = exact(x.astype(float))
+            units = np.spacing(np.abs(exact).astype(np.float32)).astype(float)
+            assert np.max(np.abs(np.asarray(found, float) - exact) / units) < WORST
+
+
+def test_derivatives():
+    """Both modes, twice, alone and in lanes, within the limit and beyond, are what jnp.sin and jnp.cos give."""
+    near = rng.uniform(-3, 3, 5)
+    for derive in (jax.grad, jax.jacfwd, lambda f: jax.jacfwd(jax.grad(f)), lambda f: jax.grad(jax.grad(f))):
+        for i, library in enumerate((jnp.sin, jnp.cos)):
+            ours = derive(lambda x: sincos(x)[i])
+            lanes, expected = jax.jit(jax.vmap(ours)), jax.vmap(derive(library))
+            for x in (near, 10 * LIMIT * near):
+                assert np.allclose(lanes(x), expected(x), rtol=0, atol=1e-15)
+            assert np.isclose(jax.jit(ours)(near[0]), expected(near)[0], rtol=0, atol=1e-15)
+
+
+def equations(jaxpr, name):
+    """How many equations of a name a jaxpr has, in the calls it makes too but not in its branches."""
+    inner = [p.jaxpr for eqn in jaxpr.eqns if eqn.primitive.name != "cond" for p in eqn.params.values()
+             if hasattr(p, "jaxpr")]  # fmt: skip
+    return sum(eqn.primitive.name == name for eqn in jaxpr.eqns) + sum(equations(j, name) for j in inner)
+
+
+def count(function, name, *args):
+    """How many equations of a name a function has."""
+    return equations(jax.make_jaxpr(function)(*args).jaxpr, name)
+
+
+@jax.jit
+def torque(q):
+    """A part of the function below with a jit of its own."""
+    return jnp.sin(q["a"]) * jnp.sin(q["b"])
+
+
+def force(q, params, power):
+    """Four sines of two arguments, and one of a third; parameters that are not arrays."""
+    return {"a": params["g"] * jnp.cos(q["a"]) ** power + torque(q), "b": jnp.sin(q["a"] - q["b"])}
+
+
+STATE = {"a": 0.3, "b": 2.1}
+ARRAYS = jax.tree.map(np.float64, STATE)
+
+
+def test_a_function_is_rewritten():
+    """Sines become branches, one for each argument; values and derivatives stay."""
+    call = lambda function: lambda q: function(q, {"g": 9.81, "name": "bead"}, 3)
+    ours = call(vectorised(force))
+    assert count(call(force), "sin", ARRAYS) + count(call(force), "cos", ARRAYS) == 4
+    assert count(ours, "sin", ARRAYS) == count(ours, "cos", ARRAYS) == 0 and count(ours, "cond", ARRAYS) == 3
+    lanes = {"a": rng.uniform(-3, 3, 7), "b": rng.uniform(-3, 3, 7)}
+    for transform in (lambda f: f, jax.jacfwd, jax.jacrev, lambda f: jax.jacfwd(jax.jacfwd(f))):
+        for function in (transform(call(vectorised(force))), vectorised(transform(call(force)))):
+            expected = jax.vmap(transform(call(force)))(lanes)
+            jax.tree.map(functools.partial(np.testing.assert_allclose, atol=1e-14), jax.vmap(function)(lanes), expected)
+
+
+def test_equal_sines_share_a_branch():
+    """A derivative that asks for a sine again and again gets one branch for it."""
+    potential = lambda q: jnp.sin(2 * q) * jnp.cos(2 * q)
+    twice = lambda q: (jax.grad(potential)(q), jax.grad(jax.grad(potential))(q), potential(q))
+    assert count(twice, "sin", 0.5) > 3 and count(vectorised(twice), "cond", 0.5) == 1
+    # Twin: arguments that differ, by the sign of a zero alone, do not.
+    assert count(vectorised(lambda q: jnp.sin(q * 0.0) + jnp.sin(q * -0.0)), "cond", 0.5) == 2
+
+
+def test_in_lanes_the_branch_stays_a_branch():
+    """Under vmap the library is called in a branch only, which lanes decide on together."""
+    x = rng.uniform(-3, 3, 6)
+    assert count(jax.vmap(vectorised(jnp.sin)), "sin", x) == 0
+    # Twin: a branch by the lane's own argument becomes a selection between both.
+    alone = lambda x: lax.cond(x > LIMIT, jnp.sin, lambda x: sincos(x)[0], x)
+    assert count(jax.vmap(alone), "sin", x) == 1
+
+
+def test_unguarded_says_where_it_is_wrong():
+    """No branch at all, and a flag for each lane; derivatives follow."""
+    x = np.array([1.0, 1e12, -2.0, -1e12])
+    function = jax.vmap(unguarded(lambda x: {"y": jnp.sin(x) + torque({"a": x, "b": 2 * x})}))
+    value, outside = function(x)
+    assert outside.tolist() == [False, True, False, True]
+    exact = np.sin(x) * (1 + np.sin(2 * x))
+    assert np.allclose(value["y"][::2], exact[::2], atol=1e-15) and not np.allclose(value["y"][1::2], exact[1::2])
+    assert count(function, "cond", x) == count(function, "sin", x) == 0
+    slope = jax.grad(lambda x: unguarded(jnp.sin)(x)[0])(0.7)
+    assert np.isclose(slope, np.cos(0.7), rtol=1e-15)
+    assert not unguarded(lambda x: x + 1)(1.0)[1]
+
+
+def test_a_derivative_rule_is_kept():
+    """A function with a rule of its own keeps it, and its sines are replaced."""
+
+    @jax.custom_jvp
+    def special(x):
+        return jnp.sin(x)
+
+    special.defjvp(lambda primals, tangents: (special(*primals), 7.0 * tangents[0]))
+    ours = vectorised(lambda x: special(x) + x)
+    assert np.isclose(ours(0.5), np.sin(0.5) + 0.5) and jax.grad(ours)(0.5) == 8.0 and jax.vmap(ours)(np.ones(2)).shape
+    assert count(lambda x: special(x) + x, "sin", 0.5) == 1 and count(ours, "sin", 0.5) == 0
+
+
+def test_what_is_left_alone():
+    """Bodies of loops, complex numbers, and functions without sines."""
+    looped = lambda x: lax.scan(lambda x, _: (jnp.sin(x), None), x, length=3)[0]
+    assert count(vectorised(looped), "sin", 0.5) == 1 and vectorised(looped)(0.5) == looped(0.5)
+    z = np.array([0.3 + 0.4j])
+    assert np.array_equal(vectorised(jnp.sin)(z), jnp.sin(z))
+    assert vectorised(lambda x, name: (x * 2, name))(1.5, "kept") == (3.0, "kept")
+
+
+def test_values_that_are_closed_over():
+    """A traced value that the function closes over is seen by derivatives and lanes."""
+    closed = lambda g: vectorised(lambda q: g * jnp.sin(g * q))(0.3)
+    exact = lambda g: g * jnp.sin(g * 0.3)
+    g = rng.uniform(1, 3, 4)
+    assert np.allclose(jax.vmap(jax.grad(closed))(g), jax.vmap(jax.grad(exact))(g), rtol=1e-14)
