@@ -30,7 +30,7 @@ from lagjax.mechanics.saddle_point import equations_of_motion, independent_equat
 
 jax.config.update("jax_enable_x64", True)
 
-COUNTS = (2, 4, 8, 16, 32, 64, 128, 256)
+COUNTS = (2, 4, 8, 16, 64, 256)
 FITTED = [16, 256]
 GRAVITY = 9.8125
 EVALUATIONS, STEPS, REPEATS = 50, 40, 7
