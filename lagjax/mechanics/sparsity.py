@@ -213,8 +213,8 @@ def _by_positions(move, source, indices, equation):
     if any(x.known is None for x in indices):
         return [None]
     # From one: where nothing is taken, the fill is zero. Of the dtype that a gather fills with zeros.
-    positions = jnp.arange(1, source.sets.size + 1, dtype=jnp.float32).reshape(source.sets.shape)
     with jax.ensure_compile_time_eval():
+        positions = jnp.arange(1, source.sets.size + 1, dtype=jnp.float32).reshape(source.sets.shape)
         taken = np.nan_to_num(np.asarray(move(positions, *(jnp.asarray(x.known) for x in indices)))).astype(int)
     taken = np.where((taken >= 0) & (taken <= source.sets.size), taken, 0)
     return [Value(np.append(np.array([0], object), np.ravel(source.sets))[taken])]

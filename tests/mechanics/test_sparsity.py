@@ -53,6 +53,14 @@ def test_patterns_are_exact(name):
     np.testing.assert_array_equal(pattern(EXACT[name], jnp.zeros(8)), nonzero(EXACT[name]))
 
 
+@pytest.mark.parametrize("name", ["chosen", "added", "gradient of chosen"])
+def test_patterns_are_found_while_tracing(name):
+    """Constant indices are constants inside a function that is being compiled, too."""
+    found = []
+    jax.jit(lambda x: found.append(pattern(EXACT[name], x)))(jnp.zeros(8))
+    np.testing.assert_array_equal(found[0], nonzero(EXACT[name]))
+
+
 @pytest.mark.parametrize("name", TOO_FULL)
 def test_unknown_primitives_are_full(name):
     """Of what is not known every output depends on every input: too full, and never too empty."""
