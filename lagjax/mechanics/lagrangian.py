@@ -30,6 +30,17 @@ class Linear(NamedTuple):
 
 def mass_and_forcing(system, t, x, u, params, unflatten) -> Linear:
     """M and F at the state with position vector `x` and velocity vector `u`."""
+    forcing, inertia = forcing_and_inertia(system, t, x, u, params, unflatten)
+    if x.size == 1:
+        mass = inertia(jnp.ones_like(u))[None]
+    else:
+        # The columns of M by name of velocity; M is symmetric.
+        mass = jax.vmap(inertia)(jnp.eye(x.size, dtype=x.dtype))
+    return Linear(mass.astype(x.dtype), forcing)
+
+
+def forcing_and_inertia(system, t, x, u, params, unflatten):
+    """F at a state, and the product with M there as a function of an acceleration."""
 
     def lagrangian(t, x, u):
         return system.lagrangian(t, unflatten(x), unflatten(u), params)
@@ -46,12 +57,7 @@ def mass_and_forcing(system, t, x, u, params, unflatten) -> Linear:
         forcing = forcing + _force_vector(system, t, x, u, params, unflatten)
     if system.dissipation is not None:
         forcing = forcing - jax.grad(lambda u: system.dissipation(t, unflatten(x), unflatten(u), params))(u)
-    if x.size == 1:
-        mass = push(zero_t, zero, jnp.ones_like(u))[None]
-    else:
-        # The columns of M by name of velocity; M is symmetric.
-        mass = jax.vmap(lambda e: push(zero_t, zero, e))(jnp.eye(x.size, dtype=x.dtype))
-    return Linear(mass.astype(x.dtype), forcing.astype(x.dtype))
+    return forcing.astype(x.dtype), lambda a: push(zero_t, zero, a)
 
 
 def check_scalar(system, t, q, v, params):

@@ -14,7 +14,8 @@ from jaxtyping import Array, PyTree
 from lagjax.mechanics import constraints, coordinates
 from lagjax.mechanics.diagnosis import explain_failure, explain_singular, where
 from lagjax.mechanics.lagrangian import check_scalar
-from lagjax.mechanics.saddle_point import examined
+from lagjax.mechanics.saddle_point import examined, verdict
+from lagjax.mechanics.sparse_plan import plan
 from lagjax.mechanics.written_out import is_small, write_out
 
 
@@ -47,7 +48,15 @@ def accelerations(system, t, q, v, params) -> tuple[PyTree[Array], dict[str, Arr
     """
     s = coordinates.state(t, q, v, params)
     check_scalar(system, *s)
-    if coordinates.is_traced((s, eqx.filter(system, eqx.is_array))):
+    traced = coordinates.is_traced((s, eqx.filter(system, eqx.is_array)))
+    if plan(system, *s) is not None:
+        found = verdict(system, *s)
+        believed = ~(found.singular | found.contradictory)
+        if traced:
+            return jax.tree.map(lambda x: jnp.where(believed, x, jnp.nan), (found.a, found.multipliers))
+        if found.finite and believed:
+            return found.a, found.multipliers
+    if traced:
         return _quickly(system, *s) if is_small(system, *s) else _believed(system, *s)
     found = examined(system, *s)
     solution = found.a, found.multipliers

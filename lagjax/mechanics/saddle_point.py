@@ -26,6 +26,7 @@ Source: Goldstein, Eq. (2.24)-(2.27); Hairer & Wanner, *Solving ODEs II*, Eq. (V
 Gutiérrez-López, Multibody Syst. Dyn. 30 (2013) 311 (uniqueness of a, minimum-norm λ).
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import equinox as eqx
@@ -34,7 +35,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
-from lagjax.mechanics import constraints, coordinates
+from lagjax.mechanics import constraints, coordinates, sparse_plan, sparse_saddle_point
 from lagjax.mechanics.lagrangian import Linear, mass_and_forcing
 from lagjax.numerics import dense
 from lagjax.numerics.rank import DEPENDENT_BELOW, independent_rows, unit_rows
@@ -54,6 +55,11 @@ def equations_of_motion(system, t, q, v, params, baumgarte_rate=None, independen
     """
     x, unflatten = coordinates.flatten(q)
     u, _ = coordinates.flatten(v)
+    if (plan := sparse_plan.plan(system, t, q, v, params)) is not None:
+        a, multipliers = sparse_saddle_point.accelerations(
+            plan, system, t, x, u, params, unflatten, baumgarte_rate, independent
+        )
+        return unflatten(a), constraints.split(system, multipliers, t, q, v, params)
     linear = mass_and_forcing(system, t, x, u, params, unflatten)
     if not system.constraints:
         return unflatten(dense.solve(linear.mass, linear.forcing)), {}
@@ -72,6 +78,8 @@ def independent_equations(system, t, q, v, params, dependent_below=None) -> Bool
         return None
     x, unflatten = coordinates.flatten(q)
     u, _ = coordinates.flatten(v)
+    if (plan := sparse_plan.plan(system, t, q, v, params)) is not None:
+        return sparse_saddle_point.independent(plan, system, t, x, u, params, unflatten, dependent_below)
     return independent_rows(constraints.jacobian(system, t, x, u, params, unflatten), dependent_below)
 
 
@@ -97,6 +105,38 @@ def displacement_map(mass, jacobian, independent):
     n = mass.shape[0]
     inverted = dense.inverse(saddle_point_matrix(mass, jacobian, independent))
     return _spread(inverted[:n, n:], independent)
+
+
+def row_sizes(system, t, q, v, params) -> Float[Array, " m"]:
+    """`Σ_j |A_ij|` of each constraint equation."""
+    x, unflatten = coordinates.flatten(q)
+    u, _ = coordinates.flatten(v)
+    if (plan := sparse_plan.plan(system, t, q, v, params)) is not None:
+        return sparse_saddle_point.row_sizes(plan, system, t, x, u, params, unflatten)
+    return jnp.sum(jnp.abs(constraints.jacobian(system, t, x, u, params, unflatten)), axis=1)
+
+
+class Return(NamedTuple):
+    """How to return to the constraints near a state: displacements by residuals of some equations, and the slopes."""
+
+    displacement: Callable
+    slope: Float[Array, " m"]
+
+
+def returning(system, t, q, v, params) -> Return:
+    """`displacement(which, r)` changes the residuals of the equations `which` by r; `slope` is `Σ_j |A_ij|`."""
+    x, unflatten = coordinates.flatten(q)
+    u, _ = coordinates.flatten(v)
+    state = (system, t, x, u, params, unflatten)
+    if (plan := sparse_plan.plan(system, t, q, v, params)) is not None:
+        kept = sparse_saddle_point.independent(plan, *state)
+        displacement = sparse_saddle_point.displacement(plan, *state, kept)
+        placed = lambda which, r: jnp.zeros(which.size, r.dtype).at[np.flatnonzero(which)].set(r)
+        return Return(lambda which, r: displacement(placed(which, r)), sparse_saddle_point.row_sizes(plan, *state))
+    jacobian = constraints.jacobian(*state)
+    # Chosen here and not at the step's start: the step may have come near a singular position.
+    matrix = displacement_map(mass_and_forcing(*state).mass, jacobian, independent_rows(jacobian))
+    return Return(lambda which, r: matrix[:, which] @ r, jnp.sum(jnp.abs(jacobian), axis=1))
 
 
 def _pick(x, independent, n):
@@ -149,6 +189,24 @@ def combinations(jacobian: Float[Array, "m n"], independent: Bool[Array, " m"]) 
     return jnp.where(independent[:, None], unit, scaled)
 
 
+@eqx.filter_jit
+def verdict(system, t, q, v, params) -> sparse_saddle_point.Verdict:
+    """Solve the equations at one state, and say whether the solution is to be believed."""
+    plan = sparse_plan.plan(system, t, q, v, params)
+    if plan is not None:
+        x, unflatten = coordinates.flatten(q)
+        u, _ = coordinates.flatten(v)
+        least = VANISHES_BELOW[np.dtype(x.dtype)]
+        found = sparse_saddle_point.verdict(plan, system, t, x, u, params, unflatten, least)
+        return found._replace(
+            a=unflatten(found.a), multipliers=constraints.split(system, found.multipliers, t, q, v, params)
+        )
+    found = examined(system, t, q, v, params)
+    finite = jnp.all(jnp.isfinite(coordinates.flatten((found.a, found.multipliers, found.lagrangian))[0]))
+    singular = dense.reciprocal_condition(found.matrix) <= SINGULAR_BELOW[np.dtype(t.dtype)]
+    return sparse_saddle_point.Verdict(found.a, found.multipliers, finite, singular, jnp.any(found.contradictory))
+
+
 class Examined(NamedTuple):
     """A solution of the equations beside what tells whether to believe it."""
 
@@ -191,9 +249,7 @@ def _without_vanishing(system, t, x, u, params, unflatten):
     rows = constraints.acceleration_rows(system, t, x, u, params, unflatten)
     if not rows.gamma.size:
         return rows
-    # Off by a thousandth of the state, differently in each coordinate.
-    off = 1e-3 * jnp.cos(jnp.arange(x.size, dtype=x.dtype))
-    x, u = (y + off * jnp.where(jnp.max(jnp.abs(y)) > 0, jnp.max(jnp.abs(y)), 1.0) for y in (x, u))
+    x, u = map(sparse_saddle_point.slightly_off, (x, u))
     nearby = constraints.jacobian(system, t, x, u, params, unflatten)
     size = lambda rows: jnp.max(jnp.abs(rows), axis=1)
     least = VANISHES_BELOW[np.dtype(x.dtype)]
@@ -206,11 +262,8 @@ def _contradictory(linear, rows, independent, a, multipliers, x, u):
     jacobian, gamma = rows
     disagreement = jnp.abs(jacobian @ a - gamma)
     terms = jnp.abs(jacobian) @ jnp.abs(a) + jnp.abs(gamma)
-    # In equilibrium and in uniform motion all these terms are round-off, of accelerations of these sizes:
     forces = jnp.abs(linear.forcing) + jnp.abs(jacobian).T @ jnp.abs(multipliers)
     inertia = jnp.max(jnp.abs(linear.mass), axis=1)
-    by_force = jnp.max(jnp.where(inertia > 0, forces / jnp.where(inertia > 0, inertia, 1.0), 0.0))
-    extent = jnp.max(jnp.abs(x))
-    by_velocity = jnp.max(jnp.abs(u)) ** 2 / jnp.where(extent > 0, extent, 1.0)
-    round_off = 1e4 * jnp.finfo(x.dtype).eps * (by_force + by_velocity) * jnp.sum(jnp.abs(jacobian), axis=1)
+    slopes = jnp.sum(jnp.abs(jacobian), axis=1)
+    round_off = slopes * sparse_saddle_point.acceleration_round_off(inertia, forces, x, u)
     return ~independent & (disagreement > DEPENDENT_BELOW[np.dtype(x.dtype)] * terms + round_off)

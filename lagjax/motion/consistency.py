@@ -12,6 +12,7 @@ Source: Hairer, Lubich & Wanner, *Geometric Numerical Integration*, §IV.4 and �
 """
 
 from collections.abc import Callable
+from functools import partial
 
 import equinox as eqx
 import jax
@@ -22,9 +23,7 @@ from jaxtyping import Array, Bool, PyTree
 
 from lagjax.mechanics import constraints, coordinates
 from lagjax.mechanics.diagnosis import equation_names
-from lagjax.mechanics.lagrangian import mass_and_forcing
-from lagjax.mechanics.saddle_point import displacement_map
-from lagjax.numerics.rank import independent_rows
+from lagjax.mechanics.saddle_point import returning, row_sizes
 
 # With the matrix kept, an iteration multiplies the residual by about the first one: one is enough from 1e-8 of the
 # size of the state, and a crude fixed step of 0.1 takes eight.
@@ -49,13 +48,8 @@ def to_manifold(system, t, q, v, params, rtol, atol) -> Projected:
     """
     x, unflatten = coordinates.flatten(q)
     u, _ = coordinates.flatten(v)
-    mass = mass_and_forcing(system, t, x, u, params, unflatten).mass
-    jacobian = constraints.jacobian(system, t, x, u, params, unflatten)
-    # Chosen here and not at the step's start: the step may have come near a singular position.
-    independent = independent_rows(jacobian)
-    # The matrix is not differentiated: where the residual vanishes its derivative does not count.
-    to_displacement = lax.stop_gradient(displacement_map(mass, jacobian, independent))
-    slope = lax.stop_gradient(jnp.sum(jnp.abs(jacobian), axis=1))
+    # Not differentiated: where the residual vanishes the derivative of the matrix does not count.
+    displacement, slope = returning(*stopped((system, t, q, v, params)))
     of_q, of_v = _allowed(jnp.abs(jnp.concatenate([x, u])), rtol, atol)
     live = (system, t, params)
     fixed = stopped(live)
@@ -64,21 +58,21 @@ def to_manifold(system, t, q, v, params, rtol, atol) -> Projected:
     position_residual = lambda problem, x: constraints.position_residual(*problem[:2], x, problem[2], unflatten)
     if holonomic.any():
         # Positions move only in directions that the velocity constraints allow: a rolling body keeps rolling.
-        x = _newton(position_residual, live, x, to_displacement[:, holonomic], slope[holonomic])
+        x = _newton(position_residual, live, x, partial(displacement, holonomic), slope[holonomic])
 
     def velocity_residual(problem_and_x, u):
         (system, t, params), x = problem_and_x
         return constraints.velocity_residual(system, t, x, u, params, unflatten)
 
-    u = _newton(velocity_residual, (live, x), u, to_displacement, slope)
+    u = _newton(velocity_residual, (live, x), u, partial(displacement, np.ones_like(holonomic)), slope)
     left = jnp.concatenate([position_residual(fixed, x), velocity_residual((fixed, x), u)])
     allowed = jnp.concatenate([slope[holonomic] * of_q, slope * of_v])
     holds = jnp.all(jnp.abs(left) <= allowed)
     return Projected(unflatten(x), unflatten(u), lax.stop_gradient(holds))
 
 
-def _newton(residual: Callable, problem: PyTree, y, to_displacement, slope):
-    """Iterate `y - D residual(problem, y)`; the last iteration alone is differentiated, enough where r vanishes."""
+def _newton(residual: Callable, problem: PyTree, y, displacement, slope):
+    """Iterate `y - displacement(r(problem, y))`; only the last iteration is differentiated, enough where r vanishes."""
     fixed, start = stopped((problem, y))
 
     def size(r):
@@ -90,7 +84,7 @@ def _newton(residual: Callable, problem: PyTree, y, to_displacement, slope):
 
     def iterate(state):
         i, y, r = state
-        y = y - to_displacement @ r
+        y = y - displacement(r)
         return i + 1, y, residual(fixed, y)
 
     r = residual(fixed, start)
@@ -98,7 +92,7 @@ def _newton(residual: Callable, problem: PyTree, y, to_displacement, slope):
     _, near, _ = lax.while_loop(unfinished, iterate, (0, start, r))
     # The value of `near`, the derivative of y.
     y = near + (y - start)
-    return y - to_displacement @ residual(problem, y)
+    return y - displacement(residual(problem, y))
 
 
 def stopped(tree):
@@ -119,46 +113,39 @@ def worst_residual(system, t, q, v, params):
 
 
 def level_size(size):
-    """The largest coordinate and the largest velocity, in place of each: one zero sets no scale."""
-    positions, velocities = jnp.split(size, 2)
-    return jnp.concatenate([jnp.full_like(positions, positions.max()), jnp.full_like(velocities, velocities.max())])
+    """The largest coordinate and the largest velocity: one zero sets no scale."""
+    return jnp.max(size.reshape(2, -1), axis=1)
 
 
 def within(system, t, q, v, params, rtol, atol) -> Bool[Array, ""]:
     """Whether a displacement of `atol + rtol |y|` makes up for every residual, of positions and velocities."""
     residual, slope, size = residuals_and_slopes(system, t, q, v, params)
-    return jnp.all(jnp.abs(residual) <= slope @ jnp.repeat(_allowed(size, rtol, atol), size.size // 2))
+    return jnp.all(jnp.abs(residual) <= slope @ _allowed(size, rtol, atol))
 
 
 def _allowed(size, rtol, atol):
     """The displacement that counts as none, of coordinates and of velocities, for a state of these sizes."""
-    largest = jnp.max(size.reshape(2, -1), axis=1)
-    return jnp.broadcast_to(atol, 2) + jnp.broadcast_to(rtol, 2) * largest
+    return jnp.broadcast_to(atol, 2) + jnp.broadcast_to(rtol, 2) * level_size(size)
 
 
 @eqx.filter_jit
 def residuals_and_slopes(system, t, q, v, params):
-    """`(r, |J|, |y|)`: residuals of both levels, their slopes in `y = (q, v)`, and the sizes of y."""
+    """Residuals of both levels, the sums of their slopes over q and over v (two columns), and `|(q, v)|`."""
     x, unflatten = coordinates.flatten(q)
     u, _ = coordinates.flatten(v)
     position = constraints.position_residual(system, t, x, params, unflatten)
     velocity = constraints.velocity_residual(system, t, x, u, params, unflatten)
-    slope_u = constraints.jacobian(system, t, x, u, params, unflatten)
+    slope = row_sizes(system, t, q, v, params)
     # ∂(dg/dt)/∂v = ∂g/∂q: the holonomic rows serve both levels.
-    slope_x = slope_u[constraints.holonomic_equations(system, t, q, v, params)]
-    slope = jnp.block(
-        [
-            [slope_x, jnp.zeros((position.size, u.size), x.dtype)],
-            [jnp.zeros((velocity.size, x.size), x.dtype), slope_u],
-        ]
-    )
-    return jnp.concatenate([position, velocity]), jnp.abs(slope), jnp.abs(jnp.concatenate([x, u]))
+    of_q = slope[constraints.holonomic_equations(system, t, q, v, params)]
+    columns = [jnp.concatenate([of_q, jnp.zeros_like(slope)]), jnp.concatenate([jnp.zeros_like(of_q), slope])]
+    return jnp.concatenate([position, velocity]), jnp.stack(columns, axis=1), jnp.abs(jnp.concatenate([x, u]))
 
 
 def departures(system, s: coordinates.State, rtol, atol) -> str:
     """Name the constraints that a state violates by more than a displacement `atol + rtol |y|`; else ''."""
     residual, slope, size = (np.asarray(part) for part in residuals_and_slopes(system, *s))
-    allowed = np.repeat(np.asarray(_allowed(size, rtol, atol)), size.size // 2)
+    allowed = np.asarray(_allowed(size, rtol, atol))
     # NaN is a violation too.
     off = np.flatnonzero(~(np.abs(residual) <= slope @ allowed))
     equations = list(zip(equation_names(system, s), constraints.holonomic_equations(system, *s)))

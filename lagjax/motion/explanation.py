@@ -10,10 +10,12 @@ from lagjax.mechanics.constraints import Holonomic
 from lagjax.mechanics.diagnosis import dependencies, describe, equation_names, explain_failure, listed
 from lagjax.mechanics.lagrangian import check_scalar
 from lagjax.mechanics.saddle_point import examined
+from lagjax.mechanics.sparse_plan import plan
 from lagjax.mechanics.structure import Structure, structure
 from lagjax.mechanics.system import System
 from lagjax.mechanics.written_out import is_small
 from lagjax.motion.consistency import departures, to_manifold, within
+from lagjax.numerics.dense import ELIMINATE_UP_TO
 from lagjax.numerics.rank import independent_rows
 
 # A state is taken for one on the constraints that was rounded, and moved there, where it is this near.
@@ -160,8 +162,10 @@ def _of_structure(found):
 def _how_solved(system, s, found):
     """What the compiled program does at each evaluation."""
     n, m = coordinates.flatten(s.q)[0].size, constraints.count(system, *s)
+    if (sparse := plan(system, *s)) is not None:
+        return str(sparse)
     if not is_small(system, *s):
-        return f"{n + m} equations by LAPACK"
+        return f"{n + m} equations by {'elimination' if n + m <= ELIMINATE_UP_TO else 'LAPACK'}"
     if n == 1 and not m:
         return "one division"
     if m:

@@ -11,13 +11,12 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float
 
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.coordinates import State
-from lagjax.mechanics.saddle_point import SINGULAR_BELOW, equations_of_motion, examined
+from lagjax.mechanics.saddle_point import equations_of_motion, verdict
 from lagjax.mechanics.in_numbers import Numbers, in_numbers
 from lagjax.mechanics.written_out import is_small, write_out
 from lagjax.mechanics.structure import angles, conserves_jacobi_integral
@@ -27,7 +26,6 @@ from lagjax.motion.consistency import stopped, to_manifold, within, worst_residu
 from lagjax.motion.sign_change import SignChange
 from lagjax.motion.stepping import OnManifold, Quick, Stages, Tolerances, forward_differentiable
 from lagjax.motion.trajectory import RESULTS, Moment, Trajectory, ended_well, pack, worst_drift
-from lagjax.numerics import dense
 from lagjax.numerics.one_function import called, one_function
 from lagjax.numerics.runge_kutta import ExplicitRungeKutta
 from lagjax.numerics.simplified_newton import SimplifiedNewton, with_tolerances
@@ -121,10 +119,8 @@ def _solve(system, q0, v0, params, ts, settings, adjoint, written):
     if settings.drift == "project":
         projected = to_manifold(system, ts[0], q0, v0, params, settings.rtol, settings.atol)
         q0, v0 = projected.q, projected.v
-    start = stopped(examined(system, ts[0], q0, v0, params))
-    finite = jnp.all(jnp.isfinite(coordinates.flatten((start.a, start.multipliers, start.lagrangian))[0]))
-    singular = dense.reciprocal_condition(start.matrix) <= SINGULAR_BELOW[np.dtype(ts.dtype)]
-    contradictory = jnp.any(start.contradictory)
+    start = stopped(verdict(system, ts[0], q0, v0, params))
+    finite, singular, contradictory = start.finite, start.singular, start.contradictory
     if settings.drift == "project":
         off_constraints = off_constraints | (finite & ~singular & ~projected.holds)
     too_small = settings.rtol[0] < ROUND_OFFS * jnp.finfo(ts.dtype).eps if settings.controller is None else False

@@ -1,0 +1,296 @@
+"""The saddle-point system of a large system whose parts touch few others: nothing of size n × n or m × n is formed.
+
+    M a = F + Aᵀ λ,    A a = gamma        =>        S λ = gamma - A M⁻¹ F,    S = A M⁻¹ Aᵀ
+
+M is taken apart into blocks that share no velocity (bodies, particles), and inverted block by block. S couples
+constraint equations that act on a common block, and is a band once they are ordered (`numerics/banded.py`). M, A and Aᵀ
+are functions, those that differentiate the user's, and S is found from the products with a few coloured vectors. Which
+entries can be other than zero is read off the jaxpr (`sparse_plan.py`) and holds at every state.
+
+One step of iterative refinement on the whole system follows. It mends what S, being a square, loses, and the error
+that a vanishing mass makes: such a mass counts as small in M⁻¹. Where the refinement does not converge the answer is
+NaN: S is singular, or far from definite.
+
+**Redundant constraints**, as in `saddle_point.py`: rows that depend on others are found by the pivots of G = A Aᵀ,
+which is a band as well, and left out; the shortest multipliers that exert the same force are their part outside the
+null space of Aᵀ, and hence of G. Applied to a vector, `mu (G + mu)⁻¹` keeps its part in that null space and makes the
+rest smaller by `mu` over an eigenvalue of G.
+
+Source: as for `saddle_point.py`; Benzi, Golub & Liesen, Acta Numerica 14 (2005) 1, §5 (Schur complement).
+"""
+
+from collections.abc import Callable
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Float
+
+from lagjax.mechanics import constraints
+from lagjax.mechanics.lagrangian import forcing_and_inertia
+from lagjax.mechanics.sparse_plan import Plan
+from lagjax.numerics import banded, dense
+
+# The sine of a dependent row; it is seen through its square, which round-off reaches sooner than in `rank.py`.
+DEPENDENT_BELOW = {np.dtype("float64"): 1e-5, np.dtype("float32"): 1e-2}
+# A vanishing mass counts as this much of the largest: small enough that one refinement makes up for it.
+VANISHING_MASS = {np.dtype("float64"): 1e-8, np.dtype("float32"): 1e-4}
+# What a refinement may change, relative to the terms of the acceleration.
+CORRECTION_AT_MOST = 1e-4
+# `mu` relative to G, powers of `mu (G + mu)⁻¹`, and how often the part so found is taken away.
+NULL_SHIFT, NULL_POWER, NULL_ROUNDS = {np.dtype("float64"): 1e-9, np.dtype("float32"): 1e-4}, 3, 3
+
+
+class Operators(NamedTuple):
+    """The products with M, M⁻¹, A and Aᵀ at one state, and which equations count; what M was given to be inverted."""
+
+    inertia: Callable
+    mass_inverse: Callable
+    added: Float[Array, " n"]
+    push: Callable
+    pull: Callable
+    kept: Bool[Array, " m"]
+
+
+def accelerations(plan: Plan, system, t, x, u, params, unflatten, baumgarte_rate=None, kept=None):
+    """The accelerations and the stacked multipliers, in vector form; `kept` (m,) says which equations to solve with."""
+    forcing, inertia = forcing_and_inertia(system, t, x, u, params, unflatten)
+    if plan.band is None:
+        return _unconstrained(plan, inertia, forcing), jnp.zeros(0, x.dtype)
+    push, pull, rate = _rows(system, t, x, u, params, unflatten)
+    gamma = -rate
+    if baumgarte_rate is not None:
+        gamma = gamma + constraints.baumgarte_feedback(system, t, x, u, params, unflatten, baumgarte_rate)
+    kept = _independent(plan, push, pull, x.dtype) if kept is None else kept
+    operators = Operators(inertia, *_mass_inverse(plan, inertia, x), push, pull, kept)
+    a, multipliers = _solve(plan, operators, forcing, gamma)
+    shortest = partial(_shortest, plan, push, pull)
+    return a, lax.cond(jnp.all(kept), lambda x: x, shortest, multipliers)
+
+
+def independent(plan: Plan, system, t, x, u, params, unflatten, dependent_below=None) -> Bool[Array, " m"]:
+    """Which constraint equations to solve with; see `numerics.banded.independent`."""
+    push, pull, _ = _rows(system, t, x, u, params, unflatten)
+    return _independent(plan, push, pull, x.dtype, dependent_below)
+
+
+def displacement(plan: Plan, system, t, x, u, params, unflatten, kept) -> Callable:
+    """The function from residuals to the shortest displacement in the metric of M that changes them by as much."""
+    _, inertia = forcing_and_inertia(system, t, x, u, params, unflatten)
+    push, pull, _ = _rows(system, t, x, u, params, unflatten)
+    operators = Operators(inertia, *_mass_inverse(plan, inertia, x), push, pull, kept)
+    schur, invert = _schur(plan, operators, x.dtype)
+
+    def of_residual(r):
+        r = jnp.where(kept, r, 0.0)
+        return operators.mass_inverse(pull(lax.custom_linear_solve(schur, r, lambda _, r: invert(r), symmetric=True)))
+
+    return of_residual
+
+
+def row_sizes(plan: Plan, system, t, x, u, params, unflatten, norm=jnp.sum) -> Float[Array, " m"]:
+    """`Σ_j |A_ij|` of each constraint equation, or another norm: columns of one colour share no row."""
+    if plan.band is None:
+        return jnp.zeros(0, x.dtype)
+    push, _, _ = _rows(system, t, x, u, params, unflatten)
+    return norm(jnp.abs(banded.compressed(push, plan.of_rows, x.dtype)), axis=0)
+
+
+class Verdict(NamedTuple):
+    """A solution of the equations at one state, and whether it is to be believed."""
+
+    a: Float[Array, " n"]
+    multipliers: Float[Array, " m"]
+    finite: Bool[Array, ""]
+    singular: Bool[Array, ""]
+    contradictory: Bool[Array, ""]
+
+
+def verdict(plan: Plan, system, t, x, u, params, unflatten, vanishes_below) -> Verdict:
+    """Solve the equations at one state, and say whether they are finite, regular, and agree with each other.
+
+    A row of A that is `vanishes_below` times what it is a little way off counts as none: the equations are singular.
+    """
+    a, multipliers = accelerations(plan, system, t, x, u, params, unflatten)
+    forcing, inertia = forcing_and_inertia(system, t, x, u, params, unflatten)
+    known = [forcing, system.lagrangian(t, unflatten(x), unflatten(u), params)]
+    singular, contradictory = jnp.zeros((), bool), jnp.zeros((), bool)
+    if plan.band is not None:
+        push, pull, rate = _rows(system, t, x, u, params, unflatten)
+        known.append(rate)
+        kept = _independent(plan, push, pull, x.dtype)
+        at = lambda x, u: row_sizes(plan, system, t, x, u, params, unflatten, jnp.max)
+        off = at(*map(slightly_off, (x, u)))
+        vanishes = at(x, u) <= vanishes_below * jnp.nan_to_num(off, posinf=0.0)
+        operators = Operators(inertia, *_mass_inverse(plan, inertia, x), push, pull, kept)
+        singular = jnp.any(vanishes) | _undetermined(plan, operators, x.dtype)
+        # |A| |a| and |A|ᵀ |λ|, colour by colour.
+        terms = _by_colours(push, plan.of_rows, a) + jnp.abs(rate)
+        forces = jnp.abs(forcing) + _by_colours(pull, plan.of_columns, multipliers)
+        slopes = row_sizes(plan, system, t, x, u, params, unflatten)
+        round_off = slopes * acceleration_round_off(_largest_inertia(plan, inertia, x), forces, x, u)
+        tolerance = DEPENDENT_BELOW[np.dtype(x.dtype)] * terms + round_off
+        contradictory = jnp.any(~kept & (jnp.abs(push(a) + rate) > tolerance))
+    finite = jnp.all(jnp.isfinite(jnp.concatenate([jnp.ravel(x) for x in known])))
+    solved = jnp.all(jnp.isfinite(jnp.concatenate([a, multipliers])))
+    return Verdict(a, multipliers, finite, finite & (singular | ~solved), contradictory)
+
+
+def _undetermined(plan, operators, dtype):
+    """Whether the constraints leave a direction free that has no mass: there what was added to M decides."""
+    some = jnp.cos(jnp.arange(operators.added.size, dtype=dtype))
+    moved, _ = _eliminated(plan, operators, dtype)(operators.added * some, jnp.zeros(operators.kept.size, dtype))
+    return jnp.max(jnp.abs(moved)) > CORRECTION_AT_MOST**0.5
+
+
+def slightly_off(y):
+    """A state off by a thousandth, differently in each coordinate."""
+    size = jnp.max(jnp.abs(y))
+    return y + 1e-3 * jnp.cos(jnp.arange(y.size, dtype=y.dtype)) * jnp.where(size > 0, size, 1.0)
+
+
+def acceleration_round_off(inertia, forces, x, u):
+    """What of an acceleration is round-off, in equilibrium and in uniform motion: all its terms nearly cancel."""
+    by_force = jnp.max(jnp.where(inertia > 0, forces / jnp.where(inertia > 0, inertia, 1.0), 0.0))
+    extent = jnp.max(jnp.abs(x))
+    by_velocity = jnp.max(jnp.abs(u)) ** 2 / jnp.where(extent > 0, extent, 1.0)
+    return 1e4 * jnp.finfo(x.dtype).eps * (by_force + by_velocity)
+
+
+def _by_colours(push, coloured, y):
+    """The product of absolute values, of the matrix that `push` stands for and of y."""
+    seeds = np.arange(coloured.count)[:, None] == coloured.of_column[None, :]
+    return jnp.sum(jnp.abs(jax.vmap(push)(jnp.where(seeds, y[None], 0.0))), axis=0)
+
+
+def _largest_inertia(plan, inertia, x):
+    return jnp.max(jnp.abs(banded.compressed(inertia, plan.of_mass, x.dtype)), axis=0)
+
+
+def _rows(system, t, x, u, params, unflatten):
+    """The products with A and Aᵀ, and d/dt of the velocity residual at constant velocity: -gamma."""
+
+    def residual(t, x, u):
+        return constraints.velocity_residual(system, t, x, u, params, unflatten)
+
+    _, rate = jax.jvp(lambda t, x: residual(t, x, u), (t, x), (jnp.ones_like(t), u))
+    _, push = jax.linearize(lambda u: residual(t, x, u), u)
+    transposed = jax.linear_transpose(push, u)
+    return push, lambda multipliers: transposed(multipliers)[0], rate
+
+
+def _mass_inverse(plan, inertia, x):
+    """The product with M⁻¹, block by block, without derivatives; and what was added to the diagonal for it."""
+    n, size = x.size, plan.members.shape[1]
+    products = lax.stop_gradient(banded.compressed(inertia, plan.of_mass, x.dtype))
+    least = VANISHING_MASS[np.dtype(x.dtype)] * jnp.max(jnp.abs(products))
+    if size == 1:
+        added = jnp.where(products[0] == 0, least, 0.0)
+        return lambda f: f / (products[0] + added), added
+    i, j, inside = plan.members[:, :, None], plan.members[:, None, :], plan.members < n
+    both = inside[:, :, None] & inside[:, None, :]
+    entries = products[np.append(plan.of_mass.of_column, 0)[j], np.minimum(i, n - 1)]
+    blocks = jnp.where(both, entries, jnp.eye(size, dtype=x.dtype)[None])
+    added = jnp.where(jnp.all(blocks == 0, axis=2), least, 0.0)
+    inverted = jax.vmap(dense.inverse)(blocks + added[:, :, None] * jnp.eye(size, dtype=x.dtype)[None])
+
+    def apply(f):
+        parts = jnp.append(f, 0.0)[plan.members]
+        return jnp.einsum("kij,kj->ki", inverted, parts).reshape(-1)[plan.place]
+
+    return apply, added.reshape(-1)[plan.place]
+
+
+def _schur(plan, operators, dtype):
+    """The product with S, rows not kept being those of the unit matrix; and with its inverse."""
+    _, mass_inverse, _, push, pull, kept = operators
+    rows = plan.band.order.rows
+    back = np.argsort(rows)
+    product = lambda multipliers: push(mass_inverse(pull(multipliers)))
+    invert = banded.solver(banded.keep(banded.entries(product, plan.band, dtype), kept[rows]))
+
+    def of_kept(multipliers):
+        return jnp.where(kept, product(jnp.where(kept, multipliers, 0.0)), multipliers)
+
+    return of_kept, lambda r: invert(r[rows])[back]
+
+
+def _eliminated(plan, operators, dtype) -> Callable:
+    """The function (F, gamma) -> (a, λ) that eliminates a, without refinement; it has no derivative by the state."""
+    _, mass_inverse, _, push, pull, kept = operators
+    _, invert = _schur(plan, operators, dtype)
+
+    def solve(forcing, gamma):
+        free = mass_inverse(forcing)
+        multipliers = invert(jnp.where(kept, gamma - push(free), 0.0))
+        return free + mass_inverse(pull(multipliers)), multipliers
+
+    return solve
+
+
+def _solve(plan, operators, forcing, gamma):
+    """a and λ with the rows that are kept, refined; differentiated by the implicit function theorem."""
+    inertia, mass_inverse, _, push, pull, kept = operators
+
+    def product(unknown):
+        a, minus = jnp.split(unknown, [n])
+        return jnp.concatenate([inertia(a) + pull(jnp.where(kept, minus, 0.0)), jnp.where(kept, push(a), minus)])
+
+    def refined(_, known):
+        forcing, gamma = jnp.split(known, [n])
+        solve = _eliminated(plan, operators, forcing.dtype)
+        a, multipliers = solve(forcing, gamma)
+        by_constraints = pull(multipliers)
+        da, more = solve(forcing + by_constraints - inertia(a), gamma - push(a))
+        terms = jnp.abs(mass_inverse(forcing)) + jnp.abs(mass_inverse(by_constraints))
+        converged = jnp.max(jnp.abs(da)) <= CORRECTION_AT_MOST * jnp.max(terms)
+        return jnp.where(converged, jnp.concatenate([a + da, -(multipliers + more)]), jnp.nan)
+
+    # One vector: with two, JAX 0.10 fails in a second derivative by which one of them does not change.
+    known, n = jnp.concatenate([forcing, jnp.where(kept, gamma, 0.0)]), forcing.size
+    a, minus = jnp.split(lax.custom_linear_solve(product, known, refined, symmetric=True), [n])
+    return a, -minus
+
+
+def _unconstrained(plan, inertia, forcing):
+    """a without constraints, refined; a vanishing mass makes it infinite or NaN."""
+
+    def refined(_, forcing):
+        mass_inverse, added = _mass_inverse(plan, inertia, forcing)
+        a = jnp.where(added == 0, mass_inverse(forcing), jnp.nan)
+        return a + mass_inverse(forcing - inertia(a))
+
+    return lax.custom_linear_solve(inertia, forcing, refined, symmetric=True)
+
+
+def _gram(plan, push, pull, dtype):
+    return banded.entries(lambda multipliers: push(pull(multipliers)), plan.band, dtype)
+
+
+def _independent(plan, push, pull, dtype, dependent_below=None):
+    rows = plan.band.order.rows
+    least = DEPENDENT_BELOW[np.dtype(dtype)]
+    least = least if dependent_below is None else max(least, dependent_below)
+    return banded.independent(_gram(plan, push, pull, dtype), least)[np.argsort(rows)]
+
+
+def _shortest(plan, push, pull, multipliers):
+    """The shortest multipliers that exert the force of these: their part outside the null space of Aᵀ."""
+    rows = plan.band.order.rows
+    back, dtype = np.argsort(rows), multipliers.dtype
+    gram = lax.stop_gradient(_gram(plan, push, pull, dtype))
+    shift = NULL_SHIFT[np.dtype(dtype)] * jnp.max(gram[:, 0])
+    invert = banded.solver(gram.at[:, 0].add(shift))
+    solve = lambda _, r: invert(r[rows])[back]
+
+    def smaller(x, _):
+        return lax.custom_linear_solve(lambda y: push(pull(y)) + shift * y, shift * x, solve, symmetric=True), None
+
+    def outside(x, _):
+        in_null_space, _ = lax.scan(smaller, x, length=NULL_POWER)
+        return x - in_null_space, None
+
+    return lax.scan(outside, multipliers, length=NULL_ROUNDS)[0]
