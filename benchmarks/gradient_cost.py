@@ -8,8 +8,8 @@ functions at the end. Four derivatives: by g, a, ω and the angle of release.
     reverse mode   of the sum of the squares of ψ and ψ' at 100 outputs by `jax.grad`
 
 "error" is the relative one against derivatives of the closed form, which are checked against its central differences
-first. diffrax's own gradients stand beside them, by `ForwardMode` and by its default adjoint. All programs of a row run
-in turn, medians.
+first. diffrax's own gradients stand beside them, by `ForwardMode` and by its default adjoint. All programs of a mode run
+in turn; medians of the turns' ratios.
 
     python benchmarks/gradient_cost.py [--json FILE] [--only TEXT]
 """
@@ -135,16 +135,17 @@ def rows(wanted):
             "diffrax's solve": program(by_diffrax, ts=ts)(tolerances[by_diffrax]),
         }
         times = in_turn(*programs.values(), repeats=REPEATS)
-        median, least = (dict(zip(programs, seconds)) for seconds in (times.medians, times.minima))
+        place = {program: i for i, program in enumerate(programs)}
         targets = {"our solve": 5.0, "diffrax's solve": 1.5} if mode == "forward" else {"diffrax's solve": 3.0}
         for ours in ("our gradient", "our gradient, adjoint named", "diffrax's gradient"):
             error = relative_error(programs[ours](), right)
             for solve in ("our solve", "diffrax's solve"):
                 target = targets.get(solve) if ours == "our gradient" else None
+                ratio, of_minima = times.ratio(place[ours], place[solve])
+                ms, solve_ms = (1e3 * times.medians[place[which]] for which in (ours, solve))
                 yield row(
-                    f"{name}: {ours} / {solve}", median[ours] / median[solve], target,
-                    minima=least[ours] / least[solve], ms=1e3 * median[ours], solve_ms=1e3 * median[solve], error=error,
-                )  # fmt: skip
+                    f"{name}: {ours} / {solve}", ratio, target, minima=of_minima, ms=ms, solve_ms=solve_ms, error=error
+                )
 
 
 if __name__ == "__main__":

@@ -30,28 +30,24 @@ from jaxtyping import PyTree
 PUSH_UP_TO = 24
 
 
-def _as_it_is(function, *args):
-    return function(*args)
-
-
-def solve_in_both_modes(solve: Callable, x: PyTree, fixed: PyTree, compiled: Callable = _as_it_is) -> PyTree:
+def solve_in_both_modes(solve: Callable, x: PyTree, fixed: PyTree) -> PyTree:
     """`solve(x, fixed, adjoint)` for a diffrax adjoint, differentiable in both modes in `x`.
 
     All leaves of `x` are floating arrays, all leaves of `fixed` and of the result are arrays, and `solve`
-    closes over no traced value. `compiled(function, *arrays)` evaluates the solve, and its derivatives.
+    closes over no traced value.
     """
-    return _solve((x, fixed), solve=solve, compiled=compiled)
+    return _solve((x, fixed), solve=solve)
 
 
 @eqx.filter_custom_jvp
-def _solve(inputs, *, solve, compiled):
-    return compiled(lambda x, fixed: solve(x, fixed, diffrax.ForwardMode()), *inputs)
+def _solve(inputs, *, solve):
+    return solve(*inputs, diffrax.ForwardMode())
 
 
 @_solve.def_jvp
-def _solve_jvp(primals, tangents, *, solve, compiled):
+def _solve_jvp(primals, tangents, *, solve):
     ((x, fixed),), ((dx, _),) = primals, tangents
-    y = compiled(lambda x, fixed: solve(x, fixed, diffrax.ForwardMode()), x, fixed)
+    y = solve(x, fixed, diffrax.ForwardMode())
     dx = jtu.tree_map(eqxi.materialise_zeros, x, dx, is_leaf=lambda leaf: leaf is None)
     leaves, structure = jtu.tree_flatten((x, fixed))
     size = len(jtu.tree_leaves(x))
@@ -62,7 +58,7 @@ def _solve_jvp(primals, tangents, *, solve, compiled):
 
     floats, rest = eqx.partition(y, eqx.is_inexact_array)
     shapes = tuple((leaf.shape, leaf.dtype) for leaf in jtu.tree_leaves(floats))
-    params = dict(outputs=float_outputs, shapes=shapes, size=size, many=False, compiled=compiled)
+    params = dict(outputs=float_outputs, shapes=shapes, size=size, many=False)
     dy = _tangent_p.bind(*leaves, *jtu.tree_leaves(dx), **params)
     dy = jtu.tree_unflatten(jtu.tree_structure(floats), dy)
     return y, eqx.combine(dy, jtu.tree_map(lambda _: None, rest))
@@ -78,12 +74,10 @@ def _split(operands, size):
     return tuple(operands[:size]), tuple(operands[size:-size]), tuple(operands[-size:])
 
 
-def _tangent(*operands, outputs, shapes, size, many, compiled):
-    def pushed(x, fixed, dx):
-        along = lambda dx: jax.jvp(lambda *x: outputs(diffrax.ForwardMode(), *x, *fixed), x, dx)[1]
-        return jax.vmap(along)(dx) if many else along(dx)
-
-    return compiled(pushed, *_split(operands, size))
+def _tangent(*operands, outputs, shapes, size, many):
+    x, fixed, dx = _split(operands, size)
+    along = lambda dx: jax.jvp(lambda *x: outputs(diffrax.ForwardMode(), *x, *fixed), x, dx)[1]
+    return jax.vmap(along)(dx) if many else along(dx)
 
 
 def _tangent_shapes(*operands, shapes, size, many, **params):
@@ -107,16 +101,13 @@ def _tangent_transpose(cotangents, *operands, size, many, **params):
     return [None] * (len(operands) - size) + [next(found) if w else None for w in wanted]
 
 
-def _pull(x, fixed, wanted, cotangents, *, outputs, compiled, **params):
-    def pulled(x, fixed, cotangents):
-        def of_wanted(*chosen):
-            chosen = iter(chosen)
-            every = [next(chosen) if w else a for a, w in zip(x, wanted)]
-            return outputs(diffrax.RecursiveCheckpointAdjoint(), *every, *fixed)
+def _pull(x, fixed, wanted, cotangents, *, outputs, **params):
+    def of_wanted(*chosen):
+        chosen = iter(chosen)
+        every = [next(chosen) if w else a for a, w in zip(x, wanted)]
+        return outputs(diffrax.RecursiveCheckpointAdjoint(), *every, *fixed)
 
-        return jax.vjp(of_wanted, *[a for a, w in zip(x, wanted) if w])[1](cotangents)
-
-    return compiled(pulled, x, fixed, cotangents)
+    return jax.vjp(of_wanted, *[a for a, w in zip(x, wanted) if w])[1](cotangents)
 
 
 def _pull_by_pushing(x, fixed, wanted, cotangents, **params):
@@ -134,7 +125,7 @@ def _pull_by_pushing(x, fixed, wanted, cotangents, **params):
     return [slopes[i : i + n].reshape(a.shape).astype(a.dtype) for i, n, a, w in zip(starts, sizes, x, wanted) if w]
 
 
-def _tangent_batched(operands, axes, *, outputs, shapes, size, many, compiled):
+def _tangent_batched(operands, axes, *, outputs, shapes, size, many):
     lanes = next(x.shape[axis] for x, axis in zip(operands, axes) if axis is not None)
     front = [x if axis is None else jnp.moveaxis(x, axis, 0) for x, axis in zip(operands, axes)]
     x, fixed, dx = _split(front, size)
@@ -142,7 +133,7 @@ def _tangent_batched(operands, axes, *, outputs, shapes, size, many, compiled):
     widen = lambda leaves, have: [
         leaf if here else jnp.broadcast_to(leaf, (lanes, *leaf.shape)) for leaf, here in zip(leaves, have)
     ]
-    params = dict(outputs=outputs, shapes=shapes, size=size, many=many, compiled=compiled)
+    params = dict(outputs=outputs, shapes=shapes, size=size, many=many)
     if not any(batched_x + batched_fixed):
         # Many directions at one point: the solve itself is not repeated.
         dx = widen(dx, batched_dx)

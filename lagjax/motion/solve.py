@@ -82,7 +82,7 @@ def trajectory_of(system, q0, v0, params, ts, settings) -> Trajectory:
         return _solve_in_numbers(*eqx.combine(x, rest), settings, adjoint)
 
     if settings.adjoint is None:
-        fields = solve_in_both_modes(solved, x, fixed, partial(one_function, checked=True, in_turn=True))
+        fields = solve_in_both_modes(solved, x, fixed)
     else:
         fields = solved(x, fixed, settings.adjoint)
     arrays, described = pack(system, params, type(settings.method).__name__)
@@ -92,7 +92,7 @@ def trajectory_of(system, q0, v0, params, ts, settings) -> Trajectory:
 
 def _solve_in_numbers(system, q0, v0, params, ts, settings, adjoint):
     """The solve, of a small system with the coordinates one by one."""
-    written = None
+    written = unflatten = None
     small = is_small(system, ts[0], q0, v0, params)
     if isinstance(settings.method, ExplicitRungeKutta) and small:
         _, unflatten = coordinates.flatten(q0)
@@ -102,7 +102,7 @@ def _solve_in_numbers(system, q0, v0, params, ts, settings, adjoint):
             settings = eqx.tree_at(lambda s: s.event, settings, _event_in_numbers(event, unflatten))
         written = write_out(system, ts[0], q0, v0, params)
     fields = _solve(system, q0, v0, params, ts, settings, adjoint, written)
-    if written is None:
+    if unflatten is None:
         return fields
     together = lambda tree: jax.vmap(lambda *x: unflatten(jnp.stack(x)))(*tree)
     end = fields["end"]
@@ -124,7 +124,10 @@ def _solve(system, q0, v0, params, ts, settings, adjoint, written):
     if settings.drift == "project":
         off_constraints = off_constraints | (finite & ~singular & ~projected.holds)
     too_small = settings.rtol[0] < ROUND_OFFS * jnp.finfo(ts.dtype).eps if settings.controller is None else False
-    refused = off_constraints | contradictory | singular | ~finite | too_small
+    backwards = jnp.any(ts[1:] < ts[:-1])
+    if settings.dt0 is not None:
+        backwards = backwards | ~(settings.dt0 > 0)
+    refused = off_constraints | contradictory | singular | ~finite | too_small | backwards
     y0 = jax.tree.map(lambda x: jnp.where(refused, 0.0, x), (q0, v0))
     terms = diffrax.ODETerm(_vector_field(system, ts, settings.drift))
     quick = None
@@ -137,29 +140,26 @@ def _solve(system, q0, v0, params, ts, settings, adjoint, written):
     bare = isinstance(adjoint, diffrax.BacksolveAdjoint)
     settings = eqx.tree_at(lambda s: s.method, settings, _with_root_finder(settings))
     at_ts, at_end = diffrax.SubSaveAt(ts=ts), diffrax.SubSaveAt(t1=True)
-    solution = diffrax.diffeqsolve(
-        terms if quick is None else quick.terms,
-        settings.method
-        if bare
-        else _solver(system, terms, quick, State(ts[0], q0, v0, params), refused, settings, adjoint),
-        t0=ts[0],
-        t1=ts[-1],
-        dt0=settings.dt0,
-        y0=y0,
-        args=params,
-        saveat=diffrax.SaveAt(ts=ts) if bare else diffrax.SaveAt(subs=(at_ts, at_end)),
-        stepsize_controller=_controller(ts, settings, bare),
-        adjoint=adjoint,
-        event=_located_event(settings.event, ts),
-        max_steps=settings.max_steps,
-        throw=False,
-        progress_meter=_progress_meter(settings.progress),
-    )
     if bare:
-        reached_ts, outputs = solution.ts, solution.ys
+        solver, saveat = settings.method, diffrax.SaveAt(ts=ts)
+    else:
+        solver = _solver(system, terms, quick, State(ts[0], q0, v0, params), refused, settings, adjoint)
+        saveat = diffrax.SaveAt(subs=(at_ts, at_end))
+    solve = partial(_diffeqsolve, max_steps=settings.max_steps, adjoint=adjoint, progress=settings.progress)
+    arguments = (
+        terms if quick is None else quick.terms, solver, ts[0], ts[-1], settings.dt0, y0, params, saveat,
+        _controller(ts, settings, bare), _located_event(settings.event, ts),
+    )  # fmt: skip
+    # Reverse mode has to look inside.
+    if isinstance(adjoint, diffrax.ForwardMode):
+        solution = one_function(solve, *arguments, checked=_has_no_checks_of_its_own(settings.controller), in_turn=True)
+    else:
+        solution = solve(*arguments)
+    if bare:
+        reached_ts, outputs = solution["ts"], solution["ys"]
         end_t, end_y = jax.tree.map(lambda x: x[-1:], (reached_ts, outputs))
     else:
-        (reached_ts, end_t), (outputs, end_y) = solution.ts, solution.ys
+        (reached_ts, end_t), (outputs, end_y) = solution["ts"], solution["ys"]
 
     # What was not reached is evaluated at the start and masked afterwards: NaN times zero would poison gradients.
     reached = jnp.isfinite(reached_ts) & ~refused
@@ -170,7 +170,7 @@ def _solve(system, q0, v0, params, ts, settings, adjoint, written):
     end = jax.tree.map(lambda x: jnp.where(refused, jnp.nan, x[-1]), everything)._replace(t=t[-1])
     _, q, v, multipliers = jax.tree.map(lambda x: jnp.where(_like(reached, x), x[:-1], jnp.nan), everything)
 
-    result = RESULTS.promote(solution.result)
+    result = RESULTS.promote(solution["result"])
     for reported, ours in TRANSLATED.items():
         result = RESULTS.where(result == getattr(RESULTS, reported), getattr(RESULTS, ours), result)
     # An output is a step of its own, and can fail where the steps of the solve did not.
@@ -181,7 +181,8 @@ def _solve(system, q0, v0, params, ts, settings, adjoint, written):
     result = RESULTS.where(contradictory, RESULTS.contradictory, result)
     result = RESULTS.where(off_constraints, RESULTS.start_off_constraints, result)
     result = RESULTS.where(too_small, RESULTS.tolerance_too_small, result)
-    stats = {name: jnp.asarray(count) for name, count in solution.stats.items() if name != "max_steps"}
+    result = RESULTS.where(backwards, RESULTS.backwards, result)
+    stats = {name: jnp.asarray(count) for name, count in solution["stats"].items() if name != "max_steps"}
     departure = _departure(system, stopped((t, everything.q, everything.v, params)), stats, settings)
     return {
         "q": q,
@@ -192,6 +193,19 @@ def _solve(system, q0, v0, params, ts, settings, adjoint, written):
         "departure": departure,
         "result": result,
     }
+
+
+def _diffeqsolve(terms, solver, t0, t1, dt0, y0, args, saveat, controller, event, *, max_steps, adjoint, progress):
+    solution = diffrax.diffeqsolve(
+        terms, solver, t0, t1, dt0, y0, args, saveat=saveat, stepsize_controller=controller, adjoint=adjoint, event=event,
+        max_steps=max_steps, throw=False, progress_meter=_progress_meter(progress),
+    )  # fmt: skip
+    return {name: getattr(solution, name) for name in ("ts", "ys", "stats", "result")}
+
+
+def _has_no_checks_of_its_own(controller):
+    # diffrax's own are about the times and the first step, which `_solve` looks at.
+    return controller is None or isinstance(controller, (diffrax.ConstantStepSize, diffrax.PIDController))
 
 
 def _departure(system, motion, stats, settings):

@@ -27,6 +27,7 @@ class RESULTS(diffrax.RESULTS):
         "A step could not be solved, could not be returned to the constraints, or lost the state in its error."
     )
     tolerance_too_small = "The tolerance is below the round-off of the state's dtype."
+    backwards = "The times do not increase, or the first step dt0 is not positive."
     drifted = "The motion was computed, but what must stay constant changed by more than 1000 tolerances."
 
 

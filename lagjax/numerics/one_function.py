@@ -21,6 +21,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import numpy as np
 from jax import lax
 from jax.experimental.xla_metadata import set_xla_metadata
 from jax.extend.core import ClosedJaxpr, Jaxpr, Primitive, jaxpr_as_fun
@@ -30,6 +31,7 @@ from lagjax.numerics.programs import bodies
 
 # Reductions and products above this become calls of a library.
 LARGE = 1024
+LARGE_PRODUCT = 343
 AT_ANY_SIZE = {
     "abs", "acos", "acosh", "add", "add_any", "and", "asin", "asinh", "atan", "atan2", "atanh", "bessel_i0e", "bessel_i1e",
     "broadcast_in_dim", "cbrt", "ceil", "clamp", "concatenate", "convert_element_type", "copy", "copy_p", "cos", "cosh",
@@ -40,10 +42,10 @@ AT_ANY_SIZE = {
     "stop_gradient", "sub", "tan", "tanh", "transpose", "unstack", "xor", "reduce_precision", "tile",
     # equinox's, which become some of the above.
     "maybe_set", "nonbatchable", "nondifferentiable", "nondifferentiable_backward", "select_if_vmap", "unvmap_all",
-    "unvmap_any", "unvmap_max", "xla_metadata_value",
+    "unvmap_any", "unvmap_max", "vprim", "xla_metadata_value",
 }  # fmt: skip
 SMALL = {
-    "argmax", "argmin", "cummax", "cummin", "cumprod", "cumsum", "dot_general", "reduce_and", "reduce_max", "reduce_min",
+    "argmax", "argmin", "cummax", "cummin", "cumprod", "cumsum", "reduce_and", "reduce_max", "reduce_min",
     "reduce_or", "reduce_prod", "reduce_sum",
 }  # fmt: skip
 WITH_BODIES = {
@@ -64,8 +66,7 @@ def one_function(function: Callable, *args, checked: bool = False, in_turn: bool
     (`error_if`, calls of the host) in it are known to pass: they are left out. In a batch on a CPU, with `in_turn`, the
     function is called for one lane after the other.
 
-    Derivatives and batches are those of the function itself; programs differentiated by JAX are not compiled so, and
-    those who want it differentiate inside.
+    Its forward derivative is one function too, also along many directions. Reverse mode needs the function as it is.
     """
     arrays, static = eqx.partition(args, eqx.is_array)
     leaves, structure = jtu.tree_flatten(arrays)
@@ -80,7 +81,7 @@ def one_function(function: Callable, *args, checked: bool = False, in_turn: bool
     jaxpr, shapes = jax.make_jaxpr(of_leaves, return_shape=True)(*leaves)
     if checked:
         jaxpr = without_checks(jaxpr)
-    found = _one_function_p.bind(*leaves, jaxpr=jaxpr, in_turn=in_turn)
+    found = _one_function_p.bind(*leaves, jaxpr=jaxpr, in_turn=in_turn, points=len(leaves), values=0, checked=checked)
     return eqx.combine(jtu.tree_unflatten(jtu.tree_structure(shapes), found), rest[0])
 
 
@@ -104,6 +105,10 @@ def _equation_fits(equation):
         name = equation.params["prim"].name
     if name in AT_ANY_SIZE:
         return True
+    if name == "dot_general":
+        (contracted, _), _ = equation.params["dimension_numbers"]
+        inner = np.prod([equation.invars[0].aval.shape[i] for i in contracted])
+        return equation.outvars[0].aval.size * inner < LARGE_PRODUCT
     if name in SMALL:
         return max(sizes) <= LARGE
     if name.startswith("scatter"):
@@ -157,26 +162,70 @@ def _marked(*operands, jaxpr, **params):
     return [set_xla_metadata(first, inlineable="false", xla_cpu_small_call="true"), *others][: len(jaxpr.out_avals)]
 
 
-def _jvp(evaluate, primals, tangents, **params):
-    tangents = tuple(None if isinstance(t, ad.Zero) else t for t in tangents)
-    return eqx.filter_jvp(lambda *x: evaluate(*x, **params), tuple(primals), tangents)
+def _pushed(jaxpr, known, checked):
+    """The program of values and derivatives, of the operands and the tangents of those that are `known` to have one."""
+
+    def pushed(*operands):
+        primals, moving = operands[: len(known)], operands[len(known) :]
+
+        def of_moved(*moved):
+            moved = iter(moved)
+            return jaxpr_as_fun(jaxpr)(*(next(moved) if k else x for x, k in zip(primals, known)))
+
+        y, dy = jax.jvp(of_moved, [x for x, k in zip(primals, known) if k], list(moving))
+        # What is no floating number has no derivative.
+        return *y, *(d for d in dy if d.dtype != jax.dtypes.float0)
+
+    moving = [aval for aval, k in zip(jaxpr.in_avals, known) if k]
+    like = [jax.ShapeDtypeStruct(aval.shape, aval.dtype) for aval in (*jaxpr.in_avals, *moving)]
+    program = jax.make_jaxpr(pushed)(*like)
+    # The derivative of a check is a check.
+    return without_checks(program) if checked else program
 
 
-def _batched(operands, axes, *, jaxpr, in_turn):
+def _jvp(primitive, primals, tangents, *, jaxpr, checked, **params):
+    known = [not isinstance(t, ad.Zero) for t in tangents]
+    moving = [t for t, k in zip(tangents, known) if k]
+    program, count = _pushed(jaxpr, known, checked), len(jaxpr.out_avals)
+    if "batched" in params:
+        params["batched"] += tuple(b for b, k in zip(params["batched"], known) if k)
+    else:
+        params |= {"points": len(primals), "values": count}
+    found = primitive.bind(*primals, *moving, jaxpr=program, checked=checked, **params)
+    derivatives = iter(found[count:])
+    shapes = [primal.aval.to_tangent_aval() for primal in jaxpr.jaxpr.outvars]
+    if "lanes" in params:
+        shapes = [aval.update(shape=(params["lanes"], *aval.shape)) for aval in shapes]
+    moves = lambda aval: aval.dtype != jax.dtypes.float0
+    return found[:count], [next(derivatives) if moves(aval) else ad.Zero(aval) for aval in shapes]
+
+
+def _batched(operands, axes, *, jaxpr, in_turn, points, values, checked):
     front = [x if axis is None else jnp.moveaxis(x, axis, 0) for x, axis in zip(operands, axes)]
-    lanes = next(x.shape[0] for x, axis in zip(front, axes) if axis is not None)
-    params = dict(jaxpr=jaxpr, batched=tuple(axis is not None for axis in axes), lanes=lanes)
-    results = _in_turn_p.bind(*front, **params) if in_turn else _lanes_together(*front, **params)
+    batched = tuple(axis is not None for axis in axes)
+    lanes = next(x.shape[0] for x, b in zip(front, batched) if b)
+    params = dict(jaxpr=jaxpr, batched=batched, lanes=lanes, checked=checked)
+    if in_turn and any(batched[:points]):
+        results = _in_turn_p.bind(*front, **params)
+    elif in_turn:
+        # Many directions at one point, whose values are computed once.
+        out_axes = [None] * values + [0] * (len(jaxpr.out_avals) - values)
+        together = jax.make_jaxpr(jax.vmap(jaxpr_as_fun(jaxpr), [0 if b else None for b in batched], out_axes))(*front)
+        params = dict(in_turn=in_turn, points=points, values=values, checked=checked)
+        results = _one_function_p.bind(*front, jaxpr=together, **params)
+        return results, [axis if axis is None else 0 for axis in out_axes]
+    else:
+        results = _lanes_together(*front, **params)
     return results, [0] * len(results)
 
 
-def _lanes_together(*operands, jaxpr, batched, lanes):
+def _lanes_together(*operands, jaxpr, batched, **params):
     return jax.vmap(jaxpr_as_fun(jaxpr), [0 if b else None for b in batched])(*operands)
 
 
-def _lanes_in_turn(*operands, jaxpr, batched, lanes):
+def _lanes_in_turn(*operands, jaxpr, batched, **params):
     if not fits(jaxpr.jaxpr):
-        return _lanes_together(*operands, jaxpr=jaxpr, batched=batched, lanes=lanes)
+        return _lanes_together(*operands, jaxpr=jaxpr, batched=batched)
 
     def lane(mine):
         mine = iter(mine)
@@ -185,7 +234,7 @@ def _lanes_in_turn(*operands, jaxpr, batched, lanes):
     return list(lax.map(lane, [x for x, b in zip(operands, batched) if b]))
 
 
-def _batched_again(operands, axes, *, jaxpr, batched, lanes):
+def _batched_again(operands, axes, *, jaxpr, batched, lanes, checked):
     more = next(x.shape[axis] for x, axis in zip(operands, axes) if axis is not None)
     flat = []
     for x, axis, b in zip(operands, axes, batched):
@@ -196,11 +245,11 @@ def _batched_again(operands, axes, *, jaxpr, batched, lanes):
         x = x if b else jnp.broadcast_to(x[:, None], (more, lanes, *x.shape[1:]))
         flat.append(x.reshape(more * lanes, *x.shape[2:]))
     varied = tuple(b or axis is not None for b, axis in zip(batched, axes))
-    results = _in_turn_p.bind(*flat, jaxpr=jaxpr, batched=varied, lanes=more * lanes)
+    results = _in_turn_p.bind(*flat, jaxpr=jaxpr, batched=varied, lanes=more * lanes, checked=checked)
     return [x.reshape(more, lanes, *x.shape[1:]) for x in results], [0] * len(results)
 
 
-def _lane_shapes(*operands, jaxpr, batched, lanes):
+def _lane_shapes(*operands, jaxpr, lanes, **params):
     return [aval.update(shape=(lanes, *aval.shape)) for aval in jaxpr.out_avals]
 
 
@@ -209,12 +258,12 @@ def _define(name, evaluate, on_cpu, shapes, batch):
     primitive.multiple_results = True
     primitive.def_impl(lambda *x, **params: jax.jit(lambda *x: primitive.bind(*x, **params))(*x))
     primitive.def_abstract_eval(shapes)
-    ad.primitive_jvps[primitive] = partial(_jvp, evaluate)
+    ad.primitive_jvps[primitive] = partial(_jvp, primitive)
     batching.primitive_batchers[primitive] = batch
     mlir.register_lowering(primitive, mlir.lower_fun(evaluate, multiple_results=True))
     mlir.register_lowering(primitive, mlir.lower_fun(on_cpu, multiple_results=True), platform="cpu")
     return primitive
 
 
-_one_function_p = _define("one_function", _plainly, _marked, lambda *x, jaxpr, in_turn: jaxpr.out_avals, _batched)
+_one_function_p = _define("one_function", _plainly, _marked, lambda *x, jaxpr, **params: jaxpr.out_avals, _batched)
 _in_turn_p = _define("in_turn", _lanes_together, _lanes_in_turn, _lane_shapes, _batched_again)

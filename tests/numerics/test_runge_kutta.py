@@ -62,7 +62,9 @@ def exact():
 
 
 @pytest.mark.parametrize(
-    ("method", "steps", "order"), [(Tsit5(), (80, 160), 5), (Dopri8(), (10, 20), 8), (Misprinted(), (80, 160), 2)], ids=name_of
+    ("method", "steps", "order"),
+    [(Tsit5(), (80, 160), 5), (Dopri8(), (10, 20), 8), (Misprinted(), (80, 160), 2)],
+    ids=name_of,
 )
 def test_order(exact, method, steps, order):
     """The order on a nonlinear problem with explicit time; a misprint in the tableau loses it."""
