@@ -1,7 +1,7 @@
 """A system seen as numbers: coordinates one by one, programs as operations on single numbers.
 
-`in_numbers` gives the same system with a tuple of numbers in place of the user's q and v. `Numbers` traces a function of
-the system and its state, writes it out, and parts it in what depends on the parameters alone and the rest.
+`in_numbers` gives the same system with a tuple of numbers in place of the user's q and v. `Numbers` traces a function
+of the system and its state, writes it out, and parts it in what depends on the parameters alone and the rest.
 """
 
 from collections.abc import Callable

@@ -32,7 +32,6 @@ from lagjax.mechanics.in_numbers import Numbers, in_numbers
 from lagjax.mechanics.lagrangian import mass_and_forcing
 from lagjax.numerics.programs import reached
 
-
 # Coordinates and equations together: of larger systems the programs are not written out.
 UP_TO = 24
 

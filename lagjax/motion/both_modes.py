@@ -3,9 +3,9 @@
 diffrax offers one derivative a solve: `ForwardMode` or `RecursiveCheckpointAdjoint`. Which one is wanted is
 known only when JAX pushes tangents through (`jacfwd`, Levenberg-Marquardt) or transposes them (`grad`).
 The derivative of y = solve(x) is therefore bound as a linear map dx -> dy of its own: a primitive that is
-evaluated by forward mode and transposed by the checkpointed reverse mode; where few derivatives are asked for, by
-forward mode too, along each of them. Undifferentiated, there is no trace of it in the compiled program. Differentiated, the plain solve runs beside the derivative's own;
-naming an `adjoint` saves that one solve.
+evaluated by forward mode and transposed by the checkpointed reverse mode; where few derivatives are asked for,
+by forward mode too, along each of them. Undifferentiated, there is no trace of it in the compiled program.
+Differentiated, the plain solve runs beside the derivative's own; naming an `adjoint` saves that one solve.
 
 Second derivatives work forward over forward (`jacfwd` of `jacfwd`).
 """

@@ -16,10 +16,10 @@ from jaxtyping import Array, Float
 
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.coordinates import State
-from lagjax.mechanics.saddle_point import equations_of_motion, verdict
 from lagjax.mechanics.in_numbers import Numbers, in_numbers
-from lagjax.mechanics.written_out import is_small, write_out
+from lagjax.mechanics.saddle_point import equations_of_motion, verdict
 from lagjax.mechanics.structure import angles, conserves_jacobi_integral
+from lagjax.mechanics.written_out import is_small, write_out
 from lagjax.motion.arriving import Arriving
 from lagjax.motion.both_modes import solve_in_both_modes
 from lagjax.motion.consistency import stopped, to_manifold, within, worst_residual
@@ -197,8 +197,8 @@ def _solve(system, q0, v0, params, ts, settings, adjoint, written):
 
 def _diffeqsolve(terms, solver, t0, t1, dt0, y0, args, saveat, controller, event, *, max_steps, adjoint, progress):
     solution = diffrax.diffeqsolve(
-        terms, solver, t0, t1, dt0, y0, args, saveat=saveat, stepsize_controller=controller, adjoint=adjoint, event=event,
-        max_steps=max_steps, throw=False, progress_meter=_progress_meter(progress),
+        terms, solver, t0, t1, dt0, y0, args, saveat=saveat, stepsize_controller=controller, adjoint=adjoint,
+        event=event, max_steps=max_steps, throw=False, progress_meter=_progress_meter(progress),
     )  # fmt: skip
     return {name: getattr(solution, name) for name in ("ts", "ys", "stats", "result")}
 

@@ -19,9 +19,9 @@ from jax import lax
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, PyTree
 
+from lagjax.mechanics.in_numbers import Numbers
 from lagjax.mechanics.saddle_point import independent_equations
 from lagjax.mechanics.system import System
-from lagjax.mechanics.in_numbers import Numbers
 from lagjax.motion.consistency import to_manifold
 from lagjax.numerics.one_function import called
 from lagjax.numerics.radau import Radau5

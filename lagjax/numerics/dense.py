@@ -106,8 +106,8 @@ class Saddle:
     """`[[M, Aᵀ], [A, 0]]` eliminated in the order in which it is written, one number at a time.
 
     For programs that are written out (`scalars.py`), where the zeros of M and A cost nothing. `believed` says whether
-    the answers are as accurate as with pivoting: M is definite (or every pivot the largest of its column), and no row of
-    A depends on those before it. A `diagonal` M without A is divided by: what is singular gives NaN or infinity.
+    the answers are as accurate as with pivoting: M is definite (or every pivot the largest of its column), and no row
+    of A depends on those before it. A `diagonal` M without A is divided by: what is singular gives NaN or infinity.
 
     Source: Golub & Van Loan, *Matrix Computations*, §4.1.2.
     """

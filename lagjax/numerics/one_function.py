@@ -33,16 +33,16 @@ from lagjax.numerics.programs import bodies
 LARGE = 1024
 LARGE_PRODUCT = 343
 AT_ANY_SIZE = {
-    "abs", "acos", "acosh", "add", "add_any", "and", "asin", "asinh", "atan", "atan2", "atanh", "bessel_i0e", "bessel_i1e",
-    "broadcast_in_dim", "cbrt", "ceil", "clamp", "concatenate", "convert_element_type", "copy", "copy_p", "cos", "cosh",
-    "digamma", "div", "dynamic_slice", "dynamic_update_slice", "eq", "erf", "erf_inv", "erfc", "exp", "exp2",
-    "expand_dims", "expm1", "floor", "gather", "ge", "gt", "integer_pow", "iota", "is_finite", "le", "lgamma", "log",
-    "log1p", "logistic", "lt", "max", "min", "mul", "ne", "neg", "nextafter", "not", "or", "pad", "pow", "rem", "reshape",
-    "rev", "round", "rsqrt", "select_n", "sign", "sin", "sinh", "slice", "split", "sqrt", "square", "squeeze", "stack",
-    "stop_gradient", "sub", "tan", "tanh", "transpose", "unstack", "xor", "reduce_precision", "tile",
-    # equinox's, which become some of the above.
-    "maybe_set", "nonbatchable", "nondifferentiable", "nondifferentiable_backward", "select_if_vmap", "unvmap_all",
-    "unvmap_any", "unvmap_max", "vprim", "xla_metadata_value",
+    "abs", "acos", "acosh", "add", "add_any", "and", "asin", "asinh", "atan", "atan2", "atanh", "bessel_i0e",
+    "bessel_i1e", "broadcast_in_dim", "cbrt", "ceil", "clamp", "concatenate", "convert_element_type", "copy",
+    "copy_p", "cos", "cosh", "digamma", "div", "dynamic_slice", "dynamic_update_slice", "eq", "erf", "erf_inv",
+    "erfc", "exp", "exp2", "expand_dims", "expm1", "floor", "gather", "ge", "gt", "integer_pow", "iota",
+    "is_finite", "le", "lgamma", "log", "log1p", "logistic", "lt", "max", "min", "mul", "ne", "neg", "nextafter",
+    "not", "or", "pad", "pow", "rem", "reshape", "rev", "round", "rsqrt", "select_n", "sign", "sin", "sincos", "sinh",
+    "slice", "split", "sqrt", "square", "squeeze", "stack", "stop_gradient", "sub", "tan", "tanh", "transpose",
+    "unstack", "xor", "reduce_precision", "tile", "maybe_set", "nonbatchable", "nondifferentiable",
+    "nondifferentiable_backward", "select_if_vmap", "unvmap_all", "unvmap_any", "unvmap_max", "vprim",
+    "xla_metadata_value",
 }  # fmt: skip
 SMALL = {
     "argmax", "argmin", "cummax", "cummin", "cumprod", "cumsum", "reduce_and", "reduce_max", "reduce_min",
@@ -205,17 +205,14 @@ def _batched(operands, axes, *, jaxpr, in_turn, points, values, checked):
     batched = tuple(axis is not None for axis in axes)
     lanes = next(x.shape[0] for x, b in zip(front, batched) if b)
     params = dict(jaxpr=jaxpr, batched=batched, lanes=lanes, checked=checked)
-    if in_turn and any(batched[:points]):
-        results = _in_turn_p.bind(*front, **params)
-    elif in_turn:
+    if not any(batched[:points]):
         # Many directions at one point, whose values are computed once.
         out_axes = [None] * values + [0] * (len(jaxpr.out_avals) - values)
         together = jax.make_jaxpr(jax.vmap(jaxpr_as_fun(jaxpr), [0 if b else None for b in batched], out_axes))(*front)
         params = dict(in_turn=in_turn, points=points, values=values, checked=checked)
         results = _one_function_p.bind(*front, jaxpr=together, **params)
         return results, [axis if axis is None else 0 for axis in out_axes]
-    else:
-        results = _lanes_together(*front, **params)
+    results = _in_turn_p.bind(*front, **params) if in_turn else _lanes_together(*front, **params)
     return results, [0] * len(results)
 
 

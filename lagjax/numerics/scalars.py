@@ -1,9 +1,9 @@
 """Small arrays written out as numbers, with their zeros left out.
 
 The mechanics is written with vectors and matrices. On a few coordinates these are mostly zeros and ones: the rows of a
-unit matrix along which a momentum is pushed, a mass matrix with its diagonal alone. `written_out` takes a program apart
-into operations on single numbers: what is multiplied by a known zero is gone, what is a known one is not multiplied, and
-what is never used is not computed. XLA keeps the rest in registers.
+unit matrix along which a momentum is pushed, a mass matrix with its diagonal alone. `written_out` takes a program
+apart into operations on single numbers: what is multiplied by a known zero is gone, what is a known one is not
+multiplied, and what is never used is not computed. XLA keeps the rest in registers.
 
 A known zero counts as zero whatever it multiplies, also infinity or NaN. Primitives that are not known here, control
 flow, and arrays of more than `LARGE` entries are left as they are.
@@ -16,15 +16,16 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Literal
 
+from lagjax.numerics.elementary import sincos_in_lanes
 from lagjax.numerics.programs import evaluate
 
 LARGE = 64
 ELEMENTWISE = {
-    "abs", "acos", "acosh", "add", "add_any", "and", "asin", "asinh", "atan", "atan2", "atanh", "cbrt", "ceil", "clamp",
-    "cos", "cosh", "convert_element_type", "digamma", "div", "eq", "erf", "erf_inv", "erfc", "exp", "exp2", "expm1",
-    "floor", "ge", "gt", "integer_pow", "is_finite", "le", "lgamma", "log", "log1p", "logistic", "lt", "max", "min", "mul",
-    "ne", "neg", "nextafter", "not", "or", "pow", "rem", "round", "rsqrt", "select_n", "sign", "sin", "sinh", "sqrt",
-    "square", "stop_gradient", "sub", "tan", "tanh", "xor",
+    "abs", "acos", "acosh", "add", "add_any", "and", "asin", "asinh", "atan", "atan2", "atanh", "cbrt", "ceil",
+    "clamp", "cos", "cosh", "convert_element_type", "digamma", "div", "eq", "erf", "erf_inv", "erfc", "exp", "exp2",
+    "expm1", "floor", "ge", "gt", "integer_pow", "is_finite", "le", "lgamma", "log", "log1p", "logistic", "lt",
+    "max", "min", "mul", "ne", "neg", "nextafter", "not", "or", "pow", "rem", "round", "rsqrt", "select_n", "sign",
+    "sin", "sinh", "sqrt", "square", "stop_gradient", "sub", "tan", "tanh", "xor",
 }  # fmt: skip
 CALLS = {"jit", "pjit", "closed_call", "core_call"}
 
@@ -37,7 +38,7 @@ def written_out(closed: ClosedJaxpr, *args) -> list:
     >>> print(jax.make_jaxpr(lambda x: written_out(program, x)[0][0])(jnp.ones(2)).jaxpr.eqns[-1].primitive)
     mul
     """
-    results = _evaluate(closed, [_split(x) if _small(x.aval) else x for x in map(_Value, args)])
+    results = _evaluate(closed, [_split(x) if _small(x.aval) else x for x in map(_Value, args)], pairs={})
     return [_joined(x, aval) for x, aval in zip(results, closed.out_avals)]
 
 
@@ -84,7 +85,7 @@ def _joined(value, aval):
     return jnp.stack(entries).reshape(aval.shape) if entries else jnp.zeros(aval.shape, aval.dtype)
 
 
-def _evaluate(closed, args):
+def _evaluate(closed, args, pairs):
     jaxpr = closed.jaxpr
     values = dict(zip(jaxpr.invars, args))
     for variable, constant in zip(jaxpr.constvars, closed.consts):
@@ -97,17 +98,17 @@ def _evaluate(closed, args):
         return values[x]
 
     for equation in jaxpr.eqns:
-        values.update(zip(equation.outvars, _apply(equation, [read(x) for x in equation.invars], jaxpr)))
+        values.update(zip(equation.outvars, _apply(equation, [read(x) for x in equation.invars], jaxpr, pairs)))
     return [read(x) for x in jaxpr.outvars]
 
 
-def _apply(equation, operands, jaxpr):
+def _apply(equation, operands, jaxpr, pairs):
     name, params = equation.primitive.name, equation.params
     apart = all(isinstance(x, np.ndarray) for x in operands) and all(_small(x.aval) for x in equation.outvars)
     if name in CALLS and len(_programs(params)) == 1:
-        return _evaluate(_programs(params)[0], operands)
+        return _evaluate(_programs(params)[0], operands, pairs)
     if apart and name in ELEMENTWISE:
-        return [_elementwise(equation, operands)]
+        return [_elementwise(equation, operands, pairs)]
     if apart and name in MOVES:
         found = MOVES[name](params, equation.outvars, *operands)
         if found is not None:
@@ -121,11 +122,18 @@ def _programs(params):
     return [p for p in params.values() if isinstance(p, ClosedJaxpr)]
 
 
-def _elementwise(equation, operands):
+def _pair(x, pairs):
+    """Sine and cosine of a number, found together once."""
+    if id(x) not in pairs:
+        pairs[id(x)] = (x, *sincos_in_lanes(x))
+    return pairs[id(x)][1:]
+
+
+def _elementwise(equation, operands, pairs):
     (variable,) = equation.outvars
     shape, dtype = variable.aval.shape, variable.aval.dtype
     rows = [np.broadcast_to(x, shape).reshape(-1) for x in operands]
-    one = lambda *x: _simplified(equation, dtype, *x)
+    one = lambda *x: _simplified(equation, dtype, pairs, *x)
     return _filled(shape, [one(*column) for column in zip(*rows)])
 
 
@@ -133,7 +141,7 @@ def _is(x, number):
     return isinstance(x, np.generic) and x == number
 
 
-def _simplified(equation, dtype, *x):
+def _simplified(equation, dtype, pairs, *x):
     """One number by a primitive, computed at once where that is trivial."""
     name = equation.primitive.name
     if name in ("add", "add_any"):
@@ -159,6 +167,8 @@ def _simplified(equation, dtype, *x):
             return np.asarray(x[0]).astype(dtype)[()]
         if x[0].dtype == dtype and not getattr(x[0], "weak_type", False):
             return x[0]
+    if name in ("sin", "cos") and not isinstance(x[0], np.generic):
+        return _pair(x[0], pairs)[name == "cos"]
     if name in KNOWN and all(isinstance(y, np.generic) for y in x):
         return np.asarray(KNOWN[name](*x), dtype)[()]
     return equation.primitive.bind(*x, **equation.params)

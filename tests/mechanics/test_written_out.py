@@ -1,4 +1,4 @@
-"""Equations written out: the same accelerations, multipliers and projections, with operations for what is there only."""
+"""Equations written out: the same accelerations, multipliers, projections; operations only for what is there."""
 
 from collections import Counter
 
@@ -6,7 +6,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from tests.systems import HORIZONTAL, PARAMS, double_pendulum_lagrangian, pendulum, rod_pendulum
 
 import lagjax as lj
 from lagjax.mechanics import coordinates
@@ -14,6 +13,7 @@ from lagjax.mechanics.saddle_point import equations_of_motion
 from lagjax.mechanics.written_out import is_small, write_out
 from lagjax.motion.consistency import to_manifold
 from lagjax.scenes import bead_on_hoop
+from tests.systems import HORIZONTAL, PARAMS, double_pendulum_lagrangian, pendulum, rod_pendulum
 
 LIBRARY = {"lu", "cholesky", "triangular_solve", "eigh", "qr", "custom_linear_solve"}
 DOUBLE = {"m1": 1.0, "m2": 0.7, "l1": 1.2, "l2": 0.8, "g": 9.81}

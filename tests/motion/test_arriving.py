@@ -3,10 +3,10 @@
 import diffrax
 import jax.numpy as jnp
 import numpy as np
-from tests.systems import PARAMS, pendulum
 
 import lagjax as lj
 from lagjax.motion.arriving import Arriving
+from tests.systems import PARAMS, pendulum
 
 
 def run(ts, **options):
@@ -15,7 +15,7 @@ def run(ts, **options):
 
 
 def test_outputs_are_those_of_one_solve():
-    """Twelve uneven outputs, one of them just after another, agree with a far more accurate run; the first is the start."""
+    """Twelve uneven outputs, one just after another, agree with another method's; the first is the start."""
     ts = np.concatenate([[0.0, 1e-9], np.sort(np.random.default_rng(1).uniform(0.0, 8.0, 9)), [8.0]])
     found, exact = run(ts), run(ts, method=lj.Tsit5(), max_steps=2**22)
     np.testing.assert_allclose(found.q, exact.q, atol=3e-9)
@@ -31,7 +31,7 @@ def test_outputs_shorten_few_steps():
 
 
 def test_the_size_proposed_before_is_kept():
-    """After a step shortened to an output the next one is as long as was proposed; a forgetful controller starts anew."""
+    """After a step shortened to an output the next one is as long as had been proposed."""
     controller = Arriving(diffrax.PIDController(rtol=1e-6, atol=1e-6), jnp.array([0.0, 1.0, 1.001, 5.0]))
     before = jnp.asarray(0.4)
     state = (controller.controller.init(None, 0.0, 5.0, 1.0, 0.4, None, lambda *a: 0.0, 5)[1], jnp.asarray(2), before)

@@ -1,7 +1,6 @@
 """Elimination in the order in which the equations are written: as accurate as LAPACK, or not believed."""
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
