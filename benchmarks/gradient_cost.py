@@ -8,8 +8,8 @@ functions at the end. Four derivatives: by g, a, ω and the angle of release.
     reverse mode   of the sum of the squares of ψ and ψ' at 100 outputs by `jax.grad`
 
 "error" is the relative one against derivatives of the closed form, which are checked against its central differences
-first. diffrax's own gradients stand beside them, by `ForwardMode` and by its default adjoint. All programs of a mode run
-in turn; medians of the turns' ratios.
+first. diffrax's own gradients stand beside them, by `ForwardMode` and by its default adjoint. A mode's programs run
+in turn; ratios are medians over the turns.
 
     python benchmarks/gradient_cost.py [--json FILE] [--only TEXT]
 """

@@ -35,7 +35,7 @@ jax.config.update("jax_enable_x64", True)
 LADDER = tuple(10.0 ** (-k / 2) for k in range(8, 26))
 LEVELS = (1e-4, 1e-6, 1e-8, 1e-10)
 WINS_WITHIN = 1.1
-REPEATS, SLOWEST = 7, 0.05
+REPEATS, SLOWEST = 5, 0.03
 DEFAULT = "default"
 
 

@@ -48,7 +48,7 @@ class Plan(NamedTuple):
 
 def plan(system, t, q, v, params) -> Plan | None:
     """How to solve a system sparsely; None where the dense solve is as good. Only shapes and dtypes count."""
-    n = sum(x.size for x in jax.tree.leaves(q))
+    n = sum(np.size(x) for x in jax.tree.leaves(q))
     if n + constraints.count(system, t, q, v, params) < UNKNOWNS_AT_LEAST:
         return None
     leaves, structure = jtu.tree_flatten((system, t, q, v, params))

@@ -58,8 +58,8 @@ def one_function(function: Callable, *args, checked: bool = False, in_turn: bool
     """`function(*args)`, compiled as one machine function where that is possible.
 
     >>> import jax.numpy as jnp
-    >>> print(one_function(lambda x: {"twice": 2 * x}, jnp.asarray(3.0)))
-    {'twice': Array(6., dtype=float64)}
+    >>> print(one_function(lambda x: {"twice": 2 * x}, jnp.asarray(3.0))["twice"])
+    6.0
 
     **Arguments:** pytrees, of which the arrays are passed and all else is compiled in; what `function` returns may
     contain anything too. It must not close over traced values. `checked` says that the checks of equinox
