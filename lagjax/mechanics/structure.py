@@ -23,7 +23,6 @@ import jax.tree_util as jtu
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 from jaxtyping import PyTree
-from scipy.sparse.csgraph import connected_components
 
 from lagjax.mechanics import constraints, coordinates
 from lagjax.mechanics.constraints import Holonomic
@@ -122,8 +121,11 @@ def _depends_on(numbers, names):
 
 
 def _blocks(nonzero, names):
-    count, label = connected_components(nonzero, directed=False)
-    return tuple(tuple(name for name, x in zip(names, label) if x == i) for i in range(count))
+    # Two coordinates are in one block where a chain of entries connects them.
+    connected = (
+        np.linalg.matrix_power((nonzero | nonzero.T | np.eye(len(names), dtype=bool)).astype(float), len(names)) > 0
+    )
+    return tuple(dict.fromkeys(tuple(name for name, x in zip(names, row) if x) for row in connected))
 
 
 def _of_constraint(constraint, args, names):

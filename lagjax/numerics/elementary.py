@@ -1,4 +1,4 @@
-"""Sine and cosine that vectorise on a CPU, and a rewriting of functions that puts them in.
+"""Sine and cosine that vectorise on a CPU.
 
 XLA calls the C library once for every sine of a float64 array. Here sine and cosine are arithmetic alone, in three
 steps without a branch, so that XLA fuses them into loops over vector registers:
@@ -8,7 +8,7 @@ steps without a branch, so that XLA fuses them into loops over vector registers:
 π/2 is split into parts (Cody & Waite) of which n times all but the last is exact, and so is the first subtraction. The
 later ones leave their rounding errors in d (Fast2Sum), which is needed where x lies next to a multiple of π/2: the
 distance is then small, and known to all its digits. Products being exact, it does not matter whether XLA contracts them
-with sums into fused operations. |n| < 2^16 in float64 and 2^10 in float32 is what this holds for; beyond `LIMITS`
+with sums into fused operations. |n| < 2^16 in float64 and 2^10 in float32 is what this holds for; beyond `limit`
 the C library takes over, behind a `lax.cond` that stays a branch under `vmap`. The polynomials in r are fdlibm's, whose
 first-order terms in d keep the error below 0.85 units in the last place (C library: 0.55).
 
@@ -17,16 +17,14 @@ Microsystems, 1993) and FreeBSD msun `k_sinf.c`, `k_cosf.c` for the coefficients
 """
 
 import functools
-from collections.abc import Callable
 from typing import NamedTuple
 
-import equinox as eqx
 import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jax.extend.core import Literal, Primitive, jaxpr_as_fun
+from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array, Float
 
@@ -119,55 +117,6 @@ def sincos(x: Float[Array, "..."]) -> tuple[Float[Array, "..."], Float[Array, ".
     return lax.cond(eqxi.unvmap_any(_is_outside(x)), _by_library, _by_arithmetic, x)
 
 
-def vectorised(function: Callable) -> Callable:
-    """The same function with sines and cosines that vectorise.
-
-    >>> import jax, jax.numpy as jnp
-    >>> pendulum = vectorised(lambda q, params: params["g"] * jnp.cos(q))
-    >>> print(jax.vmap(pendulum, (0, None))(jnp.array([0.0, jnp.pi / 2]), {"g": 9.81}).round(9))
-    [9.81 0.  ]
-
-    Its jaxpr is evaluated with `sincos` in their place, once for each argument. Bodies of loops and branches stay as
-    they are, and so do derivative rules of the function's own; what these rules belong to is rewritten. The result is
-    differentiated and batched like `function`.
-
-    **Arguments:** `function` of any pytrees; of what is passed to it, only arrays may be traced.
-
-    **Returns:** a function with the same arguments and results.
-    """
-    return lambda *args: _rewritten(function, args, sincos)
-
-
-def unguarded(function: Callable) -> Callable:
-    """The same function with sines and cosines that vectorise, and whether an argument was outside their range.
-
-    >>> import jax.numpy as jnp
-    >>> value, outside = unguarded(jnp.sin)(jnp.array([0.0, 1.0]))
-    >>> print(value.round(6), outside)
-    [0.       0.841471] False
-
-    For a caller that takes one decision over many evaluations, as a Runge-Kutta step can: without branches of their
-    own, sines fuse with what surrounds them.
-
-    **Arguments:** as for `vectorised`.
-
-    **Returns:** a function with the same arguments that returns its result, and a boolean (one a lane): where that is
-    true, the result is wrong.
-    """
-
-    def rewritten(*args):
-        outside = []
-
-        def pair(x):
-            outside.append(jnp.any(_is_outside(x)))
-            return _by_arithmetic(x)
-
-        values = _rewritten(function, args, pair)
-        return values, functools.reduce(jnp.logical_or, outside, jnp.zeros((), bool))
-
-    return rewritten
-
-
 def sincos_in_lanes(x):
     """Sine and cosine: by the C library alone, by arithmetic in a batch on a CPU, where that is several times faster.
 
@@ -229,81 +178,6 @@ def _polynomial(z, coefficients):
 PLACE = {lax.sin_p: 0, lax.cos_p: 1}
 # Calls that only name a part of a program, and where they keep it.
 INLINED = {"jit": "jaxpr", "pjit": "jaxpr", "closed_call": "call_jaxpr", "core_call": "call_jaxpr"}
-
-
-def _rewritten(function, args, pair):
-    """The result of a function, evaluated from its jaxpr with `pair(x)` for sines and cosines."""
-    closed, shape, static = eqx.filter_make_jaxpr(function)(*args)
-    arrays = jax.tree.leaves(eqx.filter(args, eqx.is_array))
-    values = _evaluate(closed, arrays, pair, {}) if _has_sines(closed.jaxpr) else jaxpr_as_fun(closed)(*arrays)
-    return eqx.combine(jax.tree.unflatten(jax.tree.structure(shape), values), static)
-
-
-def _evaluate(closed, inputs, pair, known):
-    """Evaluate a jaxpr with other sines; `known` holds what has been found, by operation and operands.
-
-    XLA merges equal sines but not equal branches, and the derivatives of a function ask for each sine many times.
-    """
-    jaxpr = closed.jaxpr
-    values = dict(zip(jaxpr.constvars, closed.consts)) | dict(zip(jaxpr.invars, inputs))
-    for eqn in jaxpr.eqns:
-        given = [atom.val if isinstance(atom, Literal) else values[atom] for atom in eqn.invars]
-        key = _key(eqn, given)
-        if key is None:
-            found = _found(eqn, given, pair, known)
-        elif key in known:
-            found, _ = known[key]
-        else:
-            # The operands are kept, or another object could take the place in memory that names them.
-            found, _ = known[key] = _found(eqn, given, pair, known), given
-        values.update(zip(eqn.outvars, found[PLACE[eqn.primitive] :] if _is_sine(eqn) else found))
-    return [atom.val if isinstance(atom, Literal) else values[atom] for atom in jaxpr.outvars]
-
-
-def _found(eqn, given, pair, known):
-    """What one equation of a jaxpr computes; sine and cosine both for either."""
-    primitive, params = eqn.primitive, eqn.params
-    if _is_sine(eqn):
-        return pair(*given)
-    if primitive.name in INLINED and _has_sines(params[INLINED[primitive.name]].jaxpr):
-        return _evaluate(params[INLINED[primitive.name]], given, pair, known)
-    if primitive.name == "custom_jvp_call" and _has_sines(params["call_jaxpr"].jaxpr):
-        original = params["call_jaxpr"]
-        # Nothing leaves it but what its rule knows of, so that its sines need branches of their own.
-        inner = jax.make_jaxpr(lambda *args: _evaluate(original, args, sincos, {}))(*given)
-        params = params | {"call_jaxpr": inner}
-    # JAX 0.9.2 moved the functions among the parameters into their dictionary.
-    bound = primitive.get_bind_params(params)
-    functions, params = ((), bound) if isinstance(bound, dict) else bound
-    found = primitive.bind(*functions, *given, **params)
-    return found if primitive.multiple_results else [found]
-
-
-def _key(eqn, given):
-    """What names an equation's result: operation, parameters and operands; None where that cannot be compared."""
-    operation = sincos if _is_sine(eqn) else (eqn.primitive, *eqn.params.items())
-    operands = [
-        (atom.aval, repr(atom.val)) if isinstance(atom, Literal) else id(value)
-        for atom, value in zip(eqn.invars, given)
-    ]
-    key = (operation, *operands)
-    try:
-        hash(key)
-    except TypeError:
-        return None
-    return None if eqn.effects else key
-
-
-def _is_sine(eqn):
-    return eqn.primitive in PLACE and np.dtype(eqn.invars[0].aval.dtype) in ARITHMETIC
-
-
-def _has_sines(jaxpr):
-    inner = INLINED | {"custom_jvp_call": "call_jaxpr"}
-    return any(
-        _is_sine(eqn) or (eqn.primitive.name in inner and _has_sines(eqn.params[inner[eqn.primitive.name]].jaxpr))
-        for eqn in jaxpr.eqns
-    )
 
 
 _sincos_p = Primitive("sincos")

@@ -6,7 +6,7 @@ import pytest
 
 import lagjax as lj
 from lagjax.mechanics import coordinates
-from lagjax.mechanics.structure import angles, conserves_jacobi_integral
+from lagjax.mechanics.structure import angles, conserves_jacobi_integral, structure
 
 free = lambda t, q, v, params: 0.5 * (v["a"] ** 2 + v["b"] ** 2)
 
@@ -66,3 +66,59 @@ def test_conserved_jacobi_integral():
     assert not known(dissipation=lambda t, q, v, params: v["a"] ** 2)
     # Time enters the expression but multiplies zero: not seen as constant, which errs on the safe side.
     assert not known(constraints={"fixed": fixed})
+
+
+def of(lagrangian, q, constraints=None, **functions):
+    """The structure at some state."""
+    s = coordinates.state(0.3, q, jnp.ones_like(q), None)
+    return structure(lj.System(lagrangian, constraints, **functions), *s)
+
+
+def test_mass_matrix():
+    """On what it depends and what it couples: constant or not, diagonal, in blocks, dense."""
+    q = jnp.array([0.2, 0.4, 0.6])
+    constant = of(lambda t, q, v, params: 0.5 * jnp.sum(v**2) - jnp.sum(q**2) * jnp.cos(t), q)
+    assert constant.mass_depends_on == () and len(constant.blocks) == 3
+    coupled = of(lambda t, q, v, params: 0.5 * jnp.sum(v**2) + v[0] * v[2] * jnp.cos(q[1] - q[2]) * t, q)
+    assert coupled.mass_depends_on == ("t", "q[1]", "q[2]")
+    assert coupled.blocks == (("q[0]", "q[2]"), ("q[1]",))
+    dense = of(lambda t, q, v, params: -jnp.sqrt(1 - jnp.dot(v, v)), q)
+    assert dense.mass_depends_on == ("velocities",) and len(dense.blocks) == 1
+    # What is a zero at this state alone is none, and what cancels in numbers only is not known to.
+    assert len(of(lambda t, q, v, params: jnp.dot(v, v) + v[0] * v[1] * (q[0] - 0.2), q).blocks) == 2
+
+
+def test_time_cyclic_coordinates_and_linear_terms():
+    """Each with a twin that differs by one term."""
+    q = jnp.array([0.2, 0.4])
+    planar = lambda t, q, v, params: 0.5 * (v[0] ** 2 + (q[0] * v[1]) ** 2)
+    central = of(planar, q)
+    assert (central.cyclic, central.explicit_time, central.linear_terms) == (("q[1]",), False, ())
+    driven = of(lambda t, q, v, params: planar(t, q, v, params) + jnp.cos(q[1] - t), q)
+    assert (driven.cyclic, driven.explicit_time) == ((), True)
+    assert of(planar, q, force=lambda t, q, v, params: jnp.stack([jnp.cos(t), 0.0])).explicit_time
+    turning = of(lambda t, q, v, params: planar(t, q, v, params) + 3.0 * q[0] ** 2 * v[1], q)
+    assert turning.linear_terms == ("q[1]",)
+
+
+def test_constraints():
+    """Linear with constant coefficients or not, moving or not."""
+    q = jnp.array([0.2, 0.4])
+    found = of(
+        lambda t, q, v, params: 0.5 * jnp.sum(v**2),
+        q,
+        {
+            "circle": lj.Holonomic(lambda t, q, params: jnp.dot(q, q) - 1),
+            "line": lj.Holonomic(lambda t, q, params: q[0] - 2 * q[1] - jnp.sin(t)),
+            "skate": lj.Nonholonomic(lambda t, q, v, params: v[0] * jnp.sin(q[1]) - v[1]),
+            "drag": lj.Nonholonomic(lambda t, q, v, params: v[0] - 3.0 * v[1] + q[0] ** 2),
+        },
+    ).constraints
+    assert {name: tuple(c) for name, c in found.items()} == {
+        "circle": (False, False), "line": (True, True), "skate": (False, False), "drag": (True, False)
+    }  # fmt: skip
+
+
+def test_a_large_system_is_not_taken_apart():
+    """Beyond two dozen coordinates there is no structure of this kind."""
+    assert of(lambda t, q, v, params: 0.5 * jnp.sum(v**2), jnp.ones(25)) is None
