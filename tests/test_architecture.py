@@ -119,7 +119,15 @@ def test_exports():
     for name in lagjax.__all__:
         doc = inspect.getdoc(getattr(lagjax, name))
         assert doc and len(doc.splitlines()) > 0, name
-    for name in ("momentum", "mass_matrix", "accelerations", "jacobi_integral", "integrate", "consistent_state"):
+    for name in (
+        "momentum",
+        "mass_matrix",
+        "accelerations",
+        "jacobi_integral",
+        "integrate",
+        "consistent_state",
+        "explain",
+    ):
         doc = inspect.getdoc(getattr(lagjax, name))
         for part in (">>>", "**Returns:**", "**Raises:**", "Source:"):
             assert part in doc, f"{name} lacks {part}"

@@ -57,17 +57,16 @@ def integrate(
     - `q0`, `v0`: initial coordinates and velocities, any pytree of float arrays, alike; `[q]`, `[q]/[t]`. A start
       that is off the constraints by no more than about the tolerance is moved onto them.
     - `params`: what the Lagrangian takes; gradients flow to its floating arrays.
-    - `ts` (T,): increasing output times, `[t]`. Outputs are steps of the method, not interpolations.
+    - `ts` (T,): increasing output times, `[t]`. Each is the end of a step of the method, not an interpolation.
     - `rtol`, `atol`: tolerances of the local error of each coordinate and velocity; by default 1e-9 in float64, 1e-5
       in float32. A pair is one for coordinates, `[q]`, and one for velocities, `[q]/[t]`. Of an angle (a coordinate
       that is seen through sines and cosines alone) at most one turn counts as its size.
 
     **Other arguments:**
 
-    - `method`: any diffrax solver, `diffrax.Dopri8()` by default: of diffrax's explicit methods it has the smallest
-      error at a given tolerance on the scenes (2 to 10 times below Tsit5's), and is the faster one where L is costly
-      or an error below 1e-10 is asked. On one or two cheap coordinates above that, `diffrax.Tsit5()` is up to four
-      times faster. `python -m lagjax` prints the comparison.
+    - `method`: any diffrax solver, `lj.Dopri8()` by default: the fastest way to an error between 1e-4 and 1e-10 on
+      nearly all scenes (`benchmarks/results/work_precision.json`). With it and `lj.Tsit5()`, small systems run on
+      equations that are written out number by number; diffrax's own methods take 2 to 10 times longer.
     - `stepsize_controller`: any diffrax controller, in place of `diffrax.PIDController(rtol, atol)`.
     - `dt0`: the first step, `[t]`; needed with `diffrax.ConstantStepSize()`.
     - `event`: a `diffrax.Event` whose condition takes `(t, (q, v), params, **kwargs)`. Without a root finder of

@@ -13,13 +13,19 @@ LAPACK, whose call costs 1-1.6 microseconds, it is faster up to n = 6.
 Differentiation never passes through the pivoting: `dx = K^-1 (db - dK x)`, transposed by JAX.
 """
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jax.extend.core import Primitive
+from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array, Float
 
 ELIMINATE_UP_TO = 6
+# Where a library cannot be called; beyond, a program is better off with it.
+ELIMINATE_INSIDE_UP_TO = 16
 # The square of the sine of a row to the span of those before it.
 INDEPENDENT_ABOVE = 1e-10
 
@@ -67,8 +73,13 @@ def inverse(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
     n = matrix.shape[0]
     if n == 1:
         return 1 / matrix
-    if n > ELIMINATE_UP_TO:
+    if n > ELIMINATE_INSIDE_UP_TO:
         return jnp.linalg.inv(matrix)
+    return _inverse_p.bind(matrix, eliminate=n <= ELIMINATE_UP_TO)
+
+
+def _eliminated(matrix):
+    n = matrix.shape[0]
     scale = 1 / jnp.max(jnp.abs(matrix), axis=1)
     work = jnp.concatenate([matrix * scale[:, None], jnp.diag(scale)], axis=1)
     row = np.arange(n)
@@ -83,6 +94,28 @@ def inverse(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
         return jnp.where((row == k)[:, None], best, work - factor[:, None] * best)
 
     return lax.fori_loop(0, n, eliminate, work)[:, n:]
+
+
+def _inverse(matrix, eliminate):
+    return _eliminated(matrix) if eliminate else jnp.linalg.inv(matrix)
+
+
+def _inverse_jvp(primals, tangents, **params):
+    inverted = _inverse_p.bind(*primals, **params)
+    return inverted, -inverted @ tangents[0] @ inverted
+
+
+def _inverse_batched(operands, axes, **params):
+    return jax.vmap(partial(_inverse, **params))(jnp.moveaxis(operands[0], axes[0], 0)), 0
+
+
+# A primitive, so that a program that is compiled as one function can have it without the library.
+_inverse_p = Primitive("inverse")
+_inverse_p.def_impl(lambda matrix, eliminate: jax.jit(_inverse, static_argnums=1)(matrix, eliminate))
+_inverse_p.def_abstract_eval(lambda matrix, eliminate: matrix)
+ad.primitive_jvps[_inverse_p] = _inverse_jvp
+batching.primitive_batchers[_inverse_p] = _inverse_batched
+mlir.register_lowering(_inverse_p, mlir.lower_fun(_inverse, multiple_results=False))
 
 
 def reciprocal_condition(matrix: Float[Array, "n n"]) -> Float[Array, ""]:

@@ -27,7 +27,7 @@ from jax.experimental.xla_metadata import set_xla_metadata
 from jax.extend.core import ClosedJaxpr, Jaxpr, Primitive, jaxpr_as_fun
 from jax.interpreters import ad, batching, mlir
 
-from lagjax.numerics.programs import bodies
+from lagjax.numerics.programs import bodies, rewritten
 
 # Reductions and products above this become calls of a library.
 LARGE = 1024
@@ -105,6 +105,8 @@ def _equation_fits(equation):
         name = equation.params["prim"].name
     if name in AT_ANY_SIZE:
         return True
+    if name == "inverse":
+        return equation.params["eliminate"]
     if name == "dot_general":
         (contracted, _), _ = equation.params["dimension_numbers"]
         inner = np.prod([equation.invars[0].aval.shape[i] for i in contracted])
@@ -120,21 +122,21 @@ def _equation_fits(equation):
 
 def without_checks(closed: ClosedJaxpr) -> ClosedJaxpr:
     """The program with each branch that calls the host replaced by the one beside it that does not."""
-    if not _calls_host(closed.jaxpr):
-        return closed
-    return closed.replace(jaxpr=closed.jaxpr.replace(eqns=[_without_check(e) for e in closed.jaxpr.eqns]))
+    return rewritten(closed, _without_check) if _calls_host(closed.jaxpr) else closed
 
 
 def _without_check(equation):
-    changed = {}
-    for name, value in equation.params.items():
-        if isinstance(value, ClosedJaxpr):
-            changed[name] = without_checks(value)
-        elif name == "branches":
-            silent = [branch for branch in value if not _calls_host(branch.jaxpr)]
-            one = len(silent) == 1
-            changed[name] = tuple(silent * len(value) if one else (without_checks(branch) for branch in value))
-    return equation.replace(params={**equation.params, **changed})
+    branches = equation.params.get("branches", ())
+    silent = [branch for branch in branches if not _calls_host(branch.jaxpr)]
+    if len(silent) != 1:
+        return equation
+    return equation.replace(params={**equation.params, "branches": tuple(silent * len(branches))})
+
+
+def _without_library(equation):
+    if equation.primitive.name != "inverse":
+        return equation
+    return equation.replace(params={**equation.params, "eliminate": True})
 
 
 def _calls_host(jaxpr):
@@ -149,8 +151,10 @@ def _plainly(*operands, jaxpr, **params):
 
 
 def _marked(*operands, jaxpr, **params):
+    original = jaxpr
+    jaxpr = rewritten(jaxpr, _without_library)
     if not fits(jaxpr.jaxpr):
-        return _plainly(*operands, jaxpr=jaxpr)
+        return _plainly(*operands, jaxpr=original)
 
     def function(*operands):
         # XLA ends the process where an operand of such a call is never used, also one that it finds out not to need:
@@ -221,7 +225,7 @@ def _lanes_together(*operands, jaxpr, batched, **params):
 
 
 def _lanes_in_turn(*operands, jaxpr, batched, **params):
-    if not fits(jaxpr.jaxpr):
+    if not fits(rewritten(jaxpr, _without_library).jaxpr):
         return _lanes_together(*operands, jaxpr=jaxpr, batched=batched)
 
     def lane(mine):

@@ -1,6 +1,6 @@
 """JAX programs (jaxprs) as data: one equation of them, what depends on what, one program as two."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 import jax.numpy as jnp
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, jaxpr_as_fun
@@ -14,6 +14,21 @@ def bodies(equation) -> list[Jaxpr]:
             if isinstance(item, (ClosedJaxpr, Jaxpr)):
                 found.append(getattr(item, "jaxpr", item))
     return found
+
+
+def rewritten(closed: ClosedJaxpr, change: Callable) -> ClosedJaxpr:
+    """The program with each of its equations changed, those inside loops, branches and functions too."""
+
+    def inside(value):
+        if isinstance(value, tuple) and any(isinstance(item, ClosedJaxpr) for item in value):
+            return tuple(map(inside, value))
+        return rewritten(value, change) if isinstance(value, ClosedJaxpr) else value
+
+    def of_equation(equation):
+        equation = change(equation)
+        return equation.replace(params={name: inside(value) for name, value in equation.params.items()})
+
+    return closed.replace(jaxpr=closed.jaxpr.replace(eqns=list(map(of_equation, closed.jaxpr.eqns))))
 
 
 def length(jaxpr: Jaxpr) -> int:
