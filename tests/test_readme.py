@@ -1,5 +1,6 @@
 """The README's code runs and prints what it says; its two commands are two."""
 
+import importlib.util
 import re
 from pathlib import Path
 
@@ -41,3 +42,12 @@ def test_size_and_commands():
     ]
     assert len(commands) == 2
     assert all(command.startswith("python3 -m venv .venv && ") for command in commands)
+
+
+def test_speeds_are_those_of_the_results():
+    """The table of speeds is what `benchmarks/quote.py` makes of `benchmarks/results/`."""
+    spec = importlib.util.spec_from_file_location("quote", Path(__file__).parent.parent / "benchmarks" / "quote.py")
+    quote = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(quote)
+    assert quote.quoted(README) == README
+    assert quote.quoted(README.replace("| ratio |", "| other |")) == README

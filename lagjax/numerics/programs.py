@@ -21,7 +21,8 @@ def rewritten(closed: ClosedJaxpr, change: Callable) -> ClosedJaxpr:
 
     def inside(value):
         if isinstance(value, tuple) and any(isinstance(item, ClosedJaxpr) for item in value):
-            return tuple(map(inside, value))
+            # A named one keeps its names.
+            return type(value)(*map(inside, value)) if hasattr(value, "_fields") else tuple(map(inside, value))
         return rewritten(value, change) if isinstance(value, ClosedJaxpr) else value
 
     def of_equation(equation):

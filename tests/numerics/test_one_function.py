@@ -90,3 +90,12 @@ def test_checks_are_left_out_where_they_are_known_to_pass():
 def test_what_fits(function, expected):
     """Library calls, large reductions and general scatters do not fit, also inside a loop."""
     assert fits(jax.make_jaxpr(function)(jnp.arange(5.0)).jaxpr) is expected
+
+
+def test_a_linear_solve_of_functions():
+    """Its programs stand in a named tuple, which the rewriting keeps."""
+
+    def solve(x):
+        return lax.custom_linear_solve(lambda y: 3 * y, x, lambda _, b: b / 3, symmetric=True)
+
+    np.testing.assert_allclose(jax.jit(lambda x: one_function(solve, x))(TWO[0]), 2 / 3, rtol=1e-15)

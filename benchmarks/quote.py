@@ -1,0 +1,65 @@
+"""Write the README's table of speeds from `benchmarks/results/`.
+
+python benchmarks/quote.py
+"""
+
+import json
+from pathlib import Path
+
+HERE = Path(__file__).parent
+README = HERE.parent / "README.md"
+BEGIN, END = "<!-- speed -->\n", "<!-- end of speed -->"
+# File of results, row in it, and what the README calls it.
+QUOTED = [
+    ("against_peers", "bead: lagjax / numba Dopri8", "bead on a hoop, 100 periods / numba, written by hand"),
+    ("against_peers", "bead: lagjax / diffrax as shipped", "the same / diffrax, acceleration by hand"),
+    ("against_peers", "bead: lagjax / heyoka", "the same / heyoka (Taylor)"),
+    ("against_peers", "bead: 100 outputs / without", "the same with 100 outputs / without"),
+    (
+        "against_peers",
+        "pendulum: Cartesian with multiplier / angle",
+        "pendulum on a rod, with its multiplier / in its angle",
+    ),
+    ("against_peers", "pendulum: lagjax / IDAS", "pendulum on a rod / SUNDIALS IDAS"),
+    ("against_peers", "slider-crank: lagjax / IDAS", "slider-crank, 7 coordinates and 6 constraints / IDAS"),
+    (
+        "against_peers",
+        "chain, 64 links: right-hand side / MuJoCo's step",
+        "64 links in angles, accelerations / MuJoCo's step",
+    ),
+    ("gradient_cost", "forward mode, 4 parameters: our gradient / our solve", "gradient by 4 parameters / one solve"),
+    (
+        "gradient_cost",
+        "reverse mode, 100 outputs: our gradient / our solve",
+        "the same by `grad`, 100 outputs / one solve",
+    ),
+    ("against_hand_written", "bead_on_hoop, single: from L / by hand", "one evaluation, bead / by hand"),
+    ("against_hand_written", "double pendulum, single: from L / by hand", "one evaluation, double pendulum / by hand"),
+    ("against_hand_written", "rolling_hoop, single: from L / by hand", "one evaluation, rolling hoop / by hand"),
+    (
+        "against_hand_written",
+        "double pendulum, a lane of 1000: from L / numba",
+        "a lane of 1,000, double pendulum / numba",
+    ),
+]
+
+
+def table() -> str:
+    """The table, of the rows that there are."""
+    lines = ["| what | ratio | target | |", "|---|---|---|---|"]
+    for file, what, name in QUOTED:
+        rows = {row["what"]: row for row in json.loads((HERE / "results" / f"{file}.json").read_text())["rows"]}
+        row = rows[what]
+        target = "" if row["target"] is None else f"≤ {row['target']:.2g}"
+        lines.append(f"| {name} | {row['value']:.2g} | {target} | {'' if row['met'] in (None, True) else 'missed'} |")
+    return "\n".join(lines) + "\n"
+
+
+def quoted(readme: str) -> str:
+    """The README with the table in its place."""
+    before, rest = readme.split(BEGIN)
+    return before + BEGIN + table() + END + rest.split(END)[1]
+
+
+if __name__ == "__main__":
+    README.write_text(quoted(README.read_text()))
