@@ -86,7 +86,7 @@ def one_function(function: Callable, *args, checked: bool = False, in_turn: bool
 
 
 def called(results):
-    """`results` of a jitted function, which is compiled once and called; else XLA copies it to each of its places."""
+    """`results` of a jitted function that stays a call; else XLA computes it anew for each of those who need them."""
     if jax.default_backend() != "cpu":
         return results
     first, *others = jtu.tree_leaves(results)

@@ -122,8 +122,9 @@ def test_vertical_disk(g):
     params, ts = DISK | {"g": g}, np.linspace(0.0, 6.0, 25)
     q, v, force = jax.tree.map(np.asarray, disk_exact(params, DISK_START, ts))
     first = lambda tree: {name: float(curve[0]) for name, curve in tree.items()}
-    run = lambda tol: lj.integrate(vertical_disk, first(q), first(v), params, ts=ts, rtol=tol, atol=tol)
-    tight, loose = run(TIGHT), run(LOOSE)
+    run = lambda tol, ts: lj.integrate(vertical_disk, first(q), first(v), params, ts=ts, rtol=tol, atol=tol)
+    # Steps end at outputs: few of them leave long steps, which have errors.
+    tight, loose = run(TIGHT, ts), run(LOOSE, ts[::12])
     for name in q:
         np.testing.assert_allclose(tight.q[name], q[name], atol=1e-11)
         np.testing.assert_allclose(tight.v[name], v[name], atol=1e-11)
@@ -131,7 +132,7 @@ def test_vertical_disk(g):
     speed = params["R"] * np.asarray(loose.v["angle"])
     sliding = [loose.v[name] - speed * of(loose.q["heading"]) for name, of in (("x", np.cos), ("y", np.sin))]
     assert np.max(np.abs(sliding)) < ROUND_OFF
-    assert 1e-8 < np.max(np.abs(loose.q["x"] - q["x"])) < 1e-2
+    assert 1e-8 < np.max(np.abs(loose.q["x"] - q["x"][::12])) < 1e-2
 
 
 def test_vertical_disk_would_show_an_error():
