@@ -110,7 +110,7 @@ def test_report_of_a_rounded_state():
     assert lj.explain(door, rounded, DOOR_STATE[2], DOOR_STATE[3]).degrees_of_freedom == 1
 
 
-@pytest.mark.parametrize("mode", [pytest.param(jax.jacfwd, marks=pytest.mark.slow), jax.jacrev])
+@pytest.mark.parametrize("mode", [jax.jacfwd, pytest.param(jax.jacrev, marks=pytest.mark.slow)])
 def test_derivatives_of_shared_multipliers(mode):
     """Accelerations and shortest multipliers have the derivatives of their closed forms, in lanes too."""
 

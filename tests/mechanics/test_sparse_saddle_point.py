@@ -97,6 +97,7 @@ def test_redundant_constraints_have_the_shortest_multipliers():
     assert largest(found[0] - alone) <= 1e-11 * largest(alone)
 
 
+@pytest.mark.slow
 def test_contradictory_constraints_are_named():
     """The same links asked for at another rate contradict: an error, and NaN while tracing."""
     system, q, v, params = chain(10)

@@ -221,6 +221,7 @@ def named(values):
     return dict(zip(("heading", "x", "y"), values))
 
 
+@pytest.mark.slow
 def test_sledge():
     """Chaplygin's sleigh straightens out, the skate crosses the slope on a cycloid; λ is the blade's force."""
     for params, exact in SLEDGES:
