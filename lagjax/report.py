@@ -20,6 +20,7 @@ from jaxtyping import PyTree
 from lagjax.mechanics.system import System
 from lagjax.motion.integrate import integrate
 from lagjax.motion.trajectory import Trajectory, ended_well, message
+from lagjax.numerics.runge_kutta import Dopri8, Tsit5
 
 # The tolerance at which a run must reach its `required` error, for the method named with it.
 JUDGED_AT = 1e-10
@@ -118,7 +119,7 @@ def work_precision(
 
     **Returns:** one `Row` a method and tolerance, `seconds` for the compiled program with results ready.
     """
-    methods = {"Tsit5": diffrax.Tsit5(), "Dopri8": diffrax.Dopri8()} if methods is None else methods
+    methods = {"Tsit5": Tsit5(), "Dopri8": Dopri8()} if methods is None else methods
     rows = []
     for name, method in methods.items():
         solve = eqx.filter_jit(_solver_of(run, method))

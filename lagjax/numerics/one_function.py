@@ -31,7 +31,8 @@ from lagjax.numerics.programs import bodies, rewritten
 
 # Reductions and products above this become calls of a library.
 LARGE = 1024
-LARGE_PRODUCT = 343
+# Multiplications of a matrix with a vector, and of two matrices, of which XLA may merge several.
+VECTOR_PRODUCT, MATRIX_PRODUCT = 343, 100
 AT_ANY_SIZE = {
     "abs", "acos", "acosh", "add", "add_any", "and", "asin", "asinh", "atan", "atan2", "atanh", "bessel_i0e",
     "bessel_i1e", "broadcast_in_dim", "cbrt", "ceil", "clamp", "concatenate", "convert_element_type", "copy",
@@ -108,9 +109,11 @@ def _equation_fits(equation):
     if name == "inverse":
         return equation.params["eliminate"]
     if name == "dot_general":
-        (contracted, _), _ = equation.params["dimension_numbers"]
-        inner = np.prod([equation.invars[0].aval.shape[i] for i in contracted])
-        return equation.outvars[0].aval.size * inner < LARGE_PRODUCT
+        (contracted, _), (batch, _) = equation.params["dimension_numbers"]
+        left, right = (x.aval for x in equation.invars)
+        inner, lanes = (np.prod([left.shape[i] for i in axes]) for axes in (contracted, batch))
+        of_matrices = min(left.size, right.size) > inner * lanes
+        return equation.outvars[0].aval.size * inner <= (MATRIX_PRODUCT if of_matrices else VECTOR_PRODUCT)
     if name in SMALL:
         return max(sizes) <= LARGE
     if name.startswith("scatter"):
