@@ -89,6 +89,8 @@ def structure(system, t, q, v, params) -> Structure | None:
 def is_diagonal(system, t, q, v, params) -> bool:
     """Whether the mass matrix is known to be diagonal."""
     x, _ = coordinates.flatten(q)
+    if x.size == 1:
+        return True
     mass = Numbers(_mass, (system, t, q, v, params))
     off = ~np.eye(x.size, dtype=bool).reshape(-1)
     return all(is_zero(x) for x, outside in zip(mass.program.jaxpr.outvars, off) if outside)

@@ -93,8 +93,7 @@ def trajectory_of(system, q0, v0, params, ts, settings) -> Trajectory:
 def _solve_in_numbers(system, q0, v0, params, ts, settings, adjoint):
     """The solve, of a small system with the coordinates one by one."""
     written = unflatten = None
-    small = is_small(system, ts[0], q0, v0, params)
-    if isinstance(settings.method, ExplicitRungeKutta) and small:
+    if isinstance(settings.method, ExplicitRungeKutta) and is_small(system, ts[0], q0, v0, params):
         _, unflatten = coordinates.flatten(q0)
         system, q0, v0 = in_numbers(system, unflatten), coordinates.numbers(q0), coordinates.numbers(v0)
         event = settings.event
@@ -104,13 +103,11 @@ def _solve_in_numbers(system, q0, v0, params, ts, settings, adjoint):
     fields = _solve(system, q0, v0, params, ts, settings, adjoint, written)
     if unflatten is None:
         return fields
-    together = lambda tree: jax.vmap(lambda *x: unflatten(jnp.stack(x)))(*tree)
-    end = fields["end"]
-    one = lambda tree: unflatten(jnp.stack(tree))
+    end, together = fields["end"], lambda numbers: unflatten(jnp.stack(numbers))
     return fields | {
-        "q": together(fields["q"]),
-        "v": together(fields["v"]),
-        "end": end._replace(q=one(end.q), v=one(end.v)),
+        "q": jax.vmap(together)(fields["q"]),
+        "v": jax.vmap(together)(fields["v"]),
+        "end": end._replace(q=together(end.q), v=together(end.v)),
     }
 
 

@@ -175,11 +175,6 @@ def _polynomial(z, coefficients):
     return functools.reduce(lambda rest, pair: pair + z * z * rest, reversed(pairs))
 
 
-PLACE = {lax.sin_p: 0, lax.cos_p: 1}
-# Calls that only name a part of a program, and where they keep it.
-INLINED = {"jit": "jaxpr", "pjit": "jaxpr", "closed_call": "call_jaxpr", "core_call": "call_jaxpr"}
-
-
 _sincos_p = Primitive("sincos")
 _sincos_p.multiple_results = True
 _sincos_p.def_impl(lambda x: list(_by_library(x)))
