@@ -14,6 +14,7 @@ The request is two attributes of the call: `inlineable="false"` and `xla_cpu_sma
 loops that its pass `small-while-loop-hoisting` has chosen. An XLA that does not know them ignores them.
 """
 
+import math
 from collections.abc import Callable
 from functools import partial
 
@@ -21,7 +22,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-import numpy as np
 from jax import lax
 from jax.experimental.xla_metadata import set_xla_metadata
 from jax.extend.core import ClosedJaxpr, Jaxpr, Primitive, jaxpr_as_fun
@@ -31,8 +31,8 @@ from lagjax.numerics.programs import bodies, rewritten
 
 # Reductions and products above this become calls of a library.
 LARGE = 1024
-# Multiplications of a matrix with a vector, and of two matrices, of which XLA may merge several.
-VECTOR_PRODUCT, MATRIX_PRODUCT = 343, 100
+# The multiplications of a product of matrices above which the library is worth more than one function.
+PRODUCT = 4096
 AT_ANY_SIZE = {
     "abs", "acos", "acosh", "add", "add_any", "and", "asin", "asinh", "atan", "atan2", "atanh", "bessel_i0e",
     "bessel_i1e", "broadcast_in_dim", "cbrt", "ceil", "clamp", "concatenate", "convert_element_type", "copy",
@@ -108,12 +108,10 @@ def _equation_fits(equation):
         return True
     if name == "inverse":
         return equation.params["eliminate"]
-    if name == "dot_general":
-        (contracted, _), (batch, _) = equation.params["dimension_numbers"]
-        left, right = (x.aval for x in equation.invars)
-        inner, lanes = (np.prod([left.shape[i] for i in axes]) for axes in (contracted, batch))
-        of_matrices = min(left.size, right.size) > inner * lanes
-        return equation.outvars[0].aval.size * inner <= (MATRIX_PRODUCT if of_matrices else VECTOR_PRODUCT)
+    if name in ("dot_general", "product"):
+        (contracted, _), _ = equation.params["dimension_numbers"]
+        summed = math.prod(equation.invars[0].aval.shape[i] for i in contracted)
+        return equation.outvars[0].aval.size * summed <= PRODUCT
     if name in SMALL:
         return max(sizes) <= LARGE
     if name.startswith("scatter"):
@@ -137,9 +135,29 @@ def _without_check(equation):
 
 
 def _without_library(equation):
-    if equation.primitive.name != "inverse":
-        return equation
-    return equation.replace(params={**equation.params, "eliminate": True})
+    name = equation.primitive.name
+    if name == "inverse":
+        return equation.replace(params={**equation.params, "eliminate": True})
+    if name == "dot_general":
+        numbers = equation.params["dimension_numbers"]
+        return equation.replace(
+            primitive=_product_p, params={"dimension_numbers": numbers, "like": equation.outvars[0].aval}
+        )
+    return equation
+
+
+def _product(left, right, dimension_numbers, like):
+    """A product of matrices by sums of multiplications, which XLA does not pass on to a library."""
+    (of_left, of_right), (left_lanes, right_lanes) = dimension_numbers
+
+    def arranged(x, contracted, lanes):
+        free = [i for i in range(x.ndim) if i not in contracted and i not in lanes]
+        shape = [x.shape[i] for i in free]
+        x = x.transpose(*lanes, *free, *contracted)
+        return x.reshape(math.prod(x.shape[: len(lanes)]), math.prod(shape), -1)
+
+    left, right = arranged(left, of_left, left_lanes), arranged(right, of_right, right_lanes)
+    return jnp.sum(left[:, :, None] * right[:, None], axis=-1, dtype=like.dtype).reshape(like.shape)
 
 
 def _calls_host(jaxpr):
@@ -268,6 +286,11 @@ def _define(name, evaluate, on_cpu, shapes, batch):
     mlir.register_lowering(primitive, mlir.lower_fun(on_cpu, multiple_results=True), platform="cpu")
     return primitive
 
+
+# Stands for `dot_general` in a program that is compiled as one function.
+_product_p = Primitive("product")
+_product_p.def_abstract_eval(lambda left, right, like, **params: like)
+mlir.register_lowering(_product_p, mlir.lower_fun(_product, multiple_results=False))
 
 _one_function_p = _define("one_function", _plainly, _marked, lambda *x, jaxpr, **params: jaxpr.out_avals, _batched)
 _in_turn_p = _define("in_turn", _lanes_together, _lanes_in_turn, _lane_shapes, _batched_again)

@@ -19,7 +19,7 @@ from jax.extend.core import ClosedJaxpr, Literal
 from lagjax.numerics.elementary import sincos_in_lanes
 from lagjax.numerics.programs import evaluate
 
-LARGE = 64
+LARGE = 512
 ELEMENTWISE = {
     "abs", "acos", "acosh", "add", "add_any", "and", "asin", "asinh", "atan", "atan2", "atanh", "cbrt", "ceil",
     "clamp", "cos", "cosh", "convert_element_type", "digamma", "div", "eq", "erf", "erf_inv", "erfc", "exp", "exp2",

@@ -82,7 +82,8 @@ def test_checks_are_left_out_where_they_are_known_to_pass():
         (lambda x: jnp.sum(jnp.outer(x, x) @ x), True),
         (lambda x: jnp.sum(jnp.tile(x, 1000)), False),
         (lambda x: jnp.outer(x, x) @ x, True),
-        (lambda x: jnp.outer(x, x) @ jnp.outer(x, x), False),
+        (lambda x: jnp.outer(x, x) @ jnp.outer(x, x), True),
+        (lambda x: jnp.outer(jnp.tile(x, 4), x) @ jnp.outer(x, jnp.tile(x, 50)), False),
         (lambda x: x.at[2].set(1.0), True),
         (lambda x: x.at[jnp.array([0, 2])].add(1.0), False),
         (lambda x: jax.pure_callback(lambda x: x, x, x), False),
@@ -92,6 +93,27 @@ def test_checks_are_left_out_where_they_are_known_to_pass():
 def test_what_fits(function, expected):
     """Library calls, large reductions and general scatters do not fit, also inside a loop."""
     assert fits(jax.make_jaxpr(function)(jnp.arange(5.0)).jaxpr) is expected
+
+
+def test_products_of_matrices():
+    """Sums of multiplications in place of the library's, whatever is contracted; several from one operand."""
+    rng = np.random.default_rng(0)
+    a, b, c = (jnp.asarray(rng.normal(size=shape)) for shape in ((3, 4, 5), (5, 3, 4, 2), (3, 5, 6)))
+
+    def products(a, b, c):
+        return [
+            jnp.einsum("ijk,kilm->jlm", a, b),
+            jnp.einsum("ijk,kijm->im", a, b),
+            jnp.einsum("ijk,ikm->ijm", a, c),
+            jnp.einsum("ijk,ikm->mji", a, c),
+            *(x @ x.T for x in a),
+            *(x.T @ x for x in a),
+        ]
+
+    assert fits(jax.make_jaxpr(products)(a, b, c).jaxpr)
+    found = jax.jit(lambda *x: one_function(products, *x))(a, b, c)
+    for mine, plain in zip(found, products(*map(np.asarray, (a, b, c)))):
+        np.testing.assert_allclose(mine, plain, rtol=1e-13, atol=1e-13)
 
 
 def test_a_linear_solve_of_functions():
