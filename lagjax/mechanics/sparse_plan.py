@@ -81,7 +81,7 @@ def _plan(structure, leaves) -> Plan | None:
     _, t, q, _, _ = jtu.tree_unflatten(structure, leaves)
     u = jax.ShapeDtypeStruct((sum(x.size for x in jax.tree.leaves(q)),), t.dtype)
     of_mass = pattern(momentum, u, arrays)
-    blocks = _blocks(of_mass | of_mass.T)
+    blocks = banded.blocks(of_mass)
     if max(map(len, blocks)) > BLOCK_AT_MOST:
         return None
     members = np.full((len(blocks), max(map(len, blocks))), u.size)
@@ -99,15 +99,3 @@ def _plan(structure, leaves) -> Plan | None:
     where = np.flatnonzero(members.ravel() < u.size)
     place = where[np.argsort(members.ravel()[where])]
     return Plan(members, place, *map(banded.colours, (together > 0, of_rows, of_rows.T)), band)
-
-
-def _blocks(touches):
-    """The sets of velocities that M couples, directly or through others."""
-    left, blocks = set(range(len(touches))), []
-    while left:
-        block = [min(left)]
-        for i in block:
-            block += [j for j in np.flatnonzero(touches[i]).tolist() if j not in block]
-        blocks.append(sorted(block))
-        left -= set(block)
-    return blocks

@@ -29,6 +29,7 @@ from lagjax.mechanics.constraints import Holonomic
 from lagjax.mechanics.constraints import evaluate as constraint_value
 from lagjax.mechanics.in_numbers import Numbers, in_numbers
 from lagjax.mechanics.lagrangian import mass_and_forcing
+from lagjax.numerics import banded
 from lagjax.numerics.programs import reached
 
 # Coordinates and equations together: of larger systems the programs are not written out.
@@ -78,7 +79,7 @@ def structure(system, t, q, v, params) -> Structure | None:
     seen = [Numbers(lambda _, *state, f=f: f(*state), args) for f in _seen(system)]
     return Structure(
         mass_depends_on=_depends_on(mass, names),
-        blocks=_blocks(nonzero, names),
+        blocks=tuple(tuple(names[i] for i in block) for block in banded.blocks(nonzero)),
         explicit_time=any("t" in _depends_on(f, names) for f in seen),
         cyclic=tuple(name for name in names if name not in _depends_on(lagrangian, names)),
         linear_terms=tuple(name for name, x in zip(names, linear.program.jaxpr.outvars) if not is_zero(x)),
@@ -120,14 +121,6 @@ def _depends_on(numbers, names):
     t, *state = numbers.state_variables
     found = [name for name, x in zip(["t", *names], [t, *state[:n]]) if depends([x])]
     return tuple([*found, "velocities"] if depends(state[n:]) else found)
-
-
-def _blocks(nonzero, names):
-    # Two coordinates are in one block where a chain of entries connects them.
-    connected = (
-        np.linalg.matrix_power((nonzero | nonzero.T | np.eye(len(names), dtype=bool)).astype(float), len(names)) > 0
-    )
-    return tuple(dict.fromkeys(tuple(name for name, x in zip(names, row) if x) for row in connected))
 
 
 def _of_constraint(constraint, args, names):

@@ -111,7 +111,7 @@ def integrate(
         adjoint=adjoint,
         rtol=problem.tolerance(rtol, "rtol", dtype),
         atol=problem.tolerance(atol, "atol", dtype),
-        dt0=None if dt0 is None else jnp.asarray(dt0, dtype),
+        dt0=problem.first_step(dt0, dtype),
         apart=any(isinstance(tol, (tuple, list)) or jnp.ndim(tol) > 0 for tol in (rtol, atol) if tol is not None),
         max_steps=max_steps,
         drift=drift,

@@ -92,6 +92,19 @@ def times(ts: Any, dtype):
     return ts
 
 
+def first_step(dt0: Any, dtype):
+    """`dt0` as a number of `dtype`, or an error where it is not positive; None where it is to be chosen."""
+    if dt0 is None:
+        return None
+    if not coordinates.is_traced(dt0) and not (np.ndim(dt0) == 0 and float(dt0) > 0):
+        raise ValueError(
+            f"dt0 must be one positive number, not {dt0}.\n"
+            "Fix: leave dt0 out, or with fixed steps dt0=1e-3 for example. To run backwards, integrate "
+            "L(-t, q, -v, params) forwards."
+        )
+    return jnp.asarray(dt0, dtype)
+
+
 def tolerance(value: Any, name: str, dtype):
     """A tolerance for coordinates and one for velocities, (2,) of `dtype`, or an error where it cannot be reached."""
     dtype = np.dtype(dtype)

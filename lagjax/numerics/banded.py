@@ -105,6 +105,24 @@ def compressed(push: Callable, coloured: Colours, dtype) -> Float[Array, "colour
     return jax.vmap(push)(jnp.asarray(seeds, dtype))
 
 
+def blocks(pattern: Bool[np.ndarray, "n n"]) -> list[list[int]]:
+    """The sets of rows that a pattern couples, directly or through others.
+
+    >>> print(blocks(np.array([[1, 0, 1], [0, 1, 0], [0, 0, 1]], bool)))
+    [[0, 2], [1]]
+    """
+    # SciPy has this, but importing its graphs takes longer than importing lagjax.
+    touches = pattern | pattern.T
+    left, found = set(range(len(touches))), []
+    while left:
+        block = [min(left)]
+        for i in block:
+            block += [j for j in np.flatnonzero(touches[i]).tolist() if j not in block]
+        found.append(sorted(block))
+        left -= set(block)
+    return found
+
+
 class Band(NamedTuple):
     """How to have a symmetric matrix as a band: pattern, colours and order."""
 

@@ -80,9 +80,8 @@ def staged(program: ClosedJaxpr, first: Sequence[int], then: Sequence[int]):
     jaxpr = program.jaxpr
     late = reached(jaxpr, (jaxpr.invars[i] for i in then))
     is_known = lambda x: not isinstance(x, Literal) and x not in late
-    equations = needed(jaxpr)
-    before = [e for e in equations if not any(x in late for x in variables(e))]
-    after = [e for e in equations if any(x in late for x in variables(e))]
+    before = [e for e in jaxpr.eqns if not any(x in late for x in variables(e))]
+    after = [e for e in jaxpr.eqns if any(x in late for x in variables(e))]
     crossing = dict.fromkeys(x for e in after for x in variables(e) if x not in late)
     crossing.update(dict.fromkeys(x for x in jaxpr.outvars if is_known(x)))
     divisors = dict.fromkeys(e.invars[1] for e in after if _divides_numbers(e) and is_known(e.invars[1]))

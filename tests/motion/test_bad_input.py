@@ -149,6 +149,12 @@ def test_times(ts, words):
         lj.integrate(pendulum, 1.0, 0.0, PARAMS, ts=ts)
 
 
+def test_first_step_backwards():
+    """dt0 that is not positive."""
+    with refusal(ValueError, "dt0 must be one positive number, not -0.1", "To run backwards"):
+        lj.integrate(pendulum, 1.0, 0.0, PARAMS, ts=TS, dt0=-0.1)
+
+
 def test_solver_class():
     """The class instead of an instance."""
     with refusal(TypeError, "Tsit5 is the class", r"diffrax.Tsit5\(\)"):
