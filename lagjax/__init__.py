@@ -25,6 +25,7 @@ from lagjax.motion.explanation import Explanation, explain
 # Motion.
 from lagjax.motion.integrate import integrate
 from lagjax.motion.trajectory import RESULTS, AccuracyWarning, Moment, Trajectory
+from lagjax.numerics.nystrom import Nystrom8, Nystrom12
 from lagjax.numerics.radau import Radau5
 from lagjax.numerics.runge_kutta import Dopri8, Tsit5
 
@@ -52,6 +53,8 @@ __all__ = [
     "integrate",
     "Dopri8",
     "Tsit5",
+    "Nystrom8",
+    "Nystrom12",
     "Radau5",
     "Trajectory",
     "Moment",

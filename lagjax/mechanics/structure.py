@@ -97,6 +97,16 @@ def is_diagonal(system, t, q, v, params) -> bool:
     return all(is_zero(x) for x, outside in zip(mass.program.jaxpr.outvars, off) if outside)
 
 
+def is_free_of_velocities(system, t, q, v, params) -> bool:
+    """Whether accelerations are known not to depend on the velocities."""
+    if system.constraints:
+        return False
+    x, unflatten = coordinates.flatten(q)
+    u, _ = coordinates.flatten(v)
+    equations = lambda t, x, u, params: mass_and_forcing(system, t, x, u, params, unflatten)
+    return _dependence(equations, (t, x, u, params), lambda args: args[2]) == Depends.NOT
+
+
 def is_zero(x) -> bool:
     """Whether a result of a written-out program is a zero that is written in it."""
     return isinstance(x, Literal) and x.val == 0

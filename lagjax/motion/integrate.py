@@ -20,7 +20,6 @@ from lagjax.mechanics.system import System
 from lagjax.motion import problem
 from lagjax.motion.solve import START_TOLERANCES, Settings, trajectory_of
 from lagjax.motion.trajectory import RESULTS, Trajectory, ended_well, message
-from lagjax.numerics.runge_kutta import Dopri8
 
 
 def integrate(
@@ -95,7 +94,6 @@ def integrate(
     Source: Hairer & Wanner, *Solving ODEs II*, §VII.2 (projection); Kidger, arXiv:2202.02435 (diffrax).
     """
     problem.check_system(system)
-    method = Dopri8() if method is None else method
     problem.check_method(method)
     t0 = ts[0] if len(np.shape(ts)) == 1 and np.shape(ts)[0] else 0.0
     start = coordinates.state(t0, q0, v0, params)

@@ -35,7 +35,9 @@ def check_system(system: Any):
 
 
 def check_method(method: Any):
-    """Raise where `method` is not an instance of a diffrax solver for a whole state."""
+    """Raise where `method` is neither None nor an instance of a diffrax solver for a whole state."""
+    if method is None:
+        return
     if isinstance(method, type) and issubclass(method, diffrax.AbstractSolver):
         raise TypeError(
             f"method must be a solver instance, and {method.__name__} is the class.\n"

@@ -18,7 +18,7 @@ from lagjax.mechanics import coordinates
 from lagjax.mechanics.coordinates import State
 from lagjax.mechanics.in_numbers import Numbers, in_numbers
 from lagjax.mechanics.saddle_point import equations_of_motion, verdict
-from lagjax.mechanics.structure import angles, conserves_jacobi_integral
+from lagjax.mechanics.structure import angles, conserves_jacobi_integral, is_free_of_velocities
 from lagjax.mechanics.written_out import is_small, write_out
 from lagjax.motion.arriving import Arriving
 from lagjax.motion.both_modes import solve_in_both_modes
@@ -26,8 +26,9 @@ from lagjax.motion.consistency import stopped, to_manifold, within, worst_residu
 from lagjax.motion.sign_change import SignChange
 from lagjax.motion.stepping import OnManifold, Quick, Stages, Tolerances, forward_differentiable
 from lagjax.motion.trajectory import RESULTS, Moment, Trajectory, ended_well, pack, worst_drift
+from lagjax.numerics.nystrom import Nystrom, Nystrom8
 from lagjax.numerics.one_function import called, one_function
-from lagjax.numerics.runge_kutta import ExplicitRungeKutta
+from lagjax.numerics.runge_kutta import Dopri8, ExplicitRungeKutta
 from lagjax.numerics.simplified_newton import SimplifiedNewton, with_tolerances
 
 # A start may be off the constraints by this many tolerances; it is then moved onto them.
@@ -57,7 +58,7 @@ UNROLL_UP_TO = 250
 class Settings(eqx.Module):
     """How to integrate: everything but the system, the state and the times."""
 
-    method: diffrax.AbstractSolver
+    method: diffrax.AbstractSolver | None
     controller: diffrax.AbstractStepSizeController | None
     event: diffrax.Event | None
     adjoint: diffrax.AbstractAdjoint | None
@@ -73,6 +74,9 @@ class Settings(eqx.Module):
 @eqx.filter_jit
 def trajectory_of(system, q0, v0, params, ts, settings) -> Trajectory:
     """The trajectory, whatever became of it."""
+    settings = eqx.tree_at(
+        lambda s: s.method, settings, _method(settings, system, ts[0], q0, v0, params), is_leaf=lambda x: x is None
+    )
     # Derivatives flow to the floating arrays of these; the settings are constants.
     x, rest = eqx.partition((system, q0, v0, params, ts), eqx.is_inexact_array)
     fixed, static = eqx.partition((rest, settings), eqx.is_array)
@@ -90,10 +94,28 @@ def trajectory_of(system, q0, v0, params, ts, settings) -> Trajectory:
     return Trajectory(t=ts, **fields, tolerance=tolerance, arrays=arrays, static=described)
 
 
+def _method(settings, system, *state):
+    """The method asked for, if it can do it; by default the fastest that can."""
+    chosen = settings.method
+    if chosen is None:
+        # BacksolveAdjoint integrates a state that is no pair (q, v).
+        pairs = not isinstance(settings.adjoint, diffrax.BacksolveAdjoint)
+        return Nystrom8() if pairs and is_free_of_velocities(system, *state) else Dopri8()
+    if isinstance(chosen, Nystrom) and not is_free_of_velocities(system, *state):
+        cause = "there are constraints" if system.constraints else "these do"
+        raise ValueError(
+            f"{type(chosen).__name__} is for accelerations that do not depend on velocities, and {cause}.\n"
+            "Usual cause: coordinates in which the kinetic energy has q in it (polar, joint angles), friction, or a "
+            "rotating frame.\n"
+            "Fix: method=lj.Dopri8(), or leave method out: it is then chosen."
+        )
+    return chosen
+
+
 def _solve_in_numbers(system, q0, v0, params, ts, settings, adjoint):
     """The solve, of a small system with the coordinates one by one."""
     written = unflatten = None
-    if isinstance(settings.method, ExplicitRungeKutta) and is_small(system, ts[0], q0, v0, params):
+    if isinstance(settings.method, (ExplicitRungeKutta, Nystrom)) and is_small(system, ts[0], q0, v0, params):
         _, unflatten = coordinates.flatten(q0)
         system, q0, v0 = in_numbers(system, unflatten), coordinates.numbers(q0), coordinates.numbers(v0)
         event = settings.event
@@ -296,6 +318,8 @@ def _solver(system, terms, quick, start, refused, settings, adjoint):
 
 def _in_a_loop(method, adjoint):
     """The method with a loop over its stages, of the kind that the derivative needs."""
+    if isinstance(method, Nystrom):
+        return type(method)(in_a_loop=True)
     ours = isinstance(method, ExplicitRungeKutta)
     method = method.shipped if ours else method
     if isinstance(adjoint, diffrax.RecursiveCheckpointAdjoint):

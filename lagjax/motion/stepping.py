@@ -23,6 +23,7 @@ from lagjax.mechanics.in_numbers import Numbers
 from lagjax.mechanics.saddle_point import independent_equations
 from lagjax.mechanics.system import System
 from lagjax.motion.consistency import to_manifold
+from lagjax.numerics.interpolation import Interpolation
 from lagjax.numerics.one_function import called
 from lagjax.numerics.radau import Radau5
 
@@ -222,7 +223,7 @@ class OnManifold(diffrax.AbstractWrappedSolver):
         return Stages(params, independent_equations(self.system, t, *y, params, threshold))
 
 
-class Arrived(diffrax.AbstractLocalInterpolation):
+class Arrived(Interpolation):
     """The state at an end of a step, where all outputs are: the first of them at the start."""
 
     t0: PyTree
@@ -230,13 +231,11 @@ class Arrived(diffrax.AbstractLocalInterpolation):
     y0: PyTree
     y1: PyTree
 
-    def evaluate(self, t0, t1=None, left=True):
-        if t1 is not None:
-            return jtu.tree_map(lambda b, a: b - a, self.evaluate(t1), self.evaluate(t0))
-        return jtu.tree_map(lambda y0, y1: jnp.where(t0 <= self.t0, y0, y1), self.y0, self.y1)
+    def at(self, t):
+        return jtu.tree_map(lambda y0, y1: jnp.where(t <= self.t0, y0, y1), self.y0, self.y1)
 
 
-class SteppedTo(diffrax.AbstractLocalInterpolation):
+class SteppedTo(Interpolation):
     """The state inside a step, by one step of the solver from the step's start; NaN where that step fails."""
 
     t0: PyTree
@@ -245,12 +244,10 @@ class SteppedTo(diffrax.AbstractLocalInterpolation):
     state: PyTree
     solver: OnManifold
 
-    def evaluate(self, t0, t1=None, left=True):
-        if t1 is not None:
-            return jtu.tree_map(lambda b, a: b - a, self.evaluate(t1), self.evaluate(t0))
+    def at(self, t):
         s = self.solver
         state = s.init(s.terms, self.t0, self.t1, self.y0, s.params) if self.state is None else self.state
-        y, error, _, _, result = s.step(s.terms, self.t0, t0, self.y0, s.params, state, made_jump=False)
+        y, error, _, _, result = s.step(s.terms, self.t0, t, self.y0, s.params, state, made_jump=False)
         believed = (result == diffrax.RESULTS.successful) & s.acceptable(self.y0, y, error)
         return jtu.tree_map(lambda x: jnp.where(believed, x, jnp.nan), y)
 

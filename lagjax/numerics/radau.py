@@ -35,6 +35,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, PyTree
 
 from lagjax.numerics import dense
+from lagjax.numerics.interpolation import Interpolation
 from lagjax.numerics.simplified_newton import Inverse, Iteration, SimplifiedNewton
 
 # Hairer & Wanner II, table IV.5.6.
@@ -221,7 +222,7 @@ class LargestOfStages(eqx.Module):
         return jnp.max(jax.vmap(lambda z: self.norm(self.unravel(z)))(z))
 
 
-class Collocation(diffrax.AbstractLocalInterpolation):
+class Collocation(Interpolation):
     """The collocation polynomial, of degree 3: through the step's start and its three stages."""
 
     t0: Any
@@ -229,12 +230,10 @@ class Collocation(diffrax.AbstractLocalInterpolation):
     y0: PyTree
     stages: PyTree
 
-    def evaluate(self, t0, t1=None, left=True):
-        """The state at t0, or its change from t0 to t1."""
-        if t1 is not None:
-            return jtu.tree_map(lambda b, a: b - a, self.evaluate(t1), self.evaluate(t0))
+    def at(self, t):
+        """The state at t."""
         length = self.t1 - self.t0
-        s = jnp.where(length == 0, 0.0, (t0 - self.t0) / jnp.where(length == 0, 1.0, length))
+        s = jnp.where(length == 0, 0.0, (t - self.t0) / jnp.where(length == 0, 1.0, length))
         weights = _powers(s) @ TO_POWERS
         return jtu.tree_map(lambda y, z: y + jnp.tensordot(weights.astype(z.dtype), z, 1), self.y0, self.stages)
 
