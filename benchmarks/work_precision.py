@@ -66,10 +66,8 @@ def solves_of(motion):
     found = {DEFAULT: default}
     for kind in (diffrax.Tsit5, diffrax.Dopri5, diffrax.Dopri8):
         found[f"diffrax.{kind.__name__}"] = program(motion, kind())
-    for name in ("Tsit5", "Dopri5", "Dopri8"):
-        if hasattr(lj, name) and name != chosen:
-            found[f"lj.{name}"] = program(motion, getattr(lj, name)())
-    return found
+    ours = ["Tsit5", "Dopri8", *(["Nystrom12"] if chosen == "Nystrom8" else [])]
+    return found | {f"lj.{name}": program(motion, getattr(lj, name)()) for name in ours if name != chosen}
 
 
 def geodesic():

@@ -11,7 +11,7 @@ from lagjax.mechanics.diagnosis import dependencies, describe, equation_names, e
 from lagjax.mechanics.lagrangian import check_scalar
 from lagjax.mechanics.saddle_point import examined
 from lagjax.mechanics.sparse_plan import plan
-from lagjax.mechanics.structure import Structure, structure
+from lagjax.mechanics.structure import Structure, is_free_of_velocities, structure
 from lagjax.mechanics.system import System
 from lagjax.mechanics.written_out import is_small
 from lagjax.motion.consistency import departures, to_manifold, within
@@ -108,6 +108,8 @@ def explain(system: System, q, v, params=None, *, t=0.0) -> Explanation:
         rows += _of_structure(found_structure)
     rows += [(name, "yes") for name in ("force", "dissipation") if getattr(system, name) is not None]
     rows.append(("solved", _how_solved(system, s, found_structure)))
+    if is_free_of_velocities(system, *s):
+        rows.append(("velocities", "accelerations do not depend on them: stepped by Nystrom8"))
     if problem:
         rows.append(("problem", problem.replace("\n", "\n    ")))
     return Explanation(

@@ -65,7 +65,7 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", [pytest.param(x, marks=[pytest.mark.slow] * (x in ("net", "bars"))) for x in CASES])
 def test_same_as_dense(name):
     """Accelerations and multipliers of chain, loop, net and jointed bars are those of the dense equations."""
     case = CASES[name]()
@@ -86,6 +86,7 @@ def doubled(count):
     return lj.System(particles, system.constraints | extra), q, v, params
 
 
+@pytest.mark.slow
 def test_redundant_constraints_have_the_shortest_multipliers():
     """With rows that depend on others the accelerations are the same, and the multipliers those of least squares."""
     case = doubled(10)

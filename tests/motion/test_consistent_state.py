@@ -60,7 +60,8 @@ def test_nearest_in_the_metric_of_the_masses():
     assert np.max(np.abs(found - euclidean)) > 0.05
 
 
-@pytest.mark.parametrize("mode", [pytest.param(jax.jacfwd, marks=pytest.mark.slow), jax.jacrev])
+@pytest.mark.slow
+@pytest.mark.parametrize("mode", [jax.jacfwd, jax.jacrev])
 def test_derivatives_by_everything(mode):
     """Its derivatives by time, state and parameters are those of the one-angle solution, also from far off."""
     ours = lambda t, q, v, params: flat(lj.consistent_state(on_ellipse, t, q, v, params))

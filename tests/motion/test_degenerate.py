@@ -163,6 +163,7 @@ def on_shell(params, start, tol=TIGHT):
     )
 
 
+@pytest.mark.slow
 def test_charge_on_its_mass_shell():
     """Indefinite M under a nonlinear velocity constraint: cyclotron, crossed fields, a force that the shell alters."""
     start = four_velocity(0.75, -1.25)

@@ -145,6 +145,7 @@ def test_gradient_by_a_closed_over_value(transform):
     np.testing.assert_allclose(transform(final)(4.0), -np.sin(2.0) / 4.0, rtol=1e-8)
 
 
+@pytest.mark.slow
 def test_event_is_located_by_the_method():
     """The rod pendulum passes the vertical at its quarter period, 1e-9 from the elliptic integral, and NaN follows."""
     special = pytest.importorskip("scipy.special")

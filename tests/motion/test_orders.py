@@ -124,7 +124,7 @@ slow = lambda cases: [pytest.param(*case, marks=pytest.mark.slow) for case in ca
 name_of = lambda value: type(value).__name__ if isinstance(value, diffrax.AbstractSolver) else None
 
 
-@pytest.mark.parametrize("form", ["free", "constrained"])
+@pytest.mark.parametrize("form", ["free", pytest.param("constrained", marks=pytest.mark.slow)])
 @pytest.mark.parametrize(("method", "order", "steps"), FAST + slow(SLOW), ids=name_of)
 def test_order(exact, form, method, order, steps):
     """Each method has its order in positions, velocities and multipliers, free and projected, between its steps."""

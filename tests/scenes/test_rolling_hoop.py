@@ -181,6 +181,7 @@ def test_flight_is_the_same_lagrangian_without_constraints():
     assert not np.allclose(hoop.flight(PARAMS, left._replace(vy=-left.vy), t).y[1:], gap.y[1:], rtol=1e-2)
 
 
+@pytest.mark.slow
 def test_swings_about_the_bottom():
     """Ten swings follow Jacobi's functions to 1e-9, with residuals below 1e-12; a disk would not."""
     *_, run = hoop.runs()
