@@ -66,7 +66,7 @@ def solves_of(motion):
     found = {DEFAULT: default}
     for kind in (diffrax.Tsit5, diffrax.Dopri5, diffrax.Dopri8):
         found[f"diffrax.{kind.__name__}"] = program(motion, kind())
-    ours = ["Tsit5", "Dopri8", *(["Nystrom12"] if chosen == "Nystrom8" else [])]
+    ours = ["Tsit5", "Dopri8", *(["Nystrom8"] if chosen == "Nystrom12" else [])]
     return found | {f"lj.{name}": program(motion, getattr(lj, name)()) for name in ours if name != chosen}
 
 

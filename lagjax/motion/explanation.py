@@ -109,7 +109,7 @@ def explain(system: System, q, v, params=None, *, t=0.0) -> Explanation:
     rows += [(name, "yes") for name in ("force", "dissipation") if getattr(system, name) is not None]
     rows.append(("solved", _how_solved(system, s, found_structure)))
     if is_free_of_velocities(system, *s):
-        rows.append(("velocities", "accelerations do not depend on them: stepped by Nystrom8"))
+        rows.append(("velocities", "accelerations do not depend on them: stepped by Nystrom12"))
     if problem:
         rows.append(("problem", problem.replace("\n", "\n    ")))
     return Explanation(

@@ -18,6 +18,7 @@ from lagjax.mechanics.closures import lift
 from lagjax.mechanics.diagnosis import explain_failure
 from lagjax.mechanics.system import System
 from lagjax.motion import problem
+from lagjax.motion.reported import report
 from lagjax.motion.solve import START_TOLERANCES, Settings, trajectory_of
 from lagjax.motion.trajectory import RESULTS, Trajectory, ended_well, message
 
@@ -63,9 +64,9 @@ def integrate(
 
     **Other arguments:**
 
-    - `method`: any diffrax solver. By default `lj.Nystrom8()` where accelerations do not depend on velocities and there
+    - `method`: any diffrax solver. By default `lj.Nystrom12()` where accelerations do not depend on velocities and there
       are no constraints (`lj.explain` says so), else `lj.Dopri8()`: the fastest way to an error between 1e-4 and 1e-10
-      on nearly all scenes (`benchmarks/results/work_precision.json`). With these, `lj.Nystrom12()` and `lj.Tsit5()`,
+      on nearly all scenes (`benchmarks/results/work_precision.json`). With these, `lj.Nystrom8()` and `lj.Tsit5()`,
       small systems run on equations that are written out number by number; diffrax's own methods take 2 to 10 times
       longer.
     - `stepsize_controller`: any diffrax controller, in place of `diffrax.PIDController(rtol, atol)`.
@@ -119,6 +120,8 @@ def integrate(
     )
     ts = problem.times(ts, dtype)
     trajectory = trajectory_of(system, start.q, start.v, start.params, ts, settings)
+    if coordinates.is_traced(trajectory):
+        trajectory = report(trajectory)
     if throw:
         trajectory = _raise_failure(trajectory, start._replace(t=ts[0]), settings)
     return trajectory

@@ -26,7 +26,7 @@ from lagjax.motion.consistency import stopped, to_manifold, within, worst_residu
 from lagjax.motion.sign_change import SignChange
 from lagjax.motion.stepping import OnManifold, Quick, Stages, Tolerances, forward_differentiable
 from lagjax.motion.trajectory import RESULTS, Moment, Trajectory, ended_well, pack, worst_drift
-from lagjax.numerics.nystrom import Nystrom, Nystrom8
+from lagjax.numerics.nystrom import Nystrom, Nystrom12
 from lagjax.numerics.one_function import called, one_function
 from lagjax.numerics.runge_kutta import Dopri8, ExplicitRungeKutta
 from lagjax.numerics.simplified_newton import SimplifiedNewton, with_tolerances
@@ -100,7 +100,7 @@ def _method(settings, system, *state):
     if chosen is None:
         # BacksolveAdjoint integrates a state that is no pair (q, v).
         pairs = not isinstance(settings.adjoint, diffrax.BacksolveAdjoint)
-        return Nystrom8() if pairs and is_free_of_velocities(system, *state) else Dopri8()
+        return Nystrom12() if pairs and is_free_of_velocities(system, *state) else Dopri8()
     if isinstance(chosen, Nystrom) and not is_free_of_velocities(system, *state):
         cause = "there are constraints" if system.constraints else "these do"
         raise ValueError(

@@ -295,7 +295,7 @@ RKN1210 = NystromTableau(
 class Nystrom8(Nystrom):
     """Order 8 with an embedded method of order 6: eight accelerations a step.
 
-    The default of `lj.integrate` where accelerations do not depend on velocities and there are no constraints.
+    For costly accelerations with many outputs: each of these is the end of a step.
 
     >>> import diffrax
     >>> import jax.numpy as jnp
@@ -313,7 +313,11 @@ class Nystrom8(Nystrom):
 
 
 class Nystrom12(Nystrom):
-    """Order 12 with an embedded method of order 10: seventeen accelerations a step. For errors below 1e-10."""
+    """Order 12 with an embedded method of order 10: seventeen accelerations a step.
+
+    The default of `lj.integrate` where accelerations do not depend on velocities and there are no constraints: of all
+    methods here the fastest to any error below 1e-4 on a bead and a pendulum. Used like `Nystrom8`.
+    """
 
     tableau: ClassVar = RKN1210
     highest: ClassVar = 12

@@ -152,9 +152,10 @@ def _product(left, right, dimension_numbers, like):
 
     def arranged(x, contracted, lanes):
         free = [i for i in range(x.ndim) if i not in contracted and i not in lanes]
-        shape = [x.shape[i] for i in free]
-        x = x.transpose(*lanes, *free, *contracted)
-        return x.reshape(math.prod(x.shape[: len(lanes)]), math.prod(shape), -1)
+        groups = (lanes, free, contracted)
+        return x.transpose(*lanes, *free, *contracted).reshape(
+            [math.prod(x.shape[i] for i in group) for group in groups]
+        )
 
     left, right = arranged(left, of_left, left_lanes), arranged(right, of_right, right_lanes)
     return jnp.sum(left[:, :, None] * right[:, None], axis=-1, dtype=like.dtype).reshape(like.shape)

@@ -105,8 +105,8 @@ def swinging(**more):
 POLAR = lj.System(lambda t, q, v, params: 0.5 * (v["r"] ** 2 + (q["r"] * v["φ"]) ** 2) + params["g"] / q["r"])
 RELATIVISTIC = lj.System(lambda t, q, v, params: -jnp.sqrt(1 - v**2) - params["g"] * q**2)
 CASES = [
-    (swinging(), 1.0, "Nystrom8"),
-    (swinging(force=lambda t, q, v, params: 0.1 * jnp.cos(t)), 1.0, "Nystrom8"),
+    (swinging(), 1.0, "Nystrom12"),
+    (swinging(force=lambda t, q, v, params: 0.1 * jnp.cos(t)), 1.0, "Nystrom12"),
     (swinging(force=lambda t, q, v, params: -0.1 * v), 1.0, "Dopri8"),
     (swinging(dissipation=lambda t, q, v, params: 0.05 * v**2), 1.0, "Dopri8"),
     (swinging(constraints={"still": lj.Holonomic(lambda t, q, params: q - 1.0)}), 1.0, "Dopri8"),

@@ -1,0 +1,130 @@
+"""How each motion inside a program went, for those who run the program and not the motion.
+
+`integrate` passes every traced trajectory through a primitive that does nothing, `report`, and `reporting` turns a
+function that integrates, wherever and in whatever it returns, into one that says how its integrations went, too.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, Primitive
+from jax.interpreters import ad, batching, mlir
+from jaxtyping import Array, Float, Int
+
+from lagjax.motion.consistency import worst_residual
+from lagjax.motion.trajectory import RESULTS, Trajectory
+from lagjax.numerics.one_function import without_checks
+from lagjax.numerics.programs import bodies, evaluate
+
+CALLS = {
+    "jit",
+    "pjit",
+    "closed_call",
+    "core_call",
+    "custom_jvp_call",
+    "custom_vjp_call",
+    "remat",
+    "remat2",
+    "checkpoint",
+}
+
+
+class Report(NamedTuple):
+    """How motions went: together the first result that was not good, all steps, the worst departure and residual.
+
+    `departure` is that of a `Trajectory`; `residual` the worst of the constraints at the outputs, relative.
+    """
+
+    result: Int[Array, ""]
+    steps: Int[Array, ""]
+    departure: Float[Array, ""]
+    residual: Float[Array, ""]
+
+
+def report(trajectory: Trajectory) -> Trajectory:
+    """The trajectory, unchanged, with its report put down in the program that is being traced."""
+    leaves, structure = jtu.tree_flatten(trajectory)
+    t = trajectory
+    residual = (
+        worst_residual(t.system, t.t, t.q, t.v, t.params) if t.system.constraints else jnp.zeros_like(t.departure)
+    )
+    told = (t.result._value, t.stats["num_steps"], t.departure, residual)
+    return jtu.tree_unflatten(structure, _report_p.bind(*map(jnp.asarray, (*leaves, *told)))[: -len(told)])
+
+
+def reporting(function: Callable) -> Callable:
+    """`function`, returning (what it returned, a `Report` of the integrations in it; None where there are none).
+
+    Checks that call the host (equinox's `error_if`) are left out: one lane must not end the others.
+    """
+
+    def wrapped(*args):
+        leaves, structure = jtu.tree_flatten(args)
+        rest = []
+
+        def of_leaves(*leaves):
+            found, shape = jtu.tree_flatten(function(*jtu.tree_unflatten(structure, leaves)))
+            rest.append(shape)
+            return [jnp.asarray(x) for x in found]
+
+        program = without_checks(jax.make_jaxpr(of_leaves)(*leaves))
+        reports = []
+        found = _told(program.jaxpr, program.consts, leaves, reports)
+        return jtu.tree_unflatten(rest[0], found), _together(reports)
+
+    return wrapped
+
+
+def _told(jaxpr: Jaxpr, constants, args, reports):
+    """Evaluate a program; calls that contain reports are entered."""
+    values = dict(zip(jaxpr.constvars, constants)) | dict(zip(jaxpr.invars, args))
+    read = lambda x: x.val if isinstance(x, Literal) else values[x]
+    for equation in jaxpr.eqns:
+        operands = [read(x) for x in equation.invars]
+        if equation.primitive is _report_p:
+            reports.append(Report(*operands[-len(Report._fields) :]))
+            results = operands
+        elif equation.primitive.name in CALLS and _reports(equation):
+            inner = next(p for p in equation.params.values() if isinstance(p, (ClosedJaxpr, Jaxpr)))
+            closed = inner if isinstance(inner, ClosedJaxpr) else ClosedJaxpr(inner, ())
+            results = _told(closed.jaxpr, closed.consts, operands, reports)
+        else:
+            results = evaluate(jaxpr, equation, values)
+        values.update(zip(equation.outvars, results))
+    return [read(x) for x in jaxpr.outvars]
+
+
+def _reports(equation):
+    return any(inner.primitive is _report_p or _reports(inner) for body in bodies(equation) for inner in body.eqns)
+
+
+def _together(reports):
+    if not reports:
+        return None
+    # A derivative inside has lanes of its own: the worst of them counts.
+    flat = [Report(*(jnp.ravel(x) for x in told)) for told in reports]
+    results, steps, departures, residuals = (jnp.concatenate(parts) for parts in zip(*flat))
+    bad = (results != RESULTS.successful._value) & (results != RESULTS.event_occurred._value)
+    departure, worst = jnp.nanmax(departures), results[jnp.argmax(bad)]
+    result = jnp.where(jnp.any(bad) | ~(departure > 1), worst, RESULTS.drifted._value)
+    return Report(result, jnp.sum(steps), departure, jnp.nanmax(residuals))
+
+
+def _batched(operands, axes):
+    return _report_p.bind(*operands), axes
+
+
+def _jvp(primals, tangents):
+    return _report_p.bind(*primals), list(tangents)
+
+
+_report_p = Primitive("report")
+_report_p.multiple_results = True
+_report_p.def_impl(lambda *operands: list(operands))
+_report_p.def_abstract_eval(lambda *avals: list(avals))
+ad.primitive_jvps[_report_p] = _jvp
+batching.primitive_batchers[_report_p] = _batched
+mlir.register_lowering(_report_p, lambda context, *operands: operands)
