@@ -30,6 +30,12 @@ from lagjax.numerics.radau import Radau5
 from lagjax.numerics.runge_kutta import Dopri8, Tsit5
 
 # isort: split
+# Many motions.
+from lagjax.sweeps.lanes import Status
+from lagjax.sweeps.result import Sweep, open_sweep
+from lagjax.sweeps.sweep import sweep
+
+# isort: split
 # Error against run time.
 from lagjax.report import Run, work_precision
 
@@ -60,6 +66,10 @@ __all__ = [
     "Moment",
     "RESULTS",
     "AccuracyWarning",
+    "sweep",
+    "Sweep",
+    "Status",
+    "open_sweep",
     "Run",
     "work_precision",
     "scenes",

@@ -86,3 +86,36 @@ def work_precision(title: str, curves: dict[str, tuple[np.ndarray, np.ndarray]])
     axis.set(xlabel="run time / ms (median)", ylabel="relative error", title=title)
     axis.legend(fontsize=8, frameon=False, loc="center left", bbox_to_anchor=(1.0, 0.5))
     return fig
+
+
+def lines(label: str, x, panels: dict[str, np.ndarray], bad):
+    """Draw values against one axis of a sweep, one panel a value; points that are `bad` are marked at the bottom."""
+    fig, axes = figure(len(panels), 1, size=(6.0, 2.8), sharex=True)
+    for axis, (name, values) in zip(axes[:, 0], panels.items()):
+        axis.plot(x, values, marker="." if len(x) < 200 else "", **style(0))
+        if np.any(bad):
+            at = np.asarray(x)[bad]
+            axis.plot(at, np.zeros(len(at)), "x", color="#D55E00", transform=axis.get_xaxis_transform(), label="not ok")
+            axis.legend(fontsize=8, frameon=False)
+        axis.set_ylabel(name)
+    axes[-1, 0].set_xlabel(label)
+    return fig
+
+
+def maps(axes: dict[str, np.ndarray], panels: dict[str, np.ndarray]):
+    """Draw values over two axes as a map, one row a value; of three axes the first has a column for each value."""
+    *first, (down, y), (across, x) = axes.items()
+    columns = [("", ...)] if not first else [(f"{first[0][0]} = {value:.4g}", i) for i, value in enumerate(first[0][1])]
+    fig, grid = figure(len(panels), len(columns), size=(4.2, 3.2), sharex=True, sharey=True)
+    for row, (name, values) in zip(grid, panels.items()):
+        low, high = np.nanmin(values), np.nanmax(values)
+        for axis, (title, i) in zip(row, columns):
+            axis.set_facecolor("#bbbbbb")
+            shown = axis.pcolormesh(x, y, values[i], cmap="cividis", vmin=low, vmax=high, shading="nearest")
+            axis.set_title(title, fontsize=9)
+            axis.grid(False)
+        row[0].set_ylabel(down)
+        fig.colorbar(shown, ax=list(row), label=name)
+    for axis in grid[-1]:
+        axis.set_xlabel(across)
+    return fig

@@ -64,11 +64,11 @@ def integrate(
 
     **Other arguments:**
 
-    - `method`: any diffrax solver. By default `lj.Nystrom12()` where accelerations do not depend on velocities and there
-      are no constraints (`lj.explain` says so), else `lj.Dopri8()`: the fastest way to an error between 1e-4 and 1e-10
-      on nearly all scenes (`benchmarks/results/work_precision.json`). With these, `lj.Nystrom8()` and `lj.Tsit5()`,
-      small systems run on equations that are written out number by number; diffrax's own methods take 2 to 10 times
-      longer.
+    - `method`: any diffrax solver. By default `lj.Nystrom12()` where there are no constraints and accelerations do not
+      depend on velocities (`lj.explain` says so), else `lj.Dopri8()`: the fastest way to an error between 1e-4 and
+      1e-10 on nearly all scenes (`benchmarks/results/work_precision.json`). With these, with `lj.Nystrom8()` and
+      `lj.Tsit5()`, small systems run on equations that are written out number by number; diffrax's own methods take 2
+      to 10 times longer.
     - `stepsize_controller`: any diffrax controller, in place of `diffrax.PIDController(rtol, atol)`.
     - `dt0`: the first step, `[t]`; needed with `diffrax.ConstantStepSize()`.
     - `event`: a `diffrax.Event` whose condition takes `(t, (q, v), params, **kwargs)`. Without a root finder of

@@ -169,6 +169,11 @@ def message(result) -> str:
     return RESULTS[result]
 
 
+def in_words(code) -> str:
+    """A result's number in words."""
+    return message(_item(RESULTS.successful, code))
+
+
 def _lines(traj):
     rows = [
         ("method", f"{traj.static.method}, rtol {_pair(traj.tolerance[0])}, atol {_pair(traj.tolerance[1])}"),

@@ -1,0 +1,100 @@
+"""What varies in a sweep: named axes, as a grid or zipped, and the point at each flat index."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+# The one dimension of zipped axes.
+POINT = "point"
+
+
+class Axes(eqx.Module):
+    """Named axes: values (n, ...) by name, one slice of which is what a point gets.
+
+    The flat index runs over the last axis first; with `zipped` axes all of them move together.
+    """
+
+    values: dict[str, Any]
+    zipped: bool = eqx.field(static=True)
+
+    @property
+    def dims(self) -> dict[str, int]:
+        """The dimensions of the sweep and their lengths."""
+        lengths = {name: len(x) for name, x in self.values.items()}
+        return {POINT: next(iter(lengths.values()))} if self.zipped else lengths
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """The lengths of the dimensions."""
+        return tuple(self.dims.values())
+
+    @property
+    def size(self) -> int:
+        """How many points there are."""
+        return int(np.prod(self.shape, dtype=np.int64))
+
+    def at(self, index) -> dict[str, Any]:
+        """The point at a flat index, traced or not."""
+        places = [index] * len(self.values) if self.zipped else _unravelled(index, self.shape)
+        take = lambda x, i: x[i] if isinstance(x, np.ndarray) else jax.lax.dynamic_index_in_dim(x, i, keepdims=False)
+        return {name: take(x, i) for (name, x), i in zip(self.values.items(), places)}
+
+    def words(self, index: int) -> str:
+        """The point at a flat index as a person writes it."""
+        point = {name: np.asarray(x) for name, x in self.at(int(index)).items()}
+        return ", ".join(
+            f"{name} = {x:.6g}" if x.ndim == 0 else f"{name} of shape {x.shape}" for name, x in point.items()
+        )
+
+
+def _unravelled(index, shape):
+    places = []
+    for length in reversed(shape):
+        places.append(index % length)
+        index = index // length
+    return places[::-1]
+
+
+def axes_of(axes: Any, zipped: bool) -> Axes:
+    """The axes that a user wrote, or an error."""
+    example = 'Fix: axes={"omega": jnp.linspace(0.0, 3.0, 100)}.'
+    if not isinstance(axes, Mapping) or not axes:
+        raise TypeError(f"axes must be a dictionary of arrays by name, not {axes!r:.60}.\n{example}")
+    values = {}
+    for name, given in axes.items():
+        if any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves(given)):
+            raise TypeError(
+                f"axis '{name}' is being traced: a sweep compiles and runs for itself, outside of jit, grad and vmap.\n"
+                "Fix: call lj.sweep with concrete arrays; inside a program use jax.vmap."
+            )
+        x = np.asarray(given)
+        if x.dtype == object or x.ndim == 0 or len(x) == 0:
+            raise ValueError(
+                f"axis '{name}' must be an array of at least one value, and is {given!r:.60}.\n{example} "
+                "What does not vary belongs into run."
+            )
+        # In the dtype that JAX would give it: float64 where that is enabled.
+        values[str(name)] = x.astype(jax.dtypes.canonicalize_dtype(x.dtype))
+    lengths = {name: len(x) for name, x in values.items()}
+    if zipped and len(set(lengths.values())) > 1:
+        told = ", ".join(f"'{name}' has {n}" for name, n in lengths.items())
+        raise ValueError(
+            f"zipped axes must be of one length: {told}.\n"
+            "Usual cause: a grid was meant.\nFix: leave zipped=True out, or cut the axes to one length."
+        )
+    found = Axes(values, zipped)
+    if found.size > jnp.iinfo(index_dtype()).max:
+        raise ValueError(
+            f"{found.size} points are more than {index_dtype()} can count.\n"
+            'Fix: jax.config.update("jax_enable_x64", True) before the first array.'
+        )
+    return found
+
+
+def index_dtype():
+    """The dtype of flat indices."""
+    return jax.dtypes.canonicalize_dtype(np.int64)

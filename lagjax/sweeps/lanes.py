@@ -1,0 +1,106 @@
+"""The compiled program of a sweep: some points, by their flat indices, to values and statuses.
+
+How lanes are laid out is measured in `benchmarks/sweep.py`. Under `vmap` on a CPU `integrate` takes small systems one
+lane after the other, each with its own steps, as one machine function; what surrounds it runs for all lanes at once.
+That is `"together"` below, and the default everywhere. `"in turn"` takes everything one lane after the other.
+"""
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh, PartitionSpec
+from jaxtyping import PyTree
+
+from lagjax.motion.reported import reporting
+from lagjax.motion.trajectory import RESULTS, Trajectory
+from lagjax.sweeps.axes import Axes, index_dtype
+
+NOT_RUN = -1
+LAYOUTS = ("together", "in turn")
+
+
+class Status(NamedTuple):
+    """How each point went, arrays in the shape of the sweep.
+
+    `result` is the code of a `RESULTS` item, or -1 where the point was not run; `steps` those of all its integrations;
+    `departure` and `residual` the worst (`Trajectory`), 0 where nothing was integrated.
+    """
+
+    result: Any
+    steps: Any
+    departure: Any
+    residual: Any
+
+
+STATUS_TYPES = Status(np.dtype(np.int8), np.dtype(np.int32), np.dtype(np.float32), np.dtype(np.float32))
+GOOD = tuple(int(item._value) for item in (RESULTS.successful, RESULTS.event_occurred, RESULTS.drifted))
+
+
+class Program(NamedTuple):
+    """A compiled program for `chunk` indices, the shapes of one point's values, and the bytes that it works with."""
+
+    call: Callable
+    chunk: int
+    values: PyTree
+    working: int
+    text: str
+
+
+def point_of(run: Callable) -> Callable:
+    """A function of one point that returns (values, `Status`); the numbers of a point that failed are NaN."""
+    told = reporting(run)
+
+    def point(at):
+        values, report = told(at)
+        if report is None:
+            floats = [x for x in jax.tree.leaves(values) if jnp.issubdtype(x.dtype, jnp.inexact)]
+            finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in floats])) if floats else jnp.asarray(True)
+            result = jnp.where(finite, RESULTS.successful._value, RESULTS.not_finite._value)
+            report = (result, 0, 0.0, 0.0)
+        status = Status(*(jnp.asarray(x, dtype) for x, dtype in zip(report, STATUS_TYPES)))
+        well = jnp.any(jnp.stack([status.result == code for code in GOOD]))
+
+        def masked(x):
+            # A trajectory says itself how far it got, and is NaN from there on.
+            if isinstance(x, Trajectory) or not jnp.issubdtype(x.dtype, jnp.inexact):
+                return x
+            return jnp.where(well, x, jnp.nan)
+
+        return jax.tree.map(masked, values, is_leaf=lambda x: isinstance(x, Trajectory)), status
+
+    return point
+
+
+def compiled(run: Callable, axes: Axes, chunk: int, devices: Sequence, layout: str) -> Program:
+    """Compile a sweep's program for chunks of some length, split between the devices."""
+    point = point_of(run)
+
+    def lanes(values, indices):
+        at = lambda index: point(Axes(values, axes.zipped).at(index))
+        return jax.lax.map(at, indices) if layout == "in turn" else jax.vmap(at)(indices)
+
+    function = lanes
+    if len(devices) > 1:
+        mesh, split = Mesh(np.asarray(devices), ("lanes",)), PartitionSpec("lanes")
+        function = jax.shard_map(lanes, mesh=mesh, in_specs=(PartitionSpec(), split), out_specs=split, check_vma=False)
+    shaped = partial(jax.tree.map, lambda x: jax.ShapeDtypeStruct(np.shape(x), x.dtype))
+    indices = jax.ShapeDtypeStruct((chunk,), index_dtype())
+    traced = jax.jit(function).trace(shaped(axes.values), indices)
+    shapes, _ = traced.out_info
+    program = traced.lower().compile()
+    memory = program.memory_analysis()
+    working = 0 if memory is None else memory.temp_size_in_bytes + memory.output_size_in_bytes
+    placed = jax.device_put(axes.values, None if len(devices) > 1 else devices[0])
+
+    def call(indices):
+        """(values, status) at some flat indices, as NumPy arrays; no more than `chunk`."""
+        count = len(indices)
+        filled = np.resize(indices, chunk).astype(index_dtype())
+        return jax.tree.map(lambda x: np.asarray(x)[:count], program(placed, filled))
+
+    one = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), shapes)
+    return Program(call, chunk, one, working, traced)

@@ -1,0 +1,233 @@
+"""The answer of a sweep: values and statuses by axis, printed, plotted, exported, and what failed run again."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import numpy as np
+from jaxtyping import PyTree
+
+from lagjax import plot
+from lagjax.motion.trajectory import RESULTS, Trajectory, in_words
+from lagjax.sweeps.axes import POINT, Axes
+from lagjax.sweeps.lanes import GOOD, NOT_RUN, Status
+from lagjax.sweeps.store import Store, named_leaves
+
+
+class Sweep:
+    """What a sweep found, by axis. It prints how its points went, plots itself and exports to xarray.
+
+    - `axes`: the names and values of what varied; `dims` the dimensions and their lengths.
+    - `values`: what `run` returned, each leaf with the axes in front (NumPy). NaN where a point failed. Of a sweep with
+      a store they are read from it when asked for.
+    - `status`: a `Status` of arrays in the shape of the axes; `ok` where the values are to be trusted.
+    - `how`: what ran it, in words; `seconds` how long it took.
+    """
+
+    def __init__(
+        self, axes: Axes, values: PyTree | Callable, status: Status, how: str, seconds: float, again: Callable
+    ):
+        self.axes = axes
+        self.status = Status(*(x.reshape(axes.shape) for x in status))
+        self.how, self.seconds = how, seconds
+        self._values, self._again = values, again
+
+    @property
+    def dims(self) -> dict[str, int]:
+        """The dimensions and their lengths."""
+        return self.axes.dims
+
+    @property
+    def values(self) -> PyTree:
+        """What `run` returned, each leaf with the axes in front."""
+        flat = self._values() if callable(self._values) else self._values
+        return jax.tree.map(lambda x: x.reshape(self.axes.shape + x.shape[1:]), flat)
+
+    @property
+    def ok(self) -> np.ndarray:
+        """Which points were computed to their end and drifted no farther than the tolerance lets expect."""
+        trusted = [code for code in GOOD if code != int(RESULTS.drifted._value)]
+        return np.isin(self.status.result, trusted)
+
+    def counts(self) -> dict[str, int]:
+        """How many points went which way, in words, the most frequent first."""
+        codes, counts = np.unique(self.status.result, return_counts=True)
+        return {_words(codes[i]): int(counts[i]) for i in np.argsort(-counts)}
+
+    def resweep(self, run: Callable | None = None, where=None) -> "Sweep":
+        """Run the points that are not `ok` again, with another `run` (other settings), and keep the rest.
+
+        **Arguments:** `run` as in `lj.sweep`, returning the same structure; by default the same one, which finishes a
+        sweep that was interrupted. `where`: booleans in the shape of the axes, of the points to run.
+
+        **Returns:** a new `Sweep`, in memory.
+        """
+        where = ~self.ok if where is None else np.broadcast_to(np.asarray(where, bool), self.axes.shape)
+        return self._again(self, run, np.flatnonzero(where.reshape(-1)))
+
+    def to_xarray(self):
+        """Values, statuses and axes as an `xarray.Dataset`, with dimensions and coordinates by name.
+
+        The outputs of a `Trajectory` have the dimension `t`, where all points share their times.
+
+        **Raises:** `ImportError` without xarray.
+        """
+        try:
+            import xarray
+        except ImportError as error:
+            raise ImportError('this needs xarray, an optional extra.\nFix: pip install "lagjax[data]"') from error
+        coords, variables = self._coordinates(), {}
+        for name, dims, x in self._labelled(coords):
+            variables[name] = ((*self.dims, *dims), x)
+        for name, x in zip(Status._fields, self.status):
+            variables[f"status_{name}" if name in variables else name] = (tuple(self.dims), x)
+        dataset = xarray.Dataset(variables, coords)
+        codes = np.unique(self.status.result)
+        dataset["result"].attrs = {"flag_values": codes.tolist(), "flag_meanings": [_words(code) for code in codes]}
+        dataset.attrs = {"how": self.how}
+        return dataset
+
+    def plot(self, value: str | Callable | None = None):
+        """Draw values over the axes: lines over one, a map over two, a map for each value of the first over three.
+
+        **Arguments:** `value`: the name of a leaf, or a function of `values` that returns an array in the shape of the
+        axes; by default every leaf with one number a point. Points that are not `ok` are marked.
+
+        **Returns:** a matplotlib `Figure`.
+
+        **Raises:** `ValueError` where there is no such value, or more than three axes.
+        """
+        panels = self._panels(value)
+        if self.axes.zipped:
+            name, x = next(iter(self.axes.values.items()))
+            return plot.lines(name, x if x.ndim == 1 else np.arange(len(x)), panels, ~self.ok)
+        axes = {name: x if x.ndim == 1 else np.arange(len(x)) for name, x in self.axes.values.items()}
+        if len(axes) == 1:
+            ((name, x),) = axes.items()
+            return plot.lines(name, x, panels, ~self.ok)
+        if len(axes) > 3:
+            raise ValueError(
+                f"a picture has room for three axes, and this sweep has {len(axes)}: {', '.join(axes)}.\n"
+                "Fix: choose a part with swept.to_xarray().isel(...) and plot that."
+            )
+        return plot.maps(axes, panels)
+
+    def _panels(self, value):
+        values = self.values
+        if callable(value):
+            chosen = {"value": np.asarray(value(values))}
+        else:
+            chosen = {name: x for name, x in named_leaves(values) if value is None or name == value}
+        numbers = {name: x for name, x in chosen.items() if x.shape == self.axes.shape}
+        if not numbers:
+            there = ", ".join(f"'{name}' {x.shape[len(self.axes.shape) :]}" for name, x in named_leaves(values))
+            named = f" named {value!r}" if isinstance(value, str) else ""
+            raise ValueError(
+                f"there is no value{named} with one number a point; a point has {there}.\n"
+                "Fix: choose one, as swept.plot(lambda values: values.q[..., -1])."
+            )
+        return numbers
+
+    def _coordinates(self):
+        if self.axes.zipped:
+            return {name: ((POINT, *_inner(name, x)), x) for name, x in self.axes.values.items()}
+        flat = {name: x for name, x in self.axes.values.items() if x.ndim == 1}
+        slices = {f"{name}_values": ((name, *_inner(name, x)), x) for name, x in self.axes.values.items() if x.ndim > 1}
+        return flat | slices
+
+    def _labelled(self, coords):
+        """Every array as (name, dimensions behind the axes, values); shared times become a coordinate."""
+        found, values = [], self.values
+        lead = len(self.axes.shape)
+        for path, part in jax.tree_util.tree_leaves_with_path(values, is_leaf=lambda x: isinstance(x, Trajectory)):
+            key = jax.tree_util.keystr(path, simple=True, separator=".")
+            if not isinstance(part, Trajectory):
+                found.append((key or "value", tuple(_inner(key or "value", part, lead)), part))
+                continue
+            under = f"{key}." if key else ""
+            times = part.t[self.status.result != NOT_RUN]
+            t = f"{under}t"
+            if len(times) and np.all(times == times[0]):
+                coords[t] = times[0]
+            else:
+                found.append((f"{under}times", (t,), part.t))
+            for leaf_path, x in jax.tree_util.tree_leaves_with_path({"q": part.q, "v": part.v, **part.multipliers}):
+                name = under + jax.tree_util.keystr(leaf_path, simple=True, separator=".")
+                found.append((name, (t, *_inner(name, x, lead + 1)), x))
+        return found
+
+    def __repr__(self):
+        size, steps = self.axes.size, self.status.steps.reshape(-1)
+        dims = " x ".join(f"{name} ({n})" for name, n in self.dims.items())
+        rows = [("points", f"{size:,}: {dims}")]
+        rows += [("status" if i == 0 else "", f"{n:,} {words}") for i, (words, n) in enumerate(self.counts().items())]
+        if bad := np.flatnonzero(~self.ok.reshape(-1)).tolist():
+            rows.append(("first not ok", self.axes.words(bad[0])))
+        if steps.any():
+            worst = int(np.argmax(steps))
+            rows.append(
+                ("steps a point", f"{int(np.median(steps)):,} (median), {steps[worst]:,} at {self.axes.words(worst)}")
+            )
+        residual = self.status.residual[np.isfinite(self.status.residual)]
+        if residual.any():
+            rows.append(("worst constraint residual", f"{residual.max():.1e} (relative)"))
+        rows.append(("values", ", ".join(self._shapes())))
+        run = int(np.sum(self.status.result != NOT_RUN))
+        speed = f"; {self.seconds:.3g} s, {run / self.seconds:,.0f} points/s" if self.seconds else ""
+        rows.append(("run", f"{self.how}{speed}"))
+        width = max(len(label) for label, _ in rows)
+        return "\n".join(["Sweep", *(f"  {label:<{width}}  {value}" for label, value in rows)])
+
+    def _shapes(self):
+        shown = []
+        leaves = self._values.like if callable(self._values) else jax.tree.map(lambda x: x[0], self._values)
+        is_trajectory = lambda x: isinstance(x, Trajectory)
+        for path, part in jax.tree_util.tree_leaves_with_path(leaves, is_leaf=is_trajectory):
+            name = jax.tree_util.keystr(path, simple=True, separator=".")
+            if is_trajectory(part):
+                shown.append(f"{name or 'value'} Trajectory at {part.t.shape[-1]} times")
+            else:
+                shown.append(f"{name or 'value'} {part.dtype}{list(part.shape) if part.shape else ''}")
+        return shown
+
+
+def _inner(name, x, lead=1):
+    return [f"{name}_{i}" for i in range(np.ndim(x) - lead)]
+
+
+def _words(code):
+    return "not run" if code == NOT_RUN else in_words(code)
+
+
+def open_sweep(path) -> Sweep:
+    """The sweep in a store, without what ran it: its values are a dictionary by name."""
+    store = Store(path)
+    status = store.status()
+    values = Stored(store, None)
+    missing = len(store.missing())
+    how = f"from {path}" + (f", of which {missing} blocks are missing" if missing else "")
+    return Sweep(store.axes(), values, status, how, 0.0, _cannot)
+
+
+def _cannot(swept, run, indices):
+    raise ValueError(
+        "a sweep that was opened from its store does not know what ran it.\n"
+        "Fix: lj.sweep(run, axes, store=path), which computes what is missing."
+    )
+
+
+class Stored:
+    """The values of a store, read when called; `like` has the shapes of one point."""
+
+    def __init__(self, store: Store, like: PyTree):
+        self.store, self._like = store, like
+
+    @property
+    def like(self) -> Any:
+        """One point's values, as shapes."""
+        if self._like is not None:
+            return self._like
+        return {name: np.empty(x.shape[1:], x.dtype) for name, x in self.store.values().items()}
+
+    def __call__(self):
+        return self.store.values(self._like)

@@ -1,0 +1,289 @@
+"""The front door of sweeps: compile once, run everywhere, lose nothing."""
+
+import math
+import os
+import time
+import warnings
+from collections.abc import Callable, Mapping
+from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
+from contextlib import nullcontext
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from jaxtyping import ArrayLike
+
+from lagjax.sweeps.axes import axes_of
+from lagjax.sweeps.lanes import LAYOUTS, NOT_RUN, STATUS_TYPES, Program, Status, compiled
+from lagjax.sweeps.result import Stored, Sweep
+from lagjax.sweeps.store import open_store
+
+# Points for one call of the compiled program. On a CPU a call costs 0.2 ms, and more gains nothing; a GPU is filled.
+CHUNK = {"cpu": 1024, "gpu": 65536}
+# On a CPU each core gets so many chunks or more, so that none waits long for the last.
+CHUNKS_EACH = 4
+# A block of a store is written about so often, and holds no more than this.
+BLOCK_SECONDS, BLOCK_BYTES = 2.0, 256e6
+# Of the memory that is free.
+FILL_AT_MOST = 0.8
+
+
+def sweep(
+    run: Callable[[dict[str, Any]], Any],
+    axes: Mapping[str, ArrayLike],
+    *,
+    zipped: bool = False,
+    store: str | os.PathLike | None = None,
+    part: tuple[int, int] | None = None,
+    chunk: int | None = None,
+    layout: str = "together",
+    devices: list | None = None,
+    workers: int | None = None,
+    progress: bool | None = None,
+) -> Sweep:
+    """Call `run` at every point of a grid, in parallel, and label what it returns.
+
+    >>> import jax.numpy as jnp
+    >>> import lagjax as lj
+    >>> swing = lj.System(lambda t, q, v, params: 0.5 * v**2 + params["g"] * jnp.cos(q))
+    >>> def run(point):
+    ...     return lj.integrate(swing, point["angle"], 0.0, {"g": point["g"]}, ts=jnp.array([0.0, 1.0])).q[-1]
+    >>> swept = sweep(run, {"g": jnp.array([1.0, 4.0]), "angle": jnp.linspace(0.0, 1.0, 3)}, progress=False)
+    >>> print(swept.values.round(4), swept.counts())
+    [[ 0.      0.272   0.5636]
+     [ 0.     -0.1947 -0.3369]] {'successful': 6}
+
+    **Main arguments:**
+
+    - `run(point)`: any JAX function; `point` is a dictionary with one scalar (or slice) an axis, and what it returns is
+      any pytree of numbers and arrays: a final state, a period, a gradient, a whole `Trajectory`. `integrate` needs
+      nothing special in it: it does not raise, and how it went is in `status`.
+    - `axes`: what varies, arrays (n, ...) by name. A grid of all combinations, the last axis fastest; with `zipped` all
+      move together.
+
+    **Long sweeps:**
+
+    - `store`: a directory, to which blocks of points are written as they are finished (zarr). Called again with the
+      same sweep, only what is missing is computed; a store of another sweep is refused.
+    - `part`: (k, n): this process computes every n-th block from the k-th on; by default as `jax.distributed` says.
+    - `progress`: show points done, rate and time left (tqdm); by default where somebody may look.
+
+    **How it runs,** which `print(swept)` says:
+
+    - `chunk`: points for one call of the compiled program.
+    - `layout`: `"together"` (`vmap`, in which `integrate` takes small systems one by one on a CPU) or `"in turn"`.
+    - `devices`: JAX devices to split each chunk between; by default all.
+    - `workers`: chunks at a time; by default the cores of the CPU, or two.
+
+    **Returns:** a `Sweep`. Interrupted (Ctrl-C) it has what was done, and `swept.resweep()` does the rest.
+
+    **Raises:** `TypeError`, `ValueError` for axes and settings that make no sense, or another sweep's store;
+    `MemoryError` where the values would not fit, before anything runs.
+    """
+    axes = axes_of(axes, zipped)
+    devices = jax.local_devices() if devices is None else list(devices)
+    part = (jax.process_index(), jax.process_count()) if part is None else part
+    _check(layout, part, store)
+    platform = devices[0].platform
+    cores = _cores() if platform == "cpu" else 2
+    workers = (cores if len(devices) == 1 else 2) if workers is None else workers
+    if chunk is None:
+        chunk = min(CHUNK.get(platform, CHUNK["gpu"]), math.ceil(axes.size / (CHUNKS_EACH * workers)))
+    chunk = math.ceil(chunk / len(devices)) * len(devices)
+    program = compiled(run, axes, chunk, devices, layout)
+    _check_memory(axes, program, workers, store, platform)
+    engine = _Engine(program, workers, _words(platform, devices, workers, layout, chunk), layout, devices)
+    if store is None:
+        return _in_memory(engine, run, axes, np.arange(axes.size), None, progress)
+    return _in_store(engine, axes, store, part, progress)
+
+
+class _Engine:
+    def __init__(self, program: Program, workers, words, layout, devices):
+        self.program, self.workers, self.words = program, workers, words
+        self.layout, self.devices = layout, devices
+
+    def over(self, indices):
+        """(which of them, values, status) of the chunks of some indices as they are finished, in any order."""
+        starts = range(0, len(indices), self.program.chunk)
+        task = lambda start: (start, *self.program.call(indices[start : start + self.program.chunk]))
+        waiting = iter(starts)
+        pool = ThreadPoolExecutor(self.workers)
+        try:
+            # No more than a few at a time: what is finished and not taken yet would fill the memory.
+            running = {pool.submit(task, start) for start in islice(waiting, 2 * self.workers)}
+            while running:
+                done, running = wait(running, return_when=FIRST_COMPLETED)
+                for future in done:
+                    running |= {pool.submit(task, start) for start in islice(waiting, 1)}
+                    start, values, status = future.result()
+                    yield slice(start, start + len(status.result)), values, status
+        finally:
+            pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _in_memory(engine, run, axes, indices, before, progress):
+    started = time.perf_counter()
+    if before is None:
+        values = jax.tree.map(lambda x: np.zeros((axes.size, *x.shape), x.dtype), engine.program.values)
+        values = jax.tree.map(lambda x: x.fill(np.nan) or x if np.issubdtype(x.dtype, np.inexact) else x, values)
+        fills = (NOT_RUN, 0, np.nan, np.nan)
+        status = Status(*(np.full(axes.size, fill, dtype) for fill, dtype in zip(fills, STATUS_TYPES)))
+    else:
+        values, status = jax.tree.map(np.copy, before)
+    done = 0
+    with _meter(len(indices), progress) as meter:
+        try:
+            for here, found, how in engine.over(indices):
+                at = indices[here]
+                for whole, some in zip(jax.tree.leaves((values, status)), jax.tree.leaves((found, how))):
+                    whole[at] = some
+                done += len(at)
+                meter.update(len(at))
+        except KeyboardInterrupt:
+            _tell_interrupted(done, len(indices), "swept.resweep() does the rest.")
+    seconds = time.perf_counter() - started
+
+    def again(swept, other, which):
+        if len(which) == 0:
+            return swept
+        flat = jax.tree.map(lambda x: x.reshape(axes.size, *x.shape[len(axes.shape) :]), (swept.values, swept.status))
+        rerun = engine
+        if other is not None:
+            chunk = min(
+                engine.program.chunk, math.ceil(len(which) / engine.workers / len(engine.devices)) * len(engine.devices)
+            )
+            program = compiled(other, axes, chunk, engine.devices, engine.layout)
+            if jax.tree.structure(program.values) != jax.tree.structure(engine.program.values):
+                raise ValueError(
+                    "this run returns another structure than the sweep has: "
+                    f"{jax.tree.structure(program.values)}, not {jax.tree.structure(engine.program.values)}.\n"
+                    "Fix: return the same, computed with other settings."
+                )
+            rerun = _Engine(program, engine.workers, engine.words, engine.layout, engine.devices)
+        return _in_memory(rerun, other or run, axes, which, flat, progress)
+
+    return Sweep(axes, values, status, engine.words, seconds, again)
+
+
+def _in_store(engine, axes, path, part, progress):
+    started = time.perf_counter()
+    block = None if Path(path).exists() else _block(engine, axes, part)
+    store = open_store(path, axes, engine.program, engine.layout, block)
+    (k, n), block = part, store.block
+    missing = [number for number in store.missing().tolist() if number % n == k]
+    length = lambda number: min(block, axes.size - number * block)
+    done = 0
+    with _meter(sum(map(length, missing)), progress) as meter:
+        try:
+            for number in missing:
+                indices = np.arange(number * block, number * block + length(number))
+                whole = None
+                for here, found, how in engine.over(indices):
+                    if whole is None:
+                        whole = jax.tree.map(lambda x: np.empty((len(indices), *x.shape[1:]), x.dtype), (found, how))
+                    for every, some in zip(jax.tree.leaves(whole), jax.tree.leaves((found, how))):
+                        every[here] = some
+                    meter.update(len(how.result))
+                store.write(number, *whole)
+                done += len(indices)
+        except KeyboardInterrupt:
+            _tell_interrupted(done, sum(map(length, missing)), "the same call goes on from there.")
+
+    def again(swept, other, which):
+        raise ValueError(
+            "what is in a store belongs to the run that it was begun with.\n"
+            "Fix: lj.sweep(other, axes of what failed, zipped=True), or a sweep without a store."
+        )
+
+    here = f"{engine.words}, in {path}"
+    return Sweep(axes, Stored(store, engine.program.values), store.status(), here, time.perf_counter() - started, again)
+
+
+def _block(engine, axes, part):
+    """Points to write together: some seconds' worth, some for each process, no more than fits."""
+    chunk = engine.program.chunk
+    first = np.arange(min(chunk, axes.size))
+    started = time.perf_counter()
+    engine.program.call(first)
+    seconds = max(time.perf_counter() - started, 1e-6)
+    wanted = max(1, round(BLOCK_SECONDS * engine.workers / seconds)) * chunk
+    fair = max(1, axes.size // (CHUNKS_EACH * part[1] * chunk)) * chunk
+    fits = max(1, int(BLOCK_BYTES / (_bytes(engine.program) * chunk))) * chunk
+    return min(wanted, fair, fits)
+
+
+def _bytes(program):
+    """What one point's values and status take."""
+    of_status = sum(dtype.itemsize for dtype in STATUS_TYPES)
+    return of_status + sum(math.prod(x.shape) * x.dtype.itemsize for x in jax.tree.leaves(program.values))
+
+
+def _check(layout, part, store):
+    if layout not in LAYOUTS:
+        raise ValueError(f"layout must be one of {', '.join(map(repr, LAYOUTS))}, not {layout!r}.")
+    k, n = part
+    if not 0 <= k < n:
+        raise ValueError(f"part must be (k, n) with 0 <= k < n, not {part}.\nFix: part=(0, 2) and part=(1, 2).")
+    if n > 1 and store is None:
+        raise ValueError(
+            f"this is process {k} of {n}, and without a store nobody gets its points.\n"
+            'Fix: store="a directory that all processes see".'
+        )
+
+
+def _check_memory(axes, program, workers, store, platform):
+    free = _free_memory()
+    kept = 0 if store is not None else axes.size * _bytes(program)
+    needed = kept + (workers * program.working if platform == "cpu" else 0)
+    if free is not None and needed > FILL_AT_MOST * free:
+        raise MemoryError(
+            f"this sweep needs {needed / 1e9:.3g} GB: {axes.size:,} points of {_bytes(program):,} bytes, and "
+            f"{workers} x {program.working / 1e9:.2g} GB to work in. {free / 1e9:.3g} GB are free.\n"
+            "Usual cause: run returns whole trajectories, or a grid with one axis too many.\n"
+            'Fix: return less of each point (a final state, a period), or store="directory"; chunk= for less at a time.'
+        )
+
+
+def _free_memory():
+    """Bytes that can be had without swapping, where the system tells."""
+    try:
+        lines = Path("/proc/meminfo").read_text().splitlines()
+    except OSError:
+        return None
+    told = {line.split(":")[0]: int(line.split()[1]) * 1024 for line in lines}
+    return told.get("MemAvailable")
+
+
+def _cores():
+    """The cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _words(platform, devices, workers, layout, chunk):
+    where = f"{len(devices)} {platform} devices" if len(devices) > 1 else f"{platform}"
+    return f"{where}, {workers} worker{'s' * (workers > 1)}, lanes {layout}, chunks of {chunk}"
+
+
+def _tell_interrupted(done, total, then):
+    warnings.warn(f"interrupted: {done:,} of {total:,} points are done and kept; {then}", stacklevel=4)
+
+
+class _NoMeter(nullcontext):
+    def __init__(self):
+        super().__init__(self)
+
+    def update(self, count):
+        """Nothing."""
+
+
+def _meter(total, progress):
+    try:
+        from tqdm.auto import tqdm
+    except ImportError:
+        return _NoMeter()
+    # Short sweeps show nothing, and nothing is shown where nobody looks, unless asked for.
+    disable = None if progress is None else not progress
+    return tqdm(total=total, unit=" points", unit_scale=True, delay=0.0 if progress else 1.0, disable=disable)
