@@ -1,11 +1,15 @@
-"""The problems of `against_peers.py`, set up in other tools as their users would.
+"""The problems of `against_peers.py` and `sweep.py`, set up in other tools as their users would.
 
 Each function takes the problem and returns `prepare(tolerance)`, which returns a function without arguments that solves
 it from the start and returns the final state. What a user does once (building, compiling) is done outside that. Each
 raises ImportError where its tool is missing.
+
+Those of lanes solve one problem for many values of one parameter, each to its own end: `parameters` and `ends` are
+arrays (lanes,), an acceleration gets the lane's parameter as its last argument, and states are (2, lanes).
 """
 
 import math
+from functools import partial
 
 import diffrax
 import jax
@@ -63,16 +67,41 @@ def numba_dopri8(acceleration, q, v, end):
     `acceleration(q, v)` is compiled by numba. Tableau, error norm and controller are those of diffrax.
     """
     needs(numba, "numba")
-    # By default numba checks every division for zero.
-    compiled = numba.njit(acceleration, error_model="numpy")
-    step = numba.njit(_written_out(diffrax.Dopri8().tableau, compiled), error_model="numpy")
+    compiled = _njit(acceleration)
+    solve = _numba_solver(lambda q, v, parameter: compiled(q, v))
+    return lambda tolerance: lambda: solve(q, v, end, tolerance, 0.0)
 
-    @numba.njit(error_model="numpy")
-    def solve(q, v, end, tolerance):
-        t, h, rate, a = 0.0, 1e-3, v, compiled(q, v)
+
+def numba_dopri8_lanes(acceleration, q, v, ends, parameters):
+    """The same one lane after the other, in one loop that numba compiles too; `acceleration(q, v, parameter)`."""
+    needs(numba, "numba")
+    solve = _numba_solver(acceleration)
+
+    @_njit
+    def lanes(q, v, ends, tolerance, parameters):
+        found = np.empty((2, len(ends)))
+        for i in range(len(ends)):
+            found[0, i], found[1, i] = solve(q, v, ends[i], tolerance, parameters[i])
+        return found
+
+    return lambda tolerance: lambda: lanes(q, v, ends, tolerance, parameters)
+
+
+def _njit(function):
+    # By default numba checks every division for zero.
+    return numba.njit(function, error_model="numpy")
+
+
+def _numba_solver(acceleration):
+    compiled = _njit(acceleration)
+    step = _njit(_written_out(diffrax.Dopri8().tableau, compiled))
+
+    @_njit
+    def solve(q, v, end, tolerance, parameter):
+        t, h, rate, a = 0.0, 1e-3, v, compiled(q, v, parameter)
         while t < end:
             h = min(h, end - t)
-            new_q, new_v, new_a, error_q, error_v = step(q, v, h, rate, a)
+            new_q, new_v, new_a, error_q, error_v = step(q, v, h, rate, a, parameter)
             error_q /= tolerance + tolerance * max(abs(q), abs(new_q))
             error_v /= tolerance + tolerance * max(abs(v), abs(new_v))
             error = math.sqrt(0.5 * (error_q**2 + error_v**2))
@@ -81,7 +110,7 @@ def numba_dopri8(acceleration, q, v, end):
             h *= min(10.0, max(0.2, 0.9 * max(error, 1e-30) ** -0.125))
         return q, v
 
-    return lambda tolerance: lambda: solve(q, v, end, tolerance)
+    return solve
 
 
 def _written_out(tableau, acceleration):
@@ -90,12 +119,12 @@ def _written_out(tableau, acceleration):
     def combination(weights, of):
         return " + ".join(f"{float(w)!r} * {of}{j}" for j, w in enumerate(weights) if w)
 
-    lines = ["def step(q, v, h, rate0, a0):"]
+    lines = ["def step(q, v, h, rate0, a0, parameter):"]
     for i, weights in enumerate(tableau.a_lower, start=1):
         lines += [
             f"    q{i} = q + h * ({combination(weights, 'rate')})",
             f"    rate{i} = v + h * ({combination(weights, 'a')})",
-            f"    a{i} = acceleration(q{i}, rate{i})",
+            f"    a{i} = acceleration(q{i}, rate{i}, parameter)",
         ]
     last, error = len(tableau.a_lower), tableau.b_error
     # The last stage is the new state.
@@ -105,6 +134,35 @@ def _written_out(tableau, acceleration):
     namespace = {"acceleration": acceleration}
     exec("\n".join(lines), namespace)
     return namespace["step"]
+
+
+def diffrax_lanes(field, y0, ends, parameters, chunk):
+    """`jax.vmap` of diffrax's Dopri8 over `chunk` lanes at a time; `field(t, y, parameter)` by hand."""
+
+    @jax.jit
+    @partial(jax.vmap, in_axes=(0, 0, None))
+    def solve(end, parameter, tolerance):
+        solution = diffrax.diffeqsolve(
+            diffrax.ODETerm(field),
+            diffrax.Dopri8(),
+            0.0,
+            end,
+            None,
+            jax.tree.map(jnp.asarray, y0),
+            args=parameter,
+            stepsize_controller=diffrax.PIDController(rtol=tolerance, atol=tolerance),
+            max_steps=2**20,
+        )
+        return jax.tree.map(lambda x: x[-1], solution.ys)
+
+    def prepare(tolerance):
+        def solved():
+            parts = [slice(i, i + chunk) for i in range(0, len(ends), chunk)]
+            return np.concatenate([np.stack(solve(ends[i], parameters[i], tolerance)) for i in parts], axis=1)
+
+        return solved
+
+    return prepare
 
 
 def heyoka_taylor(acceleration, q, v, end):
@@ -119,6 +177,32 @@ def heyoka_taylor(acceleration, q, v, end):
             solver.time, solver.state[:] = 0.0, (q, v)
             solver.propagate_until(end)
             return solver.state.copy()
+
+        return solve
+
+    return prepare
+
+
+def heyoka_lanes(acceleration, q, v, ends, parameters):
+    """heyoka's Taylor integrator in batches as wide as the processor's registers; `acceleration(q, v, module, par)`."""
+    needs(heyoka, "heyoka")
+    lanes, wide = len(ends), heyoka.recommended_simd_size()
+    # The last batch is filled with lanes from the front.
+    padded = np.resize(np.arange(lanes), (-(-lanes // wide), wide))
+
+    def prepare(tolerance):
+        x, u = heyoka.make_vars("x", "u")
+        equations = [(x, u), (u, acceleration(x, u, heyoka, heyoka.par[0]))]
+        solver = heyoka.taylor_adaptive_batch(equations, np.zeros((2, wide)), tol=tolerance, pars=np.zeros((1, wide)))
+        found = np.empty((2, lanes))
+
+        def solve():
+            for batch in padded:
+                solver.set_time(0.0)
+                solver.state[0], solver.state[1], solver.pars[0] = q, v, parameters[batch]
+                solver.propagate_until(ends[batch])
+                found[:, batch] = solver.state
+            return found
 
         return solve
 

@@ -31,9 +31,9 @@ from lagjax.numerics.runge_kutta import Dopri8, Tsit5
 
 # isort: split
 # Many motions.
+from lagjax.sweeps.engine import sweep
 from lagjax.sweeps.lanes import Status
 from lagjax.sweeps.result import Sweep, open_sweep
-from lagjax.sweeps.sweep import sweep
 
 # isort: split
 # Error against run time.

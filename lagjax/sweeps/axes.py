@@ -18,8 +18,14 @@ class Axes(eqx.Module):
     The flat index runs over the last axis first; with `zipped` axes all of them move together.
     """
 
-    values: dict[str, Any]
+    names: tuple[str, ...] = eqx.field(static=True)
+    arrays: tuple[Any, ...]
     zipped: bool = eqx.field(static=True)
+
+    @property
+    def values(self) -> dict[str, Any]:
+        """The values by name. Not a field: JAX would sort the names, and their order is that of the indices."""
+        return dict(zip(self.names, self.arrays))
 
     @property
     def dims(self) -> dict[str, int]:
@@ -39,9 +45,9 @@ class Axes(eqx.Module):
 
     def at(self, index) -> dict[str, Any]:
         """The point at a flat index, traced or not."""
-        places = [index] * len(self.values) if self.zipped else _unravelled(index, self.shape)
+        places = [index] * len(self.names) if self.zipped else _unravelled(index, self.shape)
         take = lambda x, i: x[i] if isinstance(x, np.ndarray) else jax.lax.dynamic_index_in_dim(x, i, keepdims=False)
-        return {name: take(x, i) for (name, x), i in zip(self.values.items(), places)}
+        return {name: take(x, i) for name, x, i in zip(self.names, self.arrays, places)}
 
     def words(self, index: int) -> str:
         """The point at a flat index as a person writes it."""
@@ -86,7 +92,7 @@ def axes_of(axes: Any, zipped: bool) -> Axes:
             f"zipped axes must be of one length: {told}.\n"
             "Usual cause: a grid was meant.\nFix: leave zipped=True out, or cut the axes to one length."
         )
-    found = Axes(values, zipped)
+    found = Axes(tuple(values), tuple(values.values()), zipped)
     if found.size > jnp.iinfo(index_dtype()).max:
         raise ValueError(
             f"{found.size} points are more than {index_dtype()} can count.\n"

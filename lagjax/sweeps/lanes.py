@@ -79,8 +79,8 @@ def compiled(run: Callable, axes: Axes, chunk: int, devices: Sequence, layout: s
     """Compile a sweep's program for chunks of some length, split between the devices."""
     point = point_of(run)
 
-    def lanes(values, indices):
-        at = lambda index: point(Axes(values, axes.zipped).at(index))
+    def lanes(axes, indices):
+        at = lambda index: point(axes.at(index))
         return jax.lax.map(at, indices) if layout == "in turn" else jax.vmap(at)(indices)
 
     function = lanes
@@ -89,12 +89,12 @@ def compiled(run: Callable, axes: Axes, chunk: int, devices: Sequence, layout: s
         function = jax.shard_map(lanes, mesh=mesh, in_specs=(PartitionSpec(), split), out_specs=split, check_vma=False)
     shaped = partial(jax.tree.map, lambda x: jax.ShapeDtypeStruct(np.shape(x), x.dtype))
     indices = jax.ShapeDtypeStruct((chunk,), index_dtype())
-    traced = jax.jit(function).trace(shaped(axes.values), indices)
+    traced = jax.jit(function).trace(shaped(axes), indices)
     shapes, _ = traced.out_info
     program = traced.lower().compile()
     memory = program.memory_analysis()
     working = 0 if memory is None else memory.temp_size_in_bytes + memory.output_size_in_bytes
-    placed = jax.device_put(axes.values, None if len(devices) > 1 else devices[0])
+    placed = jax.device_put(axes, None if len(devices) > 1 else devices[0])
 
     def call(indices):
         """(values, status) at some flat indices, as NumPy arrays; no more than `chunk`."""

@@ -21,15 +21,15 @@ class Sweep:
     - `values`: what `run` returned, each leaf with the axes in front (NumPy). NaN where a point failed. Of a sweep with
       a store they are read from it when asked for.
     - `status`: a `Status` of arrays in the shape of the axes; `ok` where the values are to be trusted.
-    - `how`: what ran it, in words; `seconds` how long it took.
+    - `how`: what ran it, in words; `ran` how many points this call computed, in how many `seconds`.
     """
 
     def __init__(
-        self, axes: Axes, values: PyTree | Callable, status: Status, how: str, seconds: float, again: Callable
+        self, axes: Axes, values: PyTree | Callable, status: Status, how: str, ran: int, seconds: float, again: Callable
     ):
         self.axes = axes
         self.status = Status(*(x.reshape(axes.shape) for x in status))
-        self.how, self.seconds = how, seconds
+        self.how, self.ran, self.seconds = how, ran, seconds
         self._values, self._again = values, again
 
     @property
@@ -172,8 +172,7 @@ class Sweep:
         if residual.any():
             rows.append(("worst constraint residual", f"{residual.max():.1e} (relative)"))
         rows.append(("values", ", ".join(self._shapes())))
-        run = int(np.sum(self.status.result != NOT_RUN))
-        speed = f"; {self.seconds:.3g} s, {run / self.seconds:,.0f} points/s" if self.seconds else ""
+        speed = f"; {self.seconds:.3g} s, {self.ran / self.seconds:,.0f} points/s" if self.ran else ""
         rows.append(("run", f"{self.how}{speed}"))
         width = max(len(label) for label, _ in rows)
         return "\n".join(["Sweep", *(f"  {label:<{width}}  {value}" for label, value in rows)])
@@ -206,7 +205,7 @@ def open_sweep(path) -> Sweep:
     values = Stored(store, None)
     missing = len(store.missing())
     how = f"from {path}" + (f", of which {missing} blocks are missing" if missing else "")
-    return Sweep(store.axes(), values, status, how, 0.0, _cannot)
+    return Sweep(store.axes(), values, status, how, 0, 0.0, _cannot)
 
 
 def _cannot(swept, run, indices):

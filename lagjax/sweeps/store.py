@@ -110,7 +110,8 @@ class Store:
     def axes(self) -> Axes:
         """The axes as they were written."""
         read = lambda name: np.asarray(self.group[f"axes/{name}"][...])
-        return Axes({name: read(name) for name in self.about["names"]}, self.about["zipped"])
+        names = tuple(self.about["names"])
+        return Axes(names, tuple(map(read, names)), self.about["zipped"])
 
     def values(self, like=None):
         """The values of all points (points, ...): in the structure of `like`, or in a dictionary by name."""
@@ -125,17 +126,26 @@ class Store:
         return Status(*(np.asarray(self.group[f"status/{name}"][...]) for name in Status._fields))
 
 
+def chunk_of(path) -> int:
+    """The points of a call of the program that a store was begun with."""
+    return _existing(path).about["fingerprint"]["chunk"]
+
+
+def _existing(path):
+    try:
+        return Store(path)
+    except (KeyError, FileNotFoundError, ValueError) as error:
+        raise ValueError(
+            f"{path} exists, and is no store of a sweep.\nFix: another path, or remove it if it is not needed."
+        ) from error
+
+
 def open_store(path, axes: Axes, program: Program, layout: str, block: int) -> Store:
     """Open the store of a sweep, made where there is none; refuse one that belongs to another sweep."""
     wanted = fingerprint(axes, program, layout)
     if not Path(path).exists():
         _create(Path(path), axes, program, wanted, block)
-    try:
-        store = Store(path)
-    except (KeyError, FileNotFoundError, ValueError) as error:
-        raise ValueError(
-            f"{path} exists, and is no store of a sweep.\nFix: another path, or remove it if it is not needed."
-        ) from error
+    store = _existing(path)
     if differences := _differences(store.about["fingerprint"], wanted):
         raise ValueError(
             f"{path} belongs to another sweep, and is left as it is:\n"

@@ -18,7 +18,7 @@ from jaxtyping import ArrayLike
 from lagjax.sweeps.axes import axes_of
 from lagjax.sweeps.lanes import LAYOUTS, NOT_RUN, STATUS_TYPES, Program, Status, compiled
 from lagjax.sweeps.result import Stored, Sweep
-from lagjax.sweeps.store import open_store
+from lagjax.sweeps.store import chunk_of, open_store
 
 # Points for one call of the compiled program. On a CPU a call costs 0.2 ms, and more gains nothing; a GPU is filled.
 CHUNK = {"cpu": 1024, "gpu": 65536}
@@ -26,6 +26,8 @@ CHUNK = {"cpu": 1024, "gpu": 65536}
 CHUNKS_EACH = 4
 # A block of a store is written about so often, and holds no more than this.
 BLOCK_SECONDS, BLOCK_BYTES = 2.0, 256e6
+# Points whose steps tell the order of the rest.
+PILOTS = 256
 # Of the memory that is free.
 FILL_AT_MOST = 0.8
 
@@ -40,6 +42,7 @@ def sweep(
     chunk: int | None = None,
     layout: str = "together",
     devices: list | None = None,
+    sort: bool | None = None,
     workers: int | None = None,
     progress: bool | None = None,
 ) -> Sweep:
@@ -74,6 +77,8 @@ def sweep(
 
     - `chunk`: points for one call of the compiled program.
     - `layout`: `"together"` (`vmap`, in which `integrate` takes small systems one by one on a CPU) or `"in turn"`.
+    - `sort`: first run a few points and then all in the order of their steps, so that a few long lanes do not hold the
+      rest; by default where lanes run in step, which is not on a CPU.
     - `devices`: JAX devices to split each chunk between; by default all.
     - `workers`: chunks at a time; by default the cores of the CPU, or two.
 
@@ -89,39 +94,74 @@ def sweep(
     platform = devices[0].platform
     cores = _cores() if platform == "cpu" else 2
     workers = (cores if len(devices) == 1 else 2) if workers is None else workers
-    if chunk is None:
+    if chunk is None and store is not None and Path(store).exists():
+        # What was begun on other cores goes on as it was begun.
+        chunk = chunk_of(store)
+    elif chunk is None:
         chunk = min(CHUNK.get(platform, CHUNK["gpu"]), math.ceil(axes.size / (CHUNKS_EACH * workers)))
     chunk = math.ceil(chunk / len(devices)) * len(devices)
     program = compiled(run, axes, chunk, devices, layout)
     _check_memory(axes, program, workers, store, platform)
-    engine = _Engine(program, workers, _words(platform, devices, workers, layout, chunk), layout, devices)
+    sort = platform != "cpu" if sort is None else sort
+    engine = _Engine(program, workers, sort, layout, devices)
     if store is None:
         return _in_memory(engine, run, axes, np.arange(axes.size), None, progress)
     return _in_store(engine, axes, store, part, progress)
 
 
 class _Engine:
-    def __init__(self, program: Program, workers, words, layout, devices):
-        self.program, self.workers, self.words = program, workers, words
+    """A compiled program and how it is called."""
+
+    def __init__(self, program: Program, workers, sort, layout, devices):
+        self.program, self.workers, self.sort = program, workers, sort
         self.layout, self.devices = layout, devices
 
+    @property
+    def words(self):
+        """How it is called, as a person says it."""
+        where = (
+            self.devices[0].platform if len(self.devices) == 1 else f"{len(self.devices)} {self.devices[0].platform}s"
+        )
+        by_cost = ", sorted by cost" if self.sort else ""
+        of_workers = f"{self.workers} worker{'s' * (self.workers > 1)}"
+        return f"{where}, {of_workers}, lanes {self.layout}, chunks of {self.program.chunk}{by_cost}"
+
+    def with_run(self, run, axes, count):
+        """The same for another run, over `count` points."""
+        devices = len(self.devices)
+        chunk = min(self.program.chunk, math.ceil(count / self.workers / devices) * devices)
+        return _Engine(
+            compiled(run, axes, chunk, self.devices, self.layout), self.workers, self.sort, self.layout, self.devices
+        )
+
     def over(self, indices):
-        """(which of them, values, status) of the chunks of some indices as they are finished, in any order."""
-        starts = range(0, len(indices), self.program.chunk)
-        task = lambda start: (start, *self.program.call(indices[start : start + self.program.chunk]))
-        waiting = iter(starts)
+        """(places among some indices, values, status) of chunks of them as they are finished, in any order."""
+        chunk, order = self.program.chunk, self._order(indices)
+        waiting = (order[start : start + chunk] for start in range(0, len(indices), chunk))
+        task = lambda places: (places, *self.program.call(indices[places]))
         pool = ThreadPoolExecutor(self.workers)
         try:
             # No more than a few at a time: what is finished and not taken yet would fill the memory.
-            running = {pool.submit(task, start) for start in islice(waiting, 2 * self.workers)}
+            running = {pool.submit(task, places) for places in islice(waiting, 2 * self.workers)}
             while running:
                 done, running = wait(running, return_when=FIRST_COMPLETED)
                 for future in done:
-                    running |= {pool.submit(task, start) for start in islice(waiting, 1)}
-                    start, values, status = future.result()
-                    yield slice(start, start + len(status.result)), values, status
+                    running |= {pool.submit(task, places) for places in islice(waiting, 1)}
+                    yield future.result()
         finally:
             pool.shutdown(wait=True, cancel_futures=True)
+
+    def _order(self, indices):
+        """The places of some indices, sorted by the steps that a few of them took, where lanes wait for each other."""
+        places = np.arange(len(indices))
+        if not self.sort or len(indices) < 2 * self.program.chunk:
+            return places
+        few = places[:: max(1, len(indices) // min(self.program.chunk, PILOTS))]
+        steps = np.concatenate([
+            self.program.call(indices[few[i : i + self.program.chunk]])[1].steps
+            for i in range(0, len(few), self.program.chunk)
+        ])  # fmt: skip
+        return np.argsort(np.interp(places, few, steps), kind="stable")
 
 
 def _in_memory(engine, run, axes, indices, before, progress):
@@ -136,8 +176,8 @@ def _in_memory(engine, run, axes, indices, before, progress):
     done = 0
     with _meter(len(indices), progress) as meter:
         try:
-            for here, found, how in engine.over(indices):
-                at = indices[here]
+            for places, found, how in engine.over(indices):
+                at = indices[places]
                 for whole, some in zip(jax.tree.leaves((values, status)), jax.tree.leaves((found, how))):
                     whole[at] = some
                 done += len(at)
@@ -150,22 +190,15 @@ def _in_memory(engine, run, axes, indices, before, progress):
         if len(which) == 0:
             return swept
         flat = jax.tree.map(lambda x: x.reshape(axes.size, *x.shape[len(axes.shape) :]), (swept.values, swept.status))
-        rerun = engine
-        if other is not None:
-            chunk = min(
-                engine.program.chunk, math.ceil(len(which) / engine.workers / len(engine.devices)) * len(engine.devices)
+        rerun = engine if other is None else engine.with_run(other, axes, len(which))
+        if jax.tree.structure(rerun.program.values) != jax.tree.structure(engine.program.values):
+            raise ValueError(
+                f"this run returns another structure than the sweep has: {jax.tree.structure(rerun.program.values)}, "
+                f"not {jax.tree.structure(engine.program.values)}.\nFix: return the same, computed with other settings."
             )
-            program = compiled(other, axes, chunk, engine.devices, engine.layout)
-            if jax.tree.structure(program.values) != jax.tree.structure(engine.program.values):
-                raise ValueError(
-                    "this run returns another structure than the sweep has: "
-                    f"{jax.tree.structure(program.values)}, not {jax.tree.structure(engine.program.values)}.\n"
-                    "Fix: return the same, computed with other settings."
-                )
-            rerun = _Engine(program, engine.workers, engine.words, engine.layout, engine.devices)
         return _in_memory(rerun, other or run, axes, which, flat, progress)
 
-    return Sweep(axes, values, status, engine.words, seconds, again)
+    return Sweep(axes, values, status, engine.words, done, seconds, again)
 
 
 def _in_store(engine, axes, path, part, progress):
@@ -181,11 +214,11 @@ def _in_store(engine, axes, path, part, progress):
             for number in missing:
                 indices = np.arange(number * block, number * block + length(number))
                 whole = None
-                for here, found, how in engine.over(indices):
+                for places, found, how in engine.over(indices):
                     if whole is None:
                         whole = jax.tree.map(lambda x: np.empty((len(indices), *x.shape[1:]), x.dtype), (found, how))
                     for every, some in zip(jax.tree.leaves(whole), jax.tree.leaves((found, how))):
-                        every[here] = some
+                        every[places] = some
                     meter.update(len(how.result))
                 store.write(number, *whole)
                 done += len(indices)
@@ -199,7 +232,8 @@ def _in_store(engine, axes, path, part, progress):
         )
 
     here = f"{engine.words}, in {path}"
-    return Sweep(axes, Stored(store, engine.program.values), store.status(), here, time.perf_counter() - started, again)
+    seconds = time.perf_counter() - started
+    return Sweep(axes, Stored(store, engine.program.values), store.status(), here, done, seconds, again)
 
 
 def _block(engine, axes, part):
@@ -260,11 +294,6 @@ def _free_memory():
 def _cores():
     """The cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-def _words(platform, devices, workers, layout, chunk):
-    where = f"{len(devices)} {platform} devices" if len(devices) > 1 else f"{platform}"
-    return f"{where}, {workers} worker{'s' * (workers > 1)}, lanes {layout}, chunks of {chunk}"
 
 
 def _tell_interrupted(done, total, then):

@@ -1,0 +1,287 @@
+"""How fast is a sweep, and what does it lose?
+
+    trajectories/s   the bead on a rotating hoop at 1,000 speeds of the hoop, 100 of its own periods each, ours over
+                     another's; both as loose as the error asked for allows on every lane (`loosest`)
+    spread lanes     speeds from 0.5 to 20 for one span of time, beside the sum of what each takes alone
+    short lanes      a sweep with statuses, labels and progress, beside a loop over a bare `jax.vmap`
+    layout           `integrate` under `vmap` beside everything one lane after the other
+    killed           a sweep with a store, by SIGKILL, and begun again: points that were computed twice, in blocks
+    memory           of a process with a sweep of 10 million numbers
+
+The error is that of angle and rate against elliptic functions, in radians, the largest over lanes and outputs. Sweeps
+have one worker, but where two cores are asked for; pin the process to one core for all the other rows. What is timed is
+a compiled sweep that runs all its points again. A tool that is not installed is skipped by name (`peers.py`).
+
+    python benchmarks/sweep.py [--json FILE] [--only TEXT]
+"""
+
+import contextlib
+import io
+import math
+import multiprocessing
+import os
+import tempfile
+import time
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import peers
+from against_peers import LADDER, Once, loosest
+from measure import in_turn, main, row, skipped
+
+import lagjax as lj
+from lagjax.scenes import bead_on_hoop
+from lagjax.sweeps.store import Store
+
+jax.config.update("jax_enable_x64", True)
+
+LANES, CHUNK, PERIODS, OUTPUTS, START = 1000, 250, 100, 100, 1.0
+PARAMS = bead_on_hoop.PARAMS
+BELOW = PARAMS["g"] / PARAMS["a"]
+# Of the natural rate. The homoclinic orbit through START is at 1 / cos(START / 2) = 1.14, where periods are infinite.
+SPEEDS = np.concatenate([np.linspace(0.5, 1.0, LANES // 4), np.linspace(1.3, 3.0, LANES - LANES // 4)])
+OMEGA = math.sqrt(BELOW) * SPEEDS
+ENDS = PERIODS * np.asarray(bead_on_hoop.exact_period(PARAMS | {"omega": OMEGA}, START))
+ERROR, SMALL_ERROR = 1e-6, 1e-10
+SPREAD, SPAN = np.linspace(0.5, 20.0, LANES), 20.0
+SHORT, SHORT_CHUNK = 100_000, 1000
+# Enough for several blocks, and a kill inside of one.
+STORED, KILLED_AT = 10_000, 0.4
+MANY = 10**7
+
+
+def released(omega, ts, **settings):
+    """ψ and ψ' at all times but the first, by our default from the Lagrangian."""
+    trajectory = lj.integrate(
+        bead_on_hoop.system, START, 0.0, PARAMS | {"omega": omega}, ts=ts, throw=False, **settings
+    )  # fmt: skip
+    return trajectory.q[1:], trajectory.v[1:]
+
+
+def error(state, omega=OMEGA, ends=ENDS):
+    """How far (ψ, ψ'), each (lanes,) or (lanes, outputs), are off at equidistant outputs."""
+    q, v = (np.reshape(x, (len(omega), -1)) for x in state)
+    params = PARAMS | {"omega": omega[:, None]}
+    ts = np.reshape(ends, (-1, 1)) * np.linspace(0.0, 1.0, q.shape[1] + 1)[1:]
+    psi, rate = bead_on_hoop.exact_motion(params, START, ts)
+    per_radian = bead_on_hoop.exact_period(params, START) / (2 * np.pi)
+    return float(np.max([np.abs(q - psi), np.abs(v - rate) * per_radian]))
+
+
+def by_sweep(outputs=1, tolerances=LADDER, **settings):
+    """`prepare(tolerance)` for a sweep: compiled once, with the tolerances as an axis of which one is run again."""
+    tolerances, lanes = np.asarray(tolerances), np.stack([OMEGA, ENDS], axis=1)
+
+    def run(point):
+        omega, end = point["lane"]
+        ts = end * np.linspace(0.0, 1.0, outputs + 1)
+        return released(omega, ts, rtol=point["tolerance"], atol=point["tolerance"])
+
+    axes = {"tolerance": tolerances, "lane": lanes}
+    swept = lj.sweep(run, axes, progress=False, **({"workers": 1, "chunk": CHUNK} | settings))
+
+    def prepare(tolerance):
+        (place,) = np.flatnonzero(tolerances == tolerance)
+        where = (tolerances == tolerance)[:, None]
+        return lambda: [x[place] for x in swept.resweep(where=where).values]
+
+    return prepare
+
+
+def per_second(what, ours, theirs, target, repeats=15):
+    """The row of trajectories per second by one solve over those by another, each (solve, tolerance, error)."""
+    times = in_turn(theirs[0], ours[0], repeats=repeats)
+    ratio, of_minima = times.ratio()
+    other_us, us = (1e6 * seconds / LANES for seconds in times.medians)
+    return row(
+        what, ratio, target, "more", minima=of_minima, us=us, other_us=other_us, error=ours[2], other_error=theirs[2],
+        tolerance=ours[1], other_tolerance=theirs[1],
+    )  # fmt: skip
+
+
+def rate_rows(wanted):
+    """The bead on the hoop in 1,000 lanes."""
+    begun = Once(by_sweep)
+    ours = {allowed: Once(lambda e=allowed: loosest(begun.it, error, e)) for allowed in (ERROR, SMALL_ERROR)}
+    squares = OMEGA**2
+
+    def by_numba():
+        acceleration = lambda q, v, square: math.sin(q) * (square * math.cos(q) - BELOW)
+        return peers.numba_dopri8_lanes(acceleration, START, 0.0, ENDS, squares)
+
+    def by_heyoka():
+        acceleration = lambda q, v, hy, square: hy.sin(q) * (square * hy.cos(q) - BELOW)
+        return peers.heyoka_lanes(acceleration, START, 0.0, ENDS, squares)
+
+    def by_diffrax():
+        field = lambda t, y, square: (y[1], jnp.sin(y[0]) * (square * jnp.cos(y[0]) - BELOW))
+        return peers.diffrax_lanes(field, (START, 0.0), ENDS, squares, CHUNK)
+
+    tools = [
+        ("numba Dopri8", by_numba, ERROR, 1.2, 15),
+        ("heyoka in batches", by_heyoka, ERROR, 0.45, 15),
+        ("heyoka in batches", by_heyoka, SMALL_ERROR, 0.2, 15),
+        ("diffrax under vmap", by_diffrax, ERROR, 4.5, 5),
+    ]
+    for name, build, allowed, target, repeats in tools:
+        what = f"trajectories/s, error {allowed:.0e}: lagjax / {name}"
+        if wanted(what):
+            try:
+                theirs = loosest(build(), error, allowed)
+            except (ImportError, ArithmeticError) as reason:
+                yield skipped(what, str(reason))
+                continue
+            yield per_second(what, ours[allowed].it, theirs, target, repeats)
+
+    def with_tolerance(**settings):
+        tolerance = ours[ERROR].it[1]
+        solve = by_sweep(tolerances=[tolerance], **settings)(tolerance)
+        return solve, tolerance, error(solve())
+
+    what = f"trajectories/s: {OUTPUTS} outputs / without"
+    if wanted(what):
+        yield per_second(what, with_tolerance(outputs=OUTPUTS), with_tolerance(), 0.8)
+    what = "trajectories/s: two cores / one"
+    if wanted(what):
+        if not hasattr(os, "sched_getaffinity") or len(os.sched_getaffinity(0)) < 2:
+            yield skipped(what, "only one core may be used")
+        else:
+            yield per_second(what, with_tolerance(workers=2, chunk=CHUNK // 2), with_tolerance(), 1.8)
+    what = "layout: lanes together / in turn"
+    if wanted(what):
+        yield per_second(what, with_tolerance(), with_tolerance(layout="in turn"), None)
+
+
+def spread_rows(wanted):
+    """Lanes of very different cost."""
+    what = "spread lanes: sweep / sum of each alone"
+    if not wanted(what):
+        return
+    run = lambda point: released(point["omega"], np.array([0.0, SPAN]), rtol=1e-8, atol=1e-8)
+    swept = lj.sweep(run, {"omega": SPREAD}, workers=1, progress=False)
+    alone = jax.jit(run)
+    points = [{"omega": jnp.asarray(omega)} for omega in SPREAD]
+    one_by_one = lambda: [jax.block_until_ready(alone(point)) for point in points]
+    together = lambda: swept.resweep(where=True).values
+    times = in_turn(together, one_by_one)
+    ratio, of_minima = times.ratio()
+    us, other_us = (1e6 * seconds / LANES for seconds in times.medians)
+    errors = [error(state, SPREAD, SPAN) for state in (together(), np.moveaxis(one_by_one(), 0, 1))]
+    yield row(
+        what, ratio, 1.1, minima=of_minima, us=us, other_us=other_us, error=errors[0], other_error=errors[1],
+        least_steps=int(swept.status.steps.min()), most_steps=int(swept.status.steps.max()),
+    )  # fmt: skip
+
+
+def short_rows(wanted):
+    """Lanes that take so little that everything around them shows."""
+    what = f"{SHORT:,} short lanes: sweep / bare vmap"
+    if not wanted(what):
+        return
+    end = 1 / math.sqrt(BELOW)
+    omegas = math.sqrt(BELOW) * np.linspace(0.5, 3.0, SHORT)
+    run = lambda point: released(point["omega"], np.array([0.0, end]))
+    with contextlib.redirect_stderr(io.StringIO()):
+        swept = lj.sweep(run, {"omega": omegas}, workers=1, chunk=SHORT_CHUNK, progress=True)
+    program = jax.jit(jax.vmap(run))
+
+    def by_sweep():
+        with contextlib.redirect_stderr(io.StringIO()):
+            return swept.resweep(where=True).values
+
+    def by_vmap():
+        found = np.empty((2, SHORT, 1))
+        for start in range(0, SHORT, SHORT_CHUNK):
+            here = slice(start, start + SHORT_CHUNK)
+            found[:, here] = program({"omega": omegas[here]})
+        return found
+
+    times = in_turn(by_sweep, by_vmap)
+    ratio, of_minima = times.ratio()
+    us, other_us = (1e6 * seconds / SHORT for seconds in times.medians)
+    errors = [error(state(), omegas, end) for state in (by_sweep, by_vmap)]
+    yield row(what, ratio, 1.05, minima=of_minima, us=us, other_us=other_us, error=errors[0], other_error=errors[1])
+
+
+def stored(path, log):
+    """A sweep with a store that writes the number of every point it computes to a file."""
+    omegas = np.resize(OMEGA, STORED)
+    with open(log, "ab", buffering=0) as file:
+
+        def told(number):
+            file.write(np.asarray(number).tobytes())
+            return number
+
+        def run(point):
+            shape = jax.ShapeDtypeStruct((), point["number"].dtype)
+            number = jax.pure_callback(told, shape, point["number"], vmap_method="expand_dims")
+            ts = np.array([0.0, SPAN])
+            # Nothing may come of a value that is never asked for.
+            return released(point["omega"] + 0.0 * number, ts, rtol=1e-10, atol=1e-10)
+
+        axes = {"omega": omegas, "number": np.arange(STORED)}
+        return lj.sweep(run, axes, zipped=True, store=path, chunk=CHUNK, workers=1, progress=False)
+
+
+def killed_rows(wanted):
+    """A sweep that is killed and begun again."""
+    what = "killed: points computed twice / a block"
+    if not wanted(what):
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        path, log = Path(folder, "store"), Path(folder, "log")
+        computed = lambda: log.stat().st_size // 8 if log.exists() else 0
+        process = multiprocessing.get_context("spawn").Process(target=stored, args=(path, log))
+        process.start()
+        while process.is_alive() and computed() < KILLED_AT * STORED:
+            time.sleep(0.01)
+        process.kill()
+        process.join()
+        before, store = computed(), Store(path)
+        missing, block = len(store.missing()), store.block
+        swept = stored(path, log)
+        twice = computed() - STORED
+        off = error(swept.values, np.resize(OMEGA, STORED), SPAN)
+        yield row(
+            what, twice / block, 1, block=block, before=before, missing_blocks=missing, twice=twice,
+            after=int(swept.ran), seconds=swept.seconds, error=off,
+        )  # fmt: skip
+
+
+def many():
+    """A sweep of many numbers: the most memory that its process had, in GB; its seconds, and its error."""
+    omegas = np.linspace(0.0, 0.9 * math.sqrt(BELOW), MANY)
+    run = lambda point: 2 * np.pi / bead_on_hoop.frequency(bead_on_hoop.small_motion(PARAMS | point).bottom)
+    swept = lj.sweep(run, {"omega": omegas}, workers=1, progress=False)
+    off = max(
+        float(np.max(np.abs(period * np.sqrt(BELOW - omega**2) / (2 * np.pi) - 1)))
+        for period, omega in zip(np.split(swept.values, 100), np.split(omegas, 100))
+    )
+    told = dict(line.split(":") for line in Path("/proc/self/status").read_text().splitlines())
+    return int(told["VmHWM"].split()[0]) * 1024 / 1e9, swept.seconds, off
+
+
+def memory_rows(wanted):
+    """A sweep of ten million numbers."""
+    what = f"memory: {MANY:.0e} points, GB"
+    if not wanted(what):
+        return
+    if not Path("/proc/self/status").exists():
+        yield skipped(what, "the system does not tell the most memory that a process had")
+        return
+    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
+        peak, seconds, off = pool.submit(many).result()
+    yield row(what, peak, 2, seconds=seconds, points_per_s=MANY / seconds, error=off)
+
+
+def rows(wanted):
+    """Rates, spread lanes, short lanes, a kill, memory."""
+    for of_question in (rate_rows, spread_rows, short_rows, killed_rows, memory_rows):
+        yield from of_question(wanted)
+
+
+if __name__ == "__main__":
+    main(rows, __doc__)

@@ -1,0 +1,60 @@
+"""What varies: order, zipping, slices, and what is no axis."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from lagjax.sweeps.axes import axes_of
+
+GRID = {"a": np.array([1.0, 2.0]), "b": np.array([10.0, 20.0, 30.0]), "c": np.arange(8.0).reshape(4, 2)}
+
+
+def test_the_last_axis_is_the_fastest():
+    """As NumPy's indices run; traced and not; the slices of an axis of vectors."""
+    axes = axes_of(GRID, zipped=False)
+    assert axes.shape == (2, 3, 4) and axes.size == 24
+    at = jax.jit(lambda index: axes.at(index))
+    for index in (0, 7, 23):
+        i, j, k = np.unravel_index(index, axes.shape)
+        for point in (axes.at(index), at(index)):
+            assert (point["a"], point["b"]) == (GRID["a"][i], GRID["b"][j])
+            assert np.array_equal(point["c"], GRID["c"][k])
+
+
+def test_zipped_axes_move_together():
+    """One dimension, the point."""
+    axes = axes_of({"a": jnp.arange(3.0), "b": 2 * jnp.arange(3.0)}, zipped=True)
+    assert axes.dims == {"point": 3}
+    assert axes.at(2) == {"a": 2.0, "b": 4.0}
+    assert axes.words(1) == "a = 1, b = 2"
+
+
+def test_numbers_become_those_of_jax():
+    """A list of integers stays one of integers, floats are in JAX's dtype."""
+    axes = axes_of({"n": [1, 2], "x": [0.5, 1.0]}, zipped=False)
+    assert axes.values["n"].dtype == np.int64 and axes.values["x"].dtype == np.float64
+
+
+@pytest.mark.parametrize(
+    ("axes", "zipped", "error", "words"),
+    [
+        ([1.0, 2.0], False, TypeError, "must be a dictionary of arrays by name"),
+        ({}, False, TypeError, "must be a dictionary"),
+        ({"omega": 3.0}, False, ValueError, "axis 'omega' must be an array of at least one value"),
+        ({"omega": []}, False, ValueError, "axis 'omega'"),
+        ({"omega": ["fast"], "g": [None]}, False, ValueError, "axis 'g'"),
+        ({"omega": [1.0, 2.0], "g": [1.0]}, True, ValueError, "'omega' has 2, 'g' has 1"),
+    ],
+)
+def test_what_is_no_axis(axes, zipped, error, words):
+    """By name, with the fix."""
+    with pytest.raises(error, match=words) as refusal:
+        axes_of(axes, zipped)
+    assert "Fix:" in str(refusal.value)
+
+
+def test_inside_a_program():
+    """A sweep compiles for itself."""
+    with pytest.raises(TypeError, match="axis 'x' is being traced"):
+        jax.jit(lambda x: axes_of({"x": x}, False).size)(jnp.arange(3.0))

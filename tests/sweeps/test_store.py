@@ -1,0 +1,137 @@
+"""Sweeps on disk: resumed, refused, killed, shared."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import lagjax as lj
+from lagjax.sweeps.store import Store
+from tests.sweeps import worker
+
+POINTS = 2000
+
+
+def swept(store=None, points=POINTS, **settings):
+    """The worker's sweep in this process."""
+    return lj.sweep(worker.run, worker.axes(points), store=store, chunk=32, workers=1, progress=False, **settings)
+
+
+@pytest.fixture(scope="module")
+def whole():
+    """Without a store."""
+    return swept()
+
+
+def same(found, whole):
+    """Bit for bit: a resumed sweep runs the same program."""
+    np.testing.assert_array_equal(found.values, whole.values)
+    np.testing.assert_array_equal(found.status.result, whole.status.result)
+
+
+def started(store, k=0, n=1, points=POINTS):
+    """The worker's process."""
+    root = Path(lj.__file__).parents[1]
+    environment = os.environ | {"PYTHONPATH": str(root)}
+    command = [sys.executable, worker.__file__, str(store), str(k), str(n), str(points)]
+    return subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True)
+
+
+def test_written_resumed_and_read(tmp_path, whole):
+    """A second call computes nothing; the store opens without what ran it."""
+    path = tmp_path / "sweep"
+    first = swept(path)
+    assert first.ran == POINTS
+    same(first, whole)
+    second = swept(path)
+    assert second.ran == 0
+    same(second, whole)
+    alone = lj.open_sweep(path)
+    assert alone.dims == whole.dims and alone.counts() == whole.counts()
+    np.testing.assert_array_equal(alone.values["value"], whole.values)
+    assert alone.to_xarray()["value"].dims == ("g", "angle")
+    with pytest.raises(ValueError, match="does not know what ran it"):
+        alone.resweep()
+
+
+def test_only_what_is_missing(tmp_path, whole):
+    """Blocks that are not marked are computed again, whatever stands in them."""
+    path = tmp_path / "sweep"
+    swept(path)
+    store = Store(path)
+    store.group["done"][1] = 0
+    store.group["values/value"][store.block : 2 * store.block] = -1.0
+    again = swept(path)
+    assert again.ran == store.block
+    same(again, whole)
+
+
+def test_another_sweep_is_refused(tmp_path):
+    """Other values, another function, other settings: each in words, and the store stays as it is."""
+    path, axes = tmp_path / "sweep", {"x": jnp.arange(6.0)}
+    run = lambda scale: lambda point: scale * point["x"]
+    lj.sweep(run(2.0), axes, store=path, chunk=2, progress=False)
+    cases = [
+        (run(3.0), axes, {}, "run is another function"),
+        (run(2.0), {"x": jnp.arange(6.0) + 1}, {}, "axis 'x' has other values"),
+        (run(2.0), {"x": jnp.arange(7.0)}, {}, "points: x: 6 there, x: 7 here"),
+        (run(2.0), axes, {"chunk": 3}, "chunk: 2 there, 3 here"),
+        (lambda point: (2.0 * point["x"], 1.0), axes, {}, "values 0: None there"),
+    ]
+    for other, over, settings, words in cases:
+        with pytest.raises(ValueError, match="belongs to another sweep") as refusal:
+            lj.sweep(other, over, store=path, progress=False, **settings)
+        assert words in str(refusal.value)
+    assert lj.sweep(run(2.0), axes, store=path, progress=False).ran == 0
+    (tmp_path / "other").mkdir()
+    with pytest.raises(ValueError, match="is no store of a sweep"):
+        lj.sweep(run(2.0), axes, store=tmp_path / "other", progress=False)
+
+
+def blocks_there(path):
+    """How many blocks are marked, 0 before there is a store."""
+    return 0 if not path.exists() else int(np.sum(Store(path).group["done"][:]))
+
+
+def kill_when(process, path, count):
+    """`kill -9` once some blocks are there."""
+    deadline = time.monotonic() + 120
+    while blocks_there(path) < count:
+        assert process.poll() is None and time.monotonic() < deadline
+        time.sleep(0.01)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    process.stdout.close()
+
+
+@pytest.mark.slow
+def test_killed_and_resumed(tmp_path, whole):
+    """At any moment: nothing is lost but the block that was being computed, nothing is corrupted."""
+    path = tmp_path / "sweep"
+    kill_when(started(path), path, 1)
+    kill_when(started(path), path, 2)
+    there = blocks_there(path) * Store(path).block
+    rest = started(path)
+    computed = int(rest.communicate()[0])
+    assert 0 < computed <= POINTS - there
+    same(swept(path), whole)
+
+
+@pytest.mark.slow
+def test_two_processes_one_killed(tmp_path, whole):
+    """Each takes its blocks of one store; the one that died is started again and does only what it had not."""
+    path = tmp_path / "sweep"
+    first, second = started(path, 0, 2), started(path, 1, 2)
+    kill_when(second, path, 1)
+    computed = int(first.communicate()[0])
+    missing = len(Store(path).missing())
+    again = int(started(path, 1, 2).communicate()[0])
+    assert 0 < computed < POINTS and missing > 0 and again <= missing * Store(path).block
+    assert len(Store(path).missing()) == 0
+    same(swept(path), whole)

@@ -1,0 +1,200 @@
+"""Sweeps against loops: values, gradients, steps, statuses; what they print, draw and export."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import lagjax as lj
+from lagjax.motion.reported import reporting
+from lagjax.sweeps import engine
+
+pendulum = lj.System(lambda t, q, v, params: 0.5 * v**2 + params["g"] * jnp.cos(q))
+rod = lj.System(
+    lambda t, q, v, params: 0.5 * (v["x"] ** 2 + v["y"] ** 2) - params["g"] * q["y"],
+    {"rod": lj.Holonomic(lambda t, q, params: q["x"] ** 2 + q["y"] ** 2 - 1.0)},
+)
+TS = jnp.linspace(0.0, 6.0, 4)
+AXES = {"g": jnp.array([1.0, 4.0, 9.0]), "angle": jnp.linspace(0.2, 2.8, 7)}
+OK, MAX_STEPS = int(lj.RESULTS.successful._value), int(lj.RESULTS.max_steps_reached._value)
+
+
+def swing(point, **settings):
+    """A pendulum released at rest."""
+    return lj.integrate(pendulum, point["angle"], 0.0, {"g": point["g"]}, ts=TS, **settings)
+
+
+def quiet(run, axes=AXES, **settings):
+    """A sweep in silence."""
+    return lj.sweep(run, axes, progress=False, **settings)
+
+
+def slope(point):
+    """The derivative of the last angle by g, through a program of its own."""
+    return jax.jit(jax.grad(lambda g: swing({"g": g, "angle": point["angle"]}).q[-1]))(point["g"])
+
+
+def final_angle_and_slope(point):
+    """Two values by name."""
+    traj = swing(point)
+    return {"angle": traj.q[-1], "slope": slope(point), "steps": traj.stats["num_steps"]}
+
+
+def by_loop(run, axes):
+    """Point by point, each alone."""
+    program = jax.jit(run)
+    points = [program({"g": g, "angle": angle}) for g in axes["g"] for angle in axes["angle"]]
+    return jax.tree.map(lambda *x: np.stack(x).reshape(len(axes["g"]), len(axes["angle"])), *points)
+
+
+@pytest.fixture(scope="module")
+def looped():
+    """The loop over the grid."""
+    return by_loop(final_angle_and_slope, AXES)
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [{}, {"layout": "in turn", "workers": 1}, {"chunk": 5, "sort": True}],
+    ids=["default", "in turn", "sorted"],
+)
+def test_same_as_a_loop_and_as_vmap(looped, settings):
+    """Values, gradients, step counts: a lane does not depend on its neighbours."""
+    swept = quiet(final_angle_and_slope, **settings)
+    assert swept.dims == {"g": 3, "angle": 7} and swept.ok.all()
+    np.testing.assert_array_equal(swept.values["steps"], looped["steps"])
+    for name in ("angle", "slope"):
+        np.testing.assert_allclose(swept.values[name], looped[name], rtol=1e-10, atol=1e-12)
+    # The gradient integrates too.
+    assert np.all(swept.status.steps > looped["steps"])
+
+
+def test_a_lane_that_fails_keeps_its_reason():
+    """It is NaN, the others are what they are without it; run again with other settings it is filled in."""
+    few = quiet(lambda point: swing(point, max_steps=22).q[-1])
+    failed = few.status.result == MAX_STEPS
+    assert 0 < failed.sum() < failed.size and set(np.unique(few.status.result)) == {OK, MAX_STEPS}
+    assert np.array_equal(np.isnan(few.values), failed) and np.array_equal(few.ok, ~failed)
+    enough = quiet(lambda point: swing(point).q[-1])
+    np.testing.assert_array_equal(few.values[few.ok], enough.values[few.ok])
+    again = few.resweep(lambda point: swing(point).q[-1])
+    assert again.ran == failed.sum() and again.ok.all()
+    np.testing.assert_allclose(again.values, enough.values, rtol=1e-12)
+    assert np.isnan(few.values).any(), "the first sweep stays as it was"
+    with pytest.raises(ValueError, match="another structure"):
+        few.resweep(lambda point: (point["g"], point["g"]))
+
+
+def test_starts_that_cannot_be_integrated():
+    """Off the constraint, NaN: each lane with its own word, none raises."""
+    start = lambda point: ({"x": point["x"], "y": 0.0}, {"x": 0.0, "y": 0.0})
+    run = lambda point: lj.integrate(rod, *start(point), {"g": point["g"]}, ts=TS).end.q["x"]
+    swept = quiet(run, {"x": jnp.array([1.0, 1.5]), "g": jnp.array([1.0, jnp.nan])})
+    code = lambda name: int(getattr(lj.RESULTS, name)._value)
+    assert swept.status.result.tolist() == [[OK, code("start_not_finite")], [code("start_off_constraints")] * 2]
+    assert np.isfinite(swept.values).tolist() == [[True, False], [False, False]]
+    assert 0 < swept.status.residual[0, 0] < 1e-9
+    assert "does not satisfy the constraints" in repr(swept)
+
+
+def test_a_drifting_motion_is_marked():
+    """Fixed steps that are too long: the values stay, `ok` says not to trust them."""
+    settings = {"stepsize_controller": diffrax.ConstantStepSize(), "dt0": jnp.asarray(0.5), "method": diffrax.Heun()}
+    swept = quiet(lambda point: swing(point, **settings).q[-1], {"g": jnp.array([1.0]), "angle": jnp.array([2.0])})
+    assert not swept.ok.any() and np.isfinite(swept.values).all()
+    assert swept.status.departure > 1 and "what must stay constant changed" in repr(swept)
+
+
+def test_reports_are_found_in_every_kind_of_program():
+    """Plain, under jit, grad, vmap and in a branch of a check; the worst of several counts."""
+    program = lambda wrap: jax.jit(reporting(lambda point: wrap(lambda g: swing({"g": g, "angle": 1.0}).q[-1])(point)))
+    (_, alone) = program(lambda f: f)(4.0)
+    assert int(alone.steps) > 0
+    for wrap in (jax.jit, jax.grad, lambda f: jax.jit(jax.jit(f)), jax.value_and_grad):
+        assert int(program(wrap)(4.0)[1].steps) == int(alone.steps)
+    twice = program(lambda f: lambda g: f(g) + f(g))(4.0)[1]
+    assert int(twice.steps) == 2 * int(alone.steps)
+    some = program(lambda f: lambda g: jax.vmap(f)(jnp.array([g, jnp.nan])))(4.0)[1]
+    assert int(some.result) == int(lj.RESULTS.start_not_finite._value)
+    assert jax.jit(reporting(lambda x: 2 * x))(1.0)[1] is None
+
+
+def test_without_an_integration():
+    """Any function of a point; what is not finite has failed."""
+    swept = quiet(lambda point: {"root": jnp.sqrt(point["x"]), "n": 3}, {"x": jnp.array([4.0, -1.0])})
+    assert swept.values["n"].tolist() == [3, 3] and swept.counts() == {
+        "successful": 1,
+        "The state became NaN or infinite.": 1,
+    }
+
+
+def test_whole_trajectories():
+    """One leaf of `values`, with its times as a dimension."""
+    swept = quiet(lambda point: swing(point))
+    assert swept.values.q.shape == (3, 7, 4)
+    data = swept.to_xarray()
+    assert data["q"].dims == ("g", "angle", "t") and np.array_equal(data["t"], TS)
+    np.testing.assert_array_equal(data["q"].sel(g=4.0).isel(angle=2, t=-1), swept.values.q[1, 2, -1])
+    assert data["result"].dims == ("g", "angle") and data["result"].attrs["flag_meanings"] == ["successful"]
+
+
+def test_zipped_and_labelled():
+    """The dimension is the point, the axes its coordinates."""
+    pairs = {"g": jnp.array([1.0, 4.0, 9.0]), "angle": jnp.array([0.1, 0.2, 0.3])}
+    swept = quiet(lambda point: swing(point).q[-1], pairs, zipped=True)
+    data = swept.to_xarray()
+    assert data["value"].dims == ("point",) and data["g"].dims == ("point",)
+    np.testing.assert_allclose(swept.values, by_loop(lambda point: swing(point).q[-1], pairs).diagonal(), rtol=1e-12)
+
+
+def test_repr_and_pictures():
+    """Counts by status, where it was hardest; a line, a map, small multiples; what has no picture says so."""
+    swept = quiet(lambda point: {"end": swing(point, max_steps=22).q[-1]})
+    shown = repr(swept)
+    for part in (
+        "21: g (3) x angle (7)",
+        "successful",
+        "The maximum number of solver steps",
+        "first not ok",
+        "points/s",
+    ):
+        assert part in shown
+    assert len(swept.plot().axes) == 2
+    assert len(quiet(lambda point: point["g"] ** 2, {"g": jnp.arange(5.0)}).plot().axes) == 1
+    three = quiet(lambda p: p["a"] * p["b"] * p["c"], {k: jnp.arange(1.0, 4.0) for k in "abc"})
+    assert len(three.plot().axes) == 4
+    with pytest.raises(ValueError, match=r"no value with one number a point; a point has 'q' \(4,\)"):
+        quiet(lambda point: {"q": swing(point).q}).plot()
+
+
+def test_interrupted(monkeypatch):
+    """Ctrl-C keeps what is done, and `resweep` does the rest."""
+
+    class Impatient(engine._NoMeter):
+        def update(self, count):
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(engine, "_meter", lambda total, progress: Impatient())
+    with pytest.warns(UserWarning, match=r"interrupted: 4 of 21 points are done and kept"):
+        swept = quiet(lambda point: swing(point).q[-1], chunk=4, workers=1)
+    monkeypatch.undo()
+    assert swept.ran == 4 and swept.counts()["not run"] == 17
+    whole = swept.resweep()
+    assert whole.ran == 17 and whole.ok.all()
+
+
+def test_what_would_not_fit_is_refused():
+    """Before anything runs, with the number."""
+    with pytest.raises(MemoryError, match=r"this sweep needs [\d.e+]+ GB: 1,000,000,000,000 points of \d+ bytes"):
+        quiet(lambda point: point["x"] + point["y"] + jnp.zeros(10), {"x": jnp.zeros(10**6), "y": jnp.zeros(10**6)})
+
+
+def test_bad_settings():
+    """Layout and part."""
+    with pytest.raises(ValueError, match="layout must be one of 'together', 'in turn'"):
+        quiet(lambda point: point["g"], layout="sideways")
+    with pytest.raises(ValueError, match=r"part must be \(k, n\)"):
+        quiet(lambda point: point["g"], part=(2, 2))
+    with pytest.raises(ValueError, match="without a store nobody gets its points"):
+        quiet(lambda point: point["g"], part=(0, 2))

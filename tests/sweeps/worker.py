@@ -1,0 +1,28 @@
+"""A sweep as its own process, for tests that kill it: `worker.py STORE K N POINTS` prints what it computed."""
+
+import sys
+
+import jax
+import jax.numpy as jnp
+
+import lagjax as lj
+
+jax.config.update("jax_enable_x64", True)
+
+pendulum = lj.System(lambda t, q, v, params: 0.5 * v**2 + params["g"] * jnp.cos(q))
+
+
+def run(point):
+    """The angle after a while; where it starts too far out, the steps are used up."""
+    steps = {"max_steps": 400}
+    return lj.integrate(pendulum, point["angle"], 0.0, {"g": point["g"]}, ts=jnp.array([0.0, 60.0]), **steps).q[-1]
+
+
+def axes(points):
+    """Ten values of g, and as many angles as it takes."""
+    return {"g": jnp.linspace(0.5, 20.0, 10), "angle": jnp.linspace(0.1, 3.0, points // 10)}
+
+
+if __name__ == "__main__":
+    store, k, n, points = sys.argv[1], *map(int, sys.argv[2:])
+    print(lj.sweep(run, axes(points), store=store, part=(k, n), chunk=32, workers=1, progress=False).ran)
