@@ -171,7 +171,9 @@ def _solve(system, q0, v0, params, ts, settings, adjoint, written):
     )  # fmt: skip
     # Reverse mode has to look inside.
     if isinstance(adjoint, diffrax.ForwardMode):
-        solution = one_function(solve, *arguments, checked=_has_no_checks_of_its_own(settings.controller), in_turn=True)
+        solution = one_function(
+            solve, *arguments, checked=_has_no_checks_of_its_own(settings.controller), in_blocks=True
+        )
     else:
         solution = solve(*arguments)
     if bare:

@@ -76,9 +76,9 @@ def sweep(
     **How it runs,** which `print(swept)` says:
 
     - `chunk`: points for one call of the compiled program.
-    - `layout`: `"together"` (`vmap`, in which `integrate` takes small systems one by one on a CPU) or `"in turn"`.
+    - `layout`: lanes `"together"` (`vmap`), or one after the other, `"in turn"`.
     - `sort`: first run a few points and then all in the order of their steps, so that a few long lanes do not hold the
-      rest; by default where lanes run in step, which is not on a CPU.
+      rest; by default for lanes together, from 16,000 points on.
     - `devices`: JAX devices to split each chunk between; by default all.
     - `workers`: chunks at a time; by default the cores of the CPU, or two.
 
@@ -102,7 +102,7 @@ def sweep(
     chunk = math.ceil(chunk / len(devices)) * len(devices)
     program = compiled(run, axes, chunk, devices, layout)
     _check_memory(axes, program, workers, store, platform)
-    sort = platform != "cpu" if sort is None else sort
+    sort = layout == "together" and axes.size >= 64 * PILOTS if sort is None else sort
     engine = _Engine(program, workers, sort, layout, devices)
     if store is None:
         return _in_memory(engine, run, axes, np.arange(axes.size), None, progress)

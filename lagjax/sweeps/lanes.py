@@ -1,8 +1,7 @@
 """The compiled program of a sweep: some points, by their flat indices, to values and statuses.
 
-How lanes are laid out is measured in `benchmarks/sweep.py`. Under `vmap` on a CPU `integrate` takes small systems one
-lane after the other, each with its own steps, as one machine function; what surrounds it runs for all lanes at once.
-That is `"together"` below, and the default everywhere. `"in turn"` takes everything one lane after the other.
+Lanes run together, under `vmap`, each with its own steps; on a CPU `integrate` takes 256 of them at a time. `"in turn"`
+takes one after the other, which measures slower nearly everywhere (`benchmarks/sweep.py`), and needs the least memory.
 """
 
 from collections.abc import Callable, Sequence

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from jax import lax
 
+import lagjax.numerics.one_function as one_function_module
 from lagjax.numerics.one_function import fits, one_function, without_checks
 
 
@@ -34,13 +35,15 @@ def test_same_results_and_derivatives():
         jax.grad(lambda x: one_function(lambda x: x**3, x))(TWO[0])
 
 
-def test_lanes_in_turn():
-    """A batch, and a batch of batches, of lanes of different lengths."""
+@pytest.mark.parametrize("block", [2, 4, 256])
+def test_lanes_in_blocks(monkeypatch, block):
+    """A batch, and a batch of batches, of lanes of different lengths, in blocks that they fill and do not fill."""
+    monkeypatch.setattr(one_function_module, "TOGETHER", block)
     x, y = jnp.linspace(1.0, 50.0, 6), jnp.asarray(0.3)
-    in_turn = lambda x, y: one_function(grown, x, y, in_turn=True)
+    in_blocks = lambda x, y: one_function(grown, x, y, in_blocks=True)
     expected = jax.vmap(grown, (0, None))(x, y)
-    np.testing.assert_allclose(jax.jit(jax.vmap(in_turn, (0, None)))(x, y), expected, rtol=1e-14)
-    nested = jax.vmap(jax.vmap(in_turn, (0, None)), (None, 0))
+    np.testing.assert_allclose(jax.jit(jax.vmap(in_blocks, (0, None)))(x, y), expected, rtol=1e-14)
+    nested = jax.vmap(jax.vmap(in_blocks, (0, None)), (None, 0))
     found = jax.jit(nested)(x, jnp.array([0.3, 0.3]))
     np.testing.assert_allclose(found[0][1], expected[0], rtol=1e-14)
 
