@@ -48,18 +48,21 @@ def _solve(inputs, *, solve):
 def _solve_jvp(primals, tangents, *, solve):
     ((x, fixed),), ((dx, _),) = primals, tangents
     y = solve(x, fixed, diffrax.ForwardMode())
-    dx = jtu.tree_map(eqxi.materialise_zeros, x, dx, is_leaf=lambda leaf: leaf is None)
     leaves, structure = jtu.tree_flatten((x, fixed))
-    size = len(jtu.tree_leaves(x))
+    along = jtu.tree_structure(x).flatten_up_to(dx)
+    # What is not moved is a constant: a tangent of zeros would go through every step.
+    moved = [i for i, d in enumerate(along) if d is not None] or [0]
+    dx = [eqxi.materialise_zeros(leaves[i], along[i]) for i in moved]
+    order = moved + [i for i in range(len(leaves)) if i not in moved]
 
     def float_outputs(adjoint, *operands):
-        x, fixed = jtu.tree_unflatten(structure, operands)
+        x, fixed = jtu.tree_unflatten(structure, [operands[order.index(i)] for i in range(len(order))])
         return jtu.tree_leaves(eqx.filter(solve(x, fixed, adjoint), eqx.is_inexact_array))
 
     floats, rest = eqx.partition(y, eqx.is_inexact_array)
     shapes = tuple((leaf.shape, leaf.dtype) for leaf in jtu.tree_leaves(floats))
-    params = dict(outputs=float_outputs, shapes=shapes, size=size, many=False)
-    dy = _tangent_p.bind(*leaves, *jtu.tree_leaves(dx), **params)
+    params = dict(outputs=float_outputs, shapes=shapes, size=len(moved), many=False)
+    dy = _tangent_p.bind(*(leaves[i] for i in order), *dx, **params)
     dy = jtu.tree_unflatten(jtu.tree_structure(floats), dy)
     return y, eqx.combine(dy, jtu.tree_map(lambda _: None, rest))
 
