@@ -18,11 +18,11 @@ a compiled sweep that runs all its points again. A tool that is not installed is
 import contextlib
 import io
 import math
-import multiprocessing
 import os
+import subprocess
+import sys
 import tempfile
 import time
-from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 import jax
@@ -49,7 +49,7 @@ ERROR, SMALL_ERROR = 1e-6, 1e-10
 SPREAD, SPAN = np.linspace(0.5, 20.0, LANES), 20.0
 SHORT, SHORT_CHUNK = 100_000, 1000
 # Enough for several blocks, and a kill inside of one.
-STORED, KILLED_AT = 10_000, 0.4
+STORED, STORED_SPAN, KILLED_AT = 10_000, 100.0, 0.4
 MANY = 10**7
 
 
@@ -84,9 +84,8 @@ def by_sweep(outputs=1, tolerances=LADDER, **settings):
     swept = lj.sweep(run, axes, progress=False, **({"workers": 1, "chunk": CHUNK} | settings))
 
     def prepare(tolerance):
-        (place,) = np.flatnonzero(tolerances == tolerance)
-        where = (tolerances == tolerance)[:, None]
-        return lambda: [x[place] for x in swept.resweep(where=where).values]
+        at = tolerances == tolerance
+        return lambda: [x[at] for x in swept.resweep(where=at[:, None]).values]
 
     return prepare
 
@@ -104,9 +103,14 @@ def per_second(what, ours, theirs, target, repeats=15):
 
 def rate_rows(wanted):
     """The bead on the hoop in 1,000 lanes."""
-    begun = Once(by_sweep)
-    ours = {allowed: Once(lambda e=allowed: loosest(begun.it, error, e)) for allowed in (ERROR, SMALL_ERROR)}
-    squares = OMEGA**2
+    of_ladder, squares = Once(by_sweep), OMEGA**2
+    tolerances = {e: Once(lambda e=e: loosest(of_ladder.it, error, e)[1]) for e in (ERROR, SMALL_ERROR)}
+
+    def ours(allowed=ERROR, **settings):
+        # What is timed is a sweep of these lanes and no more: how it runs may depend on how many there are.
+        tolerance = tolerances[allowed].it
+        solve = by_sweep(tolerances=[tolerance], **settings)(tolerance)
+        return solve, tolerance, error(solve())
 
     def by_numba():
         acceleration = lambda q, v, square: math.sin(q) * (square * math.cos(q) - BELOW)
@@ -134,25 +138,20 @@ def rate_rows(wanted):
             except (ImportError, ArithmeticError) as reason:
                 yield skipped(what, str(reason))
                 continue
-            yield per_second(what, ours[allowed].it, theirs, target, repeats)
-
-    def with_tolerance(**settings):
-        tolerance = ours[ERROR].it[1]
-        solve = by_sweep(tolerances=[tolerance], **settings)(tolerance)
-        return solve, tolerance, error(solve())
+            yield per_second(what, ours(allowed), theirs, target, repeats)
 
     what = f"trajectories/s: {OUTPUTS} outputs / without"
     if wanted(what):
-        yield per_second(what, with_tolerance(outputs=OUTPUTS), with_tolerance(), 0.8)
+        yield per_second(what, ours(outputs=OUTPUTS), ours(), 0.8)
     what = "trajectories/s: two cores / one"
     if wanted(what):
         if not hasattr(os, "sched_getaffinity") or len(os.sched_getaffinity(0)) < 2:
             yield skipped(what, "only one core may be used")
         else:
-            yield per_second(what, with_tolerance(workers=2, chunk=CHUNK // 2), with_tolerance(), 1.8)
+            yield per_second(what, ours(workers=2, chunk=CHUNK // 2), ours(), 1.8)
     what = "layout: lanes together / in turn"
     if wanted(what):
-        yield per_second(what, with_tolerance(), with_tolerance(layout="in turn"), None)
+        yield per_second(what, ours(), ours(layout="in turn"), None)
 
 
 def spread_rows(wanted):
@@ -188,7 +187,7 @@ def short_rows(wanted):
         swept = lj.sweep(run, {"omega": omegas}, workers=1, chunk=SHORT_CHUNK, progress=True)
     program = jax.jit(jax.vmap(run))
 
-    def by_sweep():
+    def again():
         with contextlib.redirect_stderr(io.StringIO()):
             return swept.resweep(where=True).values
 
@@ -199,10 +198,10 @@ def short_rows(wanted):
             found[:, here] = program({"omega": omegas[here]})
         return found
 
-    times = in_turn(by_sweep, by_vmap)
+    times = in_turn(again, by_vmap)
     ratio, of_minima = times.ratio()
     us, other_us = (1e6 * seconds / SHORT for seconds in times.medians)
-    errors = [error(state(), omegas, end) for state in (by_sweep, by_vmap)]
+    errors = [error(state(), omegas, end) for state in (again, by_vmap)]
     yield row(what, ratio, 1.05, minima=of_minima, us=us, other_us=other_us, error=errors[0], other_error=errors[1])
 
 
@@ -218,12 +217,19 @@ def stored(path, log):
         def run(point):
             shape = jax.ShapeDtypeStruct((), point["number"].dtype)
             number = jax.pure_callback(told, shape, point["number"], vmap_method="expand_dims")
-            ts = np.array([0.0, SPAN])
-            # Nothing may come of a value that is never asked for.
+            ts = np.array([0.0, STORED_SPAN])
+            # XLA leaves out a call of the host whose result nothing depends on.
             return released(point["omega"] + 0.0 * number, ts, rtol=1e-10, atol=1e-10)
 
         axes = {"omega": omegas, "number": np.arange(STORED)}
         return lj.sweep(run, axes, zipped=True, store=path, chunk=CHUNK, workers=1, progress=False)
+
+
+def elsewhere(code):
+    """A process of its own that runs some code with this module as `sweep`."""
+    # What a killed process leaves is told by a process of Python's that outlives it.
+    command = [sys.executable, "-W", "ignore:resource_tracker", "-c", f"import sweep; {code}"]
+    return subprocess.Popen(command, cwd=Path(__file__).parent, stdout=subprocess.PIPE, text=True)
 
 
 def killed_rows(wanted):
@@ -234,17 +240,15 @@ def killed_rows(wanted):
     with tempfile.TemporaryDirectory() as folder:
         path, log = Path(folder, "store"), Path(folder, "log")
         computed = lambda: log.stat().st_size // 8 if log.exists() else 0
-        process = multiprocessing.get_context("spawn").Process(target=stored, args=(path, log))
-        process.start()
-        while process.is_alive() and computed() < KILLED_AT * STORED:
-            time.sleep(0.01)
-        process.kill()
-        process.join()
+        with elsewhere(f"sweep.stored({str(path)!r}, {str(log)!r})") as process:
+            while process.poll() is None and computed() < KILLED_AT * STORED:
+                time.sleep(0.002)
+            process.kill()
         before, store = computed(), Store(path)
         missing, block = len(store.missing()), store.block
         swept = stored(path, log)
         twice = computed() - STORED
-        off = error(swept.values, np.resize(OMEGA, STORED), SPAN)
+        off = error(swept.values, np.resize(OMEGA, STORED), STORED_SPAN)
         yield row(
             what, twice / block, 1, block=block, before=before, missing_blocks=missing, twice=twice,
             after=int(swept.ran), seconds=swept.seconds, error=off,
@@ -252,7 +256,7 @@ def killed_rows(wanted):
 
 
 def many():
-    """A sweep of many numbers: the most memory that its process had, in GB; its seconds, and its error."""
+    """A sweep of many numbers: the most memory that its process had, in GB; its seconds; its largest relative error."""
     omegas = np.linspace(0.0, 0.9 * math.sqrt(BELOW), MANY)
     run = lambda point: 2 * np.pi / bead_on_hoop.frequency(bead_on_hoop.small_motion(PARAMS | point).bottom)
     swept = lj.sweep(run, {"omega": omegas}, workers=1, progress=False)
@@ -272,8 +276,8 @@ def memory_rows(wanted):
     if not Path("/proc/self/status").exists():
         yield skipped(what, "the system does not tell the most memory that a process had")
         return
-    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
-        peak, seconds, off = pool.submit(many).result()
+    with elsewhere("print(*sweep.many())") as process:
+        peak, seconds, off = map(float, process.communicate()[0].split())
     yield row(what, peak, 2, seconds=seconds, points_per_s=MANY / seconds, error=off)
 
 

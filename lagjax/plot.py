@@ -7,6 +7,8 @@ import numpy as np
 # Okabe & Ito's colours: distinct to colour-blind readers and in grey print, with a marker and dash each.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 DASHES = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (8, 2)), (0, (1, 1)))
+# The box of words that stand on marks.
+ON_MARKS = {"facecolor": "white", "alpha": 0.85, "edgecolor": "none", "pad": 1.5}
 MARKERS = ("o", "s", "^", "D", "v", "P", "X")
 
 

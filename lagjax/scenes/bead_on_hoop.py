@@ -35,13 +35,13 @@ from lagjax.mechanics.multipliers import accelerations
 from lagjax.mechanics.system import System
 from lagjax.motion.integrate import integrate
 from lagjax.report import Case, Run, Scene, relative_error
+from lagjax.scenes.elliptic import agm, jacobi_elliptic
+from lagjax.sweeps import sweep
 
 PARAMS = {"m": 0.5, "a": 0.75, "g": 9.8125, "omega": 6.0}
 # Exactly at the critical speed: g/a = 16 = omega².
 CRITICAL = {"m": 0.5, "a": 0.75, "g": 12.0, "omega": 4.0}
 
-# Enough for 1 - m down to 1e-150: the mean converges quadratically once the ratio is of order one.
-AGM_STEPS = 12
 
 MISPRINTS = (
     "§3 concludes from ∂L/∂ψ̇ ≠ 0 that p_ψ is not conserved: the reason is ∂L/∂ψ ≠ 0.",
@@ -170,30 +170,6 @@ def lag_behind_hoop(params):
     return below**2 / (omega**2 * (omega + frequency(small_motion(params).alpha)))
 
 
-def agm(a, b):
-    """The arithmetic-geometric mean of two positive numbers."""
-    for _ in range(AGM_STEPS):
-        a, b = 0.5 * (a + b), jnp.sqrt(a * b)
-    return a
-
-
-def jacobi_elliptic(u, m, m1):
-    """sn, cn and dn of u for m < 1, given with its complement m1 = 1 - m > 0 (Abramowitz & Stegun 16.4).
-
-    Only m1 enters the recursion, so that m near 1 costs no digits; m may be negative.
-    """
-    a, b = jnp.ones_like(m1), jnp.sqrt(m1)
-    ratios = []
-    for _ in range(AGM_STEPS):
-        a, b, c = 0.5 * (a + b), jnp.sqrt(a * b), 0.5 * (a - b)
-        ratios.append(c / a)
-    angle = 2.0**AGM_STEPS * a * u
-    for ratio in reversed(ratios):
-        angle = 0.5 * (angle + jnp.arcsin(ratio * jnp.sin(angle)))
-    sn, cn = jnp.sin(angle), jnp.cos(angle)
-    return sn, cn, jnp.sqrt(jnp.where(m < 0, 1 - m * sn**2, m1 + m * cn**2))
-
-
 def libration(params, psi):
     """Whether a bead released from rest at ψ goes through the bottom; rate, m and m1 of its elliptic functions."""
     below, squared = params["g"] / params["a"], params["omega"] ** 2
@@ -269,9 +245,18 @@ def swing(params, psi, longest, tolerance=1e-10):
 
 
 def settled(params, psi, time, tolerance=1e-9):
-    """Where a bead with friction (params["b"]) ends up, released at rest at ψ; `jax.vmap` it over the speed."""
+    """Where a bead with friction (params["b"]) ends up, released at rest at ψ."""
     ts = jnp.stack([jnp.zeros_like(time), time])
     return integrate(damped_system, psi, jnp.zeros_like(psi), params, ts=ts, rtol=tolerance, atol=tolerance).end.q
+
+
+def pitchfork(speeds, starts, **settings):
+    """Where beads with friction settle: a sweep over ω, each released at rest at its own ψ (zipped)."""
+
+    def settles(point):
+        return settled(PARAMS | {"omega": point["omega"], "b": 2.0}, point["psi"], jnp.asarray(40.0), 1e-6)
+
+    return sweep(settles, {"omega": speeds, "psi": starts}, zipped=True, progress=False, **settings)
 
 
 def driven_start(params, psi):
@@ -329,6 +314,7 @@ def cases():
     happened = f"alpha = {alpha:.6e}; arccos(1 / (1 + 1e-15)) is off by {100 * lost:.0f} %"
     rows.append(Case("(omega/omega0)² = 1 + 1e-15", happened, abs(alpha / exact - 1), 1e-15))
     rows.append(_reversed_case())
+    rows.append(_pitchfork_case())
     return rows
 
 
@@ -350,6 +336,21 @@ def _reversed_case():
     return Case("omega < 0, and psi = 0, pi", "torque as in closed form, where M is singular too", max(errors), 1e-14)
 
 
+def _pitchfork_case():
+    """Below ω0 the bottom is stable, above it the two tilted positions."""
+    speeds, starts = _speeds_and_starts()
+    swept = pitchfork(natural_rate(PARAMS) * speeds, starts)
+    exact = np.sign(starts) * np.where(speeds < 1, 0.0, tilt(np.maximum(speeds, 1.0) ** 2 - 1))
+    error = float(np.max(np.abs(swept.values - exact)))
+    return Case("23 speeds, with friction", f"settled on the pitchfork; {swept.counts()}", error, 1e-4)
+
+
+def _speeds_and_starts():
+    # Clear of ω0 itself, where friction needs for ever.
+    speeds = np.append(np.linspace(0.1, 0.92, 9), np.linspace(1.12, 2.45, 14))
+    return speeds, np.where(np.arange(speeds.size) % 2, 0.5, -0.5)
+
+
 def picture():
     """The pitchfork, with beads that settled on it; and the period, which diverges at the homoclinic orbit."""
     fig, axes = plot.figure(1, 2, size=(4.6, 3.4))
@@ -364,11 +365,8 @@ def _draw_pitchfork(axis, unit):
     axis.plot([0.0, 1.0], [0.0, 0.0], color=plot.COLOURS[0], label="stable")
     axis.plot(np.append(above[::-1], above), np.append(-branch[::-1], branch), color=plot.COLOURS[0])
     axis.plot([1.0, 2.5], [0.0, 0.0], color=plot.COLOURS[1], linestyle="--", label="unstable")
-    # Clear of ω0 itself, where friction needs for ever.
-    speeds = np.append(np.linspace(0.1, 0.92, 9), np.linspace(1.12, 2.45, 14))
-    starts = np.where(np.arange(speeds.size) % 2, 0.5, -0.5)
-    over = jax.vmap(lambda omega, psi: settled(PARAMS | {"omega": omega, "b": 2.0}, psi, jnp.asarray(40.0), 1e-6))
-    ends = np.degrees(over(unit * speeds, starts))
+    speeds, starts = _speeds_and_starts()
+    ends = np.degrees(pitchfork(unit * speeds, starts).values)
     axis.plot(speeds, ends, plot.MARKERS[0], color="black", markersize=4, label="settled, with friction")
     axis.set(xlabel=r"$\omega/\omega_0$", ylabel=r"angle $\psi$ / degrees", title="The pitchfork")
     axis.legend(fontsize=8, frameon=False, loc="center left", bbox_to_anchor=(0.0, 0.72))

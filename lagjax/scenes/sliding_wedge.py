@@ -25,6 +25,7 @@ from lagjax.mechanics.multipliers import accelerations
 from lagjax.mechanics.system import System
 from lagjax.motion.integrate import integrate
 from lagjax.report import Case, Run, Scene, relative_error
+from lagjax.sweeps import sweep
 
 PARAMS = {"m": 1.5, "M": 4.0, "alpha": 0.5, "g": 9.8125}
 Q0 = {"X": 0.0, "x": 0.0, "y": 0.0}
@@ -138,6 +139,7 @@ def cases():
     ts = jnp.linspace(0.0, 1000.0, 11)
     fall = integrate(system, Q0, V0, params, ts=ts, rtol=1e-10, atol=1e-10)
     error = relative_error((fall.q, fall.v), exact_motion(params, Q0, V0, ts))
+    rows.append(_ratio_case())
     rows.append(Case("M = 0 for 1000 s", f"free fall; residual {float(fall.residual()):.0e}", error, 1e-9))
     return rows
 
@@ -147,28 +149,49 @@ def _worst(got, exact):
     return max(abs(float(a) - float(b)) / (abs(float(b)) or 1.0) for a, b in zip(got, exact))
 
 
+def over_mass_ratios(ratios, **settings):
+    """Accelerations and normal force over m/M, as a sweep; m is that of `PARAMS`."""
+
+    def at(point):
+        a, multipliers = accelerations(system, 0.0, Q0, V0, PARAMS | {"M": PARAMS["m"] / point["m_over_M"]})
+        return a | {"normal force": multipliers["incline"]}
+
+    return sweep(at, {"m_over_M": ratios}, progress=False, **settings)
+
+
+def _ratio_case():
+    ratios = 2.0 ** np.arange(-40, 41)
+    swept = over_mass_ratios(ratios)
+    exact = exact_accelerations(PARAMS | {"M": PARAMS["m"] / ratios})
+    got = [swept.values[name] for name in ("X", "x", "y", "normal force")]
+    error = max(float(np.max(np.abs(a / b - 1))) for a, b in zip(got, exact))
+    return Case("m/M = 2^-40 ... 2^40", f"a sweep, as in closed form; {swept.counts()}", error, 1e-12)
+
+
 def picture():
     """Accelerations over sixteen decades of the mass ratio: who moves, and how much."""
-    ratios = jnp.logspace(-8, 8, 161)
-    at = jax.vmap(lambda M: accelerations(system, 0.0, Q0, V0, PARAMS | {"M": M}))
-    a, multipliers = at(PARAMS["m"] / ratios)
+    ratios = np.logspace(-8, 8, 161)
+    a = over_mass_ratios(ratios).values
     fig, axes = plot.figure(1, 2, size=(4.6, 3.4))
     g = PARAMS["g"]
     for i, (label, values) in enumerate({"particle, x": a["x"], "particle, y": a["y"], "wedge, X": a["X"]}.items()):
         axes[0, 0].semilogx(ratios, values / g, label=label, **plot.style(i))
     axes[0, 0].set(xlabel="m / M", ylabel="acceleration / g", title="Who moves")
     axes[0, 0].legend(fontsize=8, frameon=False)
-    angles = jnp.linspace(0.0, jnp.pi / 2, 91)
-    for i, ratio in enumerate((0.01, 0.375, 10.0, 1000.0)):
-        force = jax.vmap(
-            lambda alpha: accelerations(system, 0.0, Q0, V0, PARAMS | {"alpha": alpha, "M": PARAMS["m"] / ratio})[1][
-                "incline"
-            ]
-        )(angles)
+    some, angles = (0.01, 0.375, 10.0, 1000.0), np.linspace(0.0, np.pi / 2, 91)
+    for i, (ratio, force) in enumerate(zip(some, _normal_forces(np.array(some), angles))):
         axes[0, 1].plot(np.degrees(angles), force / (PARAMS["m"] * g), label=f"m/M = {ratio:g}", **plot.style(i))
     axes[0, 1].set(xlabel="angle of the incline / degrees", ylabel="normal force / (m g)", title="The multiplier")
     axes[0, 1].legend(fontsize=8, frameon=False)
     return fig
+
+
+def _normal_forces(ratios, angles):
+    def at(point):
+        params = PARAMS | {"alpha": point["alpha"], "M": PARAMS["m"] / point["m_over_M"]}
+        return accelerations(system, 0.0, Q0, V0, params)[1]["incline"]
+
+    return sweep(at, {"m_over_M": ratios, "alpha": angles}, progress=False).values
 
 
 SCENE = Scene(

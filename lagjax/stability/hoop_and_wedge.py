@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax.scenes import bead_on_hoop, sliding_wedge
+from lagjax.scenes.elliptic import jacobi_elliptic
 from lagjax.stability.trial import ACCURATE, FULL, QUICK, REDUCED, REFUSED, Trial, by_parameter
 
 
@@ -115,7 +116,7 @@ def _fall(q0, v0, params, ts):
     """χ and its rate from rest at χ0 next to the top (g counted negative there): tan(χ/2) = tan(χ0/2) / cn(ω0 t)."""
     rate = jnp.sqrt(-params["g"] / params["a"])
     s2, c2 = jnp.sin(0.5 * q0) ** 2, jnp.cos(0.5 * q0) ** 2
-    sn, cn, dn = bead_on_hoop.jacobi_elliptic(rate * ts, c2, s2)
+    sn, cn, dn = jacobi_elliptic(rate * ts, c2, s2)
     tangent = jnp.tan(0.5 * q0)
     # χ = 2 atan(tangent / cn) continued through the bottom, χ = π, where cn = 0.
     return 2 * jnp.arctan2(tangent, cn), 2 * tangent * rate * sn * dn / (cn**2 + tangent**2)

@@ -46,7 +46,7 @@ class Axes(eqx.Module):
     def at(self, index) -> dict[str, Any]:
         """The point at a flat index, traced or not."""
         places = [index] * len(self.names) if self.zipped else _unravelled(index, self.shape)
-        take = lambda x, i: x[i] if isinstance(x, np.ndarray) else jax.lax.dynamic_index_in_dim(x, i, keepdims=False)
+        take = lambda x, i: x[i] if isinstance(i, int) else jax.lax.dynamic_index_in_dim(x, i, keepdims=False)
         return {name: take(x, i) for name, x, i in zip(self.names, self.arrays, places)}
 
     def words(self, index: int) -> str:
