@@ -34,13 +34,11 @@ QUOTED = [
         "the same by `grad`, 100 outputs / one solve",
     ),
     ("against_hand_written", "bead_on_hoop, single: from L / by hand", "one evaluation, bead / by hand"),
-    ("against_hand_written", "double pendulum, single: from L / by hand", "one evaluation, double pendulum / by hand"),
     ("against_hand_written", "rolling_hoop, single: from L / by hand", "one evaluation, rolling hoop / by hand"),
-    (
-        "against_hand_written",
-        "double pendulum, a lane of 1000: from L / numba",
-        "a lane of 1,000, double pendulum / numba",
-    ),
+    ("sweep", "trajectories/s, error 1e-06: lagjax / numba", "sweep over 1,000 speeds, error 1e-6 / numba"),
+    ("sweep", "trajectories/s, error 1e-06: lagjax / heyoka in batches", "the same / heyoka, eight lanes at a time"),
+    ("sweep", "trajectories/s, error 1e-10: lagjax / heyoka in batches", "the same at error 1e-10"),
+    ("sweep", "trajectories/s: two cores / one", "the same, two cores / one"),
 ]
 
 
@@ -50,7 +48,7 @@ def table() -> str:
     for file, what, name in QUOTED:
         rows = {row["what"]: row for row in json.loads((HERE / "results" / f"{file}.json").read_text())["rows"]}
         row = rows[what]
-        target = "" if row["target"] is None else f"≤ {row['target']:.2g}"
+        target = "" if row["target"] is None else f"{'≤' if row['better'] == 'less' else '≥'} {row['target']:.2g}"
         lines.append(f"| {name} | {row['value']:.2g} | {target} | {'' if row['met'] in (None, True) else 'missed'} |")
     return "\n".join(lines) + "\n"
 

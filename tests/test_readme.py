@@ -7,8 +7,9 @@ from pathlib import Path
 import jax
 import pytest
 
-README = (Path(__file__).parent.parent / "README.md").read_text()
-PYTHON_BLOCKS = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
+ROOT = Path(__file__).parent.parent
+README = (ROOT / "README.md").read_text()
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 
 
 def claimed_and_printed(block, capsys):
@@ -20,11 +21,13 @@ def claimed_and_printed(block, capsys):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("block", PYTHON_BLOCKS, ids=range(len(PYTHON_BLOCKS)))
-def test_python_blocks(block, capsys):
-    """Every printed number stands in the comment beside its print."""
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_python_blocks(page, capsys, tmp_path, monkeypatch):
+    """A page's blocks, one after the other: every printed number stands in the comment beside its print."""
     assert jax.config.jax_enable_x64
-    claimed, printed = claimed_and_printed(block, capsys)
+    monkeypatch.chdir(tmp_path)
+    blocks = re.findall(r"```python\n(.*?)```", page.read_text(), re.DOTALL)
+    claimed, printed = claimed_and_printed("\n".join(blocks), capsys)
     assert claimed == printed
 
 
