@@ -58,8 +58,8 @@ def sweep(
     ...     return lj.integrate(swing, point["angle"], 0.0, {"g": point["g"]}, ts=jnp.array([0.0, 1.0])).q[-1]
     >>> swept = sweep(run, {"g": jnp.array([1.0, 4.0]), "angle": jnp.linspace(0.0, 1.0, 3)}, progress=False)
     >>> print(swept.values.round(4), swept.counts())
-    [[ 0.      0.272   0.5636]
-     [ 0.     -0.1947 -0.3369]] {'successful': 6}
+    [[ 0.      0.2777  0.6001]
+     [ 0.     -0.1947 -0.3062]] {'successful': 6}
 
     **Main arguments:**
 

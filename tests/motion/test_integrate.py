@@ -161,6 +161,7 @@ def test_event_is_located_by_the_method():
     assert bool(traj.result == lj.RESULTS.event_occurred)
 
 
+@pytest.mark.slow
 def test_lanes_with_and_without_an_event():
     """A batch may mix lanes that reach the event, that do not, and that fail; a true-or-false condition works too."""
     event = diffrax.Event({"bottom": lambda t, y, p, **kwargs: y[0], "late": lambda t, y, p, **kwargs: t > 1.5})

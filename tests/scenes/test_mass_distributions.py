@@ -254,6 +254,7 @@ def test_noether_table(name):
         assert change < 1e-9 if charge in scene.CONSERVED[name] else change > 0.02, (charge, change)
 
 
+@pytest.mark.slow
 def test_screw_charge_and_its_misprint():
     """h p_z + 2π L_z is kept for both hands (h < 0: left); h p_z + L_z moves at O(1), and so does the wrong hand."""
     q0, v0, _ = scene.ORBITS["helix"]

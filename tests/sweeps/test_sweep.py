@@ -60,6 +60,7 @@ def assert_same(found, expected, rtol, atol):
         np.testing.assert_allclose(found[name], expected[name], rtol=rtol, atol=atol)
 
 
+@pytest.mark.slow
 def test_same_as_a_loop(looped):
     """One lane after the other: the same steps. Together: sines are rounded otherwise, and first steps see that."""
     in_turn, together = quiet(final_angle_and_slope, layout="in turn", workers=1), quiet(final_angle_and_slope)
@@ -72,6 +73,7 @@ def test_same_as_a_loop(looped):
     assert np.all(in_turn.status.steps > looped["steps"])
 
 
+@pytest.mark.slow
 def test_same_as_vmap_and_whoever_is_beside():
     """The same steps as under `jax.vmap`, in other chunks, sorted, and among other lanes."""
     swept = quiet(final_angle_and_slope)
@@ -122,6 +124,7 @@ def test_a_drifting_motion_is_marked():
     assert swept.status.departure > 1 and "what must stay constant changed" in repr(swept)
 
 
+@pytest.mark.slow
 def test_reports_are_found_in_every_kind_of_program():
     """Plain, under jit, grad, vmap and in a branch of a check; the worst of several counts."""
     program = lambda wrap: jax.jit(reporting(lambda point: wrap(lambda g: swing({"g": g, "angle": 1.0}).q[-1])(point)))
