@@ -18,15 +18,9 @@ from tests.sweeps import worker
 POINTS = 2000
 
 
-def swept(store=None, points=POINTS, **settings):
-    """The worker's sweep in this process."""
-    return lj.sweep(worker.run, worker.axes(points), store=store, chunk=32, workers=1, progress=False, **settings)
-
-
-@pytest.fixture(scope="module")
-def whole():
-    """Without a store."""
-    return swept()
+def swept(run, store=None, **settings):
+    """The worker's sweep, or a quicker one, in this process."""
+    return lj.sweep(run, worker.axes(POINTS), store=store, chunk=32, workers=1, progress=False, **settings)
 
 
 def same(found, whole):
@@ -43,13 +37,13 @@ def started(store, k=0, n=1, points=POINTS):
     return subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True)
 
 
-def test_written_resumed_and_read(tmp_path, whole):
+def test_written_resumed_and_read(tmp_path):
     """A second call computes nothing; the store opens without what ran it."""
-    path = tmp_path / "sweep"
-    first = swept(path)
+    path, whole = tmp_path / "sweep", swept(worker.quick)
+    first = swept(worker.quick, path)
     assert first.ran == POINTS
     same(first, whole)
-    second = swept(path)
+    second = swept(worker.quick, path)
     assert second.ran == 0
     same(second, whole)
     alone = lj.open_sweep(path)
@@ -60,14 +54,14 @@ def test_written_resumed_and_read(tmp_path, whole):
         alone.resweep()
 
 
-def test_only_what_is_missing(tmp_path, whole):
+def test_only_what_is_missing(tmp_path):
     """Blocks that are not marked are computed again, whatever stands in them."""
-    path = tmp_path / "sweep"
-    swept(path)
+    path, whole = tmp_path / "sweep", swept(worker.quick)
+    swept(worker.quick, path)
     store = Store(path)
     store.group["done"][1] = 0
     store.group["values/value"][store.block : 2 * store.block] = -1.0
-    again = swept(path)
+    again = swept(worker.quick, path)
     assert again.ran == store.block
     same(again, whole)
 
@@ -111,7 +105,7 @@ def kill_when(process, path, count):
 
 
 @pytest.mark.slow
-def test_killed_and_resumed(tmp_path, whole):
+def test_killed_and_resumed(tmp_path):
     """At any moment: nothing is lost but the block that was being computed, nothing is corrupted."""
     path = tmp_path / "sweep"
     kill_when(started(path), path, 1)
@@ -120,11 +114,11 @@ def test_killed_and_resumed(tmp_path, whole):
     rest = started(path)
     computed = int(rest.communicate()[0])
     assert 0 < computed <= POINTS - there
-    same(swept(path), whole)
+    same(swept(worker.run, path), swept(worker.run))
 
 
 @pytest.mark.slow
-def test_two_processes_one_killed(tmp_path, whole):
+def test_two_processes_one_killed(tmp_path):
     """Each takes its blocks of one store; the one that died is started again and does only what it had not."""
     path = tmp_path / "sweep"
     first, second = started(path, 0, 2), started(path, 1, 2)
@@ -134,4 +128,4 @@ def test_two_processes_one_killed(tmp_path, whole):
     again = int(started(path, 1, 2).communicate()[0])
     assert 0 < computed < POINTS and missing > 0 and again <= missing * Store(path).block
     assert len(Store(path).missing()) == 0
-    same(swept(path), whole)
+    same(swept(worker.run, path), swept(worker.run))
