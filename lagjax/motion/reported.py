@@ -10,6 +10,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, Primitive
 from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array, Float, Int
@@ -68,6 +69,12 @@ def reporting(function: Callable) -> Callable:
         def of_leaves(*leaves):
             found, shape = jtu.tree_flatten(function(*jtu.tree_unflatten(structure, leaves)))
             rest.append(shape)
+            for x in found:
+                if not isinstance(x, Array | np.ndarray | np.generic | bool | int | float | complex):
+                    raise TypeError(
+                        f"run must return numbers and arrays, and returned {x!r:.60}, a {type(x).__name__}.\n"
+                        "Fix: return only what differs from point to point."
+                    )
             return [jnp.asarray(x) for x in found]
 
         program = without_checks(jax.make_jaxpr(of_leaves)(*leaves))

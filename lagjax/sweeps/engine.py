@@ -105,7 +105,7 @@ def sweep(
         chunk = min(CHUNK.get(platform, CHUNK["gpu"]), each)
     chunk = math.ceil(chunk / len(devices)) * len(devices)
     program = compiled(run, axes, chunk, devices, layout)
-    _check_memory(axes, program, workers, store, platform)
+    _check_memory(axes, program, workers, store, devices)
     engine = _Engine(program, workers, sort, layout, devices)
     if store is None:
         return _in_memory(engine, run, axes, np.arange(axes.size), None, progress)
@@ -275,10 +275,16 @@ def _check(layout, part, store):
         )
 
 
-def _check_memory(axes, program, workers, store, platform):
-    free = _free_memory()
+def _check_memory(axes, program, workers, store, devices):
+    on_host, free = devices[0].platform == "cpu", _free_memory()
+    of_device = None if on_host else (devices[0].memory_stats() or {}).get("bytes_limit")
+    if of_device is not None and workers * program.working > of_device:
+        raise MemoryError(
+            f"a chunk of {program.chunk:,} points works with {program.working / 1e9:.3g} GB on each device, and "
+            f"{workers} at a time do not fit into its {of_device / 1e9:.3g} GB.\nFix: chunk={program.chunk // 4}."
+        )
     kept = 0 if store is not None else axes.size * _bytes(program)
-    needed = kept + (workers * program.working if platform == "cpu" else 0)
+    needed = kept + (workers * program.working if on_host else 0)
     if free is not None and needed > FILL_AT_MOST * free:
         raise MemoryError(
             f"this sweep needs {needed / 1e9:.3g} GB: {axes.size:,} points of {_bytes(program):,} bytes, and "

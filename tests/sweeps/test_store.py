@@ -2,6 +2,7 @@
 
 import os
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -29,11 +30,11 @@ def same(found, whole):
     np.testing.assert_array_equal(found.status.result, whole.status.result)
 
 
-def started(store, k=0, n=1, points=POINTS):
+def started(store, k=0, n=1, *port):
     """The worker's process."""
     root = Path(lj.__file__).parents[1]
     environment = os.environ | {"PYTHONPATH": str(root)}
-    command = [sys.executable, worker.__file__, str(store), str(k), str(n), str(points)]
+    command = [sys.executable, worker.__file__, str(store), str(k), str(n), str(POINTS), *map(str, port)]
     return subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True)
 
 
@@ -93,12 +94,17 @@ def blocks_there(path):
     return 0 if not path.exists() else int(np.sum(Store(path).group["done"][:]))
 
 
-def kill_when(process, path, count):
-    """`kill -9` once some blocks are there."""
+def wait_for(process, path, count):
+    """Until some blocks are there."""
     deadline = time.monotonic() + 120
     while blocks_there(path) < count:
         assert process.poll() is None and time.monotonic() < deadline
         time.sleep(0.01)
+
+
+def kill_when(process, path, count):
+    """`kill -9` once some blocks are there."""
+    wait_for(process, path, count)
     process.send_signal(signal.SIGKILL)
     process.wait()
     process.stdout.close()
@@ -114,6 +120,32 @@ def test_killed_and_resumed(tmp_path):
     rest = started(path)
     computed = int(rest.communicate()[0])
     assert 0 < computed <= POINTS - there
+    same(swept(worker.run, path), swept(worker.run))
+
+
+@pytest.mark.slow
+def test_interrupted_from_the_keyboard(tmp_path):
+    """The process ends well, with what it had, and says so."""
+    path = tmp_path / "sweep"
+    process = started(path)
+    wait_for(process, path, 1)
+    process.send_signal(signal.SIGINT)
+    computed = int(process.communicate()[0])
+    assert process.returncode == 0 and 0 < computed < POINTS
+    assert blocks_there(path) * Store(path).block == computed
+    same(swept(worker.run, path), swept(worker.run))
+
+
+@pytest.mark.slow
+def test_two_processes_by_jax_distributed(tmp_path):
+    """On loopback: each finds its part, and together they have it all."""
+    path = tmp_path / "sweep"
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    processes = [started(path, k, 2, port) for k in range(2)]
+    computed = [int(process.communicate(timeout=300)[0]) for process in processes]
+    assert sum(computed) == POINTS and min(computed) > 0
     same(swept(worker.run, path), swept(worker.run))
 
 

@@ -203,6 +203,12 @@ def test_what_would_not_fit_is_refused():
         quiet(lambda point: point["x"] + point["y"] + jnp.zeros(10), {"x": jnp.zeros(10**6), "y": jnp.zeros(10**6)})
 
 
+def test_what_run_must_not_return():
+    """Words."""
+    with pytest.raises(TypeError, match="run must return numbers and arrays, and returned 'fast', a str"):
+        quiet(lambda point: (point["g"], "fast"))
+
+
 def test_bad_settings():
     """Layout and part."""
     with pytest.raises(ValueError, match="layout must be one of 'together', 'in turn'"):

@@ -1,4 +1,7 @@
-"""A sweep as its own process, for tests that kill it: `worker.py STORE K N POINTS` prints what it computed."""
+"""A sweep as its own process, for tests that kill it: `worker.py STORE K N POINTS [PORT]` prints what it computed.
+
+With a port the processes know of each other by `jax.distributed`, which then says which part is whose.
+"""
 
 import sys
 
@@ -29,5 +32,8 @@ def axes(points):
 
 
 if __name__ == "__main__":
-    store, k, n, points = sys.argv[1], *map(int, sys.argv[2:])
-    print(lj.sweep(run, axes(points), store=store, part=(k, n), chunk=32, workers=1, progress=False).ran)
+    store, k, n, points, *port = sys.argv[1], *map(int, sys.argv[2:])
+    if port:
+        jax.distributed.initialize(f"127.0.0.1:{port[0]}", num_processes=n, process_id=k)
+    part = None if port else (k, n)
+    print(lj.sweep(run, axes(points), store=store, part=part, chunk=32, workers=1, progress=False).ran)
