@@ -86,5 +86,4 @@ MECHANISM = Mechanism(
     ),
     origin="closed form",
     digits=14,
-    measured={1e-6: (0.0, 0.0), 1e-8: (0.0, 0.0), 1e-10: (0.0, 0.0)},
 )

@@ -1,7 +1,7 @@
 """What a test problem consists of."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 from lagjax.mechanics.system import System
@@ -17,8 +17,6 @@ class Mechanism:
       of its digits, relative to the largest coordinate and the largest velocity, are trusted.
     - `freedom`: degrees of freedom, away from singular positions. Where more constraints are given than
       coordinates minus this, they are redundant.
-    - `measured`: rtol = atol -> (position error, velocity error) at `end` of the default method, each relative to
-      the largest and in units of rtol.
     """
 
     name: str
@@ -33,4 +31,3 @@ class Mechanism:
     reference: tuple[Any, Any] | None = None
     origin: str = ""
     digits: int = 0
-    measured: Mapping[float, tuple[float, float]] = field(default_factory=dict)
