@@ -18,7 +18,7 @@ from lagjax.mechanics.closures import lift
 from lagjax.mechanics.diagnosis import explain_failure
 from lagjax.mechanics.system import System
 from lagjax.motion import problem
-from lagjax.motion.reported import report
+from lagjax.motion.reported import patient, report
 from lagjax.motion.solve import START_TOLERANCES, Settings, trajectory_of
 from lagjax.motion.trajectory import RESULTS, Trajectory, ended_well, message
 
@@ -114,7 +114,7 @@ def integrate(
         atol=problem.tolerance(atol, "atol", dtype),
         dt0=problem.first_step(dt0, dtype),
         apart=any(isinstance(tol, (tuple, list)) or jnp.ndim(tol) > 0 for tol in (rtol, atol) if tol is not None),
-        max_steps=max_steps,
+        max_steps=patient(max_steps),
         drift=drift,
         progress=progress,
     )

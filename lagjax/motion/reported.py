@@ -5,6 +5,7 @@ function that integrates, wherever and in whatever it returns, into one that say
 """
 
 from collections.abc import Callable
+from contextvars import ContextVar
 from typing import NamedTuple
 
 import jax
@@ -20,6 +21,8 @@ from lagjax.motion.trajectory import RESULTS, Trajectory
 from lagjax.numerics.one_function import without_checks
 from lagjax.numerics.programs import bodies, evaluate
 
+# In a program for many lanes that wait for each other: the steps after which a motion is given up, to be run alone.
+PATIENCE = ContextVar("patience", default=None)
 CALLS = {
     "jit",
     "pjit",
@@ -54,6 +57,12 @@ def report(trajectory: Trajectory) -> Trajectory:
     )
     told = (t.result._value, t.stats["num_steps"], t.departure, residual)
     return jtu.tree_unflatten(structure, _report_p.bind(*map(jnp.asarray, (*leaves, *told)))[: -len(told)])
+
+
+def patient(max_steps: int | None) -> int | None:
+    """The steps that a motion may take here and now."""
+    limits = [limit for limit in (max_steps, PATIENCE.get()) if limit is not None]
+    return min(limits, default=None)
 
 
 def reporting(function: Callable) -> Callable:

@@ -2,6 +2,7 @@
 
 import math
 import os
+import threading
 import time
 import warnings
 from collections.abc import Callable, Mapping
@@ -15,9 +16,10 @@ import jax
 import numpy as np
 from jaxtyping import ArrayLike
 
+from lagjax.motion.trajectory import RESULTS
 from lagjax.numerics.one_function import TOGETHER
 from lagjax.sweeps.axes import axes_of
-from lagjax.sweeps.lanes import LAYOUTS, NOT_RUN, STATUS_TYPES, Program, Status, compiled
+from lagjax.sweeps.lanes import LAYOUTS, NOT_RUN, STATUS_TYPES, Status, compiled
 from lagjax.sweeps.result import Stored, Sweep
 from lagjax.sweeps.store import chunk_of, open_store
 
@@ -31,6 +33,9 @@ BLOCK_SECONDS, BLOCK_BYTES = 2.0, 256e6
 PILOTS = 256
 # The longest of which takes no more than this times the mean: nothing is gained by sorting.
 ALIKE = 1.5
+# Lanes together wait for the longest: one that takes more steps than this is run again, alone.
+PATIENCE = 2**15
+MAX_STEPS = int(RESULTS.max_steps_reached._value)
 # Of the memory that is free.
 FILL_AT_MOST = 0.8
 
@@ -79,7 +84,8 @@ def sweep(
     **How it runs,** which `print(swept)` says:
 
     - `chunk`: points for one call of the compiled program.
-    - `layout`: lanes `"together"` (`vmap`), or one after the other, `"in turn"`.
+    - `layout`: lanes `"together"` (`vmap`; those that take more than 32,768 steps are run again alone), or one after
+      the other, `"in turn"`.
     - `sort`: first run a few points and then all in the order of their steps, so that a few long lanes do not hold the
       rest; by default for lanes together, from 16,000 points on.
     - `devices`: JAX devices to split each chunk between; by default all.
@@ -104,43 +110,60 @@ def sweep(
         each = max(math.ceil(axes.size / (CHUNKS_EACH * workers)), min(TOGETHER, math.ceil(axes.size / workers)))
         chunk = min(CHUNK.get(platform, CHUNK["gpu"]), each)
     chunk = math.ceil(chunk / len(devices)) * len(devices)
-    program = compiled(run, axes, chunk, devices, layout)
-    _check_memory(axes, program, workers, store, devices)
-    engine = _Engine(program, workers, sort, layout, devices)
+    engine = _Engine(run, axes, chunk, workers, sort, layout, devices)
+    _check_memory(axes, engine.program, workers, store, devices)
     if store is None:
-        return _in_memory(engine, run, axes, np.arange(axes.size), None, progress)
+        return _in_memory(engine, np.arange(axes.size), None, progress)
     return _in_store(engine, axes, store, part, progress)
 
 
 class _Engine:
     """A compiled program and how it is called."""
 
-    def __init__(self, program: Program, workers, sort, layout, devices):
-        self.program, self.workers, self.sort = program, workers, sort
-        self.layout, self.devices = layout, devices
+    def __init__(self, run, axes, chunk, workers, sort, layout, devices):
+        self.run, self.axes, self.chunk = run, axes, chunk
+        self.workers, self.sort, self.layout, self.devices = workers, sort, layout, devices
+        patience = PATIENCE if layout == "together" else None
+        self.program = compiled(run, axes, chunk, devices, layout, patience)
+        self._lock, self._one = threading.Lock(), None
 
     @property
     def words(self):
         """How it is called, as a person says it."""
-        where = (
-            self.devices[0].platform if len(self.devices) == 1 else f"{len(self.devices)} {self.devices[0].platform}s"
-        )
+        platform, count = self.devices[0].platform, len(self.devices)
+        where = platform if count == 1 else f"{count} {platform}s"
         of_workers = f"{self.workers} worker{'s' * (self.workers > 1)}"
-        return f"{where}, {of_workers}, lanes {self.layout}, chunks of {self.program.chunk}"
+        return f"{where}, {of_workers}, lanes {self.layout}, chunks of {self.chunk}"
 
-    def with_run(self, run, axes, count):
+    def with_run(self, run, count):
         """The same for another run, over `count` points."""
         devices = len(self.devices)
-        chunk = min(self.program.chunk, math.ceil(count / self.workers / devices) * devices)
-        return _Engine(
-            compiled(run, axes, chunk, self.devices, self.layout), self.workers, self.sort, self.layout, self.devices
-        )
+        chunk = min(self.chunk, math.ceil(count / self.workers / devices) * devices)
+        return _Engine(run, self.axes, chunk, self.workers, self.sort, self.layout, self.devices)
+
+    def at(self, indices):
+        """(values, status) at no more than `chunk` indices; lanes that were given up are run alone."""
+        values, status = self.program.call(indices)
+        given_up = (status.result == MAX_STEPS) & (status.steps >= PATIENCE) & (self.layout == "together")
+        if given_up.any():
+            values, status = jax.tree.map(np.array, (values, status))
+            for i in np.flatnonzero(given_up):
+                for every, one in zip(*map(jax.tree.leaves, ((values, status), self._alone.call(indices[i : i + 1])))):
+                    every[i] = one[0]
+        return values, status
+
+    @property
+    def _alone(self):
+        # Compiled only where a lane needs it.
+        with self._lock:
+            self._one = self._one or compiled(self.run, self.axes, 1, self.devices[:1], "in turn")
+        return self._one
 
     def over(self, indices):
         """(places among some indices, values, status) of chunks of them as they are finished, in any order."""
-        chunk, order = self.program.chunk, self._order(indices)
+        chunk, order = self.chunk, self._order(indices)
         waiting = (order[start : start + chunk] for start in range(0, len(indices), chunk))
-        task = lambda places: (places, *self.program.call(indices[places]))
+        task = lambda places: (places, *self.at(indices[places]))
         if self.workers == 1:
             yield from map(task, waiting)
             return
@@ -162,15 +185,15 @@ class _Engine:
         worth = self.layout == "together" and len(indices) >= 64 * PILOTS if self.sort is None else self.sort
         if not worth:
             return places
-        few = places[:: max(1, len(indices) // min(self.program.chunk, PILOTS))][: self.program.chunk]
+        few = places[:: max(1, len(indices) // min(self.chunk, PILOTS))][: self.chunk]
         steps = self.program.call(indices[few])[1].steps
         if self.sort is None and steps.max() <= ALIKE * steps.mean():
             return places
         return np.argsort(np.interp(places, few, steps), kind="stable")
 
 
-def _in_memory(engine, run, axes, indices, before, progress):
-    started = time.perf_counter()
+def _in_memory(engine, indices, before, progress):
+    started, axes = time.perf_counter(), engine.axes
     if before is None:
         values = jax.tree.map(lambda x: np.zeros((axes.size, *x.shape), x.dtype), engine.program.values)
         values = jax.tree.map(lambda x: x.fill(np.nan) or x if np.issubdtype(x.dtype, np.inexact) else x, values)
@@ -197,13 +220,13 @@ def _in_memory(engine, run, axes, indices, before, progress):
         if len(which) == 0:
             return swept
         flat = jax.tree.map(lambda x: x.reshape(axes.size, *x.shape[len(axes.shape) :]), (swept.values, swept.status))
-        rerun = engine if other is None else engine.with_run(other, axes, len(which))
+        rerun = engine if other is None else engine.with_run(other, len(which))
         if jax.tree.structure(rerun.program.values) != jax.tree.structure(engine.program.values):
             raise ValueError(
                 f"this run returns another structure than the sweep has: {jax.tree.structure(rerun.program.values)}, "
                 f"not {jax.tree.structure(engine.program.values)}.\nFix: return the same, computed with other settings."
             )
-        return _in_memory(rerun, other or run, axes, which, flat, progress)
+        return _in_memory(rerun, which, flat, progress)
 
     return Sweep(axes, values, status, engine.words, done, seconds, again)
 

@@ -14,7 +14,7 @@ import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import PyTree
 
-from lagjax.motion.reported import reporting
+from lagjax.motion.reported import PATIENCE, reporting
 from lagjax.motion.trajectory import RESULTS, Trajectory
 from lagjax.sweeps.axes import Axes, index_dtype
 
@@ -74,8 +74,11 @@ def point_of(run: Callable) -> Callable:
     return point
 
 
-def compiled(run: Callable, axes: Axes, chunk: int, devices: Sequence, layout: str) -> Program:
-    """Compile a sweep's program for chunks of some length, split between the devices."""
+def compiled(run: Callable, axes: Axes, chunk: int, devices: Sequence, layout: str, patience=None) -> Program:
+    """Compile a sweep's program for chunks of some length, split between the devices.
+
+    With `patience`, motions in it are given up after so many steps.
+    """
     point = point_of(run)
 
     def lanes(axes, indices):
@@ -88,7 +91,9 @@ def compiled(run: Callable, axes: Axes, chunk: int, devices: Sequence, layout: s
         function = jax.shard_map(lanes, mesh=mesh, in_specs=(PartitionSpec(), split), out_specs=split, check_vma=False)
     shaped = partial(jax.tree.map, lambda x: jax.ShapeDtypeStruct(np.shape(x), x.dtype))
     indices = jax.ShapeDtypeStruct((chunk,), index_dtype())
+    before = PATIENCE.set(patience)
     traced = jax.jit(function).trace(shaped(axes), indices)
+    PATIENCE.reset(before)
     shapes, _ = traced.out_info
     program = traced.lower().compile()
     memory = program.memory_analysis()

@@ -104,6 +104,21 @@ def test_a_lane_that_fails_keeps_its_reason():
         few.resweep(lambda point: (point["g"], point["g"]))
 
 
+def test_long_lanes_are_run_alone(monkeypatch):
+    """The others do not wait for them; steps that run out by the user's own word are not taken again."""
+    monkeypatch.setattr(engine, "PATIENCE", 30)
+    run = lambda limit: lambda point: swing(point, max_steps=limit).q[-1]
+    swept = quiet(run(2**16))
+    assert swept.ok.all() and 0 < np.sum(swept.status.steps > 30) < 10
+    alone = jax.jit(run(2**16))
+    for i, j in np.argwhere(swept.status.steps > 30):
+        np.testing.assert_allclose(
+            swept.values[i, j], alone({"g": AXES["g"][i], "angle": AXES["angle"][j]}), rtol=1e-14
+        )
+    few = quiet(run(28))
+    assert few.status.steps.max() == 28 and np.any(few.status.result == MAX_STEPS)
+
+
 def test_starts_that_cannot_be_integrated():
     """Off the constraint, NaN: each lane with its own word, none raises."""
     start = lambda point: ({"x": point["x"], "y": 0.0}, {"x": 0.0, "y": 0.0})
