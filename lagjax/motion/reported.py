@@ -5,7 +5,6 @@ function that integrates, wherever and in whatever it returns, into one that say
 """
 
 from collections.abc import Callable
-from contextvars import ContextVar
 from typing import NamedTuple
 
 import jax
@@ -21,8 +20,9 @@ from lagjax.motion.trajectory import RESULTS, Trajectory
 from lagjax.numerics.one_function import without_checks
 from lagjax.numerics.programs import bodies, evaluate
 
-# In a program for many lanes that wait for each other: the steps after which a motion is given up, to be run alone.
-PATIENCE = ContextVar("patience", default=None)
+# In a program for many lanes that wait for each other: the steps after which a motion is given up, to be run alone. A
+# context of JAX's: a function that the user has jitted is traced again under it.
+PATIENCE = jax.make_user_context(default_value=None)
 CALLS = {
     "jit",
     "pjit",
@@ -61,7 +61,7 @@ def report(trajectory: Trajectory) -> Trajectory:
 
 def patient(max_steps: int | None) -> int | None:
     """The steps that a motion may take here and now."""
-    limits = [limit for limit in (max_steps, PATIENCE.get()) if limit is not None]
+    limits = [limit for limit in (max_steps, PATIENCE.value) if limit is not None]
     return min(limits, default=None)
 
 

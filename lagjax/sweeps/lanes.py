@@ -91,9 +91,8 @@ def compiled(run: Callable, axes: Axes, chunk: int, devices: Sequence, layout: s
         function = jax.shard_map(lanes, mesh=mesh, in_specs=(PartitionSpec(), split), out_specs=split, check_vma=False)
     shaped = partial(jax.tree.map, lambda x: jax.ShapeDtypeStruct(np.shape(x), x.dtype))
     indices = jax.ShapeDtypeStruct((chunk,), index_dtype())
-    before = PATIENCE.set(patience)
-    traced = jax.jit(function).trace(shaped(axes), indices)
-    PATIENCE.reset(before)
+    with PATIENCE(patience):
+        traced = jax.jit(function).trace(shaped(axes), indices)
     shapes, _ = traced.out_info
     program = traced.lower().compile()
     memory = program.memory_analysis()
