@@ -35,7 +35,7 @@ QUOTED = [
     ),
     ("against_hand_written", "bead_on_hoop, single: from L / by hand", "one evaluation, bead / by hand"),
     ("against_hand_written", "rolling_hoop, single: from L / by hand", "one evaluation, rolling hoop / by hand"),
-    ("sweep", "trajectories/s, error 1e-06: lagjax / numba", "sweep over 1,000 speeds, error 1e-6 / numba"),
+    ("sweep", "trajectories/s, error 1e-06: lagjax / numba Dopri8", "sweep over 1,000 speeds, error 1e-6 / numba"),
     ("sweep", "trajectories/s, error 1e-06: lagjax / heyoka in batches", "the same / heyoka, eight lanes at a time"),
     ("sweep", "trajectories/s, error 1e-10: lagjax / heyoka in batches", "the same at error 1e-10"),
     ("sweep", "trajectories/s: two cores / one", "the same, two cores / one"),
