@@ -18,13 +18,13 @@ import diffrax
 import jax
 
 from lagjax import plot, report, stability
-from lagjax.numerics.runge_kutta import Dopri8, Tsit5
+from lagjax.numerics.runge_kutta import Dopri8
 from lagjax.scenes import SCENES
 
 STABILITY = "stability"
 
 FULL = {
-    "methods": {"Tsit5": Tsit5(), "Dopri8": Dopri8()},
+    "methods": None,
     "tolerances": (1e-4, 1e-6, 1e-8, 1e-10, 1e-12),
     "repeats": 5,
 }

@@ -17,9 +17,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
+from lagjax.mechanics import coordinates
+from lagjax.mechanics.structure import is_free_of_velocities
 from lagjax.mechanics.system import System
 from lagjax.motion.integrate import integrate
 from lagjax.motion.trajectory import Trajectory, ended_well, message
+from lagjax.numerics.nystrom import Nystrom12
 from lagjax.numerics.runge_kutta import Dopri8, Tsit5
 
 # The tolerance at which a run must reach its `required` error, for the method named with it.
@@ -114,12 +117,12 @@ def work_precision(
 ) -> list[Row]:
     """Integrate one run by several methods at several tolerances, timed and checked.
 
-    **Arguments:** `methods` by name (Dopri8 and Tsit5 by default); `tolerances`, each used as rtol and atol;
-    `repeats`, of which the median time is kept.
+    **Arguments:** `methods` by name (by default Tsit5, Dopri8 and, where it can be used, Nystrom12); `tolerances`, each
+    used as rtol and atol; `repeats`, of which the median time is kept.
 
     **Returns:** one `Row` a method and tolerance, `seconds` for the compiled program with results ready.
     """
-    methods = {"Tsit5": Tsit5(), "Dopri8": Dopri8()} if methods is None else methods
+    methods = _methods_for(run) if methods is None else methods
     rows = []
     for name, method in methods.items():
         solve = eqx.filter_jit(_solver_of(run, method))
@@ -188,6 +191,12 @@ def case_table(cases: Sequence[Case]) -> str:
     # The last column is prose: keep it to the left.
     width = max(len(row[-1]) for row in [header, *cells])
     return table(header[:-1] + (header[-1].ljust(width),), [row[:-1] + (row[-1].ljust(width),) for row in cells])
+
+
+def _methods_for(run):
+    by_runge_kutta = {"Tsit5": Tsit5(), "Dopri8": Dopri8()}
+    state = coordinates.state(run.ts[0], run.q0, run.v0, run.params)
+    return by_runge_kutta | ({"Nystrom12": Nystrom12()} if is_free_of_velocities(run.system, *state) else {})
 
 
 def _solver_of(run, method):

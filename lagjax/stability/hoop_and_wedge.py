@@ -1,9 +1,12 @@
 """Wedge and bead on a hoop: mass ratios, angles, speeds, amplitudes and single precision, against closed forms."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from lagjax.numerics.nystrom import Nystrom12
 from lagjax.scenes import bead_on_hoop, sliding_wedge
 from lagjax.scenes.elliptic import jacobi_elliptic
 from lagjax.stability.trial import ACCURATE, FULL, QUICK, REDUCED, REFUSED, Trial, by_parameter
@@ -72,7 +75,12 @@ def bead():
         for side in (-1e-9, 1e-9):
             name, omega = f"omega = critical (1 {side:+.0e}), psi = {psi:.3g}", critical * (1 + side)
             rows.append(swing(name, {"omega": omega}, psi, 3.7, tier=REDUCED if side > 0 else FULL))
-    return rows
+    return by_both(rows)
+
+
+def by_both(rows):
+    """The same by the default where accelerations do not depend on velocities."""
+    return [*rows, *(replace(row, method=Nystrom12()) for row in rows)]
 
 
 def separatrix():
@@ -109,7 +117,7 @@ def separatrix():
             family="separatrix", amplification=distance**-2, derived=False,
         )
     )  # fmt: skip
-    return rows
+    return by_both(rows)
 
 
 def _fall(q0, v0, params, ts):

@@ -6,7 +6,7 @@ import numpy as np
 
 from lagjax.mechanics.system import System
 from lagjax.scenes import bead_on_hoop
-from lagjax.stability.hoop_and_wedge import swing
+from lagjax.stability.hoop_and_wedge import by_both, swing
 from lagjax.stability.trial import DEGRADED, REDUCED, REFUSED, Trial
 
 
@@ -43,9 +43,13 @@ def long():
         _whole_turns, method=diffrax.Tsit5(), tolerance=1e-9, options=fixed, observed=_direction, periods=n, **what,
     )  # fmt: skip
     return [
-        swing("1e2 periods", omega, 1.0, 100.3, family="long", tier=REDUCED),
-        swing("1e3 periods", omega, 1.0, 1000.3, family="long"),
-        swing("1e4 periods", omega, 1.0, 10000.3, family="long", derived=False, expected=None),
+        *by_both(
+            [
+                swing("1e2 periods", omega, 1.0, 100.3, family="long", tier=REDUCED),
+                swing("1e3 periods", omega, 1.0, 1000.3, family="long"),
+                swing("1e4 periods", omega, 1.0, 10000.3, family="long", derived=False, expected=None),
+            ]
+        ),
         swing("1e6 periods, as they come", omega, 1.0, 1e6, family="long", derived=False, expected=REFUSED),
         swing(
             "1e6 periods at 1e-4",
