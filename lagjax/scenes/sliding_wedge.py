@@ -165,7 +165,7 @@ def _ratio_case():
     exact = exact_accelerations(PARAMS | {"M": PARAMS["m"] / ratios})
     got = [swept.values[name] for name in ("X", "x", "y", "normal force")]
     error = max(float(np.max(np.abs(a / b - 1))) for a, b in zip(got, exact))
-    return Case("m/M = 2^-40 ... 2^40", f"a sweep, as in closed form; {swept.counts()}", error, 1e-12)
+    return Case("m/M = 2^-40 ... 2^40", f"a sweep, {swept.ok.sum()} of {ratios.size} as in closed form", error, 1e-12)
 
 
 def picture():
