@@ -120,8 +120,7 @@ def integrate(
     )
     ts = problem.times(ts, dtype)
     trajectory = trajectory_of(system, start.q, start.v, start.params, ts, settings)
-    if coordinates.is_traced(trajectory):
-        trajectory = report(trajectory)
+    trajectory = report(trajectory)
     if throw:
         trajectory = _raise_failure(trajectory, start._replace(t=ts[0]), settings)
     return trajectory

@@ -1,7 +1,7 @@
 """How each motion inside a program went, for those who run the program and not the motion.
 
-`integrate` passes every traced trajectory through a primitive that does nothing, `report`, and `reporting` turns a
-function that integrates, wherever and in whatever it returns, into one that says how its integrations went, too.
+`reporting` turns a function that integrates, wherever in it, into one that says how its integrations went, too. While
+it traces the function, `integrate` passes every trajectory through a primitive that does nothing, `report`.
 """
 
 from collections.abc import Callable
@@ -15,14 +15,14 @@ from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, Primitive
 from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array, Float, Int
 
-from lagjax.motion.consistency import worst_residual
+from lagjax.motion.consistency import stopped, worst_residual
 from lagjax.motion.trajectory import RESULTS, Trajectory
 from lagjax.numerics.one_function import without_checks
 from lagjax.numerics.programs import bodies, evaluate
 
-# In a program for many lanes that wait for each other: the steps after which a motion is given up, to be run alone. A
-# context of JAX's: a function that the user has jitted is traced again under it.
-PATIENCE = jax.make_user_context(default_value=None)
+# Whether somebody wants reports; and, in a program for many lanes that wait for each other, the steps after which a
+# motion is given up, to be run alone. Contexts of JAX's: under them what the user has jitted is traced again.
+WATCHED, PATIENCE = jax.make_user_context(default_value=False), jax.make_user_context(default_value=None)
 CALLS = {
     "jit",
     "pjit",
@@ -49,12 +49,14 @@ class Report(NamedTuple):
 
 
 def report(trajectory: Trajectory) -> Trajectory:
-    """The trajectory, unchanged, with its report put down in the program that is being traced."""
+    """The trajectory, unchanged; where somebody watches, its report is put down in the program that is being traced."""
+    if not WATCHED.value:
+        return trajectory
     leaves, structure = jtu.tree_flatten(trajectory)
-    t = trajectory
-    residual = (
-        worst_residual(t.system, t.t, t.q, t.v, t.params) if t.system.constraints else jnp.zeros_like(t.departure)
-    )
+    t = stopped(trajectory)
+    residual = jnp.zeros_like(t.departure)
+    if t.system.constraints:
+        residual = worst_residual(t.system, t.t, t.q, t.v, t.params)
     told = (t.result._value, t.stats["num_steps"], t.departure, residual)
     return jtu.tree_unflatten(structure, _report_p.bind(*map(jnp.asarray, (*leaves, *told)))[: -len(told)])
 
@@ -86,7 +88,8 @@ def reporting(function: Callable) -> Callable:
                     )
             return [jnp.asarray(x) for x in found]
 
-        program = without_checks(jax.make_jaxpr(of_leaves)(*leaves))
+        with WATCHED(True):
+            program = without_checks(jax.make_jaxpr(of_leaves)(*leaves))
         reports = []
         found = _told(program.jaxpr, program.consts, leaves, reports)
         return jtu.tree_unflatten(rest[0], found), _together(reports)
