@@ -11,7 +11,6 @@ Source: Dormand, El-Mikkawy & Prince, *High-order embedded Runge-Kutta-Nyström 
 423: RKN8(6)9FM and RKN12(10)17M.
 """
 
-import functools
 from collections.abc import Callable
 from typing import ClassVar, NamedTuple
 
@@ -25,6 +24,7 @@ from jax import lax
 from jaxtyping import PyTree
 
 from lagjax.numerics.interpolation import Interpolation
+from lagjax.numerics.runge_kutta import weighted_sum
 
 
 class NystromTableau(NamedTuple):
@@ -108,14 +108,7 @@ def _one_by_one(tableau, acceleration, t0, t1, h, y0, first):
     """The last stage, and the sums of all of them by their weights; zero weights leave no trace."""
     found = [first]
 
-    def combined(weights):
-        chosen = [(w, k) for w, k in zip(weights, found) if w != 0]
-        # By lax and not by jnp, which takes three times as long to trace.
-        of_leaves = lambda *ks: functools.reduce(
-            lax.add, [lax.mul(k, lax.full_like(k, w)) for (w, _), k in zip(chosen, ks)]
-        )
-        return jtu.tree_map(of_leaves, *(k for _, k in chosen))
-
+    combined = lambda weights: weighted_sum(None, weights, found)
     for c, row in zip(tableau.c[1:], tableau.a):
         # Rounded differently, the last stage would not be at the time of the next step's first.
         t = t1 if c == 1 else t0 + c * (t1 - t0)

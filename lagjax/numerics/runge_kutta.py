@@ -48,15 +48,15 @@ class ExplicitRungeKutta(diffrax.AbstractAdaptiveSolver):
         for weights, c in zip(tableau.a_lower, tableau.c):
             # Rounded differently, the last stage would not be at the time of the next step's first.
             t = t1 if c == 1 else t0 + c * (t1 - t0)
-            rate = terms.vf(t, _sum(y0, weights, increments), args)
+            rate = terms.vf(t, weighted_sum(y0, weights, increments), args)
             increments.append(terms.prod(rate, control))
-        y1 = _sum(y0, tableau.b_sol, increments)
-        error = _sum(None, tableau.b_error, increments)
+        y1 = weighted_sum(y0, tableau.b_sol, increments)
+        error = weighted_sum(None, tableau.b_error, increments)
         stages = jtu.tree_map(lambda *k: jnp.stack(k), *increments)
         return y1, error, {"y0": y0, "y1": y1, "k": stages}, rate if tableau.fsal else None, diffrax.RESULTS.successful
 
 
-def _sum(start, weights, increments):
+def weighted_sum(start, weights, increments):
     """`start + sum_i weights_i increments_i`, leaf by leaf."""
     chosen = [(w, k) for w, k in zip(weights, increments) if w != 0]
 

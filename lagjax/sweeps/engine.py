@@ -195,8 +195,8 @@ class _Engine:
 def _in_memory(engine, indices, before, progress):
     started, axes = time.perf_counter(), engine.axes
     if before is None:
-        values = jax.tree.map(lambda x: np.zeros((axes.size, *x.shape), x.dtype), engine.program.values)
-        values = jax.tree.map(lambda x: x.fill(np.nan) or x if np.issubdtype(x.dtype, np.inexact) else x, values)
+        nothing = lambda x: np.nan if np.issubdtype(x.dtype, np.inexact) else 0
+        values = jax.tree.map(lambda x: np.full((axes.size, *x.shape), nothing(x), x.dtype), engine.program.values)
         fills = (NOT_RUN, 0, np.nan, np.nan)
         status = Status(*(np.full(axes.size, fill, dtype) for fill, dtype in zip(fills, STATUS_TYPES)))
     else:

@@ -40,13 +40,13 @@ GOOD = tuple(int(item._value) for item in (RESULTS.successful, RESULTS.event_occ
 
 
 class Program(NamedTuple):
-    """A compiled program for `chunk` indices, the shapes of one point's values, and the bytes that it works with."""
+    """A compiled program for `chunk` indices: one point's shapes, the bytes that it works with, what was traced."""
 
     call: Callable
     chunk: int
     values: PyTree
     working: int
-    text: str
+    traced: Any
 
 
 def point_of(run: Callable) -> Callable:

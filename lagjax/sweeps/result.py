@@ -91,7 +91,7 @@ class Sweep:
         """Draw values over the axes: lines over one, a map over two, a map for each value of the first over three.
 
         **Arguments:** `value`: the name of a leaf, or a function of `values` that returns an array in the shape of the
-        axes; by default every leaf with one number a point. Points that are not `ok` are marked.
+        axes; by default every leaf with one number a point. Lines mark the points that are not `ok`; NaN is grey in maps.
 
         **Returns:** a matplotlib `Figure`.
 
@@ -224,9 +224,7 @@ class Stored:
     @property
     def like(self) -> Any:
         """One point's values, as shapes."""
-        if self._like is not None:
-            return self._like
-        return {name: np.empty(x.shape[1:], x.dtype) for name, x in self.store.values().items()}
+        return self.store.one() if self._like is None else self._like
 
     def __call__(self):
         return self.store.values(self._like)

@@ -50,7 +50,7 @@ def fingerprint(axes: Axes, program: Program, layout: str) -> dict[str, Any]:
         "values": {name: f"{x.dtype}{list(x.shape)}" for name, x in named_leaves(program.values)},
         "chunk": program.chunk,
         "layout": layout,
-        "program": _digest(_text(program.text.jaxpr).encode()),
+        "program": _digest(_text(program.traced.jaxpr).encode()),
         "versions": {name: version(name) for name in ("lagjax", "jax", "diffrax")},
     }
 
@@ -120,6 +120,11 @@ class Store:
         if like is None:
             return found
         return jax.tree.unflatten(jax.tree.structure(like), [found[name] for name, _ in named_leaves(like)])
+
+    def one(self) -> dict[str, jax.ShapeDtypeStruct]:
+        """The shapes of one point's values by name, without reading any."""
+        arrays = {name: self.group[f"values/{name}"] for name in self.about["fingerprint"]["values"]}
+        return {name: jax.ShapeDtypeStruct(x.shape[1:], x.dtype) for name, x in arrays.items()}
 
     def status(self) -> Status:
         """The statuses of all points."""
