@@ -91,7 +91,7 @@ class Sweep:
         """Draw values over the axes: lines over one, a map over two, a map for each value of the first over three.
 
         **Arguments:** `value`: the name of a leaf, or a function of `values` that returns an array in the shape of the
-        axes; by default every leaf with one number a point. Lines mark the points that are not `ok`; NaN is grey in maps.
+        axes; by default every leaf with one number a point. Lines mark what is not `ok`; NaN is grey in maps.
 
         **Returns:** a matplotlib `Figure`.
 
