@@ -36,6 +36,13 @@ from lagjax.sweeps.lanes import Status
 from lagjax.sweeps.result import Sweep, open_sweep
 
 # isort: split
+# From measured motion.
+from lagjax.fitting.engine import fit, identifiability
+from lagjax.fitting.identifiability import Identifiability
+from lagjax.fitting.records import Record
+from lagjax.fitting.result import Fit, FitWarning
+
+# isort: split
 # Error against run time.
 from lagjax.report import Run, work_precision
 
@@ -70,6 +77,12 @@ __all__ = [
     "Sweep",
     "Status",
     "open_sweep",
+    "fit",
+    "Record",
+    "Fit",
+    "FitWarning",
+    "identifiability",
+    "Identifiability",
     "Run",
     "work_precision",
     "scenes",

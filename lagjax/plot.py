@@ -90,6 +90,30 @@ def work_precision(title: str, curves: dict[str, tuple[np.ndarray, np.ndarray]])
     return fig
 
 
+def fits(panels: dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]]):
+    """Draw measurements and what a fit makes of them, and beside them the residuals, one row a channel.
+
+    **Arguments:** `panels` by name: times (T,), measurements and residuals (T,) or (T, n).
+
+    **Returns:** a matplotlib `Figure`.
+    """
+    fig, axes = figure(len(panels), 2, size=(5.2, 2.3), sharex=True)
+    for (left, right), (name, (t, measured, residuals)) in zip(axes, panels.items()):
+        fitted = measured + residuals
+        for i, (x, y) in enumerate(zip(measured.reshape(len(t), -1).T, fitted.reshape(len(t), -1).T)):
+            left.plot(t, x, ".", color="#888888", markersize=3, label="measured" if i == 0 else None)
+            left.plot(t, y, linewidth=1.2, label="fit" if i == 0 else None, **style(i))
+        for i, r in enumerate(residuals.reshape(len(t), -1).T):
+            right.plot(t, r, ".", markersize=3, color=COLOURS[i % len(COLOURS)])
+        right.axhline(0.0, color="black", linewidth=0.8)
+        left.set_ylabel(name)
+        right.set_ylabel(f"fit less measured: {name}")
+        left.legend(fontsize=8, frameon=False)
+    for axis in axes[-1]:
+        axis.set_xlabel("t")
+    return fig
+
+
 def lines(label: str, x, panels: dict[str, np.ndarray], bad):
     """Draw values against one axis of a sweep, one panel a value; points that are `bad` are marked at the bottom."""
     fig, axes = figure(len(panels), 1, size=(6.0, 2.8), sharex=True)

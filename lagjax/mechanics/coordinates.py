@@ -96,6 +96,11 @@ def as_arrays(tree, dtype):
     return jtu.tree_map(convert, tree)
 
 
+def numpy_of(tree):
+    """NumPy where the values of `tree` can be looked at, else `jax.numpy`: small work outside a program compiles less."""
+    return jnp if is_traced(tree) else np
+
+
 def is_traced(tree) -> bool:
     """Whether JAX is tracing through `tree`, so that its values cannot be looked at."""
     return any(isinstance(leaf, jax.core.Tracer) for leaf in jtu.tree_leaves(tree))

@@ -70,10 +70,10 @@ def consistent_state(system, t, q, v, params, hold: str | Iterable[str] = ()):
     """
     s = coordinates.state(t, q, v, params)
     check_scalar(system, *s)
-    free = _free(s, hold)
+    free = free_coordinates(s.q, hold)
     if not system.constraints:
         return s.q, s.v
-    q, v, reached = _consistent_state(system, *s, jnp.asarray(free))
+    q, v, reached = nearest_state(system, *s, jnp.asarray(free), jnp.asarray(free))
     if coordinates.is_traced((q, v)):
         return jax.tree.map(lambda x: jnp.where(reached, x, jnp.nan), (q, v))
     if not reached:
@@ -81,9 +81,9 @@ def consistent_state(system, t, q, v, params, hold: str | Iterable[str] = ()):
     return q, v
 
 
-def _free(s, hold):
+def free_coordinates(q, hold) -> np.ndarray:
     """Which coordinates may move, (n,) booleans."""
-    names = coordinates.names(s.q)
+    names = coordinates.names(q)
     if isinstance(hold, Mapping):
         hold = [name for name, held in hold.items() if held]
     hold = {hold} if isinstance(hold, str) else set(hold)
@@ -114,20 +114,21 @@ def _round_off(t):
 
 
 @eqx.filter_jit
-def _consistent_state(system, t, q, v, params, free):
+def nearest_state(system, t, q, v, params, free_q, free_v):
+    """(q, v, whether they satisfy the constraints), with what is not free held, of positions and of velocities."""
     x0, unflatten = coordinates.flatten(q)
     u0, _ = coordinates.flatten(v)
     metric = mass_and_forcing(system, t, x0, u0, params, unflatten).mass
     x, u, live = x0, u0, (system, t, params)
     if constraints.holonomic_equations(system, t, q, v, params).any():
         position = lambda problem, x: constraints.position_residual(*problem[:2], x, problem[2], unflatten)
-        x = _nearest(position, live, x0, metric, free)
+        x = _nearest(position, live, x0, metric, free_q)
 
     def velocity(problem_and_x, u):
         (system, t, params), x = problem_and_x
         return constraints.velocity_residual(system, t, x, u, params, unflatten)
 
-    u = _nearest(velocity, (live, x), u0, metric, free)
+    u = _nearest(velocity, (live, x), u0, metric, free_v)
     q, v = unflatten(x), unflatten(u)
     tolerance = _round_off(t)
     return q, v, within(system, t, q, v, params, tolerance, tolerance)

@@ -1,0 +1,1 @@
+"""Fits: parameters, initial states and learned terms from measured motion."""

@@ -1,0 +1,141 @@
+"""Which combinations of parameters the data can see: the singular values of the motion's sensitivity.
+
+In relative changes δx/x the equations at a point are `R δx/x`, with the starts of the runs eliminated. A right singular
+vector n whose singular value vanishes is a change of the parameters that leaves no trace in the data: if m and M grow by
+the same factor and the motion stays as it is, only m/M is seen. A singular value s means that the combination is known
+to the relative error 1/s, in units of the measurement error.
+
+Source: Brun, Reichert & Künsch, *Water Resources Research* 37 (2001) 1015, Eqs. (6)-(9); Belsley, *Regression
+Diagnostics*, §3.2.
+"""
+
+from fractions import Fraction
+from itertools import combinations
+
+import equinox as eqx
+import numpy as np
+import scipy.linalg
+from jaxtyping import Array, Float
+
+from lagjax.mechanics.diagnosis import listed
+
+# A combination whose exponents are these, after scaling, is a power product: m/M, k/m², not m^0.37 M^-1.2.
+LARGEST_DENOMINATOR, EXPONENT_ERROR = 4, 1e-3
+# Among more parameters the simplest combinations are not looked for.
+ENUMERATE_UP_TO = 10
+
+
+class Identifiability(eqx.Module):
+    """What of the parameters the data see. It says so in words.
+
+    - `names`: of the numbers that are asked for. `values` (p,): where.
+    - `singular_values` (p,): the largest first; the reciprocal of a relative error, in units of `noise`.
+    - `combinations` (p, p): by row, the relative changes that belong to them.
+    - `noise`: the size of one measurement error: 1 where `sigma` was given; else the rms residual, unknown before a fit.
+    """
+
+    names: tuple[str, ...] = eqx.field(static=True)
+    values: Float[Array, " p"]
+    singular_values: Float[Array, " p"]
+    combinations: Float[Array, "p p"]
+    noise: Float[Array, ""] | None
+
+    @property
+    def rank(self) -> int:
+        """How many independent combinations the data see."""
+        s = np.asarray(self.singular_values)
+        return int(np.sum(s > _floor(s.dtype) * np.max(s, initial=0.0)))
+
+    def combined(self) -> list[str]:
+        """The combinations that the data see, as products of powers where they are such."""
+        return [_combination(self.names, row) for row in _simplest(np.asarray(self.combinations)[: self.rank])]
+
+    def unseen(self) -> list[str]:
+        """The names of what leaves no trace in the data, neither alone nor with others."""
+        rows = np.asarray(self.combinations)[: self.rank]
+        seen = np.sqrt(np.sum(rows**2, axis=0)) > EXPONENT_ERROR
+        return [name for name, s in zip(self.names, seen) if not s]
+
+    def __repr__(self):
+        names, rank = listed(list(self.names)), self.rank
+        if not self.names:
+            return "Identifiability: no parameter is asked for, only starts"
+        if rank == len(self.names):
+            lines = [f"Identifiability: the data see {names}"]
+        else:
+            lines = [f"Identifiability: of {names} the data see only", *(f"  {words}" for words in self.combined())]
+        if self.unseen():
+            lines.append(f"  {listed(self.unseen())}: no trace in the data")
+        if self.noise is not None and rank:
+            error = float(self.noise / self.singular_values[rank - 1])
+            lines.append(f"  least certain: {_mixture(self.names, self.combinations[rank - 1])}, to {error:.2g}")
+        return "\n".join(lines)
+
+
+def _floor(dtype):
+    return np.sqrt(np.finfo(dtype).eps)
+
+
+def _simplest(rows):
+    """A basis of the space of some orthonormal rows, with as few entries each as can be."""
+    rank, p = rows.shape
+    if rank in (0, p) or p > ENUMERATE_UP_TO:
+        return np.eye(p) if rank == p else rows
+    unseen = scipy.linalg.null_space(rows)
+    basis = np.zeros((0, p))
+    for size in range(1, p + 1):
+        for support in combinations(range(p), size):
+            # A vector on these entries alone that has no part along what is not seen.
+            _, s, vt = np.linalg.svd(unseen[list(support)].T)
+            if len(s) == size and s[-1] > EXPONENT_ERROR:
+                continue
+            found = np.zeros(p)
+            found[list(support)] = vt[-1]
+            if np.linalg.matrix_rank(np.vstack([basis, found]), tol=EXPONENT_ERROR) > len(basis):
+                basis = np.vstack([basis, found])
+            if len(basis) == rank:
+                return basis
+    return rows
+
+
+def _members(row):
+    return [int(i) for i in np.flatnonzero(np.abs(row) > 1e-3 * np.max(np.abs(row)))]
+
+
+def _exponents(row, members):
+    """The entries as small whole numbers, up to a factor; None where they are none."""
+    smallest = min((row[i] for i in members), key=abs)
+    ratios = [Fraction(float(row[i] / smallest)).limit_denominator(LARGEST_DENOMINATOR) for i in members]
+    if any(
+        abs(float(f) - row[i] / smallest) > EXPONENT_ERROR * abs(row[i] / smallest) for f, i in zip(ratios, members)
+    ):
+        return None
+    whole = np.lcm.reduce([f.denominator for f in ratios])
+    return [int(f * whole) for f in ratios]
+
+
+def _combination(names, row):
+    members = _members(row)
+    exponents = _exponents(row, members)
+    if exponents is None:
+        return _mixture(names, row)
+    if exponents[0] < 0:
+        exponents = [-e for e in exponents]
+    up = [names[i] + _power(e) for i, e in zip(members, exponents) if e > 0]
+    down = [names[i] + _power(-e) for i, e in zip(members, exponents) if e < 0]
+    below = f"({' '.join(down)})" if len(down) > 1 else "".join(down)
+    return " ".join(up) + (f"/{below}" if down else "")
+
+
+def _power(e):
+    return "" if e == 1 else f"^{e}"
+
+
+def _mixture(names, row):
+    """A relative change of several, without those that hardly take part."""
+    row = np.asarray(row)
+    members = sorted(np.flatnonzero(np.abs(row) > 0.1 * np.max(np.abs(row))), key=lambda i: -abs(row[i]))[:4]
+    if len(members) == 1:
+        return names[members[0]]
+    row = row * np.sign(row[members[0]])
+    return " ".join(f"{row[i]:+.2g} δ{names[i]}/{names[i]}" for i in members).lstrip("+")

@@ -1,0 +1,160 @@
+"""Which numbers among the parameters are found, within which bounds, and what is known of them before.
+
+A found number x is searched as a free one, z:
+
+    x = z                         without bounds
+    x = low + exp z               above `low`      (positive numbers: z is the logarithm)
+    x = high - exp(-z)            below `high`
+    x = low + (high - low) / (1 + exp(-z))         between
+"""
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+from jaxtyping import Array, Float, PyTree
+
+from lagjax.mechanics import coordinates
+from lagjax.mechanics.diagnosis import listed
+
+
+class Found(eqx.Module):
+    """The numbers among `params` that a fit finds.
+
+    - `start` (p,): where the search starts. `low`, `high` (p,): bounds, infinite where there are none.
+    - `mean`, `sd` (p,): what is known before; `sd` is infinite where nothing is.
+    - `names`: of each number, as the user writes it.
+    """
+
+    params: PyTree
+    start: Float[Array, " p"]
+    low: Float[Array, " p"]
+    high: Float[Array, " p"]
+    mean: Float[Array, " p"]
+    sd: Float[Array, " p"]
+    names: tuple[str, ...] = eqx.field(static=True)
+    leaves: tuple[int, ...] = eqx.field(static=True)
+
+    def into(self, x: Float[Array, " p"]) -> PyTree:
+        """`params` with the numbers `x` in place."""
+        leaves, structure = jtu.tree_flatten(self.params)
+        at = 0
+        for i in self.leaves:
+            size = leaves[i].size
+            leaves[i] = x[at : at + size].reshape(leaves[i].shape).astype(leaves[i].dtype)
+            at += size
+        return jtu.tree_unflatten(structure, leaves)
+
+    def out_of(self, params: PyTree) -> Float[Array, " p"]:
+        """The found numbers of other parameters of the same structure."""
+        leaves = jtu.tree_leaves(params)
+        return jnp.concatenate([jnp.ravel(leaves[i]) for i in self.leaves] or [jnp.zeros(0)])
+
+    def natural(self, z):
+        """Numbers within their bounds from free ones."""
+        low, high = jnp.isfinite(self.low), jnp.isfinite(self.high)
+        below, above = jnp.where(low, self.low, 0.0), jnp.where(high, self.high, 0.0)
+        # Zeros where a branch is not taken: an overflow there would poison derivatives.
+        of = lambda taken: jnp.where(taken, z, 0.0)
+        x = jnp.where(low & ~high, below + jnp.exp(of(low & ~high)), z)
+        x = jnp.where(high & ~low, above - jnp.exp(-of(high & ~low)), x)
+        return jnp.where(high & low, below + (above - below) * jax.nn.sigmoid(of(high & low)), x)
+
+    def free(self, x):
+        """The inverse of `natural`."""
+        low, high = jnp.isfinite(self.low), jnp.isfinite(self.high)
+        share = (x - self.low) / jnp.where(low & high, self.high - self.low, 1.0)
+        z = jnp.where(low & ~high, jnp.log(jnp.where(low & ~high, x - self.low, 1.0)), x)
+        z = jnp.where(high & ~low, -jnp.log(jnp.where(high & ~low, self.high - x, 1.0)), z)
+        return jnp.where(high & low, jax.scipy.special.logit(jnp.where(high & low, share, 0.5)), z)
+
+
+def find(
+    params: PyTree,
+    free: str | Iterable[str] | None,
+    bounds: Mapping[str, tuple[float | None, float | None]],
+    priors: Mapping[str, tuple[float, float]],
+    dtype,
+) -> Found:
+    """Read off `params`, names, bounds and priors what is to be found."""
+    params = coordinates.as_arrays(params, dtype)
+    named = [(leaf_name(path), x) for path, x in jtu.tree_leaves_with_path(params)]
+    floating = {name: i for i, (name, x) in enumerate(named) if eqx.is_inexact_array(x)}
+    if free is None:
+        chosen = set(floating)
+    else:
+        wanted = [free] if isinstance(free, str) else list(free)
+        chosen = set().union(*(_matching(name, floating, "free") for name in wanted)) if wanted else set()
+    order = tuple(i for name, i in floating.items() if name in chosen)
+    entries = [entry for i in order for entry in _entries(*named[i])]
+    sizes = {named[i][0]: named[i][1].size for i in order}
+    xp = coordinates.numpy_of(params)
+    start = xp.concatenate([xp.ravel(named[i][1]).astype(dtype) for i in order] or [xp.zeros(0, dtype)])
+
+    def spread(given, default, what):
+        values = [np.full(len(entries), value) for value in default]
+        places = dict(zip(sizes, np.cumsum([0, *sizes.values()])))
+        for name, pair in given.items():
+            _check_pair(name, pair, what)
+            for leaf in _matching(name, sizes, what):
+                part = slice(places[leaf], places[leaf] + sizes[leaf])
+                for value, new in zip(values, pair):
+                    if new is not None:
+                        value[part] = np.ravel(np.broadcast_to(np.asarray(new, float), named[floating[leaf]][1].shape))
+        return values
+
+    low, high = spread(bounds, (-np.inf, np.inf), "bounds")
+    mean, sd = spread(priors, (0.0, np.inf), "priors")
+    if np.any(sd <= 0):
+        raise ValueError('the standard deviation of a prior must be positive.\nFix: priors={"g": (9.81, 0.01)}.')
+    found = Found(params, start, *(x.astype(dtype) for x in (low, high, mean, sd)), tuple(entries), order)
+    _check_start(found, low, high)
+    return found
+
+
+def leaf_name(path) -> str:
+    """The name of a leaf of `params` as a person writes it."""
+    return jtu.keystr(path, simple=True, separator=".") or "params"
+
+
+def _entries(name, x):
+    return [name + ("[" + ", ".join(map(str, i)) + "]" if i else "") for i in np.ndindex(x.shape)]
+
+
+def _matching(name: Any, among: Iterable[str], argument: str) -> set[str]:
+    found = {leaf for leaf in among if leaf == name or leaf.startswith(f"{name}.")}
+    if not found:
+        raise ValueError(
+            f"{argument} names {name!r}, which is no floating number of params that is found: {listed(list(among))}.\n"
+            'Usual cause: a misspelled name, or a whole number written without its point ("m": 1).\n'
+            f"Fix: use the names that stand in params; leaves of a dict in a dict as 'arm.length'."
+        )
+    return found
+
+
+def _check_pair(name, pair, what):
+    if not isinstance(pair, tuple | list) or len(pair) != 2:
+        example = '{"m": (0.0, None)}' if what == "bounds" else '{"g": (9.81, 0.01)}, mean and standard deviation'
+        raise ValueError(f"{what} of '{name}' must be a pair, not {pair!r}.\nFix: {what}={example}.")
+
+
+def _check_start(found, low, high):
+    if np.any(low >= high):
+        i = int(np.argmax(low >= high))
+        raise ValueError(f"the bounds of '{found.names[i]}' are ({low[i]}, {high[i]}): low must be below high.")
+    if coordinates.is_traced(found.start):
+        return
+    x = np.asarray(found.start)
+    if not np.all(np.isfinite(x)):
+        raise ValueError(f"'{found.names[int(np.argmin(np.isfinite(x)))]}' starts at {x[~np.isfinite(x)][0]}.")
+    outside = (x <= low) | (x >= high)
+    if outside.any():
+        i = int(np.argmax(outside))
+        raise ValueError(
+            f"'{found.names[i]}' starts at {x[i]:.6g}, and must start inside its bounds, from {low[i]:.6g} to "
+            f"{high[i]:.6g}.\nFix: start a positive number at its order of magnitude, such as 1e-3, not at 0."
+        )

@@ -1,0 +1,237 @@
+"""From what the user gives to the arrays of a fit, or an error in the user's words."""
+
+import warnings
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+
+from lagjax.fitting.equations import LOSSES, Problem, replace
+from lagjax.fitting.parameters import find, leaf_name
+from lagjax.fitting.records import KINDS, Record, channel_name, cut
+from lagjax.fitting.result import FitWarning
+from lagjax.fitting.starts import starts
+from lagjax.mechanics import coordinates
+from lagjax.mechanics.diagnosis import listed
+from lagjax.mechanics.multipliers import accelerations
+from lagjax.motion.problem import check_system
+
+# What `integrate` takes and a fit sets itself.
+OURS = {"ts", "throw", "progress", "adjoint"}
+
+
+def problem_of(system, records, params, free, observe, bounds, priors, loss, window, options) -> Problem:
+    """Check everything and make arrays of it."""
+    check_system(system)
+    records = [records] if isinstance(records, Record) else list(records)
+    if not records or not all(isinstance(record, Record) for record in records):
+        raise TypeError("records must be a lj.Record or a list of them.\nFix: lj.Record(t, q=measured).")
+    if loss not in LOSSES:
+        raise ValueError(f"loss must be {listed(list(LOSSES))}, not {loss!r}.")
+    if OURS & set(options):
+        raise ValueError(f"{listed(sorted(OURS & set(options)))} cannot be given: a fit sets it itself.")
+    absolute = _absolute(records, loss, priors)
+    dtype = jnp.result_type(float)
+    options = {name: jnp.asarray(x, dtype) if isinstance(x, float) else x for name, x in options.items()}
+    found = find(params, free, bounds or {}, priors or {}, dtype)
+    windows = cut(records, window, dtype)
+    overrides = _overrides(records, windows, found)
+    params_of = lambda r: replace(found.params, {name: values[r] for name, values in overrides.items()})
+    starting, unflatten = starts(system, records, windows, params_of, options)
+    _check_kinds(records, observe, options)
+    measured = {kind: _gathered(windows, [record.measured[kind] for record in records], kind)
+                for kind in records[0].measured}  # fmt: skip
+    sigma, spread, ratio = _sigmas(records, windows, measured, absolute)
+    per_window = {name: values[windows.record] for name, values in overrides.items()}
+    xp = coordinates.numpy_of(starting)
+    unit = xp.std(xp.concatenate([starting.q, starting.v], axis=1), axis=0)
+    problem = Problem(
+        system, found, per_window, windows, starting, measured, sigma, spread, ratio,
+        xp.where(unit > 0, unit, 1.0), unflatten, observe, options, loss, absolute,
+    )  # fmt: skip
+    _check_predicted(problem)
+    _warn_of_wrapped(records)
+    return problem
+
+
+def _absolute(records, loss, priors):
+    """Whether the sizes of the errors are known; raise where they must be and are not."""
+    given = [record.sigma is not None for record in records]
+    if any(given) and not all(given):
+        raise ValueError(
+            f"record {given.index(False)} has no sigma and others have one.\nFix: give it to all, or none."
+        )
+    if all(given):
+        return True
+    why = None
+    if any(len(record.measured) > 1 for record in records):
+        why = f"measurements of several kinds ({listed(list(records[0].measured))}) must be weighed against each other"
+    elif priors:
+        why = "a prior must be weighed against the data"
+    elif loss != "squares":
+        why = f"loss={loss!r} must know how large an ordinary error is"
+    if why:
+        raise ValueError(f"{why}, and the records have no sigma.\nFix: lj.Record(..., sigma=0.01).")
+    return False
+
+
+def _overrides(records, windows, found):
+    names = sorted({name for record in records for name in record.params})
+    known = {leaf_name(path): x for path, x in jtu.tree_leaves_with_path(found.params)}
+    fitted = {name.partition("[")[0] for name in found.names}
+    values = {}
+    for name in names:
+        if name not in known:
+            raise ValueError(f"a record sets '{name}', which is not in params: {listed(list(known))}.")
+        if name in fitted:
+            raise ValueError(
+                f"a record sets '{name}', which is also to be found.\nFix: leave it out of free=, or out of the record."
+            )
+        given = [record.params.get(name, known[name]) for record in records]
+        xp = coordinates.numpy_of(given)
+        values[name] = xp.stack([xp.asarray(x, jnp.result_type(float)) for x in given])
+    return values
+
+
+def _check_kinds(records, observe, options):
+    kinds = set(records[0].measured)
+    for r, record in enumerate(records):
+        structures = [jax.tree.structure(x.measured) for x in (records[0], record)]
+        if structures[0] != structures[1]:
+            raise ValueError(
+                f"record {r} holds {listed([n for n, _ in record.channels()])}, and record 0 "
+                f"{listed([n for n, _ in records[0].channels()])}: they must hold the same.\n"
+                "Fix: write NaN for what was not measured in a run."
+            )
+    if ("observed" in kinds) != (observe is not None):
+        raise ValueError(
+            "observe= and the records' observed= belong together, and only one of them is given.\n"
+            'Fix: lj.Record(t, observed={"x": x}) and observe=lambda t, q, v, params: {"x": ...}.'
+        )
+    if "end" in kinds and options.get("event") is None:
+        raise ValueError(
+            "records have end=, and the fit no event= that ends the motion.\nFix: event=diffrax.Event(...)."
+        )
+
+
+def _gathered(windows, trees, kind):
+    if kind == "end":
+        last = np.append(windows.record[1:] != windows.record[:-1], True)
+        xp = coordinates.numpy_of(trees)
+        place = lambda *x: xp.stack([xp.where(at, x[r], np.nan) for r, at in zip(windows.record, last)])
+        return jax.tree.map(place, *trees)
+    return jax.tree.map(lambda *x: windows.gather(x), *trees)
+
+
+def _sigmas(records, windows, measured, absolute):
+    """Sigmas like the measurements, the spread of each channel, and the typical spread in sigmas."""
+    spread = jax.tree.map(_spread, measured)
+    if not absolute:
+        # One size for all: what is estimated is its multiple.
+        xp = coordinates.numpy_of(spread)
+        common = xp.sqrt(xp.mean(xp.stack(jax.tree.leaves(spread)) ** 2))
+        return jax.tree.map(lambda x: xp.full(x.shape, common), measured), spread, np.asarray(1.0)
+    each = [{kind: _broadcast(record, kind) for kind in record.measured} for record in records]
+    sigma = {kind: _gathered(windows, [tree[kind] for tree in each], kind) for kind in measured}
+    xp = coordinates.numpy_of((spread, sigma))
+    finest = lambda s: xp.nanmin(xp.where(xp.isfinite(s), s, np.nan))
+    ratios = [a / finest(s) for a, s in zip(jax.tree.leaves(spread), jax.tree.leaves(sigma))]
+    return sigma, spread, xp.max(xp.stack(ratios))
+
+
+def _spread(x):
+    """The standard deviation of a channel; of one number its size; 1 where that is 0."""
+    xp = coordinates.numpy_of(x)
+    spread = xp.nanstd(x)
+    spread = xp.where(spread > 0, spread, xp.abs(xp.nanmean(x)))
+    return xp.where(spread > 0, spread, 1.0)
+
+
+def _broadcast(record, kind):
+    sigma, tree = record.sigma, record.measured[kind]
+    if isinstance(sigma, Mapping):
+        if kind not in sigma:
+            raise ValueError(
+                f"sigma has no entry '{kind}'; it has {listed(list(sigma))}.\n"
+                f'Fix: sigma={{"{kind}": ...}}, by kind of measurement ({listed(KINDS)}).'
+            )
+        sigma = sigma[kind]
+
+    def like(s, part):
+        def one(x):
+            xp = coordinates.numpy_of(s)
+            given = xp.asarray(s, x.dtype)
+            if xp is np and not np.all(given > 0):
+                raise ValueError("sigma must be positive.\nFix: sigma=jnp.inf leaves a value out; NaN data too.")
+            if 0 < given.ndim < x.ndim and given.shape == x.shape[: given.ndim]:
+                given = given.reshape(given.shape + (1,) * (x.ndim - given.ndim))
+            return xp.broadcast_to(given, x.shape)
+
+        return jax.tree.map(one, part)
+
+    try:
+        return jtu.tree_map(like, sigma, tree)
+    except (ValueError, TypeError) as error:
+        if "sigma must" in str(error):
+            raise
+        raise ValueError(f"sigma of '{kind}' does not fit the measurements: {error}") from error
+
+
+def _check_predicted(problem: Problem):
+    """Raise where the measurements do not have the shape of what the motion says."""
+    begin = jax.tree.map(lambda x: x[0], (problem.starts.q, problem.starts.v))
+    q, v = (jax.eval_shape(problem.unflatten, x) for x in begin)
+    t, params = jax.ShapeDtypeStruct((), problem.windows.ts.dtype), problem.found.params
+
+    def one_time(t, q, v, params):
+        said = {"q": q, "v": v, "multipliers": accelerations(problem.system, t, q, v, params)[1]}
+        if problem.observe is not None:
+            said["observed"] = problem.observe(t, q, v, params)
+        return said | {"end": {"t": t, **said}}
+
+    said = eqx.filter_eval_shape(one_time, t, q, v, params)
+    for kind, tree in problem.measured.items():
+        _match(kind, said[kind], tree, 1 if kind == "end" else 2)
+
+
+def _match(kind: str, said: Any, measured: Any, axes: int, path=()):
+    if isinstance(measured, dict) and isinstance(said, dict):
+        for name, part in measured.items():
+            if name not in said:
+                raise ValueError(
+                    f"'{name}' was measured as {kind}, and there {listed(list(said))}.\n"
+                    f"Fix: name what the motion has: {kind}={{{list(said)[0]!r}: ...}}."
+                )
+            _match(kind, said[name], part, axes, (*path, jtu.DictKey(name)))
+        return
+    found, wanted = jtu.tree_structure(said), jtu.tree_structure(measured)
+    if found != wanted:
+        raise ValueError(
+            f"{kind} was measured as {wanted}, and the motion has {found}.\nFix: give it in that structure."
+        )
+    for x, y in zip(jtu.tree_leaves(said), jtu.tree_leaves(measured)):
+        if x.shape != y.shape[axes:]:
+            raise ValueError(
+                f"'{channel_name(kind, path)}' was measured with the shape {y.shape[axes:]} at each time, and the "
+                f"motion has {x.shape}.\nUsual cause: an array of one entry where a number is meant, or observe returning "
+                "another shape."
+            )
+
+
+def _warn_of_wrapped(records: Sequence[Record]):
+    for r, record in enumerate(records):
+        for name, x in record.channels():
+            if name.startswith("end") or "q" not in record.measured or coordinates.is_traced(x):
+                continue
+            jumps = np.abs(np.diff(np.asarray(x), axis=0))
+            if np.any(np.abs(jumps - 2 * np.pi) < 0.05 * np.pi) and np.nanmedian(jumps) < 0.5:
+                warnings.warn(
+                    f"'{name}' of record {r} jumps by a whole turn: the angle seems to be wrapped.\n"
+                    f"Fix: np.unwrap({name}).",
+                    FitWarning,
+                    stacklevel=4,
+                )

@@ -1,0 +1,224 @@
+"""What was measured in one run, and records cut into windows of one shape, so that one program serves them all."""
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
+
+from lagjax.mechanics import coordinates
+
+# What of a motion can be measured; the last as numbers of a run, the others at each of its times.
+KINDS = ("q", "v", "multipliers", "observed", "end")
+# Times of padding follow each other at this part of the shortest interval.
+PADDING = 1e-3
+
+
+class Record(eqx.Module):
+    """What was measured in one run.
+
+    >>> import jax.numpy as jnp
+    >>> t = jnp.linspace(0.0, 1.0, 50)
+    >>> Record(t, q={"theta": 0.1 * jnp.cos(3.0 * t)}, v0={"theta": 0.0}, hold_v=True, sigma=0.001)
+    Record(50 times from 0 to 1, q: theta)
+
+    **Arguments,** T times and whatever of the following was measured, each leaf (T, ...), NaN where a value is missing:
+
+    - `t` (T,): increasing times, `[t]`. The run starts at `t[0]`, from a state that is an unknown of the fit.
+    - `q`, `v`: coordinates and velocities, in the structure of the state; of a dictionary some of the names.
+    - `multipliers`: by constraint name, some or all: a measured normal force, for example.
+    - `observed`: like what `observe(t, q, v, params)` of the fit returns.
+    - `end`: what was measured of the event that ended the motion, some of `{"t": ..., "q": ..., "v": ...,
+      "multipliers": ...}`, without a time axis. The fit's `event` says what ends it.
+
+    **Of the run:**
+
+    - `q0`, `v0`: a guess of the state at `t[0]`. Left out, it is read off measured coordinates.
+    - `hold_q`, `hold_v`: which of them are known, not guessed: `True` for all, or names of coordinates.
+    - `params`: parameters that are other ones in this run, by name: `{"omega": 3.0}`.
+    - `sigma`: the standard deviation of the measurement errors, one number or by kind, `{"q": 0.01, "end": {"t": 1e-3}}`;
+      also arrays like the measurements: an infinite one leaves a value out. Without it the errors are taken to be alike,
+      and their size is read off the residuals.
+
+    **Raises:** `ValueError` for times that do not increase, measurements of another length, infinite numbers.
+    """
+
+    t: np.ndarray
+    measured: dict[str, PyTree]
+    q0: PyTree
+    v0: PyTree
+    hold_q: bool | tuple[str, ...] = eqx.field(static=True)
+    hold_v: bool | tuple[str, ...] = eqx.field(static=True)
+    params: dict[str, Any]
+    sigma: Any
+
+    def __init__(
+        self,
+        t: ArrayLike,
+        q: PyTree = None,
+        v: PyTree = None,
+        multipliers: Mapping[str, ArrayLike] | None = None,
+        observed: PyTree = None,
+        end: Mapping[str, PyTree] | None = None,
+        *,
+        q0: PyTree = None,
+        v0: PyTree = None,
+        hold_q: bool | str | Iterable[str] = False,
+        hold_v: bool | str | Iterable[str] = False,
+        params: Mapping[str, ArrayLike] | None = None,
+        sigma: PyTree = None,
+    ):
+        if coordinates.is_traced(t):
+            raise TypeError("the times of a record must be numbers, and these are traced: they give it its shape.")
+        self.t = _times(t)
+        given = zip(KINDS, (q, v, multipliers, observed, end))
+        self.measured = {kind: jax.tree.map(_as_floats, tree) for kind, tree in given if tree is not None}
+        if not jax.tree.leaves(self.measured):
+            raise ValueError(
+                'a record holds no measurement.\nFix: lj.Record(t, q={"theta": angles}), or v=, multipliers=, observed=, '
+                "end=."
+            )
+        for name, x in self.channels():
+            _check(name, x, len(self.t))
+        self.q0, self.v0 = q0, v0
+        self.hold_q, self.hold_v = _held(hold_q), _held(hold_v)
+        self.params, self.sigma = dict(params or {}), sigma
+
+    def channels(self) -> list[tuple[str, Array]]:
+        """What was measured, by name: `theta`, `v.theta`, `contact`, ..."""
+        found = []
+        for kind, tree in self.measured.items():
+            for path, x in jtu.tree_leaves_with_path(tree):
+                found.append((channel_name(kind, path), x))
+        return found
+
+    def __repr__(self):
+        of = {kind: ", ".join(jtu.keystr(p, simple=True, separator=".") for p, _ in jtu.tree_leaves_with_path(tree))
+              for kind, tree in self.measured.items()}  # fmt: skip
+        told = "; ".join(f"{kind}: {names}" if names else kind for kind, names in of.items())
+        return f"Record({len(self.t)} times from {self.t[0]:.6g} to {self.t[-1]:.6g}, {told})"
+
+
+def channel_name(kind: str, path) -> str:
+    """The name of a measured quantity as a person writes it."""
+    name = jtu.keystr(path, simple=True, separator=".")
+    if kind in ("q", "multipliers", "observed"):
+        return name or kind
+    return f"{kind}.{name}" if name else kind
+
+
+def _as_floats(x):
+    return coordinates.numpy_of(x).asarray(x, jnp.result_type(float))
+
+
+def _held(hold):
+    if isinstance(hold, bool):
+        return hold
+    return (hold,) if isinstance(hold, str) else tuple(hold)
+
+
+def _times(t):
+    t = np.asarray(t, np.result_type(np.asarray(t).dtype, np.float32))
+    if t.ndim != 1 or len(t) < 2:
+        raise ValueError(f"the times of a record must be a vector of two or more, and have the shape {t.shape}.")
+    if not np.all(np.isfinite(t)):
+        raise ValueError("the times of a record contain NaN or infinity.\nFix: drop these samples.")
+    late = np.flatnonzero(np.diff(t) <= 0)
+    if late.size:
+        i = int(late[0])
+        raise ValueError(
+            f"the times of a record must increase, and t[{i + 1}] = {t[i + 1]:.9g} follows t[{i}] = {t[i]:.9g}.\n"
+            "Usual cause: two records in one file, or a time written twice.\n"
+            "Fix: order = np.argsort(t); sort the measurements with it; for several runs, one lj.Record each."
+        )
+    return t
+
+
+def _check(name, x, count):
+    if not name.startswith("end") and (x.ndim == 0 or len(x) != count):
+        raise ValueError(
+            f"'{name}' has the shape {x.shape}, and the record has {count} times.\n"
+            "Usual cause: time as the second axis, or samples dropped from one of the two.\n"
+            "Fix: the first axis is time; write NaN where a value is missing."
+        )
+    if not coordinates.is_traced(x) and np.any(np.isinf(x)):
+        raise ValueError(f"'{name}' contains infinity.\nFix: write NaN where a value is missing.")
+
+
+class Windows(eqx.Module):
+    """All records, cut into windows of one number of times.
+
+    - `ts` (W, T): times; a window that is seamed to the next has the next's first time as its last.
+    - `real` (W, T): which are times of the record, not padding and not the seam.
+    - `sample` (W, T): their places in their record.
+    - `last` (W,): the place of the last time that is not padding. `seam` (W,): whether the next window goes on from there.
+    - `record` (W,): the record that a window is of.
+    """
+
+    ts: Float[np.ndarray, "W T"]
+    real: Bool[np.ndarray, "W T"]
+    sample: Int[np.ndarray, "W T"]
+    last: Int[np.ndarray, " W"]
+    seam: Bool[np.ndarray, " W"]
+    record: Int[np.ndarray, " W"]
+
+    @property
+    def count(self) -> int:
+        """How many windows there are."""
+        return len(self.record)
+
+    @property
+    def first(self) -> np.ndarray:
+        """The first window of each record."""
+        return np.flatnonzero(np.diff(self.record, prepend=-1))
+
+    def gather(self, of_records: Sequence[Array]) -> Array:
+        """Samples (T_r, ...) of each record as (W, T, ...), NaN where there are none."""
+        rows, xp = [], coordinates.numpy_of(of_records)
+        for w, r in enumerate(self.record):
+            x = of_records[r]
+            where = self.real[w].reshape(-1, *(1,) * (x.ndim - 1))
+            rows.append(xp.where(where, x[self.sample[w]], np.nan))
+        return xp.stack(rows)
+
+
+def cut(records: Sequence[Record], window: float | None, dtype) -> Windows:
+    """Cut records into windows of a length in time, or one each."""
+    pieces = []
+    for r, record in enumerate(records):
+        t, span = record.t, record.t[-1] - record.t[0]
+        if window is not None and not 0 < window:
+            raise ValueError(f"window must be a positive length of time, not {window}.")
+        if window is not None and window < 2 * np.max(np.diff(t)):
+            raise ValueError(
+                f"window = {window:.6g} is shorter than two intervals of a record, of {np.max(np.diff(t)):.6g}.\n"
+                f"Fix: a window with several samples, such as window={20 * np.median(np.diff(t)):.3g}."
+            )
+        count = 1 if window is None else max(1, math.ceil(span / window * (1 - 1e-9)))
+        edges = np.searchsorted(t, t[0] + span / count * np.arange(count) * (1 - 1e-12))
+        edges = np.append(edges, len(t))
+        pieces += [(r, edges[i], edges[i + 1], i + 1 < count) for i in range(count)]
+    length = max(stop - start + seamed for _, start, stop, seamed in pieces)
+    length = max(length, 2)
+    ts, sample = np.zeros((len(pieces), length)), np.zeros((len(pieces), length), int)
+    real = np.zeros((len(pieces), length), bool)
+    for w, (r, start, stop, seamed) in enumerate(pieces):
+        t, n = records[r].t, stop - start
+        kept = t[start : stop + seamed]
+        step = max(PADDING * np.min(np.diff(t)), 8 * np.finfo(dtype).eps * np.max(np.abs(t)))
+        ts[w] = np.concatenate([kept, kept[-1] + step * (1 + np.arange(length - len(kept)))])
+        sample[w, :n], real[w, :n] = np.arange(start, stop), True
+    last = np.array([stop - start + seamed - 1 for _, start, stop, seamed in pieces])
+    return Windows(
+        np.asarray(ts, dtype),
+        real,
+        sample,
+        last,
+        np.array([seamed for *_, seamed in pieces]),
+        np.array([r for r, *_ in pieces]),
+    )
