@@ -77,7 +77,7 @@ def fit(
 
     **The search:**
 
-    - `window`: cut records into windows of this length, `[t]`, each from a state of its own: for chaotic motion, and for
+    - `window`: cut records into windows of this length, `[t]`, each from a state of its own: for chaotic motion and
       long records. With `joined` (multiple shooting) the windows are drawn together in a few stages until each goes on
       where the last one ended; else they stay on their own, which forgives what the system leaves out.
     - `grow`: begin with the first part of each record or window and double it, stage by stage: a long record has many
@@ -141,8 +141,8 @@ def identifiability(
     Identifiability: of 'k' and 'm' the data see only
       k/m
 
-    **Arguments:** as for `lj.fit`. Only the times, what was measured, and `sigma` count, not the measured values; `params`
-    and the starts are where it is asked.
+    **Arguments:** as for `lj.fit`. Only the times, what was measured, and `sigma` count, not the measured values;
+    `params` and the starts are where it is asked.
 
     **Returns:** an `Identifiability`.
 

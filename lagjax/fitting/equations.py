@@ -28,7 +28,7 @@ from lagjax.numerics.chained import Equations, Slopes, Unknowns
 NOT_REACHED = 10.0
 # A wild guess may be stiff: steps that a motion may take, for each output and besides.
 STEPS_EACH, STEPS = 16, 10_000
-# By residual (in sigmas) the loss over its square, after scaling with the constant of 95 % efficiency for normal errors.
+# The scale (in sigmas) for 95 % efficiency with normal errors, and the loss over the square of a scaled residual.
 LOSSES = {
     "squares": (1.0, lambda z2: jnp.ones_like(z2)),
     "soft_l1": (1.345, lambda z2: 2 / (1 + jnp.sqrt(1 + z2))),

@@ -1,9 +1,9 @@
 """Which combinations of parameters the data can see: the singular values of the motion's sensitivity.
 
 In relative changes δx/x the equations at a point are `R δx/x`, with the starts of the runs eliminated. A right singular
-vector n whose singular value vanishes is a change of the parameters that leaves no trace in the data: if m and M grow by
-the same factor and the motion stays as it is, only m/M is seen. A singular value s means that the combination is known
-to the relative error 1/s, in units of the measurement error.
+vector n whose singular value vanishes is a change of the parameters that leaves no trace in the data: if m and M may
+grow by one factor and the motion stays as it is, only m/M is seen. A singular value s means that the combination is
+known to the relative error 1/s, in units of the measurement error.
 
 Source: Brun, Reichert & Künsch, *Water Resources Research* 37 (2001) 1015, Eqs. (6)-(9); Belsley, *Regression
 Diagnostics*, §3.2.
@@ -31,7 +31,7 @@ class Identifiability(eqx.Module):
     - `names`: of the numbers that are asked for. `values` (p,): where.
     - `singular_values` (p,): the largest first; the reciprocal of a relative error, in units of `noise`.
     - `combinations` (p, p): by row, the relative changes that belong to them.
-    - `noise`: the size of one measurement error: 1 where `sigma` was given; else the rms residual, unknown before a fit.
+    - `noise`: the size of an error in sigmas: 1 where these were given; else estimated, and unknown before a fit.
     """
 
     names: tuple[str, ...] = eqx.field(static=True)

@@ -217,8 +217,7 @@ def _match(kind: str, said: Any, measured: Any, axes: int, path=()):
         if x.shape != y.shape[axes:]:
             raise ValueError(
                 f"'{channel_name(kind, path)}' was measured with the shape {y.shape[axes:]} at each time, and the "
-                f"motion has {x.shape}.\nUsual cause: an array of one entry where a number is meant, or observe returning "
-                "another shape."
+                f"motion has {x.shape}.\nUsual cause: an array of one entry where a number is meant."
             )
 
 

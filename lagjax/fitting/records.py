@@ -41,9 +41,9 @@ class Record(eqx.Module):
     - `q0`, `v0`: a guess of the state at `t[0]`. Left out, it is read off measured coordinates.
     - `hold_q`, `hold_v`: which of them are known, not guessed: `True` for all, or names of coordinates.
     - `params`: parameters that are other ones in this run, by name: `{"omega": 3.0}`.
-    - `sigma`: the standard deviation of the measurement errors, one number or by kind, `{"q": 0.01, "end": {"t": 1e-3}}`;
-      also arrays like the measurements: an infinite one leaves a value out. Without it the errors are taken to be alike,
-      and their size is read off the residuals.
+    - `sigma`: the standard deviation of the measurement errors, one number, or by kind, `{"q": 0.01, "end":
+      {"t": 1e-3}}`; also arrays like the measurements: an infinite one leaves a value out. Without it the errors are
+      taken to be alike, and their size is read off the residuals.
 
     **Raises:** `ValueError` for times that do not increase, measurements of another length, infinite numbers.
     """
@@ -80,8 +80,8 @@ class Record(eqx.Module):
         self.measured = {kind: jax.tree.map(_as_floats, tree) for kind, tree in given if tree is not None}
         if not jax.tree.leaves(self.measured):
             raise ValueError(
-                'a record holds no measurement.\nFix: lj.Record(t, q={"theta": angles}), or v=, multipliers=, observed=, '
-                "end=."
+                'a record holds no measurement.\nFix: lj.Record(t, q={"theta": angles}), or v=, multipliers=, '
+                "observed=, end=."
             )
         for name, x in self.channels():
             _check(name, x, len(self.t))
@@ -156,7 +156,7 @@ class Windows(eqx.Module):
     - `ts` (W, T): times; a window that is seamed to the next has the next's first time as its last.
     - `real` (W, T): which are times of the record, not padding and not the seam.
     - `sample` (W, T): their places in their record.
-    - `last` (W,): the place of the last time that is not padding. `seam` (W,): whether the next window goes on from there.
+    - `last` (W,): the place of the last time that is not padding. `seam` (W,): whether the next window goes on there.
     - `record` (W,): the record that a window is of.
     """
 

@@ -97,7 +97,7 @@ class Fit(eqx.Module):
 
     @property
     def noise(self) -> Float[Array, ""]:
-        """The size of one measurement error: 1, in sigmas, where these were given; else estimated, in the data's unit."""
+        """The size of a measurement error: 1, in sigmas, where these were given; else estimated, in the data's unit."""
         first = jax.tree.leaves(self.problem.sigma)[0]
         return jnp.sqrt(self.variance) * (1.0 if self.problem.absolute else jnp.nanmax(first))
 
@@ -238,7 +238,7 @@ class Fit(eqx.Module):
         if not bool(self.converged):
             found.append(
                 f"the search stopped after {int(self.steps)} steps without converging; this is its best point.\n"
-                "Usual cause: a guess too far off, parameters that the data hardly see, or noise in the motion itself.\n"
+                "Usual cause: a guess too far off, parameters that the data hardly see, noise in the motion itself.\n"
                 "Fix: look at found.plot(); try restarts=8, a shorter window=, or iterations=1000."
             )
         if self.seen is not None and self.identifiability.rank < len(self.names):

@@ -97,7 +97,7 @@ def seen_from(problem: Problem, u: Unknowns, linear: Linear, stage: Stage) -> Se
     triangular = eliminate(linear.slopes, linear.values, floor)
     # In units of the slopes: what the data do not see has a singular value of about FLOOR.
     size = filled(sizes).shared
-    left, singular, right = jnp.linalg.svd(triangular.shared / size)
+    left, singular, right = jnp.linalg.svd(triangular.shared / size[None])
     seen = singular > 1 / UNSEEN
     inverse = (right.T / size[:, None]) @ (jnp.where(seen, 1 / jnp.where(seen, singular, 1.0), 0.0)[:, None] * left.T)
     of = covariance(triangular, inverse)
@@ -105,7 +105,7 @@ def seen_from(problem: Problem, u: Unknowns, linear: Linear, stage: Stage) -> Se
     own = jnp.sqrt(jax.vmap(jnp.diag)(of.own))
     determined = Unknowns(known_alone, (sizes.own > 0) & (sizes.own * own < UNSEEN))
     relative = jnp.where(u.shared != 0, jnp.abs(u.shared), 1.0)
-    _, singular_values, combinations = jnp.linalg.svd(triangular.shared * relative)
+    _, singular_values, combinations = jnp.linalg.svd(triangular.shared * relative[None])
     chi2 = jnp.sum(linear.values.rows**2)
     known = [jnp.sum(jnp.isfinite(x) & jnp.isfinite(s)) for x, s in zip(*map(jax.tree.leaves, problem.data))]
     # A seam takes away what a start of its own adds.

@@ -97,7 +97,7 @@ def as_arrays(tree, dtype):
 
 
 def numpy_of(tree):
-    """NumPy where the values of `tree` can be looked at, else `jax.numpy`: small work outside a program compiles less."""
+    """NumPy where the values of `tree` can be looked at, which compiles nothing; else `jax.numpy`."""
     return jnp if is_traced(tree) else np
 
 

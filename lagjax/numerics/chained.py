@@ -65,9 +65,9 @@ class Slopes(NamedTuple):
     def scaled(self, by_shared: Float[Array, " p"]) -> "Slopes":
         """The slopes by shared unknowns that are measured in other units."""
         return self._replace(
-            rows_by_shared=self.rows_by_shared * by_shared,
-            seams_by_shared=self.seams_by_shared * by_shared,
-            shared=self.shared * by_shared,
+            rows_by_shared=self.rows_by_shared * by_shared[None, None],
+            seams_by_shared=self.seams_by_shared * by_shared[None, None],
+            shared=self.shared * by_shared[None],
         )
 
 
