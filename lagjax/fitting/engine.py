@@ -166,7 +166,8 @@ def _stages(problem: Problem, grow: bool, joined: bool) -> tuple[Stage, Any]:
     rtol = problem.options.get("rtol")
     done = DONE if rtol is None else jnp.maximum(DONE, OF_RTOL * jnp.max(jnp.asarray(rtol)))
     last = np.arange(len(parts)) == len(parts) - 1
-    return Stage(np.asarray(parts), np.asarray(weights) * ratio), np.where(last, done, STAGE_DONE) * ratio
+    xp = coordinates.numpy_of((ratio, done))
+    return Stage(np.asarray(parts), xp.asarray(weights) * ratio), xp.where(last, done, STAGE_DONE) * ratio
 
 
 def _searched(problem, stages, tolerances, optimiser, iterations, restarts, spread, seed):

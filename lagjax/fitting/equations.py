@@ -74,7 +74,7 @@ class Problem(eqx.Module):
     @property
     def start(self) -> Unknowns:
         """Where the search starts, in natural numbers."""
-        return Unknowns(self.found.start, np.zeros((self.windows.count, self.starts.along_q.shape[2])))
+        return Unknowns(self.found.start, np.zeros((self.windows.count, self.starts.unknowns)))
 
     @property
     def data(self) -> tuple[PyTree, PyTree]:

@@ -81,7 +81,9 @@ def find(
     dtype,
 ) -> Found:
     """Read off `params`, names, bounds and priors what is to be found."""
-    params = coordinates.as_arrays(params, dtype)
+    if not coordinates.is_traced(params):
+        with jax.ensure_compile_time_eval():
+            params = coordinates.as_arrays(params, dtype)
     named = [(leaf_name(path), x) for path, x in jtu.tree_leaves_with_path(params)]
     floating = {name: i for i, (name, x) in enumerate(named) if eqx.is_inexact_array(x)}
     if free is None:

@@ -34,6 +34,7 @@ def problem_of(system, records, params, free, observe, bounds, priors, loss, win
         raise ValueError(f"loss must be {listed(list(LOSSES))}, not {loss!r}.")
     if OURS & set(options):
         raise ValueError(f"{listed(sorted(OURS & set(options)))} cannot be given: a fit sets it itself.")
+    _check_kinds(records, observe, options)
     absolute = _absolute(records, loss, priors)
     dtype = jnp.result_type(float)
     options = {name: jnp.asarray(x, dtype) if isinstance(x, float) else x for name, x in options.items()}
@@ -42,13 +43,12 @@ def problem_of(system, records, params, free, observe, bounds, priors, loss, win
     overrides = _overrides(records, windows, found)
     params_of = lambda r: replace(found.params, {name: values[r] for name, values in overrides.items()})
     starting, unflatten = starts(system, records, windows, params_of, options)
-    _check_kinds(records, observe, options)
     measured = {kind: _gathered(windows, [record.measured[kind] for record in records], kind)
                 for kind in records[0].measured}  # fmt: skip
     sigma, spread, ratio = _sigmas(records, windows, measured, absolute)
     per_window = {name: values[windows.record] for name, values in overrides.items()}
-    xp = coordinates.numpy_of(starting)
-    unit = xp.std(xp.concatenate([starting.q, starting.v], axis=1), axis=0)
+    xp = coordinates.numpy_of((starting.q.guess, starting.v.guess))
+    unit = xp.std(xp.concatenate([starting.q.guess, starting.v.guess], axis=1), axis=0)
     problem = Problem(
         system, found, per_window, windows, starting, measured, sigma, spread, ratio,
         xp.where(unit > 0, unit, 1.0), unflatten, observe, options, loss, absolute,
@@ -183,7 +183,7 @@ def _broadcast(record, kind):
 
 def _check_predicted(problem: Problem):
     """Raise where the measurements do not have the shape of what the motion says."""
-    begin = jax.tree.map(lambda x: x[0], (problem.starts.q, problem.starts.v))
+    begin = jax.tree.map(lambda x: x[0], (problem.starts.q.guess, problem.starts.v.guess))
     q, v = (jax.eval_shape(problem.unflatten, x) for x in begin)
     t, params = jax.ShapeDtypeStruct((), problem.windows.ts.dtype), problem.found.params
 

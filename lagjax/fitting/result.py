@@ -1,6 +1,6 @@
 """The answer of a fit: estimates, how certain they are, and whether the residuals look like measurement errors."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import equinox as eqx
 import jax
@@ -116,13 +116,14 @@ class Fit(eqx.Module):
 
     @property
     def start_sd(self) -> tuple[list[PyTree], list[PyTree]]:
-        starts, found = self.problem.starts, ([], [])
-        own = self._of_errors() * self._seen().covariance.own
-        for w in self.problem.windows.first:
-            for along, into in ((starts.along_q, found[0]), (starts.along_v, found[1])):
-                of = jnp.sqrt(jnp.maximum(jnp.einsum("ni,ij,nj->n", along[w], own[w], along[w]), 0.0))
-                into.append(self.problem.unflatten(of))
-        return found
+        own, problem = self._of_errors() * self._seen().covariance.own, self.problem
+        of_q, of_v = [], []
+        for w in problem.windows.first:
+            state = lambda s, w=w: problem.setting(self.unknowns.shared, s, w, WHOLE)[2]
+            for slope, into in zip(jax.jacfwd(state)(self.unknowns.own[w]), (of_q, of_v)):
+                of = lambda x, w=w: jnp.sqrt(jnp.maximum(jnp.einsum("...i,ij,...j", x, own[w], x), 0.0))
+                into.append(jax.tree.map(of, slope))
+        return of_q, of_v
 
     def _seen(self) -> Seen:
         if self.seen is None:
@@ -210,19 +211,24 @@ class Fit(eqx.Module):
         """The unknowns as `log_likelihood` takes them: parameters by name, and the starts' deviations, (W, k)."""
         return dict(zip(self.names, self.unknowns.shared)) | {"starts": self.unknowns.own}
 
-    def log_likelihood(self, unknowns: Mapping[str, Array]) -> Float[Array, ""]:
-        """The logarithm of the probability density of the measurements, up to a constant; without priors.
+    @property
+    def log_likelihood(self) -> Callable[[Mapping[str, Array]], Float[Array, ""]]:
+        """A function: the logarithm of the probability density of the measurements, up to a constant; without priors.
 
-        For samplers: differentiable, and can be jitted. `unknowns` as in `sampling`; what is left out stays at its
-        estimate. -inf outside the bounds.
+        For samplers: differentiable, and can be jitted. It takes unknowns as in `sampling`; what is left out stays at
+        its estimate. -inf outside the bounds, and where there is no motion.
         """
-        found = self.problem.found
-        x = jnp.stack([jnp.asarray(unknowns.get(n, x)) for n, x in zip(self.names, self.values)] or [jnp.zeros(0)])
-        u = Unknowns(x, jnp.asarray(unknowns.get("starts", self.unknowns.own)))
-        values = equations(self.problem, u, WHOLE)
-        inside = jnp.all((x > found.low) & (x < found.high))
-        fits = -0.5 * jnp.sum(values.rows**2) / self.variance
-        return jnp.where(inside & jnp.isfinite(fits), fits, -jnp.inf)
+        found, variance = self.problem.found, self.variance
+
+        def density(unknowns):
+            known = self.sampling | dict(unknowns)
+            x = jnp.stack([jnp.asarray(known[name]) for name in self.names] or [jnp.zeros(())])[: len(self.names)]
+            values = equations(self.problem, Unknowns(x, jnp.asarray(known["starts"])), WHOLE)
+            inside = jnp.all((x > found.low) & (x < found.high))
+            fits = -0.5 * (jnp.sum(values.rows**2) + jnp.sum(values.seams**2)) / variance
+            return jnp.where(inside & jnp.isfinite(fits), fits, -jnp.inf)
+
+        return density
 
     def at_bounds(self) -> list[str]:
         """The names of numbers that ended at a bound."""

@@ -4,6 +4,7 @@ One program serves all stages: how far the records count, and how tightly window
 slopes of all equations are computed together with their values, forward, in one pass over the motions.
 """
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import diffrax
@@ -15,6 +16,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from lagjax.fitting.equations import Problem, Stage, equations, of_window, over_windows, slopes_together, together
+from lagjax.motion.reported import PATIENCE, WATCHED
 from lagjax.numerics.chained import (
     ByWindows,
     Covariance,
@@ -121,7 +123,8 @@ def seen_from(problem: Problem, u: Unknowns, linear: Linear, stage: Stage) -> Se
 @eqx.filter_jit
 def look(problem: Problem, u: Unknowns, stage: Stage) -> Seen:
     """What the data say at `u`."""
-    return seen_from(problem, u, linearised(problem, u, stage, "squares"), stage)
+    at = lambda problem, u, stage: seen_from(problem, u, linearised(problem, u, stage, "squares"), stage)
+    return _in_turn(at, problem, u, stage)
 
 
 def _natural(problem, y: Unknowns) -> Unknowns:
@@ -175,8 +178,28 @@ def _largest_change(tree):
 def search(problem: Problem, start: Unknowns, stages: Stage, tolerances, optimiser: Any, limit: int):
     """Search from `start` through all stages, whose numbers have a leading axis.
 
-    Returns a `Searched` and, where the search has them, the plain equations and their slopes where it ended.
+    Returns a `Searched` and, where the search has its slopes, what the data say at its end.
     """
+    return _in_turn(lambda *args: _search(*args, limit), problem, start, stages, tolerances, optimiser)
+
+
+def _in_turn(function: Callable, *args):
+    """`function(*args)`; on a CPU lanes of a `vmap` run one after the other, which compiles once and wastes no steps.
+
+    A sweep of fits does not hear of the motions that a search tries.
+    """
+    live, static = eqx.partition(args, eqx.is_array)
+
+    def run(live):
+        with WATCHED(False), PATIENCE(None):
+            return function(*eqx.combine(live, static))
+
+    if jax.default_backend() == "cpu":
+        run = jax.custom_batching.sequential_vmap(run)
+    return run(jax.tree.map(jnp.asarray, live))
+
+
+def _search(problem, start, stages, tolerances, optimiser, limit):
 
     def one_stage(carried, x):
         (y, taken), (stage, tolerance) = carried, x

@@ -1,7 +1,14 @@
 """Where each run, or window of a run, starts: a guess, and the directions in which the guess may be wrong.
 
-A start is written as `q = q_guess + N s`, with the columns of N along the constraints and not along what is known;
-after that it is returned to the constraints, which other parameters may have moved.
+Without constraints a start is the guess plus its unknown deviations. On constraints it is written in the coordinates of
+the tangent space at the guess,
+
+    q = q_guess + N s + C c(s, params),        g(t, q, params) = 0,
+
+with the columns of N along the constraints, those of C across them, and c found by Newton's method; neither touches a
+coordinate that is known. Velocities likewise, with `phi(t, q, v, params) = 0`.
+
+Source: Hairer, Lubich & Wanner, *Geometric Numerical Integration*, §IV.5.3 (tangent space parametrization).
 """
 
 from collections.abc import Callable, Sequence
@@ -11,70 +18,131 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.linalg
-from jaxtyping import Array, Bool, Float
+from jax import lax
+from jaxtyping import Array, Float
 
 from lagjax.fitting.records import Record, Windows
 from lagjax.mechanics import constraints, coordinates
 from lagjax.mechanics.coordinates import State
-from lagjax.motion.consistent_state import consistent_state, free_coordinates, nearest_state
+from lagjax.motion.consistency import departures, stopped
+from lagjax.motion.consistent_state import free_coordinates
 from lagjax.motion.integrate import integrate
 
 # Samples from whose parabola position and velocity are read.
 SAMPLES = 7
+# Iterations for c, each with its own matrix; they end where the residual no longer falls.
+ITERATIONS = 12
+# Of a guess, what is left of the constraints after that, in displacements relative to the state.
+OFF = 1e-6
+
+
+class Chart(eqx.Module):
+    """Directions at a guess: `along` the constraints (n, k), all unknowns of the start, and `across` them (n, r)."""
+
+    guess: Float[Array, " n"]
+    along: Float[Array, "n k"]
+    across: Float[Array, "n r"]
+
+    def at(self, s: Float[Array, " k"], residual: Callable, problem):
+        """The vector y with `residual(problem, y) = 0`, which is differentiable in `s` and in `problem`."""
+        y = self.guess + self.along @ s
+        if self.across.shape[-1] == 0:
+            return y
+
+        def step(problem, y):
+            """Towards the constraints; of more equations than directions, the least squares."""
+            rows = jax.jacfwd(lambda y: residual(problem, y))(y) @ self.across
+            return -self.across @ jnp.linalg.solve(rows.T @ rows, rows.T @ residual(problem, y))
+
+        fixed = stopped(problem)
+        size = lambda y: jnp.max(jnp.abs(residual(fixed, y)))
+
+        def iterate(state):
+            i, y, _ = state
+            nearer = y + step(fixed, y)
+            return i + 1, nearer, size(nearer) < 0.5 * size(y)
+
+        start = stopped(y)
+        _, near, _ = lax.while_loop(lambda state: (state[0] < ITERATIONS) & state[2], iterate, (0, start, True))
+        # The value of `near`, and by one more step with its matrix kept the derivative of the solution.
+        y = near + (y - start)
+        rows = jax.jacfwd(lambda y: residual(fixed, y))(near) @ self.across
+        return y - self.across @ jnp.linalg.solve(rows.T @ rows, rows.T @ residual(problem, y))
 
 
 class Starts(eqx.Module):
-    """Guessed starts of all windows (W, n), and the directions (W, n, k) in which they are unknown."""
+    """The starts of all windows: charts of coordinates and of velocities, each with a leading axis W."""
 
-    q: Float[Array, "W n"]
-    v: Float[Array, "W n"]
-    along_q: Float[Array, "W n k"]
-    along_v: Float[Array, "W n k"]
-    free_q: Bool[Array, "W n"]
-    free_v: Bool[Array, "W n"]
+    q: Chart
+    v: Chart
+
+    @property
+    def unknowns(self) -> int:
+        """How many numbers a window's start has."""
+        return self.q.along.shape[-1]
 
     def state(self, s: Float[Array, " k"], system, t, params, unflatten):
         """(q, v) of one window, where `self` holds this window's entries and `s` its unknowns."""
-        q, v = unflatten(self.q + self.along_q @ s), unflatten(self.v + self.along_v @ s)
-        if not system.constraints:
-            return q, v
-        # What is not reached stays where it is: the integration then says that it is off the constraints.
-        return nearest_state(system, t, q, v, params, self.free_q, self.free_v)[:2]
+        x, u = self.vectors(s, s, system, t, params, unflatten)
+        return unflatten(x), unflatten(u)
+
+    def vectors(self, s, r, system, t, params, unflatten):
+        """Coordinates at `s` and velocities at `r`."""
+
+        def of_position(problem, x):
+            system, t, params = problem
+            return constraints.position_residual(system, t, x, params, unflatten)
+
+        def of_velocity(problem, u):
+            (system, t, params), x = problem
+            return constraints.velocity_residual(system, t, x, u, params, unflatten)
+
+        x = self.q.at(s, of_position, (system, t, params))
+        return x, self.v.at(r, of_velocity, ((system, t, params), x))
 
 
 def starts(
     system, records: Sequence[Record], windows: Windows, params_of: Callable, options
 ) -> tuple[Starts, Callable]:
     """The guessed starts of all windows, and the function that makes a pytree of a vector of coordinates."""
-    found, unflatten = [], None
+    guesses = []
     for r, record in enumerate(records):
         here = np.flatnonzero(windows.record == r)
         first = _guess(system, record, r, params_of(r))
-        (x, unflatten), (u, _) = coordinates.flatten(first.q), coordinates.flatten(first.v)
-        found.append((x, u))
+        guesses.append(first)
         later = [_read_off(record, windows.sample[w][windows.real[w]]) for w in here[1:]]
-        if len(here) > 1 and (None in later or coordinates.flatten(later[0][0])[0].size != x.size):
+        structure = jax.tree.structure(first.q)
+        if any(found is None or jax.tree.structure(found[0]) != structure for found in later):
             later = _along_the_motion(system, first, windows.ts[here, 0], options)
-        for q, v in later:
-            s = coordinates.state(record.t[0], q, v, first.params)
-            found.append((coordinates.flatten(s.q)[0], coordinates.flatten(s.v)[0]))
-    q, v = (_stacked(part) for part in zip(*found))
-    bases, free = [], []
-    for w, r in enumerate(windows.record):
-        here = State(windows.ts[w, 0], unflatten(q[w]), unflatten(v[w]), params_of(r))
+        for w, (q, v) in zip(here[1:], later):
+            guesses.append(_concrete(lambda w=w, q=q, v=v: coordinates.state(windows.ts[w, 0], q, v, first.params)))
+    charts = []
+    for w, (r, guess) in enumerate(zip(windows.record, guesses)):
         held = (records[r].hold_q, records[r].hold_v) if w in windows.first else (False, False)
-        free.append([_free(here.q, hold) for hold in held])
-        bases.append(_directions(system, here, *free[-1]))
-    of_q, of_v = (max(basis[i].shape[1] for basis in bases) for i in (0, 1))
-    wide = lambda basis, before, after: np.pad(basis, ((0, 0), (before, after)))
-    along_q = np.stack([wide(a, 0, of_q + of_v - a.shape[1]) for a, _ in bases])
-    along_v = np.stack([wide(b, of_q, of_v - b.shape[1]) for _, b in bases])
-    free_q, free_v = (np.stack(part) for part in zip(*free))
-    return Starts(q, v, along_q.astype(q.dtype), along_v.astype(q.dtype), free_q, free_v), unflatten
+        charts.append(_charts(system, guess, *(_free(guess.q, hold) for hold in held), r))
+    q, v = zip(*charts)
+    k = max(chart.along.shape[1] for chart in q), max(chart.along.shape[1] for chart in v)
+    flat = _concrete(lambda: coordinates.flatten(guesses[0].q))
+    return Starts(_stacked(q, 0, sum(k)), _stacked(v, k[0], sum(k))), flat[1]
 
 
-def _stacked(vectors):
-    return coordinates.numpy_of(vectors).stack(vectors)
+def _stacked(charts: Sequence[Chart], before: int, k: int) -> Chart:
+    """Charts of one shape; the unknowns of this kind stand after `before` others."""
+    r = max(chart.across.shape[1] for chart in charts)
+    wide = lambda x, before, width: np.pad(x, ((0, 0), (before, width - before - x.shape[1])))
+    guesses = [chart.guess for chart in charts]
+    along = np.stack([wide(chart.along, before, k) for chart in charts])
+    across = np.stack([wide(chart.across, 0, r) for chart in charts])
+    return Chart(coordinates.numpy_of(guesses).stack(guesses), along, across)
+
+
+def _concrete(function: Callable):
+    """`function()`, with numbers for results where it has numbers for inputs, also while a program is traced."""
+    try:
+        with jax.ensure_compile_time_eval():
+            return function()
+    except jax.errors.JAXTypeError:
+        return function()
 
 
 def _guess(system, record, r, params) -> State:
@@ -87,15 +155,15 @@ def _guess(system, record, r, params) -> State:
                 "Fix: lj.Record(..., q0=..., v0=...), alike to the state of lj.integrate."
             )
         q, v = (read[0] if q is None else q), (read[1] if v is None else v)
-    s = coordinates.state(record.t[0], q, v, params)
-    if not system.constraints:
-        return s
-    if coordinates.is_traced(s):
-        raise TypeError(
-            "the start of a constrained system is being traced, and its free directions are read off its values.\n"
-            "Fix: give q0 and v0 of the record, and params, as numbers; measurements may be traced."
-        )
-    return State(s.t, *consistent_state(system, *s), s.params)
+    if coordinates.is_traced((q, v, params)):
+        if system.constraints:
+            raise TypeError(
+                "the start of a constrained system is being traced, and its free directions are read off its values.\n"
+                "Fix: give q0 and v0 of the record, and params, as numbers; measurements may be traced."
+            )
+        return coordinates.state(record.t[0], q, v, params)
+    with jax.ensure_compile_time_eval():
+        return coordinates.state(record.t[0], q, v, params)
 
 
 def _read_off(record, samples):
@@ -129,8 +197,8 @@ def _along_the_motion(system, first, ts, options):
     known = {name: value for name, value in options.items() if name != "event"}
     motion = integrate(system, first.q, first.v, first.params, ts=ts, **(known | {"throw": False}))
     # Where the guess does not get so far, the start serves as well as anything.
-    fill = lambda x: jnp.where(jnp.isfinite(x), x, x[:1])
-    q, v = jax.tree.map(fill, (motion.q, motion.v))
+    fill = lambda x, x0: jnp.where(jnp.isfinite(x), x, x0[None])
+    q, v = jax.tree.map(fill, (motion.q, motion.v), (first.q, first.v))
     return [jax.tree.map(lambda x, i=i: x[i], (q, v)) for i in range(1, len(ts))]
 
 
@@ -140,21 +208,48 @@ def _free(q, hold):
     return free_coordinates(q, hold)
 
 
-def _directions(system, s: State, free_q, free_v):
-    """Orthonormal directions, (n, k) of positions and of velocities, along the constraints and not of what is held."""
+def _charts(system, s: State, free_q, free_v, r) -> tuple[Chart, Chart]:
+    x, u = (_concrete(lambda tree=tree: coordinates.flatten(tree)[0]) for tree in (s.q, s.v))
     if not system.constraints:
-        return np.eye(len(free_q))[:, free_q], np.eye(len(free_v))[:, free_v]
-    x, unflatten = coordinates.flatten(s.q)
-    u, _ = coordinates.flatten(s.v)
-    of_q = jax.jacfwd(lambda x: constraints.position_residual(system, s.t, x, s.params, unflatten))(x)
-    of_v = jax.jacfwd(lambda u: constraints.velocity_residual(system, s.t, x, u, s.params, unflatten))(u)
-    return _along(np.asarray(of_q), free_q), _along(np.asarray(of_v), free_v)
+        nothing = np.zeros((len(free_q), 0))
+        x, u = (y if coordinates.is_traced(y) else np.asarray(y) for y in (x, u))
+        return Chart(x, np.eye(len(free_q))[:, free_q], nothing), Chart(u, np.eye(len(free_v))[:, free_v], nothing)
+    with jax.ensure_compile_time_eval():
+        _, unflatten = coordinates.flatten(s.q)
+        # Twice: the directions are those of the guess after it was moved onto the constraints.
+        for _ in range(2):
+            of_q, of_v = _rows(system, s.t, x, u, s.params, unflatten)
+            q, v = _chart(x, of_q, free_q), _chart(u, of_v, free_v)
+            zeros = Starts(q, v), jnp.zeros(q.along.shape[1]), jnp.zeros(v.along.shape[1])
+            x, u = eqx.filter_jit(Starts.vectors)(*zeros, system, s.t, s.params, unflatten)
+        found = State(s.t, unflatten(x), unflatten(u), s.params)
+        left = departures(system, found, OFF, OFF)
+    if left:
+        raise ValueError(
+            f"the start of record {r} cannot be moved onto the constraints: at the best one {left}.\n"
+            "Usual cause: a guess too far off, or too much held.\n"
+            "Fix: q0, v0 = lj.consistent_state(system, t[0], q0, v0, params), and hold less."
+        )
+    return (Chart(np.asarray(x), np.asarray(q.along), np.asarray(q.across)),
+            Chart(np.asarray(u), np.asarray(v.along), np.asarray(v.across)))  # fmt: skip
 
 
-def _along(rows, free):
-    basis = np.zeros((len(free), 0))
-    if free.any():
-        inner = scipy.linalg.null_space(rows[:, free], rcond=1e-9) if len(rows) else np.eye(int(free.sum()))
-        basis = np.zeros((len(free), inner.shape[1]))
-        basis[free] = inner
-    return basis
+def _chart(y, rows, free):
+    """The chart at y of equations with these rows, in which only what is free moves."""
+    rows = np.asarray(rows)[:, free]
+    along, across = np.zeros((len(free), int(free.sum()))), np.zeros((len(free), 0))
+    if len(rows) and free.any():
+        inner = scipy.linalg.null_space(rows, rcond=1e-9)
+        normal = scipy.linalg.null_space(inner.T) if inner.shape[1] else np.eye(len(inner))
+        along, across = np.zeros((len(free), inner.shape[1])), np.zeros((len(free), normal.shape[1]))
+        along[free], across[free] = inner, normal
+    elif free.any():
+        along[free] = np.eye(int(free.sum()))
+    return Chart(jnp.asarray(y), jnp.asarray(along), jnp.asarray(across))
+
+
+@eqx.filter_jit
+def _rows(system, t, x, u, params, unflatten):
+    of_q = jax.jacfwd(lambda x: constraints.position_residual(system, t, x, params, unflatten))(x)
+    of_v = jax.jacfwd(lambda u: constraints.velocity_residual(system, t, x, u, params, unflatten))(u)
+    return of_q, of_v

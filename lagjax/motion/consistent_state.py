@@ -73,7 +73,7 @@ def consistent_state(system, t, q, v, params, hold: str | Iterable[str] = ()):
     free = free_coordinates(s.q, hold)
     if not system.constraints:
         return s.q, s.v
-    q, v, reached = nearest_state(system, *s, jnp.asarray(free), jnp.asarray(free))
+    q, v, reached = _consistent_state(system, *s, jnp.asarray(free))
     if coordinates.is_traced((q, v)):
         return jax.tree.map(lambda x: jnp.where(reached, x, jnp.nan), (q, v))
     if not reached:
@@ -114,21 +114,20 @@ def _round_off(t):
 
 
 @eqx.filter_jit
-def nearest_state(system, t, q, v, params, free_q, free_v):
-    """(q, v, whether they satisfy the constraints), with what is not free held, of positions and of velocities."""
+def _consistent_state(system, t, q, v, params, free):
     x0, unflatten = coordinates.flatten(q)
     u0, _ = coordinates.flatten(v)
     metric = mass_and_forcing(system, t, x0, u0, params, unflatten).mass
     x, u, live = x0, u0, (system, t, params)
     if constraints.holonomic_equations(system, t, q, v, params).any():
         position = lambda problem, x: constraints.position_residual(*problem[:2], x, problem[2], unflatten)
-        x = _nearest(position, live, x0, metric, free_q)
+        x = _nearest(position, live, x0, metric, free)
 
     def velocity(problem_and_x, u):
         (system, t, params), x = problem_and_x
         return constraints.velocity_residual(system, t, x, u, params, unflatten)
 
-    u = _nearest(velocity, (live, x), u0, metric, free_v)
+    u = _nearest(velocity, (live, x), u0, metric, free)
     q, v = unflatten(x), unflatten(u)
     tolerance = _round_off(t)
     return q, v, within(system, t, q, v, params, tolerance, tolerance)

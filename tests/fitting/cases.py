@@ -1,0 +1,111 @@
+"""Systems to be fitted, with the truth: what is free, where the guess is, what is measured and how well."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import lagjax as lj
+from lagjax.scenes import bead_on_hoop, cross_rails, mass_distributions, rolling_hoop, sliding_wedge, sphere_geodesic
+
+
+class Case(NamedTuple):
+    """`sigma` by kind of measurement, of what `measured(traj)` returns; the guess is the truth times `off`."""
+
+    system: Any
+    params: dict
+    free: dict[str, float]
+    q0: Any
+    v0: Any
+    ts: np.ndarray
+    measured: Any
+    sigma: dict
+
+    def truth(self):
+        """The motion that is measured."""
+        return lj.integrate(self.system, self.q0, self.v0, self.params, ts=self.ts)
+
+    def guess(self):
+        """Parameters off the truth."""
+        return {**self.params, **{name: self.params[name] * off for name, off in self.free.items()}}
+
+    def fit(self, measured, **options):
+        """The fit of some measurements."""
+        record = lj.Record(self.ts, **measured, q0=self.q0, v0=self.v0, sigma=self.sigma)
+        return lj.fit(self.system, record, self.guess(), free=sorted(self.free), **options)
+
+    def noisy(self, measured, key):
+        """Measurements with errors of these sizes."""
+        leaves, structure = jax.tree.flatten(measured)
+        like = lambda kind: jax.tree.map(lambda _: self.sigma[kind], measured[kind])
+        sigmas = jax.tree.leaves({kind: like(kind) for kind in measured})
+        keys = jax.random.split(key, len(leaves))
+        noisy = [x + s * jax.random.normal(k, x.shape) for x, s, k in zip(leaves, sigmas, keys)]
+        return jax.tree.unflatten(structure, noisy)
+
+
+def swing(t, q, v, params):
+    """L of a pendulum in its angle."""
+    return 0.5 * params["m"] * params["l"] ** 2 * v**2 + params["m"] * params["g"] * params["l"] * jnp.cos(q)
+
+
+def air(t, q, v, params):
+    """Viscous friction."""
+    return 0.5 * params["c"] * v**2
+
+
+pendulum = lj.System(swing, dissipation=air)
+PENDULUM = {"m": 1.0, "l": 1.25, "g": 9.81, "c": 0.05}
+
+
+def hanging(t, q, v, params):
+    """L of a pendulum in Cartesian coordinates."""
+    return 0.5 * params["m"] * (v["x"] ** 2 + v["y"] ** 2) - params["m"] * params["g"] * q["y"]
+
+
+rod = lj.Holonomic(lambda t, q, params: q["x"] ** 2 + q["y"] ** 2 - params["l"] ** 2)
+hung = lj.System(hanging, {"rod": rod})
+HUNG = {"m": 1.5, "g": 9.81, "l": 2.0}
+
+of_q = lambda traj: {"q": traj.q}
+with_forces = lambda traj: {"q": traj.q, "multipliers": traj.multipliers}
+WEDGE = sliding_wedge.PARAMS
+ON_WEDGE = sliding_wedge.start_on_incline(WEDGE, X=0.25, X_rate=0.5, along=0.125, along_rate=-0.75)
+R = sphere_geodesic.PARAMS["R"]
+
+CASES = {
+    "pendulum": Case(
+        pendulum, PENDULUM, {"l": 1.1, "c": 1.5}, 1.0, 0.0, np.linspace(0.0, 5.0, 100), of_q, {"q": 0.01}
+    ),
+    "pendulum on a rod": Case(
+        hung, HUNG, {"l": 1.1, "m": 0.8}, {"x": 2.0, "y": 0.0}, {"x": 0.0, "y": 0.0}, np.linspace(0.0, 4.0, 60),
+        with_forces, {"q": 0.02, "multipliers": 0.1},
+    ),
+    "sphere": Case(
+        sphere_geodesic.embedded, {"R": R}, {"R": 1.1}, R * np.array([0.6, 0.0, 0.8]), np.array([0.5, 1.0, -0.375]),
+        np.linspace(0.0, 6.0, 40), of_q, {"q": 0.02},
+    ),
+    "rolling hoop": Case(
+        rolling_hoop.system, rolling_hoop.PARAMS, {"g": 1.1, "m": 0.9}, *rolling_hoop.start(rolling_hoop.PARAMS, 1.2),
+        np.linspace(0.0, 0.6, 60),
+        lambda traj: {"q": {"theta": traj.q["theta"]}, "multipliers": {"contact": traj.multipliers["contact"]}},
+        {"q": 0.005, "multipliers": 0.1},
+    ),
+    "bead": Case(
+        bead_on_hoop.system, bead_on_hoop.PARAMS, {"omega": 1.1, "g": 0.9}, 0.7, 0.3, np.linspace(0.0, 4.0, 100), of_q,
+        {"q": 0.01},
+    ),
+    "dumbbell": Case(
+        mass_distributions.SYSTEMS["dumbbell"], mass_distributions.PARAMS["dumbbell"], {"M1": 1.1, "M2": 0.9},
+        *mass_distributions.ORBITS["dumbbell"][:2], np.linspace(0.0, 4.0, 60), of_q, {"q": 0.02},
+    ),
+    "wedge": Case(
+        sliding_wedge.system, WEDGE, {"M": 1.1, "alpha": 0.9}, *ON_WEDGE,
+        np.linspace(0.0, 2.0, 50), of_q, {"q": 0.005},
+    ),
+    "cross-rails": Case(
+        cross_rails.rotating_system, cross_rails.PARAMS, {"K": 1.1, "k": 0.9, "omega": 1.05}, {"R": 1.5, "r": 0.2},
+        {"R": 0.0, "r": 0.5}, np.linspace(0.0, 4.0, 60), of_q, {"q": 0.01},
+    ),
+}  # fmt: skip

@@ -1,0 +1,297 @@
+"""What a fit finds, and what it says of what it cannot find."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import optimistix as optx
+import pytest
+from scipy.optimize import least_squares
+
+import lagjax as lj
+from lagjax.fitting.equations import WHOLE, equations, of_window
+from lagjax.fitting.problem import problem_of
+from lagjax.fitting.search import linearised
+from lagjax.numerics.chained import Unknowns
+from lagjax.scenes import rolling_hoop
+from tests.fitting.cases import CASES, HUNG, PENDULUM, hung, pendulum
+
+TS = np.linspace(0.0, 5.0, 100)
+GUESS = PENDULUM | {"l": 1.4, "c": 0.1}
+FREE = ["c", "l"]
+
+
+@pytest.fixture(scope="module")
+def swinging():
+    """A pendulum's angle and rate at `TS`."""
+    traj = lj.integrate(pendulum, 1.0, 0.0, PENDULUM, ts=TS)
+    return np.asarray(traj.q), np.asarray(traj.v)
+
+
+def noisy(x, sigma=0.01, seed=0):
+    """With errors."""
+    return x + sigma * np.random.default_rng(seed).normal(size=x.shape)
+
+
+def test_finds_parameters_and_start(swinging):
+    """Without errors: parameters, start and their names, to 1e-8; without a guess of the start."""
+    found = lj.fit(pendulum, lj.Record(TS, q=swinging[0]), GUESS, free=FREE, bounds={"l": (0.0, None)})
+    assert bool(found.converged) and found.names == ("c", "l")
+    np.testing.assert_allclose(found.values, [0.05, 1.25], rtol=1e-8)
+    np.testing.assert_allclose([found.q0[0], found.v0[0]], [1.0, 0.0], atol=1e-8)
+    assert found.params["l"] == found.values[1] and found.params["m"] == 1.0
+    # Twin: another friction law does not fit.
+    stuck = lj.fit(pendulum, lj.Record(TS, q=swinging[0]), GUESS | {"c": 0.2}, free=["l"], bounds={"l": (0.0, None)})
+    assert stuck.rms()["q"] > 1e-2
+
+
+def test_against_scipy(swinging):
+    """Estimates and covariance are those of SciPy's least squares with numerical slopes."""
+    data = noisy(swinging[0])
+    found = lj.fit(pendulum, lj.Record(TS, q=data, sigma=0.01), GUESS, free=FREE, bounds={"l": (0.0, None)})
+    solve = jax.jit(
+        lambda x: lj.integrate(pendulum, x[2], x[3], PENDULUM | {"c": x[0], "l": x[1]}, ts=TS, throw=False).q
+    )
+    theirs = least_squares(
+        lambda x: (np.asarray(solve(x)) - data) / 0.01, [0.1, 1.3, 1.0, 0.0], x_scale=[0.1, 1, 1, 1], xtol=1e-12,
+        ftol=1e-12,
+    )  # fmt: skip
+    ours = np.array([*found.values, found.q0[0], found.v0[0]])
+    np.testing.assert_allclose(ours, theirs.x, atol=1e-6)
+    covariance = np.linalg.inv(theirs.jac.T @ theirs.jac)
+    np.testing.assert_allclose(found.covariance, covariance[:2, :2], rtol=1e-3, atol=1e-9)
+    np.testing.assert_allclose(float(found.start_sd[0][0]), np.sqrt(covariance[2, 2]), rtol=1e-3)
+    np.testing.assert_allclose(found.chi2, 2 * theirs.cost, rtol=1e-8)
+    assert abs(float(found.correlation[0, 1])) < 1 and float(found.correlation[1, 1]) == pytest.approx(1)
+    assert int(found.freedom) == 96
+    # Sigmas taken from the residuals give nearly the same.
+    alone = lj.fit(pendulum, lj.Record(TS, q=data), GUESS, free=FREE, bounds={"l": (0.0, None)})
+    np.testing.assert_allclose(alone.values, found.values, rtol=1e-6)
+    np.testing.assert_allclose(float(alone.noise), np.sqrt(float(found.chi2) / 96) * 0.01, rtol=1e-4)
+
+
+def test_gaps_and_several_runs(swinging):
+    """Missing values, another run with its own start, length and mass, and only what is missing is left out."""
+    angle = swinging[0].copy()
+    angle[10:20] = np.nan
+    other = lj.integrate(pendulum, -0.4, 1.0, PENDULUM | {"m": 2.0}, ts=TS[:60])
+    records = [lj.Record(TS, q=angle), lj.Record(TS[:60], q=np.asarray(other.q), params={"m": 2.0})]
+    found = lj.fit(pendulum, records, GUESS, free=FREE)
+    np.testing.assert_allclose(found.values, [0.05, 1.25], rtol=1e-8)
+    np.testing.assert_allclose(np.array(found.q0), [1.0, -0.4], atol=1e-8)
+    assert int(found.freedom) == 90 + 60 - 6
+    residuals = found.residuals(0)["q"]
+    assert residuals.shape == (100,) and np.isnan(residuals[10:20]).all() and np.isfinite(residuals).sum() == 90
+    assert "record 1" in repr(found)
+    # Twin: with the other run's mass forgotten it does not fit.
+    wrong = lj.fit(pendulum, [records[0], lj.Record(TS[:60], q=np.asarray(other.q))], GUESS, free=FREE)
+    assert wrong.rms()["q"] > 1e-3
+
+
+def test_identifiability_before_and_after(swinging):
+    """Of m, l, g and friction a swing shows g/l and c/(m l²); what is not seen gets no uncertainty."""
+    record = lj.Record(TS, q=noisy(swinging[0]))
+    told = lj.identifiability(pendulum, record, PENDULUM)
+    assert told.rank == 2 and told.combined()[0] == "g/l"
+    assert "g/l" in repr(told)
+    with pytest.warns(lj.FitWarning, match="do not determine"):
+        found = lj.fit(pendulum, record, PENDULUM)
+    assert np.isnan(found.sd).all() and np.isfinite(found.start_sd[0][0])
+    assert "not determined" in repr(found)
+    np.testing.assert_allclose(found.values[1] / found.values[2], 9.81 / 1.25, rtol=0.01)
+    # Twin: with l known the rest of these is seen, and the mass where friction is known.
+    assert lj.identifiability(pendulum, record, PENDULUM, free=["g", "c"]).rank == 2
+    assert lj.identifiability(pendulum, record, PENDULUM, free=["m", "c"]).combined() == ["c/m"]
+    # A parameter that L does not contain.
+    more = PENDULUM | {"colour": 3.0}
+    assert lj.identifiability(pendulum, record, more, free=["g", "colour"]).unseen() == ["colour"]
+
+
+@pytest.mark.slow
+def test_a_measured_force_shows_the_mass():
+    """The scale of L is invisible in a motion, and seen in a multiplier."""
+    case = CASES["pendulum on a rod"]
+    traj = case.truth()
+    record = lambda **measured: lj.Record(
+        case.ts, **measured, q0=case.q0, v0=case.v0, sigma={"q": 0.01, "multipliers": 0.1}
+    )
+    free = ["g", "l", "m"]
+    assert lj.identifiability(hung, record(q=traj.q), HUNG, free=free).unseen() == ["m"]
+    assert lj.identifiability(hung, record(q=traj.q, multipliers=traj.multipliers), HUNG, free=free).rank == 3
+
+
+@pytest.mark.slow
+def test_observation_velocity_and_end():
+    """Positions through an observation function, velocities, a time of departure: each finds what it shows."""
+    measured = lambda t, q, v, params: {"x": params["l"] * jnp.sin(q), "y": -params["l"] * jnp.cos(q)}
+    traj = lj.integrate(pendulum, 1.0, 0.0, PENDULUM, ts=TS)
+    seen = jax.vmap(lambda t, q, v: measured(t, q, v, PENDULUM))(traj.t, traj.q, traj.v)
+    record = lj.Record(TS, observed=seen, q0=0.9, v0=0.1)
+    found = lj.fit(pendulum, record, GUESS, free=["c", "g", "l"], observe=measured)
+    np.testing.assert_allclose(found.values, [0.05, 9.81, 1.25], rtol=1e-8)
+    record = lj.Record(TS, v=traj.v, q0=0.9, v0=0.0, hold_v=True)
+    found = lj.fit(pendulum, record, GUESS, free=FREE)
+    np.testing.assert_allclose(found.values, [0.05, 1.25], rtol=1e-8)
+    assert float(found.v0[0]) == 0.0 and float(found.start_sd[1][0]) == 0.0
+
+    q0, v0 = rolling_hoop.start(rolling_hoop.PARAMS, 1.3)
+    until = np.array([0.0, 3.0])
+    left = lj.integrate(rolling_hoop.system, q0, v0, rolling_hoop.PARAMS, ts=until, event=rolling_hoop.DEPARTURE)
+    record = lj.Record(until, end={"t": left.end.t}, q0=q0, v0=v0, hold_q=True, hold_v=True, sigma=1e-3)
+    guess = rolling_hoop.PARAMS | {"g": 8.0}
+    found = lj.fit(rolling_hoop.system, record, guess, free="g", event=rolling_hoop.DEPARTURE)
+    np.testing.assert_allclose(found.values, [rolling_hoop.PARAMS["g"]], rtol=1e-8)
+    # The time scales as 1/sqrt(g): its slope is -t/2g, and so is the uncertainty.
+    np.testing.assert_allclose(found.sd, 1e-3 * 2 * rolling_hoop.PARAMS["g"] / float(left.end.t), rtol=1e-6)
+
+
+@pytest.mark.slow
+def test_a_long_record_wants_a_growing_horizon():
+    """From 20 % off, 40 periods at once end in a wrong minimum; a growing part of them, and joined windows, do not."""
+    ts = np.linspace(0.0, 60.0, 1500)
+    truth = lj.integrate(pendulum, 1.0, 0.0, PENDULUM | {"c": 0.01}, ts=ts)
+    record = lj.Record(ts, q=noisy(np.asarray(truth.q)))
+    guess = PENDULUM | {"l": 1.5, "c": 0.02}
+    found = lj.fit(pendulum, record, guess, free=FREE)
+    np.testing.assert_allclose(found.values, [0.01, 1.25], rtol=0.01)
+    joined = lj.fit(pendulum, record, guess, free=FREE, window=5.0)
+    np.testing.assert_allclose(joined.values, found.values, rtol=1e-4)
+    np.testing.assert_allclose(joined.sd, found.sd, rtol=0.02)
+    assert joined.freedom == found.freedom
+    apart = lj.fit(pendulum, record, guess, free=FREE, window=5.0, joined=False)
+    np.testing.assert_allclose(apart.values[1], 1.25, rtol=0.01)
+    assert float(apart.sd[1]) > 3 * float(found.sd[1])
+    # Twin: at once, it is lost.
+    lost = lj.fit(pendulum, record, guess, free=FREE, grow=False)
+    assert lost.rms()["q"] > 0.1
+    # Unless it is started from many places.
+    best = lj.fit(pendulum, record, guess, free=FREE, grow=False, restarts=20, spread=0.2)
+    np.testing.assert_allclose(best.values, found.values, rtol=1e-4)
+    assert len(best.costs) == 21
+
+
+def test_outliers_priors_and_bounds(swinging):
+    """A robust loss forgives wild values; a prior counts as a measurement; a bound is named."""
+    data = noisy(swinging[0])
+    wild = data.copy()
+    wild[::10] += 1.5
+    record = lambda x: lj.Record(TS, q=x, q0=1.0, v0=0.0, sigma=0.01)
+    fit = lambda x, **more: lj.fit(pendulum, record(x), GUESS, free=FREE, **more)
+    clean, plain, robust = fit(data), fit(wild), fit(wild, loss="cauchy")
+    off = lambda found: np.max(np.abs(found.values - clean.values) / clean.sd)
+    assert off(plain) > 10 and off(robust) < 2
+    assert np.all(robust.sd > clean.sd) and np.all(robust.sd < 2 * clean.sd)
+
+    known = fit(data, priors={"l": (1.2, 0.0005)})
+    weights = np.array([1 / clean.sd[1] ** 2, 1 / 0.0005**2])
+    assert abs(float(known.values[1]) - np.average([clean.values[1], 1.2], weights=weights)) < 2e-4
+    assert float(known.sd[1]) < 0.0005
+    with pytest.warns(lj.FitWarning, match="'l' ended at a bound"):
+        held = fit(data, bounds={"l": (1.3, 2.0)})
+    assert float(held.values[1]) == pytest.approx(1.3, abs=1e-5) and held.at_bounds() == ["l"]
+
+
+def problem(case, measured):
+    """The arrays of a fit."""
+    record = lj.Record(case.ts, **measured, q0=case.q0, v0=case.v0, sigma=case.sigma)
+    return problem_of(case.system, record, case.guess(), sorted(case.free), None, None, None, "squares", None, {})
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["pendulum", "pendulum on a rod", "rolling hoop"])
+def test_slopes_three_ways(name):
+    """Slopes of all residuals, of measured multipliers too: forward, reverse, and by differences with frozen steps."""
+    case = CASES[name]
+    p = problem(case, case.measured(case.truth()))
+    u = p.start
+    flat, back = jax.flatten_util.ravel_pytree(u)
+    slopes = linearised(p, u, WHOLE, "squares").slopes
+    forward = np.concatenate([slopes.rows_by_shared[0], slopes.rows_by_own[0]], axis=1)
+    rows = lambda x: equations(p, back(x), WHOLE).rows[0]
+    direction = np.random.default_rng(0).normal(size=forward.shape[0])
+    pulled = jax.jit(jax.grad(lambda x: direction @ rows(x)))(flat)
+    np.testing.assert_allclose(pulled, direction @ forward, rtol=1e-7, atol=1e-6 * np.max(np.abs(direction @ forward)))
+    # Fixed steps: the same grid for both sides of a difference.
+    fine = problem_of(
+        case.system, lj.Record(case.ts, **case.measured(case.truth()), q0=case.q0, v0=case.v0, sigma=case.sigma),
+        case.guess(), sorted(case.free), None, None, None, "squares", None, {"rtol": 1e-12, "atol": 1e-12},
+    )  # fmt: skip
+    at = jax.jit(lambda x: of_window(fine, x[: len(case.free)], x[len(case.free) :], 0, WHOLE)[0].rows)
+    for i in range(len(flat)):
+        h = 1e-4 * max(abs(float(flat[i])), 0.1)
+        step = np.zeros(len(flat))
+        step[i] = h
+        two = lambda h: (np.asarray(at(flat + h * step)) - np.asarray(at(flat - h * step))) / (2 * h * step[i])
+        difference = (4 * two(0.5) - two(1.0)) / 3
+        scale = np.max(np.abs(forward[:, i]))
+        np.testing.assert_allclose(difference, forward[:, i], rtol=1e-4, atol=2e-6 * scale)
+
+
+def test_inside_a_program(swinging):
+    """Fits of many measurements in one program: the same as one by one."""
+    data = np.stack([noisy(swinging[0], seed=i) for i in range(3)])
+
+    def estimate(x):
+        return lj.fit(pendulum, lj.Record(TS, q=x, q0=1.0, v0=0.0), GUESS, free=FREE).values
+
+    together = jax.jit(jax.vmap(estimate))(data)
+    np.testing.assert_allclose(together[1], estimate(data[1]), rtol=1e-7)
+    assert np.ptp(np.asarray(together)[:, 1]) > 1e-5
+
+
+@pytest.mark.slow
+def test_other_optimisers(swinging):
+    """Another least-squares solver, and minimisers with derivatives in reverse, end in the same place."""
+    data = noisy(swinging[0])
+    fit = lambda **more: lj.fit(pendulum, lj.Record(TS, q=data, sigma=0.01), GUESS, free=FREE, **more)
+    ours = fit()
+    dogleg = fit(optimiser=optx.Dogleg(rtol=1e-9, atol=1e-9))
+    np.testing.assert_allclose(dogleg.values, ours.values, rtol=1e-5)
+    bfgs = fit(optimiser=optx.BFGS(rtol=1e-6, atol=1e-6), iterations=300)
+    np.testing.assert_allclose(bfgs.values, ours.values, rtol=1e-3)
+    np.testing.assert_allclose(bfgs.sd, ours.sd, rtol=1e-2)
+    adam = optx.OptaxMinimiser(optax.adam(0.02), rtol=1e-5, atol=1e-5)
+    slow = lj.fit(pendulum, lj.Record(TS, q=data), GUESS, free=FREE, optimiser=adam, iterations=2000, grow=False)
+    np.testing.assert_allclose(slow.values[1], ours.values[1], rtol=1e-2)
+
+
+def test_log_likelihood(swinging):
+    """The likelihood is largest at the estimates, and falls by a half at one standard deviation."""
+    data = noisy(swinging[0])
+    found = lj.fit(
+        pendulum, lj.Record(TS, q=data, sigma=0.01, q0=1.0, v0=0.0, hold_q=True, hold_v=True), GUESS, free="l"
+    )
+    density = jax.jit(found.log_likelihood)
+    best = float(density(found.sampling))
+    assert best == pytest.approx(-0.5 * float(found.chi2), rel=1e-9)
+    moved = float(density({"l": found.values[0] + found.sd[0]}))
+    assert moved - best == pytest.approx(-0.5, rel=0.02)
+    assert abs(float(jax.grad(lambda l: density({"l": l}))(found.values[0]))) < 1e-2 / float(found.sd[0])
+
+
+def test_prints_and_plots(swinging):
+    """The table has estimates with their uncertainties in the user's units; the picture a row a channel."""
+    found = lj.fit(pendulum, lj.Record(TS, q=noisy(swinging[0])), GUESS, free=FREE, units={"l": "m"})
+    lines = repr(found).splitlines()
+    assert lines[0].startswith("Fit: converged")
+    assert any(line.split()[:1] == ["l"] and "±" in line and line.endswith("m") for line in lines)
+    assert "96 degrees of freedom" in repr(found) and "NOT white" not in repr(found)
+    assert abs(found.whiteness()["q"]) < 0.3 and found.rms()["q"] == pytest.approx(0.01, rel=0.2)
+    assert len(found.plot().axes) == 2
+    assert np.max(np.abs(np.asarray(found.motion().q) - (noisy(swinging[0]) + found.residuals()["q"]))) < 1e-8
+    # Twin: a slow error is not white.
+    slow = lj.fit(pendulum, lj.Record(TS, q=swinging[0] + 0.05 * np.sin(TS)), GUESS, free=FREE)
+    assert "NOT white" in repr(slow) and slow.whiteness()["q"] > 0.5
+
+
+def test_unknowns_of_a_start_keep_to_the_constraints():
+    """Whatever its unknowns, a start satisfies the constraints, for other parameters too."""
+    case = CASES["pendulum on a rod"]
+    p = problem(case, {"q": case.truth().q})
+    assert p.start.own.shape == (1, 2)
+    state = jax.jit(lambda u: p.setting(u.shared, u.own[0], 0, WHOLE)[2])
+    for own in ([0.3, -0.5], [-0.5, 1.0]):
+        u = Unknowns(jnp.array([2.4, 1.0]), jnp.array([own]))
+        q, v = state(u)
+        assert abs(q["x"] ** 2 + q["y"] ** 2 - 2.4**2) < 1e-12
+        assert abs(q["x"] * v["x"] + q["y"] * v["y"]) < 1e-12
