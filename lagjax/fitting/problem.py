@@ -15,9 +15,8 @@ from lagjax.fitting.parameters import find, leaf_name
 from lagjax.fitting.records import KINDS, Record, channel_name, cut
 from lagjax.fitting.result import FitWarning
 from lagjax.fitting.starts import starts
-from lagjax.mechanics import coordinates
+from lagjax.mechanics import constraints, coordinates
 from lagjax.mechanics.diagnosis import listed
-from lagjax.mechanics.multipliers import accelerations
 from lagjax.motion.problem import check_system
 
 # What `integrate` takes and a fit sets itself.
@@ -188,7 +187,8 @@ def _check_predicted(problem: Problem):
     t, params = jax.ShapeDtypeStruct((), problem.windows.ts.dtype), problem.found.params
 
     def one_time(t, q, v, params):
-        said = {"q": q, "v": v, "multipliers": accelerations(problem.system, t, q, v, params)[1]}
+        shapes = constraints.shapes(problem.system, t, q, v, params)
+        said = {"q": q, "v": v, "multipliers": {name: jnp.zeros(shape) for name, shape in shapes.items()}}
         if problem.observe is not None:
             said["observed"] = problem.observe(t, q, v, params)
         return said | {"end": {"t": t, **said}}
