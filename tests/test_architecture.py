@@ -13,7 +13,10 @@ import lagjax
 ROOT = Path(lagjax.__file__).parent
 FILES = sorted(ROOT.rglob("*.py"))
 # From the ground up: a module imports only from its own layer or from those before it.
-LAYERS = ("numerics", "mechanics", "plot", "motion", "sweeps", "fitting", "report", "mechanisms", "scenes", "stability")
+LAYERS = (
+    *("numerics", "mechanics", "plot", "animation", "motion", "sweeps"),
+    *("fitting", "report", "mechanisms", "scenes", "stability"),
+)
 TOP = {"__init__", "__main__"}
 OPTIONAL = {"matplotlib", "tqdm", "xarray", "zarr"}
 
