@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Float, PyTree
 from lagjax import plot
 from lagjax.animation import Animation
 from lagjax.mechanics import coordinates
+from lagjax.mechanics.structure import angles
 from lagjax.mechanics.system import System
 from lagjax.motion import frames
 from lagjax.motion.consistency import worst_residual
@@ -122,6 +123,23 @@ class Trajectory(eqx.Module):
                 name + suffix: curve for name, values in self.multipliers.items() for suffix, curve in _columns(values)
             }
         return plot.time_series(np.asarray(self.t), panels)
+
+    def phase_portrait(self):
+        """Plot velocities against coordinates, a panel a coordinate; returns a matplotlib `Figure`.
+
+        A dot marks the start. An angle (a coordinate that is seen through sines and cosines alone) that goes around is
+        drawn between -π and π. Of a batched trajectory every lane is drawn.
+
+        **Raises:** `ImportError` without matplotlib.
+        """
+        lanes = jax.tree.map(lambda x: np.asarray(x).reshape(-1, *x.shape[self.t.ndim - 1 :]), self)
+        lanes = [jax.tree.map(lambda x: x[i], lanes) for i in range(len(lanes.t))]
+        first = jax.tree.map(lambda x: x[0], (lanes[0].t, lanes[0].q, lanes[0].v))
+        of_leaves = angles(lanes[0].system, *first, lanes[0].params)
+        is_angle = coordinates.flatten(jax.tree.map(lambda yes, x: np.full(x.shape, yes), of_leaves, first[1]))[0]
+        curves = [(_curves(lane.q), _curves(lane.v)) for lane in lanes]
+        drawn = {name: [_finite(q[name], v[name]) for q, v in curves] for name in curves[0][0]}
+        return plot.phase_portrait({name: (drawn[name], bool(yes)) for name, yes in zip(drawn, is_angle)})
 
     def animate(
         self, positions: Callable, *, seconds: float | None = None, rate: float = 25.0, trail: float = 2.0
@@ -277,6 +295,11 @@ def _curves(tree):
     first = jax.tree.map(lambda x: np.asarray(x[0]), tree)
     columns = np.stack([np.ravel(x) for x in _rows(tree)])
     return dict(zip(coordinates.names(first), columns.T))
+
+
+def _finite(*curves):
+    there = np.isfinite(curves).all(axis=0)
+    return tuple(x[there] for x in curves)
 
 
 def _rows(tree):
