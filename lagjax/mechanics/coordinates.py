@@ -120,9 +120,12 @@ def _check_floating(tree, which):
 def _check_alike(q, v):
     q_structure, v_structure = jtu.tree_structure(q), jtu.tree_structure(v)
     if q_structure != v_structure:
+        has = ["no names" if jtu.treedef_is_leaf(jtu.tree_structure(x)) else ", ".join(names(x)) for x in (q, v)]
+        if has[0] == has[1]:
+            has = [str(q_structure), str(v_structure)]
         raise ValueError(
-            f"v must have the structure of q.\n  q: {q_structure}\n  v: {v_structure}\n"
-            "Usual cause: a coordinate missing from v, or another key.\n"
+            f"v must have the structure of q.\n  q: {has[0]}\n  v: {has[1]}\n"
+            "Usual cause: a coordinate missing from v, or a name written in two ways.\n"
             "Fix: start from v = jax.tree.map(jnp.zeros_like, q)."
         )
     for (path, a), b in zip(jtu.tree_flatten_with_path(q)[0], jtu.tree_leaves(v)):

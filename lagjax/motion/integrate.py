@@ -16,6 +16,7 @@ from jaxtyping import ArrayLike, PyTree
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.closures import lift
 from lagjax.mechanics.diagnosis import explain_failure
+from lagjax.mechanics.first_call import check_functions
 from lagjax.mechanics.system import System
 from lagjax.motion import problem
 from lagjax.motion.reported import patient, report
@@ -101,7 +102,7 @@ def integrate(
     t0 = ts[0] if len(np.shape(ts)) == 1 and np.shape(ts)[0] else 0.0
     start = coordinates.state(t0, q0, v0, params)
     dtype = start.t.dtype
-    problem.check_functions(system, start)
+    check_functions(system, *start)
     system = lift(system, start)
     drift = problem.check_drift(drift, system)
     problem.check_adjoint(adjoint, drift)
