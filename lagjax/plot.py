@@ -20,7 +20,7 @@ def figure(rows=1, columns=1, size=(4.6, 3.2), **options):
 
     fig = Figure(figsize=(size[0] * columns, size[1] * rows), layout="constrained", dpi=130)
     # Shown once as a cell's value, without pyplot and the figures that it keeps open.
-    fig._repr_png_ = lambda: _png(fig)
+    setattr(fig, "_repr_png_", lambda: _png(fig))
     axes = fig.subplots(rows, columns, squeeze=False, **options)
     for axis in axes.flat:
         axis.grid(True, linewidth=0.4, alpha=0.5)

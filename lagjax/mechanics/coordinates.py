@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
+from jax.core import Tracer
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PyTree
 
@@ -103,7 +104,7 @@ def numpy_of(tree):
 
 def is_traced(tree) -> bool:
     """Whether JAX is tracing through `tree`, so that its values cannot be looked at."""
-    return any(isinstance(leaf, jax.core.Tracer) for leaf in jtu.tree_leaves(tree))
+    return any(isinstance(leaf, Tracer) for leaf in jtu.tree_leaves(tree))
 
 
 def _check_floating(tree, which):

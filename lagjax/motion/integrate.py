@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import diffrax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import ArrayLike, PyTree
+from jaxtyping import Array, ArrayLike, PyTree
 
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.closures import lift
@@ -30,7 +30,7 @@ def integrate(
     v0: PyTree[ArrayLike],
     params: PyTree = None,
     *,
-    ts: ArrayLike | Sequence[float],
+    ts: Array | np.ndarray | Sequence[float],
     rtol: ArrayLike | tuple[ArrayLike, ArrayLike] | None = None,
     atol: ArrayLike | tuple[ArrayLike, ArrayLike] | None = None,
     method: diffrax.AbstractSolver | None = None,

@@ -89,7 +89,7 @@ def times(ts: Any, dtype):
     if not coordinates.is_traced(ts):
         if not np.all(np.isfinite(ts)):
             raise ValueError("ts contains NaN or infinity.\nFix: give finite times.")
-        late = np.flatnonzero(np.diff(np.asarray(ts)) <= 0)
+        late = np.flatnonzero(np.diff(np.asarray(ts, float)) <= 0)
         if late.size:
             i = int(late[0])
             raise ValueError(
