@@ -57,7 +57,7 @@ class Static(NamedTuple):
 
 
 class Trajectory(eqx.Module):
-    """A motion at the requested times. It prints its own quality and plots itself.
+    """A motion at the requested times. It prints its own quality, and plots and plays itself.
 
     - `t` (T,): the times asked for.
     - `q`, `v`: in the structure of the initial state, each leaf with a leading axis T. NaN after an event
