@@ -10,7 +10,6 @@ are solved in vector form, and every message speaks of the coordinate by the use
 
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
