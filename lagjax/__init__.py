@@ -23,6 +23,7 @@ from lagjax.motion.explanation import Explanation, explain
 
 # isort: split
 # Motion.
+from lagjax.animation import Animation
 from lagjax.motion.integrate import integrate
 from lagjax.motion.trajectory import RESULTS, AccuracyWarning, Moment, Trajectory
 from lagjax.numerics.nystrom import Nystrom8, Nystrom12
@@ -71,6 +72,7 @@ __all__ = [
     "Radau5",
     "Trajectory",
     "Moment",
+    "Animation",
     "RESULTS",
     "AccuracyWarning",
     "sweep",

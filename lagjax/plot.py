@@ -1,6 +1,7 @@
 """One look for every picture. Needs matplotlib (`pip install "lagjax[plot]"`)."""
 
 import io
+from fractions import Fraction
 
 import numpy as np
 
@@ -19,7 +20,7 @@ def figure(rows=1, columns=1, size=(4.6, 3.2), **options):
 
     fig = Figure(figsize=(size[0] * columns, size[1] * rows), layout="constrained", dpi=130)
     # Shown once as a cell's value, without pyplot and the figures that it keeps open.
-    fig._repr_png_ = lambda: _png(fig)
+    setattr(fig, "_repr_png_", lambda: _png(fig))
     axes = fig.subplots(rows, columns, squeeze=False, **options)
     for axis in axes.flat:
         axis.grid(True, linewidth=0.4, alpha=0.5)
@@ -66,6 +67,60 @@ def time_series(t, panels: dict[str, dict[str, np.ndarray]]):
             axis.legend(fontsize=8, frameon=False, loc="center left", bbox_to_anchor=(1.0, 0.5))
     axes[-1, 0].set_xlabel("t")
     return fig
+
+
+def phase_portrait(panels: dict[str, tuple[list[tuple[np.ndarray, np.ndarray]], bool]]):
+    """Draw velocities against coordinates, one panel a coordinate, one curve a motion; a dot where each starts.
+
+    **Arguments:** `panels` by coordinate: [(q (T,), v (T,)) of each motion], and whether it is an angle. Angles that go
+    around are drawn between -π and π.
+
+    **Returns:** a matplotlib `Figure`.
+    """
+    columns = min(3, len(panels))
+    fig, axes = figure(-(-len(panels) // columns), columns, size=(4.2, 3.4))
+    for axis, (name, (curves, is_angle)) in zip(axes.flat, panels.items()):
+        around = is_angle and any(np.ptp(q) > 2 * np.pi for q, _ in curves)
+        for i, (q, v) in enumerate(curves):
+            x, y = _cut_at_half_turns(q, v) if around else (q, v)
+            axis.plot(x, y, linewidth=1.2, color=COLOURS[i % len(COLOURS)])
+            axis.plot(x[:1], y[:1], "o", markersize=5, color=COLOURS[i % len(COLOURS)])
+        if is_angle:
+            _ticks_in_pi(axis)
+        entry = name[1:] if name == "q" or name.startswith("q[") else f": {name}"
+        axis.set(xlabel=f"q{entry}", ylabel=f"v{entry}")
+    for axis in axes.flat[len(panels) :]:
+        axis.set_visible(False)
+    return fig
+
+
+def _cut_at_half_turns(q, v):
+    """An angle brought between -π and π, the curve cut (by NaN) where it leaves on one side and enters on the other."""
+    turn = np.floor((q + np.pi) / (2 * np.pi))
+    i = np.flatnonzero(np.diff(turn))
+    edge = 2 * np.pi * np.maximum(turn[i], turn[i + 1]) - np.pi
+    at_edge = v[i] + (edge - q[i]) / (q[i + 1] - q[i]) * (v[i + 1] - v[i])
+    side, gap = np.pi * np.sign(turn[i + 1] - turn[i]), np.full(len(i), np.nan)
+    insert = lambda x, *pieces: np.insert(x, np.repeat(i + 1, 3), np.stack(pieces, axis=1).reshape(-1))
+    return insert(q - 2 * np.pi * turn, side, gap, -side), insert(v, at_edge, gap, at_edge)
+
+
+def _ticks_in_pi(axis):
+    """Mark fractions of a half turn where a quarter turn or more is shown."""
+    from matplotlib.ticker import FuncFormatter, MultipleLocator
+
+    low, high = axis.get_xlim()
+    if high - low < np.pi / 2:
+        return
+    step = next(n for n in (4, 2, 1) if (high - low) * n / np.pi <= 6 or n == 1)
+
+    def label(x, _):
+        whole = Fraction(round(x * step / np.pi), step)
+        top = {0: "0", 1: "π", -1: "-π"}.get(whole.numerator, f"{whole.numerator}π")
+        return top if whole.denominator == 1 else f"{top}/{whole.denominator}"
+
+    axis.xaxis.set_major_locator(MultipleLocator(np.pi / step))
+    axis.xaxis.set_major_formatter(FuncFormatter(label))
 
 
 def work_precision(title: str, curves: dict[str, tuple[np.ndarray, np.ndarray]]):

@@ -193,8 +193,8 @@ def case_table(cases: Sequence[Case]) -> str:
     return table(header[:-1] + (header[-1].ljust(width),), [row[:-1] + (row[-1].ljust(width),) for row in cells])
 
 
-def _methods_for(run):
-    by_runge_kutta = {"Tsit5": Tsit5(), "Dopri8": Dopri8()}
+def _methods_for(run) -> dict[str, diffrax.AbstractSolver]:
+    by_runge_kutta: dict[str, diffrax.AbstractSolver] = {"Tsit5": Tsit5(), "Dopri8": Dopri8()}
     state = coordinates.state(run.ts[0], run.q0, run.v0, run.params)
     return by_runge_kutta | ({"Nystrom12": Nystrom12()} if is_free_of_velocities(run.system, *state) else {})
 

@@ -44,6 +44,12 @@ traj
 traj.plot()
 
 # %% [markdown]
+# And it plays: say where its points are, and they are linked in order. The last one leaves a trail.
+
+# %%
+traj.animate(lambda t, q, params: [(0.0, 0.0), (params["l"] * jnp.sin(q), -params["l"] * jnp.cos(q))])
+
+# %% [markdown]
 # A quarter of the period ends where the angle crosses zero: an event. Its time has a derivative with respect to
 # everything that went in; gravity shortens the period as $\mathrm{d}T/\mathrm{d}g = -T/(2g)$.
 

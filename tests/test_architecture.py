@@ -1,6 +1,7 @@
 """The house: layers, cycles, file sizes, docstrings, exports."""
 
 import ast
+import doctest
 import importlib
 import inspect
 import pkgutil
@@ -13,8 +14,12 @@ import lagjax
 ROOT = Path(lagjax.__file__).parent
 FILES = sorted(ROOT.rglob("*.py"))
 # From the ground up: a module imports only from its own layer or from those before it.
-LAYERS = ("numerics", "mechanics", "plot", "motion", "sweeps", "fitting", "report", "mechanisms", "scenes", "stability")
+LAYERS = (
+    *("numerics", "mechanics", "plot", "animation", "motion", "sweeps"),
+    *("fitting", "report", "mechanisms", "scenes", "stability"),
+)
 TOP = {"__init__", "__main__"}
+FINDER = doctest.DocTestFinder()
 OPTIONAL = {"matplotlib", "tqdm", "xarray", "zarr"}
 
 
@@ -131,6 +136,32 @@ def test_exports():
         doc = inspect.getdoc(getattr(lagjax, name))
         for part in (">>>", "**Returns:**", "**Raises:**", "Source:"):
             assert part in doc, f"{name} lacks {part}"
+
+
+def written_examples(source):
+    """The names of everything whose docstring has an example; "" for the module."""
+    documented = (ast.FunctionDef, ast.ClassDef, ast.Module)
+    nodes = [node for node in ast.walk(ast.parse(source)) if isinstance(node, documented)]
+    return {getattr(node, "name", "") for node in nodes if ">>>" in (ast.get_docstring(node) or "")}
+
+
+@pytest.mark.parametrize("path", [path for path in FILES if path.stem != "__main__"], ids=module_name)
+def test_every_example_is_executed(path):
+    """What doctest finds, and so runs, is all that is written: wrappers may hide a docstring from it."""
+    module = importlib.import_module(module_name(path))
+    found = {test.name.removeprefix(module.__name__).split(".")[-1] for test in FINDER.find(module) if test.examples}
+    assert found == written_examples(path.read_text())
+
+
+def test_the_example_check_can_fail():
+    """Twin: an example that is written is listed, by class, function and method."""
+    source = 'class A:\n    def f(self):\n        """One.\n\n        >>> 1\n        1\n        """\n'
+    assert written_examples(source) == {"f"} != written_examples(source.replace(">>>", ""))
+
+
+def test_types_are_shipped():
+    """The marker by which type checkers read the annotations lies beside the code."""
+    assert (ROOT / "py.typed").exists()
 
 
 def test_import_computes_nothing():

@@ -10,10 +10,10 @@ are solved in vector form, and every message speaks of the coordinate by the use
 
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
+from jax.core import Tracer
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PyTree
 
@@ -103,7 +103,7 @@ def numpy_of(tree):
 
 def is_traced(tree) -> bool:
     """Whether JAX is tracing through `tree`, so that its values cannot be looked at."""
-    return any(isinstance(leaf, jax.core.Tracer) for leaf in jtu.tree_leaves(tree))
+    return any(isinstance(leaf, Tracer) for leaf in jtu.tree_leaves(tree))
 
 
 def _check_floating(tree, which):
@@ -120,9 +120,12 @@ def _check_floating(tree, which):
 def _check_alike(q, v):
     q_structure, v_structure = jtu.tree_structure(q), jtu.tree_structure(v)
     if q_structure != v_structure:
+        has = ["no names" if jtu.treedef_is_leaf(jtu.tree_structure(x)) else ", ".join(names(x)) for x in (q, v)]
+        if has[0] == has[1]:
+            has = [str(q_structure), str(v_structure)]
         raise ValueError(
-            f"v must have the structure of q.\n  q: {q_structure}\n  v: {v_structure}\n"
-            "Usual cause: a coordinate missing from v, or another key.\n"
+            f"v must have the structure of q.\n  q: {has[0]}\n  v: {has[1]}\n"
+            "Usual cause: a coordinate missing from v, or a name written in two ways.\n"
             "Fix: start from v = jax.tree.map(jnp.zeros_like, q)."
         )
     for (path, a), b in zip(jtu.tree_flatten_with_path(q)[0], jtu.tree_leaves(v)):

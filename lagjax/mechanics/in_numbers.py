@@ -34,15 +34,15 @@ class InNumbers(eqx.Module):
 
 def in_numbers(system: System, unflatten: Callable) -> System:
     """The same system, with a tuple of numbers for q and for v."""
-    wrap = lambda function, **kw: None if function is None else InNumbers(function, unflatten, **kw)
+    wrap = lambda function, **kw: InNumbers(function, unflatten, **kw)
     return System(
         wrap(system.lagrangian),
         {
             name: Holonomic(wrap(c.g)) if isinstance(c, Holonomic) else Nonholonomic(wrap(c.phi))
             for name, c in system.constraints.items()
         },
-        force=wrap(system.force, returns_coordinates=True),
-        dissipation=wrap(system.dissipation),
+        force=None if system.force is None else wrap(system.force, returns_coordinates=True),
+        dissipation=None if system.dissipation is None else wrap(system.dissipation),
     )
 
 

@@ -19,6 +19,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
 from lagjax.mechanics import coordinates
+from lagjax.mechanics.first_call import check_functions
 
 
 class Linear(NamedTuple):
@@ -58,33 +59,6 @@ def forcing_and_inertia(system, t, x, u, params, unflatten):
     if system.dissipation is not None:
         forcing = forcing - jax.grad(lambda u: system.dissipation(t, unflatten(x), unflatten(u), params))(u)
     return forcing.astype(x.dtype), lambda a: push(zero_t, zero, a)
-
-
-def check_scalar(system, t, q, v, params):
-    """Raise where L or R does not return one real number, or Q does not return forces like q."""
-    for role, function in (("L", system.lagrangian), ("dissipation", system.dissipation)):
-        if function is None:
-            continue
-        value = eqx.filter_eval_shape(function, t, q, v, params)
-        shape, dtype = getattr(value, "shape", None), getattr(value, "dtype", None)
-        if shape is None and isinstance(value, (int, float)):
-            continue
-        if shape != () or not jnp.issubdtype(dtype, jnp.floating):
-            got = f"shape {shape}, {dtype}" if shape is not None else f"a {type(value).__name__}"
-            raise ValueError(
-                f"{role}(t, q, v, params) must return one real number, and returned {got}.\n"
-                "Usual cause: energies of several bodies left unsummed, as in 0.5 * m * v**2 with v a vector.\n"
-                "Fix: 0.5 * m * jnp.sum(v**2), or jnp.dot(v, v)."
-            )
-    if system.force is not None:
-        force = eqx.filter_eval_shape(system.force, t, q, v, params)
-        expected = jax.tree.map(jnp.shape, q)
-        if jax.tree.map(jnp.shape, force) != expected:
-            raise ValueError(
-                f"force(t, q, v, params) must return one force a coordinate, like q.\n"
-                f"  q has shapes {expected}\n  the force has {jax.tree.map(jnp.shape, force)}\n"
-                "Fix: return the structure of q, with 0.0 where no force acts."
-            )
 
 
 def momentum(system, t, q, v, params) -> PyTree[Float[Array, "..."]]:
@@ -153,7 +127,7 @@ def jacobi_integral(system, t, q, v, params) -> Float[Array, ""]:
 
 def _checked(system, t, q, v, params):
     s = coordinates.state(t, q, v, params)
-    check_scalar(system, *s)
+    check_functions(system, *s)
     return s
 
 

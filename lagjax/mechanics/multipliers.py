@@ -13,7 +13,7 @@ from jaxtyping import Array, PyTree
 
 from lagjax.mechanics import constraints, coordinates
 from lagjax.mechanics.diagnosis import explain_failure, explain_singular, where
-from lagjax.mechanics.lagrangian import check_scalar
+from lagjax.mechanics.first_call import check_functions
 from lagjax.mechanics.saddle_point import examined, verdict
 from lagjax.mechanics.sparse_plan import plan
 from lagjax.mechanics.written_out import is_small, write_out
@@ -47,7 +47,7 @@ def accelerations(system, t, q, v, params) -> tuple[PyTree[Array], dict[str, Arr
     Source: Goldstein, Eq. (2.24)-(2.27).
     """
     s = coordinates.state(t, q, v, params)
-    check_scalar(system, *s)
+    check_functions(system, *s)
     traced = coordinates.is_traced((s, eqx.filter(system, eqx.is_array)))
     if plan(system, *s) is not None:
         found = verdict(system, *s)
@@ -130,6 +130,7 @@ def constraint_residual(system, t, q, v, params, level: str = "constraint") -> d
     if level not in ("constraint", "velocity"):
         raise ValueError(f'level must be "constraint" or "velocity", not {level!r}.')
     s = coordinates.state(t, q, v, params)
+    check_functions(system, *s)
     return _constraint_residual(system, *s, level)
 
 

@@ -21,13 +21,13 @@ Source: as for `saddle_point.py`; Benzi, Golub & Liesen, Acta Numerica 14 (2005)
 
 from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, PyTree
 
 from lagjax.mechanics import constraints
 from lagjax.mechanics.lagrangian import forcing_and_inertia
@@ -100,10 +100,10 @@ def row_sizes(plan: Plan, system, t, x, u, params, unflatten, norm=jnp.sum) -> F
 
 
 class Verdict(NamedTuple):
-    """A solution of the equations at one state, and whether it is to be believed."""
+    """A solution of the equations at one state, as vectors or by name, and whether it is to be believed."""
 
-    a: Float[Array, " n"]
-    multipliers: Float[Array, " m"]
+    a: PyTree[Array]
+    multipliers: Any
     finite: Bool[Array, ""]
     singular: Bool[Array, ""]
     contradictory: Bool[Array, ""]

@@ -21,6 +21,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 from jax import lax
+from jax.core import ShapedArray
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 from jaxtyping import PyTree
@@ -85,7 +86,7 @@ def _tangent(*operands, outputs, shapes, size, many):
 
 def _tangent_shapes(*operands, shapes, size, many, **params):
     lead = operands[-1].shape[:1] if many else ()
-    return [jax.core.ShapedArray((*lead, *shape), dtype) for shape, dtype in shapes]
+    return [ShapedArray((*lead, *shape), dtype) for shape, dtype in shapes]
 
 
 def _tangent_jvp(primals, tangents, **params):

@@ -24,7 +24,8 @@ from jax import lax
 
 from lagjax.mechanics import constraints, coordinates
 from lagjax.mechanics.diagnosis import describe, listed
-from lagjax.mechanics.lagrangian import check_scalar, mass_and_forcing
+from lagjax.mechanics.first_call import check_functions
+from lagjax.mechanics.lagrangian import mass_and_forcing
 from lagjax.mechanics.saddle_point import displacement_map, saddle_point_matrix
 from lagjax.motion.consistency import departures, stopped, within
 from lagjax.numerics import dense
@@ -69,7 +70,7 @@ def consistent_state(system, t, q, v, params, hold: str | Iterable[str] = ()):
     Source: Hairer, Lubich & Wanner, *Geometric Numerical Integration*, Eq. (IV.4.3).
     """
     s = coordinates.state(t, q, v, params)
-    check_scalar(system, *s)
+    check_functions(system, *s)
     free = free_coordinates(s.q, hold)
     if not system.constraints:
         return s.q, s.v

@@ -8,7 +8,7 @@ import numpy as np
 from lagjax.mechanics import constraints, coordinates
 from lagjax.mechanics.constraints import Holonomic
 from lagjax.mechanics.diagnosis import dependencies, describe, equation_names, explain_failure, listed
-from lagjax.mechanics.lagrangian import check_scalar
+from lagjax.mechanics.first_call import check_functions
 from lagjax.mechanics.saddle_point import examined
 from lagjax.mechanics.sparse_plan import plan
 from lagjax.mechanics.structure import Structure, is_free_of_velocities, structure
@@ -79,7 +79,7 @@ def explain(system: System, q, v, params=None, *, t=0.0) -> Explanation:
     Source: García de Jalón & Bayo, *Kinematic and Dynamic Simulation of Multibody Systems*, §3.2 (rank and freedoms).
     """
     s = coordinates.state(t, q, v, params)
-    check_scalar(system, *s)
+    check_functions(system, *s)
     off = ""
     if system.constraints:
         s, off = _on_the_constraints(system, s)

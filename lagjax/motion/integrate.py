@@ -11,11 +11,12 @@ from collections.abc import Sequence
 import diffrax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import ArrayLike, PyTree
+from jaxtyping import Array, ArrayLike, PyTree
 
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.closures import lift
 from lagjax.mechanics.diagnosis import explain_failure
+from lagjax.mechanics.first_call import check_functions
 from lagjax.mechanics.system import System
 from lagjax.motion import problem
 from lagjax.motion.reported import patient, report
@@ -29,7 +30,7 @@ def integrate(
     v0: PyTree[ArrayLike],
     params: PyTree = None,
     *,
-    ts: ArrayLike | Sequence[float],
+    ts: Array | np.ndarray | Sequence[float],
     rtol: ArrayLike | tuple[ArrayLike, ArrayLike] | None = None,
     atol: ArrayLike | tuple[ArrayLike, ArrayLike] | None = None,
     method: diffrax.AbstractSolver | None = None,
@@ -101,7 +102,7 @@ def integrate(
     t0 = ts[0] if len(np.shape(ts)) == 1 and np.shape(ts)[0] else 0.0
     start = coordinates.state(t0, q0, v0, params)
     dtype = start.t.dtype
-    problem.check_functions(system, start)
+    check_functions(system, *start)
     system = lift(system, start)
     drift = problem.check_drift(drift, system)
     problem.check_adjoint(adjoint, drift)

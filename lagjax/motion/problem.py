@@ -8,10 +8,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lagjax.mechanics import constraints, coordinates
+from lagjax.mechanics import coordinates
 from lagjax.mechanics.coordinates import State
 from lagjax.mechanics.diagnosis import describe, explain_failure
-from lagjax.mechanics.lagrangian import check_scalar
 from lagjax.mechanics.saddle_point import equations_of_motion
 from lagjax.mechanics.system import System
 from lagjax.motion.consistency import departures
@@ -21,6 +20,8 @@ from lagjax.motion.trajectory import RESULTS, AccuracyWarning
 
 # Tolerances that each dtype reaches with room to spare.
 DEFAULT_TOLERANCE = {np.dtype("float64"): 1e-9, np.dtype("float32"): 1e-5}
+# How methods are called by where they come from.
+PACKAGES = {"diffrax": "diffrax.", "lagjax": "lj."}
 # Starts that cannot be integrated, whose reason is in the equations.
 REFUSED = (RESULTS.start_not_finite, RESULTS.start_singular, RESULTS.contradictory)
 
@@ -41,10 +42,15 @@ def check_method(method: Any):
     if isinstance(method, type) and issubclass(method, diffrax.AbstractSolver):
         raise TypeError(
             f"method must be a solver instance, and {method.__name__} is the class.\n"
-            f"Fix: method=diffrax.{method.__name__}()."
+            "Usual cause: the brackets left out.\n"
+            f"Fix: method={PACKAGES.get(method.__module__.split('.')[0], '')}{method.__name__}()."
         )
     if not isinstance(method, diffrax.AbstractSolver):
-        raise TypeError(f"method must be a diffrax solver, not {type(method).__name__}.\nFix: method=diffrax.Dopri8().")
+        raise TypeError(
+            f"method must be a diffrax solver, not {type(method).__name__}.\n"
+            "Usual cause: a method by its name, as in SciPy.\n"
+            "Fix: method=lj.Dopri8(), any of diffrax's, or leave it out."
+        )
     if method.term_structure is not diffrax.AbstractTerm:
         raise TypeError(
             f"{type(method).__name__} needs a vector field of a special form, and the accelerations of a general "
@@ -76,13 +82,14 @@ def times(ts: Any, dtype):
     if ts.ndim != 1 or ts.shape[0] < 2:
         raise ValueError(
             f"ts must be a vector of at least two times, and has shape {ts.shape}.\n"
-            "The motion starts at ts[0] with (q0, v0).\nFix: ts=jnp.linspace(0.0, 10.0, 101)."
+            "Usual cause: the last time alone; the motion starts at ts[0] with (q0, v0).\n"
+            "Fix: ts=jnp.linspace(0.0, 10.0, 101)."
         )
     ts = ts.astype(dtype)
     if not coordinates.is_traced(ts):
         if not np.all(np.isfinite(ts)):
             raise ValueError("ts contains NaN or infinity.\nFix: give finite times.")
-        late = np.flatnonzero(np.diff(np.asarray(ts)) <= 0)
+        late = np.flatnonzero(np.diff(np.asarray(ts, float)) <= 0)
         if late.size:
             i = int(late[0])
             raise ValueError(
@@ -134,12 +141,6 @@ def _check_tolerance(value, name, dtype):
             f"{name} = {value:.3g} is below what {dtype} can reach ({floor:.1g}).\n"
             f"{cause}Fix: {remedy}{name}={10 * floor:.0e} or more."
         )
-
-
-def check_functions(system: System, s: State):
-    """Raise where L, R, Q or a constraint returns something of the wrong shape."""
-    check_scalar(system, *s)
-    constraints.shapes(system, *s)
 
 
 def check_finite(s: State):

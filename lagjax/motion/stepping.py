@@ -159,6 +159,7 @@ class OnManifold(diffrax.AbstractWrappedSolver):
     @eqx.filter_jit
     def _quick_step(self, t0, t1, y0, args, solver_state, made_jump):
         quick, project = self.quick, self.project
+        assert quick is not None
         jumped = True if project else made_jump
         y1, error, _, solver_state, result = quick.solver.step(quick.terms, t0, t1, y0, args, solver_state, jumped)
         if project:

@@ -1,5 +1,6 @@
 """The answer of an integration: times, states, multipliers, and how it went."""
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import diffrax
@@ -10,8 +11,11 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
 from lagjax import plot
+from lagjax.animation import Animation
 from lagjax.mechanics import coordinates
+from lagjax.mechanics.structure import angles
 from lagjax.mechanics.system import System
+from lagjax.motion import frames
 from lagjax.motion.consistency import worst_residual
 
 
@@ -53,7 +57,7 @@ class Static(NamedTuple):
 
 
 class Trajectory(eqx.Module):
-    """A motion at the requested times. It prints its own quality and plots itself.
+    """A motion at the requested times. It prints its own quality, and plots and plays itself.
 
     - `t` (T,): the times asked for.
     - `q`, `v`: in the structure of the initial state, each leaf with a leading axis T. NaN after an event
@@ -112,17 +116,67 @@ class Trajectory(eqx.Module):
 
         **Raises:** `ImportError` without matplotlib; `ValueError` for a batched trajectory.
         """
-        if self.t.ndim != 1:
-            raise ValueError(
-                f"this trajectory is a batch of shape {self.t.shape[:-1]}: plot one lane of it.\n"
-                "Fix: jax.tree.map(lambda x: x[0], traj).plot()"
-            )
+        self._check_alone("plot()")
         panels = {"q": _curves(self.q), "v": _curves(self.v)}
         if self.multipliers:
             panels["multipliers"] = {
                 name + suffix: curve for name, values in self.multipliers.items() for suffix, curve in _columns(values)
             }
         return plot.time_series(np.asarray(self.t), panels)
+
+    def phase_portrait(self):
+        """Plot velocities against coordinates, a panel a coordinate; returns a matplotlib `Figure`.
+
+        A dot marks the start. An angle (a coordinate that is seen through sines and cosines alone) that goes around is
+        drawn between -π and π. Of a batched trajectory every lane is drawn.
+
+        **Raises:** `ImportError` without matplotlib.
+        """
+        lanes = jax.tree.map(lambda x: np.asarray(x).reshape(-1, *x.shape[self.t.ndim - 1 :]), self)
+        lanes = [jax.tree.map(lambda x: x[i], lanes) for i in range(len(lanes.t))]
+        first = jax.tree.map(lambda x: x[0], (lanes[0].t, lanes[0].q, lanes[0].v))
+        of_leaves = angles(lanes[0].system, *first, lanes[0].params)
+        is_angle = coordinates.flatten(jax.tree.map(lambda yes, x: np.full(x.shape, yes), of_leaves, first[1]))[0]
+        curves = [(_curves(lane.q), _curves(lane.v)) for lane in lanes]
+        drawn = {name: [_finite(q[name], v[name]) for q, v in curves] for name in curves[0][0]}
+        return plot.phase_portrait({name: (drawn[name], bool(yes)) for name, yes in zip(drawn, is_angle)})
+
+    def animate(
+        self, positions: Callable, *, seconds: float | None = None, rate: float = 25.0, trail: float = 2.0
+    ) -> Animation:
+        """Play the motion: points in the plane, lines that link them, and trails.
+
+        >>> import jax.numpy as jnp
+        >>> import lagjax as lj
+        >>> stone = lj.System(lambda t, q, v, params: 0.5 * (v["x"] ** 2 + v["y"] ** 2) - params["g"] * q["y"])
+        >>> start = {"x": 0.0, "y": 0.0}, {"x": 1.0, "y": 5.0}
+        >>> traj = lj.integrate(stone, *start, {"g": 10.0}, ts=jnp.linspace(0.0, 1.0, 11))
+        >>> traj.animate(lambda t, q, params: (q["x"], q["y"]))
+        Animation of 51 frames, 2 s, 5 kB: plays in a notebook, and with .save("motion.html") in a browser
+
+        **Arguments:**
+
+        - `positions`: `positions(t, q, params)` -> a point `(x, y)`; or points (k, 2), linked by lines in order; or
+          these by name, each name in a colour of its own. The last point of each leaves a trail. Plain NumPy will do.
+        - `seconds`: how long it plays; by default as long as the motion takes in units of t, but 2 to 20 s.
+        - `rate`: frames a second. Between outputs q is interpolated, cubically, with v as its slope.
+        - `trail`: how many seconds of playing the trails reach back.
+
+        **Returns:** an `Animation`. It ends where the motion did: at an event, or at the last output before it failed.
+
+        **Raises:** `ValueError` for a batched trajectory, positions that are no points of the plane, and outputs too
+        far apart to tell what happens between them.
+        """
+        self._check_alone("animate(positions)")
+        ended_by_event = bool(self.result == RESULTS.event_occurred)
+        return frames.film(self, positions, seconds, rate, trail, ended_by_event)
+
+    def _check_alone(self, call):
+        if self.t.ndim != 1:
+            raise ValueError(
+                f"this trajectory is a batch of shape {self.t.shape[:-1]}: draw one lane of it.\n"
+                f"Fix: jax.tree.map(lambda x: x[0], traj).{call}"
+            )
 
     def __repr__(self):
         if coordinates.is_traced(self):
@@ -241,6 +295,11 @@ def _curves(tree):
     first = jax.tree.map(lambda x: np.asarray(x[0]), tree)
     columns = np.stack([np.ravel(x) for x in _rows(tree)])
     return dict(zip(coordinates.names(first), columns.T))
+
+
+def _finite(*curves):
+    there = np.isfinite(curves).all(axis=0)
+    return tuple(x[there] for x in curves)
 
 
 def _rows(tree):

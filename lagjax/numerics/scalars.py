@@ -14,6 +14,7 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jax.extend.core import ClosedJaxpr, Literal
 
 from lagjax.numerics.elementary import sincos_in_lanes
@@ -51,13 +52,13 @@ class _Value:
 
 
 def _small(aval):
-    return hasattr(aval, "shape") and aval.size <= LARGE and not jax.dtypes.issubdtype(aval.dtype, jax.dtypes.extended)
+    return hasattr(aval, "shape") and aval.size <= LARGE and not jnp.issubdtype(aval.dtype, jax.dtypes.extended)
 
 
 def _split(value):
     """The numbers of a whole array, in an array of objects."""
     array = value.array
-    if isinstance(array, (np.ndarray, np.generic)) or not isinstance(array, jax.core.Tracer):
+    if isinstance(array, (np.ndarray, np.generic)) or not isinstance(array, Tracer):
         return _known(np.asarray(array))
     if array.shape == ():
         return _filled((), [array])

@@ -7,6 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 
 # The one dimension of zipped axes.
 POINT = "point"
@@ -72,7 +73,7 @@ def axes_of(axes: Any, zipped: bool) -> Axes:
         raise TypeError(f"axes must be a dictionary of arrays by name, not {axes!r:.60}.\n{example}")
     values = {}
     for name, given in axes.items():
-        if any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves(given)):
+        if any(isinstance(x, Tracer) for x in jax.tree.leaves(given)):
             raise TypeError(
                 f"axis '{name}' is being traced: a sweep compiles and runs for itself, outside of jit, grad and vmap.\n"
                 "Fix: call lj.sweep with concrete arrays; inside a program use jax.vmap."

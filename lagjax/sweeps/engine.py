@@ -96,7 +96,7 @@ def sweep(
     **Raises:** `TypeError`, `ValueError` for axes and settings that make no sense, or another sweep's store;
     `MemoryError` where the values would not fit, before anything runs.
     """
-    axes = axes_of(axes, zipped)
+    grid = axes_of(axes, zipped)
     devices = jax.local_devices() if devices is None else list(devices)
     part = (jax.process_index(), jax.process_count()) if part is None else part
     _check(layout, part, store)
@@ -107,14 +107,14 @@ def sweep(
         # What was begun on other cores goes on as it was begun.
         chunk = chunk_of(store)
     elif chunk is None:
-        each = max(math.ceil(axes.size / (CHUNKS_EACH * workers)), min(TOGETHER, math.ceil(axes.size / workers)))
+        each = max(math.ceil(grid.size / (CHUNKS_EACH * workers)), min(TOGETHER, math.ceil(grid.size / workers)))
         chunk = min(CHUNK.get(platform, CHUNK["gpu"]), each)
     chunk = math.ceil(chunk / len(devices)) * len(devices)
-    engine = _Engine(run, axes, chunk, workers, sort, layout, devices)
-    _check_memory(axes, engine.program, workers, store, devices)
+    engine = _Engine(run, grid, chunk, workers, sort, layout, devices)
+    _check_memory(grid, engine.program, workers, store, devices)
     if store is None:
-        return _in_memory(engine, np.arange(axes.size), None, progress)
-    return _in_store(engine, axes, store, part, progress)
+        return _in_memory(engine, np.arange(grid.size), None, progress)
+    return _in_store(engine, grid, store, part, progress)
 
 
 class _Engine:

@@ -21,6 +21,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from jax.core import Tracer
 from jax.extend.core import ClosedJaxpr
 
 from lagjax.numerics.programs import bodies
@@ -67,7 +68,7 @@ def _digest(data):
 
 def _text(closed: ClosedJaxpr):
     """A program as text that is the same in every process: without addresses, with the constants of its parts."""
-    constants = "".join(_digest(np.asarray(x).tobytes()) for x in closed.consts if not isinstance(x, jax.core.Tracer))
+    constants = "".join(_digest(np.asarray(x).tobytes()) for x in closed.consts if not isinstance(x, Tracer))
     return re.sub(r"0x[0-9a-f]+", "", str(closed.jaxpr)) + constants + "".join(_constants(closed.jaxpr))
 
 
@@ -86,8 +87,8 @@ class Store:
 
     def __init__(self, path):
         self.path = Path(path)
-        self.group = import_zarr().open_group(str(path), mode="r+")
-        self.about = dict(self.group.attrs["lagjax"])
+        self.group: Any = import_zarr().open_group(str(path), mode="r+")
+        self.about: dict[str, Any] = dict(self.group.attrs["lagjax"])
 
     @property
     def block(self) -> int:

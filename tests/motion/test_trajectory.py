@@ -1,5 +1,6 @@
 """The answer prints itself, plots itself, and carries what it was made of."""
 
+import diffrax
 import jax
 import matplotlib
 import numpy as np
@@ -60,6 +61,45 @@ def test_a_batch_is_plotted_lane_by_lane():
         batch.plot()
     assert len(jax.tree.map(lambda x: x[0], batch).plot().axes) == 2
     assert "2" in repr(batch).splitlines()[2]
+
+
+def test_phase_portrait_of_a_rotation_stays_in_a_turn():
+    """An angle that goes around lies between -π and π, cut where it leaves; one that swings is left alone."""
+    spin = lj.integrate(pendulum, 1.0, 9.0, PARAMS, ts=np.linspace(0.0, 3.0, 101))
+    assert float(np.ptp(spin.q)) > 2 * 2 * np.pi
+    (axis,) = spin.phase_portrait().axes
+    x, y = axis.lines[0].get_data()
+    assert np.nanmax(np.abs(x)) <= np.pi and np.nanmax(x) == np.pi and np.nanmin(x) == -np.pi
+    assert np.isnan(x).sum() == int(np.ptp(np.floor((np.asarray(spin.q) + np.pi) / (2 * np.pi))))
+    # On the cut the curve is still an orbit: ½ v² - (g/l) cos q is that of the start, to the outputs' distance.
+    energy = 0.5 * y**2 - PARAMS["g"] / PARAMS["l"] * np.cos(x)
+    np.testing.assert_allclose(energy[np.isfinite(energy)], energy[0], rtol=2e-3)
+    assert [label.get_text() for label in axis.get_xticklabels() if abs(label.get_position()[0]) < 3.2] == [
+        "-π", "-π/2", "0", "π/2", "π"]  # fmt: skip
+    swing = lj.integrate(pendulum, 1.0, 0.0, PARAMS, ts=TS)
+    drawn = swing.phase_portrait().axes[0].lines[0].get_data()
+    np.testing.assert_array_equal(drawn, [swing.q, swing.v])
+
+
+def test_phase_portrait_has_a_panel_a_coordinate(traj):
+    """Names of the user's; lengths keep their own ticks and are never cut; a batch has a curve a lane."""
+    axes = [axis for axis in traj.phase_portrait().axes if axis.get_visible()]
+    assert [(axis.get_xlabel(), axis.get_ylabel()) for axis in axes] == [("q: x", "v: x"), ("q: y", "v: y")]
+    np.testing.assert_array_equal(axes[1].lines[0].get_data(), [traj.q["y"], traj.v["y"]])
+    free = lj.System(lambda t, q, v, params: 0.5 * v**2)
+    far = lj.integrate(free, 0.0, 100.0, ts=TS).phase_portrait().axes[0]
+    assert far.lines[0].get_xdata()[-1] == 100.0 and "π" not in far.get_xticklabels()[0].get_text()
+    batch = jax.vmap(lambda q0: lj.integrate(pendulum, q0, 0.0, PARAMS, ts=TS))(np.array([0.5, 1.0]))
+    starts = [line.get_xdata()[0] for line in batch.phase_portrait().axes[0].lines[::2]]
+    assert starts == [0.5, 1.0]
+
+
+def test_phase_portrait_ends_with_the_motion():
+    """The NaN after an event are not drawn."""
+    down = diffrax.Event(lambda t, y, params, **kwargs: y[0])
+    ended = lj.integrate(pendulum, 1.0, 0.0, PARAMS, ts=np.linspace(0.0, 2.0, 41), event=down)
+    x, _ = ended.phase_portrait().axes[0].lines[0].get_data()
+    assert np.isfinite(x).all() and len(x) == int(np.isfinite(ended.q).sum()) < 41
 
 
 def test_progress_is_shown(capfd):

@@ -1,0 +1,171 @@
+"""A film of points in the plane that plays in a notebook or a browser: one SVG, its numbers, and forty lines of script.
+
+It needs no network, no encoder and no other file. Where scripts are not run (an untrusted notebook, a preview) the
+first frame stands there. Coordinates are whole tenths of a pixel, so that ten seconds of a pendulum are about 10 kB.
+"""
+
+import hashlib
+import html
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+
+from lagjax.plot import COLOURS
+
+# The largest field of the picture in tenths of a pixel, and what stands around it: left, top, right, bottom.
+FIELD = (4200, 3600)
+MARGINS = (520, 80, 160, 440)
+# A direction in which little moves is shown at least as wide as this share of the other.
+NARROWEST = 0.3
+# Points of longer lines are not marked: these are outlines.
+MARKED_UP_TO = 8
+
+# The page may hold a film twice: the script takes the first that no script has taken.
+PLAYER = """
+(() => {
+  const root = document.querySelector("#ID:not([data-live])");
+  root.dataset.live = "";
+  const film = DATA, count = film.parts[0].length, groups = root.querySelectorAll("g[data-part]");
+  const [button, slider, clock] = ["button", "input", "output"].map(name => root.querySelector(name));
+  let began = null;
+  const draw = i => {
+    film.parts.forEach((frames, k) => {
+      const [trail, line, dots] = groups[k].children, from = Math.max(0, i - film.trail);
+      trail.setAttribute("points", frames.slice(from, i + 1).map(frame => frame.slice(-2)).join(" "));
+      line.setAttribute("points", frames[i].join(" "));
+      if (dots) dots.setAttribute("d", frames[i].map((x, j) => j % 2 ? x + "h0" : "M" + x + " ").join(""));
+    });
+    clock.textContent = "t = " + (film.start + i * film.step).toFixed(film.digits);
+  };
+  const pause = () => { began = null; button.textContent = "\\u25b6"; button.ariaLabel = "play"; };
+  const advance = now => {
+    if (began === null || !root.isConnected) return;
+    slider.value = Math.floor(Math.max(0, now - began) / 1000 * film.rate) % count;
+    draw(+slider.value);
+    requestAnimationFrame(advance);
+  };
+  button.onclick = () => {
+    if (began !== null) return pause();
+    began = performance.now() - slider.value / film.rate * 1000;
+    button.textContent = "\\u275a\\u275a";
+    button.ariaLabel = "pause";
+    requestAnimationFrame(advance);
+  };
+  slider.oninput = () => { pause(); draw(+slider.value); };
+})();
+"""
+
+
+class Animation:
+    """A motion that plays itself in a notebook, and in a browser from the page that `save` writes.
+
+    - `t` (F,): the time of each frame; `points`: by name, (F, k, 2), what is drawn.
+    - `rate`: frames a second; `trail`: how many frames behind a trail reaches.
+    """
+
+    def __init__(self, t: np.ndarray, points: dict[str, np.ndarray], rate: float, trail: int):
+        self.t, self.points, self.rate, self.trail = t, points, rate, trail
+
+    def save(self, path) -> None:
+        """Write a page that plays in any browser, without a network."""
+        page = f'<!DOCTYPE html><meta charset="utf-8"><title>Motion</title>\n{self._repr_html_()}\n'
+        Path(path).write_text(page, encoding="utf-8")
+
+    def _repr_html_(self):
+        low, size, scale = _field(self.points)
+        parts = {name: _in_tenths_of_pixels(x, low, size, scale) for name, x in self.points.items()}
+        step = float(self.t[1] - self.t[0])
+        digits = max(0, math.ceil(-math.log10(step)))
+        flat = [x.reshape(len(x), -1).tolist() for x in parts.values()]
+        film = {"rate": self.rate, "trail": self.trail, "start": float(self.t[0]), "step": step, "digits": digits}
+        data = json.dumps(film | {"parts": flat}, separators=(",", ":"))
+        name = "lagjax-" + hashlib.sha256((data + repr(list(parts))).encode()).hexdigest()[:12]
+        dot = '<span style="margin-right:1em"><span style="color:{}">&#9679;</span> {}</span>'
+        named = [dot.format(_colour(i), html.escape(str(part))) for i, part in enumerate(parts) if len(parts) > 1]
+        script = PLAYER.replace("ID", name).replace("DATA", data)
+        return (
+            f'<div id="{name}" style="max-width:520px;font:13px sans-serif"><div>{"".join(named)}</div>\n'
+            f"{_picture(parts, low, size, scale)}\n"
+            '<div style="display:flex;gap:8px;align-items:center">'
+            '<button aria-label="play" style="width:3em">&#9654;</button>'
+            f'<input type="range" aria-label="time" min="0" max="{len(self.t) - 1}" value="0" style="flex:1">'
+            f'<output style="min-width:6em">t = {float(self.t[0]):.{digits}f}</output></div>\n'
+            f"<script>{script}</script></div>"
+        )
+
+    def __repr__(self):
+        seconds, size = (len(self.t) - 1) / self.rate, len(self._repr_html_()) / 1000
+        return (
+            f"Animation of {len(self.t)} frames, {seconds:.3g} s, {math.ceil(size)} kB: "
+            'plays in a notebook, and with .save("motion.html") in a browser'
+        )
+
+
+def _field(points):
+    """The lower left corner and the size of what is shown, and tenths of a pixel to a unit, the same both ways."""
+    every = np.concatenate([x.reshape(-1, 2) for x in points.values()])
+    low, high = every.min(axis=0), every.max(axis=0)
+    size = high - low
+    size = np.maximum(size, NARROWEST * size.max())
+    size = 1.1 * np.where(size > 0, size, 1.0)
+    return (low + high - size) / 2, size, float(np.min(np.array(FIELD) / size))
+
+
+def _in_tenths_of_pixels(x, low, size, scale):
+    left, top, *_ = MARGINS
+    across, up = np.moveaxis((x - low) * scale, -1, 0)
+    return np.rint(np.stack([left + across, top + size[1] * scale - up], axis=-1)).astype(int)
+
+
+def _picture(parts, low, size, scale):
+    """The SVG: frame, ticks, and the first frame's points."""
+    left, top, right, bottom = MARGINS
+    width, height = np.rint(size * scale).astype(int)
+    drawn = [
+        f'<rect x="{left}" y="{top}" width="{width}" height="{height}" fill="none" stroke="#999" stroke-width="8"/>'
+    ]
+    text = '<text x="{}" y="{}" text-anchor="{}" font-size="110" font-family="sans-serif">{}</text>'
+    grid = '<path d="{}" stroke="#ddd" stroke-width="5"/>'
+    for value, label in _ticks(low[0], low[0] + size[0]):
+        x = round(left + (value - low[0]) * scale)
+        drawn += [grid.format(f"M{x} {top}v{height}"), text.format(x, top + height + 150, "middle", label)]
+    for value, label in _ticks(low[1], low[1] + size[1]):
+        y = round(top + height - (value - low[1]) * scale)
+        drawn += [grid.format(f"M{left} {y}h{width}"), text.format(left - 50, y + 40, "end", label)]
+    drawn.append(text.format(left + width // 2, top + height + 330, "middle", "x"))
+    drawn.append(text.format(70, top + height // 2, "middle", "y"))
+    drawn += [_part(i, x[0]) for i, x in enumerate(parts.values())]
+    whole = (left + width + right, top + height + bottom)
+    return (
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {whole[0]} {whole[1]}" width="{whole[0] // 10}" '
+        f'style="max-width:100%;background:#fff">{"".join(drawn)}</svg>'
+    )
+
+
+def _part(i, points):
+    """A trail, a line and its dots, which the script moves."""
+    colour = _colour(i)
+    line = " ".join(f"{x} {y}" for x, y in points)
+    dots = "".join(f"M{x} {y}h0" for x, y in points)
+    marks = f'<path d="{dots}" stroke="{colour}" stroke-width="110" stroke-linecap="round"/>'
+    return (
+        f'<g data-part="" fill="none" stroke="{colour}" stroke-linejoin="round">'
+        f'<polyline points="" stroke-width="16" stroke-opacity="0.45"/><polyline points="{line}" stroke-width="24"/>'
+        f"{marks if len(points) <= MARKED_UP_TO else ''}</g>"
+    )
+
+
+def _colour(i):
+    return COLOURS[i % len(COLOURS)]
+
+
+def _ticks(low, high):
+    """Round numbers between two, three to six of them, and their labels."""
+    rough = (high - low) / 4
+    power = 10.0 ** math.floor(math.log10(rough))
+    step = min((m * power for m in (1, 2, 5, 10)), key=lambda step: abs(math.log(step / rough)))
+    places = max(0, -math.floor(math.log10(step) + 1e-9))
+    values = [i * step for i in range(math.ceil(low / step), math.floor(high / step) + 1)]
+    return [(value, f"{value:.{places}f}" if 1e-4 <= step < 1e6 else f"{value:.3g}") for value in values]

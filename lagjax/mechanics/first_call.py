@@ -1,0 +1,214 @@
+"""The first call of the user's functions: on shapes alone, before anything is computed or compiled.
+
+What goes wrong in there is said in the user's names, with the line where it happened. What is not recognized is raised
+as it came: it is then between the user and the function.
+"""
+
+import difflib
+import inspect
+import re
+import traceback
+from collections.abc import Callable, Mapping
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from lagjax.mechanics.constraints import Holonomic
+
+OF_STATE, OF_POSITION = ("t", "q", "v", "params"), ("t", "q", "params")
+
+
+def check_functions(system, t, q, v, params):
+    """Raise where L, R, Q or a constraint cannot be called, or returns something of the wrong kind or shape."""
+    given = {"t": t, "q": q, "v": v, "params": params}
+    for role, function in (("L", system.lagrangian), ("dissipation", system.dissipation)):
+        if function is not None:
+            _check_energy(_Call(role, function, OF_STATE), given)
+    if system.force is not None:
+        _check_force(_Call("force", system.force, OF_STATE), given)
+    for name, constraint in system.constraints.items():
+        if isinstance(constraint, Holonomic):
+            _check_constraint(_Call("g", constraint.g, OF_POSITION, f" of constraint '{name}'"), given)
+        else:
+            _check_constraint(_Call("phi", constraint.phi, OF_STATE, f" of constraint '{name}'"), given)
+
+
+class _Call(NamedTuple):
+    """A function of the user's, what it is called here, the arguments that it gets, and to what it belongs."""
+
+    role: str
+    function: Callable
+    takes: tuple[str, ...]
+    owner: str = ""
+
+    def __str__(self):
+        return f"{self.role}({', '.join(self.takes)}){self.owner}"
+
+
+def _check_energy(call, given):
+    value = _shapes(call, given)
+    shape, dtype = getattr(value, "shape", None), getattr(value, "dtype", None)
+    if shape is None and isinstance(value, (int, float)):
+        return
+    if value is None:
+        raise ValueError(
+            f"{call} must return one real number, and returned None.\n"
+            "Usual cause: a function without return.\n"
+            "Fix: return kinetic - potential."
+        )
+    if shape != () or not jnp.issubdtype(dtype, jnp.floating):
+        got = f"shape {shape}, {dtype}" if shape is not None else f"a {type(value).__name__}"
+        raise ValueError(
+            f"{call} must return one real number, and returned {got}.\n"
+            "Usual cause: energies left unsummed, as in 0.5 * m * v**2 with v a vector, be it of one.\n"
+            "Fix: 0.5 * m * jnp.sum(v**2), or jnp.dot(v, v); for one coordinate q0 = 0.1, not q0 = [0.1]."
+        )
+
+
+def _check_force(call, given):
+    force, expected = _shapes(call, given), jax.tree.map(jnp.shape, given["q"])
+    if jax.tree.map(jnp.shape, force) != expected:
+        raise ValueError(
+            f"{call} must return one force a coordinate, like q.\n"
+            f"  q has shapes {expected}\n  the force has {jax.tree.map(jnp.shape, force)}\n"
+            "Usual cause: a force for one of the coordinates alone.\n"
+            "Fix: return the structure of q, with 0.0 where no force acts."
+        )
+
+
+def _check_constraint(call, given):
+    value = _shapes(call, given)
+    shape, dtype = getattr(value, "shape", None), getattr(value, "dtype", None)
+    if shape is None or len(shape) > 1:
+        got = f"an array of shape {shape}" if shape is not None else f"a {type(value).__name__}"
+        raise ValueError(
+            f"{call} must return a scalar or a vector, and returned {got}.\n"
+            "Usual cause: several equations in a tuple or a matrix, or a function without return.\n"
+            "Fix: return jnp.stack([...]) of the equations, or give each a name of its own."
+        )
+    if not jnp.issubdtype(dtype, jnp.floating):
+        raise ValueError(
+            f"{call} must return real numbers that vanish where it holds, and returned {dtype}.\n"
+            "Usual cause: an equation in place of its residual, x**2 + y**2 == l**2.\n"
+            "Fix: return x**2 + y**2 - l**2."
+        )
+
+
+def _shapes(call, given):
+    """The shapes and dtypes that the function returns, or an error in the user's words."""
+    args = [given[name] for name in call.takes]
+    try:
+        inspect.signature(call.function).bind(*args)
+    except TypeError as error:
+        raise TypeError(_wrong_arguments(call)) from error
+    except ValueError:
+        pass  # A built-in without a signature.
+    try:
+        return eqx.filter_eval_shape(call.function, *args)
+    except KeyError as error:
+        raise ValueError(_missing(call, given, error)) from error
+    except (TypeError, AttributeError) as error:
+        words = _in_words(call, given, error)
+        if words is None:
+            raise
+        raise TypeError(words) from error
+
+
+def _wrong_arguments(call):
+    name = getattr(call.function, "__name__", "f")
+    takes = f"{'f' if name == '<lambda>' else name}{inspect.signature(call.function)}"
+    return (
+        f"{call} is called with {len(call.takes)} arguments, and the function is {takes}.\n"
+        "Usual cause: an argument left out that the function does not need, or one too many: positions are constrained "
+        "without v.\n"
+        f"Fix: def {'f' if name == '<lambda>' else name}({', '.join(call.takes)})."
+    )
+
+
+def _missing(call, given, error):
+    """A key that is not there: where it was looked for, what is there, and what may have been meant."""
+    key, line = error.args[0], _line(call, error)
+    there = {name: list(x) for name, x in given.items() if isinstance(x, Mapping) and name in call.takes}
+    asked = re.search(rf"(\w+)\[[\"']{re.escape(str(key))}[\"']\]", line)
+    parameters = list(inspect.signature(call.function).parameters)
+    if asked and asked[1] in parameters[: len(call.takes)]:
+        source = call.takes[parameters.index(asked[1])]
+        there = {source: there[source]} if source in there else there
+    has = "; ".join(f"{name} has {', '.join(map(repr, keys))}" for name, keys in there.items())
+    meant = difflib.get_close_matches(str(key), [str(k) for keys in there.values() for k in keys], 1)
+    if set(there) & {"q", "v"} and "params" not in there:
+        fix = f'q0 = {{"{key}": 0.1}} and v0 = {{"{key}": 0.0}}'
+    else:
+        fix = f'params = {{..., "{key}": 1.0}}'
+    return (
+        f"{call} asks for '{key}', and there is none{': ' + has if has else ''}.{_quoted(line)}\n"
+        "Usual cause: a name written in two ways, or left out.\n"
+        f"Fix: {fix}" + (f", or write '{meant[0]}'." if meant else ".")
+    )
+
+
+def _in_words(call, given, error):
+    """What a TypeError or AttributeError means; None where that is not known."""
+    line, said = _line(call, error), str(error)
+    where = _quoted(line)
+    if isinstance(error, jax.errors.TracerArrayConversionError):
+        used = re.search(r"\b(?:np|numpy)\.([\w.]+)", line)
+        name = used[1] if used else "cos"
+        return (
+            f"{call} hands a coordinate, velocity or parameter to NumPy, and NumPy cannot be differentiated.{where}\n"
+            "Usual cause: np in place of jnp.\n"
+            f"Fix: import jax.numpy as jnp, and jnp.{name} in place of np.{name}."
+        )
+    if isinstance(error, jax.errors.TracerBoolConversionError):
+        return (
+            f"{call} decides by the value of a coordinate, velocity or parameter, and has none while JAX traces.{where}"
+            "\nUsual cause: if, and, or, not, min or max.\n"
+            "Fix: jnp.where(condition, a, b), jnp.minimum(a, b), or jnp.maximum(a, b)."
+        )
+    if isinstance(error, jax.errors.ConcretizationTypeError):
+        used = re.search(r"\bmath\.(\w+)", line)
+        instead = f"jnp.{used[1]} in place of math.{used[1]}" if used else "leave out float(...) and int(...)"
+        return (
+            f"{call} makes a Python number of a coordinate, velocity or parameter, and such a number cannot be "
+            f"differentiated.{where}\n"
+            "Usual cause: a function of the module math, float(...), int(...), or range(...).\n"
+            f"Fix: {instead}."
+        )
+    if given["params"] is None and "NoneType" in said:
+        return (
+            f"{call} uses params, and none were given.{where}\n"
+            "Usual cause: params left out of the call, where they follow q and v.\n"
+            'Fix: lj.integrate(system, q0, v0, {"m": 1.0, "g": 9.81}, ts=ts).'
+        )
+    if missing := re.match(r"'dict' object has no attribute '(\w+)'", said):
+        return (
+            f"{call} asks for .{missing[1]} of a dict.{where}\n"
+            "Usual cause: names are looked up in brackets.\n"
+            f'Fix: q["{missing[1]}"] in place of q.{missing[1]}.'
+        )
+    if asked := re.search(r"string indexing; got idx='(.*)'", said):
+        return (
+            f"{call} asks for '{asked[1]}' of an array, which has no names.{where}\n"
+            "Usual cause: a start that is a number or an array, and a function that is written for a dict.\n"
+            f'Fix: q0 = {{"{asked[1]}": 0.1}} and v0 = {{"{asked[1]}": 0.0}}.'
+        )
+    if kind := re.search(r"'(list|tuple)'", said):
+        return (
+            f"{call} calculates with a {kind[1]}.{where}\n"
+            f"Usual cause: a start or a parameter that is a {kind[1]} of numbers, as q0 = [0.1, 0.2].\n"
+            "Fix: make it an array, q0 = jnp.array([0.1, 0.2])."
+        )
+    return None
+
+
+def _line(call, error):
+    """The line of the user's file in which it happened, or ""."""
+    code = getattr(inspect.unwrap(call.function), "__code__", None)
+    frames = [f for f in traceback.extract_tb(error.__traceback__) if code and f.filename == code.co_filename]
+    return (frames[-1].line or "") if frames else ""
+
+
+def _quoted(line):
+    return f"\n    {line.strip()}" if line else ""

@@ -1,0 +1,133 @@
+"""A motion at instants of one's own: between outputs by cubic Hermite interpolation of q, with v as its slope.
+
+    q(t_i + s h) = (1 + 2 s)(1 - s)² q_i + s² (3 - 2 s) q_{i+1} + h s (1 - s)² v_i - h s² (1 - s) v_{i+1}
+
+The values at outputs are exact; between them the error falls with the fourth power of their distance, which is enough
+for pictures where outputs are dense. Whether they are is seen by leaving every other one out: what the rest then make
+of it is wrong by about sixteen times the error.
+"""
+
+from collections.abc import Callable, Mapping
+
+import jax
+import numpy as np
+
+from lagjax.animation import Animation
+
+# Without every other output the picture may be wrong by this share of its size: with all of them by a hundredth.
+MAY_MISS = 0.16
+# How long a motion plays at least and at most, in seconds, where nothing else is said.
+SHORTEST, LONGEST = 2.0, 20.0
+
+
+def film(
+    traj, positions: Callable, seconds: float | None, rate: float, trail: float, ended_by_event: bool
+) -> Animation:
+    """The frames of one trajectory, as they are drawn."""
+    t, q, v = _reached(traj, ended_by_event)
+    seconds = float(np.clip(t[-1] - t[0], SHORTEST, LONGEST)) if seconds is None else seconds
+    count = round(seconds * rate) + 1 if np.isfinite(seconds * rate) else 0
+    if count < 2 or not trail >= 0:
+        raise ValueError(
+            f"seconds = {seconds:g} at rate = {rate:g} frames a second, with a trail of {trail:g} s, is no film.\n"
+            "Fix: traj.animate(positions, seconds=10.0), and a trail of zero or more seconds."
+        )
+    at = np.linspace(t[0], t[-1], count)
+    points = _drawn(positions, at, hermite(t, q, v, at), traj.params)
+    _check_dense(positions, t, q, v, traj.params, points)
+    return Animation(at, points, rate, int(min(trail * rate, count)))
+
+
+def hermite(t, q, v, at):
+    """q at the times `at`, from values and slopes at the times t; each leaf (T, ...) becomes (len(at), ...)."""
+    i = np.clip(np.searchsorted(t, at, side="right") - 1, 0, len(t) - 2)
+    h = t[i + 1] - t[i]
+
+    def leaf(q, v):
+        width, s = (x.reshape(-1, *(1,) * (q.ndim - 1)) for x in (h, (at - t[i]) / h))
+        values = (1 + 2 * s) * (1 - s) ** 2 * q[i] + s**2 * (3 - 2 * s) * q[i + 1]
+        return values + width * s * (1 - s) * ((1 - s) * v[i] - s * v[i + 1])
+
+    return jax.tree.map(leaf, q, v)
+
+
+def _reached(traj, ended_by_event):
+    """Times, q and v of the outputs that the motion came to, and of the event that ended it.
+
+    Where it failed the last state is left out: in a collapse its velocity is too large for interpolation.
+    """
+    outputs, end = (traj.t, traj.q, traj.v), (traj.end.t, traj.end.q, traj.end.v)
+    outputs, end = jax.tree.map(np.asarray, (outputs, end))
+    there = np.isfinite(np.concatenate([x.reshape(len(x), -1) for x in jax.tree.leaves(outputs)], axis=1)).all(axis=1)
+    t, q, v = jax.tree.map(lambda x: x[there], outputs)
+    if ended_by_event and end[0] > t[-1]:
+        t, q, v = jax.tree.map(lambda x, last: np.concatenate([x, last[None]]), (t, q, v), end)
+    if len(t) < 3:
+        raise ValueError(
+            f"there are {len(t)} states to draw, and a film needs at least three.\n"
+            "Usual cause: ts of two times, or a motion that failed at its start (see traj.result).\n"
+            "Fix: ts=jnp.linspace(t0, t1, 201)."
+        )
+    return t, q, v
+
+
+def _drawn(positions, t, q, params) -> dict[str, np.ndarray]:
+    """What `positions` makes of each state: by name, (T, k, 2)."""
+    frames = []
+    for i, now in enumerate(t):
+        found = positions(now, jax.tree.map(lambda x: x[i], q), params)
+        found = found if isinstance(found, Mapping) else {"": found}
+        frames.append({name: _points(name, value) for name, value in found.items()})
+    shapes = {tuple((name, x.shape) for name, x in frame.items()) for frame in frames}
+    if len(shapes) != 1 or not frames[0]:
+        raise ValueError(
+            "positions(t, q, params) must return the same points, at least one, at all times.\n"
+            "Fix: return NaN-free points of one shape for each name, without if."
+        )
+    drawn = {name: np.stack([frame[name] for frame in frames]) for name in frames[0]}
+    for name, x in drawn.items():
+        if not np.all(np.isfinite(x)):
+            first = t[~np.isfinite(x).all(axis=(1, 2))][0]
+            raise ValueError(
+                f"positions(t, q, params) returned NaN or infinity{_of(name)} at t = {first:.6g}.\n"
+                "Usual cause: a root or a quotient outside its domain, or NaN in params.\n"
+                "Fix: evaluate positions there, term by term."
+            )
+    return drawn
+
+
+def _points(name, value):
+    """One point or several as (k, 2), or an error."""
+    try:
+        x = np.asarray(value, float)
+        shape = f"an array of shape {x.shape}"
+    except (TypeError, ValueError):
+        x, shape = np.zeros(0), f"a {type(value).__name__} that is no array of numbers"
+    if x.shape[-1:] != (2,) or x.ndim > 2 or x.size == 0:
+        raise ValueError(
+            f"positions(t, q, params) must return points of the plane, and returned {shape}{_of(name)}.\n"
+            "Usual cause: three coordinates in space, an angle in place of a point, or a coordinate of shape (1,).\n"
+            'Fix: return (x, y), points (k, 2) that are linked in order, or these by name: {"rod": [(0, 0), (x, y)]}.'
+        )
+    return x.reshape(-1, 2)
+
+
+def _of(name):
+    return f" for '{name}'" if name else ""
+
+
+def _check_dense(positions, t, q, v, params, points):
+    """Raise where the outputs are too far apart for what is drawn between them."""
+    every_other, skipped = slice(None, None, 2), slice(1, len(t) - 1, 2)
+    half = lambda tree: jax.tree.map(lambda x: x[every_other], tree)
+    guessed = _drawn(positions, t[skipped], hermite(t[every_other], half(q), half(v), t[skipped]), params)
+    known = _drawn(positions, t[skipped], jax.tree.map(lambda x: x[skipped], q), params)
+    size = max(np.ptp(x.reshape(-1, 2), axis=0).max() for x in points.values())
+    missed = max(np.abs(guessed[name] - known[name]).max() for name in known)
+    if missed > MAY_MISS * size:
+        raise ValueError(
+            f"{len(t)} outputs are too few to draw what happens between them: from every other one, the rest would be "
+            f"misplaced by {missed / size:.0%} of the picture.\n"
+            "Usual cause: fewer than about ten outputs an oscillation.\n"
+            f"Fix: ts=jnp.linspace({t[0]:.6g}, {t[-1]:.6g}, {8 * len(t) + 1})."
+        )

@@ -1,0 +1,96 @@
+"""A film is one piece of HTML that holds its numbers and needs nothing else."""
+
+import json
+import re
+import xml.etree.ElementTree as ET
+
+import numpy as np
+import pytest
+
+from lagjax.animation import FIELD, MARKED_UP_TO, Animation
+
+T = np.linspace(0.0, 2.0, 51)
+CIRCLE = np.stack([3 * np.cos(T), 3 * np.sin(T)], axis=1)[:, None]
+POINTS = {"rod & bob": np.concatenate([np.zeros_like(CIRCLE), CIRCLE], axis=1), "tip": CIRCLE + 0.5}
+
+
+@pytest.fixture(scope="module")
+def page():
+    """The HTML of a rod that turns, and a point beside it."""
+    return Animation(T, POINTS, 25.0, 10)._repr_html_()
+
+
+def numbers(page):
+    """What the script draws from."""
+    return json.loads(re.search(r"film = (\{.*?\}), count", page)[1])
+
+
+def picture(page):
+    """The SVG that stands there before any script runs."""
+    return ET.fromstring(re.search(r"<svg.*</svg>", page)[0])
+
+
+def test_needs_nothing_from_outside(page):
+    """No address but the name of SVG, no import, no file; small."""
+    assert re.findall(r"(?:src|href|url|import|fetch)\b", page) == []
+    assert set(re.findall(r"https?://[^\"]*", page)) == {"http://www.w3.org/2000/svg"}
+    assert len(page) < 15_000
+
+
+def test_numbers_are_the_points(page):
+    """Undoing the scale gives the points back to a twentieth of a pixel, with one scale for x and y, y upwards."""
+    film = numbers(page)
+    drawn = [np.array(part, float).reshape(len(T), -1, 2) for part in film["parts"]]
+    pixels, points = (np.concatenate([x.reshape(-1, 2) for x in all_]) for all_ in (drawn, POINTS.values()))
+    scale = np.ptp(pixels[:, 0]) / np.ptp(points[:, 0])
+    np.testing.assert_allclose(pixels[:, 0] - pixels[0, 0], scale * (points[:, 0] - points[0, 0]), atol=2)
+    np.testing.assert_allclose(pixels[:, 1] - pixels[0, 1], -scale * (points[:, 1] - points[0, 1]), atol=2)
+    assert np.ptp(pixels[:, 0]) <= FIELD[0] and np.ptp(pixels[:, 1]) <= FIELD[1]
+    # Twin: another scale is told apart.
+    assert np.max(np.abs(pixels[:, 0] - pixels[0, 0] - 1.02 * scale * (points[:, 0] - points[0, 0]))) > 2
+
+
+def test_first_frame_stands_without_a_script(page):
+    """The SVG shows the first frame, with ticks and axis labels; a name is escaped."""
+    groups = [g for g in picture(page).iter() if "data-part" in g.attrib]
+    for group, frames in zip(groups, numbers(page)["parts"], strict=True):
+        trail, line, dots = group
+        assert trail.attrib["points"] == ""
+        assert [int(x) for x in line.attrib["points"].split()] == frames[0]
+        assert [int(x) for x in re.findall(r"-?\d+(?= |h0)", dots.attrib["d"])] == frames[0]
+    words = [e.text for e in picture(page).iter() if e.tag.endswith("text")]
+    assert {"x", "y", "-1", "0", "3"} <= set(words)
+    assert "rod &amp; bob" in page
+
+
+def test_outlines_have_no_marks():
+    """Up to eight points are marked, a longer line is an outline."""
+    line = np.stack([np.arange(MARKED_UP_TO + 1.0), np.zeros(MARKED_UP_TO + 1)], axis=1)
+    for n, marked in ((MARKED_UP_TO, True), (MARKED_UP_TO + 1, False)):
+        (group,) = (g for g in picture(Animation(T, {"": np.stack([line[:n]] * 51)}, 25.0, 0)._repr_html_()).iter()
+                    if "data-part" in g.attrib)  # fmt: skip
+        assert (len(group) == 3) is marked
+
+
+def test_the_same_film_is_the_same_text(page):
+    """Run again, a notebook does not change; another film on the same page has another name."""
+    assert Animation(T, POINTS, 25.0, 10)._repr_html_() == page
+    other = Animation(T, {"tip": POINTS["tip"]}, 25.0, 10)._repr_html_()
+    assert other[:30] != page[:30]
+
+
+def test_saves_a_page(tmp_path, page):
+    """The page holds the same film."""
+    Animation(T, POINTS, 25.0, 10).save(tmp_path / "motion.html")
+    text = (tmp_path / "motion.html").read_text(encoding="utf-8")
+    assert text.startswith("<!DOCTYPE html>") and page in text
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-9, 1e12])
+def test_any_size(size):
+    """A point at rest, a tiny and a huge motion have a picture and distinct ticks."""
+    page = Animation(T, {"": size * CIRCLE}, 25.0, 10)._repr_html_()
+    labels = [e.text for e in picture(page).iter() if e.tag.endswith("text")]
+    assert 6 <= len(labels) <= 16
+    horizontal = labels[: labels.index("x")]
+    assert len(set(horizontal)) >= 3

@@ -1,0 +1,212 @@
+"""What a newcomer gets wrong first: one paragraph with what happened, the usual cause, and the fix as code.
+
+All of these fail before anything is compiled.
+"""
+
+import math
+import re
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import lagjax as lj
+
+TS = np.linspace(0.0, 1.0, 5)
+PARAMS = {"m": 1.5, "g": 9.81}
+START = {"theta": 1.0}, {"theta": 0.0}
+POINT = {"x": 1.0, "y": 0.0}, {"x": 0.0, "y": 0.0}
+
+
+def swing(t, q, v, params):
+    """A pendulum of length 1."""
+    return params["m"] * (0.5 * v["theta"] ** 2 + params["g"] * jnp.cos(q["theta"]))
+
+
+def point(t, q, v, params):
+    """A point in a vertical plane."""
+    return 0.5 * (v["x"] ** 2 + v["y"] ** 2) - params["g"] * q["y"]
+
+
+pendulum = lj.System(swing)
+
+
+def move(lagrangian, start=START, params=PARAMS, **options):
+    """Integrate a system or a Lagrangian."""
+    system = lagrangian if isinstance(lagrangian, lj.System) else lj.System(lagrangian)
+    return lj.integrate(system, *start, params, **{"ts": TS} | options)
+
+
+def constrained(g, kind=lj.Holonomic):
+    """Integrate the point under a constraint."""
+    return move(lj.System(point, {"rod": kind(g)}), POINT)
+
+
+def by_numpy(t, q, v, params):
+    """NumPy in place of jax.numpy."""
+    return 0.5 * v["theta"] ** 2 + params["g"] * np.cos(q["theta"])
+
+
+def by_math(t, q, v, params):
+    """The module math in place of jax.numpy."""
+    return 0.5 * v["theta"] ** 2 + params["g"] * math.cos(q["theta"])
+
+
+def by_float(t, q, v, params):
+    """A Python number made of a coordinate."""
+    return 0.5 * v["theta"] ** 2 + float(q["theta"])
+
+
+def with_if(t, q, v, params):
+    """A potential by cases."""
+    if q["theta"] > 0:
+        return 0.5 * v["theta"] ** 2
+    return 0.5 * v["theta"] ** 2 - 1.0
+
+
+def without_return(t, q, v, params):
+    """An energy that is not returned."""
+    0.5 * v["theta"] ** 2
+
+
+def attributes(t, q, v, params):
+    """Names as attributes."""
+    return 0.5 * v.theta**2
+
+
+def without_time(q, v, params):
+    """An argument left out."""
+    return 0.5 * v["theta"] ** 2
+
+
+def of_a_vector(t, q, v, params):
+    """Energies left unsummed."""
+    return 0.5 * v**2 + jnp.cos(q)
+
+
+def needs_mass(t, q, v, params):
+    """A parameter by another name."""
+    return 0.5 * params["mass"] * v["theta"] ** 2
+
+
+with_length = lj.System(point, {"rod": lj.Holonomic(lambda t, q, p: q["x"] - p["l"])})
+VALUE, TYPE = ValueError, TypeError
+NUMPY = r"NumPy cannot be differentiated"
+MISTAKES = {
+    "another name in v": (lambda: move(swing, ({"theta": 1.0}, {"thta": 0.0})), VALUE, "structure of q", "v: thta"),
+    "v a number": (lambda: move(swing, ({"theta": 1.0}, 0.0)), VALUE, "q: theta", "v: no names", "zeros_like"),
+    "v of another shape": (lambda: move(swing, ({"theta": 1.0}, {"theta": np.zeros(1)})), VALUE, r"\(1,\) in v"),
+    "whole numbers": (lambda: move(swing, ({"theta": 1}, {"theta": 0})), TYPE, "'theta' of q is int", "1.0"),
+    "no params": (lambda: move(swing, params=None), TYPE, "none were given", r"ts=ts\)"),
+    "a parameter left out": (
+        lambda: move(swing, params={"m": 1.0}), VALUE, "'g', and there is none: params has 'm'", '"g": 1.0'),
+    "a parameter misspelt": (
+        lambda: move(needs_mass, params={"masss": 1.0}), VALUE, "'mass'", r'params\["mass"\]', "write 'masss'"),
+    "a coordinate misspelt": (
+        lambda: move(swing, ({"thteta": 1.0}, {"thteta": 0.0})), VALUE, "has 'thteta'", 'q0 = {"theta": 0.1}'),
+    "a start without names": (lambda: move(swing, (1.0, 0.0)), TYPE, "'theta' of an array", 'q0 = {"theta": 0.1}'),
+    "a list": (lambda: move(of_a_vector, ([1.0], [0.0])), TYPE, "with a list", r"q0 = jnp.array\("),
+    "a vector of one": (
+        lambda: move(of_a_vector, (np.ones(1), np.zeros(1))), VALUE, r"shape \(1,\)", "jnp.sum", "q0 = 0.1"),
+    "float32": (
+        lambda: move(swing, jax.tree.map(np.float32, START), rtol=1e-10), VALUE, "float32", "jax_enable_x64"),
+    "times backwards": (lambda: move(swing, ts=TS[::-1]), VALUE, "must increase", r"jnp.sort\(ts\)"),
+    "one time": (lambda: move(swing, ts=10.0), VALUE, r"starts at ts\[0\]", "linspace"),
+    "a matrix of constraints": (
+        lambda: constrained(lambda t, q, params: q["x"] * jnp.eye(2)), VALUE, "'rod'", r"\(2, 2\)", "jnp.stack"),
+    "a tuple of constraints": (
+        lambda: constrained(lambda t, q, params: (q["x"], q["y"])), VALUE, "'rod'", "a tuple", "jnp.stack"),
+    "an equation for a residual": (
+        lambda: constrained(lambda t, q, params: q["x"] == 1.0), VALUE, "'rod'", "returned bool", r"- l\*\*2"),
+    "a constraint of the velocity": (
+        lambda: constrained(lambda t, q, v, params: q["x"]), TYPE, "'rod'", "3 arguments", r"def f\(t, q, params"),
+    "a rolling condition without v": (
+        lambda: constrained(lambda t, q, params: q["x"], lj.Nonholonomic), TYPE, "'rod'",
+        r"def f\(t, q, v, params"),
+    "a constraint's parameter": (
+        lambda: constrained(lambda t, q, p: q["x"] - p["l"]), VALUE, "'rod'", "'l'", "has 'm', 'g'|has 'g', 'm'"),
+    "a constraint by NumPy": (
+        lambda: constrained(lambda t, q, p: np.sqrt(q["x"])), TYPE, "'rod'", NUMPY, "jnp.sqrt"),
+    "NumPy": (lambda: move(by_numpy), TYPE, r"L\(t, q, v, params\)", NUMPY, r'np.cos\(q\["theta"\]\)', "jnp.cos"),
+    "math": (lambda: move(by_math), TYPE, "Python number", "jnp.cos in place of math.cos"),
+    "float": (lambda: move(by_float), TYPE, "Python number", "leave out float"),
+    "if": (lambda: move(with_if), TYPE, "decides", r'if q\["theta"\] > 0', "jnp.where"),
+    "no return": (lambda: move(without_return), VALUE, "returned None", "return kinetic - potential"),
+    "attributes": (lambda: move(attributes), TYPE, ".theta of a dict", r'q\["theta"\]'),
+    "no time": (lambda: move(without_time), TYPE, "4 arguments", r"without_time\(q, v, params\)", "def without_time"),
+    "a force for one coordinate": (
+        lambda: move(lj.System(point, force=lambda t, q, v, params: -v["x"]), POINT), VALUE, "like q", "0.0 where"),
+    "a friction's parameter": (
+        lambda: move(lj.System(swing, dissipation=lambda t, q, v, p: p["c"] * v["theta"] ** 2)), VALUE,
+        r"dissipation\(t, q, v, params\) asks for 'c'", '"c": 1.0'),
+    "our solver's class": (lambda: move(swing, method=lj.Radau5), TYPE, r"method=lj.Radau5\(\)"),
+    "diffrax's solver's class": (lambda: move(swing, method=diffrax.Dopri5), TYPE, r"method=diffrax.Dopri5\(\)"),
+    "a solver's name": (lambda: move(swing, method="RK45"), TYPE, "not str", r"lj.Dopri8\(\)"),
+    "the state of the explanation": (lambda: lj.explain(lj.System(by_numpy), *START, PARAMS), TYPE, NUMPY, "jnp.cos"),
+    "one acceleration": (
+        lambda: lj.accelerations(lj.System(needs_mass), 0.0, *START, PARAMS), VALUE, "'mass'", "'m'"),
+    "the nearest state": (
+        lambda: lj.consistent_state(with_length, 0.0, *POINT, PARAMS),
+        VALUE, "'rod'", "'l'"),
+    "one residual": (lambda: lj.constraint_residual(with_length, 0.0, *POINT, PARAMS), VALUE, "'rod'", "'l'"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_says_what_happened_and_what_to_do(mistake):
+    """One paragraph: the user's names, a usual cause, a fix, and nothing of JAX's insides."""
+    act, kind, *parts = MISTAKES[mistake]
+    with pytest.raises(kind) as caught:
+        act()
+    said = str(caught.value)
+    for part in (*parts, "Usual cause: ", "Fix: "):
+        assert re.search(part, said), f"{part!r} is not in:\n{said}"
+    assert said.index("Usual cause") < said.index("Fix") and len(said.splitlines()) <= 6 and "\n\n" not in said
+    assert "racer" not in said and "PyTreeDef" not in said and "/" not in said.replace("[q]/[t]", "")
+
+
+def test_the_check_can_fail():
+    """Twin: JAX's own message would not pass, and right functions raise nothing."""
+    with pytest.raises(jax.errors.TracerArrayConversionError) as caught:
+        jax.eval_shape(by_numpy, 0.0, *START, PARAMS)
+    assert "Fix: " not in str(caught.value)
+    lj.momentum(pendulum, 0.0, *START, PARAMS)
+
+
+def test_an_unknown_error_is_the_users_own():
+    """What is not recognized comes as it was raised."""
+
+    def fails(t, q, v, params):
+        raise RuntimeError("my own")
+
+    with pytest.raises(RuntimeError, match="my own"):
+        move(fails)
+    with pytest.raises(TypeError, match="unsupported operand"):
+        move(lambda t, q, v, params: 0.5 * v["theta"] ** 2 + {})
+
+
+def test_closed_over_parameters_work():
+    """Parameters that L closes over are no mistake."""
+    length = 2.0
+    closed = lj.System(lambda t, q, v, params: 0.5 * (length * v["theta"]) ** 2)
+    assert float(lj.momentum(closed, 0.0, {"theta": 0.0}, {"theta": 1.5}, None)["theta"]) == 6.0
+
+
+def test_callables_of_any_kind():
+    """Objects with __call__, partial functions and compiled ones are called as functions are."""
+    import functools
+
+    class Swing:
+        def __call__(self, t, q, v, params):
+            return swing(t, q, v, params)
+
+    for lagrangian in (
+        Swing(),
+        jax.jit(swing),
+        functools.partial(lambda m, t, q, v, params: m * swing(t, q, v, params), 1.0),
+    ):
+        assert float(lj.momentum(lj.System(lagrangian), 0.0, *START, PARAMS)["theta"]) == 0.0
+    with pytest.raises(ValueError, match="'mass'"):
+        lj.momentum(lj.System(functools.partial(needs_mass)), 0.0, *START, PARAMS)
