@@ -218,8 +218,8 @@ gained = books.E - books.E[0]
 fig, axes = plot.figure(1, 2, size=(4.2, 3.0))
 left, right = axes[0]
 left.plot(ts, gained, label="energy gained", **plot.style(0))
-left.plot(ts, work, label=r"$\omega\,\Delta L_z$, the motor's work", **plot.style(1))
-left.plot(ts, books.h - books.h[0], label="change of h", **plot.style(2))
+left.plot(ts[::6], work[::6], "o", color="black", markersize=3, label=r"$\omega\,\Delta L_z$, the motor's work")
+left.plot(ts, books.h - books.h[0], label="change of h", **plot.style(1))
 left.set(xlabel="t / s", ylabel="energy / J", title="The motor pays, and is paid back", ylim=(-9, 6))
 left.legend(fontsize=9, frameon=False, loc="upper right")
 middle = 0.5 * (ts[1:] + ts[:-1])
