@@ -111,9 +111,9 @@ fig
 # The multipliers lie on their closed forms. A cylinder pushes; it cannot pull. At 30° $\lambda$ becomes negative, and
 # the hoop leaves.
 #
-# The solution that this notebook follows says that the formula for $\lambda$ gives "at the bottom, when $\theta = 0$,
-# a negative value". Negative it is, but $\theta = 0$ is not the bottom: the centre's height is $r \sin\theta$. Ask at
-# both places for the force that it would take to hold the hoop there.
+# The solution that this notebook follows says that the formula for $\lambda$ gives a negative value "at the bottom,
+# when $\theta = 0$". Negative it is, but $\theta = 0$ is not the bottom: the centre's height is $r \sin\theta$. Ask
+# at both places for the force that it would take to hold the hoop there.
 
 # %%
 names = {"the side": 0.0, "the bottom": -np.pi / 2}
@@ -282,9 +282,9 @@ fig
 
 # %% [markdown]
 # With $c = 1/4$ the hoop slips at 65.70° and leaves at 36.63°; with $c = 1$ at 43.05° and 32.43°. "This is the angle
-# at which the hoop falls from the cylinder, $\theta = 30°$", says the solution; for every finite coefficient that
-# fails: it lets go between 30° and 41.81°, because the normal force goes to zero, and before that because friction
-# goes with it.
+# at which the hoop falls from the cylinder, $\theta = 30°$", says the solution. For every finite coefficient that
+# fails: the hoop leaves between 30° and 41.81°, because the normal force goes to zero; and it slips before, because
+# friction goes with it.
 
 # %%
 on_the_way, rate = (np.asarray(x["theta"]) for x in (rolled.q, rolled.v))

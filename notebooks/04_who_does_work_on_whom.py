@@ -150,8 +150,8 @@ fig
 
 # %% [markdown]
 # With $u = m/M$ the share is $u\cos^2\alpha\,/\,[(1 + u)(1 + u\sin^2\alpha)]$. For a given angle it is largest at
-# $M = m\sin\alpha$, the dashed line, where it is $(1 - \sin\alpha)/(1 + \sin\alpha)$, the thin lines: 70 % at 10°, 33
-# % at 30°, 7 % at 60°. A light wedge shoots away but carries nothing; a heavy one stays.
+# $M = m\sin\alpha$, the dashed line, where it is $(1 - \sin\alpha)/(1 + \sin\alpha)$, the thin lines: 70 per cent at
+# 10°, 33 at 30° and 7 at 60°. A light wedge shoots away but carries nothing; a heavy one stays.
 #
 # ## Two formulas that fail
 #

@@ -105,8 +105,8 @@ fig
 # table is the expected one, with two remarks and one question.
 #
 # - The half plane's force is infinite. The solution that this notebook follows treats it like the rest. A strip of
-#   the width $W$ pulls along $y$ with $2 G\sigma\ln W$ and more; only without this uniform pull is there a limit for
-#   $W \to \infty$, and it is that limit which was integrated. It breaks no symmetry that the half plane has.
+#   the width $W$ pulls along $y$ with $2 G\sigma\ln W$, which has no limit for $W \to \infty$; what remains without
+#   this uniform pull has one, and that was integrated. It has the symmetry of the half plane.
 # - $E$ belongs to the list everywhere: "only $p_x$", as the solution says, is $p_x$ and $E$.
 # - The helix seems to conserve nothing but energy.
 
@@ -126,11 +126,11 @@ for power in (10, 20, 40):
 # %% [markdown]
 # ## The helix has a screw
 #
-# Turn the helix by an angle $\varepsilon$ and it looks displaced by $h\varepsilon/2\pi$ along $z$, with $h$ its
-# pitch. Both together, for every $\varepsilon$, are a symmetry, and the constant that belongs to it is
-# $\frac{h}{2\pi} p_z + L_z$, or $h\,p_z + 2\pi L_z$. The solution speaks of a translation by $h$ with a rotation by
-# $2\pi$, and prints $h\,p_z + L_z$. But a rotation by $2\pi$ does nothing at all, and a translation by $h$ alone is a
-# step, not a motion: it has no constant.
+# Turn the helix by an angle $\varepsilon$ and it looks displaced along $z$, by $h\varepsilon/2\pi$ with $h$ its
+# pitch; displace it back and it is where it was. Both together, for every $\varepsilon$, are a symmetry, and the
+# constant that belongs to it is $\frac{h}{2\pi} p_z + L_z$, or $h\,p_z + 2\pi L_z$. The solution speaks of a
+# translation by $h$ with a rotation by $2\pi$, and prints $h\,p_z + L_z$. But a rotation by $2\pi$ does nothing at
+# all, and a translation by $h$ alone is a step, not a motion: it has no constant.
 
 # %%
 pitch = masses.PARAMS["helix"]["h"]
@@ -185,7 +185,8 @@ fig
 # along $x$ and $y$ are constant one by one. The dumbbell's two balls alone, on a rod without mass, are Euler's
 # problem of two centres:
 # $(\mathbf r_1\times\mathbf v)\cdot(\mathbf r_2\times\mathbf v) + 2cG\,(M_2\cos\theta_2 - M_1\cos\theta_1)$ is
-# constant, until the rod is given a mass.
+# constant, until the rod is given a mass. (Outside the ellipse, the expressions for the two energies are those of the
+# inside.)
 
 # %%
 ellipse = masses.PARAMS["elliptic cylinder"]

@@ -81,7 +81,7 @@ right.legend(fontsize=9, frameon=False, loc="upper center", ncols=2)
 fig
 
 # %% [markdown]
-# "The equilibrium position is not $R_0$, but a smaller length", says the solution that this notebook follows. It is
+# The equilibrium position "is not $R_0$, but a smaller length", says the solution that this notebook follows. It is
 # the other way: the carriage circles about $R_0\,/\,(1 - m\omega^2/K) = 0.889$ m, and $R_0 = 0.75$ m.
 #
 # ## Three energies

@@ -57,8 +57,10 @@ params = {"R": 1.0}  # all lengths in radii
 # %% [markdown]
 # ## Great circles in disguise
 #
-# With $\theta$ as time the solutions must be $\cot\psi = A\cos\theta + B\sin\theta$, plane sections of the sphere.
-# The solution that this notebook follows adds "with $A^2 + B^2 < 1$". A sweep over the inclination $i$ of the plane:
+# (The solution that this notebook follows calls $\psi$ the azimuth and $\theta$ the polar angle; with $z = R\cos\psi$
+# it is the other way round.) With $\theta$ as time the solutions must be $\cot\psi = A\cos\theta + B\sin\theta$,
+# plane sections of the sphere. The solution adds "with $A^2 + B^2 < 1$". A sweep over the inclination $i$ of the
+# plane:
 
 # %%
 theta = jnp.linspace(-jnp.pi, jnp.pi, 25)
@@ -175,9 +177,9 @@ left.legend(fontsize=9, frameon=False)
 fig
 
 # %% [markdown]
-# With $\theta$ as time everything happens in a jump, with $\psi' = \mathrm d\psi/\mathrm d\theta$ up to
-# $1/\varepsilon$: six digits of the end are lost at $\varepsilon = 10^{-4}$, and nearer to the pole it gives up. With
-# $\psi$ and $\theta$ as coordinates of the free particle it is $\theta$ that jumps,
+# With $\theta$ as time everything happens in a jump, and $\psi' = \mathrm d\psi/\mathrm d\theta$ is of the order of
+# $1/\varepsilon$ before and after it: six digits of the end are lost at $\varepsilon = 10^{-4}$, and nearer to the
+# pole it gives up. With $\psi$ and $\theta$ as coordinates of the free particle it is $\theta$ that jumps,
 # $\dot\theta = \sin\varepsilon/\sin^2\psi$; the steps follow it, ever more of them, as $\ln(1/\varepsilon)$. In space
 # nothing happens at all: eight steps, since the pole is a point like any other.
 #
@@ -211,10 +213,10 @@ print(f"comes back to its start to {closes:.0e}; multiplier {orbit.multipliers['
 # %% [markdown]
 # ## Stationary is not shortest
 #
-# "The path with minimum length" is what the solution looks for, and Lagrange's equation gives any *stationary* one.
-# Displace an arc of the angle $S$ sideways by $\epsilon\sin(\pi s/S)$: its length changes by
-# $\frac{1}{4}S\,[(\pi/S)^2 - 1]\,\epsilon^2$, and beyond half a turn that is a gain. Going on past the antipode, a
-# great circle is a saddle.
+# The solution looks for "the path with minimum length", and Lagrange's equation gives any *stationary* one. Displace
+# an arc of the angle $S$ sideways by $\epsilon\sin(\pi s/S)$: its length changes by
+# $\frac{1}{4}S\,[(\pi/S)^2 - 1]\,\epsilon^2$, and beyond half a turn it becomes shorter. Past the antipode a great
+# circle is a saddle.
 
 # %%
 amplitude = jnp.linspace(-0.5, 0.5, 41)
