@@ -60,6 +60,8 @@ class Identifiability(eqx.Module):
         names, rank = listed(list(self.names)), self.rank
         if not self.names:
             return "Identifiability: no parameter is asked for, only starts"
+        if len(self.names) > ENUMERATE_UP_TO:
+            return f"Identifiability: of {len(self.names)} numbers the data see {rank} combinations"
         if rank == len(self.names):
             lines = [f"Identifiability: the data see {names}"]
         else:

@@ -77,7 +77,9 @@ class Record(eqx.Module):
             raise TypeError("the times of a record must be numbers, and these are traced: they give it its shape.")
         self.t = _times(t)
         given = zip(KINDS, (q, v, multipliers, observed, end))
-        self.measured = {kind: jax.tree.map(_as_floats, tree) for kind, tree in given if tree is not None}
+        # Sorted as JAX sorts them: residuals stand in this order.
+        given = sorted(((kind, tree) for kind, tree in given if tree is not None), key=lambda pair: pair[0])
+        self.measured = {kind: jax.tree.map(_as_floats, tree) for kind, tree in given}
         if not jax.tree.leaves(self.measured):
             raise ValueError(
                 'a record holds no measurement.\nFix: lj.Record(t, q={"theta": angles}), or v=, multipliers=, '

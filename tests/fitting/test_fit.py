@@ -160,7 +160,7 @@ def test_a_long_record_wants_a_growing_horizon():
     assert joined.freedom == found.freedom
     apart = lj.fit(pendulum, record, guess, free=FREE, window=5.0, joined=False)
     np.testing.assert_allclose(apart.values[1], 1.25, rtol=0.01)
-    assert float(apart.sd[1]) > 3 * float(found.sd[1])
+    assert float(apart.sd[1]) > 2 * float(found.sd[1])
     # Twin: at once, it is lost.
     lost = lj.fit(pendulum, record, guess, free=FREE, grow=False)
     assert lost.rms()["q"] > 0.1
@@ -182,9 +182,11 @@ def test_outliers_priors_and_bounds(swinging):
     assert off(plain) > 10 and off(robust) < 2
     assert np.all(robust.sd > clean.sd) and np.all(robust.sd < 2 * clean.sd)
 
-    known = fit(data, priors={"l": (1.2, 0.0005)})
+    known = fit(data, priors={"l": (1.248, 0.0005)})
     weights = np.array([1 / clean.sd[1] ** 2, 1 / 0.0005**2])
-    assert abs(float(known.values[1]) - np.average([clean.values[1], 1.2], weights=weights)) < 2e-4
+    expected = np.average([clean.values[1], 1.248], weights=weights)
+    assert float(known.values[1]) == pytest.approx(expected, abs=2e-5)
+    assert abs(float(clean.values[1]) - expected) > 2e-4
     assert float(known.sd[1]) < 0.0005
     with pytest.warns(lj.FitWarning, match="'l' ended at a bound"):
         held = fit(data, bounds={"l": (1.3, 2.0)})
@@ -257,16 +259,15 @@ def test_other_optimisers(swinging):
 
 def test_log_likelihood(swinging):
     """The likelihood is largest at the estimates, and falls by a half at one standard deviation."""
-    data = noisy(swinging[0])
-    found = lj.fit(
-        pendulum, lj.Record(TS, q=data, sigma=0.01, q0=1.0, v0=0.0, hold_q=True, hold_v=True), GUESS, free="l"
-    )
+    record = lj.Record(TS, q=swinging[0], sigma=0.01, q0=1.0, v0=0.0, hold_q=True, hold_v=True)
+    found = lj.fit(pendulum, record, GUESS, free="l")
     density = jax.jit(found.log_likelihood)
     best = float(density(found.sampling))
-    assert best == pytest.approx(-0.5 * float(found.chi2), rel=1e-9)
+    assert best == pytest.approx(-0.5 * float(found.chi2), abs=1e-9)
     moved = float(density({"l": found.values[0] + found.sd[0]}))
-    assert moved - best == pytest.approx(-0.5, rel=0.02)
-    assert abs(float(jax.grad(lambda l: density({"l": l}))(found.values[0]))) < 1e-2 / float(found.sd[0])
+    assert moved - best == pytest.approx(-0.5, rel=0.01)
+    slope = jax.grad(lambda l: found.log_likelihood({"l": l}))(found.values[0] + found.sd[0])
+    assert float(slope * found.sd[0]) == pytest.approx(-1.0, rel=0.02)
 
 
 def test_prints_and_plots(swinging):
