@@ -4,6 +4,7 @@ import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -115,8 +116,14 @@ def fit(
     if seen is not None and not coordinates.is_traced(seen) and not np.any(np.asarray(seen.well)):
         _check_motion(problem, seen, problem.start)
     found = Fit(problem, *searched, costs, seen, tuple(sorted((units or {}).items())))
-    if not coordinates.is_traced(found.cost):
-        _warn(found)
+    if coordinates.is_traced(found.cost):
+        return found
+    if seen is not None and found.at_bounds():
+        # There the search's own slopes vanish.
+        last = jax.tree.map(lambda x: x[-1], stages)
+        found = eqx.tree_at(lambda f: f.seen, found, look(problem, searched.unknowns, last))
+    for words in found.complaints():
+        warnings.warn(words, FitWarning, stacklevel=2)
     return found
 
 
@@ -212,8 +219,3 @@ def _check_motion(problem, seen, u):
         f"from the guess the motion of record {int(problem.windows.record[w])} fails: {reason}\n"
         "Fix: guess params, q0 and v0 nearer to the truth; try them with lj.integrate first."
     )
-
-
-def _warn(found: Fit):
-    for words in found.complaints():
-        warnings.warn(words, FitWarning, stacklevel=3)
