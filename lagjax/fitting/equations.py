@@ -105,8 +105,9 @@ class Problem(eqx.Module):
     def said(self, motion) -> dict[str, PyTree]:
         """All that can be measured of a motion."""
         said = {"q": motion.q, "v": motion.v, "multipliers": motion.multipliers, "end": motion.end._asdict()}
-        if self.observe is not None:
-            at = lambda t, q, v: self.observe(t, q, v, motion.params)
+        observe = self.observe
+        if observe is not None:
+            at = lambda t, q, v: observe(t, q, v, motion.params)
             said["observed"] = jax.vmap(at)(motion.t, motion.q, motion.v)
         return said
 
@@ -180,6 +181,9 @@ def _seamed(problem, stage):
 
 def equations(problem: Problem, u: Unknowns, stage: Stage) -> Equations:
     """The residuals at unknowns in natural numbers, in units of their sigmas."""
+    # NumPy's arrays cannot be indexed by a window's traced number.
+    live, static = eqx.partition(problem, eqx.is_array)
+    problem = eqx.combine(jax.tree.map(jnp.asarray, live), static)
     parts = over_windows(lambda w, s: of_window(problem, u.shared, s, w, stage)[0], problem, u)
     return together(problem, u, parts, stage)
 

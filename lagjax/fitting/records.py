@@ -179,7 +179,7 @@ class Windows(eqx.Module):
         """The first window of each record."""
         return np.flatnonzero(np.diff(self.record, prepend=-1))
 
-    def gather(self, of_records: Sequence[Array]) -> Array:
+    def gather(self, of_records: Sequence[Array]) -> Array | np.ndarray:
         """Samples (T_r, ...) of each record as (W, T, ...), NaN where there are none."""
         rows, xp = [], coordinates.numpy_of(of_records)
         for w, r in enumerate(self.record):

@@ -154,7 +154,8 @@ def _guess(system, record, r, params) -> State:
                 f"record {r} has no guess of its start, and no measured coordinates to read it from.\n"
                 "Fix: lj.Record(..., q0=..., v0=...), alike to the state of lj.integrate."
             )
-        q, v = (read[0] if q is None else q), (read[1] if v is None else v)
+        read_q, read_v = read
+        q, v = (read_q if q is None else q), (read_v if v is None else v)
     if coordinates.is_traced((q, v, params)):
         if system.constraints:
             raise TypeError(
@@ -216,12 +217,16 @@ def _charts(system, s: State, free_q, free_v, r) -> tuple[Chart, Chart]:
         return Chart(x, np.eye(len(free_q))[:, free_q], nothing), Chart(u, np.eye(len(free_v))[:, free_v], nothing)
     with jax.ensure_compile_time_eval():
         _, unflatten = coordinates.flatten(s.q)
-        # Twice: the directions are those of the guess after it was moved onto the constraints.
-        for _ in range(2):
+
+        def charts(x, u):
             of_q, of_v = _rows(system, s.t, x, u, s.params, unflatten)
-            q, v = _chart(x, of_q, free_q), _chart(u, of_v, free_v)
-            zeros = Starts(q, v), jnp.zeros(q.along.shape[1]), jnp.zeros(v.along.shape[1])
-            x, u = eqx.filter_jit(Starts.vectors)(*zeros, system, s.t, s.params, unflatten)
+            return _chart(x, of_q, free_q), _chart(u, of_v, free_v)
+
+        q, v = charts(x, u)
+        zeros = jnp.zeros(q.along.shape[1]), jnp.zeros(v.along.shape[1])
+        x, u = eqx.filter_jit(Starts.vectors)(Starts(q, v), *zeros, system, s.t, s.params, unflatten)
+        # The directions are those of the guess after it was moved onto the constraints.
+        q, v = charts(x, u)
         found = State(s.t, unflatten(x), unflatten(u), s.params)
         left = departures(system, found, OFF, OFF)
     if left:

@@ -57,10 +57,11 @@ class Slopes(NamedTuple):
 
     def sizes(self) -> Unknowns:
         """The norm of the slopes by each unknown."""
-        squares = lambda *blocks: sum(jnp.sum(x**2, axis=1) for x in blocks)
-        shared = squares(self.rows_by_shared, self.seams_by_shared).sum(0) + jnp.sum(self.shared**2, axis=0)
+        squares = lambda blocks: jnp.sum(blocks**2, axis=1)
+        shared = jnp.sum(squares(self.rows_by_shared) + squares(self.seams_by_shared), axis=0)
+        shared = shared + jnp.sum(self.shared**2, axis=0)
         # A window's start is also where the seam before it ends.
-        own = squares(self.rows_by_own, self.seams_by_own) + jnp.roll(squares(self.seams_by_next), 1, axis=0)
+        own = squares(self.rows_by_own) + squares(self.seams_by_own) + jnp.roll(squares(self.seams_by_next), 1, axis=0)
         return Unknowns(jnp.sqrt(shared), jnp.sqrt(own))
 
     def scaled(self, by_shared: Float[Array, " p"]) -> "Slopes":

@@ -296,3 +296,10 @@ def test_unknowns_of_a_start_keep_to_the_constraints():
         q, v = state(u)
         assert abs(q["x"] ** 2 + q["y"] ** 2 - 2.4**2) < 1e-12
         assert abs(q["x"] * v["x"] + q["y"] * v["y"]) < 1e-12
+
+
+def test_log_likelihood_of_several_runs(swinging):
+    """Two records: the likelihood of both, at their best the sum of squares."""
+    records = [lj.Record(TS, q=noisy(swinging[0], seed=i), q0=1.0, v0=0.0, sigma=0.01) for i in (1, 2)]
+    found = lj.fit(pendulum, records, GUESS, free=FREE)
+    assert float(found.log_likelihood(found.sampling)) == pytest.approx(-0.5 * float(found.chi2), rel=1e-9)
