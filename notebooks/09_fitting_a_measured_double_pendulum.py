@@ -53,9 +53,9 @@ solve = {"rtol": 1e-6, "atol": 1e-6}
 # ## The record
 #
 # With `LAGJAX_DOUBLE_PENDULUM` set to the path of a file (comma-separated, with the first line
-# `t[s],theta1[rad],theta2[rad],...`) this notebook fits that file. Without it, as here, it makes its own measurements: the motion that follows from the
-# published parameters of the MultiArm pendulum (University of Washington; Kaheman, Fasel, Bramburger, Strom, Kutz and
-# Brunton; MIT licence), 20 s at 100 Hz, with errors of 2 mrad.
+# `t[s],theta1[rad],theta2[rad],...`) this notebook fits that file. Without it, as here, it makes its own measurements:
+# the motion that follows from the published parameters of the MultiArm pendulum (University of Washington; Kaheman,
+# Fasel, Bramburger, Strom, Kutz and Brunton; MIT licence), 20 s at 100 Hz, with errors of 2 mrad.
 
 # %%
 arms = {  # kg, m, kg m², kg m²/s, m/s²
@@ -168,7 +168,7 @@ axis.semilogy(t, of_one_start, label="one start", linewidth=1.2, **plot.style(1)
 axis.semilogy(t, of_windows, ".", markersize=2, color=plot.COLOURS[0], label="windows of 0.6 s")
 axis.set(xlabel="t / s", ylabel=r"|fit - measured| of $\theta_2$ / rad", ylim=(1e-5, 1e2))
 axis.set_title("A start that is known to a milliradian is forgotten")
-axis.legend(fontsize=9, frameon=False, loc="lower right")
+axis.legend(fontsize=9, frameon=False, loc="center right")
 fig
 
 # %% [markdown]
