@@ -31,6 +31,17 @@ def test_python_blocks(page, capsys, tmp_path, monkeypatch):
     assert claimed == printed
 
 
+@pytest.mark.slow
+def test_the_figure_is_drawn(tmp_path):
+    """The script that made the README's figure still makes one, and the README shows it."""
+    assert "(docs/overview.png)" in README and (ROOT / "docs" / "overview.png").exists()
+    spec = importlib.util.spec_from_file_location("overview", ROOT / "docs" / "overview.py")
+    overview = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(overview)
+    overview.main(tmp_path / "overview.png")
+    assert (tmp_path / "overview.png").stat().st_size > 20_000
+
+
 def test_the_block_check_can_fail(capsys):
     """Twin: a wrong number in a comment is found."""
     claimed, printed = claimed_and_printed("print(1 + 1)  # 3\n", capsys)

@@ -50,6 +50,12 @@ class Identifiability(eqx.Module):
         """The combinations that the data see, as products of powers where they are such."""
         return [_combination(self.names, row) for row in _simplest(np.asarray(self.combinations)[: self.rank])]
 
+    def _scaled(self) -> list[str]:
+        """The names of those that may all grow by one factor, where that is the last combination."""
+        row = np.asarray(self.combinations)[-1]
+        members = _members(row)
+        return [self.names[i] for i in members] if np.ptp(row[members]) < EXPONENT_ERROR else []
+
     def unseen(self) -> list[str]:
         """The names of what leaves no trace in the data, neither alone nor with others."""
         rows = np.asarray(self.combinations)[: self.rank]
@@ -64,6 +70,9 @@ class Identifiability(eqx.Module):
             return f"Identifiability: of {len(self.names)} numbers the data see {rank} combinations"
         if rank == len(self.names):
             lines = [f"Identifiability: the data see {names}"]
+        elif rank == len(self.names) - 1 and len(self._scaled()) > 2:
+            which = "all" if len(self._scaled()) == len(self.names) else listed(self._scaled())
+            lines = [f"Identifiability: the data see {names} but for one common factor of {which}"]
         else:
             lines = [f"Identifiability: of {names} the data see only", *(f"  {words}" for words in self.combined())]
         if self.unseen():

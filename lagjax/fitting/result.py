@@ -19,6 +19,8 @@ from lagjax.motion.integrate import integrate
 from lagjax.motion.trajectory import Trajectory
 from lagjax.numerics.chained import Unknowns
 
+# Residuals so many times larger (squared) than sigma allows are not errors of measurement.
+MISFIT = 10.0
 # A number that is closer to its bound than this, relative to the bound's size, or its start's, is at it.
 AT_BOUND = 1e-6
 
@@ -230,6 +232,10 @@ class Fit(eqx.Module):
 
         return density
 
+    def _is_off(self):
+        plain = self.problem.absolute and self.problem.loss == "squares" and self.seen is not None
+        return plain and float(self.chi2) > MISFIT * float(self.freedom) > 0
+
     def at_bounds(self) -> list[str]:
         """The names of numbers that ended at a bound."""
         found, x = self.problem.found, np.asarray(self.values)
@@ -252,6 +258,13 @@ class Fit(eqx.Module):
                 f"the data do not determine all parameters.\n{self.identifiability}\n"
                 "What is not determined has no uncertainty, and stays near its guess.\n"
                 "Fix: leave some out of free=, give priors=, or measure more."
+            )
+        if self._is_off():
+            times = float(jnp.sqrt(self.chi2 / self.freedom))
+            found.append(
+                f"the residuals are {times:.2g} times as large as sigma says, so that the ± mean nothing.\n"
+                "Usual cause: a wrong minimum, something that the system leaves out, outliers, or too small a sigma.\n"
+                'Fix: look at found.plot(); try a shorter window=, restarts=8, loss="cauchy".'
             )
         if self.at_bounds():
             found.append(f"{listed(self.at_bounds())} ended at a bound, where uncertainties mean nothing.")

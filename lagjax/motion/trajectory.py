@@ -220,6 +220,8 @@ def message(result) -> str:
     """A result in words."""
     if bool(result == RESULTS.successful):
         return "successful"
+    if bool(result == RESULTS.event_occurred):
+        return "ended by its event"
     return RESULTS[result]
 
 
