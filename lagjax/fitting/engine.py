@@ -29,7 +29,7 @@ JOINED = (0.1, 1.0, 10.0, 100.0, 1e4)
 # Uncertainties of more numbers than this are not computed.
 COVARIANCE_UP_TO = 1000
 # In units of the data's spread: when a stage is done, and when the last one is; not below what the motion is good for.
-STAGE_DONE, DONE, OF_RTOL = 1e-4, 1e-8, 10.0
+STAGE_DONE, DONE, OF_RTOL, ROUND_OFFS = 1e-4, 1e-8, 10.0, 100.0
 
 
 def fit(
@@ -98,7 +98,8 @@ def fit(
     **Raises:**
 
     - `ValueError` for names, shapes and kinds that do not match; for a guess from which the motion fails at once.
-    - Warns (`lj.FitWarning`) where the search did not converge, and of parameters that the data cannot see.
+    - Warns (`lj.FitWarning`) where the search did not converge, a motion stops early, residuals are far larger than
+      `sigma` says, an estimate is at its bound, or the data cannot see a parameter.
 
     Source: Nocedal & Wright, *Numerical Optimization*, §10.3; Bock, in *Modelling of Chemical Reaction Systems* (1981)
     (multiple shooting); Bierman, *Factorization Methods for Discrete Sequential Estimation* (covariance).
@@ -171,7 +172,8 @@ def _stages(problem: Problem, grow: bool, joined: bool) -> tuple[Stage, Any]:
     weights = [0.0] * (doublings + 1) + list(JOINED if joined else ())
     ratio = problem.spread_in_sigmas
     rtol = problem.options.get("rtol")
-    done = DONE if rtol is None else jnp.maximum(DONE, OF_RTOL * jnp.max(jnp.asarray(rtol)))
+    done = max(DONE, ROUND_OFFS * np.finfo(problem.windows.ts.dtype).eps)
+    done = done if rtol is None else jnp.maximum(done, OF_RTOL * jnp.max(jnp.asarray(rtol)))
     last = np.arange(len(parts)) == len(parts) - 1
     xp = coordinates.numpy_of((ratio, done))
     return Stage(np.asarray(parts), xp.asarray(weights) * ratio), xp.where(last, done, STAGE_DONE) * ratio

@@ -259,6 +259,13 @@ class Fit(eqx.Module):
                 "What is not determined has no uncertainty, and stays near its guess.\n"
                 "Fix: leave some out of free=, give priors=, or measure more."
             )
+        failed = [] if self.seen is None else np.flatnonzero(~np.asarray(self.seen.well))
+        if len(failed):
+            record = int(self.problem.windows.record[failed[0]])
+            found.append(
+                f"at the estimates the motion of record {record} stops early; what it misses counts as far off.\n"
+                f"Fix: found.motion({record}).result says why; guess nearer, or give bounds=."
+            )
         if self._is_off():
             times = float(jnp.sqrt(self.chi2 / self.freedom))
             found.append(

@@ -11,6 +11,7 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optimistix as optx
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
@@ -31,8 +32,8 @@ from lagjax.numerics.chained import (
 
 # Of the slopes, enough to make what the data cannot see regular, and too little to be seen itself.
 FLOOR = 1e-10
-# An uncertainty that is so many times larger than it would be with all else known is none: the data do not see it.
-UNSEEN = 1e7
+# An uncertainty so many times (over √eps) larger than with all else known is none: the data do not see it.
+UNSEEN = 0.15
 # A parameter with no larger part (squared) in what is not seen is determined.
 NO_PART = 1e-8
 
@@ -100,12 +101,13 @@ def seen_from(problem: Problem, u: Unknowns, linear: Linear, stage: Stage) -> Se
     # In units of the slopes: what the data do not see has a singular value of about FLOOR.
     size = filled(sizes).shared
     left, singular, right = jnp.linalg.svd(triangular.shared / size[None])
-    seen = singular > 1 / UNSEEN
+    unseen = UNSEEN / np.sqrt(np.finfo(size.dtype).eps)
+    seen = singular > 1 / unseen
     inverse = (right.T / size[:, None]) @ (jnp.where(seen, 1 / jnp.where(seen, singular, 1.0), 0.0)[:, None] * left.T)
     of = covariance(triangular, inverse)
     known_alone = jnp.sum(jnp.where(seen[:, None], 0.0, right) ** 2, axis=0) < NO_PART
     own = jnp.sqrt(jax.vmap(jnp.diag)(of.own))
-    determined = Unknowns(known_alone, (sizes.own > 0) & (sizes.own * own < UNSEEN))
+    determined = Unknowns(known_alone, (sizes.own > 0) & (sizes.own * own < unseen))
     relative = jnp.where(u.shared != 0, jnp.abs(u.shared), 1.0)
     _, singular_values, combinations = jnp.linalg.svd(triangular.shared * relative[None])
     chi2 = jnp.sum(linear.values.rows**2)
@@ -200,7 +202,6 @@ def _in_turn(function: Callable, *args):
 
 
 def _search(problem, start, stages, tolerances, optimiser, limit):
-
     def one_stage(carried, x):
         (y, taken), (stage, tolerance) = carried, x
         solver = optimiser
