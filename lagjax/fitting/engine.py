@@ -195,14 +195,18 @@ def _searched(problem, stages, tolerances, optimiser, iterations, restarts, spre
 
 def _scattered(found, count, spread, seed):
     """Starts (count, p) around the guess, or between two bounds."""
-    here, anywhere = jax.random.split(jax.random.key(seed))
     size = jnp.where(found.start != 0, found.start, 1.0)
-    x = found.start + size * jnp.expm1(spread * jax.random.normal(here, (count, found.start.size)))
-    share = jax.random.uniform(anywhere, x.shape, minval=0.01, maxval=0.99)
     bounded = jnp.isfinite(found.low) & jnp.isfinite(found.high)
-    between = jnp.where(bounded, found.low + share * jnp.where(bounded, found.high - found.low, 0.0), 0.0)
-    inside = (x > found.low) & (x < found.high)
-    return jnp.where(bounded, between, jnp.where(inside, x, found.start))
+    width = jnp.where(bounded, found.high - found.low, 0.0)
+
+    def one(key):
+        here, anywhere = jax.random.split(key)
+        x = found.start + size * jnp.expm1(spread * jax.random.normal(here, size.shape))
+        share = jax.random.uniform(anywhere, size.shape, minval=0.01, maxval=0.99)
+        inside = (x > found.low) & (x < found.high)
+        return jnp.where(bounded, found.low + share * width, jnp.where(inside, x, found.start))
+
+    return jax.vmap(one)(jax.random.split(jax.random.key(seed), count))
 
 
 def _check_motion(problem, seen, u):
