@@ -111,9 +111,10 @@ def fit(
         )
     problem = problem_of(system, records, params, free, observe, bounds, priors, loss, window, options)
     stages, tolerances = _stages(problem, grow, joined and window is not None)
+    last = jax.tree.map(lambda x: x[-1], stages)
     searched, seen, costs = _searched(problem, stages, tolerances, optimiser, iterations, restarts, spread, seed)
     if seen is None and problem.found.start.size <= COVARIANCE_UP_TO:
-        seen = look(problem, searched.unknowns, jax.tree.map(lambda x: x[-1], stages))
+        seen = look(problem, searched.unknowns, last)
     if seen is not None and not coordinates.is_traced(seen) and not np.any(np.asarray(seen.well)):
         _check_motion(problem, seen, problem.start)
     found = Fit(problem, *searched, costs, seen, tuple(sorted((units or {}).items())))
@@ -121,7 +122,6 @@ def fit(
         return found
     if seen is not None and found.at_bounds():
         # There the search's own slopes vanish.
-        last = jax.tree.map(lambda x: x[-1], stages)
         found = eqx.tree_at(lambda f: f.seen, found, look(problem, searched.unknowns, last))
     for words in found.complaints():
         warnings.warn(words, FitWarning, stacklevel=2)

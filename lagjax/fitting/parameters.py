@@ -49,11 +49,6 @@ class Found(eqx.Module):
             at += size
         return jtu.tree_unflatten(structure, leaves)
 
-    def out_of(self, params: PyTree) -> Float[Array, " p"]:
-        """The found numbers of other parameters of the same structure."""
-        leaves = jtu.tree_leaves(params)
-        return jnp.concatenate([jnp.ravel(leaves[i]) for i in self.leaves] or [jnp.zeros(0)])
-
     def natural(self, z):
         """Numbers within their bounds from free ones."""
         low, high = jnp.isfinite(self.low), jnp.isfinite(self.high)
