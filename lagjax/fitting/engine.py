@@ -29,7 +29,7 @@ JOINED = (0.1, 1.0, 10.0, 100.0, 1e4)
 # Uncertainties of more numbers than this are not computed.
 COVARIANCE_UP_TO = 1000
 # In units of the data's spread: when a stage is done, and when the last one is; not below what the motion is good for.
-STAGE_DONE, DONE, OF_RTOL, ROUND_OFFS = 1e-4, 1e-8, 10.0, 100.0
+STAGE_DONE, DONE, OF_RTOL, ROUND_OFFS = 1e-4, 1e-9, 10.0, 100.0
 
 
 def fit(
