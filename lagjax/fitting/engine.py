@@ -2,6 +2,7 @@
 
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import equinox as eqx
@@ -16,9 +17,10 @@ from lagjax.fitting.identifiability import Identifiability
 from lagjax.fitting.problem import problem_of
 from lagjax.fitting.records import Record
 from lagjax.fitting.result import Fit, FitWarning
-from lagjax.fitting.search import look, search
+from lagjax.fitting.search import listening, look, search
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.system import System
+from lagjax.meter import meter
 from lagjax.motion.integrate import integrate
 from lagjax.numerics.chained import Unknowns
 
@@ -51,6 +53,7 @@ def fit(
     seed: int = 0,
     optimiser: optx.AbstractLeastSquaresSolver | optx.AbstractMinimiser | None = None,
     iterations: int = 100,
+    progress: bool | None = None,
     **options,
 ) -> Fit:
     """Find the parameters and initial states with which the motion is nearest to what was measured.
@@ -89,6 +92,7 @@ def fit(
       least-squares solvers; or a minimiser of it, with derivatives in reverse, for thousands of parameters, such as
       `optimistix.BFGS(rtol, atol)` or `optimistix.OptaxMinimiser(optax.adam(1e-3), rtol, atol)`.
     - `iterations`: the largest number in each stage.
+    - `progress`: show stage, steps and cost (tqdm); by default where somebody may look.
     - `options` go to `lj.integrate`: `rtol`, `atol`, `method`, `event`, `max_steps`, ...
 
     **Returns:** a `Fit`: estimates with their uncertainties, residuals, what the data do not determine. It is the best
@@ -112,7 +116,9 @@ def fit(
     problem = problem_of(system, records, params, free, observe, bounds, priors, loss, window, options)
     stages, tolerances = _stages(problem, grow, joined and window is not None)
     last = jax.tree.map(lambda x: x[-1], stages)
-    searched, seen, costs = _searched(problem, stages, tolerances, optimiser, iterations, restarts, spread, seed)
+    with _shown(problem, len(tolerances), progress) as tell:
+        run = lambda u: search(problem, u, stages, tolerances, optimiser, iterations, tell)
+        searched, seen, costs = _best(run, problem, restarts, spread, seed)
     if seen is None and problem.found.start.size <= COVARIANCE_UP_TO:
         seen = look(problem, searched.unknowns, last)
     if seen is not None and not coordinates.is_traced(seen) and not np.any(np.asarray(seen.well)):
@@ -179,9 +185,27 @@ def _stages(problem: Problem, grow: bool, joined: bool) -> tuple[Stage, Any]:
     return Stage(np.asarray(parts), xp.asarray(weights) * ratio), xp.where(last, done, STAGE_DONE) * ratio
 
 
-def _searched(problem, stages, tolerances, optimiser, iterations, restarts, spread, seed):
+@contextmanager
+def _shown(problem, stages, progress):
+    """A meter of the search's steps; whether there is one."""
+    if coordinates.is_traced(problem):
+        yield False
+        return
+    with meter(progress, unit=" steps", desc="fit") as shown:
+        if shown.disable:
+            yield False
+            return
+
+        def step(stage, cost):
+            shown.set_postfix_str(f"stage {stage + 1} of {stages}, cost {cost:.4g}", refresh=False)
+            shown.update(1)
+
+        with listening(step):
+            yield True
+
+
+def _best(run, problem, restarts, spread, seed):
     """The best search, what the data say at its end if it knows, and the costs of all restarts."""
-    run = lambda u: search(problem, u, stages, tolerances, optimiser, iterations)
     start = problem.start
     if not restarts:
         return *run(start), None

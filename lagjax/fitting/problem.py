@@ -20,7 +20,7 @@ from lagjax.mechanics.diagnosis import listed
 from lagjax.motion.problem import check_system
 
 # What `integrate` takes and a fit sets itself.
-OURS = {"ts", "throw", "progress", "adjoint"}
+OURS = {"ts", "throw", "adjoint"}
 
 
 def problem_of(system, records, params, free, observe, bounds, priors, loss, window, options) -> Problem:

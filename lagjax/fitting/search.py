@@ -5,6 +5,8 @@ slopes of all equations are computed together with their values, forward, in one
 """
 
 from collections.abc import Callable
+from contextlib import contextmanager
+from functools import partial
 from typing import Any, NamedTuple
 
 import diffrax
@@ -149,18 +151,20 @@ def _equations_jvp(primals, tangents):
     return (linear.values, linear.well), (linear.slopes.along(du), None)
 
 
-def _least_squares(solver, problem, y, stage, limit):
+def _least_squares(solver, problem, y, stage, limit, told):
     def with_cost(y, args):
         values, well = _equations(y, *args)
+        told(_cost(values))
         return values, (_cost(values), well)
 
     return optx.least_squares(with_cost, solver, y, (problem, stage), has_aux=True, max_steps=limit, throw=False)
 
 
-def _minimise(solver, problem, y, stage, limit):
+def _minimise(solver, problem, y, stage, limit, told):
     def cost(y, args):
         problem, stage = args
         value = _cost(equations(problem, _natural(problem, y), stage))
+        told(value)
         return value, (value, jnp.ones(problem.windows.count, bool))
 
     solver = optx.BestSoFarMinimiser(solver)
@@ -177,12 +181,32 @@ def _largest_change(tree):
 
 
 @eqx.filter_jit
-def search(problem: Problem, start: Unknowns, stages: Stage, tolerances, optimiser: Any, limit: int):
-    """Search from `start` through all stages, whose numbers have a leading axis.
+def search(problem: Problem, start: Unknowns, stages: Stage, tolerances, optimiser: Any, limit: int, tell: bool):
+    """Search from `start` through all stages, whose numbers have a leading axis; `tell` those who are `listening`.
 
     Returns a `Searched` and, where the search has its slopes, what the data say at its end.
     """
-    return _in_turn(lambda *args: _search(*args, limit), problem, start, stages, tolerances, optimiser)
+    return _in_turn(lambda *args: _search(*args, limit, tell), problem, start, stages, tolerances, optimiser)
+
+
+# Who hears of each step; outside of the program, which is kept for the next search.
+_LISTENERS = []
+
+
+@contextmanager
+def listening(listener: Callable[[int, float], None]):
+    """While it lasts, `listener(stage, cost)` is called after each step of a search that tells."""
+    _LISTENERS.append(listener)
+    try:
+        yield
+        jax.effects_barrier()
+    finally:
+        _LISTENERS.remove(listener)
+
+
+def _heard(stage, cost):
+    for listener in _LISTENERS:
+        listener(int(stage), float(cost))
 
 
 def _in_turn(function: Callable, *args):
@@ -201,14 +225,15 @@ def _in_turn(function: Callable, *args):
     return run(jax.tree.map(jnp.asarray, live))
 
 
-def _search(problem, start, stages, tolerances, optimiser, limit):
+def _search(problem, start, stages, tolerances, optimiser, limit, tell):
     def one_stage(carried, x):
-        (y, taken), (stage, tolerance) = carried, x
+        (y, taken), (number, stage, tolerance) = carried, x
+        told = partial(jax.debug.callback, _heard, number) if tell else lambda cost: None
         solver = optimiser
         if optimiser is None:
             solver = optx.LevenbergMarquardt(tolerance, tolerance, norm=_largest_change, linear_solver=ByWindows())
         by = _minimise if isinstance(solver, optx.AbstractMinimiser) else _least_squares
-        solution = by(solver, problem, y, stage, limit)
+        solution = by(solver, problem, y, stage, limit, told)
         last = None
         if optimiser is None and problem.loss == "squares":
             # The slopes that the search has last, by free numbers, as its linear solver sees them.
@@ -218,7 +243,7 @@ def _search(problem, start, stages, tolerances, optimiser, limit):
         return (solution.value, taken + solution.stats["num_steps"]), (solution.aux, converged, last)
 
     first = Unknowns(problem.found.free(start.shared), start.own), jnp.asarray(0)
-    (y, steps), told = lax.scan(one_stage, first, (stages, tolerances))
+    (y, steps), told = lax.scan(one_stage, first, (jnp.arange(len(tolerances)), stages, tolerances))
     (cost, well), converged, last = jax.tree.map(lambda x: x[-1], told)
     u = _natural(problem, y)
     if last is not None:

@@ -7,7 +7,6 @@ import time
 import warnings
 from collections.abc import Callable, Mapping
 from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
-from contextlib import nullcontext
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -16,6 +15,7 @@ import jax
 import numpy as np
 from jaxtyping import ArrayLike
 
+from lagjax.meter import meter
 from lagjax.motion.trajectory import RESULTS
 from lagjax.numerics.one_function import TOGETHER
 from lagjax.sweeps.axes import axes_of
@@ -202,7 +202,7 @@ def _in_memory(engine, indices, before, progress):
     else:
         values, status = jax.tree.map(np.copy, before)
     done = 0
-    with _meter(len(indices), progress) as meter:
+    with _meter(len(indices), progress) as shown:
         try:
             for places, found, how in engine.over(indices):
                 at = indices[places]
@@ -211,7 +211,7 @@ def _in_memory(engine, indices, before, progress):
                 for whole, some in zip(jax.tree.leaves((values, status)), jax.tree.leaves((found, how))):
                     whole[at] = some
                 done += len(places)
-                meter.update(len(places))
+                shown.update(len(places))
         except KeyboardInterrupt:
             _tell_interrupted(done, len(indices), "swept.resweep() does the rest.")
     seconds = time.perf_counter() - started
@@ -239,7 +239,7 @@ def _in_store(engine, axes, path, part, progress):
     missing = [number for number in store.missing().tolist() if number % n == k]
     length = lambda number: min(block, axes.size - number * block)
     done = 0
-    with _meter(sum(map(length, missing)), progress) as meter:
+    with _meter(sum(map(length, missing)), progress) as shown:
         try:
             for number in missing:
                 indices = np.arange(number * block, number * block + length(number))
@@ -249,7 +249,7 @@ def _in_store(engine, axes, path, part, progress):
                         whole = jax.tree.map(lambda x: np.empty((len(indices), *x.shape[1:]), x.dtype), (found, how))
                     for every, some in zip(jax.tree.leaves(whole), jax.tree.leaves((found, how))):
                         every[places] = some
-                    meter.update(len(how.result))
+                    shown.update(len(how.result))
                 store.write(number, *whole)
                 done += len(indices)
         except KeyboardInterrupt:
@@ -336,19 +336,5 @@ def _tell_interrupted(done, total, then):
     warnings.warn(f"interrupted: {done:,} of {total:,} points are done and kept; {then}", stacklevel=4)
 
 
-class _NoMeter(nullcontext):
-    def __init__(self):
-        super().__init__(self)
-
-    def update(self, count):
-        """Nothing."""
-
-
 def _meter(total, progress):
-    try:
-        from tqdm.auto import tqdm
-    except ImportError:
-        return _NoMeter()
-    # Short sweeps show nothing, and nothing is shown where nobody looks, unless asked for.
-    disable = None if progress is None else not progress
-    return tqdm(total=total, unit=" points", unit_scale=True, delay=0.0 if progress else 1.0, disable=disable)
+    return meter(progress, total=total, unit=" points", unit_scale=True)

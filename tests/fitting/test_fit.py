@@ -33,16 +33,19 @@ def noisy(x, sigma=0.01, seed=0):
     return x + sigma * np.random.default_rng(seed).normal(size=x.shape)
 
 
-def test_finds_parameters_and_start(swinging):
-    """Without errors: parameters, start and their names, to 1e-8; without a guess of the start."""
-    found = lj.fit(pendulum, lj.Record(TS, q=swinging[0]), GUESS, free=FREE, bounds={"l": (0.0, None)})
+def test_finds_parameters_and_start(swinging, capsys):
+    """Without errors: parameters, start and their names, to 1e-8; without a guess of the start. It shows its steps."""
+    record = lj.Record(TS, q=swinging[0])
+    found = lj.fit(pendulum, record, GUESS, free=FREE, bounds={"l": (0.0, None)}, progress=True)
+    shown = capsys.readouterr().err
+    assert f"{int(found.steps)} steps" in shown and "stage 3 of 3, cost" in shown
     assert bool(found.converged) and found.names == ("c", "l")
     np.testing.assert_allclose(found.values, [0.05, 1.25], rtol=1e-8)
     np.testing.assert_allclose([found.q0[0], found.v0[0]], [1.0, 0.0], atol=1e-8)
     assert found.params["l"] == found.values[1] and found.params["m"] == 1.0
     # Twin: another friction law does not fit.
-    stuck = lj.fit(pendulum, lj.Record(TS, q=swinging[0]), GUESS | {"c": 0.2}, free=["l"], bounds={"l": (0.0, None)})
-    assert stuck.rms()["q"] > 1e-2
+    stuck = lj.fit(pendulum, record, GUESS | {"c": 0.2}, free=["l"], bounds={"l": (0.0, None)})
+    assert stuck.rms()["q"] > 1e-2 and not capsys.readouterr().err
 
 
 def test_against_scipy(swinging):

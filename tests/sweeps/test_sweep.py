@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import lagjax as lj
+from lagjax.meter import Silent
 from lagjax.motion.reported import reporting
 from lagjax.sweeps import engine
 
@@ -200,7 +201,7 @@ def test_repr_and_pictures():
 def test_interrupted(monkeypatch):
     """Ctrl-C keeps what is done, and `resweep` does the rest."""
 
-    class Impatient(engine._NoMeter):
+    class Impatient(Silent):
         def update(self, count):
             raise KeyboardInterrupt
 
