@@ -1,4 +1,4 @@
-"""Write the README's table of speeds from `benchmarks/results/`.
+"""Write the README's tables, of errors and run times and of speeds, from `benchmarks/results/`.
 
 python benchmarks/quote.py
 """
@@ -8,7 +8,16 @@ from pathlib import Path
 
 HERE = Path(__file__).parent
 README = HERE.parent / "README.md"
-BEGIN, END = "<!-- speed -->\n", "<!-- end of speed -->"
+# Motions in `work_precision.json`, and what the README calls them.
+MOTIONS = {
+    "sphere_geodesic, embedded": "great circle on a sphere, in space, 1 multiplier",
+    "rolling_hoop": "hoop rolling off a cylinder, 2 multipliers",
+    "bead_on_hoop": "bead on a rotating hoop",
+    "mass_distributions, helix": "orbit in the field of a helix of mass",
+    "cross_rails, rotating": "carriage on rotating cross-rails",
+    "Cartesian pendulum": "pendulum on a rod, 1 multiplier",
+}
+ERRORS = ("1e-04", "1e-06", "1e-08", "1e-10")
 # File of results, row in it, and what the README calls it.
 QUOTED = [
     ("against_peers", "bead: lagjax / numba Dopri8", "bead on a hoop, 100 periods / numba, written by hand"),
@@ -34,21 +43,38 @@ QUOTED = [
 ]
 
 
-def table() -> str:
-    """The table, of the rows that there are."""
+def accuracy() -> str:
+    """The table of run times by error."""
+    times = {row["what"]: row["default ms"] for row in rows("work_precision")}
+    lines = [f"| ms to an error of | {' | '.join(ERRORS)} |", "|---" * (len(ERRORS) + 1) + "|"]
+    for motion, name in MOTIONS.items():
+        took = [f"{times[f'{motion}, error {error}']:.2g}" for error in ERRORS]
+        lines.append(f"| {name} | {' | '.join(took)} |")
+    return "\n".join(lines) + "\n"
+
+
+def speed() -> str:
+    """The table of speeds."""
     lines = ["| what | ratio | target | |", "|---|---|---|---|"]
     for file, what, name in QUOTED:
-        rows = {row["what"]: row for row in json.loads((HERE / "results" / f"{file}.json").read_text())["rows"]}
-        row = rows[what]
+        row = next(row for row in rows(file) if row["what"] == what)
         target = "" if row["target"] is None else f"{'≤' if row['better'] == 'less' else '≥'} {row['target']:.2g}"
         lines.append(f"| {name} | {row['value']:.2g} | {target} | {'' if row['met'] in (None, True) else 'missed'} |")
     return "\n".join(lines) + "\n"
 
 
+def rows(file: str) -> list[dict]:
+    """The rows of one file of results."""
+    return json.loads((HERE / "results" / f"{file}.json").read_text())["rows"]
+
+
 def quoted(readme: str) -> str:
-    """The README with the table in its place."""
-    before, rest = readme.split(BEGIN)
-    return before + BEGIN + table() + END + rest.split(END)[1]
+    """The README with the tables in their places."""
+    for name, table in (("accuracy", accuracy()), ("speed", speed())):
+        begin, end = f"<!-- {name} -->\n", f"<!-- end of {name} -->"
+        before, rest = readme.split(begin)
+        readme = before + begin + table + end + rest.split(end)[1]
+    return readme
 
 
 if __name__ == "__main__":

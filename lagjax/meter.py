@@ -19,7 +19,7 @@ class Silent(nullcontext):
 
 
 def meter(progress: bool | None, **settings):
-    """A context that takes `update(count)`; `settings` are those of tqdm. `progress` None: shown where somebody looks."""
+    """A context that takes `update(count)`; `settings` go to tqdm. `progress` None: shown where somebody looks."""
     try:
         from tqdm.auto import tqdm
     except ImportError:
