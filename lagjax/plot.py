@@ -190,13 +190,16 @@ def maps(axes: dict[str, np.ndarray], panels: dict[str, np.ndarray]):
     fig, grid = figure(len(panels), len(columns), size=(4.2, 3.2), sharex=True, sharey=True)
     for row, (name, values) in zip(grid, panels.items()):
         low, high = np.nanmin(values), np.nanmax(values)
-        for axis, (title, i) in zip(row, columns):
+        shown = [
+            axis.pcolormesh(x, y, values[i], cmap="cividis", vmin=low, vmax=high, shading="nearest")
+            for axis, (_, i) in zip(row, columns)
+        ]
+        for axis, (title, _) in zip(row, columns):
             axis.set_facecolor("#bbbbbb")
-            shown = axis.pcolormesh(x, y, values[i], cmap="cividis", vmin=low, vmax=high, shading="nearest")
             axis.set_title(title, fontsize=9)
             axis.grid(False)
         row[0].set_ylabel(down)
-        fig.colorbar(shown, ax=list(row), label=name)
+        fig.colorbar(shown[0], ax=list(row), label=name)
     for axis in grid[-1]:
         axis.set_xlabel(across)
     return fig

@@ -117,7 +117,7 @@ def test_a_wrong_derivative_is_found():
     """The derivative by the frequency counts: right it is accurate, twin: a reference that ignores ω is found out."""
     by_frequency = replace(fixed(0.25), along=(0.0, 0.0, {"omega": 1.0}))
     right = by_frequency.attempt()
-    assert right.verdict == ACCURATE and right.gradient < 1e-6
+    assert right.verdict == ACCURATE and right.gradient is not None and right.gradient < 1e-6
     ignorant = lambda q0, v0, params, ts: oscillator.exact(q0, v0, jax.lax.stop_gradient(params), ts)
     wrong = replace(by_frequency, exact=ignorant).attempt()
     assert wrong.verdict == SILENTLY_WRONG and wrong.error == right.error

@@ -110,9 +110,10 @@ def starts(
         here = np.flatnonzero(windows.record == r)
         first = _guess(system, record, r, params_of(r))
         guesses.append(first)
-        later = [_read_off(record, windows.sample[w][windows.real[w]]) for w in here[1:]]
+        read = [_read_off(record, windows.sample[w][windows.real[w]]) for w in here[1:]]
         structure = jax.tree.structure(first.q)
-        if any(found is None or jax.tree.structure(found[0]) != structure for found in later):
+        later = [found for found in read if found is not None and jax.tree.structure(found[0]) == structure]
+        if len(later) < len(read):
             later = _along_the_motion(system, first, windows.ts[here, 0], options)
         for w, (q, v) in zip(here[1:], later):
             guesses.append(_concrete(lambda w=w, q=q, v=v: coordinates.state(windows.ts[w, 0], q, v, first.params)))

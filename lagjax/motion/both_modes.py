@@ -11,7 +11,7 @@ Second derivatives work forward over forward (`jacfwd` of `jacfwd`).
 """
 
 from collections.abc import Callable
-from functools import partial
+from functools import partial, reduce
 
 import diffrax
 import equinox as eqx
@@ -125,7 +125,8 @@ def _pull_by_pushing(x, fixed, wanted, cotangents, **params):
         for a, w, start in zip(x, wanted, starts)
     ]
     dy = _tangent_p.bind(*x, *fixed, *axes, many=True, **params)
-    slopes = sum(jnp.sum((d * ct[None]).reshape(total, -1), axis=1) for d, ct in zip(dy, cotangents))
+    of_outputs = [jnp.sum((d * ct[None]).reshape(total, -1), axis=1) for d, ct in zip(dy, cotangents)]
+    slopes = reduce(jnp.add, of_outputs)
     return [slopes[i : i + n].reshape(a.shape).astype(a.dtype) for i, n, a, w in zip(starts, sizes, x, wanted) if w]
 
 

@@ -135,12 +135,13 @@ def _solve_in_numbers(system, q0, v0, params, ts, settings, adjoint):
 
 def _solve(system, q0, v0, params, ts, settings, adjoint, written):
     off_constraints = _off_constraints(system, ts[0], q0, v0, params, settings)
+    projected = None
     if settings.drift == "project":
         projected = to_manifold(system, ts[0], q0, v0, params, settings.rtol, settings.atol)
         q0, v0 = projected.q, projected.v
     start = stopped(verdict(system, ts[0], q0, v0, params))
     finite, singular, contradictory = start.finite, start.singular, start.contradictory
-    if settings.drift == "project":
+    if projected is not None:
         off_constraints = off_constraints | (finite & ~singular & ~projected.holds)
     too_small = settings.rtol[0] < ROUND_OFFS * jnp.finfo(ts.dtype).eps if settings.controller is None else False
     backwards = jnp.any(ts[1:] < ts[:-1])
@@ -152,9 +153,10 @@ def _solve(system, q0, v0, params, ts, settings, adjoint, written):
     quick = None
     if written is not None and settings.drift != "baumgarte":
         field = WrittenField(written.equations, written.equations.prepare(system, params))
-        prepared = written.project.prepare(system, params) if written.project else ()
+        project = written.project if settings.drift == "project" else None
+        prepared = () if project is None else project.prepare(system, params)
         stages = settings.method if written.equations.length <= UNROLL_UP_TO else _in_a_loop(settings.method, adjoint)
-        quick = Quick(stages, diffrax.ODETerm(field), written.project, prepared, written.careful)
+        quick = Quick(stages, diffrax.ODETerm(field), project, prepared, written.careful)
     # BacksolveAdjoint integrates a larger state backwards: it takes the bare method, and no end beside the outputs.
     bare = isinstance(adjoint, diffrax.BacksolveAdjoint)
     settings = eqx.tree_at(lambda s: s.method, settings, _with_root_finder(settings))

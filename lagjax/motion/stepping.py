@@ -7,7 +7,7 @@ Dopri8's is of order six) and satisfy the constraints, for one step's cost an ou
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import diffrax
 import equinox as eqx
@@ -53,7 +53,10 @@ class Stages(NamedTuple):
 
 
 class Quick(eqx.Module):
-    """A step on equations that are written out, which may give NaN where the careful one does not."""
+    """A step on equations that are written out, which may give NaN where the careful one does not.
+
+    `project` is None where a step is not returned to constraints.
+    """
 
     solver: diffrax.AbstractSolver
     terms: PyTree[diffrax.AbstractTerm]
@@ -96,17 +99,18 @@ class OnManifold(diffrax.AbstractWrappedSolver):
     def term_compatible_contr_kwargs(self):
         return self.solver.term_compatible_contr_kwargs
 
+    # diffrax asks for the next three only where the wrapped solver is of the kind that has them.
     @property
     def scan_kind(self):
-        return self.solver.scan_kind
+        return cast(diffrax.AbstractRungeKutta, self.solver).scan_kind
 
     @property
     def root_finder(self):
-        return self.solver.root_finder
+        return cast(diffrax.AbstractImplicitSolver, self.solver).root_finder
 
     @property
     def root_find_max_steps(self):
-        return self.solver.root_find_max_steps
+        return cast(diffrax.AbstractImplicitSolver, self.solver).root_find_max_steps
 
     @property
     def interpolation_cls(self) -> Callable:
@@ -158,11 +162,11 @@ class OnManifold(diffrax.AbstractWrappedSolver):
     # Jitted, so that it is traced once: diffrax traces the body of its loop three times.
     @eqx.filter_jit
     def _quick_step(self, t0, t1, y0, args, solver_state, made_jump):
-        quick, project = self.quick, self.project
+        quick = self.quick
         assert quick is not None
-        jumped = True if project else made_jump
+        jumped = made_jump if quick.project is None else True
         y1, error, _, solver_state, result = quick.solver.step(quick.terms, t0, t1, y0, args, solver_state, jumped)
-        if project:
+        if quick.project is not None:
             y1 = called(quick.project.at(quick.prepared, t1, *y1))
         if self.weigh:
             error = self._weighed(y0, y1, error)

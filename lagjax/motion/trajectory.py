@@ -19,7 +19,8 @@ from lagjax.motion import frames
 from lagjax.motion.consistency import worst_residual
 
 
-class RESULTS(diffrax.RESULTS):
+# For checkers equinox's enumerations are Python's, of which none can have more items than its parent.
+class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
     """How an integration ended: diffrax's results, and a start that could not be integrated."""
 
     start_off_constraints = "The initial state does not satisfy the constraints."

@@ -49,10 +49,9 @@ def order(pattern: Bool[np.ndarray, "m m"]) -> Order:
     left, rows = set(range(len(pattern))), []
     while left:
         # The end of a longest path begins a part: walk to a farthest row, and from there once more.
-        start = min(left, key=lambda i: (degree[i], i))
-        for _ in range(3):
-            part = _outwards(start, neighbours, degree)
-            start = part[-1]
+        part = _outwards(min(left, key=lambda i: (degree[i], i)), neighbours, degree)
+        for _ in range(2):
+            part = _outwards(part[-1], neighbours, degree)
         rows += part
         left -= set(part)
     rows = np.array(rows, int)

@@ -49,12 +49,12 @@ class Nystrom(diffrax.AbstractAdaptiveSolver):
     suits large ones; otherwise it is copied to each.
     """
 
-    in_a_loop: bool = eqx.field(default=False, static=True)
-
     tableau: AbstractClassVar[NystromTableau]
     highest: AbstractClassVar[int]
     embedded: AbstractClassVar[int]
     term_structure: ClassVar = diffrax.AbstractTerm
+
+    in_a_loop: bool = eqx.field(default=False, static=True)
 
     @property
     def interpolation_cls(self) -> Callable:

@@ -3,6 +3,8 @@
 from collections.abc import Callable, Iterable, Sequence
 
 import jax.numpy as jnp
+import numpy as np
+from jax.core import ShapedArray
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, jaxpr_as_fun
 
 
@@ -40,6 +42,13 @@ def length(jaxpr: Jaxpr) -> int:
 def variables(equation) -> list:
     """The distinct operands of an equation that are not written in it."""
     return list(dict.fromkeys(x for x in equation.invars if not isinstance(x, Literal)))
+
+
+def written(literal: Literal) -> np.ndarray:
+    """The number that stands in a program in place of a variable, in the dtype that it has there."""
+    # To JAX an operand may be no array at all; such a one is never written down.
+    assert isinstance(literal.aval, ShapedArray)
+    return np.asarray(literal.val, literal.aval.dtype)
 
 
 def evaluate(jaxpr: Jaxpr, equation, values) -> list:
@@ -103,7 +112,7 @@ def staged(program: ClosedJaxpr, first: Sequence[int], then: Sequence[int]):
             else:
                 results = evaluate(jaxpr, equation, values)
             values.update(zip(equation.outvars, results))
-        return [jnp.asarray(x.val, x.aval.dtype) if isinstance(x, Literal) else values[x] for x in jaxpr.outvars]
+        return [jnp.asarray(written(x)) if isinstance(x, Literal) else values[x] for x in jaxpr.outvars]
 
     return at_first, afterwards
 

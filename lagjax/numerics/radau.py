@@ -55,7 +55,7 @@ def _real_and_complex(matrix):
     """Eigenvalues, right and left eigenvectors of a real 3 x 3 matrix: of the real one, and of one of the pair."""
     values, right = np.linalg.eig(matrix)
     left = np.linalg.inv(right)
-    real, pair = np.argmin(np.abs(values.imag)), np.argmax(values.imag)
+    real, pair = np.argmin(np.abs(np.imag(values))), np.argmax(np.imag(values))
     # The scale of an eigenvector is free; that of the real one is chosen real.
     phase = right[0, real] / abs(right[0, real])
     as_real = values[real].real, (right[:, real] / phase).real, (left[real] * phase).real

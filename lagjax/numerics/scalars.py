@@ -18,7 +18,7 @@ from jax.core import Tracer
 from jax.extend.core import ClosedJaxpr, Literal
 
 from lagjax.numerics.elementary import sincos_in_lanes
-from lagjax.numerics.programs import evaluate
+from lagjax.numerics.programs import evaluate, written
 
 LARGE = 512
 ELEMENTWISE = {
@@ -96,7 +96,7 @@ def _evaluate(closed, args, pairs):
 
     def read(x):
         if isinstance(x, Literal):
-            return _known(np.asarray(x.val, x.aval.dtype))
+            return _known(written(x))
         return values[x]
 
     for equation in jaxpr.eqns:
@@ -189,7 +189,7 @@ def _add(x, y):
     if _is(y, 0):
         return x
     if isinstance(x, np.generic) and isinstance(y, np.generic):
-        return x + y
+        return np.add(x, y)
     return jax.lax.add(*_arrays(x, y))
 
 
@@ -202,12 +202,12 @@ def _multiply(x, y):
         if _is(a, -1):
             return _negative(b)
     if isinstance(x, np.generic) and isinstance(y, np.generic):
-        return x * y
+        return np.multiply(x, y)
     return jax.lax.mul(*_arrays(x, y))
 
 
 def _negative(x):
-    return -x if isinstance(x, np.generic) else jax.lax.neg(x)
+    return np.negative(x) if isinstance(x, np.generic) else jax.lax.neg(x)
 
 
 def _arrays(x, y):

@@ -141,7 +141,9 @@ class Trial:
         if self.exact is None:
             return self._outcome(effort=steps, residual=residual, said=said)
         error = relative_error(self.observed(trajectory), self.exact(*self._exactly()))
-        return self._outcome(effort=steps, error=error, residual=residual, said=said, gradient=self._gradient_error())
+        return self._outcome(
+            effort=steps, error=error, residual=residual, said=said, gradient=self._gradient_error(self.exact)
+        )
 
     def _options(self):
         return {"rtol": self.tolerance, "atol": self.tolerance, "method": self.method, **self.options}
@@ -158,19 +160,19 @@ class Trial:
         ts = np.asarray(self.ts).astype(start.t.dtype)
         return jax.tree.map(lambda x: jnp.asarray(x, float), (start.q, start.v, start.params, ts))
 
-    def _gradient_error(self):
+    def _gradient_error(self, exact):
         if self.along is None:
             return None
         *exactly, ts = self._exactly()
         tangents = jax.tree.map(lambda x, dx: jnp.broadcast_to(jnp.asarray(dx, float), x.shape), exactly, [*self.along])
-        exact = jax.jvp(lambda *x: self.exact(*x, ts), tuple(exactly), tuple(tangents))[1]
+        wanted = jax.jvp(lambda *x: exact(*x, ts), tuple(exactly), tuple(tangents))[1]
         start = coordinates.state(self.ts[0], self.q0, self.v0, self.params)
         point, dtype = [start.q, start.v, start.params], start.t.dtype
         tangents = jax.tree.map(lambda x, dx: dx.astype(x.dtype), point, tangents)
         as_array = lambda x: np.asarray(x, dtype) if isinstance(x, (float, np.ndarray)) else x
         options = jax.tree.map(as_array, self._options())
         got = _derivative(self.system, point, tangents, np.asarray(self.ts, dtype), options, self.observed)
-        return relative_error(_gathered(got), _gathered(exact))
+        return relative_error(_gathered(got), _gathered(wanted))
 
 
 @eqx.filter_jit

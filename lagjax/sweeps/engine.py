@@ -194,13 +194,7 @@ class _Engine:
 
 def _in_memory(engine, indices, before, progress):
     started, axes = time.perf_counter(), engine.axes
-    if before is None:
-        nothing = lambda x: np.nan if np.issubdtype(x.dtype, np.inexact) else 0
-        values = jax.tree.map(lambda x: np.full((axes.size, *x.shape), nothing(x), x.dtype), engine.program.values)
-        fills = (NOT_RUN, 0, np.nan, np.nan)
-        status = Status(*(np.full(axes.size, fill, dtype) for fill, dtype in zip(fills, STATUS_TYPES)))
-    else:
-        values, status = jax.tree.map(np.copy, before)
+    values, status = _not_run(engine.program, axes.size) if before is None else jax.tree.map(np.copy, before)
     done = 0
     with _meter(len(indices), progress) as shown:
         try:
@@ -231,6 +225,14 @@ def _in_memory(engine, indices, before, progress):
     return Sweep(axes, values, status, engine.words, done, seconds, again)
 
 
+def _not_run(program, count):
+    """Room for the values and statuses of some points: NaN, or 0 in numbers that have none."""
+    nothing = lambda x: np.nan if np.issubdtype(x.dtype, np.inexact) else 0
+    values = jax.tree.map(lambda x: np.full((count, *x.shape), nothing(x), x.dtype), program.values)
+    fills = (NOT_RUN, 0, np.nan, np.nan)
+    return values, Status(*(np.full(count, fill, dtype) for fill, dtype in zip(fills, STATUS_TYPES)))
+
+
 def _in_store(engine, axes, path, part, progress):
     started = time.perf_counter()
     block = None if Path(path).exists() else _block(engine, axes, part)
@@ -243,14 +245,12 @@ def _in_store(engine, axes, path, part, progress):
         try:
             for number in missing:
                 indices = np.arange(number * block, number * block + length(number))
-                whole = None
+                values, status = _not_run(engine.program, len(indices))
                 for places, found, how in engine.over(indices):
-                    if whole is None:
-                        whole = jax.tree.map(lambda x: np.empty((len(indices), *x.shape[1:]), x.dtype), (found, how))
-                    for every, some in zip(jax.tree.leaves(whole), jax.tree.leaves((found, how))):
-                        every[places] = some
-                    shown.update(len(how.result))
-                store.write(number, *whole)
+                    for whole, some in zip(jax.tree.leaves((values, status)), jax.tree.leaves((found, how))):
+                        whole[places] = some
+                    shown.update(len(places))
+                store.write(number, values, status)
                 done += len(indices)
         except KeyboardInterrupt:
             _tell_interrupted(done, sum(map(length, missing)), "the same call goes on from there.")

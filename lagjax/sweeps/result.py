@@ -25,7 +25,7 @@ class Sweep:
     """
 
     def __init__(
-        self, axes: Axes, values: PyTree | Callable, status: Status, how: str, ran: int, seconds: float, again: Callable
+        self, axes: Axes, values: "PyTree | Stored", status: Status, how: str, ran: int, seconds: float, again: Callable
     ):
         self.axes = axes
         self.status = Status(*(x.reshape(axes.shape) for x in status))
@@ -40,7 +40,7 @@ class Sweep:
     @property
     def values(self) -> PyTree:
         """What `run` returned, each leaf with the axes in front."""
-        flat = self._values() if callable(self._values) else self._values
+        flat = self._values() if isinstance(self._values, Stored) else self._values
         return jax.tree.map(lambda x: x.reshape(self.axes.shape + x.shape[1:]), flat)
 
     @property
@@ -179,7 +179,7 @@ class Sweep:
 
     def _shapes(self):
         shown = []
-        leaves = self._values.like if callable(self._values) else jax.tree.map(lambda x: x[0], self._values)
+        leaves = self._values.like if isinstance(self._values, Stored) else jax.tree.map(lambda x: x[0], self._values)
         is_trajectory = lambda x: isinstance(x, Trajectory)
         for path, part in jax.tree_util.tree_leaves_with_path(leaves, is_leaf=is_trajectory):
             name = jax.tree_util.keystr(path, simple=True, separator=".")

@@ -170,7 +170,9 @@ def _differences(there, here, under=""):
             found += _differences(a, b, f"{name} ")
         elif name == "program" and a != b:
             found.append("run is another function")
-        elif a != b and under == "axes " and a and b and a.split()[0] == b.split()[0]:
+        elif (
+            a != b and under == "axes " and isinstance(a, str) and isinstance(b, str) and a.split()[:1] == b.split()[:1]
+        ):
             found.append(f"axis '{key}' has other values")
         elif a != b:
             found.append(f"{name}: {a} there, {b} here")

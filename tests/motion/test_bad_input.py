@@ -101,6 +101,7 @@ def test_missing_velocity():
 def test_constraint_without_a_derivative():
     """A constraint that is a square has no derivative where it holds: named, and not taken for a redundant one."""
     rod = rod_pendulum.constraints["rod"]
+    assert isinstance(rod, lj.Holonomic)
     squared = lj.Holonomic(lambda t, q, params: rod.g(t, q, params) ** 2)
     system = lj.System(rod_pendulum.lagrangian, {"rod": rod, "squared": squared})
     with refusal(ValueError, "constraint 'squared' does not act independently"):

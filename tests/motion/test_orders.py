@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 import pytest
+from jax.flatten_util import ravel_pytree
 
 import lagjax as lj
 from lagjax.numerics.simplified_newton import SimplifiedNewton
@@ -187,11 +188,11 @@ def test_gradients_through_a_thousand_constrained_steps():
             double_rods, q0, v0, x["params"], ts=np.array([0.0, 8.0]), method=diffrax.Tsit5(), dt0=jnp.asarray(0.008),
             stepsize_controller=diffrax.ConstantStepSize(), max_steps=1024, throw=False,
         )  # fmt: skip
-        final = jax.flatten_util.ravel_pytree((traj.end.q, traj.end.v, traj.end.multipliers))[0]
+        final = ravel_pytree((traj.end.q, traj.end.v, traj.end.multipliers))[0]
         return final, traj.stats["num_accepted_steps"]
 
     angles, rates = DOUBLE_SWING
-    x, unflatten = jax.flatten_util.ravel_pytree({"angles": angles, "rates": rates, "params": DOUBLE_PARAMS})
+    x, unflatten = ravel_pytree({"angles": angles, "rates": rates, "params": DOUBLE_PARAMS})
     final = jax.jit(lambda x: outcome(unflatten(x)))
     assert int(final(x)[1]) in (1000, 1001)
     forward, reverse = (jax.jit(jac(lambda x: final(x)[0]))(x) for jac in (jax.jacfwd, jax.jacrev))

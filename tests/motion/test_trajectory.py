@@ -68,7 +68,7 @@ def test_phase_portrait_of_a_rotation_stays_in_a_turn():
     spin = lj.integrate(pendulum, 1.0, 9.0, PARAMS, ts=np.linspace(0.0, 3.0, 101))
     assert float(np.ptp(spin.q)) > 2 * 2 * np.pi
     (axis,) = spin.phase_portrait().axes
-    x, y = axis.lines[0].get_data()
+    x, y = map(np.asarray, axis.lines[0].get_data())
     assert np.nanmax(np.abs(x)) <= np.pi and np.nanmax(x) == np.pi and np.nanmin(x) == -np.pi
     assert np.isnan(x).sum() == int(np.ptp(np.floor((np.asarray(spin.q) + np.pi) / (2 * np.pi))))
     # On the cut the curve is still an orbit: ½ v² - (g/l) cos q is that of the start, to the outputs' distance.
@@ -88,9 +88,9 @@ def test_phase_portrait_has_a_panel_a_coordinate(traj):
     np.testing.assert_array_equal(axes[1].lines[0].get_data(), [traj.q["y"], traj.v["y"]])
     free = lj.System(lambda t, q, v, params: 0.5 * v**2)
     far = lj.integrate(free, 0.0, 100.0, ts=TS).phase_portrait().axes[0]
-    assert far.lines[0].get_xdata()[-1] == 100.0 and "π" not in far.get_xticklabels()[0].get_text()
+    assert np.asarray(far.lines[0].get_xdata())[-1] == 100.0 and "π" not in far.get_xticklabels()[0].get_text()
     batch = jax.vmap(lambda q0: lj.integrate(pendulum, q0, 0.0, PARAMS, ts=TS))(np.array([0.5, 1.0]))
-    starts = [line.get_xdata()[0] for line in batch.phase_portrait().axes[0].lines[::2]]
+    starts = [np.asarray(line.get_xdata())[0] for line in batch.phase_portrait().axes[0].lines[::2]]
     assert starts == [0.5, 1.0]
 
 

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax import lax
+from jax.extend.core import jaxpr_as_fun
 
 from lagjax.numerics.programs import needed, staged
 from lagjax.numerics.scalars import written_out
@@ -56,7 +57,7 @@ def test_same_values_and_derivatives(name):
     """The written-out program is the program, and so is its derivative."""
     function = FUNCTIONS[name]
     program = numbers(function, X)
-    out = lambda x: jax.core.eval_jaxpr(program.jaxpr, program.consts, x)[0]
+    out = lambda x: jaxpr_as_fun(program)(x)[0]
     np.testing.assert_allclose(out(X), function(X), rtol=1e-14, atol=1e-15)
     np.testing.assert_allclose(jax.jacfwd(out)(X), jax.jacfwd(function)(X), rtol=1e-13, atol=1e-14)
 

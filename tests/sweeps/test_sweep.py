@@ -1,6 +1,7 @@
 """Sweeps against loops: values, gradients, steps, statuses; what they print, draw and export."""
 
 import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -196,6 +197,22 @@ def test_repr_and_pictures():
     assert len(three.plot().axes) == 4
     with pytest.raises(ValueError, match=r"no value with one number a point; a point has 'q' \(4,\)"):
         quiet(lambda point: {"q": point["g"] * TS}).plot()
+
+
+class Spring(eqx.Module):
+    """A result that is a function as well, as a trained network is."""
+
+    k: jax.Array
+
+    def __call__(self, x):
+        return -self.k * x
+
+
+def test_what_run_returns_may_be_a_function():
+    """A module that can be called is a pytree as any other."""
+    swept = quiet(lambda point: Spring(point["g"]), {"g": AXES["g"]})
+    np.testing.assert_array_equal(swept.values(1.0), -AXES["g"])
+    assert "k float64" in repr(swept)
 
 
 def test_interrupted(monkeypatch):
