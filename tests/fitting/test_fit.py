@@ -1,7 +1,5 @@
 """What a fit finds, and what it says of what it cannot find."""
 
-from functools import partial
-
 import diffrax
 import jax
 import jax.numpy as jnp
@@ -216,35 +214,24 @@ def problem(case, measured, **options):
     return problem_of(case.system, record, case.guess(), sorted(case.free), None, None, None, "squares", None, options)
 
 
-def departure(**options):
-    """The arrays of a fit to the time at which the hoop leaves the cylinder."""
-    q0, v0 = rolling_hoop.start(rolling_hoop.PARAMS, 1.3)
-    record = lj.Record(np.array([0.0, 3.0]), end={"t": np.asarray(1.0)}, q0=q0, v0=v0, sigma=0.1)
-    options = {"event": rolling_hoop.DEPARTURE} | options
-    free = ["R", "a", "beta", "g"]
-    return problem_of(rolling_hoop.system, record, rolling_hoop.PARAMS, free, *[None] * 3, "squares", None, options)
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["pendulum", "pendulum on a rod", "rolling hoop", "departure"])
+@pytest.mark.parametrize("name", ["pendulum", "pendulum on a rod", "rolling hoop"])
 def test_slopes_three_ways(name):
-    """Slopes of all residuals, multipliers and a time of departure among them: forward, reverse, differences."""
-    case = CASES.get(name)
-    of = departure if case is None else partial(problem, case, case.measured(case.truth()))
-    u = of().start
+    """Slopes of all residuals, measured multipliers among them: forward, reverse, and by differences.
+
+    Steps do not depend on what is varied, so that what is differenced is smooth. Times of events: see the rolling hoop.
+    """
+    case = CASES[name]
+    fixed = {"stepsize_controller": diffrax.ConstantStepSize(), "dt0": np.asarray(0.01)}
+    p = problem(case, case.measured(case.truth()), **fixed)
+    u = p.start
     flat, back = ravel_pytree(u)
-
-    def slopes_and_rows(p):
-        slopes = linearised(p, u, WHOLE, "squares").slopes
-        forward = np.concatenate([slopes.rows_by_shared[0], slopes.rows_by_own[0]], axis=1)
-        return forward, lambda x: equations(p, back(x), WHOLE).rows[0]
-
-    forward, rows = slopes_and_rows(of())
+    slopes = linearised(p, u, WHOLE, "squares").slopes
+    forward = np.concatenate([slopes.rows_by_shared[0], slopes.rows_by_own[0]], axis=1)
+    rows = lambda x: equations(p, back(x), WHOLE).rows[0]
     direction = np.random.default_rng(0).normal(size=forward.shape[0])
     pulled = jax.jit(jax.grad(lambda x: direction @ rows(x)))(flat)
-    np.testing.assert_allclose(pulled, direction @ forward, rtol=1e-7, atol=1e-6 * np.max(np.abs(direction @ forward)))
-    # Steps that do not depend on what is varied: what is differenced is smooth.
-    forward, rows = slopes_and_rows(of(stepsize_controller=diffrax.ConstantStepSize(), dt0=np.asarray(0.01)))
+    np.testing.assert_allclose(pulled, direction @ forward, rtol=1e-9, atol=1e-9 * np.max(np.abs(direction @ forward)))
     at = jax.jit(rows)
     for i in range(len(flat)):
         step = np.zeros(len(flat))
