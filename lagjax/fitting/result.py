@@ -1,6 +1,7 @@
 """The answer of a fit: estimates, how certain they are, and whether the residuals look like measurement errors."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -27,6 +28,15 @@ AT_BOUND = 1e-6
 
 class FitWarning(UserWarning):
     """A fit has an answer, and there is something to know about it."""
+
+
+class Channel(NamedTuple):
+    """A kind of measurement: its name, times (T,) (None for ends), what was measured and residuals, (T, ...)."""
+
+    name: str
+    t: np.ndarray | None
+    measured: np.ndarray
+    residuals: np.ndarray
 
 
 class Fit(eqx.Module):
@@ -177,7 +187,7 @@ class Fit(eqx.Module):
 
         Of all records one after the other, or of one.
         """
-        return {name: r for name, _, r in self._channels(record)}
+        return {channel.name: channel.residuals for channel in self._channels(record)}
 
     def rms(self, record: int | None = None) -> dict[str, float]:
         """The root mean square of the residuals by channel, in the data's unit."""
@@ -191,22 +201,22 @@ class Fit(eqx.Module):
             found[name] = float(np.nanmean(r[1:] * r[:-1])) if len(r) > 1 else np.nan
         return found
 
-    def _channels(self, record=None):
-        """(name, times, residuals) of each channel."""
+    def _channels(self, record: int | None = None) -> Iterator[Channel]:
         windows, at = self.problem.windows, 0
         chosen = np.asarray(windows.record) == (np.asarray(windows.record) if record is None else record)
+        real = np.asarray(windows.real)[chosen]
         for kind, tree in self.problem.measured.items():
             sigmas = jax.tree.leaves(self.problem.sigma[kind])
             for (path, x), sigma in zip(jax.tree_util.tree_leaves_with_path(tree), sigmas):
-                size = int(np.prod(x.shape[1:]))
+                x, size = np.asarray(x), int(np.prod(x.shape[1:]))
                 r = np.asarray(self._seen().rows[:, at : at + size]).reshape(x.shape) * np.asarray(sigma)
-                r = np.where(np.isfinite(np.asarray(x)), r, np.nan)
+                r = np.where(np.isfinite(x), r, np.nan)
                 at += size
                 if kind == "end":
-                    yield channel_name(kind, path), None, r[chosen]
+                    yield Channel(channel_name(kind, path), None, x[chosen], r[chosen])
                 else:
-                    real = np.asarray(windows.real)[chosen]
-                    yield channel_name(kind, path), np.asarray(windows.ts)[chosen][real], r[chosen][real]
+                    t = np.asarray(windows.ts)[chosen][real]
+                    yield Channel(channel_name(kind, path), t, x[chosen][real], r[chosen][real])
 
     @property
     def sampling(self) -> dict[str, Array]:
@@ -279,17 +289,7 @@ class Fit(eqx.Module):
 
     def plot(self, record: int = 0):
         """Draw data, fit and residuals of a record, a row each channel; returns a matplotlib `Figure`."""
-        measured = dict(self._measured(record))
-        return plot.fits({name: (t, measured[name], r) for name, t, r in self._channels(record) if t is not None})
-
-    def _measured(self, record):
-        windows = self.problem.windows
-        chosen = np.asarray(windows.record) == record
-        real = np.asarray(windows.real)[chosen]
-        for kind, tree in self.problem.measured.items():
-            for path, x in jax.tree_util.tree_leaves_with_path(tree):
-                if kind != "end":
-                    yield channel_name(kind, path), np.asarray(x)[chosen][real]
+        return plot.fits({name: rest for name, *rest in self._channels(record) if rest[0] is not None})
 
     def __repr__(self):
         if coordinates.is_traced(self.cost):
