@@ -31,6 +31,7 @@ def test_broken_systems_are_reported_and_healthy_ones_are_not():
     assert row["worst"] < 1
 
 
+@pytest.mark.slow
 def test_silence_and_false_alarms_are_caught():
     """With broken and healthy exchanged every verdict turns: silence on the one side, alarm on the other."""
 

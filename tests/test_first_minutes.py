@@ -118,6 +118,8 @@ MISTAKES = {
         lambda: constrained(lambda t, q, params: q["x"] * jnp.eye(2)), VALUE, "'rod'", r"\(2, 2\)", "jnp.stack"),
     "a tuple of constraints": (
         lambda: constrained(lambda t, q, params: (q["x"], q["y"])), VALUE, "'rod'", "a tuple", "jnp.stack"),
+    "a constraint without an equation": (
+        lambda: constrained(lambda t, q, params: q["x"] * jnp.zeros(0)), VALUE, "'rod'", "no equation at all"),
     "an equation for a residual": (
         lambda: constrained(lambda t, q, params: q["x"] == 1.0), VALUE, "'rod'", "returned bool", r"- l\*\*2"),
     "a constraint of the velocity": (

@@ -88,6 +88,8 @@ def _check_constraint(call, given):
             "Usual cause: several equations in a tuple or a matrix, or a function without return.\n"
             "Fix: return jnp.stack([...]) of the equations, or give each a name of its own."
         )
+    if 0 in shape:
+        raise ValueError(f"{call} returned no equation at all.\nFix: leave the constraint out where it has none.")
     if not jnp.issubdtype(dtype, jnp.floating):
         raise ValueError(
             f"{call} must return real numbers that vanish where it holds, and returned {dtype}.\n"

@@ -50,6 +50,7 @@ def test_finds_parameters_and_start(swinging, capsys):
     assert stuck.rms()["q"] > 1e-2 and not capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_against_scipy(swinging):
     """Estimates and covariance are those of SciPy's least squares with numerical slopes."""
     data = noisy(swinging[0])
@@ -75,6 +76,7 @@ def test_against_scipy(swinging):
     np.testing.assert_allclose(float(alone.noise), np.sqrt(float(found.chi2) / 96) * 0.01, rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_gaps_and_several_runs(swinging):
     """Missing values, another run with its own start, length and mass, and only what is missing is left out."""
     angle = swinging[0].copy()
@@ -93,6 +95,7 @@ def test_gaps_and_several_runs(swinging):
     assert wrong.rms()["q"] > 1e-3
 
 
+@pytest.mark.slow
 def test_identifiability_before_and_after(swinging):
     """Of m, l, g and friction a swing shows g/l and c/(m l²); what is not seen gets no uncertainty."""
     record = lj.Record(TS, q=noisy(swinging[0]))
@@ -182,6 +185,7 @@ def test_a_long_record_wants_a_growing_horizon():
     assert int(np.sum(best.costs > 2 * best.cost)) > 5
 
 
+@pytest.mark.slow
 def test_outliers_priors_and_bounds(swinging):
     """A robust loss forgives wild values; a prior counts as a measurement; a bound is named."""
     data = noisy(swinging[0])
@@ -270,6 +274,7 @@ def test_other_optimisers(swinging):
     np.testing.assert_allclose(slow.values[1], ours.values[1], rtol=1e-2)
 
 
+@pytest.mark.slow
 def test_log_likelihood(swinging):
     """The likelihood is largest at the estimates, and falls by a half at one standard deviation."""
     record = lj.Record(TS, q=swinging[0], sigma=0.01, q0=1.0, v0=0.0, hold_q=True, hold_v=True)
@@ -298,6 +303,7 @@ def test_prints_and_plots(swinging):
     assert "NOT white" in repr(slow) and slow.whiteness()["q"] > 0.5
 
 
+@pytest.mark.slow
 def test_unknowns_of_a_start_keep_to_the_constraints():
     """Whatever its unknowns, a start satisfies the constraints, for other parameters too."""
     case = CASES["pendulum on a rod"]
@@ -311,6 +317,7 @@ def test_unknowns_of_a_start_keep_to_the_constraints():
         assert abs(q["x"] * v["x"] + q["y"] * v["y"]) < 1e-12
 
 
+@pytest.mark.slow
 def test_log_likelihood_of_several_runs(swinging):
     """Two records: the likelihood of both, at their best the sum of squares."""
     records = [lj.Record(TS, q=noisy(swinging[0], seed=i), q0=1.0, v0=0.0, sigma=0.01) for i in (1, 2)]

@@ -88,6 +88,7 @@ def test_door_on_three_hinges():
     np.testing.assert_allclose(np.concatenate([multipliers["hinges"], multipliers["rigid"]]), shortest, atol=1e-11)
 
 
+@pytest.mark.slow
 def test_report_names_dependent_constraints_and_counts_freedoms():
     """`explain`: a pendulum on two rods has one degree of freedom, and both rods are named."""
     pair = lj.explain(twice(2.0), *STATE[1:])
@@ -110,6 +111,7 @@ def test_report_of_a_rounded_state():
     assert lj.explain(door, rounded, DOOR_STATE[2], DOOR_STATE[3]).degrees_of_freedom == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", [jax.jacfwd, pytest.param(jax.jacrev, marks=pytest.mark.slow)])
 def test_derivatives_of_shared_multipliers(mode):
     """Accelerations and shortest multipliers have the derivatives of their closed forms, in lanes too."""

@@ -98,6 +98,7 @@ def test_missing_velocity():
         lj.integrate(system, {"a": 1.0, "b": 0.5}, {"a": 0.0, "b": 0.0}, ts=TS)
 
 
+@pytest.mark.slow
 def test_constraint_without_a_derivative():
     """A constraint that is a square has no derivative where it holds: named, and not taken for a redundant one."""
     rod = rod_pendulum.constraints["rod"]

@@ -65,6 +65,7 @@ def test_frames_follow_the_motion(traj):
     np.testing.assert_allclose(ends[:, 1, 0], PARAMS["l"] * np.sin(finer.q), atol=1e-4)
 
 
+@pytest.mark.slow
 def test_ends_where_an_event_ended_the_motion():
     """The NaN after an event are cut off, and the last frame is the event."""
     down = diffrax.Event(lambda t, y, params, **kwargs: y[0])
@@ -75,6 +76,7 @@ def test_ends_where_an_event_ended_the_motion():
     np.testing.assert_allclose(film.points["rod"][-1, 1], [0.0, -PARAMS["l"]], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_motion_that_failed_plays_as_far_as_it_came():
     """With throw=False the film ends at the last output that was reached; one that never began is refused."""
     kepler = lj.System(lambda t, q, v, params: 0.5 * v**2 + 1 / q)
@@ -85,6 +87,7 @@ def test_a_motion_that_failed_plays_as_far_as_it_came():
         lj.integrate(kepler, 0.0, 0.0, ts=DENSE, throw=False).animate(bob)
 
 
+@pytest.mark.slow
 def test_a_batch_is_animated_lane_by_lane():
     """A batch says how to take a lane of it, and the lane plays."""
     batch = jax.vmap(lambda q0: lj.integrate(pendulum, q0, 0.0, PARAMS, ts=DENSE))(np.array([0.5, 1.0]))

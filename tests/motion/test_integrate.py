@@ -199,6 +199,7 @@ def test_event_time_gradient():
     np.testing.assert_allclose(jax.grad(time_of)(1.25), expected, rtol=1e-7)
 
 
+@pytest.mark.slow
 def test_float32_says_what_it_is():
     """float32 runs in float32 at its own default tolerance, keeps the constraint to its round-off and says so."""
     single = lambda tree: jax.tree.map(np.float32, tree)

@@ -248,6 +248,7 @@ def test_sledge_would_show_an_error():
         assert departure(run("half Chetaev")[2], expected[2]) > 0.1
 
 
+@pytest.mark.slow
 def test_the_skate_does_not_go_downhill():
     """From rest it never gets lower than g / (2 ω²), however long it slides: it drifts across, at g / (2 ω)."""
     turn = 1.5

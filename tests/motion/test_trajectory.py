@@ -54,6 +54,7 @@ def test_plot_has_a_panel_for_each_kind(traj):
     assert [axis.get_ylabel() for axis in free.plot().axes] == ["q", "v"]
 
 
+@pytest.mark.slow
 def test_a_batch_is_plotted_lane_by_lane():
     """A batch refuses to plot itself and says how to take a lane."""
     batch = jax.vmap(lambda q0: lj.integrate(pendulum, q0, 0.0, PARAMS, ts=TS))(np.array([0.5, 1.0]))
@@ -94,6 +95,7 @@ def test_phase_portrait_has_a_panel_a_coordinate(traj):
     assert starts == [0.5, 1.0]
 
 
+@pytest.mark.slow
 def test_phase_portrait_ends_with_the_motion():
     """The NaN after an event are not drawn."""
     down = diffrax.Event(lambda t, y, params, **kwargs: y[0])

@@ -159,6 +159,7 @@ def test_exact_motion_obeys_equation_13():
         assert np.max(np.abs(second + params["g"] / params["a"] * jnp.sin(angle))) > 0.1
 
 
+@pytest.mark.slow
 def test_measured_periods():
     """Periods measured by an event on ψ̇ at tolerance 1e-10 are those of the elliptic integrals to 1e-9, but for one."""
     params = _stacked([params for params, _ in PERIODS.values()])
@@ -246,6 +247,7 @@ def test_speed_zero_amplitude_and_reversal():
         assert float(getattr(mirrored, name)) == sign * float(getattr(state, name)), name
 
 
+@pytest.mark.slow
 def test_pitchfork_over_speeds():
     """One vmap over ω through the pitchfork: beads with friction settle at 0 below ω0 and at ±α above it."""
     speeds = scene.natural_rate(FAST) * jnp.array([0.2, 0.6, 0.85, 1.2, 1.6, 2.4])

@@ -106,6 +106,7 @@ def test_a_lane_that_fails_keeps_its_reason():
         few.resweep(lambda point: (point["g"], point["g"]))
 
 
+@pytest.mark.slow
 def test_long_lanes_are_run_alone(monkeypatch):
     """The others do not wait for them; steps that run out by the user's own word are not taken again."""
     monkeypatch.setattr(engine, "PATIENCE", 30)
@@ -122,6 +123,7 @@ def test_long_lanes_are_run_alone(monkeypatch):
     assert few.status.steps.max() == 28 and np.any(few.status.result == MAX_STEPS)
 
 
+@pytest.mark.slow
 def test_starts_that_cannot_be_integrated():
     """Off the constraint, NaN: each lane with its own word, none raises."""
     start = lambda point: ({"x": point["x"], "y": 0.0}, {"x": 0.0, "y": 0.0})
