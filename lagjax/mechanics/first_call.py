@@ -89,7 +89,11 @@ def _check_constraint(call, given):
             "Fix: return jnp.stack([...]) of the equations, or give each a name of its own."
         )
     if 0 in shape:
-        raise ValueError(f"{call} returned no equation at all.\nFix: leave the constraint out where it has none.")
+        raise ValueError(
+            f"{call} must return a scalar or a vector, and returned no equation at all, shape {shape}.\n"
+            "Usual cause: a list of joints that is empty.\n"
+            "Fix: leave the constraint out where it has none."
+        )
     if not jnp.issubdtype(dtype, jnp.floating):
         raise ValueError(
             f"{call} must return real numbers that vanish where it holds, and returned {dtype}.\n"

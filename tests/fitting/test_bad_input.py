@@ -80,6 +80,7 @@ def test_a_guess_that_cannot_move():
         lj.fit(pendulum, RECORD, PENDULUM | {"l": 0.0}, free="g")
 
 
+@pytest.mark.slow
 def test_wrapped_angles():
     """An angle that jumps by a turn is pointed out."""
     angle = np.linspace(0.0, 9.0, 60)

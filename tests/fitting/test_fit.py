@@ -246,6 +246,7 @@ def test_slopes_three_ways(name):
         np.testing.assert_allclose(difference, forward[:, i], atol=1e-7 * scale, rtol=0)
 
 
+@pytest.mark.slow
 def test_inside_a_program(swinging):
     """Fits of many measurements in one program: the same as one by one."""
     data = np.stack([noisy(swinging[0], seed=i) for i in range(3)])

@@ -141,6 +141,7 @@ def acceleration(system, q, v):
     return sparse, dense
 
 
+@pytest.mark.slow
 def test_derivatives_in_both_modes():
     """By every mass and by gravity, forward and reverse, as the dense equations'."""
     system, q, v, params = chain(8)

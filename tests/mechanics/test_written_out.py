@@ -116,6 +116,7 @@ def test_the_compiled_program():
     assert is_small(seven, *coordinates.state(0.0, np.ones(7), np.ones(7), PARAMS))
 
 
+@pytest.mark.slow
 def test_changed_numbers_do_not_compile_again():
     """Tolerances, parameters, times and initial states are arguments: L is traced for the first of them only."""
     traced = []

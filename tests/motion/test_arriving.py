@@ -3,6 +3,7 @@
 import diffrax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 import lagjax as lj
 from lagjax.motion.arriving import Arriving
@@ -14,6 +15,7 @@ def run(ts, **options):
     return lj.integrate(pendulum, 2.0, 0.0, PARAMS, ts=np.asarray(ts), rtol=1e-10, atol=1e-10, **options)
 
 
+@pytest.mark.slow
 def test_outputs_are_those_of_one_solve():
     """Twelve uneven outputs, one just after another, agree with another method's; the first is the start."""
     ts = np.concatenate([[0.0, 1e-9], np.sort(np.random.default_rng(1).uniform(0.0, 8.0, 9)), [8.0]])
@@ -22,6 +24,7 @@ def test_outputs_are_those_of_one_solve():
     assert found.q[0] == 2.0
 
 
+@pytest.mark.slow
 def test_outputs_shorten_few_steps():
     """Each output adds one step at most, and a few of them none but their own."""
     steps = lambda count: int(run(np.linspace(0.0, 8.0, count)).stats["num_steps"])

@@ -121,6 +121,7 @@ def test_start_off_the_constraint():
     assert float(traj.residual()) < 1e-14
 
 
+@pytest.mark.slow
 def test_a_constraint_may_have_any_name():
     """A name with a bracket in it is not taken for an index."""
     system = lj.System(rod_pendulum.lagrangian, {"rod[left]": rod_pendulum.constraints["rod"]})

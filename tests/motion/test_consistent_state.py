@@ -85,6 +85,7 @@ crank_slider = lj.System(
 )
 
 
+@pytest.mark.slow
 def test_held_coordinates_keep_position_and_velocity():
     """With the crank's angle and speed held, rod and slider follow from the closed form of the mechanism."""
     guess = {"crank": 0.7, "rod": -0.2, "slider": 3.0}
@@ -114,6 +115,7 @@ def test_random_starts_reach_the_manifold_in_lanes():
     assert np.mean(np.abs(along) < 1e-10) > 0.95
 
 
+@pytest.mark.slow
 def test_unreachable_is_an_error_with_the_residual_by_name():
     """A coordinate held where the constraint cannot be met, a contradiction, and a wrong name: each says so."""
     state = {"x": 3.0, "y": 0.5}, {"x": 0.0, "y": 0.0}

@@ -57,6 +57,7 @@ def test_massless_crank():
     assert np.max(np.abs(x - 0.5 * np.cos(slower * CRANK_TS) - np.sin(slower * CRANK_TS) / slower)) > 0.5
 
 
+@pytest.mark.slow
 def test_massless_crank_reaches_its_dead_centre():
     """Faster, the slider reaches l, where nothing determines θ: the motion ends there, with time and place."""
     speed = 2.5

@@ -351,6 +351,7 @@ def driven_exact(params, t, x=0.75, speed=1.25):
     return np.stack([position, y]), np.stack([speed * np.ones_like(t), position * c]), force
 
 
+@pytest.mark.slow
 def test_driven_in_time():
     """A constraint with explicit time and place: ∂phi/∂t and (∂phi/∂q) v both enter motion and λ; neither is lost."""
     ts = np.linspace(0.0, 4.0, 9)

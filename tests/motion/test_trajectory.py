@@ -64,6 +64,7 @@ def test_a_batch_is_plotted_lane_by_lane():
     assert "2" in repr(batch).splitlines()[2]
 
 
+@pytest.mark.slow
 def test_phase_portrait_of_a_rotation_stays_in_a_turn():
     """An angle that goes around lies between -π and π, cut where it leaves; one that swings is left alone."""
     spin = lj.integrate(pendulum, 1.0, 9.0, PARAMS, ts=np.linspace(0.0, 3.0, 101))
@@ -82,6 +83,7 @@ def test_phase_portrait_of_a_rotation_stays_in_a_turn():
     np.testing.assert_array_equal(drawn, [swing.q, swing.v])
 
 
+@pytest.mark.slow
 def test_phase_portrait_has_a_panel_a_coordinate(traj):
     """Names of the user's; lengths keep their own ticks and are never cut; a batch has a curve a lane."""
     axes = [axis for axis in traj.phase_portrait().axes if axis.get_visible()]
@@ -104,6 +106,7 @@ def test_phase_portrait_ends_with_the_motion():
     assert np.isfinite(x).all() and len(x) == int(np.isfinite(ended.q).sum()) < 41
 
 
+@pytest.mark.slow
 def test_progress_is_shown(capfd):
     """`progress=True` shows a meter."""
     jax.block_until_ready(lj.integrate(pendulum, 1.0, 0.0, PARAMS, ts=TS, progress=True))

@@ -19,6 +19,7 @@ def shuffled(m, half_bandwidth, seed=0):
     return a[np.ix_(order, order)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("m, half_bandwidth", [(1, 0), (2, 1), (3, 1), (20, 0), (20, 1), (20, 2), (30, 5), (5, 4)])
 def test_solves_as_lapack(m, half_bandwidth):
     """Found in its random order, coloured, and solved to round-off, some rows left out."""
@@ -79,6 +80,7 @@ def test_singular_is_never_plausible():
         assert not np.all(np.abs(banded.solver(band)(jnp.array([1.0, 2.0, 3.0]))) < 1e12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 def test_independent_rows_by_pivots(seed):
     """As many rows as the rank, themselves independent; with none dependent all are kept."""

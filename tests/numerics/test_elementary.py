@@ -117,6 +117,7 @@ def test_float32():
             assert np.max(np.abs(np.asarray(found, float) - exact) / units) < WORST
 
 
+@pytest.mark.slow
 def test_derivatives():
     """Both modes, twice, alone and in lanes, within the limit and beyond, are what jnp.sin and jnp.cos give."""
     near = rng.uniform(-3, 3, 5)
@@ -150,6 +151,7 @@ def test_in_lanes_the_branch_stays_a_branch():
     assert count(jax.vmap(alone), "sin", x) == 1
 
 
+@pytest.mark.slow
 def test_by_the_library_alone_by_arithmetic_in_lanes():
     """One number takes libm's own values; lanes agree to round-off, with derivatives in both modes and orders."""
     x = rng.uniform(-9, 9, 50)

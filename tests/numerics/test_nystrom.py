@@ -79,6 +79,7 @@ def test_weights_are_quadratures(tableau):
     np.testing.assert_allclose([sum(row) for row in tableau.a], c[1:] ** 2 / 2, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_stages_in_a_loop_are_the_same():
     """Step by step."""
     fixed = diffrax.ConstantStepSize()

@@ -50,6 +50,7 @@ def test_tableau():
     assert abs(radau.GAMMA - (3 + np.cbrt(9.0) - np.cbrt(3.0))) < 1e-13
 
 
+@pytest.mark.slow
 def test_stability():
     """One step is R(z) of Hairer & Wanner II, table IV.3.3 in all of the left half-plane; R(-1e6) = 3e-6 (L-stable)."""
     z = np.array([-1e6, -1e2, -3.0, 0.5, 1e-3j, 1j, 30j, 1e6j, -1 + 2j, -50 + 1e4j])
@@ -205,6 +206,7 @@ def gradient_of_decay(k, y0):
     return np.array([-(y0**2), 1.0]) / (1 + k * y0) ** 2
 
 
+@pytest.mark.slow
 def test_forward_derivative():
     """The derivative of an end state by parameter and start is that of the closed form."""
     forward = jax.jit(jax.jacfwd(lambda p: end_of_decay(p, diffrax.ForwardMode())))

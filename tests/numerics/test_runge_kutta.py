@@ -28,6 +28,7 @@ def solve(method, controller, ts=None, dt0=None):
     )  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("ours", "shipped"), PAIRS, ids=name_of)
 def test_the_steps_of_diffrax(ours, shipped):
     """The same steps, states and dense output as diffrax's implementation."""

@@ -163,6 +163,7 @@ def test_a_start_without_contact_is_refused(theta, theta_rate):
         hoop.roll(PARAMS, theta, theta_rate, np.array([0.0, 1.0]))
 
 
+@pytest.mark.slow
 def test_flight_is_the_same_lagrangian_without_constraints():
     """Unconstrained, the hoop follows the parabola to 1e-9, never touching again."""
     _, air, _ = hoop.runs()
