@@ -127,7 +127,7 @@ print(asked)
 off = {"A": 1.2, "C": 0.85, "D": 1.2, "E": 0.85, "k1": 2.0, "k2": 2.0}
 guess = {"B": 1.0} | {name: factor * published[name] for name, factor in off.items()}
 units = {"D": "1/s²", "E": "1/s²", "k1": "1/s", "k2": "1/s"}
-found = lj.fit(pendulum, record, guess, free=list(off), units=units, window=0.6, joined=False, **solve)
+found = lj.fit(pendulum, record, guess, free=list(off), units=units, window=0.6, joined=False, progress=False, **solve)
 print(found)
 
 # %% [markdown]

@@ -84,7 +84,7 @@ fig
 
 # %%
 warnings.filterwarnings("ignore", category=lj.FitWarning)
-settings = {"joined": False, "priors": {"potential": (0.0, 10.0)}, "rtol": 1e-7, "atol": 1e-7}
+settings = {"joined": False, "priors": {"potential": (0.0, 10.0)}, "rtol": 1e-7, "atol": 1e-7, "progress": False}
 first = lj.fit(particle, records, {"potential": network}, window=1.0, iterations=100, **settings)
 found = lj.fit(particle, records, first.params, window=2.0, grow=False, iterations=100, **settings)
 learned = found.params
