@@ -65,6 +65,31 @@ def test_a_learned_potential():
 
 
 @pytest.mark.slow
+def test_a_learned_friction():
+    """A force -v f(v²) that is no viscous friction, where the motions had velocities."""
+    restoring = lambda t, q, v, params: 0.5 * v**2 + 9.0 * jnp.cos(q)
+    rubs = lambda v: -(0.3 * jnp.tanh(3 * v) + 0.1 * v**3)
+    truth = lj.System(restoring, force=lambda t, q, v, params: rubs(v))
+    system = lj.System(restoring, force=lambda t, q, v, params: -v * params["friction"](v**2 / 4))
+    rng, noise, ts = np.random.default_rng(0), 0.001, np.linspace(0.0, 6.0, 120)
+    runs = [np.asarray(lj.integrate(truth, q0, 0.0, ts=ts).q) for q0 in (2.5, 1.5, -2.0)]
+    measured = [lj.Record(ts, q=q + noise * rng.normal(size=len(ts)), sigma=noise) for q in runs]
+    net = eqx.nn.MLP("scalar", "scalar", 6, 1, jnp.tanh, key=jax.random.key(0))
+    options = {"priors": {"friction": (0.0, 10.0)}, "window": 2.0, "joined": False, "rtol": 1e-7, "atol": 1e-7}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", lj.FitWarning)
+        found = lj.fit(system, measured, {"friction": net}, **options)
+    v = jnp.linspace(-3.5, 3.5, 71)
+    of = lambda params: jax.vmap(lambda v: system.force(0.0, 0.0, v, params))(v)
+    off = lambda params: float(jnp.max(jnp.abs(of(params) - rubs(v)))) / float(jnp.max(jnp.abs(rubs(v))))
+    assert off(found.params) < 0.03 < 0.5 < off({"friction": net})
+    # Twin: viscous friction does not fit.
+    viscous = lj.System(restoring, force=lambda t, q, v, params: -params["c"] * v)
+    with pytest.warns(lj.FitWarning, match="times as large as sigma"):
+        assert float(lj.fit(viscous, measured, {"c": 0.5}).rms()["q"]) > 10 * noise
+
+
+@pytest.mark.slow
 def test_slopes_of_a_network_in_reverse():
     """The gradient of the cost by 193 weights: pulled back in one pass, and pushed forward along each."""
     net = eqx.nn.MLP("scalar", "scalar", 12, 2, jnp.tanh, key=jax.random.key(0))
