@@ -75,9 +75,8 @@ class SignChange(optx.AbstractRootFinder):
         safe = lambda x: jnp.where(x == 0, 1.0, x)
         xi, phi = (a - b) / safe(c - b), (fa - fb) / safe(fc - fb)
         trusted = (phi**2 < xi) & ((1 - phi) ** 2 < 1 - xi)
-        quadratic = fa / safe(fb - fa) * fc / safe(fb - fc) + (c - a) / safe(b - a) * fa / safe(fc - fa) * fb / safe(
-            fc - fb
-        )
+        from_b = fa / safe(fb - fa) * fc / safe(fb - fc)
+        from_c = (c - a) / safe(b - a) * fa / safe(fc - fa) * fb / safe(fc - fb)
         least = jnp.minimum(0.5 * self._width(state) / safe(jnp.abs(b - a)), 0.5)
-        share = jnp.clip(jnp.where(trusted, quadratic, 0.5), least, 1 - least)
+        share = jnp.clip(jnp.where(trusted, from_b + from_c, 0.5), least, 1 - least)
         return a + share * (b - a)
