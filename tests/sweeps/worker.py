@@ -1,14 +1,18 @@
 """A sweep as its own process, for tests that kill it: `worker.py STORE K N POINTS [PORT]` prints what it computed.
 
+It rests after each chunk, so that there is a while in which it can be killed.
 With a port the processes know of each other by `jax.distributed`, which then says which part is whose.
 """
 
 import sys
+import time
 
 import jax
 import jax.numpy as jnp
 
 import lagjax as lj
+from lagjax.meter import Silent
+from lagjax.sweeps import engine
 
 jax.config.update("jax_enable_x64", True)
 
@@ -31,7 +35,16 @@ def axes(points):
     return {"g": jnp.linspace(0.5, 20.0, 10), "angle": jnp.linspace(0.1, 3.0, points // 10)}
 
 
+class Resting(Silent):
+    """A meter that takes its time."""
+
+    def update(self, count):
+        """After a chunk."""
+        time.sleep(0.05)
+
+
 if __name__ == "__main__":
+    engine._meter = lambda total, progress: Resting()
     store, k, n, points, *port = sys.argv[1], *map(int, sys.argv[2:])
     if port:
         jax.distributed.initialize(f"127.0.0.1:{port[0]}", num_processes=n, process_id=k)
