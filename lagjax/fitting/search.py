@@ -243,8 +243,8 @@ def _search(problem, start, stages, tolerances, optimiser, limit, tell):
         return (solution.value, taken + solution.stats["num_steps"]), (solution.aux, converged, last)
 
     first = Unknowns(problem.found.free(start.shared), start.own), jnp.asarray(0)
-    (y, steps), told = lax.scan(one_stage, first, (jnp.arange(len(tolerances)), stages, tolerances))
-    (cost, well), converged, last = jax.tree.map(lambda x: x[-1], told)
+    (y, steps), stagewise = lax.scan(one_stage, first, (jnp.arange(len(tolerances)), stages, tolerances))
+    (cost, well), converged, last = jax.tree.map(lambda x: x[-1], stagewise)
     u = _natural(problem, y)
     if last is not None:
         values, by_free = last
