@@ -38,7 +38,8 @@ class Record(eqx.Module):
 
     **Of the run:**
 
-    - `q0`, `v0`: a guess of the state at `t[0]`. Left out, it is read off measured coordinates.
+    - `q0`, `v0`: a guess of the state at `t[0]`. Left out, it is read off measured coordinates and velocities; where
+      some were not measured, `q0` has to be given, and their velocities are guessed to be zero.
     - `hold_q`, `hold_v`: which of them are known, not guessed: `True` for all, or names of coordinates.
     - `params`: parameters that are other ones in this run, by name: `{"omega": 3.0}`.
     - `sigma`: the standard deviation of the measurement errors, one number, or by kind, `{"q": 0.01, "end":

@@ -46,7 +46,8 @@ class Fit(eqx.Module):
     - `names`, `values`, `sd` (p,): the numbers found, and their standard deviations; NaN where the data do not
       determine one. With `sigma` given they follow from it, else from the residuals.
     - `covariance`, `correlation` (p, p).
-    - `start_sd`: standard deviations of `q0` and `v0`, as two lists of pytrees.
+    - `start_sd`: standard deviations of `q0` and `v0`, as two lists of pytrees; 0 of what was held, NaN of what the
+      data do not determine.
     - `identifiability`: which combinations the data see.
     - `chi2`, `freedom`: the sum of squared residuals in sigmas (of the unit that is estimated, without sigmas), and the
       number of measurements less that of unknowns. `noise`: the estimated sigma, where none was given.
@@ -128,13 +129,22 @@ class Fit(eqx.Module):
 
     @property
     def start_sd(self) -> tuple[list[PyTree], list[PyTree]]:
-        own, problem = self._of_errors() * self._seen().covariance.own, self.problem
+        # On constraints a start depends on the parameters too: that of a rod of unknown length, for example.
+        problem, (shared, own), of, determined = self.problem, self.unknowns, *self._seen()[2:4]
         of_q, of_v = [], []
         for w in problem.windows.first:
-            state = lambda s, w=w: problem.setting(self.unknowns.shared, s, w, WHOLE)[2]
-            for slope, into in zip(jax.jacfwd(state)(self.unknowns.own[w]), (of_q, of_v)):
-                of = lambda x, w=w: jnp.sqrt(jnp.maximum(jnp.einsum("...i,ij,...j", x, own[w], x), 0.0))
-                into.append(jax.tree.map(of, slope))
+            state = lambda both, w=w: problem.setting(both[: shared.size], both[shared.size :], w, WHOLE)[2]
+            slopes = jax.jacfwd(state)(jnp.concatenate([shared, own[w]]))
+            joint = jnp.block([[of.shared, of.own_shared[w].T], [of.own_shared[w], of.own[w]]])
+            known = jnp.concatenate([determined.shared, determined.own[w]])
+
+            def sd(slope, joint=self._of_errors() * joint, known=known):
+                variance = jnp.einsum("...i,ij,...j", slope, joint, slope)
+                unknown = jnp.any(jnp.where(known, 0.0, slope) != 0, axis=-1)
+                return jnp.where(unknown, jnp.nan, jnp.sqrt(jnp.maximum(variance, 0.0)))
+
+            of_q.append(jax.tree.map(sd, slopes[0]))
+            of_v.append(jax.tree.map(sd, slopes[1]))
         return of_q, of_v
 
     def _seen(self) -> Seen:
@@ -320,7 +330,7 @@ def _lines(fit: Fit):
             for label, x, sd in (("", q, q_sd), ("v.", v, v_sd)):
                 x, sd = (np.asarray(coordinates.flatten(y)[0]) for y in (x, sd))
                 told = zip(coordinates.names(q), x, sd)
-                rows += [(f"{label}{name}(0){of}", _plus_minus(a, b), "") for name, a, b in told if b > 0]
+                rows += [(f"{label}{name}(0){of}", _plus_minus(a, b), "") for name, a, b in told if b != 0]
     width, wide = max(len(row[0]) for row in rows) if rows else 0, max((len(row[1]) for row in rows), default=0)
     lines += [f"  {name:<{width}}  {value:<{wide}}  {unit}".rstrip() for name, value, unit in rows]
     if many:

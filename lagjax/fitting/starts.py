@@ -24,6 +24,8 @@ from jaxtyping import Array, Float
 from lagjax.fitting.records import Record, Windows
 from lagjax.mechanics import constraints, coordinates
 from lagjax.mechanics.coordinates import State
+from lagjax.mechanics.diagnosis import listed
+from lagjax.mechanics.first_call import check_functions
 from lagjax.motion.consistency import departures, stopped
 from lagjax.motion.consistent_state import free_coordinates
 from lagjax.motion.integrate import integrate
@@ -111,8 +113,8 @@ def starts(
         first = _guess(system, record, r, params_of(r))
         guesses.append(first)
         read = [_read_off(record, windows.sample[w][windows.real[w]]) for w in here[1:]]
-        structure = jax.tree.structure(first.q)
-        later = [found for found in read if found is not None and jax.tree.structure(found[0]) == structure]
+        structure = jax.tree.structure((first.q, first.v))
+        later = [found for found in read if jax.tree.structure(found) == structure]
         if len(later) < len(read):
             later = _along_the_motion(system, first, windows.ts[here, 0], options)
         for w, (q, v) in zip(here[1:], later):
@@ -149,14 +151,15 @@ def _concrete(function: Callable):
 def _guess(system, record, r, params) -> State:
     q, v = record.q0, record.v0
     if q is None or v is None:
-        read = _read_off(record, np.arange(len(record.t)))
-        if read is None:
+        read_q, read_v = _read_off(record, np.arange(len(record.t)))
+        q, v = (read_q if q is None else q), (read_v if v is None else v)
+        if q is None or v is None:
             raise ValueError(
                 f"record {r} has no guess of its start, and no measured coordinates to read it from.\n"
                 "Fix: lj.Record(..., q0=..., v0=...), alike to the state of lj.integrate."
             )
-        read_q, read_v = read
-        q, v = (read_q if q is None else q), (read_v if v is None else v)
+        if record.v0 is None and isinstance(q, dict) and isinstance(v, dict):
+            v = {name: jnp.zeros_like(x) for name, x in q.items()} | v
     if coordinates.is_traced((q, v, params)):
         if system.constraints:
             raise TypeError(
@@ -165,17 +168,32 @@ def _guess(system, record, r, params) -> State:
             )
         return coordinates.state(record.t[0], q, v, params)
     with jax.ensure_compile_time_eval():
-        return coordinates.state(record.t[0], q, v, params)
+        guess = coordinates.state(record.t[0], q, v, params)
+    try:
+        check_functions(system, *guess)
+    except ValueError as error:
+        if record.q0 is not None or not isinstance(q, dict):
+            raise
+        raise ValueError(
+            f"{error}\nThe start of record {r} was read off what it measures, {listed(list(q))}; a guess of all "
+            "coordinates is lj.Record(..., q0=..., v0=...)."
+        ) from error
+    return guess
 
 
 def _read_off(record, samples):
-    """(q, v) at the first of some samples, from the parabola through the first measured coordinates; None without."""
-    q = record.measured.get("q")
-    if q is None:
-        return None
+    """(q, v) at the first of some samples, from the parabola through the first measured ones; None for what was not."""
     t = record.t[samples] - record.t[samples[0]]
-    pairs = jax.tree.map(lambda x: _parabola(t.astype(x.dtype), x[samples]), q)
-    return tuple(jax.tree.map(lambda x, pair, i=i: pair[i], q, pairs) for i in (0, 1))
+
+    def parabolas(kind):
+        tree = record.measured.get(kind)
+        pairs = jax.tree.map(lambda x: _parabola(t.astype(x.dtype), x[samples]), tree)
+        return [jax.tree.map(lambda x, pair, i=i: pair[i], tree, pairs) for i in (0, 1)]
+
+    (q, slopes), (v, _) = parabolas("q"), parabolas("v")
+    if isinstance(slopes, dict) and isinstance(v, dict):
+        return q, slopes | v
+    return q, slopes if v is None else v
 
 
 def _parabola(t, x):

@@ -175,8 +175,7 @@ class OnManifold(diffrax.AbstractWrappedSolver):
         believed = _all_finite((y1, error))
 
         def again():
-            state = self.solver.init(self.terms, t0, t1, y0, self._stages(t0, y0, args))
-            y1, error, _, result = self._careful_step(self.terms, t0, t1, y0, args, state, True)
+            y1, error, _, result = self._careful_step(self.terms, t0, t1, y0, args, None, True)
             return y1, error, quick.solver.init(quick.terms, t1, t1, y1, args), result
 
         # A branch also in a batch, where it is taken for all lanes or none.
@@ -186,6 +185,8 @@ class OnManifold(diffrax.AbstractWrappedSolver):
         # The projection moves the state, so a derivative kept from the last step's end is stale.
         jumped = True if self.project else made_jump
         stages = self._stages(t0, y0, args)
+        if solver_state is None:
+            solver_state = self.solver.init(terms, t0, t1, y0, stages)
         y1, error, _, solver_state, result = self.solver.step(terms, t0, t1, y0, stages, solver_state, jumped)
         if self.weigh and error is not None:
             error = self._weighed(y0, y1, error)
@@ -250,12 +251,10 @@ class SteppedTo(Interpolation):
     solver: OnManifold
 
     def at(self, t):
-        s, state = self.solver, self.state
+        s = self.solver
         # Three places of diffrax's program ask, and each is compiled: the careful step alone takes a third of the time
         # of both, and costs little at run time, since most outputs are ends of steps.
-        if state is None:
-            state = s.solver.init(s.terms, self.t0, self.t1, self.y0, s._stages(self.t0, self.y0, s.params))
-        y, error, _, result = s._careful_step(s.terms, self.t0, t, self.y0, s.params, state, made_jump=False)
+        y, error, _, result = s._careful_step(s.terms, self.t0, t, self.y0, s.params, self.state, made_jump=False)
         believed = (result == diffrax.RESULTS.successful) & s.acceptable(self.y0, y, error)
         return jtu.tree_map(lambda x: jnp.where(believed, x, jnp.nan), y)
 

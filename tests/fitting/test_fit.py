@@ -16,7 +16,7 @@ from lagjax.fitting.problem import problem_of
 from lagjax.fitting.search import linearised
 from lagjax.numerics.chained import Unknowns
 from lagjax.scenes import rolling_hoop
-from tests.fitting.cases import CASES, HUNG, PENDULUM, hung, pendulum
+from tests.fitting.cases import CASES, HUNG, PENDULUM, hung, pendulum, swing
 
 TS = np.linspace(0.0, 5.0, 100)
 GUESS = PENDULUM | {"l": 1.4, "c": 0.1}
@@ -131,6 +131,46 @@ def test_a_measured_force_shows_the_mass():
     free = ["g", "l", "m"]
     assert lj.identifiability(hung, record(q=traj.q), HUNG, free=free).unseen() == ["m"]
     assert lj.identifiability(hung, record(q=traj.q, multipliers=traj.multipliers), HUNG, free=free).rank == 3
+
+
+@pytest.mark.slow
+def test_a_start_on_constraints_is_as_uncertain_as_they_are():
+    """Held at its side a bob is a rod's length away, to the error of that length; as much in the angle, exactly."""
+    case = CASES["pendulum on a rod"]
+    data = case.noisy({"q": case.truth().q}, jax.random.key(1))["q"]
+    # Of y nothing is known but a guess, which is off the rod.
+    record = lj.Record(case.ts, q={"x": data["x"]}, q0={"x": 1.9, "y": 0.1}, sigma=0.02)
+    found = lj.fit(hung, record, HUNG | {"l": 2.1}, free=["g", "l"])
+    (q_sd,), (v_sd,) = found.start_sd
+    x = lambda t, q, v, params: params["l"] * jnp.sin(q)
+    swung = lj.Record(case.ts, observed=data["x"], q0=1.4, v0=0.0, sigma=0.02)
+    angle = lj.fit(lj.System(swing), swung, {"m": 1.5, "g": 9.81, "l": 2.1}, free=["g", "l"], observe=x)
+    np.testing.assert_allclose(found.values, angle.values, rtol=1e-6)
+    np.testing.assert_allclose(found.covariance, angle.covariance, rtol=1e-3, atol=1e-9)
+    of = angle.seen.covariance
+    joint = np.block([[of.shared, of.own_shared[0].T], [of.own_shared[0], of.own[0]]])
+    state = lambda l, q, v: jnp.stack([l * jnp.sin(q), -l * jnp.cos(q), l * jnp.cos(q) * v, l * jnp.sin(q) * v])
+    slope = jnp.stack(jax.jacfwd(state, (0, 1, 2))(angle.values[1], angle.q0[0], angle.v0[0]), axis=1)
+    slope = np.concatenate([np.zeros((4, 1)), slope], axis=1)
+    expected = np.sqrt(np.diag(slope @ joint @ slope.T))
+    np.testing.assert_allclose([q_sd["x"], q_sd["y"], v_sd["x"], v_sd["y"]], expected, rtol=1e-2)
+    # Twin: with the length taken for known, the side's distance would be as well.
+    slope[:, 1] = 0
+    assert np.sqrt(slope[0] @ joint @ slope[0]) < 0.2 * expected[0]
+
+
+@pytest.mark.slow
+def test_a_start_that_the_data_do_not_see():
+    """Of a coordinate that is not measured, and moves on its own, nothing is known; nor of what L asks for in vain."""
+    both = lambda t, q, v, p: 0.5 * (v["a"] ** 2 + v["b"] ** 2) - 0.5 * p["k"] * q["a"] ** 2 - 0.5 * q["b"] ** 2
+    ts = np.linspace(0.0, 4.0, 60)
+    record = lj.Record(ts, q={"a": np.cos(2 * ts)}, q0={"a": 1.0, "b": 0.5})
+    found = lj.fit(lj.System(both), record, {"k": 3.0})
+    np.testing.assert_allclose(found.values, [4.0], rtol=1e-8)
+    assert np.isnan(found.start_sd[0][0]["b"]) and np.isfinite(found.start_sd[0][0]["a"])
+    assert "b(0)    0.5 (not determined)" in repr(found)
+    with pytest.raises(ValueError, match="(?s)asks for 'b'.*start of record 0 was read off what it measures, 'a'"):
+        lj.fit(lj.System(both), lj.Record(ts, q={"a": np.cos(2 * ts)}), {"k": 3.0})
 
 
 @pytest.mark.slow
