@@ -12,6 +12,7 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import PyTree
 
+from lagjax.fitting.doubts import doubts
 from lagjax.fitting.equations import WHOLE, Problem, Stage, one_by_one
 from lagjax.fitting.identifiability import Identifiability
 from lagjax.fitting.problem import problem_of
@@ -28,6 +29,8 @@ from lagjax.numerics.chained import Unknowns
 A_STAGE_HAS, STAGES = 4, 7
 # What a jump between joined windows costs, stage by stage, in units of what missing the data by as much costs.
 JOINED = (0.1, 1.0, 10.0, 100.0, 1e4)
+# With a loss that forgives outliers so many stages more, in which to learn the size of an ordinary error.
+SETTLING = 2
 # Uncertainties of more numbers than this are not computed.
 COVARIANCE_UP_TO = 1000
 # In units of the data's spread: when a stage is done, and when the last one is; not below what the motion is good for.
@@ -71,12 +74,13 @@ def fit(
 
     - `records`: one `Record` or several, each with its own initial state. Angles as they run on, not wrapped to a turn.
     - `params`: what the Lagrangian takes, with guesses of what is to be found; all records share it.
-    - `free`: the names of what is found, `"g"`, `["m", "arm.length"]`, or of a part, such as a network: `"potential"`.
-      By default every floating number in `params`.
+    - `free`: the names of what is found, `"g"`, `["m[1]", "arm.length"]`, or of a part, such as a network,
+      `"potential"`. By default every floating number in `params`.
     - `observe(t, q, v, params)`: what `observed` in the records are measurements of: positions, for example.
     - `bounds`: by name, `{"m": (0.0, None)}`. A number that is positive is searched by its logarithm.
     - `priors`: by name (mean, standard deviation) of what is known already; needs `sigma` in the records.
-    - `loss`: `"squares"`; or `"huber"`, `"soft_l1"`, `"cauchy"`, against outliers, which need `sigma`.
+    - `loss`: `"squares"`; or `"huber"`, `"soft_l1"`, `"cauchy"`, against outliers, which need `sigma`. Until the last
+      stage an ordinary error is the median of what the motion is off, since far from the truth all are large.
     - `units`: by name, for the table.
 
     **The search:**
@@ -106,7 +110,8 @@ def fit(
       `sigma` says, an estimate is at its bound, or the data cannot see a parameter.
 
     Source: Nocedal & Wright, *Numerical Optimization*, §10.3; Bock, in *Modelling of Chemical Reaction Systems* (1981)
-    (multiple shooting); Bierman, *Factorization Methods for Discrete Sequential Estimation* (covariance).
+    (multiple shooting); Huber, *Robust Statistics*, §7.8 (scale by the median); Bierman, *Factorization Methods for
+    Discrete Sequential Estimation* (covariance).
     """
     if optimiser is not None and not isinstance(optimiser, optx.AbstractLeastSquaresSolver | optx.AbstractMinimiser):
         raise TypeError(
@@ -129,7 +134,7 @@ def fit(
     if seen is not None and found.at_bounds():
         # There the search's own slopes vanish.
         found = eqx.tree_at(lambda f: f.seen, found, look(problem, searched.unknowns, last))
-    for words in found.complaints():
+    for words in doubts(found):
         warnings.warn(words, FitWarning, stacklevel=2)
     return found
 
@@ -174,15 +179,17 @@ def _stages(problem: Problem, grow: bool, joined: bool) -> tuple[Stage, Any]:
     measured = sum(int(np.prod(x.shape[1:])) for x in jax.tree.leaves(problem.measured))
     doublings = int(np.clip(np.log2(max(measured / max(A_STAGE_HAS * unknowns, 1), 1)), 0, STAGES - 1))
     doublings = doublings if grow else 0
-    parts = [2.0**-i for i in range(doublings, -1, -1)] + [1.0] * (len(JOINED) if joined else 0)
-    weights = [0.0] * (doublings + 1) + list(JOINED if joined else ())
+    settling, joining = (0 if problem.loss == "squares" else SETTLING), (JOINED if joined else ())
+    parts = [2.0**-i for i in range(doublings, -1, -1)] + [1.0] * (settling + len(joining))
+    weights = [0.0] * (doublings + 1 + settling) + list(joining)
     ratio = problem.spread_in_sigmas
     rtol = problem.options.get("rtol")
     done = max(DONE, ROUND_OFFS * np.finfo(problem.windows.ts.dtype).eps)
     done = done if rtol is None else jnp.maximum(done, OF_RTOL * jnp.max(jnp.asarray(rtol)))
     last = np.arange(len(parts)) == len(parts) - 1
     xp = coordinates.numpy_of((ratio, done))
-    return Stage(np.asarray(parts), xp.asarray(weights) * ratio), xp.where(last, done, STAGE_DONE) * ratio
+    stages = Stage(np.asarray(parts), xp.asarray(weights) * ratio, np.ones(len(parts)))
+    return stages, xp.where(last, done, STAGE_DONE) * ratio
 
 
 @contextmanager

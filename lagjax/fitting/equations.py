@@ -17,7 +17,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, PyTree
 
-from lagjax.fitting.parameters import Found
+from lagjax.fitting.parameters import Found, leaf_name
 from lagjax.fitting.records import PADDING, Windows
 from lagjax.fitting.starts import Starts
 from lagjax.motion.integrate import integrate
@@ -38,14 +38,17 @@ LOSSES = {
 
 
 class Stage(eqx.Module):
-    """How much of the record counts: the part of each window's time, and how tightly windows are joined."""
+    """How a search takes the data: the part of each window's time that counts, how tightly windows are joined, and the
+    size of an ordinary error, in sigmas, for a loss that forgives larger ones.
+    """
 
     part: Float[Array, ""]
     joined: Float[Array, ""]
+    ordinary: Float[Array, ""]
 
 
 # All of the record, windows on their own.
-WHOLE = Stage(np.asarray(1.0), np.asarray(0.0))
+WHOLE = Stage(np.asarray(1.0), np.asarray(0.0), np.asarray(1.0))
 
 
 class Problem(eqx.Module):
@@ -124,11 +127,8 @@ def among(said: PyTree, wanted: PyTree) -> PyTree:
 
 
 def replace(params, values):
-    """`params`, a dictionary, with entries replaced; those of inner dictionaries by 'arm.length'."""
-    for name, value in values.items():
-        first, _, rest = name.partition(".")
-        params = params | {first: replace(params[first], {rest: value}) if rest else value}
-    return params
+    """`params` with some leaves replaced, by name; those of inner dictionaries by 'arm.length'."""
+    return jax.tree_util.tree_map_with_path(lambda path, x: values.get(leaf_name(path), x), params)
 
 
 class OfWindow(NamedTuple):
@@ -219,14 +219,14 @@ def residuals(problem, motion, w, stage, loss):
             sigma = jnp.where(known, sigma, 1.0)
             r = jnp.where(known, (says - jnp.where(known, measured, 0.0)) / sigma, 0.0)
             r = jnp.where(jnp.isfinite(r), r, NOT_REACHED * spread / sigma)
-            parts.append(jnp.ravel(dampened(r, loss)))
+            parts.append(jnp.ravel(dampened(r, loss, stage.ordinary)))
     return jnp.concatenate(parts)
 
 
-def dampened(r, loss):
-    """A residual whose square is the loss."""
+def dampened(r, loss, ordinary=1.0):
+    """A residual whose square is the loss, where an ordinary one has this size."""
     constant, ratio = LOSSES[loss]
-    return r * jnp.sqrt(ratio((r / constant) ** 2))
+    return r * jnp.sqrt(ratio((r / (constant * ordinary)) ** 2))
 
 
 def _as_far_as(t, last, part):

@@ -77,7 +77,7 @@ class Identifiability(eqx.Module):
             lines = [f"Identifiability: of {names} the data see only", *(f"  {words}" for words in self.combined())]
         if self.unseen():
             lines.append(f"  {listed(self.unseen())}: no trace in the data")
-        if self.noise is not None and rank:
+        if self.noise is not None and np.isfinite(self.noise) and rank:
             error = float(self.noise / self.singular_values[rank - 1])
             lines.append(f"  least certain: {_mixture(self.names, self.combinations[rank - 1])}, to {error:.2g}")
         return "\n".join(lines)

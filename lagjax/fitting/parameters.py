@@ -9,7 +9,8 @@ A found number x is searched as a free one, z:
 """
 
 from collections.abc import Iterable, Mapping
-from typing import Any
+from itertools import compress
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -20,6 +21,13 @@ from jaxtyping import Array, Float, PyTree
 
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.diagnosis import listed
+
+
+class Leaf(NamedTuple):
+    """A leaf of `params` by its number, and which of its entries are found; None stands for all."""
+
+    number: int
+    places: tuple[int, ...] | None
 
 
 class Found(eqx.Module):
@@ -37,15 +45,19 @@ class Found(eqx.Module):
     mean: Float[Array, " p"]
     sd: Float[Array, " p"]
     names: tuple[str, ...] = eqx.field(static=True)
-    leaves: tuple[int, ...] = eqx.field(static=True)
+    leaves: tuple[Leaf, ...] = eqx.field(static=True)
 
     def into(self, x: Float[Array, " p"]) -> PyTree:
         """`params` with the numbers `x` in place."""
         leaves, structure = jtu.tree_flatten(self.params)
         at = 0
-        for i in self.leaves:
-            size = leaves[i].size
-            leaves[i] = x[at : at + size].reshape(leaves[i].shape).astype(leaves[i].dtype)
+        for number, places in self.leaves:
+            old = leaves[number]
+            size = old.size if places is None else len(places)
+            new = x[at : at + size].astype(old.dtype)
+            if places is not None:
+                new = jnp.ravel(old).at[np.array(places)].set(new)
+            leaves[number] = new.reshape(old.shape)
             at += size
         return jtu.tree_unflatten(structure, leaves)
 
@@ -80,35 +92,40 @@ def find(
         with jax.ensure_compile_time_eval():
             params = coordinates.as_arrays(params, dtype)
     named = [(leaf_name(path), x) for path, x in jtu.tree_leaves_with_path(params)]
-    floating = {name: i for i, (name, x) in enumerate(named) if eqx.is_inexact_array(x)}
-    if free is None:
-        chosen = set(floating)
-    else:
-        wanted = [free] if isinstance(free, str) else list(free)
-        chosen = set().union(*(_matching(name, floating, "free") for name in wanted)) if wanted else set()
-    order = tuple(i for name, i in floating.items() if name in chosen)
-    entries = [entry for i in order for entry in _entries(*named[i])]
-    sizes = {named[i][0]: named[i][1].size for i in order}
+    floating = {name: x for name, x in named if eqx.is_inexact_array(x)}
+    chosen = {name: np.full(x.size, free is None) for name, x in floating.items()}
+    for wanted in [free] if isinstance(free, str) else free or ():
+        for name, places in _matching(wanted, floating, "free").items():
+            chosen[name][places] = True
+    chosen = {name: places for name, places in chosen.items() if places.any()}
+    entries = [entry for name, places in chosen.items() for entry in compress(_entries(name, floating[name]), places)]
     xp = coordinates.numpy_of(params)
-    start = xp.concatenate([xp.ravel(named[i][1]).astype(dtype) for i in order] or [xp.zeros(0, dtype)])
+    values = [xp.ravel(floating[name])[places].astype(dtype) for name, places in chosen.items()]
+    start = xp.concatenate(values or [xp.zeros(0, dtype)])
 
     def spread(given, default, what):
-        values = [np.full(len(entries), value) for value in default]
-        places = dict(zip(sizes, np.cumsum([0, *sizes.values()])))
-        for name, pair in given.items():
-            _check_pair(name, pair, what)
-            for leaf in _matching(name, sizes, what):
-                part = slice(places[leaf], places[leaf] + sizes[leaf])
-                for value, new in zip(values, pair):
+        by_leaf = [{name: np.full(len(places), value) for name, places in chosen.items()} for value in default]
+        among = {name: floating[name] for name in chosen}
+        for wanted, pair in given.items():
+            _check_pair(wanted, pair, what)
+            for name, places in _matching(wanted, among, what, chosen).items():
+                shape = floating[name].shape if isinstance(places, slice) else (1,)
+                for numbers, new in zip(by_leaf, pair):
                     if new is not None:
-                        value[part] = np.ravel(np.broadcast_to(np.asarray(new, float), named[floating[leaf]][1].shape))
-        return values
+                        numbers[name][places] = np.broadcast_to(np.asarray(new, float), shape).ravel()
+        return [np.concatenate([numbers[name][places] for name, places in chosen.items()] or [np.zeros(0)])
+                for numbers in by_leaf]  # fmt: skip
 
     low, high = spread(bounds, (-np.inf, np.inf), "bounds")
     mean, sd = spread(priors, (0.0, np.inf), "priors")
     if np.any(sd <= 0):
         raise ValueError('the standard deviation of a prior must be positive.\nFix: priors={"g": (9.81, 0.01)}.')
-    found = Found(params, start, *(x.astype(dtype) for x in (low, high, mean, sd)), tuple(entries), order)
+    numbers = {name: i for i, (name, _) in enumerate(named)}
+    leaves = tuple(
+        Leaf(numbers[name], None if places.all() else tuple(map(int, np.flatnonzero(places))))
+        for name, places in chosen.items()
+    )
+    found = Found(params, start, *(x.astype(dtype) for x in (low, high, mean, sd)), tuple(entries), leaves)
     _check_start(found, low, high)
     return found
 
@@ -122,13 +139,18 @@ def _entries(name, x):
     return [name + ("[" + ", ".join(map(str, i)) + "]" if i else "") for i in np.ndindex(x.shape)]
 
 
-def _matching(name: Any, among: Iterable[str], argument: str) -> set[str]:
-    found = {leaf for leaf in among if leaf == name or leaf.startswith(f"{name}.")}
+def _matching(name: Any, among: Mapping[str, Array], argument: str, chosen=None) -> dict[str, Any]:
+    """The leaves that a name stands for, each with the places in it: all of them, or that of an element, 'm[1]'."""
+    found: dict[str, Any] = {leaf: slice(None) for leaf in among if leaf == name or leaf.startswith(f"{name}.")}
+    leaf = str(name).partition("[")[0]
+    if not found and leaf in among:
+        places = [i for i, entry in enumerate(_entries(leaf, among[leaf])) if entry == name]
+        found = {leaf: [i] for i in places if chosen is None or chosen[leaf][i]}
     if not found:
         raise ValueError(
             f"{argument} names {name!r}, which is no floating number of params that is found: {listed(list(among))}.\n"
             'Usual cause: a misspelled name, or a whole number written without its point ("m": 1).\n'
-            f"Fix: use the names that stand in params; leaves of a dict in a dict as 'arm.length'."
+            "Fix: use the names that stand in params; leaves of a dict in a dict as 'arm.length', elements as 'm[1]'."
         )
     return found
 

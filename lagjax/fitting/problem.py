@@ -12,7 +12,7 @@ import numpy as np
 
 from lagjax.fitting.equations import LOSSES, Problem, replace
 from lagjax.fitting.parameters import find, leaf_name
-from lagjax.fitting.records import KINDS, Record, channel_name, cut
+from lagjax.fitting.records import KINDS, Record, channel_name, cut, spread
 from lagjax.fitting.result import FitWarning
 from lagjax.fitting.starts import starts
 from lagjax.mechanics import constraints, coordinates
@@ -44,12 +44,13 @@ def problem_of(system, records, params, free, observe, bounds, priors, loss, win
     starting, unflatten = starts(system, records, windows, params_of, options)
     measured = {kind: _gathered(windows, [record.measured[kind] for record in records], kind)
                 for kind in records[0].measured}  # fmt: skip
-    sigma, spread, ratio = _sigmas(records, windows, measured, absolute)
+    _check_anything_measured(measured)
+    sigma, spreads, ratio = _sigmas(records, windows, measured, absolute)
     per_window = {name: values[windows.record] for name, values in overrides.items()}
     xp = coordinates.numpy_of((starting.q.guess, starting.v.guess))
     unit = xp.std(xp.concatenate([starting.q.guess, starting.v.guess], axis=1), axis=0)
     problem = Problem(
-        system, found, per_window, windows, starting, measured, sigma, spread, ratio,
+        system, found, per_window, windows, starting, measured, sigma, spreads, ratio,
         xp.where(unit > 0, unit, 1.0), unflatten, observe, options, loss, absolute,
     )  # fmt: skip
     _check_predicted(problem)
@@ -126,28 +127,36 @@ def _gathered(windows, trees, kind):
     return jax.tree.map(lambda *x: windows.gather(x), *trees)
 
 
+def _check_anything_measured(measured):
+    if not coordinates.is_traced(measured) and all(np.all(np.isnan(x)) for x in jax.tree.leaves(measured)):
+        raise ValueError(
+            "all measurements are NaN.\nUsual cause: a column of a file that was not read as numbers.\n"
+            "Fix: look at record.measured; NaN stands for a value that is missing."
+        )
+
+
 def _sigmas(records, windows, measured, absolute):
     """Sigmas like the measurements, the spread of each channel, and the typical spread in sigmas."""
-    spread = jax.tree.map(_spread, measured)
+    spreads = jax.tree.map(_spread, measured)
     if not absolute:
         # One size for all: what is estimated is its multiple.
-        xp = coordinates.numpy_of(spread)
-        common = xp.sqrt(xp.mean(xp.stack(jax.tree.leaves(spread)) ** 2))
-        return jax.tree.map(lambda x: xp.full(x.shape, common), measured), spread, np.asarray(1.0)
+        xp = coordinates.numpy_of(spreads)
+        common = xp.sqrt(xp.mean(xp.stack(jax.tree.leaves(spreads)) ** 2))
+        return jax.tree.map(lambda x: xp.full(x.shape, common), measured), spreads, np.asarray(1.0)
     each = [{kind: _broadcast(record, kind) for kind in record.measured} for record in records]
     sigma = {kind: _gathered(windows, [tree[kind] for tree in each], kind) for kind in measured}
-    xp = coordinates.numpy_of((spread, sigma))
+    xp = coordinates.numpy_of((spreads, sigma))
     finest = lambda s: xp.nanmin(xp.where(xp.isfinite(s), s, np.nan))
-    ratios = [a / finest(s) for a, s in zip(jax.tree.leaves(spread), jax.tree.leaves(sigma))]
-    return sigma, spread, xp.max(xp.stack(ratios))
+    ratios = [a / finest(s) for a, s in zip(jax.tree.leaves(spreads), jax.tree.leaves(sigma))]
+    return sigma, spreads, xp.max(xp.stack(ratios))
 
 
 def _spread(x):
     """The standard deviation of a channel; of one number its size; 1 where that is 0."""
-    xp = coordinates.numpy_of(x)
-    spread = xp.nanstd(x)
-    spread = xp.where(spread > 0, spread, xp.abs(xp.nanmean(x)))
-    return xp.where(spread > 0, spread, 1.0)
+    xp, of = coordinates.numpy_of(x), spread(x)
+    size = xp.max(xp.where(xp.isnan(x), 0.0, xp.abs(x)), initial=0.0)
+    of = xp.where(of > 0, of, size)
+    return xp.where(of > 0, of, 1.0)
 
 
 def _broadcast(record, kind):

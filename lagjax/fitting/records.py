@@ -80,7 +80,7 @@ class Record(eqx.Module):
         given = zip(KINDS, (q, v, multipliers, observed, end))
         # Sorted as JAX sorts them: residuals stand in this order.
         given = sorted(((kind, tree) for kind, tree in given if tree is not None), key=lambda pair: pair[0])
-        self.measured = {kind: jax.tree.map(_as_floats, tree) for kind, tree in given}
+        self.measured = {kind: jax.tree.map(_as_floats, tree, is_leaf=_is_list_of_numbers) for kind, tree in given}
         if not jax.tree.leaves(self.measured):
             raise ValueError(
                 'a record holds no measurement.\nFix: lj.Record(t, q={"theta": angles}), or v=, multipliers=, '
@@ -113,6 +113,17 @@ def channel_name(kind: str, path) -> str:
     if kind in ("q", "multipliers", "observed"):
         return name or kind
     return f"{kind}.{name}" if name else kind
+
+
+def spread(x):
+    """The standard deviation of what is not missing; 0 where everything is."""
+    xp, known = coordinates.numpy_of(x), ~coordinates.numpy_of(x).isnan(x)
+    mean = lambda y: xp.sum(xp.where(known, y, 0.0)) / xp.maximum(xp.sum(known), 1)
+    return xp.sqrt(mean((x - mean(x)) ** 2))
+
+
+def _is_list_of_numbers(x):
+    return isinstance(x, list) and all(isinstance(y, int | float | np.number) for y in jax.tree.leaves(x))
 
 
 def _as_floats(x):

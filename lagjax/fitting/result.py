@@ -20,8 +20,6 @@ from lagjax.motion.integrate import integrate
 from lagjax.motion.trajectory import Trajectory
 from lagjax.numerics.chained import Unknowns
 
-# Residuals so many times larger (squared) than sigma allows are not errors of measurement.
-MISFIT = 10.0
 # A number that is closer to its bound than this, relative to the bound's size, or its start's, is at it.
 AT_BOUND = 1e-6
 
@@ -106,7 +104,8 @@ class Fit(eqx.Module):
         """The variance of an error in sigmas: 1 where sigmas were given."""
         if self.problem.absolute:
             return jnp.ones_like(self.chi2)
-        return self.chi2 / jnp.maximum(self.freedom, 1)
+        # Of as many numbers as measurements nothing is left over to tell the size of an error by.
+        return jnp.where(self.freedom > 0, self.chi2 / jnp.maximum(self.freedom, 1), jnp.nan)
 
     @property
     def noise(self) -> Float[Array, ""]:
@@ -165,12 +164,13 @@ class Fit(eqx.Module):
         slope = jax.vmap(jax.grad(half))
         curvature = jax.vmap(jax.grad(jax.grad(half)))
         r = jnp.where(r == 0, constant * 1e-9, r)
-        known = self._known()
+        known = self.known()
         mean = lambda x: jnp.sum(jnp.where(known, x, 0.0)) / jnp.sum(known)
         # Huber, Robust Statistics, Eq. (7.6.2).
         return mean(slope(r) ** 2) / mean(curvature(r)) ** 2
 
-    def _known(self):
+    def known(self) -> Bool[Array, " windows*m"]:
+        """Which of the residuals `seen.rows`, in a row, belong to a measurement."""
         parts = []
         for kind, tree in self.problem.measured.items():
             for x, s in zip(jax.tree.leaves(tree), jax.tree.leaves(self.problem.sigma[kind])):
@@ -197,7 +197,7 @@ class Fit(eqx.Module):
 
         Of all records one after the other, or of one.
         """
-        return {channel.name: channel.residuals for channel in self._channels(record)}
+        return {channel.name: channel.residuals for channel in self.channels(record)}
 
     def rms(self, record: int | None = None) -> dict[str, float]:
         """The root mean square of the residuals by channel, in the data's unit."""
@@ -211,7 +211,8 @@ class Fit(eqx.Module):
             found[name] = float(np.nanmean(r[1:] * r[:-1])) if len(r) > 1 else np.nan
         return found
 
-    def _channels(self, record: int | None = None) -> Iterator[Channel]:
+    def channels(self, record: int | None = None) -> Iterator[Channel]:
+        """Each kind of measurement, of all records one after the other, or of one."""
         windows, at = self.problem.windows, 0
         chosen = np.asarray(windows.record) == (np.asarray(windows.record) if record is None else record)
         real = np.asarray(windows.real)[chosen]
@@ -252,10 +253,6 @@ class Fit(eqx.Module):
 
         return density
 
-    def _is_off(self):
-        plain = self.problem.absolute and self.problem.loss == "squares" and self.seen is not None
-        return plain and float(self.chi2) > MISFIT * float(self.freedom) > 0
-
     def at_bounds(self) -> list[str]:
         """The names of numbers that ended at a bound."""
         found, x = self.problem.found, np.asarray(self.values)
@@ -264,42 +261,9 @@ class Fit(eqx.Module):
         near = (x - low < AT_BOUND * size) | (high - x < AT_BOUND * size)
         return [name for name, at in zip(self.names, near) if at]
 
-    def complaints(self) -> list[str]:
-        """What there is to warn of."""
-        found = []
-        if not bool(self.converged):
-            found.append(
-                f"the search stopped after {int(self.steps)} steps without converging; this is its best point.\n"
-                "Usual cause: a guess too far off, parameters that the data hardly see, noise in the motion itself.\n"
-                "Fix: look at found.plot(); try restarts=8, a shorter window=, or iterations=1000."
-            )
-        if self.seen is not None and self.identifiability.rank < len(self.names):
-            found.append(
-                f"the data do not determine all parameters.\n{self.identifiability}\n"
-                "What is not determined has no uncertainty, and stays near its guess.\n"
-                "Fix: leave some out of free=, give priors=, or measure more."
-            )
-        failed = [] if self.seen is None else np.flatnonzero(~np.asarray(self.seen.well))
-        if len(failed):
-            record = int(self.problem.windows.record[failed[0]])
-            found.append(
-                f"at the estimates the motion of record {record} stops early; what it misses counts as far off.\n"
-                f"Fix: found.motion({record}).result says why; guess nearer, or give bounds=."
-            )
-        if self._is_off():
-            times = float(jnp.sqrt(self.chi2 / self.freedom))
-            found.append(
-                f"the residuals are {times:.2g} times as large as sigma says, so that the ± mean nothing.\n"
-                "Usual cause: a wrong minimum, something that the system leaves out, outliers, or too small a sigma.\n"
-                'Fix: look at found.plot(); try a shorter window=, restarts=8, loss="cauchy".'
-            )
-        if self.at_bounds():
-            found.append(f"{listed(self.at_bounds())} ended at a bound, where uncertainties mean nothing.")
-        return found
-
     def plot(self, record: int = 0):
         """Draw data, fit and residuals of a record, a row each channel; returns a matplotlib `Figure`."""
-        return plot.fits({name: rest for name, *rest in self._channels(record) if rest[0] is not None})
+        return plot.fits({name: rest for name, *rest in self.channels(record) if rest[0] is not None})
 
     def __repr__(self):
         if coordinates.is_traced(self.cost):
@@ -350,7 +314,7 @@ def _lines(fit: Fit):
 
 
 def _whiteness(fit):
-    lag, count = fit.whiteness(), int(np.sum(np.asarray(fit._known())))
+    lag, count = fit.whiteness(), int(np.sum(np.asarray(fit.known())))
     worst = max(lag, key=lambda name: abs(np.nan_to_num(lag[name])))
     if abs(np.nan_to_num(lag[worst])) < 3 / np.sqrt(max(count / len(lag), 1)):
         return []

@@ -32,6 +32,8 @@ from lagjax.numerics.chained import (
     slopes_of,
 )
 
+# A standard deviation over the median of the absolute value, of normal errors.
+OF_NORMAL = 1.4826
 # Of the slopes, enough to make what the data cannot see regular, and too little to be seen itself.
 FLOOR = 1e-10
 # An uncertainty so many times (over √eps) larger than with all else known is none: the data do not see it.
@@ -171,6 +173,15 @@ def _minimise(solver, problem, y, stage, limit, told):
     return optx.minimise(cost, solver, y, (problem, stage), has_aux=True, max_steps=limit, throw=False)
 
 
+def _ordinary(problem, u, stage):
+    """The size of an ordinary error at `u`, in sigmas: what half of the residuals do not exceed; not below a sigma."""
+    unforgiving = eqx.tree_at(lambda stage: stage.ordinary, stage, jnp.asarray(jnp.inf))
+    rows = equations(problem, u, unforgiving).rows
+    # What was not measured, or does not count yet, is zero.
+    half = jnp.nanmedian(jnp.where(rows == 0, jnp.nan, jnp.abs(rows)))
+    return jnp.maximum(OF_NORMAL * jnp.where(jnp.isfinite(half), half, 0.0), 1.0)
+
+
 def _cost(values: Equations):
     return 0.5 * sum(jnp.sum(x**2) for x in values)
 
@@ -229,6 +240,11 @@ def _search(problem, start, stages, tolerances, optimiser, limit, tell):
     def one_stage(carried, x):
         (y, taken), (number, stage, tolerance) = carried, x
         told = partial(jax.debug.callback, _heard, number) if tell else lambda cost: None
+        if problem.loss != "squares":
+            # Far from the truth every residual would look like an outlier, and such a loss has no slope there.
+            estimated = _ordinary(problem, _natural(problem, y), stage)
+            ordinary = jnp.where(number == len(tolerances) - 1, stage.ordinary, estimated)
+            stage = eqx.tree_at(lambda stage: stage.ordinary, stage, ordinary)
         solver = optimiser
         if optimiser is None:
             solver = optx.LevenbergMarquardt(tolerance, tolerance, norm=_largest_change, linear_solver=ByWindows())

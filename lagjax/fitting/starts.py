@@ -12,6 +12,7 @@ Source: Hairer, Lubich & Wanner, *Geometric Numerical Integration*, §IV.5.3 (ta
 """
 
 from collections.abc import Callable, Sequence
+from itertools import combinations
 
 import equinox as eqx
 import jax
@@ -21,7 +22,7 @@ import scipy.linalg
 from jax import lax
 from jaxtyping import Array, Float
 
-from lagjax.fitting.records import Record, Windows
+from lagjax.fitting.records import Record, Windows, spread
 from lagjax.mechanics import constraints, coordinates
 from lagjax.mechanics.coordinates import State
 from lagjax.mechanics.diagnosis import listed
@@ -32,6 +33,9 @@ from lagjax.motion.integrate import integrate
 
 # Samples from whose parabola position and velocity are read.
 SAMPLES = 7
+# So many of them agree; what is off by so many times more than these, and by so much of the data's spread, is wild.
+# (Samples far apart, along a curve that is no parabola, come to 30 times.)
+MOST, WILD, OF_SPREAD = 5, 100.0, 0.3
 # Iterations for c, each with its own matrix; they end where the residual no longer falls.
 ITERATIONS = 12
 # Of a guess, what is left of the constraints after that, in displacements relative to the state.
@@ -187,7 +191,7 @@ def _read_off(record, samples):
 
     def parabolas(kind):
         tree = record.measured.get(kind)
-        pairs = jax.tree.map(lambda x: _parabola(t.astype(x.dtype), x[samples]), tree)
+        pairs = jax.tree.map(lambda x: _parabola(t.astype(x.dtype), x, samples), tree)
         return [jax.tree.map(lambda x, pair, i=i: pair[i], tree, pairs) for i in (0, 1)]
 
     (q, slopes), (v, _) = parabolas("q"), parabolas("v")
@@ -196,17 +200,33 @@ def _read_off(record, samples):
     return q, slopes if v is None else v
 
 
-def _parabola(t, x):
-    """Value and slope at t = 0 of a parabola through the first samples that are not missing."""
+def _parabola(t, x, samples):
+    """Value and slope at the first of some samples, at t = 0, of a parabola through the first that are not missing.
+
+    Wild values among them do not count: of the parabolas through three samples each, the one to which most others are
+    nearest tells which belong together, and these are fitted.
+
+    Source: Rousseeuw, *J. Am. Stat. Assoc.* 79 (1984) 871 (least median of squares).
+    """
     xp, shape = coordinates.numpy_of(x), x.shape[1:]
+    count = min(SAMPLES, len(t))
+    threes = np.array(list(combinations(range(count), 3)))
     values, slopes = [], []
-    for column in x.reshape(len(t), -1).T:
-        known = xp.isfinite(column)
-        weight = known & (xp.cumsum(known) <= SAMPLES)
-        scale = xp.max(xp.where(weight, t, 0.0))
+    for column in x.reshape(len(x), -1).T:
+        wild, column = OF_SPREAD * spread(column), column[samples]
+        first = xp.argsort(~xp.isfinite(column), stable=True)[:count]
+        y, known = column[first], xp.isfinite(column[first])
+        scale = xp.max(xp.where(known, t[first], 0.0))
         scale = xp.where(scale > 0, scale, 1.0)
-        powers = (t / scale)[:, None] ** np.arange(3)
-        found = xp.linalg.lstsq(powers * weight[:, None], xp.where(weight, column, 0.0))[0]
+        powers = (t[first] / scale)[:, None] ** np.arange(3)
+        near, y = known, xp.where(known, y, 0.0)
+        if count == SAMPLES:
+            through = xp.linalg.solve(powers[threes], y[threes][..., None])
+            off = xp.abs(y - (powers @ through)[..., 0])
+            typical = xp.sort(off, axis=1)[:, MOST - 1]
+            best = xp.argmin(typical)
+            near = known & (~xp.all(known) | (off[best] <= xp.maximum(WILD * typical[best], wild)))
+        found = xp.linalg.lstsq(powers * near[:, None], xp.where(near, y, 0.0))[0]
         values.append(found[0])
         slopes.append(found[1] / scale)
     return tuple(xp.stack(part).reshape(shape) for part in (values, slopes))

@@ -35,6 +35,8 @@ RECORD = lj.Record(T, q=Q)
     "arguments, error, words",
     [
         ((RECORD, PENDULUM, {"free": "length"}), ValueError, "free names 'length'.*'l'"),
+        ((RECORD, PENDULUM, {"free": "l[0]"}), ValueError, r"free names 'l\[0\]'.*elements as 'm\[1\]'"),
+        ((lj.Record(T, q=np.nan * Q), PENDULUM, {}), ValueError, "all measurements are NaN"),
         ((RECORD, PENDULUM | {"m": 1}, {"free": "m"}), ValueError, "whole number"),
         ((RECORD, PENDULUM, {"bounds": {"l": (2.0, None)}}), ValueError, "'l' starts at 1.25.*inside its bounds"),
         ((RECORD, PENDULUM, {"bounds": {"l": 2.0}}), ValueError, "must be a pair"),

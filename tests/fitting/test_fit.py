@@ -1,6 +1,9 @@
 """What a fit finds, and what it says of what it cannot find."""
 
+from typing import Any, NamedTuple
+
 import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,9 +14,12 @@ from jax.flatten_util import ravel_pytree
 from scipy.optimize import least_squares
 
 import lagjax as lj
+from lagjax.fitting import search
+from lagjax.fitting.doubts import doubts
 from lagjax.fitting.equations import WHOLE, equations
 from lagjax.fitting.problem import problem_of
 from lagjax.fitting.search import linearised
+from lagjax.fitting.starts import _parabola
 from lagjax.numerics.chained import Unknowns
 from lagjax.scenes import rolling_hoop
 from tests.fitting.cases import CASES, HUNG, PENDULUM, hung, pendulum, swing
@@ -173,6 +179,49 @@ def test_a_start_that_the_data_do_not_see():
         lj.fit(lj.System(both), lj.Record(ts, q={"a": np.cos(2 * ts)}), {"k": 3.0})
 
 
+class Springs(NamedTuple):
+    """Parameters that are not a dictionary."""
+
+    m: Any
+    walls: dict
+
+
+springs = lj.System(lambda t, q, v, p: 0.5 * jnp.sum(p.m * v**2) - 0.5 * jnp.sum(p.walls["k"] * q**2))
+SPRINGS = Springs(jnp.array([1.0, 2.0]), {"k": jnp.array([3.0, 5.0])})
+
+
+@pytest.mark.slow
+def test_elements_of_any_pytree():
+    """One entry of an array is found, the others stay; bounds by element; a run with parameters of its own."""
+    ts = np.linspace(0.0, 4.0, 60)
+    heavy = SPRINGS._replace(m=jnp.array([1.5, 2.0]))
+    runs = [lj.integrate(springs, jnp.ones(2), jnp.zeros(2), p, ts=ts).q for p in (SPRINGS, heavy)]
+    records = [lj.Record(ts, q=runs[0]), lj.Record(ts, q=runs[1], params={"m": heavy.m})]
+    guess = SPRINGS._replace(walls={"k": jnp.array([3.0, 4.0])})
+    found = lj.fit(springs, records, guess, free="walls.k[1]", bounds={"walls.k[1]": (0.0, None)})
+    assert found.names == ("walls.k[1]",)
+    np.testing.assert_allclose(found.params.walls["k"], [3.0, 5.0], rtol=1e-8)
+    np.testing.assert_array_equal(found.params.m, SPRINGS.m)
+
+
+@pytest.mark.slow
+def test_what_the_residuals_tell():
+    """Nothing is left over of as many numbers as measurements; what follows a curve is no error of measurement."""
+    spring = lj.System(lambda t, q, v, p: 0.5 * v**2 - 0.5 * p["k"] * q**2)
+    with pytest.warns(lj.FitWarning, match="as many unknowns as measurements.*\n.*sigma="):
+        found = lj.fit(spring, lj.Record([0.0, 0.5, 1.0], q=[1.0, 0.9, 0.6]), {"k": 1.0})
+    assert np.isnan(found.sd).all() and np.isnan(found.start_sd[0][0])
+    # Twin: the same with the size of the errors told.
+    told = lj.fit(spring, lj.Record([0.0, 0.5, 1.0], q=[1.0, 0.9, 0.6], sigma=0.01), {"k": 1.0})
+    assert np.isfinite(told.sd).all()
+    clean = lj.integrate(spring, 1.0, 0.0, {"k": 4.0}, ts=TS).q
+    data = noisy(np.asarray(clean) + 0.3 * np.cos(9 * TS), 0.02)
+    with pytest.warns(lj.FitWarning, match="residuals of 'q' are no errors of measurement"):
+        lj.fit(spring, lj.Record(TS, q=data), {"k": 3.0})
+    # Twin: as large, and each on its own.
+    lj.fit(spring, lj.Record(TS, q=noisy(np.asarray(clean), 0.25)), {"k": 3.0})
+
+
 @pytest.mark.slow
 def test_observation_velocity_and_end():
     """Positions through an observation function, velocities, a time of departure: each finds what it shows."""
@@ -239,6 +288,8 @@ def test_outliers_priors_and_bounds(swinging):
     off = lambda found: np.max(np.abs(found.values - clean.values) / clean.sd)
     assert off(plain) > 10 and off(robust) < 2
     assert np.all(robust.sd > clean.sd) and np.all(robust.sd < 2 * clean.sd)
+    astray = eqx.tree_at(lambda found: found.unknowns.shared, clean, jnp.array([0.05, 1e9]))
+    assert "'l' was guessed to be 1.4, and came to 1e+09" in doubts(astray)[0] and not doubts(clean)
 
     known = fit(data, priors={"l": (1.248, 0.0005)})
     weights = np.array([1 / clean.sd[1] ** 2, 1 / 0.0005**2])
@@ -250,6 +301,45 @@ def test_outliers_priors_and_bounds(swinging):
         held = fit(data, bounds={"l": (1.3, 2.0)})
     assert any("'l' ended at a bound" in str(warning.message) for warning in told)
     assert float(held.values[1]) == pytest.approx(1.3, abs=1e-5) and held.at_bounds() == ["l"]
+
+
+@pytest.mark.slow
+def test_outliers_from_far(swinging, monkeypatch):
+    """With a wild value first, and others, a robust loss still gets from a bad guess to the truth."""
+    rng = np.random.default_rng(2)
+    wild = swinging[0] + 0.002 * rng.normal(size=100)
+    wild[::7] += rng.normal(size=15)
+    guess, start = GUESS | {"l": 1.9}, {"q0": 0.3, "v0": 2.0}
+    fit = lambda **more: lj.fit(pendulum, lj.Record(TS, q=wild, sigma=0.002, **start), guess, free=FREE, **more)
+    found = fit(loss="cauchy")
+    assert bool(found.converged) and np.max(found.sd) < 1e-3 and abs(float(found.q0[0]) - 1.0) < 0.005
+    np.testing.assert_allclose(found.values, [0.05, 1.25], atol=3 * np.max(found.sd))
+    # Without a guess of the start the wild value is not taken for one.
+    start.clear()
+    np.testing.assert_allclose(fit(loss="huber").values, [0.05, 1.25], atol=4 * np.max(found.sd))
+    # Twin: with an ordinary error of a sigma from the beginning all of the data look like outliers.
+    start.update({"q0": 0.3, "v0": 2.0})
+    monkeypatch.setattr(search, "_ordinary", lambda *state: 1.0)
+    with pytest.warns(lj.FitWarning, match="times as large as sigma says"):
+        # Another number of iterations, so that it is traced again.
+        astray = fit(loss="cauchy", iterations=99)
+    assert not np.allclose(astray.values, found.values, atol=0.1)
+
+
+@pytest.mark.parametrize("wild", [0, 3, 6])
+def test_a_start_is_read_off_without_wild_values(wild):
+    """From the first seven samples, one of them wild: position and velocity nearly as from the others."""
+    t = 0.05 * np.arange(40.0)
+    x = 1.0 + 0.5 * t - 2.0 * t**2 + 1e-3 * np.random.default_rng(0).normal(size=40)
+    x[wild] += 3.0
+    q, v = _parabola(t, x, np.arange(40))
+    assert abs(q - 1.0) < 0.01 and abs(v - 0.5) < 0.1
+    # Twin: least squares follow it; and a parabola through samples far apart keeps them all.
+    near = np.polynomial.Polynomial.fit(t[:7], x[:7], 2)
+    assert abs(near(0.0) - 1.0) > 0.1 or abs(near.deriv()(0.0) - 0.5) > 1.0
+    t, far = np.arange(7.0), np.cos(0.8 * np.arange(7.0))
+    near = np.polynomial.Polynomial.fit(t, far, 2)
+    np.testing.assert_allclose(_parabola(t, far, np.arange(7))[0], near(0.0))
 
 
 def problem(case, measured, **options):

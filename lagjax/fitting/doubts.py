@@ -1,0 +1,110 @@
+"""What there is to doubt about a fit, in words: each says what happened, the usual cause, and what to do."""
+
+import jax.numpy as jnp
+import numpy as np
+
+from lagjax.fitting.records import spread
+from lagjax.fitting.result import Fit
+from lagjax.fitting.search import OF_NORMAL
+from lagjax.mechanics.diagnosis import listed
+
+# Residuals so many times larger than sigma are not errors of measurement.
+MISFIT = 3.0
+# Nor are those of this part of the data's spread, if they correlate so much with the next.
+MISSED, MISSED_AND_ALIKE = 0.05, 0.7
+# A number so many times as large as it was guessed to be has not been found.
+ASTRAY = 1e6
+
+
+def doubts(fit: Fit) -> list[str]:
+    """What a user has to know of a fit, the gravest first."""
+    words = [_of_search(fit), _astray(fit)]
+    if fit.seen is not None:
+        words += [_of_parameters(fit), _of_motion(fit)]
+        words += [_against_sigma(fit)] if fit.problem.absolute else [_without_freedom(fit), _on_a_curve(fit)]
+    if fit.at_bounds():
+        words.append(f"{listed(fit.at_bounds())} ended at a bound, where uncertainties mean nothing.")
+    return [told for told in words if told]
+
+
+def _of_search(fit):
+    if bool(fit.converged):
+        return ""
+    return (
+        f"the search stopped after {int(fit.steps)} steps without converging; this is its best point.\n"
+        "Usual cause: a guess too far off, parameters that the data hardly see, noise in the motion itself.\n"
+        "Fix: look at found.plot(); try restarts=8, a shorter window=, or iterations=1000."
+    )
+
+
+def _astray(fit):
+    guesses = zip(fit.names, np.asarray(fit.problem.found.start), np.asarray(fit.values))
+    for name, guess, x in guesses:
+        if guess and abs(x) > ASTRAY * abs(guess):
+            return (
+                f"the search went astray: '{name}' was guessed to be {guess:.4g}, and came to {x:.4g}.\n"
+                "Usual cause: a guess too far off, outliers, angles that are wrapped to a turn.\n"
+                f'Fix: bounds={{"{name}": (low, high)}}, a nearer guess, a shorter window=, or loss="cauchy".'
+            )
+    return ""
+
+
+def _of_parameters(fit):
+    if fit.identifiability.rank == len(fit.names):
+        return ""
+    return (
+        f"the data do not determine all parameters.\n{fit.identifiability}\n"
+        "What is not determined has no uncertainty, and stays near its guess.\n"
+        "Fix: leave some out of free=, give priors=, or measure more."
+    )
+
+
+def _of_motion(fit):
+    failed = np.flatnonzero(~np.asarray(fit.seen.well))
+    if not failed.size:
+        return ""
+    record = int(fit.problem.windows.record[failed[0]])
+    return (
+        f"at the estimates the motion of record {record} stops early; what it misses counts as far off.\n"
+        f"Fix: found.motion({record}).result says why; guess nearer, or give bounds=."
+    )
+
+
+def _against_sigma(fit):
+    if float(fit.freedom) <= 0:
+        return ""
+    if fit.problem.loss == "squares":
+        times = float(jnp.sqrt(fit.chi2 / fit.freedom))
+    else:
+        # Wild values are forgiven; the better half of the residuals is not.
+        times = float(OF_NORMAL * np.median(np.abs(fit.seen.rows.reshape(-1)[fit.known()])))
+    if times <= MISFIT:
+        return ""
+    return (
+        f"the residuals are {times:.2g} times as large as sigma says, so that the ± mean nothing.\n"
+        "Usual cause: a wrong minimum, something that the system leaves out, outliers, or too small a sigma.\n"
+        'Fix: look at found.plot(); try a shorter window=, restarts=8, loss="cauchy".'
+    )
+
+
+def _without_freedom(fit):
+    if float(fit.freedom) > 0:
+        return ""
+    return (
+        "there are as many unknowns as measurements, so that nothing tells how certain they are.\n"
+        "Fix: measure more, free fewer, or say how large errors are: lj.Record(..., sigma=0.01)."
+    )
+
+
+def _on_a_curve(fit):
+    """Of channels whose residuals are a good part of the data's spread, and follow a curve."""
+    like_the_next, rms = fit.whiteness(), fit.rms()
+    large = {c.name for c in fit.channels() if rms[c.name] > MISSED * spread(c.measured)}
+    missed = [name for name in rms if name in large and like_the_next[name] > MISSED_AND_ALIKE]
+    if not missed:
+        return ""
+    return (
+        f"the residuals of {listed(missed)} are no errors of measurement: large, and each like the next.\n"
+        "Usual cause: a wrong minimum, or something that the system leaves out.\n"
+        "Fix: look at found.plot(); try a nearer guess, restarts=8, a shorter window=."
+    )
