@@ -69,6 +69,28 @@ def time_series(t, panels: dict[str, dict[str, np.ndarray]]):
     return fig
 
 
+def families(label: str, x, ts, panels: dict[str, np.ndarray]):
+    """Draw curves against time, one panel a coordinate, one curve a value of `x` (N,), in its shade.
+
+    **Arguments:** `ts` (N, T); `panels` by coordinate, curves (N, T).
+
+    **Returns:** a matplotlib `Figure`.
+    """
+    matplotlib = import_matplotlib()
+    low, high = np.min(x), np.max(x)
+    # The lightest shades would not be seen on white.
+    shades = matplotlib.colors.ListedColormap(matplotlib.colormaps["cividis"](np.linspace(0.0, 0.88, 256)))
+    shade = matplotlib.cm.ScalarMappable(matplotlib.colors.Normalize(low, high if high > low else low + 1), shades)
+    fig, axes = figure(len(panels), 1, size=(6.4, 2.4), sharex=True)
+    for axis, (name, curves) in zip(axes[:, 0], panels.items()):
+        for of, t, curve in zip(x, ts, curves):
+            axis.plot(t, curve, linewidth=1.2, color=shade.to_rgba(of))
+        axis.set_ylabel(name)
+    axes[-1, 0].set_xlabel("t")
+    fig.colorbar(shade, ax=list(axes[:, 0]), label=label)
+    return fig
+
+
 def phase_portrait(panels: dict[str, tuple[list[tuple[np.ndarray, np.ndarray]], bool]]):
     """Draw velocities against coordinates, one panel a coordinate, one curve a motion; a dot where each starts.
 

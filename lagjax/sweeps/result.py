@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import PyTree
 
 from lagjax import plot
+from lagjax.mechanics import coordinates
 from lagjax.motion.trajectory import RESULTS, Trajectory, in_words
 from lagjax.sweeps.axes import POINT, Axes
 from lagjax.sweeps.lanes import GOOD, NOT_RUN, Status
@@ -91,12 +92,15 @@ class Sweep:
         """Draw values over the axes: lines over one, a map over two, a map for each value of the first over three.
 
         **Arguments:** `value`: the name of a leaf, or a function of `values` that returns an array in the shape of the
-        axes; by default every leaf with one number a point. Lines mark what is not `ok`; NaN is grey in maps.
+        axes; by default every leaf with one number a point. Lines mark what is not `ok`; NaN is grey in maps. A
+        `Trajectory` over one axis is drawn against time, a curve a point.
 
         **Returns:** a matplotlib `Figure`.
 
         **Raises:** `ValueError` where there is no such value, or more than three axes.
         """
+        if value is None and isinstance(self.values, Trajectory) and len(self.axes.shape) == 1:
+            return self._plot_motions(self.values)
         panels = self._panels(value)
         if self.axes.zipped:
             name, x = next(iter(self.axes.values.items()))
@@ -112,12 +116,23 @@ class Sweep:
             )
         return plot.maps(axes, panels)
 
+    def _plot_motions(self, motions):
+        (name, x), *others = self.axes.values.items()
+        if others or x.ndim > 1:
+            name, x = POINT if others else name, np.arange(len(x))
+        columns = [q.reshape(*motions.t.shape, -1) for q in jax.tree.leaves(motions.q)]
+        curves = np.moveaxis(np.concatenate(columns, axis=-1), -1, 0)
+        one = jax.tree.map(lambda q: q[0, 0], motions.q)
+        return plot.families(name, x, motions.t, dict(zip(coordinates.names(one), curves)))
+
     def _panels(self, value):
         values = self.values
         if callable(value):
             chosen = {"value": np.asarray(value(values))}
         else:
-            chosen = {name: x for name, x in named_leaves(values) if value is None or name == value}
+            of_motions = jax.tree.map(_without_motion, values, is_leaf=lambda x: isinstance(x, Trajectory))
+            drawn = named_leaves(of_motions if value is None else values)
+            chosen = {name: x for name, x in drawn if value is None or name == value}
         numbers = {name: x for name, x in chosen.items() if x.shape == self.axes.shape}
         if not numbers:
             there = ", ".join(f"'{name}' {x.shape[len(self.axes.shape) :]}" for name, x in named_leaves(values))
@@ -192,6 +207,10 @@ class Sweep:
 
 def _inner(name, x, lead=1):
     return [f"{name}_{i}" for i in range(np.ndim(x) - lead)]
+
+
+def _without_motion(part):
+    return None if isinstance(part, Trajectory) else part
 
 
 def _words(code):

@@ -199,6 +199,12 @@ def test_repr_and_pictures():
     assert len(three.plot().axes) == 4
     with pytest.raises(ValueError, match=r"no value with one number a point; a point has 'q' \(4,\)"):
         quiet(lambda point: {"q": point["g"] * TS}).plot()
+    motions = quiet(swing, {"g": jnp.array([1.0, 4.0, 9.0]), "angle": jnp.array([0.1, 0.2, 0.3])}, zipped=True)
+    panel, shades = motions.plot().axes
+    assert shades.get_ylabel() == "point" and panel.get_xlabel() == "t" and len(panel.lines) == 3
+    np.testing.assert_array_equal(panel.lines[2].get_ydata(), motions.values.q[2])
+    with pytest.raises(ValueError, match="(?s)a point has.*'q' .*Fix: choose one"):
+        quiet(swing).plot()
 
 
 class Spring(eqx.Module):
