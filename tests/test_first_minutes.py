@@ -1,6 +1,6 @@
 """What a newcomer gets wrong first: one paragraph with what happened, the usual cause, and the fix as code.
 
-All of these fail before anything is compiled.
+All of these but the film fail before anything is compiled.
 """
 
 import math
@@ -37,6 +37,11 @@ def move(lagrangian, start=START, params=PARAMS, **options):
     """Integrate a system or a Lagrangian."""
     system = lagrangian if isinstance(lagrangian, lj.System) else lj.System(lagrangian)
     return lj.integrate(system, *start, params, **{"ts": TS} | options)
+
+
+def swept(run):
+    """A sweep over masses."""
+    return lj.sweep(run, {"m": [1.0, 2.0]}, progress=False)
 
 
 def constrained(g, kind=lj.Holonomic):
@@ -136,7 +141,7 @@ MISTAKES = {
     "float": (lambda: move(by_float), TYPE, "Python number", "leave out float"),
     "if": (lambda: move(with_if), TYPE, "decides", r'if q\["theta"\] > 0', "jnp.where"),
     "no return": (lambda: move(without_return), VALUE, "returned None", "return kinetic - potential"),
-    "attributes": (lambda: move(attributes), TYPE, ".theta of a dict", r'q\["theta"\]'),
+    "attributes": (lambda: move(attributes), TYPE, ".theta of a dict", r'v\["theta"\]'),
     "no time": (lambda: move(without_time), TYPE, "4 arguments", r"without_time\(q, v, params\)", "def without_time"),
     "a force for one coordinate": (
         lambda: move(lj.System(point, force=lambda t, q, v, params: -v["x"]), POINT), VALUE, "like q", "0.0 where"),
@@ -146,6 +151,21 @@ MISTAKES = {
     "our solver's class": (lambda: move(swing, method=lj.Radau5), TYPE, r"method=lj.Radau5\(\)"),
     "diffrax's solver's class": (lambda: move(swing, method=diffrax.Dopri5), TYPE, r"method=diffrax.Dopri5\(\)"),
     "a solver's name": (lambda: move(swing, method="RK45"), TYPE, "not str", r"lj.Dopri8\(\)"),
+    "a parameter read as text": (
+        lambda: move(swing, params=PARAMS | {"g": "9.81"}), TYPE, "with 'g' of params", '"g": 1.0'),
+    "a parameter to be filled in": (lambda: move(swing, params=PARAMS | {"g": None}), TYPE, "with 'g' of params"),
+    "params as a whole": (
+        lambda: move(lambda t, q, v, params: v["theta"] ** 2 - params * q["theta"]), TYPE, "with a dict", "'g'|'m'"),
+    "amplitudes": (lambda: move(swing, ({"theta": 1j}, {"theta": 0j})), TYPE, "is complex", "jnp.real"),
+    "an axis by another name": (
+        lambda: swept(lambda point: point["mass"]), VALUE, r"run\(point\) asks for 'mass'", "point has 'm'", "axes ="),
+    "an axis as an attribute": (lambda: swept(lambda point: point.m**2), TYPE, ".m of a dict", r'point\["m"\]'),
+    "a point for a number": (lambda: swept(lambda m: m**2), TYPE, "with a dict", r"point\['m'\]"),
+    "axes one by one": (lambda: swept(lambda m, g: m * g), TYPE, "with 1 argument,", r"f\(m, g\)", r"f\(point\)"),
+    "if in a sweep": (lambda: swept(lambda p: 1.0 if p["m"] > 1 else 0.0), TYPE, "decides", "jnp.where"),
+    "float in a sweep": (lambda: swept(lambda p: float(p["m"])), TYPE, "Python number", "leave out float"),
+    "a film of q alone": (
+        lambda: move(swing).animate(lambda q: (q["theta"], 0.0)), TYPE, r"positions\(t, q, params\)", r"f\(t, q, params\)"),
     "the state of the explanation": (lambda: lj.explain(lj.System(by_numpy), *START, PARAMS), TYPE, NUMPY, "jnp.cos"),
     "one acceleration": (
         lambda: lj.accelerations(lj.System(needs_mass), 0.0, *START, PARAMS), VALUE, "'mass'", "'m'"),
@@ -186,7 +206,7 @@ def test_an_unknown_error_is_the_users_own():
     with pytest.raises(RuntimeError, match="my own"):
         move(fails)
     with pytest.raises(TypeError, match="unsupported operand"):
-        move(lambda t, q, v, params: 0.5 * v["theta"] ** 2 + {})
+        move(lambda t, q, v, params: 0.5 * v["theta"] ** 2 + set())
 
 
 def test_closed_over_parameters_work():

@@ -108,13 +108,19 @@ def is_traced(tree) -> bool:
 
 def _check_floating(tree, which):
     for path, leaf in jtu.tree_flatten_with_path(tree)[0]:
-        if not jnp.issubdtype(leaf.dtype, jnp.floating):
-            raise TypeError(
-                f"coordinate '{_path_name(path)}' of {which} is {leaf.dtype}, "
-                "and the equations of motion need floats.\n"
-                f"Usual cause: a whole number written without its decimal point.\n"
-                f"Fix: write 1.0 instead of 1, or jnp.asarray(..., dtype=float)."
-            )
+        if jnp.issubdtype(leaf.dtype, jnp.floating):
+            continue
+        cause, fix = (
+            "a whole number written without its decimal point",
+            "1.0 instead of 1, or jnp.asarray(..., dtype=float)",
+        )
+        if jnp.issubdtype(leaf.dtype, jnp.complexfloating):
+            cause, fix = "the root of a negative number, or an amplitude", "its real part, jnp.real(...)"
+        raise TypeError(
+            f"coordinate '{_path_name(path)}' of {which} is {leaf.dtype}, and the equations of motion need floats.\n"
+            f"Usual cause: {cause}.\n"
+            f"Fix: write {fix}."
+        )
 
 
 def _check_alike(q, v):

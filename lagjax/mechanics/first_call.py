@@ -9,7 +9,8 @@ import inspect
 import re
 import traceback
 from collections.abc import Callable, Mapping
-from typing import NamedTuple
+from contextlib import contextmanager
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -25,17 +26,17 @@ def check_functions(system, t, q, v, params):
     given = {"t": t, "q": q, "v": v, "params": params}
     for role, function in (("L", system.lagrangian), ("dissipation", system.dissipation)):
         if function is not None:
-            _check_energy(_Call(role, function, OF_STATE), given)
+            _check_energy(Call(role, function, OF_STATE), given)
     if system.force is not None:
-        _check_force(_Call("force", system.force, OF_STATE), given)
+        _check_force(Call("force", system.force, OF_STATE), given)
     for name, constraint in system.constraints.items():
         if isinstance(constraint, Holonomic):
-            _check_constraint(_Call("g", constraint.g, OF_POSITION, f" of constraint '{name}'"), given)
+            _check_constraint(Call("g", constraint.g, OF_POSITION, f" of constraint '{name}'"), given)
         else:
-            _check_constraint(_Call("phi", constraint.phi, OF_STATE, f" of constraint '{name}'"), given)
+            _check_constraint(Call("phi", constraint.phi, OF_STATE, f" of constraint '{name}'"), given)
 
 
-class _Call(NamedTuple):
+class Call(NamedTuple):
     """A function of the user's, what it is called here, the arguments that it gets, and to what it belongs."""
 
     role: str
@@ -104,15 +105,36 @@ def _check_constraint(call, given):
 
 def _shapes(call, given):
     """The shapes and dtypes that the function returns, or an error in the user's words."""
-    args = [given[name] for name in call.takes]
+    check_arguments(call, "an argument left out that the function does not need, or one too many: positions are "
+                    "constrained without v")  # fmt: skip
+    with in_words(call, given):
+        return eqx.filter_eval_shape(call.function, *(given[name] for name in call.takes))
+
+
+def check_arguments(call: Call, usual_cause: str):
+    """Raise where the function cannot be called with so many arguments."""
     try:
-        inspect.signature(call.function).bind(*args)
-    except TypeError as error:
-        raise TypeError(_wrong_arguments(call)) from error
+        signature = inspect.signature(call.function)
     except ValueError:
-        pass  # A built-in without a signature.
+        return  # A built-in without a signature.
     try:
-        return eqx.filter_eval_shape(call.function, *args)
+        signature.bind(*call.takes)
+    except TypeError as error:
+        name = getattr(call.function, "__name__", "f")
+        name = "f" if name == "<lambda>" else name
+        count = f"{len(call.takes)} argument{'s' * (len(call.takes) > 1)}"
+        raise TypeError(
+            f"{call} is called with {count}, and the function is {name}{signature}.\n"
+            f"Usual cause: {usual_cause}.\n"
+            f"Fix: def {name}({', '.join(call.takes)})."
+        ) from error
+
+
+@contextmanager
+def in_words(call: Call, given: Mapping[str, Any]):
+    """What goes wrong inside, while the function is called with what is `given`, is raised in the user's words."""
+    try:
+        yield
     except KeyError as error:
         raise ValueError(_missing(call, given, error)) from error
     except (TypeError, AttributeError) as error:
@@ -120,17 +142,6 @@ def _shapes(call, given):
         if words is None:
             raise
         raise TypeError(words) from error
-
-
-def _wrong_arguments(call):
-    name = getattr(call.function, "__name__", "f")
-    takes = f"{'f' if name == '<lambda>' else name}{inspect.signature(call.function)}"
-    return (
-        f"{call} is called with {len(call.takes)} arguments, and the function is {takes}.\n"
-        "Usual cause: an argument left out that the function does not need, or one too many: positions are constrained "
-        "without v.\n"
-        f"Fix: def {'f' if name == '<lambda>' else name}({', '.join(call.takes)})."
-    )
 
 
 def _missing(call, given, error):
@@ -144,7 +155,9 @@ def _missing(call, given, error):
         there = {source: there[source]} if source in there else there
     has = "; ".join(f"{name} has {', '.join(map(repr, keys))}" for name, keys in there.items())
     meant = difflib.get_close_matches(str(key), [str(k) for keys in there.values() for k in keys], 1)
-    if set(there) & {"q", "v"} and "params" not in there:
+    if "point" in there:
+        fix = f'axes = {{..., "{key}": jnp.linspace(0.0, 1.0, 11)}}'
+    elif set(there) & {"q", "v"} and "params" not in there:
         fix = f'q0 = {{"{key}": 0.1}} and v0 = {{"{key}": 0.0}}'
     else:
         fix = f'params = {{..., "{key}": 1.0}}'
@@ -182,17 +195,31 @@ def _in_words(call, given, error):
             "Usual cause: a function of the module math, float(...), int(...), or range(...).\n"
             f"Fix: {instead}."
         )
-    if given["params"] is None and "NoneType" in said:
+    if "params" in given and given["params"] is None and "NoneType" in said:
         return (
             f"{call} uses params, and none were given.{where}\n"
             "Usual cause: params left out of the call, where they follow q and v.\n"
             'Fix: lj.integrate(system, q0, v0, {"m": 1.0, "g": 9.81}, ts=ts).'
         )
     if missing := re.match(r"'dict' object has no attribute '(\w+)'", said):
+        used = re.search(rf"(\w+)\.{missing[1]}\b", line)
+        of = used[1] if used else "q"
         return (
             f"{call} asks for .{missing[1]} of a dict.{where}\n"
             "Usual cause: names are looked up in brackets.\n"
-            f'Fix: q["{missing[1]}"] in place of q.{missing[1]}.'
+            f'Fix: {of}["{missing[1]}"] in place of {of}.{missing[1]}.'
+        )
+    if "'dict'" in said and "unsupported operand" in said:
+        return (
+            f"{call} calculates with a dict.{where}\n"
+            "Usual cause: all of what has names taken for one of them.\n"
+            f"Fix: look a name up in it, as in {call.takes[-1]}[{next(iter(given.get(call.takes[-1]) or ['g']))!r}]."
+        )
+    if odd := [name for name, x in _leaves(given.get("params")) if x is None or isinstance(x, str)]:
+        return (
+            f"{call} calculates with '{odd[0]}' of params, which is no number.{where}\n"
+            "Usual cause: a number read as text, or left to be filled in.\n"
+            f'Fix: params = {{..., "{odd[0]}": 1.0}}.'
         )
     if asked := re.search(r"string indexing; got idx='(.*)'", said):
         return (
@@ -207,6 +234,11 @@ def _in_words(call, given, error):
             "Fix: make it an array, q0 = jnp.array([0.1, 0.2])."
         )
     return None
+
+
+def _leaves(tree):
+    named = jax.tree_util.tree_leaves_with_path(tree, is_leaf=lambda x: x is None)
+    return [(jax.tree_util.keystr(path, simple=True, separator="."), x) for path, x in named if path]
 
 
 def _line(call, error):

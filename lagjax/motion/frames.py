@@ -13,6 +13,7 @@ import jax
 import numpy as np
 
 from lagjax.animation import Animation
+from lagjax.mechanics.first_call import Call, check_arguments
 
 # Without every other output the picture may be wrong by this share of its size: with all of them by a hundredth.
 MAY_MISS = 0.16
@@ -24,6 +25,7 @@ def film(
     traj, positions: Callable, seconds: float | None, rate: float, trail: float, ended_by_event: bool
 ) -> Animation:
     """The frames of one trajectory, as they are drawn."""
+    check_arguments(Call("positions", positions, ("t", "q", "params")), "an argument left out that is not needed")
     t, q, v = _reached(traj, ended_by_event)
     seconds = float(np.clip(t[-1] - t[0], SHORTEST, LONGEST)) if seconds is None else seconds
     count = round(seconds * rate) + 1 if np.isfinite(seconds * rate) else 0

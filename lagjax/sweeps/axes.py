@@ -79,9 +79,9 @@ def axes_of(axes: Any, zipped: bool) -> Axes:
                 "Fix: call lj.sweep with concrete arrays; inside a program use jax.vmap."
             )
         x = np.asarray(given)
-        if x.dtype == object or x.ndim == 0 or len(x) == 0:
+        if not np.issubdtype(x.dtype, np.number) and x.dtype != bool or x.ndim == 0 or len(x) == 0:
             raise ValueError(
-                f"axis '{name}' must be an array of at least one value, and is {given!r:.60}.\n{example} "
+                f"axis '{name}' must be an array of at least one number, and is {given!r:.60}.\n{example} "
                 "What does not vary belongs into run."
             )
         # In the dtype that JAX would give it: float64 where that is enabled.

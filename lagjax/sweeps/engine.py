@@ -96,6 +96,11 @@ def sweep(
     **Raises:** `TypeError`, `ValueError` for axes and settings that make no sense, or another sweep's store;
     `MemoryError` where the values would not fit, before anything runs.
     """
+    if not callable(run):
+        raise TypeError(
+            f"run must be a function of a point, not {type(run).__name__}.\n"
+            "Fix: lambda point: lj.integrate(system, q0, v0, params | point, ts=ts).q."
+        )
     grid = axes_of(axes, zipped)
     devices = jax.local_devices() if devices is None else list(devices)
     part = (jax.process_index(), jax.process_count()) if part is None else part

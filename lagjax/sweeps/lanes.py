@@ -14,9 +14,10 @@ import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import PyTree
 
+from lagjax.mechanics.first_call import Call, check_arguments, in_words
 from lagjax.motion.reported import PATIENCE, reporting
 from lagjax.motion.trajectory import RESULTS, Trajectory
-from lagjax.sweeps.axes import Axes, index_dtype
+from lagjax.sweeps.axes import POINT, Axes, index_dtype
 
 NOT_RUN = -1
 LAYOUTS = ("together", "in turn")
@@ -91,7 +92,9 @@ def compiled(run: Callable, axes: Axes, chunk: int, devices: Sequence, layout: s
         function = jax.shard_map(lanes, mesh=mesh, in_specs=(PartitionSpec(), split), out_specs=split, check_vma=False)
     shaped = partial(jax.tree.map, lambda x: jax.ShapeDtypeStruct(np.shape(x), x.dtype))
     indices = jax.ShapeDtypeStruct((chunk,), index_dtype())
-    with PATIENCE(patience):
+    of_user = Call("run", run, (POINT,))
+    check_arguments(of_user, "the axes taken one by one; a point is one dictionary")
+    with PATIENCE(patience), in_words(of_user, {POINT: axes.at(0)}):
         traced = jax.jit(function).trace(shaped(axes), indices)
     shapes, _ = traced.out_info
     program = traced.lower().compile()

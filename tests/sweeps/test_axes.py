@@ -41,9 +41,10 @@ def test_numbers_become_those_of_jax():
     [
         ([1.0, 2.0], False, TypeError, "must be a dictionary of arrays by name"),
         ({}, False, TypeError, "must be a dictionary"),
-        ({"omega": 3.0}, False, ValueError, "axis 'omega' must be an array of at least one value"),
+        ({"omega": 3.0}, False, ValueError, "axis 'omega' must be an array of at least one number"),
         ({"omega": []}, False, ValueError, "axis 'omega'"),
-        ({"omega": ["fast"], "g": [None]}, False, ValueError, "axis 'g'"),
+        ({"omega": ["fast"]}, False, ValueError, "axis 'omega'"),
+        ({"omega": [True, False], "g": [None]}, False, ValueError, "axis 'g'"),
         ({"omega": [1.0, 2.0], "g": [1.0]}, True, ValueError, "'omega' has 2, 'g' has 1"),
     ],
 )
