@@ -76,11 +76,15 @@ def families(label: str, x, ts, panels: dict[str, np.ndarray]):
 
     **Returns:** a matplotlib `Figure`.
     """
-    matplotlib = import_matplotlib()
+    import_matplotlib()
+    from matplotlib import colormaps
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import ListedColormap, Normalize
+
     low, high = np.min(x), np.max(x)
     # The lightest shades would not be seen on white.
-    shades = matplotlib.colors.ListedColormap(matplotlib.colormaps["cividis"](np.linspace(0.0, 0.88, 256)))
-    shade = matplotlib.cm.ScalarMappable(matplotlib.colors.Normalize(low, high if high > low else low + 1), shades)
+    shades = ListedColormap(colormaps["cividis"](np.linspace(0.0, 0.88, 256)))
+    shade = ScalarMappable(Normalize(low, high if high > low else low + 1), shades)
     fig, axes = figure(len(panels), 1, size=(6.4, 2.4), sharex=True)
     for axis, (name, curves) in zip(axes[:, 0], panels.items()):
         for of, t, curve in zip(x, ts, curves):

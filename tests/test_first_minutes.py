@@ -165,7 +165,8 @@ MISTAKES = {
     "if in a sweep": (lambda: swept(lambda p: 1.0 if p["m"] > 1 else 0.0), TYPE, "decides", "jnp.where"),
     "float in a sweep": (lambda: swept(lambda p: float(p["m"])), TYPE, "Python number", "leave out float"),
     "a film of q alone": (
-        lambda: move(swing).animate(lambda q: (q["theta"], 0.0)), TYPE, r"positions\(t, q, params\)", r"f\(t, q, params\)"),
+        lambda: move(swing).animate(lambda q: (q["theta"], 0.0)), TYPE, r"positions\(t, q, params\)",
+        r"def f\(t, q, params\)"),
     "the state of the explanation": (lambda: lj.explain(lj.System(by_numpy), *START, PARAMS), TYPE, NUMPY, "jnp.cos"),
     "one acceleration": (
         lambda: lj.accelerations(lj.System(needs_mass), 0.0, *START, PARAMS), VALUE, "'mass'", "'m'"),
