@@ -129,7 +129,8 @@ class Fit(eqx.Module):
     @property
     def start_sd(self) -> tuple[list[PyTree], list[PyTree]]:
         # On constraints a start depends on the parameters too: that of a rod of unknown length, for example.
-        problem, (shared, own), of, determined = self.problem, self.unknowns, *self._seen()[2:4]
+        problem, (shared, own), seen = self.problem, self.unknowns, self._seen()
+        of, determined = seen.covariance, seen.determined
         of_q, of_v = [], []
         for w in problem.windows.first:
             state = lambda both, w=w: problem.setting(both[: shared.size], both[shared.size :], w, WHOLE)[2]

@@ -220,7 +220,8 @@ def _parabola(t, x, samples):
         scale = xp.where(scale > 0, scale, 1.0)
         powers = (t[first] / scale)[:, None] ** np.arange(3)
         near, y = known, xp.where(known, y, 0.0)
-        if count == SAMPLES:
+        # Traced, it would be compiled for each window.
+        if count == SAMPLES and xp is np:
             through = xp.linalg.solve(powers[threes], y[threes][..., None])
             off = xp.abs(y - (powers @ through)[..., 0])
             typical = xp.sort(off, axis=1)[:, MOST - 1]

@@ -209,13 +209,14 @@ def _in_words(call, given, error):
             "Usual cause: names are looked up in brackets.\n"
             f'Fix: {of}["{missing[1]}"] in place of {of}.{missing[1]}.'
         )
-    if "'dict'" in said and "unsupported operand" in said:
+    dicts = [name for name in call.takes if isinstance(given[name], Mapping) and given[name]]
+    if dicts and "'dict'" in said and "unsupported operand" in said:
         return (
             f"{call} calculates with a dict.{where}\n"
             "Usual cause: all of what has names taken for one of them.\n"
-            f"Fix: look a name up in it, as in {call.takes[-1]}[{next(iter(given.get(call.takes[-1]) or ['g']))!r}]."
+            f"Fix: look a name up in it, as in {dicts[-1]}[{next(iter(given[dicts[-1]]))!r}]."
         )
-    if odd := [name for name, x in _leaves(given.get("params")) if x is None or isinstance(x, str)]:
+    if odd := [name for name, kind in _no_numbers(given.get("params")) if re.search(kind, said)]:
         return (
             f"{call} calculates with '{odd[0]}' of params, which is no number.{where}\n"
             "Usual cause: a number read as text, or left to be filled in.\n"
@@ -236,9 +237,12 @@ def _in_words(call, given, error):
     return None
 
 
-def _leaves(tree):
-    named = jax.tree_util.tree_leaves_with_path(tree, is_leaf=lambda x: x is None)
-    return [(jax.tree_util.keystr(path, simple=True, separator="."), x) for path, x in named if path]
+def _no_numbers(tree):
+    """The leaves that are None or text, by name, with what is said of such a one in a calculation."""
+    for path, x in jax.tree_util.tree_leaves_with_path(tree, is_leaf=lambda x: x is None):
+        if path and (x is None or isinstance(x, str)):
+            said = "NoneType" if x is None else "str|sequence|scalar index"
+            yield jax.tree_util.keystr(path, simple=True, separator="."), said
 
 
 def _line(call, error):
