@@ -46,7 +46,8 @@ class Record(eqx.Module):
       {"t": 1e-3}}`; also arrays like the measurements: an infinite one leaves a value out. Without it the errors are
       taken to be alike, and their size is read off the residuals.
 
-    **Raises:** `ValueError` for times that do not increase, measurements of another length, infinite numbers.
+    **Raises:** `ValueError` for times that do not increase, measurements of another length, infinite numbers, what is
+    held and not given.
     """
 
     t: np.ndarray
@@ -90,6 +91,12 @@ class Record(eqx.Module):
             _check(name, x, len(self.t))
         self.q0, self.v0 = q0, v0
         self.hold_q, self.hold_v = _held(hold_q), _held(hold_v)
+        for which, held, known in (("q", self.hold_q, q0), ("v", self.hold_v, v0)):
+            if held and known is None:
+                raise ValueError(
+                    f"hold_{which} says that {which}0 is known, and it is not given.\n"
+                    f"Fix: lj.Record(..., {which}0=..., hold_{which}=...)."
+                )
         self.params, self.sigma = dict(params or {}), sigma
 
     def channels(self) -> list[tuple[str, Array]]:

@@ -20,6 +20,8 @@ Q = np.cos(T)
         (lambda: lj.Record(T, q=np.where(T > 0.5, np.inf, Q)), "infinity"),
         (lambda: lj.Record(T), "no measurement"),
         (lambda: lj.Record([0.0], q=[1.0]), "two or more"),
+        (lambda: lj.Record(T, q=Q, hold_v=True), "v0 is known, and it is not given"),
+        (lambda: lj.Record(T, q={"theta": Q}, hold_q="theta"), "q0 is known"),
     ],
 )
 def test_records(make, words):
