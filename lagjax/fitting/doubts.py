@@ -98,9 +98,8 @@ def _without_freedom(fit):
 
 def _on_a_curve(fit):
     """Of channels whose residuals are a good part of the data's spread, and follow a curve."""
-    like_the_next, rms = fit.whiteness(), fit.rms()
-    large = {c.name for c in fit.channels() if rms[c.name] > MISSED * spread(c.measured)}
-    missed = [name for name in rms if name in large and like_the_next[name] > MISSED_AND_ALIKE]
+    large = [c.name for c in fit.channels() if np.nanmean(c.residuals**2) > (MISSED * spread(c.measured)) ** 2]
+    missed = [name for name in large if fit.whiteness()[name] > MISSED_AND_ALIKE]
     if not missed:
         return ""
     return (
