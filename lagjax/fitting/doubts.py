@@ -99,7 +99,8 @@ def _without_freedom(fit):
 def _on_a_curve(fit):
     """Of channels whose residuals are a good part of the data's spread, and follow a curve."""
     large = [c.name for c in fit.channels() if np.nanmean(c.residuals**2) > (MISSED * spread(c.measured)) ** 2]
-    missed = [name for name in large if fit.whiteness()[name] > MISSED_AND_ALIKE]
+    like_the_next = fit.whiteness() if large else {}
+    missed = [name for name in large if like_the_next[name] > MISSED_AND_ALIKE]
     if not missed:
         return ""
     return (

@@ -130,7 +130,7 @@ class Fit(eqx.Module):
     def start_sd(self) -> tuple[list[PyTree], list[PyTree]]:
         # On constraints a start depends on the parameters too: that of a rod of unknown length, for example.
         problem, (shared, own), seen = self.problem, self.unknowns, self._seen()
-        of, determined = seen.covariance, seen.determined
+        of, determined, of_errors = seen.covariance, seen.determined, self._of_errors()
         of_q, of_v = [], []
         for w in problem.windows.first:
             state = lambda both, w=w: problem.setting(both[: shared.size], both[shared.size :], w, WHOLE)[2]
@@ -138,7 +138,7 @@ class Fit(eqx.Module):
             joint = jnp.block([[of.shared, of.own_shared[w].T], [of.own_shared[w], of.own[w]]])
             known = jnp.concatenate([determined.shared, determined.own[w]])
 
-            def sd(slope, joint=self._of_errors() * joint, known=known):
+            def sd(slope, joint=of_errors * joint, known=known):
                 variance = jnp.einsum("...i,ij,...j", slope, joint, slope)
                 unknown = jnp.any(jnp.where(known, 0.0, slope) != 0, axis=-1)
                 return jnp.where(unknown, jnp.nan, jnp.sqrt(jnp.maximum(variance, 0.0)))

@@ -94,7 +94,7 @@ def compiled(run: Callable, axes: Axes, chunk: int, devices: Sequence, layout: s
     indices = jax.ShapeDtypeStruct((chunk,), index_dtype())
     of_user = Call("run", run, (POINT,))
     check_arguments(of_user, "the axes taken one by one; a point is one dictionary")
-    with PATIENCE(patience), in_words(of_user, {POINT: axes.at(0)}):
+    with PATIENCE(patience), in_words(of_user, {POINT: axes.values}):
         traced = jax.jit(function).trace(shaped(axes), indices)
     shapes, _ = traced.out_info
     program = traced.lower().compile()

@@ -99,9 +99,10 @@ class Sweep:
 
         **Raises:** `ValueError` where there is no such value, or more than three axes.
         """
-        if value is None and isinstance(self.values, Trajectory) and len(self.axes.shape) == 1:
-            return self._plot_motions(self.values)
-        panels = self._panels(value)
+        values = self.values
+        if value is None and isinstance(values, Trajectory) and len(self.axes.shape) == 1:
+            return self._plot_motions(values)
+        panels = self._panels(values, value)
         if self.axes.zipped:
             name, x = next(iter(self.axes.values.items()))
             return plot.lines(name, x if x.ndim == 1 else np.arange(len(x)), panels, ~self.ok)
@@ -125,8 +126,7 @@ class Sweep:
         one = jax.tree.map(lambda q: q[0, 0], motions.q)
         return plot.families(name, x, motions.t, dict(zip(coordinates.names(one), curves)))
 
-    def _panels(self, value):
-        values = self.values
+    def _panels(self, values, value):
         if callable(value):
             chosen = {"value": np.asarray(value(values))}
         else:
