@@ -16,14 +16,11 @@ compiled in less than a second, `jax.config.update("jax_persistent_cache_min_com
     python benchmarks/compile_time.py [--json FILE] [--only TEXT]
 """
 
-import json
 import statistics
-import subprocess
-import sys
 import tempfile
 import time
 
-from measure import CLOCK, main, row
+from measure import CLOCK, in_new_process, main, row
 
 EXPLICIT, IMPLICIT, CACHED, CACHED_COMPILE, IMPORT = 1.5, 6.0, 0.8, 0.1, 0.3
 # Source of the method, what its first result may take, and how many processes are measured.
@@ -109,10 +106,7 @@ print(json.dumps(result))
 def measured(source, cache=None):
     """What a new process that runs the source prints."""
     source = f"CACHE = {cache!r}\n{START}{source}"
-    done = subprocess.run([sys.executable, "-c", source], capture_output=True, text=True)
-    if done.returncode:
-        raise RuntimeError(done.stderr)
-    return json.loads(done.stdout.splitlines()[-1])
+    return in_new_process(source)
 
 
 def medians(results):

@@ -11,6 +11,8 @@ import importlib.metadata
 import json
 import os
 import platform
+import subprocess
+import sys
 import time
 from pathlib import Path
 from typing import NamedTuple
@@ -55,6 +57,14 @@ def _seconds(function, calls):
     for _ in range(calls):
         jax.block_until_ready(function())
     return (CLOCK["seconds"]() - started) / calls
+
+
+def in_new_process(source):
+    """What a new Python process that runs the source prints on its last line, as JSON."""
+    done = subprocess.run([sys.executable, "-c", source], capture_output=True, text=True)
+    if done.returncode:
+        raise RuntimeError(done.stderr)
+    return json.loads(done.stdout.splitlines()[-1])
 
 
 def compiled(function, *arguments):

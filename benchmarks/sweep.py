@@ -6,6 +6,7 @@
     short lanes      a sweep with statuses, labels and progress, beside a loop over a bare `jax.vmap`
     layout           `integrate` under `vmap` beside everything one lane after the other
     killed           a sweep with a store, by SIGKILL, and begun again: points that were computed twice, in blocks
+    store            the full check of a store of a million numbers beside writing it; seconds to open it
     memory           of a process with a sweep of 10 million numbers
 
 The error is that of angle and rate against elliptic functions, in radians, the largest over lanes and outputs. Sweeps
@@ -255,6 +256,30 @@ def killed_rows(wanted):
         )  # fmt: skip
 
 
+def store_rows(wanted):
+    """A million numbers: checked whole, and only looked at, beside written."""
+    what = "store of 1e6 points: full check / writing"
+    if not wanted(what):
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        path, axes = Path(folder, "store"), {"x": np.linspace(0.0, 1.0, 10**6)}
+        lj.sweep(lambda point: jnp.sin(point["x"]), axes, store=path, chunk=10_000, workers=1, progress=False)
+        store = Store(path)
+        values, (status, _, _) = store.values()[0], store.status()
+        blocks = [store.points(number) for number in range(store.blocks)]
+        parts = [jax.tree.map(lambda x: x[here], (values, status)) for here in blocks]
+        write = lambda: [store.write(number, *part) for number, part in enumerate(parts)]
+        check = lambda: store.damage(range(store.blocks), read=True)
+        times, opened = in_turn(check, write, repeats=7), in_turn(lambda: lj.open_sweep(path), check, repeats=7)
+        ratio, of_minima = times.ratio()
+        seconds, writing = times.medians
+        off = float(np.max(np.abs(values["value"] - np.sin(axes["x"]))))
+        yield row(
+            what, ratio, 0.15, minima=of_minima, blocks=store.blocks, check_seconds=seconds, write_seconds=writing,
+            open_seconds=opened.medians[0], error=off,
+        )  # fmt: skip
+
+
 def many():
     """A sweep of many numbers: the most memory that its process had, in GB; its seconds; its largest relative error."""
     omegas = np.linspace(0.0, 0.9 * math.sqrt(BELOW), MANY)
@@ -282,8 +307,8 @@ def memory_rows(wanted):
 
 
 def rows(wanted):
-    """Rates, spread lanes, short lanes, a kill, memory."""
-    for of_question in (rate_rows, spread_rows, short_rows, killed_rows, memory_rows):
+    """Rates, spread lanes, short lanes, a kill, a store, memory."""
+    for of_question in (rate_rows, spread_rows, short_rows, killed_rows, store_rows, memory_rows):
         yield from of_question(wanted)
 
 

@@ -24,6 +24,7 @@ from lagjax.motion.explanation import Explanation, explain
 # isort: split
 # Motion.
 from lagjax.animation import Animation
+from lagjax.motion.crossings import Crossing, Crossings, EventWarning
 from lagjax.motion.integrate import integrate
 from lagjax.motion.trajectory import RESULTS, AccuracyWarning, Moment, Trajectory
 from lagjax.numerics.nystrom import Nystrom8, Nystrom12
@@ -65,6 +66,9 @@ __all__ = [
     "explain",
     "Explanation",
     "integrate",
+    "Crossing",
+    "Crossings",
+    "EventWarning",
     "Dopri8",
     "Tsit5",
     "Nystrom8",

@@ -1,9 +1,9 @@
 """`python -m lagjax`: every scene, checked, timed and drawn; then the stability report.
 
-For each scene: error against run time by method and tolerance, then what happened in stiff and extreme
-cases; work-precision diagrams and a picture as PNG, all numbers as JSON. `python -m lagjax stability` prints the
-whole stability report, the main job a part of it. The exit status is 1 where a scene misses its accuracy, or a row
-of the stability report is silently wrong or not as it should be.
+For each scene: error against run time by method and tolerance, how long its first answer took, then what happened in
+stiff and extreme cases; work-precision diagrams and a picture as PNG, all numbers as JSON. `python -m lagjax stability`
+prints the whole stability report, the main job a part of it. The exit status is 1 where a scene misses its accuracy, or
+a row of the stability report is silently wrong or not as it should be.
 """
 
 import argparse
@@ -140,6 +140,7 @@ def _draw(scene, rows, folder, with_picture):
 def _print_scene(scene, rows, cases):
     print(f"{scene.title}\n{'=' * len(scene.title)}\n{scene.source}\n")
     print(report.work_precision_table(rows))
+    print(report.first_answer(rows))
     for run, measured in dict.fromkeys((row.run, row.measured) for row in rows):
         print(f"error of '{run}': {measured}")
     print()
@@ -157,7 +158,7 @@ def _progress(text):
 def _machine():
     return (
         f"lagjax on {jax.devices()[0].platform}, {platform.machine()}, Python {platform.python_version()}, "
-        f"JAX {jax.__version__}, diffrax {diffrax.__version__}, float64; times are medians, compile time apart"
+        f"JAX {jax.__version__}, diffrax {diffrax.__version__}, float64; times are medians, first answers apart"
     )
 
 

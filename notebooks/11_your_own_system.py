@@ -18,6 +18,8 @@
 # Each step below asks one thing more of it; at the end stands what errors look like, and what they ask for.
 
 # %%
+import warnings
+
 import diffrax
 import jax
 import jax.numpy as jnp
@@ -128,6 +130,12 @@ for tolerance in (1e-4, 1e-6, 1e-8):
     print(f"{tolerance:.0e}: halved it changes by {halved[-1][0]:.1e}; the error was {halved[-1][1]:.1e}")
 
 # %% [markdown]
+# What is narrower than a step is passed over, and no tolerance tells: a push of a tenth of a second within a hundred, a
+# thin barrier. `max_step=` is the longest step (no step is longer than the time between two outputs either), and
+# `jump_ts=` names the times at which a force is switched. Where something narrow may be, compare with a `max_step` of
+# its width.
+
+# %% [markdown]
 # ## 6. A gradient against a difference
 #
 # The angle at the end, by gravity. A difference of two motions keeps about half of the digits. (Through constraints the
@@ -153,6 +161,46 @@ part = slice(last - 1, last + 3)
 height = np.asarray(traj.q["y"] / traj.q["y"][0])
 leaves_at = np.polyval(np.polyfit(force[part], height[part], 3), 0.0)
 print(f"the wall is left at {leaves_at:.6f} of the first height")
+
+# %% [markdown]
+# ## 8. Slips that only you can see
+#
+# $L = T + V$ in place of $T - V$ is a Lagrangian, too: that of a ladder that falls upwards. Its Jacobi integral is as
+# constant as the right one, so that nothing in the print tells. What tells is a sign that is known by hand: let go at
+# rest, everything goes to where V is lower.
+
+
+# %%
+def by_its_angle_with_the_wrong_sign(t, q, v, params):
+    m, l, g = params["m"], params["l"], params["g"]
+    return 2 / 3 * m * l**2 * v**2 + m * g * l * jnp.sin(q)
+
+
+upwards = lj.System(by_its_angle_with_the_wrong_sign)
+of_rest = lambda system: lj.accelerations(system, 0.0, 1.2, 0.0, params)[0]
+climbed = lj.integrate(upwards, 1.2, 0.0, params, ts=ts)
+print(f"angular acceleration at rest: {of_rest(one_angle):.3f} with T - V, {of_rest(upwards):+.3f} with T + V")
+print(f"change of the Jacobi integral with T + V: {climbed.drift():.0e}")
+
+# %% [markdown]
+# An angle is in radians. 60.0, meant in degrees, is nine turns and a half: a motion like any other, somewhere else. A
+# place that is known by hand tells, or the film: here the height of the centre at the start.
+
+# %%
+by_hand = 2.5 * np.sqrt(3) / 2
+for start in (60.0, np.radians(60.0)):
+    print(f"angle {start:.4g}: the centre is at {params['l'] * np.sin(start):+.3f}, by hand at {by_hand:+.3f}")
+
+# %% [markdown]
+# A force given in place of Rayleigh's function R, whose force is $-\partial R / \partial v$, is seen: no
+# dissipation changes its sign with the velocity.
+
+# %%
+dragged = lj.System(by_its_angle, dissipation=lambda t, q, v, params: -3.0 * v)
+with warnings.catch_warnings(record=True) as told:
+    warnings.simplefilter("always")
+    lj.integrate(dragged, 1.2, 0.0, params, ts=ts)
+print(told[0].message)
 
 # %% [markdown]
 # ## What errors look like
@@ -229,3 +277,5 @@ assert apart < 1e-12
 assert all(0.1 < change / error < 2 for change, error in halved)
 assert abs(gradient / difference - 1) < 1e-6
 assert abs(leaves_at - 2 / 3) < 1e-5
+assert of_rest(one_angle) < 0 < of_rest(upwards) and climbed.drift() < 1e-12
+assert "force=" in str(told[0].message)

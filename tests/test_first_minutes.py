@@ -117,7 +117,8 @@ MISTAKES = {
         lambda: move(of_a_vector, (np.ones(1), np.zeros(1))), VALUE, r"shape \(1,\)", "jnp.sum", "q0 = 0.1"),
     "float32": (
         lambda: move(swing, jax.tree.map(np.float32, START), rtol=1e-10), VALUE, "float32", "jax_enable_x64"),
-    "times backwards": (lambda: move(swing, ts=TS[::-1]), VALUE, "must increase", r"jnp.sort\(ts\)"),
+    "times out of order": (
+        lambda: move(swing, ts=np.array([0.0, 2.0, 1.0, 3.0])), VALUE, "must increase", r"jnp.unique\(ts\)"),
     "one time": (lambda: move(swing, ts=10.0), VALUE, r"starts at ts\[0\]", "linspace"),
     "a matrix of constraints": (
         lambda: constrained(lambda t, q, params: q["x"] * jnp.eye(2)), VALUE, "'rod'", r"\(2, 2\)", "jnp.stack"),

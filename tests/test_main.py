@@ -50,7 +50,8 @@ def test_tables_pictures_and_numbers(run, monkeypatch):
     for part in (
         "tol",
         "error",
-        "compile/s",
+        "first/s",
+        "first answer: ",
         "Dopri8",
         "1e-10",
         "easy",

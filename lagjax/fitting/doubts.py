@@ -1,34 +1,30 @@
 """What there is to doubt about a fit, in words: each says what happened, the usual cause, and what to do."""
 
-import jax.numpy as jnp
+import jax
 import numpy as np
 
-from lagjax.fitting.records import spread
+from lagjax.fitting.identifiability import rank_of
+from lagjax.fitting.records import channel_name
 from lagjax.fitting.result import Fit
-from lagjax.fitting.search import OF_NORMAL
 from lagjax.mechanics.diagnosis import listed
 
-# Residuals so many times larger than sigma are not errors of measurement.
-MISFIT = 3.0
-# Nor are those of this part of the data's spread, if they correlate so much with the next.
-MISSED, MISSED_AND_ALIKE = 0.05, 0.7
 # A number so many times as large as it was guessed to be has not been found.
 ASTRAY = 1e6
 
 
 def doubts(fit: Fit) -> list[str]:
     """What a user has to know of a fit, the gravest first."""
-    words = [_of_search(fit), _astray(fit)]
+    words = [_of_search(fit), _astray(fit), _against_sigma(fit) or _on_a_curve(fit)]
     if fit.seen is not None:
         words += [_of_parameters(fit), _of_motion(fit)]
-        words += [_against_sigma(fit)] if fit.problem.absolute else [_without_freedom(fit), _on_a_curve(fit)]
-    if fit.at_bounds():
-        words.append(f"{listed(fit.at_bounds())} ended at a bound, where uncertainties mean nothing.")
+        words += [] if fit.problem.absolute else [_without_freedom(fit)]
+    if at := fit.at_bounds():
+        words.append(f"{listed(at)} ended at a bound, where uncertainties mean nothing.")
     return [told for told in words if told]
 
 
 def _of_search(fit):
-    if bool(fit.converged):
+    if bool(fit.rested):
         return ""
     return (
         f"the search stopped after {int(fit.steps)} steps without converging; this is its best point.\n"
@@ -50,7 +46,7 @@ def _astray(fit):
 
 
 def _of_parameters(fit):
-    if fit.identifiability.rank == len(fit.names):
+    if rank_of(np.asarray(fit.seen.singular_values)) == len(fit.names):
         return ""
     return (
         f"the data do not determine all parameters.\n{fit.identifiability}\n"
@@ -71,19 +67,14 @@ def _of_motion(fit):
 
 
 def _against_sigma(fit):
-    if float(fit.freedom) <= 0:
+    large = [name for name, large in zip(_channels(fit), np.asarray(fit.misfit.large)) if large]
+    if not large:
         return ""
-    if fit.problem.loss == "squares":
-        times = float(jnp.sqrt(fit.chi2 / fit.freedom))
-    else:
-        # Wild values are forgiven; the better half of the residuals is not.
-        times = float(OF_NORMAL * np.median(np.abs(fit.seen.rows.reshape(-1)[fit.known()])))
-    if times <= MISFIT:
-        return ""
+    times = float(np.nanmax(fit.misfit.times))
     return (
-        f"the residuals are {times:.2g} times as large as sigma says, so that the ± mean nothing.\n"
+        f"the residuals of {listed(large)} are {times:.2g} times as large as sigma says, so that the ± mean nothing.\n"
         "Usual cause: a wrong minimum, something that the system leaves out, outliers, or too small a sigma.\n"
-        'Fix: look at found.plot(); try a shorter window=, restarts=8, loss="cauchy".'
+        'Fix: look at found.plot(); try a shorter window=, restarts=30, loss="cauchy".'
     )
 
 
@@ -97,14 +88,17 @@ def _without_freedom(fit):
 
 
 def _on_a_curve(fit):
-    """Of channels whose residuals are a good part of the data's spread, and follow a curve."""
-    large = [c.name for c in fit.channels() if np.nanmean(c.residuals**2) > (MISSED * spread(c.measured)) ** 2]
-    like_the_next = fit.whiteness() if large else {}
-    missed = [name for name in large if like_the_next[name] > MISSED_AND_ALIKE]
+    missed = [name for name, curved in zip(_channels(fit), np.asarray(fit.misfit.curved)) if curved]
     if not missed:
         return ""
     return (
         f"the residuals of {listed(missed)} are no errors of measurement: large, and each like the next.\n"
         "Usual cause: a wrong minimum, or something that the system leaves out.\n"
-        "Fix: look at found.plot(); try a nearer guess, restarts=8, a shorter window=."
+        "Fix: look at found.plot(); try a nearer guess, restarts=30, a shorter window=."
     )
+
+
+def _channels(fit):
+    """The names of what was measured, in the order of a `Misfit`."""
+    paths = {kind: jax.tree_util.tree_leaves_with_path(tree) for kind, tree in fit.problem.measured.items()}
+    return [channel_name(kind, path) for kind, leaves in paths.items() for path, _ in leaves]

@@ -3,34 +3,39 @@
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import contextmanager
-from typing import Any
+from functools import lru_cache
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 from jaxtyping import PyTree
 
 from lagjax.fitting.doubts import doubts
-from lagjax.fitting.equations import WHOLE, Problem, Stage, one_by_one
+from lagjax.fitting.equations import WHOLE, Problem, Stage
 from lagjax.fitting.identifiability import Identifiability
 from lagjax.fitting.problem import problem_of
 from lagjax.fitting.records import Record
 from lagjax.fitting.result import Fit, FitWarning
-from lagjax.fitting.search import listening, look, search
+from lagjax.fitting.search import Course, listening, look, search
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.system import System
-from lagjax.meter import meter
+from lagjax.meter import meter, waiting
 from lagjax.motion.integrate import integrate
-from lagjax.numerics.chained import Unknowns
+from lagjax.motion.reported import reported
 
 # The first part of a record has so many measurements an unknown, and each next stage twice as many.
 A_STAGE_HAS, STAGES = 4, 7
 # What a jump between joined windows costs, stage by stage, in units of what missing the data by as much costs.
-JOINED = (0.1, 1.0, 10.0, 100.0, 1e4)
+# (Farther up, the round-off of chaotic motions in the jumps keeps a search from coming to rest.)
+JOINED = (0.1, 1.0, 10.0, 100.0, 1e3)
 # With a loss that forgives outliers so many stages more, in which to learn the size of an ordinary error.
 SETTLING = 2
+# While only a part of a record counts, a change of a number by so much of it costs as much as an error of measurement;
+# without sigma that is so much of the data's spread.
+REACH, AN_ERROR = 0.3, 0.03
+# Further starts where the end is doubtful, for no more numbers than this.
+AGAIN, AGAIN_UP_TO = 8, 20
 # Uncertainties of more numbers than this are not computed.
 COVARIANCE_UP_TO = 1000
 # In units of the data's spread: when a stage is done, and when the last one is; not below what the motion is good for.
@@ -51,7 +56,7 @@ def fit(
     window: float | None = None,
     joined: bool = True,
     grow: bool = True,
-    restarts: int = 0,
+    restarts: int | None = None,
     spread: float = 0.3,
     seed: int = 0,
     optimiser: optx.AbstractLeastSquaresSolver | optx.AbstractMinimiser | None = None,
@@ -89,9 +94,11 @@ def fit(
       long records. With `joined` (multiple shooting) the windows are drawn together in a few stages until each goes on
       where the last one ended; else they stay on their own, which forgives what the system leaves out.
     - `grow`: begin with the first part of each record or window and double it, stage by stage: a long record has many
-      wrong minima, whole periods off.
+      wrong minima, whole periods off. What a part does not see stays near its guess. Where the end is doubtful, joined
+      windows grow along their record, and the whole record is searched at once from the guess, too.
     - `restarts`: further starts of the search, with parameters `spread` (relative) away from their guess, or anywhere
-      between two bounds; `seed` says which. The best end counts.
+      between two bounds; `seed` says which. The best end counts. By default 8, of up to 20 numbers, and these only as
+      long as the best end is doubtful: not at rest, or with residuals that errors of measurement would hardly leave.
     - `optimiser`: by default `optimistix.LevenbergMarquardt`, with derivatives taken forward. Any other of optimistix's
       least-squares solvers; or a minimiser of it, with derivatives in reverse, for thousands of parameters, such as
       `optimistix.BFGS(rtol, atol)` or `optimistix.OptaxMinimiser(optax.adam(1e-3), rtol, atol)`.
@@ -100,18 +107,19 @@ def fit(
     - `options` go to `lj.integrate`: `rtol`, `atol`, `method`, `event`, `max_steps`, ...
 
     **Returns:** a `Fit`: estimates with their uncertainties, residuals, what the data do not determine. It is the best
-    point found also where the search did not converge (`converged`, and a `FitWarning`). Inside `jax.vmap`, `jit` or
-    `lj.sweep` measurements and guesses may be traced, times not.
+    point found also where it is no success (`converged`, and a `FitWarning`): where the search did not come to rest, or
+    the residuals contradict `sigma` or follow a curve. Inside `jax.vmap`, `jit` or `lj.sweep` measurements and guesses
+    may be traced, times not; a sweep's `status` says which fits are none.
 
     **Raises:**
 
     - `ValueError` for names, shapes and kinds that do not match; for a guess from which the motion fails at once.
-    - Warns (`lj.FitWarning`) where the search did not converge, a motion stops early, residuals are far larger than
-      `sigma` says, an estimate is at its bound, or the data cannot see a parameter.
+    - Warns (`lj.FitWarning`) where the search did not converge, a motion stops early, residuals are larger than `sigma`
+      says or follow a curve, an estimate is at its bound, or the data cannot see a parameter.
 
     Source: Nocedal & Wright, *Numerical Optimization*, §10.3; Bock, in *Modelling of Chemical Reaction Systems* (1981)
     (multiple shooting); Huber, *Robust Statistics*, §7.8 (scale by the median); Bierman, *Factorization Methods for
-    Discrete Sequential Estimation* (covariance).
+    Discrete Sequential Estimation* (covariance); Box & Pierce, *J. Am. Stat. Assoc.* 65 (1970) 1509 (residuals).
     """
     if optimiser is not None and not isinstance(optimiser, optx.AbstractLeastSquaresSolver | optx.AbstractMinimiser):
         raise TypeError(
@@ -119,16 +127,21 @@ def fit(
             "Fix: leave it out; or optimistix.OptaxMinimiser(optax.adam(1e-3), rtol=1e-6, atol=1e-6)."
         )
     problem = problem_of(system, records, params, free, observe, bounds, priors, loss, window, options)
-    stages, tolerances = _stages(problem, grow, joined and window is not None)
-    last = jax.tree.map(lambda x: x[-1], stages)
-    with _shown(problem, len(tolerances), progress) as tell:
-        run = lambda u: search(problem, u, stages, tolerances, optimiser, iterations, tell)
-        searched, seen, costs = _best(run, problem, restarts, spread, seed)
+    further = restarts
+    if restarts is None:
+        further = AGAIN if optimiser is None and 0 < problem.found.start.size <= AGAIN_UP_TO else 0
+    scattered = _scattered(problem.found, further, spread, seed)
+    course = _course(problem, grow, joined and window is not None, scattered, bool(restarts))
+    last = jax.tree.map(lambda x: x[-1], course.stages)
+    with _shown(problem, course, progress) as tell:
+        searched, seen = search(problem, course, optimiser, iterations, tell)
+    costs = coordinates.numpy_of(searched.costs).asarray(searched.costs)[: int(course.count)]
+    searched = searched._replace(costs=costs)
     if seen is None and problem.found.start.size <= COVARIANCE_UP_TO:
         seen = look(problem, searched.unknowns, last)
     if seen is not None and not coordinates.is_traced(seen) and not np.any(np.asarray(seen.well)):
         _check_motion(problem, seen, problem.start)
-    found = Fit(problem, *searched, costs, seen, tuple(sorted((units or {}).items())))
+    found = reported(Fit(problem, *searched, seen, tuple(sorted((units or {}).items()))), Fit.report)
     if coordinates.is_traced(found.cost):
         return found
     if seen is not None and found.at_bounds():
@@ -174,70 +187,107 @@ def identifiability(
     return Identifiability(problem.found.names, problem.found.start, seen.singular_values, seen.combinations, noise)
 
 
-def _stages(problem: Problem, grow: bool, joined: bool) -> tuple[Stage, Any]:
+def _course(problem: Problem, grow: bool, joined: bool, scattered, all_of_them: bool) -> Course:
+    """The stages of a search, with the starts from which it goes through them."""
+    windows = problem.windows
     unknowns = sum(x.shape[-1] for x in jax.tree.leaves(problem.start))
-    measured = sum(int(np.prod(x.shape[1:])) for x in jax.tree.leaves(problem.measured))
-    doublings = int(np.clip(np.log2(max(measured / max(A_STAGE_HAS * unknowns, 1), 1)), 0, STAGES - 1))
-    doublings = doublings if grow else 0
+    measured = sum(
+        int(np.prod(x.shape[1:])) if kind == "end" else windows.longest * int(np.prod(x.shape[2:]))
+        for kind, tree in problem.measured.items()
+        for x in jax.tree.leaves(tree)
+    )
+    growing = lambda measured: _doubled(measured / max(A_STAGE_HAS * unknowns, 1)) if grow else np.zeros(0)
+    alike = lambda parts: np.repeat(np.asarray(parts)[:, None], windows.count, axis=1)
+    of_windows = alike(growing(measured))
+    # Windows that are joined are one record, which may grow as such.
+    of_records = np.zeros((0, windows.count))
+    if joined and windows.count > 1:
+        of_records = _of_records(windows, growing(measured * int(np.max(np.bincount(windows.record)))))
     settling, joining = (0 if problem.loss == "squares" else SETTLING), (JOINED if joined else ())
-    parts = [2.0**-i for i in range(doublings, -1, -1)] + [1.0] * (settling + len(joining))
-    weights = [0.0] * (doublings + 1 + settling) + list(joining)
+    each = np.concatenate([of_records, of_windows, alike(np.ones(1 + settling + len(joining)))])
+    # Filled up in front, by stages that none begins with: a program is one for all numbers of them.
+    kinds = 0 if not grow else 2 if joined and windows.count > 1 else 1
+    filled = kinds * (STAGES - 1) - len(of_records) - len(of_windows)
+    each = np.concatenate([alike(np.ones(filled)), each])
+    partly = np.any(each < 1, axis=1)
+    weights = np.append(np.zeros(len(each) - len(joining)), joining)
     ratio = problem.spread_in_sigmas
     rtol = problem.options.get("rtol")
-    done = max(DONE, ROUND_OFFS * np.finfo(problem.windows.ts.dtype).eps)
-    done = done if rtol is None else jnp.maximum(done, OF_RTOL * jnp.max(jnp.asarray(rtol)))
-    last = np.arange(len(parts)) == len(parts) - 1
-    xp = coordinates.numpy_of((ratio, done))
-    stages = Stage(np.asarray(parts), xp.asarray(weights) * ratio, np.ones(len(parts)))
-    return stages, xp.where(last, done, STAGE_DONE) * ratio
+    done = max(DONE, ROUND_OFFS * np.finfo(windows.ts.dtype).eps)
+    if rtol is not None:
+        xp = coordinates.numpy_of(rtol)
+        done = xp.maximum(done, OF_RTOL * xp.max(xp.asarray(rtol)))
+    last = np.arange(len(each)) == len(each) - 1
+    xp = coordinates.numpy_of((ratio, done, scattered, problem.found.start))
+    held = np.where(partly, (1.0 if problem.absolute else AN_ERROR) / REACH, 0.0)
+    stages = Stage(each, weights * ratio, np.ones(len(each)), held)
+    # Round-off in the jumps between windows weighs as much as the jumps do.
+    tolerances = xp.where(last, done * (JOINED[-1] if joined else 1.0), STAGE_DONE) * ratio
+    # From the guess: growing windows, growing records, and the whole record at once, where these are not the same.
+    begin = np.unique([len(of_records), 0, len(of_records) + len(of_windows)])
+    begin = np.append(len(of_records), begin[begin != len(of_records)])
+    # From elsewhere the first two in turn.
+    first = np.append(begin, np.resize(begin[:2] if len(of_records) else begin[:1], len(scattered))) + filled
+    count, more = len(first), 1 + kinds - len(begin)
+    guess = xp.asarray(problem.found.start)[None]
+    starts = xp.concatenate([guess] * len(begin) + [scattered] + [guess] * more)
+    first = np.append(first, np.full(more, filled))
+    return Course(stages, tolerances, starts, first, np.asarray(count), np.asarray(count if all_of_them else 1))
 
 
 @contextmanager
-def _shown(problem, stages, progress):
+def _shown(problem, course, progress):
     """A meter of the search's steps; whether there is one."""
     if coordinates.is_traced(problem):
         yield False
         return
+    before = int(np.min(course.first))
+    stages = len(course.tolerances) - before
     with meter(progress, unit=" steps", desc="fit") as shown:
         if shown.disable:
             yield False
             return
+        with waiting(progress, "compiling") as begun:
 
-        def step(stage, cost):
-            shown.set_postfix_str(f"stage {stage + 1} of {stages}, cost {cost:.4g}", refresh=False)
-            shown.update(1)
+            def step(stage, cost):
+                begun.set()
+                shown.set_postfix_str(f"stage {stage - before + 1} of {stages}, cost {cost:.4g}", refresh=False)
+                shown.update(1)
 
-        with listening(step):
-            yield True
+            with listening(step):
+                yield True
 
 
-def _best(run, problem, restarts, spread, seed):
-    """The best search, what the data say at its end if it knows, and the costs of all restarts."""
-    start = problem.start
-    if not restarts:
-        return *run(start), None
-    x = _scattered(problem.found, restarts, spread, seed)
-    starts = Unknowns(jnp.concatenate([start.shared[None], x]), jnp.stack([start.own] * (restarts + 1)))
-    every = one_by_one(run, starts)
-    costs = every[0].cost
-    best = jnp.argmin(jnp.where(jnp.isfinite(costs), costs, jnp.inf))
-    return *jax.tree.map(lambda x: x[best], every), costs
+def _doubled(times):
+    """Parts that are doubled until the whole, which is not among them, where it has so many times the first part."""
+    return 2.0 ** -np.arange(np.clip(np.floor(np.log2(max(times, 1))), 0, STAGES - 1), 0, -1)
+
+
+def _of_records(windows, parts):
+    """The part of each window's time (S, W) that lies in some first parts (S,) of its record."""
+    begin, end = windows.ts[:, 0], np.take_along_axis(windows.ts, windows.last[:, None], axis=1)[:, 0]
+    first, record = begin[windows.first][windows.record], windows.record
+    whole = np.array([end[record == r].max() for r in record]) - first
+    return np.clip((first + parts[:, None] * whole - begin) / (end - begin), 0.0, 1.0)
 
 
 def _scattered(found, count, spread, seed):
     """Starts (count, p) around the guess, or between two bounds."""
-    size = jnp.where(found.start != 0, found.start, 1.0)
-    bounded = jnp.isfinite(found.low) & jnp.isfinite(found.high)
-    width = jnp.where(bounded, found.high - found.low, 0.0)
+    xp = coordinates.numpy_of(found.start)
+    start, low, high = (x[None] for x in (found.start, found.low, found.high))
+    here, share = _drawn(seed, (count, start.size))
+    x = start + xp.where(start != 0, start, 1.0) * np.expm1(spread * here)
+    inside = (x > low) & (x < high)
+    bounded = np.isfinite(low) & np.isfinite(high)
+    anywhere = np.where(bounded, low, 0.0) + share * np.where(bounded, high, 1.0) - share * np.where(bounded, low, 0.0)
+    return xp.where(bounded, anywhere, xp.where(inside, x, start))
 
-    def one(key):
-        here, anywhere = jax.random.split(key)
-        x = found.start + size * jnp.expm1(spread * jax.random.normal(here, size.shape))
-        share = jax.random.uniform(anywhere, size.shape, minval=0.01, maxval=0.99)
-        inside = (x > found.low) & (x < found.high)
-        return jnp.where(bounded, found.low + share * width, jnp.where(inside, x, found.start))
 
-    return jax.vmap(one)(jax.random.split(jax.random.key(seed), count))
+@lru_cache
+def _drawn(seed, shape):
+    """Normal numbers, and uniform ones between 0 and 1 but for the ends."""
+    random = np.random.default_rng(seed)
+    return random.normal(size=shape), random.uniform(0.01, 0.99, shape)
 
 
 def _check_motion(problem, seen, u):

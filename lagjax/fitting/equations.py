@@ -8,18 +8,22 @@ Where a motion does not reach a sample its residual is a large constant, so that
 """
 
 from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import jax.tree_util as jtu
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Float, Int, PyTree
 
 from lagjax.fitting.parameters import Found, leaf_name
 from lagjax.fitting.records import PADDING, Windows
 from lagjax.fitting.starts import Starts
+from lagjax.mechanics.compiled import compiled
 from lagjax.motion.integrate import integrate
 from lagjax.motion.trajectory import ended_well
 from lagjax.numerics.chained import Equations, Slopes, Unknowns
@@ -37,21 +41,29 @@ LOSSES = {
 }
 
 
-class Stage(eqx.Module):
-    """How a search takes the data: the part of each window's time that counts, how tightly windows are joined, and the
-    size of an ordinary error, in sigmas, for a loss that forgives larger ones.
+class Stage(NamedTuple):
+    """How a search takes the data: the part of each window's time that counts (W,), how tightly windows are joined, and
+    the size of an ordinary error, in sigmas, for a loss that forgives larger ones.
+
+    While only a part counts, shared unknowns are held `around` (p,) the place where the search began: there a change
+    by all of a number costs `held`, in units of a residual.
     """
 
-    part: Float[Array, ""]
+    part: Float[Array, "*W"]
     joined: Float[Array, ""]
     ordinary: Float[Array, ""]
+    held: Float[Array, ""] | None = None
+    around: Float[Array, " p"] | None = None
 
 
 # All of the record, windows on their own.
 WHOLE = Stage(np.asarray(1.0), np.asarray(0.0), np.asarray(1.0))
 
 
-class Problem(eqx.Module):
+# Modules of equinox take half a millisecond of each fit, by what they do when one is made or asked for a method.
+@jtu.register_dataclass
+@dataclass(frozen=True, eq=False)
+class Problem:
     """All that a fit is about, as arrays of one shape for all windows.
 
     `measured` and `sigma` have leaves (W, T, ...), those of `end` (W, ...); `spread` has one number each, and
@@ -68,11 +80,11 @@ class Problem(eqx.Module):
     spread: PyTree
     spread_in_sigmas: Float[Array, ""]
     unit: Float[Array, " 2n"]
-    unflatten: Callable = eqx.field(static=True)
+    unflatten: Callable = field(metadata={"static": True})
     observe: Callable | None
     options: dict[str, Any]
-    loss: str = eqx.field(static=True)
-    absolute: bool = eqx.field(static=True)
+    loss: str = field(metadata={"static": True})
+    absolute: bool = field(metadata={"static": True})
 
     @property
     def start(self) -> Unknowns:
@@ -91,13 +103,19 @@ class Problem(eqx.Module):
             return params
         return replace(params, {name: value[w] for name, value in self.overrides.items()})
 
+    def part(self, w, stage: Stage) -> Float[Array, ""]:
+        """The part of window w that counts."""
+        return jnp.broadcast_to(stage.part, (self.windows.count,))[w]
+
     def setting(self, x, s, w, stage: Stage):
         """Times, parameters, start and options of the motion of window w, at its times as far as they count."""
-        ts = _as_far_as(jnp.asarray(self.windows.ts)[w], jnp.asarray(self.windows.last)[w], stage.part)
-        params = self.params(x, w)
-        of_window = jax.tree.map(lambda a: a[w], self.starts)
-        start = of_window.state(s, self.system, ts[0], params, self.unflatten)
-        return ts, params, start, self.options
+        ts = _as_far_as(jnp.asarray(self.windows.ts)[w], jnp.asarray(self.windows.last)[w], self.part(w, stage))
+        return ts, self.params(x, w), self.state(x, s, w), self.options
+
+    def state(self, x, s, w):
+        """(q, v) from which the motion of window w starts."""
+        of_window, t = jax.tree.map(lambda a: a[w], self.starts), jnp.asarray(self.windows.ts)[w, 0]
+        return of_window.state(s, self.system, t, self.params(x, w), self.unflatten)
 
     def motion(self, x, s, w, stage: Stage, adjoint=None):
         """The motion of window w, and the state it starts from."""
@@ -126,9 +144,22 @@ def among(said: PyTree, wanted: PyTree) -> PyTree:
     return said
 
 
+@partial(compiled, in_numpy=True)
+def starts_at(problem: Problem, u: Unknowns, windows: Int[Array, " R"]):
+    """(q, v) at the starts of some windows, and their slopes by the shared unknowns and those of each window."""
+    p = u.shared.size
+
+    def at(w):
+        state = lambda both: problem.state(both[:p], both[p:], w)
+        both = jnp.concatenate([u.shared, u.own[w]])
+        return state(both), jax.jacfwd(state)(both)
+
+    return jax.vmap(at)(windows)
+
+
 def replace(params, values):
     """`params` with some leaves replaced, by name; those of inner dictionaries by 'arm.length'."""
-    return jax.tree_util.tree_map_with_path(lambda path, x: values.get(leaf_name(path), x), params)
+    return jtu.tree_map_with_path(lambda path, x: values.get(leaf_name(path), x), params)
 
 
 class OfWindow(NamedTuple):
@@ -157,8 +188,8 @@ def of_window(problem: Problem, x, s, w, stage: Stage, adjoint=None, loss: str |
 def together(problem: Problem, u: Unknowns, parts: OfWindow, stage: Stage) -> Equations:
     """All equations, from what the windows contribute (leading axis W)."""
     gap = jnp.where(_seamed(problem, stage) > 0, parts.end - jnp.roll(parts.begin, -1, axis=0), 0.0)
-    prior = (u.shared - problem.found.mean) / problem.found.sd
-    return Equations(parts.rows, _seamed(problem, stage) * gap, prior)
+    known, weight = _known_before(problem, stage)
+    return Equations(parts.rows, _seamed(problem, stage) * gap, weight * (u.shared - known))
 
 
 def slopes_together(problem: Problem, by_shared: OfWindow, by_own: OfWindow, stage: Stage) -> Slopes:
@@ -171,8 +202,23 @@ def slopes_together(problem: Problem, by_shared: OfWindow, by_own: OfWindow, sta
         seamed * (by_shared.end - following(by_shared.begin)),
         seamed * by_own.end,
         -seamed * following(by_own.begin),
-        jnp.diag(1 / problem.found.sd),
+        jnp.diag(_known_before(problem, stage)[1]),
     )
+
+
+def _known_before(problem, stage):
+    """What is known of the shared unknowns before the data: a mean, and the inverse of its standard deviation.
+
+    A prior and a hold are two squares of one unknown, which are one square and a constant.
+    """
+    found = problem.found
+    if stage.around is None:
+        return found.mean, 1 / found.sd
+    # A number that was guessed to be 0 has no size to be held by.
+    held = jnp.where(found.start != 0, stage.held / jnp.where(found.start != 0, found.start, 1.0), 0.0) ** 2
+    both = 1 / found.sd**2 + held
+    mean = (found.mean / found.sd**2 + held * stage.around) / jnp.where(both > 0, both, 1.0)
+    return mean, jnp.sqrt(both)
 
 
 def _seamed(problem, stage):
@@ -203,8 +249,8 @@ def one_by_one(function: Callable, xs):
 def residuals(problem, motion, w, stage, loss):
     """The residuals of one window in one vector; zero where nothing was measured or does not count yet."""
     last = problem.windows.last[w]
-    t = problem.windows.ts[w]
-    counts = t <= t[0] + stage.part * (t[last] - t[0])
+    part = problem.part(w, stage)
+    counts = _counts(problem.windows.ts[w], last, part)
     predicted = problem.predicted(motion)
     parts = []
     for kind, tree in problem.measured.items():
@@ -213,7 +259,7 @@ def residuals(problem, motion, w, stage, loss):
             measured, sigma = measured[w], sigma[w]
             known = jnp.isfinite(measured) & jnp.isfinite(sigma)
             if kind == "end":
-                known = known & (stage.part >= 1)
+                known = known & (part >= 1)
             else:
                 known = known & counts.reshape(-1, *(1,) * (measured.ndim - 1))
             sigma = jnp.where(known, sigma, 1.0)
@@ -229,9 +275,14 @@ def dampened(r, loss, ordinary=1.0):
     return r * jnp.sqrt(ratio((r / (constant * ordinary)) ** 2))
 
 
+def _counts(t, last, part):
+    """Which times count; of the whole the last one does, too, which rounding might leave out."""
+    return t <= jnp.where(part < 1, t[0] + part * (t[last] - t[0]), t[last])
+
+
 def _as_far_as(t, last, part):
     """Times of which those beyond a part of the window follow each other closely: they are not wanted."""
-    kept = jnp.sum(t <= t[0] + part * (t[last] - t[0]))
+    kept = jnp.sum(_counts(t, last, part))
     closest = jnp.maximum(PADDING * (t[1] - t[0]), 8 * jnp.finfo(t.dtype).eps * jnp.max(jnp.abs(t)))
     beyond = jnp.arange(t.shape[0]) - (kept - 1)
     return jnp.where(beyond <= 0, t, t[kept - 1] + beyond * closest)

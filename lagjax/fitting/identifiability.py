@@ -43,8 +43,7 @@ class Identifiability(eqx.Module):
     @property
     def rank(self) -> int:
         """How many independent combinations the data see."""
-        s = np.asarray(self.singular_values)
-        return int(np.sum(s > _floor(s.dtype) * np.max(s, initial=0.0)))
+        return rank_of(np.asarray(self.singular_values))
 
     def combined(self) -> list[str]:
         """The combinations that the data see, as products of powers where they are such."""
@@ -78,13 +77,16 @@ class Identifiability(eqx.Module):
         if self.unseen():
             lines.append(f"  {listed(self.unseen())}: no trace in the data")
         if self.noise is not None and np.isfinite(self.noise) and rank:
-            error = float(self.noise / self.singular_values[rank - 1])
-            lines.append(f"  least certain: {_mixture(self.names, self.combinations[rank - 1])}, to {error:.2g}")
+            error = float(self.noise) / float(np.asarray(self.singular_values)[rank - 1])
+            least = _mixture(self.names, np.asarray(self.combinations)[rank - 1])
+            lines.append(f"  least certain: {least}, to {error:.2g}")
         return "\n".join(lines)
 
 
-def _floor(dtype):
-    return np.sqrt(np.finfo(dtype).eps)
+def rank_of(singular_values: np.ndarray) -> int:
+    """How many of them are not of round-off."""
+    floor = np.sqrt(np.finfo(singular_values.dtype).eps)
+    return int(np.sum(singular_values > floor * np.max(singular_values, initial=0.0)))
 
 
 def _simplest(rows):

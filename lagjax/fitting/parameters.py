@@ -9,6 +9,7 @@ A found number x is searched as a free one, z:
 """
 
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from itertools import compress
 from typing import Any, NamedTuple
 
@@ -30,7 +31,9 @@ class Leaf(NamedTuple):
     places: tuple[int, ...] | None
 
 
-class Found(eqx.Module):
+@jtu.register_dataclass
+@dataclass(frozen=True, eq=False)
+class Found:
     """The numbers among `params` that a fit finds.
 
     - `start` (p,): where the search starts. `low`, `high` (p,): bounds, infinite where there are none.
@@ -56,7 +59,7 @@ class Found(eqx.Module):
             size = old.size if places is None else len(places)
             new = x[at : at + size].astype(old.dtype)
             if places is not None:
-                new = jnp.ravel(old).at[np.array(places)].set(new)
+                new = _with(old, np.array(places), new)
             leaves[number] = new.reshape(old.shape)
             at += size
         return jtu.tree_unflatten(structure, leaves)
@@ -80,6 +83,15 @@ class Found(eqx.Module):
         return jnp.where(high & low, jax.scipy.special.logit(jnp.where(high & low, share, 0.5)), z)
 
 
+def _with(old, places, new):
+    """All entries of `old` in a row, some of them replaced."""
+    if coordinates.is_traced((old, new)):
+        return jnp.ravel(old).at[places].set(new)
+    row = np.array(old).ravel()
+    row[places] = new
+    return row
+
+
 def find(
     params: PyTree,
     free: str | Iterable[str] | None,
@@ -90,7 +102,7 @@ def find(
     """Read off `params`, names, bounds and priors what is to be found."""
     if not coordinates.is_traced(params):
         with jax.ensure_compile_time_eval():
-            params = coordinates.as_arrays(params, dtype)
+            params = coordinates.given_params(params, dtype)
     named = [(leaf_name(path), x) for path, x in jtu.tree_leaves_with_path(params)]
     floating = {name: x for name, x in named if eqx.is_inexact_array(x)}
     chosen = {name: np.full(x.size, free is None) for name, x in floating.items()}

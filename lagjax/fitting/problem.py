@@ -2,9 +2,7 @@
 
 import warnings
 from collections.abc import Mapping, Sequence
-from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
@@ -12,11 +10,12 @@ import numpy as np
 
 from lagjax.fitting.equations import LOSSES, Problem, replace
 from lagjax.fitting.parameters import find, leaf_name
-from lagjax.fitting.records import KINDS, Record, channel_name, cut, spread
+from lagjax.fitting.records import KINDS, Record, cut, spread
 from lagjax.fitting.result import FitWarning
 from lagjax.fitting.starts import starts
-from lagjax.mechanics import constraints, coordinates
+from lagjax.mechanics import coordinates
 from lagjax.mechanics.diagnosis import listed
+from lagjax.mechanics.outside import up_to_date
 from lagjax.motion.problem import check_system
 
 # What `integrate` takes and a fit sets itself.
@@ -26,6 +25,7 @@ OURS = {"ts", "throw", "adjoint"}
 def problem_of(system, records, params, free, observe, bounds, priors, loss, window, options) -> Problem:
     """Check everything and make arrays of it."""
     check_system(system)
+    system = up_to_date(system)
     records = [records] if isinstance(records, Record) else list(records)
     if not records or not all(isinstance(record, Record) for record in records):
         raise TypeError("records must be a lj.Record or a list of them.\nFix: lj.Record(t, q=measured).")
@@ -36,7 +36,7 @@ def problem_of(system, records, params, free, observe, bounds, priors, loss, win
     _check_kinds(records, observe, options)
     absolute = _absolute(records, loss, priors)
     dtype = jnp.result_type(float)
-    options = {name: jnp.asarray(x, dtype) if isinstance(x, float) else x for name, x in options.items()}
+    options = {name: np.asarray(x, dtype) if isinstance(x, float) else x for name, x in options.items()}
     found = find(params, free, bounds or {}, priors or {}, dtype)
     windows = cut(records, window, dtype)
     overrides = _overrides(records, windows, found)
@@ -49,13 +49,11 @@ def problem_of(system, records, params, free, observe, bounds, priors, loss, win
     per_window = {name: values[windows.record] for name, values in overrides.items()}
     xp = coordinates.numpy_of((starting.q.guess, starting.v.guess))
     unit = xp.std(xp.concatenate([starting.q.guess, starting.v.guess], axis=1), axis=0)
-    problem = Problem(
+    _warn_of_wrapped(records)
+    return Problem(
         system, found, per_window, windows, starting, measured, sigma, spreads, ratio,
         xp.where(unit > 0, unit, 1.0), unflatten, observe, options, loss, absolute,
     )  # fmt: skip
-    _check_predicted(problem)
-    _warn_of_wrapped(records)
-    return problem
 
 
 def _absolute(records, loss, priors):
@@ -112,9 +110,10 @@ def _check_kinds(records, observe, options):
             "observe= and the records' observed= belong together, and only one of them is given.\n"
             'Fix: lj.Record(t, observed={"x": x}) and observe=lambda t, q, v, params: {"x": ...}.'
         )
-    if "end" in kinds and options.get("event") is None:
+    if "end" in kinds and not (options.get("event") or options.get("events")):
         raise ValueError(
-            "records have end=, and the fit no event= that ends the motion.\nFix: event=diffrax.Event(...)."
+            "records have end=, and the fit no events= that end the motion.\n"
+            'Fix: events={"down": lj.Crossing(lambda t, q, v, params: q["y"])}.'
         )
 
 
@@ -148,7 +147,7 @@ def _sigmas(records, windows, measured, absolute):
     xp = coordinates.numpy_of((spreads, sigma))
     finest = lambda s: xp.nanmin(xp.where(xp.isfinite(s), s, np.nan))
     ratios = [a / finest(s) for a, s in zip(jax.tree.leaves(spreads), jax.tree.leaves(sigma))]
-    return sigma, spreads, xp.max(xp.stack(ratios))
+    return sigma, spreads, xp.asarray(xp.max(xp.stack(ratios)))
 
 
 def _spread(x):
@@ -189,54 +188,14 @@ def _broadcast(record, kind):
         raise ValueError(f"sigma of '{kind}' does not fit the measurements: {error}") from error
 
 
-def _check_predicted(problem: Problem):
-    """Raise where the measurements do not have the shape of what the motion says."""
-    begin = jax.tree.map(lambda x: x[0], (problem.starts.q.guess, problem.starts.v.guess))
-    q, v = (jax.eval_shape(problem.unflatten, x) for x in begin)
-    t, params = jax.ShapeDtypeStruct((), problem.windows.ts.dtype), problem.found.params
-
-    def one_time(t, q, v, params):
-        shapes = constraints.shapes(problem.system, t, q, v, params)
-        said = {"q": q, "v": v, "multipliers": {name: jnp.zeros(shape) for name, shape in shapes.items()}}
-        if problem.observe is not None:
-            said["observed"] = problem.observe(t, q, v, params)
-        return said | {"end": {"t": t, **said}}
-
-    said = eqx.filter_eval_shape(one_time, t, q, v, params)
-    for kind, tree in problem.measured.items():
-        _match(kind, said[kind], tree, 1 if kind == "end" else 2)
-
-
-def _match(kind: str, said: Any, measured: Any, axes: int, path=()):
-    if isinstance(measured, dict) and isinstance(said, dict):
-        for name, part in measured.items():
-            if name not in said:
-                raise ValueError(
-                    f"'{name}' was measured as {kind}, and there {listed(list(said))}.\n"
-                    f"Fix: name what the motion has: {kind}={{{list(said)[0]!r}: ...}}."
-                )
-            _match(kind, said[name], part, axes, (*path, jtu.DictKey(name)))
-        return
-    found, wanted = jtu.tree_structure(said), jtu.tree_structure(measured)
-    if found != wanted:
-        raise ValueError(
-            f"{kind} was measured as {wanted}, and the motion has {found}.\nFix: give it in that structure."
-        )
-    for x, y in zip(jtu.tree_leaves(said), jtu.tree_leaves(measured)):
-        if x.shape != y.shape[axes:]:
-            raise ValueError(
-                f"'{channel_name(kind, path)}' was measured with the shape {y.shape[axes:]} at each time, and the "
-                f"motion has {x.shape}.\nUsual cause: an array of one entry where a number is meant."
-            )
-
-
 def _warn_of_wrapped(records: Sequence[Record]):
     for r, record in enumerate(records):
         for name, x in record.channels():
             if name.startswith("end") or "q" not in record.measured or coordinates.is_traced(x):
                 continue
             jumps = np.abs(np.diff(np.asarray(x), axis=0))
-            if np.any(np.abs(jumps - 2 * np.pi) < 0.05 * np.pi) and np.nanmedian(jumps) < 0.5:
+            turns = (jumps > 1.95 * np.pi) & (jumps < 2.05 * np.pi)
+            if turns.any() and np.nanmedian(jumps) < 0.5:
                 warnings.warn(
                     f"'{name}' of record {r} jumps by a whole turn: the angle seems to be wrapped.\n"
                     f"Fix: np.unwrap({name}).",

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
 from lagjax.mechanics import coordinates
+from lagjax.mechanics.memory import filled_up
 
 # What of a motion can be measured; the last as numbers of a run, the others at each of its times.
 KINDS = ("q", "v", "multipliers", "observed", "end")
@@ -34,7 +35,7 @@ class Record(eqx.Module):
     - `multipliers`: by constraint name, some or all: a measured normal force, for example.
     - `observed`: like what `observe(t, q, v, params)` of the fit returns.
     - `end`: what was measured of the event that ended the motion, some of `{"t": ..., "q": ..., "v": ...,
-      "multipliers": ...}`, without a time axis. The fit's `event` says what ends it.
+      "multipliers": ...}`, without a time axis. The fit's `events` say what ends it.
 
     **Of the run:**
 
@@ -171,7 +172,7 @@ def _check(name, x, count):
         raise ValueError(f"'{name}' contains infinity.\nFix: write NaN where a value is missing.")
 
 
-class Windows(eqx.Module):
+class Windows(NamedTuple):
     """All records, cut into windows of one number of times.
 
     - `ts` (W, T): times; a window that is seamed to the next has the next's first time as its last.
@@ -192,6 +193,11 @@ class Windows(eqx.Module):
     def count(self) -> int:
         """How many windows there are."""
         return len(self.record)
+
+    @property
+    def longest(self) -> int:
+        """The times of the longest window, without padding."""
+        return int(np.max(self.last)) + 1
 
     @property
     def first(self) -> np.ndarray:
@@ -224,8 +230,7 @@ def cut(records: Sequence[Record], window: float | None, dtype) -> Windows:
         edges = np.searchsorted(t, t[0] + span / count * np.arange(count) * (1 - 1e-12))
         edges = np.append(edges, len(t))
         pieces += [(r, edges[i], edges[i + 1], i + 1 < count) for i in range(count)]
-    length = max(stop - start + seamed for _, start, stop, seamed in pieces)
-    length = max(length, 2)
+    length = filled_up(int(max(stop - start + seamed for _, start, stop, seamed in pieces)))
     ts, sample = np.zeros((len(pieces), length)), np.zeros((len(pieces), length), int)
     real = np.zeros((len(pieces), length), bool)
     for w, (r, start, stop, seamed) in enumerate(pieces):

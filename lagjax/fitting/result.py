@@ -1,7 +1,8 @@
 """The answer of a fit: estimates, how certain they are, and whether the residuals look like measurement errors."""
 
 from collections.abc import Callable, Iterator, Mapping
-from typing import NamedTuple
+from functools import partial
+from typing import Any, NamedTuple, cast
 
 import equinox as eqx
 import jax
@@ -10,14 +11,17 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from lagjax import plot
-from lagjax.fitting.equations import LOSSES, WHOLE, Problem, dampened, equations
+from lagjax.fitting.equations import LOSSES, WHOLE, Problem, dampened, equations, starts_at
 from lagjax.fitting.identifiability import Identifiability
+from lagjax.fitting.misfit import Misfit
 from lagjax.fitting.records import channel_name
 from lagjax.fitting.search import Seen
 from lagjax.mechanics import coordinates
+from lagjax.mechanics.compiled import compiled
 from lagjax.mechanics.diagnosis import listed
 from lagjax.motion.integrate import integrate
-from lagjax.motion.trajectory import Trajectory
+from lagjax.motion.reported import Report
+from lagjax.motion.trajectory import RESULTS, Trajectory
 from lagjax.numerics.chained import Unknowns
 
 # A number that is closer to its bound than this, relative to the bound's size, or its start's, is at it.
@@ -49,15 +53,19 @@ class Fit(eqx.Module):
     - `identifiability`: which combinations the data see.
     - `chi2`, `freedom`: the sum of squared residuals in sigmas (of the unit that is estimated, without sigmas), and the
       number of measurements less that of unknowns. `noise`: the estimated sigma, where none was given.
-    - `converged`, `steps`, `cost`: of the search; `costs` of its restarts.
+    - `result`: a `RESULTS` item: `lj.RESULTS.successful`, `not_converged` or `misfit`. `converged`: whether it is the
+      first: the search came to rest, and the residuals neither contradict `sigma` nor follow a curve.
+    - Arrays are NumPy's, but where the fit is part of a program.
+    - `steps`, `cost`: of the search. `costs`: from each start, the guess first; NaN where none was needed.
     """
 
     problem: Problem
     unknowns: Unknowns
     cost: Float[Array, ""]
     steps: Int[Array, ""]
-    converged: Bool[Array, ""]
-    costs: Float[Array, " starts"] | None
+    rested: Bool[Array, ""]
+    misfit: Misfit
+    costs: Float[Array, " starts"]
     seen: Seen | None
     units: tuple[tuple[str, str], ...] = eqx.field(static=True)
 
@@ -75,11 +83,37 @@ class Fit(eqx.Module):
 
     @property
     def q0(self) -> list[PyTree]:
-        return [q for q, _ in self._starts()]
+        return [q for q, _ in self.starts()]
 
     @property
     def v0(self) -> list[PyTree]:
-        return [v for _, v in self._starts()]
+        return [v for _, v in self.starts()]
+
+    @property
+    def result(self) -> RESULTS:
+        if not self._traced:
+            ended = RESULTS.misfit if np.any(self.misfit.any) else RESULTS.successful
+            return cast(RESULTS, ended if self.rested else RESULTS.not_converged)
+        ended = RESULTS.where(self.misfit.any, RESULTS.misfit, RESULTS.successful)
+        return RESULTS.where(self.rested, ended, RESULTS.not_converged)
+
+    @property
+    def converged(self) -> Bool[Array, ""]:
+        return self.rested & ~self.misfit.any
+
+    @property
+    def _traced(self) -> bool:
+        return coordinates.is_traced((self.cost, self.unknowns))
+
+    @property
+    def _xp(self) -> Any:
+        """What to compute with: NumPy compiles nothing."""
+        return jnp if self._traced else np
+
+    def report(self) -> Report:
+        """How it went, for a sweep's status."""
+        nothing = jnp.zeros_like(self.cost)
+        return Report(self.result._value, self.steps, nothing, nothing)
 
     @property
     def determined(self) -> Bool[Array, " p"]:
@@ -88,7 +122,7 @@ class Fit(eqx.Module):
     @property
     def identifiability(self) -> Identifiability:
         seen = self._seen()
-        noise = jnp.sqrt(self.variance)
+        noise = self._xp.sqrt(self.variance)
         return Identifiability(self.names, self.values, seen.singular_values, seen.combinations, noise)
 
     @property
@@ -102,50 +136,54 @@ class Fit(eqx.Module):
     @property
     def variance(self) -> Float[Array, ""]:
         """The variance of an error in sigmas: 1 where sigmas were given."""
+        xp = self._xp
         if self.problem.absolute:
-            return jnp.ones_like(self.chi2)
+            return xp.ones_like(self.chi2)
         # Of as many numbers as measurements nothing is left over to tell the size of an error by.
-        return jnp.where(self.freedom > 0, self.chi2 / jnp.maximum(self.freedom, 1), jnp.nan)
+        return xp.where(self.freedom > 0, self.chi2 / xp.maximum(self.freedom, 1), np.nan)
 
     @property
     def noise(self) -> Float[Array, ""]:
         """The size of a measurement error: 1, in sigmas, where these were given; else estimated, in the data's unit."""
         first = jax.tree.leaves(self.problem.sigma)[0]
-        return jnp.sqrt(self.variance) * (1.0 if self.problem.absolute else jnp.nanmax(first))
+        xp = self._xp
+        return xp.sqrt(self.variance) * (1.0 if self.problem.absolute else xp.nanmax(first))
 
     @property
     def covariance(self) -> Float[Array, "p p"]:
         known = self.determined[:, None] & self.determined[None, :]
-        return jnp.where(known, self._of_errors() * self._seen().covariance.shared, jnp.nan)
+        return self._xp.where(known, self._of_errors() * self._seen().covariance.shared, np.nan)
 
     @property
     def sd(self) -> Float[Array, " p"]:
-        return jnp.sqrt(jnp.diag(self.covariance))
+        return self._xp.sqrt(self._xp.diag(self.covariance))
 
     @property
     def correlation(self) -> Float[Array, "p p"]:
-        return self.covariance / (self.sd[:, None] * self.sd[None, :])
+        sd = self.sd
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return self.covariance / (sd[:, None] * sd[None, :])
 
     @property
     def start_sd(self) -> tuple[list[PyTree], list[PyTree]]:
         # On constraints a start depends on the parameters too: that of a rod of unknown length, for example.
-        problem, (shared, own), seen = self.problem, self.unknowns, self._seen()
+        xp, seen, windows = self._xp, self._seen(), self.problem.windows.first
         of, determined, of_errors = seen.covariance, seen.determined, self._of_errors()
-        of_q, of_v = [], []
-        for w in problem.windows.first:
-            state = lambda both, w=w: problem.setting(both[: shared.size], both[shared.size :], w, WHOLE)[2]
-            slopes = jax.jacfwd(state)(jnp.concatenate([shared, own[w]]))
-            joint = jnp.block([[of.shared, of.own_shared[w].T], [of.own_shared[w], of.own[w]]])
-            known = jnp.concatenate([determined.shared, determined.own[w]])
+        _, slopes = starts_at(self.problem, self.unknowns, windows)
+        found = []
+        for r, w in enumerate(windows):
+            joint = of_errors * xp.block([[of.shared, of.own_shared[w].T], [of.own_shared[w], of.own[w]]])
+            known = xp.concatenate([determined.shared, determined.own[w]])
 
-            def sd(slope, joint=of_errors * joint, known=known):
-                variance = jnp.einsum("...i,ij,...j", slope, joint, slope)
-                unknown = jnp.any(jnp.where(known, 0.0, slope) != 0, axis=-1)
-                return jnp.where(unknown, jnp.nan, jnp.sqrt(jnp.maximum(variance, 0.0)))
+            def sd(slopes, r=r, joint=joint, known=known):
+                with np.errstate(invalid="ignore"):
+                    variance = xp.einsum("...i,ij,...j", slopes[r], joint, slopes[r])
+                unknown = xp.any(xp.where(known, 0.0, slopes[r]) != 0, axis=-1)
+                return xp.where(unknown, np.nan, xp.sqrt(xp.maximum(variance, 0.0)))
 
-            of_q.append(jax.tree.map(sd, slopes[0]))
-            of_v.append(jax.tree.map(sd, slopes[1]))
-        return of_q, of_v
+            found.append(jax.tree.map(sd, slopes))
+        of_q, of_v = zip(*found)
+        return list(of_q), list(of_v)
 
     def _seen(self) -> Seen:
         if self.seen is None:
@@ -159,39 +197,33 @@ class Fit(eqx.Module):
         """The variance of an M-estimate of many measurements, in units of that of least squares with these sigmas."""
         if self.problem.loss == "squares":
             return self.variance
-        r = self._seen().rows.reshape(-1)
-        constant, _ = LOSSES[self.problem.loss]
-        half = lambda r: 0.5 * dampened(r, self.problem.loss) ** 2
-        slope = jax.vmap(jax.grad(half))
-        curvature = jax.vmap(jax.grad(jax.grad(half)))
-        r = jnp.where(r == 0, constant * 1e-9, r)
-        known = self.known()
-        mean = lambda x: jnp.sum(jnp.where(known, x, 0.0)) / jnp.sum(known)
-        # Huber, Robust Statistics, Eq. (7.6.2).
-        return mean(slope(r) ** 2) / mean(curvature(r)) ** 2
+        return _of_forgiven_errors(self._seen().rows.reshape(-1), self.known(), self.problem.loss)
 
     def known(self) -> Bool[Array, " windows*m"]:
         """Which of the residuals `seen.rows`, in a row, belong to a measurement."""
         parts = []
         for kind, tree in self.problem.measured.items():
             for x, s in zip(jax.tree.leaves(tree), jax.tree.leaves(self.problem.sigma[kind])):
-                known = jnp.isfinite(x) & jnp.isfinite(s)
+                xp: Any = coordinates.numpy_of((x, s))
+                known = xp.isfinite(x) & xp.isfinite(s)
                 parts.append(known.reshape(known.shape[0], -1))
-        return jnp.concatenate(parts, axis=1).reshape(-1)
+        together: Any = coordinates.numpy_of(parts).concatenate(parts, axis=1)
+        return together.reshape(-1)
 
-    def _starts(self):
-        u = self.unknowns
-        return [self.problem.setting(u.shared, u.own[w], w, WHOLE)[2] for w in self.problem.windows.first]
+    def starts(self) -> list[tuple[PyTree, PyTree]]:
+        """(q, v) at the start of each record."""
+        windows = self.problem.windows.first
+        states, _ = starts_at(self.problem, self.unknowns, windows)
+        return [jax.tree.map(lambda x, r=r: x[r], states) for r in range(len(windows))]
 
     def motion(self, record: int = 0, ts=None) -> Trajectory:
         """The fitted motion of a record from its start, at its times or at others from the same start."""
         windows = np.flatnonzero(np.asarray(self.problem.windows.record) == record)
-        w = int(windows[0])
-        times, params, (q, v), options = self.problem.setting(self.unknowns.shared, self.unknowns.own[w], w, WHOLE)
+        params, (q, v) = self.problem.params(self.unknowns.shared, int(windows[0])), self.starts()[record]
         if ts is None:
             real = np.asarray(self.problem.windows.real)
             ts = np.concatenate([np.asarray(self.problem.windows.ts)[i][real[i]] for i in windows])
-        return integrate(self.problem.system, q, v, params, ts=ts, **({"throw": False} | options))
+        return integrate(self.problem.system, q, v, params, ts=ts, **({"throw": False} | self.problem.options))
 
     def residuals(self, record: int | None = None) -> dict[str, np.ndarray]:
         """Predicted less measured, by channel, (T, ...) in the data's unit, NaN where nothing was measured.
@@ -233,7 +265,9 @@ class Fit(eqx.Module):
     @property
     def sampling(self) -> dict[str, Array]:
         """The unknowns as `log_likelihood` takes them: parameters by name, and the starts' deviations, (W, k)."""
-        return dict(zip(self.names, self.unknowns.shared)) | {"starts": self.unknowns.own}
+        # JAX's arrays, for a sampler.
+        of_names = {name: jnp.asarray(self.unknowns.shared[i]) for i, name in enumerate(self.names)}
+        return of_names | {"starts": jnp.asarray(self.unknowns.own)}
 
     @property
     def log_likelihood(self) -> Callable[[Mapping[str, Array]], Float[Array, ""]]:
@@ -272,13 +306,27 @@ class Fit(eqx.Module):
         return "\n".join(_lines(self))
 
 
+@partial(compiled, in_numpy=True)
+def _of_forgiven_errors(r, known, loss):
+    """The variance of an M-estimate, Huber, Robust Statistics, Eq. (7.6.2)."""
+    constant, _ = LOSSES[loss]
+    half = lambda r: 0.5 * dampened(r, loss) ** 2
+    slope = jax.vmap(jax.grad(half))
+    curvature = jax.vmap(jax.grad(jax.grad(half)))
+    r = jnp.where(r == 0, constant * 1e-9, r)
+    mean = lambda x: jnp.sum(jnp.where(known, x, 0.0)) / jnp.sum(known)
+    return mean(slope(r) ** 2) / mean(curvature(r)) ** 2
+
+
 def _lines(fit: Fit):
-    how = "converged" if bool(fit.converged) else "NOT converged"
+    how = "converged" if bool(fit.rested) else "NOT converged"
+    how += ", and the residuals are NO errors of measurement," if bool(fit.misfit.any) else ""
     windows = np.asarray(fit.problem.windows.record)
     lines = [f"Fit: {how} after {int(fit.steps)} steps"]
-    if fit.costs is not None:
+    tried = int(np.sum(np.isfinite(fit.costs)))
+    if tried > 1:
         near = int(np.sum(np.asarray(fit.costs) <= 1.01 * float(fit.cost) + 1e-300))
-        lines[0] += f"; {near} of {len(fit.costs)} starts ended here"
+        lines[0] += f"; {near} of {tried} starts ended here"
     if fit.seen is None:
         lines.append(f"  {len(fit.names)} numbers, uncertainties not computed; cost {float(fit.cost):.6g}")
         return lines
@@ -288,12 +336,12 @@ def _lines(fit: Fit):
         rows.append((name, _plus_minus(x, sd), unit))
     many = len(rows) > 40
     rows = rows[:40]
-    starts = zip(fit.q0, fit.v0, *fit.start_sd)
-    for r, (q, v, q_sd, v_sd) in enumerate(starts):
+    starts = fit.starts()
+    for r, ((q, v), q_sd, v_sd) in enumerate(zip(starts, *fit.start_sd)):
         if r < 4:
-            of = f" of record {r}" if len(fit.q0) > 1 else ""
+            of = f" of record {r}" if len(starts) > 1 else ""
             for label, x, sd in (("", q, q_sd), ("v.", v, v_sd)):
-                x, sd = (np.asarray(coordinates.flatten(y)[0]) for y in (x, sd))
+                x, sd = (np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(y)]) for y in (x, sd))
                 told = zip(coordinates.names(q), x, sd)
                 rows += [(f"{label}{name}(0){of}", _plus_minus(a, b), "") for name, a, b in told if b != 0]
     width, wide = max(len(row[0]) for row in rows) if rows else 0, max((len(row[1]) for row in rows), default=0)
@@ -309,8 +357,8 @@ def _lines(fit: Fit):
     lines.append(f"  residuals: rms {told}; {size}, {int(fit.freedom)} degrees of freedom")
     lines += _whiteness(fit)
     lines += ["  " + line for line in repr(fit.identifiability).splitlines()[1:]]
-    if fit.at_bounds():
-        lines.append(f"  at a bound: {listed(fit.at_bounds())}")
+    if at := fit.at_bounds():
+        lines.append(f"  at a bound: {listed(at)}")
     return lines
 
 

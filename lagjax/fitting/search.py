@@ -2,6 +2,14 @@
 
 One program serves all stages: how far the records count, and how tightly windows are joined, are numbers in it. The
 slopes of all equations are computed together with their values, forward, in one pass over the motions.
+
+The first part of a record cannot see everything. What it does not see would go wherever its errors send it, and the
+next part begins there. So every part but the last is fitted with a hold, a square that costs a change by `REACH` (of
+the engine) as much as an error of measurement: beside the data it is nothing where the part sees, and all where it does
+not.
+
+An end that its residuals contradict (`misfit`) is not the last word: the whole record from the guess itself comes next,
+then other starts. They are further turns of the same compiled loop, and the best end counts.
 """
 
 from collections.abc import Callable
@@ -19,7 +27,11 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from lagjax.fitting.equations import Problem, Stage, equations, of_window, over_windows, slopes_together, together
-from lagjax.motion.reported import PATIENCE, WATCHED
+from lagjax.fitting.misfit import OF_NORMAL, Misfit, misfit
+from lagjax.fitting.predicted import check_predicted
+from lagjax.jax_internals.tracing import WATCHED
+from lagjax.mechanics.compiled import compiled
+from lagjax.motion.reported import PATIENCE
 from lagjax.numerics.chained import (
     ByWindows,
     Covariance,
@@ -32,23 +44,44 @@ from lagjax.numerics.chained import (
     slopes_of,
 )
 
-# A standard deviation over the median of the absolute value, of normal errors.
-OF_NORMAL = 1.4826
 # Of the slopes, enough to make what the data cannot see regular, and too little to be seen itself.
 FLOOR = 1e-10
+# Costs that differ by this part are the same.
+SAME = 1e-6
 # An uncertainty so many times (over √eps) larger than with all else known is none: the data do not see it.
 UNSEEN = 0.15
 # A parameter with no larger part (squared) in what is not seen is determined.
 NO_PART = 1e-8
 
 
+class Course(NamedTuple):
+    """The course of a search: its stages, their numbers with a leading axis S, and where it may begin.
+
+    - `tolerances` (S,): when a stage is done, in units of a residual.
+    - `starts` (A, p): of shared unknowns. `first` (A,): the stage with which a search from there begins.
+    - `count`: how many of them there are, and no more than fill the array up. `must`: how many of them are tried in any
+      case; the others while the best end is doubtful.
+    """
+
+    stages: Stage
+    tolerances: Float[Array, " S"]
+    starts: Float[Array, "A p"]
+    first: Int[Array, " A"]
+    count: Int[Array, ""]
+    must: Int[Array, ""]
+
+
 class Searched(NamedTuple):
-    """Where a search ended, its cost (half the sum of squares), the steps it took and how it ended."""
+    """Where a search ended, its cost (half the sum of squares), the steps it took, whether it came to rest there, what
+    the residuals say, and the costs from all starts (A,), NaN from those that were not tried.
+    """
 
     unknowns: Unknowns
     cost: Float[Array, ""]
     steps: Int[Array, ""]
-    converged: Bool[Array, ""]
+    rested: Bool[Array, ""]
+    misfit: Misfit
+    costs: Float[Array, " A"]
 
 
 class Linear(NamedTuple):
@@ -126,9 +159,10 @@ def seen_from(problem: Problem, u: Unknowns, linear: Linear, stage: Stage) -> Se
     )  # fmt: skip
 
 
-@eqx.filter_jit
+@partial(compiled, in_numpy=True)
 def look(problem: Problem, u: Unknowns, stage: Stage) -> Seen:
     """What the data say at `u`."""
+    check_predicted(problem)
     at = lambda problem, u, stage: seen_from(problem, u, linearised(problem, u, stage, "squares"), stage)
     return _in_turn(at, problem, u, stage)
 
@@ -157,7 +191,7 @@ def _least_squares(solver, problem, y, stage, limit, told):
     def with_cost(y, args):
         values, well = _equations(y, *args)
         told(_cost(values))
-        return values, (_cost(values), well)
+        return values, (values, well)
 
     return optx.least_squares(with_cost, solver, y, (problem, stage), has_aux=True, max_steps=limit, throw=False)
 
@@ -165,9 +199,9 @@ def _least_squares(solver, problem, y, stage, limit, told):
 def _minimise(solver, problem, y, stage, limit, told):
     def cost(y, args):
         problem, stage = args
-        value = _cost(equations(problem, _natural(problem, y), stage))
-        told(value)
-        return value, (value, jnp.ones(problem.windows.count, bool))
+        values = equations(problem, _natural(problem, y), stage)
+        told(_cost(values))
+        return _cost(values), (values, jnp.ones(problem.windows.count, bool))
 
     solver = optx.BestSoFarMinimiser(solver)
     return optx.minimise(cost, solver, y, (problem, stage), has_aux=True, max_steps=limit, throw=False)
@@ -175,8 +209,7 @@ def _minimise(solver, problem, y, stage, limit, told):
 
 def _ordinary(problem, u, stage):
     """The size of an ordinary error at `u`, in sigmas: what half of the residuals do not exceed; not below a sigma."""
-    unforgiving = eqx.tree_at(lambda stage: stage.ordinary, stage, jnp.asarray(jnp.inf))
-    rows = equations(problem, u, unforgiving).rows
+    rows = equations(problem, u, stage._replace(ordinary=jnp.asarray(jnp.inf))).rows
     # What was not measured, or does not count yet, is zero.
     half = jnp.nanmedian(jnp.where(rows == 0, jnp.nan, jnp.abs(rows)))
     return jnp.maximum(OF_NORMAL * jnp.where(jnp.isfinite(half), half, 0.0), 1.0)
@@ -191,13 +224,15 @@ def _largest_change(tree):
     return jnp.asarray(0.0) if isinstance(tree, Unknowns) else optx.max_norm(tree)
 
 
-@eqx.filter_jit
-def search(problem: Problem, start: Unknowns, stages: Stage, tolerances, optimiser: Any, limit: int, tell: bool):
-    """Search from `start` through all stages, whose numbers have a leading axis; `tell` those who are `listening`.
+@partial(compiled, in_numpy=True)
+def search(problem: Problem, course: Course, optimiser: Any, limit: int, tell: bool):
+    """Search from the starts of a course through all its stages; `tell` those who are `listening`.
 
     Returns a `Searched` and, where the search has its slopes, what the data say at its end.
     """
-    return _in_turn(lambda *args: _search(*args, limit, tell), problem, start, stages, tolerances, optimiser)
+    # Here while it is traced: of the same functions and shapes it need not be asked again.
+    check_predicted(problem)
+    return _in_turn(lambda *args: _search(*args, limit, tell), problem, course, optimiser)
 
 
 # Who hears of each step; outside of the program, which is kept for the next search.
@@ -236,35 +271,95 @@ def _in_turn(function: Callable, *args):
     return run(jax.tree.map(jnp.asarray, live))
 
 
-def _search(problem, start, stages, tolerances, optimiser, limit, tell):
-    def one_stage(carried, x):
-        (y, taken), (number, stage, tolerance) = carried, x
+class _Best(NamedTuple):
+    """The best end so far, in free numbers; `slopes` where the search has them."""
+
+    y: Unknowns
+    cost: Float[Array, ""]
+    values: Equations
+    slopes: Slopes | None
+    well: Bool[Array, " W"]
+    rested: Bool[Array, ""]
+    misfit: Misfit
+
+
+def _search(problem, course, optimiser, limit, tell):
+    last = len(course.tolerances) - 1
+    tries = course.count
+    own = jnp.asarray(problem.start.own)
+
+    def one_stage(y, stage, tolerance, number):
         told = partial(jax.debug.callback, _heard, number) if tell else lambda cost: None
         if problem.loss != "squares":
             # Far from the truth every residual would look like an outlier, and such a loss has no slope there.
             estimated = _ordinary(problem, _natural(problem, y), stage)
-            ordinary = jnp.where(number == len(tolerances) - 1, stage.ordinary, estimated)
-            stage = eqx.tree_at(lambda stage: stage.ordinary, stage, ordinary)
+            stage = stage._replace(ordinary=jnp.where(number == last, stage.ordinary, estimated))
         solver = optimiser
         if optimiser is None:
             solver = optx.LevenbergMarquardt(tolerance, tolerance, norm=_largest_change, linear_solver=ByWindows())
         by = _minimise if isinstance(solver, optx.AbstractMinimiser) else _least_squares
         solution = by(solver, problem, y, stage, limit, told)
-        last = None
-        if optimiser is None and problem.loss == "squares":
+        slopes = None
+        if _keeps_slopes(problem, optimiser):
             # The slopes that the search has last, by free numbers, as its linear solver sees them.
-            info = solution.state.f_info
-            last = info.residual, slopes_of(info.jac.mv, y)
-        converged = solution.result == optx.RESULTS.successful
-        return (solution.value, taken + solution.stats["num_steps"]), (solution.aux, converged, last)
+            slopes = slopes_of(solution.state.f_info.jac.mv, y)
+        values, well = solution.aux
+        rested = (solution.result == optx.RESULTS.successful) & jnp.all(well)
+        end = _Best(solution.value, _cost(values), values, slopes, well, rested, misfit(problem, values))
+        return end, solution.stats["num_steps"]
 
-    first = Unknowns(problem.found.free(start.shared), start.own), jnp.asarray(0)
-    (y, steps), stagewise = lax.scan(one_stage, first, (jnp.arange(len(tolerances)), stages, tolerances))
-    (cost, well), converged, last = jax.tree.map(lambda x: x[-1], stagewise)
-    u = _natural(problem, y)
-    if last is not None:
-        values, by_free = last
-        _, rate = jax.jvp(problem.found.natural, (y.shared,), (jnp.ones_like(y.shared),))
-        last = Linear(values, by_free.scaled(jnp.where(rate != 0, 1 / rate, 0.0)), well)
-        last = seen_from(problem, u, last, jax.tree.map(lambda x: x[-1], stages))
-    return Searched(u, cost, steps, converged), last
+    def begin(number):
+        x = course.starts[jnp.minimum(number, tries - 1)]
+        return Unknowns(problem.found.free(x), own), course.first[jnp.minimum(number, tries - 1)]
+
+    def go_on(state):
+        turn, *_, best = state
+        doubtful = best.misfit.doubtful | ~best.rested
+        return (turn < tries) & ((turn < course.must) | doubtful)
+
+    def step(state):
+        turn, number, y, taken, costs, best = state
+        stage = jax.tree.map(lambda x: x[number], course.stages)
+        stage = stage._replace(around=course.starts[turn])
+        end, steps = one_stage(y, stage, course.tolerances[number], number)
+        done = number == last
+        # Of chaotic windows round-off keeps a search moving; two that end in one place have found it.
+        again = jnp.any(jnp.abs(costs - end.cost) < SAME * end.cost) & jnp.all(end.well)
+        end = end._replace(rested=end.rested | again)
+        below = (end.cost < best.cost) | (again & ~best.rested & (end.cost < (1 + SAME) * best.cost))
+        better = done & (below | ~jnp.isfinite(best.cost))
+        best = jax.tree.map(lambda new, old: jnp.where(better, new, old), end, best)
+        costs = costs.at[turn].set(jnp.where(done, end.cost, costs[turn]))
+        next_y, first = begin(turn + 1)
+        y = jax.tree.map(lambda new, old: jnp.where(done, new, old), next_y, end.y)
+        return turn + done, jnp.where(done, first, number + 1), y, taken + steps, costs, best
+
+    y, number = begin(0)
+    nothing = _nothing(problem, y, _keeps_slopes(problem, optimiser))
+    start = jnp.asarray(0), number, y, jnp.asarray(0), jnp.full(len(course.starts), jnp.nan, y.shared.dtype), nothing
+    *_, steps, costs, best = lax.while_loop(go_on, step, start)
+    u, seen = _natural(problem, best.y), None
+    if best.slopes is not None:
+        _, rate = jax.jvp(problem.found.natural, (best.y.shared,), (jnp.ones_like(best.y.shared),))
+        linear = Linear(best.values, best.slopes.scaled(jnp.where(rate != 0, 1 / rate, 0.0)), best.well)
+        seen = seen_from(problem, u, linear, jax.tree.map(lambda x: x[-1], course.stages))
+    return Searched(u, best.cost, steps, best.rested, best.misfit, costs), seen
+
+
+def _keeps_slopes(problem, optimiser):
+    return optimiser is None and problem.loss == "squares"
+
+
+def _nothing(problem, y, with_slopes):
+    """What stands for the best end before there is one."""
+    (p,), (windows, k), dtype = y.shared.shape, y.own.shape, y.shared.dtype
+    m = sum(int(np.prod(x.shape[1:])) for x in jax.tree.leaves(problem.measured))
+    j = 0 if windows == 1 else problem.unit.size
+    of = lambda *shape: jnp.zeros(shape, dtype)
+    w = windows
+    values = Equations(of(w, m), of(w, j), of(p))
+    slopes = Slopes(of(w, m, p), of(w, m, k), of(w, j, p), of(w, j, k), of(w, j, k), of(p, p))
+    no, each = jnp.zeros((), bool), jnp.zeros(len(jax.tree.leaves(problem.measured)), bool)
+    judged = Misfit(jnp.zeros(each.shape, dtype), each, each, no)
+    cost = jnp.full((), jnp.inf, dtype)
+    return _Best(y, cost, values, slopes if with_slopes else None, jnp.zeros(w, bool), no, judged)

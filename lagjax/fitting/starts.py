@@ -12,7 +12,9 @@ Source: Hairer, Lubich & Wanner, *Geometric Numerical Integration*, §IV.5.3 (ta
 """
 
 from collections.abc import Callable, Sequence
+from functools import lru_cache
 from itertools import combinations
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -27,6 +29,7 @@ from lagjax.mechanics import constraints, coordinates
 from lagjax.mechanics.coordinates import State
 from lagjax.mechanics.diagnosis import listed
 from lagjax.mechanics.first_call import check_functions
+from lagjax.mechanics.memory import kinds, remembered
 from lagjax.motion.consistency import departures, stopped
 from lagjax.motion.consistent_state import free_coordinates
 from lagjax.motion.integrate import integrate
@@ -42,7 +45,7 @@ ITERATIONS = 12
 OFF = 1e-6
 
 
-class Chart(eqx.Module):
+class Chart(NamedTuple):
     """Directions at a guess: `along` the constraints (n, k), all unknowns of the start, and `across` them (n, r)."""
 
     guess: Float[Array, " n"]
@@ -76,7 +79,7 @@ class Chart(eqx.Module):
         return y - self.across @ jnp.linalg.solve(rows.T @ rows, rows.T @ residual(problem, y))
 
 
-class Starts(eqx.Module):
+class Starts(NamedTuple):
     """The starts of all windows: charts of coordinates and of velocities, each with a leading axis W."""
 
     q: Chart
@@ -122,34 +125,48 @@ def starts(
         if len(later) < len(read):
             later = _along_the_motion(system, first, windows.ts[here, 0], options)
         for w, (q, v) in zip(here[1:], later):
-            guesses.append(_concrete(lambda w=w, q=q, v=v: coordinates.state(windows.ts[w, 0], q, v, first.params)))
+            guesses.append(_state(windows.ts[w, 0], q, v, first.params))
     charts = []
     for w, (r, guess) in enumerate(zip(windows.record, guesses)):
         held = (records[r].hold_q, records[r].hold_v) if w in windows.first else (False, False)
         charts.append(_charts(system, guess, *(_free(guess.q, hold) for hold in held), r))
     q, v = zip(*charts)
     k = max(chart.along.shape[1] for chart in q), max(chart.along.shape[1] for chart in v)
-    flat = _concrete(lambda: coordinates.flatten(guesses[0].q))
-    return Starts(_stacked(q, 0, sum(k)), _stacked(v, k[0], sum(k))), flat[1]
+    return Starts(_stacked(q, 0, sum(k)), _stacked(v, k[0], sum(k))), _unflatten(kinds(guesses[0].q))
 
 
 def _stacked(charts: Sequence[Chart], before: int, k: int) -> Chart:
     """Charts of one shape; the unknowns of this kind stand after `before` others."""
-    r = max(chart.across.shape[1] for chart in charts)
-    wide = lambda x, before, width: np.pad(x, ((0, 0), (before, width - before - x.shape[1])))
-    guesses = [chart.guess for chart in charts]
-    along = np.stack([wide(chart.along, before, k) for chart in charts])
-    across = np.stack([wide(chart.across, 0, r) for chart in charts])
+    guesses, n = [chart.guess for chart in charts], len(charts[0].guess)
+    along = np.zeros((len(charts), n, k), charts[0].along.dtype)
+    across = np.zeros((len(charts), n, max(chart.across.shape[1] for chart in charts)), along.dtype)
+    for w, chart in enumerate(charts):
+        along[w, :, before : before + chart.along.shape[1]] = chart.along
+        across[w, :, : chart.across.shape[1]] = chart.across
     return Chart(coordinates.numpy_of(guesses).stack(guesses), along, across)
 
 
-def _concrete(function: Callable):
-    """`function()`, with numbers for results where it has numbers for inputs, also while a program is traced."""
-    try:
-        with jax.ensure_compile_time_eval():
-            return function()
-    except jax.errors.JAXTypeError:
-        return function()
+def _state(t, q, v, params) -> State:
+    """A state, of numbers where it is made of numbers, also while a program is traced."""
+    if coordinates.is_traced((q, v, params)):
+        return coordinates.given_state(t, q, v, params)
+    with jax.ensure_compile_time_eval():
+        s = coordinates.given_state(t, q, v, params)
+    return s._replace(q=jax.tree.map(np.asarray, s.q), v=jax.tree.map(np.asarray, s.v))
+
+
+def _vector(tree):
+    """All coordinates in one vector, of NumPy where they can be looked at."""
+    xp = coordinates.numpy_of(tree)
+    return xp.concatenate([xp.ravel(x) for x in jax.tree.leaves(tree)])
+
+
+@lru_cache
+def _unflatten(of_kinds) -> Callable:
+    """The function that makes coordinates of these `kinds` of a vector."""
+    structure, *arrays = of_kinds
+    with jax.ensure_compile_time_eval():
+        return coordinates.flatten(jax.tree.unflatten(structure, [np.zeros(*array) for array in arrays]))[1]
 
 
 def _guess(system, record, r, params) -> State:
@@ -163,19 +180,18 @@ def _guess(system, record, r, params) -> State:
                 "Fix: lj.Record(..., q0=..., v0=...), alike to the state of lj.integrate."
             )
         if record.v0 is None and isinstance(q, dict) and isinstance(v, dict):
-            v = {name: jnp.zeros_like(x) for name, x in q.items()} | v
+            v = {name: np.zeros(np.shape(x), jnp.result_type(float)) for name, x in q.items()} | v
     if coordinates.is_traced((q, v, params)):
         if system.constraints:
             raise TypeError(
                 "the start of a constrained system is being traced, and its free directions are read off its values.\n"
                 "Fix: give q0 and v0 of the record, and params, as numbers; measurements may be traced."
             )
-        return coordinates.state(record.t[0], q, v, params)
-    with jax.ensure_compile_time_eval():
-        guess = coordinates.state(record.t[0], q, v, params)
+        return _state(record.t[0], q, v, params)
+    guess = _state(record.t[0], q, v, params)
     if record.q0 is None and isinstance(q, dict):
         try:
-            check_functions(system, *guess)
+            remembered(system, (check_functions, kinds(guess)), lambda: check_functions(system, *guess))
         except ValueError as error:
             raise ValueError(
                 f"{error}\nThe start of record {r} was read off what it measures, {listed(list(q))}; a guess of all "
@@ -208,8 +224,9 @@ def _parabola(t, x, samples):
     Source: Rousseeuw, *J. Am. Stat. Assoc.* 79 (1984) 871 (least median of squares).
     """
     xp, shape = coordinates.numpy_of(x), x.shape[1:]
+    t = xp.asarray(t)
     count = min(SAMPLES, len(t))
-    threes = np.array(list(combinations(range(count), 3)))
+    threes = _threes(count)
     values, slopes = [], []
     for column in x.reshape(len(x), -1).T:
         wild, column = OF_SPREAD * spread(column), column[samples]
@@ -217,7 +234,7 @@ def _parabola(t, x, samples):
         y, known = column[first], xp.isfinite(column[first])
         scale = xp.max(xp.where(known, t[first], 0.0))
         scale = xp.where(scale > 0, scale, 1.0)
-        powers = (t[first] / scale)[:, None] ** np.arange(3)
+        powers = (t[first] / scale)[:, None] ** np.arange(3)[None]
         near, y = known, xp.where(known, y, 0.0)
         # Traced, it would be compiled for each window.
         if count == SAMPLES and xp is np:
@@ -232,12 +249,19 @@ def _parabola(t, x, samples):
     return tuple(xp.stack(part).reshape(shape) for part in (values, slopes))
 
 
+@lru_cache
+def _threes(count):
+    """All choices of three among so many."""
+    return np.array(list(combinations(range(count), 3)))
+
+
 def _along_the_motion(system, first, ts, options):
     """The states at the starts of a record's later windows, along the motion from its guessed start."""
-    known = {name: value for name, value in options.items() if name != "event"}
+    known = {name: value for name, value in options.items() if name not in ("event", "events")}
     motion = integrate(system, first.q, first.v, first.params, ts=ts, **(known | {"throw": False}))
     # Where the guess does not get so far, the start serves as well as anything.
-    fill = lambda x, x0: jnp.where(jnp.isfinite(x), x, x0[None])
+    xp = coordinates.numpy_of((motion.q, motion.v, first.q, first.v))
+    fill = lambda x, x0: xp.where(xp.isfinite(x), x, x0[None])
     q, v = jax.tree.map(fill, (motion.q, motion.v), (first.q, first.v))
     return [jax.tree.map(lambda x, i=i: x[i], (q, v)) for i in range(1, len(ts))]
 
@@ -249,20 +273,19 @@ def _free(q, hold):
 
 
 def _charts(system, s: State, free_q, free_v, r) -> tuple[Chart, Chart]:
-    x, u = (_concrete(lambda tree=tree: coordinates.flatten(tree)[0]) for tree in (s.q, s.v))
+    x, u = _vector(s.q), _vector(s.v)
     if not system.constraints:
         nothing = np.zeros((len(free_q), 0))
-        x, u = (y if coordinates.is_traced(y) else np.asarray(y) for y in (x, u))
         return Chart(x, np.eye(len(free_q))[:, free_q], nothing), Chart(u, np.eye(len(free_v))[:, free_v], nothing)
     with jax.ensure_compile_time_eval():
-        _, unflatten = coordinates.flatten(s.q)
+        unflatten = _unflatten(kinds(s.q))
 
         def charts(x, u):
             of_q, of_v = _rows(system, s.t, x, u, s.params, unflatten)
             return _chart(x, of_q, free_q), _chart(u, of_v, free_v)
 
         q, v = charts(x, u)
-        zeros = jnp.zeros(q.along.shape[1]), jnp.zeros(v.along.shape[1])
+        zeros = np.zeros(q.along.shape[1]), np.zeros(v.along.shape[1])
         x, u = eqx.filter_jit(Starts.vectors)(Starts(q, v), *zeros, system, s.t, s.params, unflatten)
         # The directions are those of the guess after it was moved onto the constraints.
         q, v = charts(x, u)
@@ -289,7 +312,7 @@ def _chart(y, rows, free):
         along[free], across[free] = inner, normal
     elif free.any():
         along[free] = np.eye(int(free.sum()))
-    return Chart(jnp.asarray(y), jnp.asarray(along), jnp.asarray(across))
+    return Chart(np.asarray(y), along.astype(y.dtype), across.astype(y.dtype))
 
 
 @eqx.filter_jit

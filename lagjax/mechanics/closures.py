@@ -12,6 +12,7 @@ import equinox as eqx
 import jax
 from jaxtyping import Array
 
+from lagjax.jax_internals.tracing import is_eager
 from lagjax.mechanics.constraints import Holonomic, Nonholonomic
 from lagjax.mechanics.coordinates import State
 from lagjax.mechanics.system import System
@@ -29,22 +30,27 @@ class Lifted(eqx.Module):
 
 def lift(system: System, s: State) -> System:
     """The system with traced closed-over values lifted; the same object where there are none."""
+    if is_eager():
+        return system
     of_state, of_position = (s.t, s.q, s.v, s.params), (s.t, s.q, s.params)
     functions = {
-        "lagrangian": _lift(system.lagrangian, of_state),
-        "force": _lift(system.force, of_state),
-        "dissipation": _lift(system.dissipation, of_state),
+        "lagrangian": lift_function(system.lagrangian, of_state),
+        "force": lift_function(system.force, of_state),
+        "dissipation": lift_function(system.dissipation, of_state),
     }
     constraints = {
-        name: Holonomic(_lift(c.g, of_position)) if isinstance(c, Holonomic) else Nonholonomic(_lift(c.phi, of_state))
+        name: Holonomic(lift_function(c.g, of_position))
+        if isinstance(c, Holonomic)
+        else Nonholonomic(lift_function(c.phi, of_state))
         for name, c in system.constraints.items()
     }
-    lifted = System(constraints=constraints, **functions)
+    lifted = System(constraints=constraints, **functions).reading(system.read)
     return lifted if any(isinstance(f, Lifted) for f in jax.tree.leaves(lifted, is_leaf=_is_lifted)) else system
 
 
-def _lift(function, args):
-    if function is None or (isinstance(function, types.FunctionType) and function.__closure__ is None):
+def lift_function(function: Callable | None, args: tuple):
+    """A function with the traced values that it closes over lifted; itself where there are none."""
+    if function is None or is_eager() or (isinstance(function, types.FunctionType) and function.__closure__ is None):
         return function
     arrays, static = eqx.partition(args, eqx.is_array)
     converted, values = jax.closure_convert(lambda arrays: function(*eqx.combine(arrays, static)), arrays)

@@ -21,6 +21,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from lagjax.mechanics import coordinates
+from lagjax.mechanics.memory import kinds, remembered, shape_of
+
 
 class Holonomic(eqx.Module):
     """Constrain positions: `g(t, q, params) = 0`.
@@ -80,10 +83,13 @@ def _check_callable(function, kind, signature):
 
 def shapes(system, t, q, v, params) -> dict[str, tuple[int, ...]]:
     """The shape of each constraint's residual, by name, found without computing anything."""
-    return {
-        name: jnp.shape(eqx.filter_eval_shape(evaluate, constraint, t, q, v, params))
+    if not system.constraints:
+        return {}
+    found = lambda: {
+        name: jnp.shape(shape_of(evaluate, constraint, t, q, v, params))
         for name, constraint in system.constraints.items()
     }
+    return remembered(system, (shapes, system.read, kinds((t, q, v, params))), found)
 
 
 def count(system, t, q, v, params) -> int:
@@ -99,6 +105,11 @@ def split(system, stacked, t, q, v, params) -> dict[str, Array]:
         parts[name] = stacked[start : start + size].reshape(shape)
         start += size
     return parts
+
+
+def zero_multipliers(system, s: coordinates.State) -> dict[str, np.ndarray]:
+    """Multipliers by name that are all zero: their shapes."""
+    return {name: np.zeros(shape, s.t.dtype) for name, shape in shapes(system, *s).items()}
 
 
 def position_residual(system, t, x, params, unflatten) -> Float[Array, " mh"]:

@@ -6,10 +6,12 @@ Everything here looks at values, and so happens outside compiled programs.
 import numpy as np
 
 from lagjax.mechanics import constraints, coordinates
-from lagjax.mechanics.saddle_point import SINGULAR_BELOW, Examined, combinations, examined
+from lagjax.mechanics.saddle_point import SINGULAR_BELOW, Examined, combinations, examined, row_sizes
 
 # A row counts as part of a combination where it makes up more than this share of it.
 SHARE = 1e-6
+# Velocities count as off a constraint where they would have to change by more than this share of their size.
+OFF_ABOVE = 1e-6
 
 
 def explain_failure(system, s: coordinates.State) -> str | None:
@@ -80,12 +82,34 @@ def explain_contradiction(found: Examined, system, s: coordinates.State) -> str 
     names = equation_names(system, s)
     groups = {group[0]: group for group in dependencies(found.rows.jacobian, found.independent, names)}
     involved = groups[names[against[0]]]
+    off = _velocities_off(system, s, involved)
+    if off:
+        return (
+            f"constraints {listed(involved)} depend on each other, and the state is off them: {off}, where 0 is asked. "
+            f"They agree about the acceleration only where they hold. This is {where(s)}.\n"
+            "Usual cause: velocities that the constraints do not allow, computed for other parameters or guessed.\n"
+            "Fix: q, v = lj.consistent_state(system, t, q, v, params) for a consistent state near it."
+        )
     return (
         f"constraints {listed(involved)} contradict each other {where(s)}: they restrict the same motion, and no "
         "acceleration satisfies all of them.\n"
         "Usual cause: one motion prescribed twice, with functions of time or parameters that differ, or a loop that "
         "cannot close.\n"
         f"Fix: remove '{involved[0]}', or let it ask for what the others ask for."
+    )
+
+
+def _velocities_off(system, s, names):
+    """Which of the named equations the velocities violate, with their residuals."""
+    x, unflatten = coordinates.flatten(s.q)
+    u, _ = coordinates.flatten(s.v)
+    residual = np.asarray(constraints.velocity_residual(system, s.t, x, u, s.params, unflatten))
+    allowed = OFF_ABOVE * np.asarray(row_sizes(system, *s)) * max(1e-300, float(np.max(np.abs(u))))
+    rows = zip(equation_names(system, s), constraints.holonomic_equations(system, *s), residual, allowed)
+    return ", ".join(
+        f"{'d/dt ' if holonomic else ''}'{name}' = {r:.3g}"
+        for name, holonomic, r, most in rows
+        if name in names and abs(r) > most
     )
 
 

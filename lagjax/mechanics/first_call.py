@@ -12,13 +12,53 @@ from collections.abc import Callable, Mapping
 from contextlib import contextmanager
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
 
+from lagjax.jax_internals.tracing import is_eager
 from lagjax.mechanics.constraints import Holonomic
+from lagjax.mechanics.coordinates import State
+from lagjax.mechanics.memory import kinds, remembered, shape_of
+from lagjax.mechanics.outside import first_alike, up_to_date
+from lagjax.mechanics.system import System
 
 OF_STATE, OF_POSITION = ("t", "q", "v", "params"), ("t", "q", "params")
+
+
+def looked_at(system: System, s: State) -> System:
+    """The system as its functions are now, which `check_functions` found to be in order; the first one of its kind."""
+    now = up_to_date(system)
+    remembered(system, (check_functions, now.read, kinds(s)), lambda: check_functions(now, *s))
+    return first_alike(system, now) if is_eager() else now
+
+
+def with_known_kinds(system: System, s: State) -> State:
+    """The state with whole numbers in `params` as floats, where the system was given floats there before.
+
+    `g=10` after `g=9.81` is another number, not another program. A function for which it matters that a number is whole
+    (an index, a count) has refused the float.
+    """
+    seen: dict = remembered(system, with_known_kinds, dict)
+    mine = kinds(s.params)
+    if mine not in seen and (places := _whole_numbers(s.params)):
+        leaves, structure = jtu.tree_flatten(s.params)
+        for known in seen:
+            asked = [i for i, (a, b) in enumerate(zip(known[1:], mine[1:])) if a != b]
+            if known[0] != structure or not places.issuperset(asked):
+                continue
+            changed = [np.asarray(x, s.t.dtype) if i in asked else x for i, x in enumerate(leaves)]
+            if kinds(changed)[1:] == known[1:]:
+                return s._replace(params=jtu.tree_unflatten(structure, changed))
+    seen[mine] = True
+    return s
+
+
+def _whole_numbers(params):
+    """Which of the leaves are whole numbers."""
+    is_whole = lambda x: type(x) is int or isinstance(x, np.ndarray) and np.issubdtype(x.dtype, np.integer)
+    return {i for i, x in enumerate(jtu.tree_leaves(params)) if is_whole(x)}
 
 
 def check_functions(system, t, q, v, params):
@@ -108,7 +148,7 @@ def _shapes(call, given):
     check_arguments(call, "an argument left out that the function does not need, or one too many: positions are "
                     "constrained without v")  # fmt: skip
     with in_words(call, given):
-        return eqx.filter_eval_shape(call.function, *(given[name] for name in call.takes))
+        return shape_of(call.function, *(given[name] for name in call.takes))
 
 
 def check_arguments(call: Call, usual_cause: str):

@@ -12,10 +12,12 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 
+from lagjax.jax_internals.one_function import calls_host, poisoned
+from lagjax.jax_internals.programs import length, needed, staged
+from lagjax.jax_internals.tracing import WATCHED
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.constraints import Holonomic, Nonholonomic
 from lagjax.mechanics.system import System
-from lagjax.numerics.programs import length, needed, staged
 from lagjax.numerics.scalars import written_out
 
 
@@ -43,13 +45,14 @@ def in_numbers(system: System, unflatten: Callable) -> System:
         },
         force=None if system.force is None else wrap(system.force, returns_coordinates=True),
         dissipation=None if system.dissipation is None else wrap(system.dissipation),
-    )
+    ).reading(system.read)
 
 
 class Numbers:
     """A function of (system, t, q, v, params), traced once and written out.
 
-    What depends on the system and the parameters alone is computed by `prepare`, once; `at` does the rest.
+    What depends on the system and the parameters alone is computed by `prepare`, once; `at` does the rest. `calls_host`
+    says whether a function of the user's calls Python at run time.
     """
 
     def __init__(self, function, args):
@@ -64,6 +67,9 @@ class Numbers:
 
         like = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in jtu.tree_leaves(arrays)]
         program = jax.make_jaxpr(of_leaves)(*like)
+        self.calls_host = calls_host(program.jaxpr)
+        if WATCHED.value:
+            program = poisoned(program)
         full = jax.make_jaxpr(lambda *leaves: written_out(program, *leaves))(*like)
         self.program = full.replace(jaxpr=full.jaxpr.replace(eqns=needed(full.jaxpr)))
         of_problem, of_state = _leaves_of(arrays, (0, 4)), _leaves_of(arrays, (1, 2, 3))

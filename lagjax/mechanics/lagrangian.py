@@ -19,7 +19,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
 from lagjax.mechanics import coordinates
-from lagjax.mechanics.first_call import check_functions
+from lagjax.mechanics.first_call import looked_at
 
 
 class Linear(NamedTuple):
@@ -77,7 +77,7 @@ def momentum(system, t, q, v, params) -> PyTree[Float[Array, "..."]]:
 
     Source: Goldstein, Eq. (2.44).
     """
-    s = _checked(system, t, q, v, params)
+    system, s = _checked(system, t, q, v, params)
     return _momentum(system, *s)
 
 
@@ -98,7 +98,7 @@ def mass_matrix(system, t, q, v, params) -> Float[Array, "n n"]:
 
     Source: Goldstein, Eq. (1.71).
     """
-    s = _checked(system, t, q, v, params)
+    system, s = _checked(system, t, q, v, params)
     return _mass_matrix(system, *s)
 
 
@@ -121,14 +121,13 @@ def jacobi_integral(system, t, q, v, params) -> Float[Array, ""]:
 
     Source: Goldstein, Eq. (2.53).
     """
-    s = _checked(system, t, q, v, params)
+    system, s = _checked(system, t, q, v, params)
     return _jacobi_integral(system, *s)
 
 
 def _checked(system, t, q, v, params):
     s = coordinates.state(t, q, v, params)
-    check_functions(system, *s)
-    return s
+    return looked_at(system, s), s
 
 
 @eqx.filter_jit

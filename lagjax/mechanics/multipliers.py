@@ -13,7 +13,8 @@ from jaxtyping import Array, PyTree
 
 from lagjax.mechanics import constraints, coordinates
 from lagjax.mechanics.diagnosis import explain_failure, explain_singular, where
-from lagjax.mechanics.first_call import check_functions
+from lagjax.mechanics.first_call import looked_at
+from lagjax.mechanics.outside import up_to_date
 from lagjax.mechanics.saddle_point import examined, verdict
 from lagjax.mechanics.sparse_plan import plan
 from lagjax.mechanics.written_out import is_small, write_out
@@ -46,8 +47,8 @@ def accelerations(system, t, q, v, params) -> tuple[PyTree[Array], dict[str, Arr
 
     Source: Goldstein, Eq. (2.24)-(2.27).
     """
-    s = coordinates.state(t, q, v, params)
-    check_functions(system, *s)
+    s = coordinates.prepared(t, q, v, params)
+    system = looked_at(system, s)
     traced = coordinates.is_traced((s, eqx.filter(system, eqx.is_array)))
     if plan(system, *s) is not None:
         found = verdict(system, *s)
@@ -60,8 +61,8 @@ def accelerations(system, t, q, v, params) -> tuple[PyTree[Array], dict[str, Arr
         return _quickly(system, *s) if is_small(system, *s) else _believed(system, *s)
     found = examined(system, *s)
     solution = found.a, found.multipliers
-    finite = np.all(np.isfinite(coordinates.flatten((solution, found.lagrangian))[0]))
-    if not finite or np.any(found.contradictory) or explain_singular(np.asarray(found.matrix), system, s):
+    finite = all(np.all(np.isfinite(x)) for x in jax.tree.leaves((solution, found.lagrangian)))
+    if not finite or np.any(np.asarray(found.contradictory)) or explain_singular(np.asarray(found.matrix), system, s):
         raise ValueError(explain_failure(system, s) or f"the accelerations are not finite {where(s)}.")
     return solution
 
@@ -108,6 +109,7 @@ def constraint_force(system, t, q, v, params) -> dict[str, PyTree[Array]]:
     """
     s = coordinates.state(t, q, v, params)
     _, multipliers = accelerations(system, *s)
+    system = up_to_date(system)
     return _constraint_force(system, *s, multipliers)
 
 
@@ -130,7 +132,7 @@ def constraint_residual(system, t, q, v, params, level: str = "constraint") -> d
     if level not in ("constraint", "velocity"):
         raise ValueError(f'level must be "constraint" or "velocity", not {level!r}.')
     s = coordinates.state(t, q, v, params)
-    check_functions(system, *s)
+    system = looked_at(system, s)
     return _constraint_residual(system, *s, level)
 
 

@@ -36,6 +36,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
 from lagjax.mechanics import constraints, coordinates, sparse_plan, sparse_saddle_point
+from lagjax.mechanics.compiled import compiled
 from lagjax.mechanics.lagrangian import Linear, mass_and_forcing
 from lagjax.numerics import dense
 from lagjax.numerics.rank import DEPENDENT_BELOW, independent_rows, unit_rows
@@ -207,6 +208,17 @@ def verdict(system, t, q, v, params) -> sparse_saddle_point.Verdict:
     return sparse_saddle_point.Verdict(found.a, found.multipliers, finite, singular, jnp.any(found.contradictory))
 
 
+def is_regular(system, t, q, v, params) -> Bool[Array, ""]:
+    """Whether the equations at one state are regular: no constraint depends on others, and nothing is undetermined."""
+    x, unflatten = coordinates.flatten(q)
+    u, _ = coordinates.flatten(v)
+    mass = mass_and_forcing(system, t, x, u, params, unflatten).mass
+    jacobian = _without_vanishing(system, t, x, u, params, unflatten).jacobian
+    independent = independent_rows(jacobian)
+    matrix = saddle_point_matrix(mass, jacobian, independent)
+    return jnp.all(independent) & (dense.reciprocal_condition(matrix) > SINGULAR_BELOW[np.dtype(x.dtype)])
+
+
 class Examined(NamedTuple):
     """A solution of the equations beside what tells whether to believe it."""
 
@@ -220,7 +232,7 @@ class Examined(NamedTuple):
     contradictory: Bool[Array, " m"]
 
 
-@eqx.filter_jit
+@compiled
 def examined(system, t, q, v, params) -> Examined:
     """Solve the equations at one state, and keep their matrix and which dependent constraints disagree."""
     x, unflatten = coordinates.flatten(q)

@@ -18,8 +18,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.core import Tracer
-from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 from jaxtyping import Bool
+
+from lagjax.jax_internals.names import ACCUMULATING, CALLS, CALLS_WITH_RULES, ELEMENTWISE, REDUCING
+from lagjax.jax_internals.programs import ClosedJaxpr, Jaxpr, Literal
 
 
 class Value(NamedTuple):
@@ -29,19 +31,9 @@ class Value(NamedTuple):
     known: np.ndarray | None = None
 
 
-ENTRYWISE = {
-    "add", "add_any", "sub", "mul", "div", "rem", "pow", "neg", "max", "min", "abs", "sign", "integer_pow", "square",
-    "sqrt", "rsqrt", "cbrt", "exp", "exp2", "expm1", "log", "log1p", "logistic", "sin", "cos", "tan", "asin", "acos",
-    "atan", "atan2", "sinh", "cosh", "tanh", "asinh", "acosh", "atanh", "erf", "erfc", "erf_inv", "lgamma", "digamma",
-    "floor", "ceil", "round", "is_finite", "clamp", "select_n", "convert_element_type", "copy", "copy_p",
-    "lt", "le", "gt", "ge", "eq", "ne", "and", "or", "not", "xor", "reduce_precision", "stop_gradient",
-}  # fmt: skip
-REDUCING = {"reduce_sum", "reduce_max", "reduce_min", "reduce_prod", "reduce_and", "reduce_or"}
-ACCUMULATING = {"cumsum", "cumprod", "cummax", "cummin", "cumlogsumexp"}
+ENTRYWISE = ELEMENTWISE | {"copy", "reduce_precision"}
 # Primitives that stand for the jaxpr that they carry; others, such as a reduction, carry one for pairs of entries.
-CALLS = {
-    "jit", "pjit", "closed_call", "core_call", "remat", "remat2", "checkpoint", "custom_jvp_call", "custom_vjp_call",
-}  # fmt: skip
+ENTERED = CALLS | CALLS_WITH_RULES
 # What indices are made of.
 EVALUATED = {
     "add": np.add, "sub": np.subtract, "mul": np.multiply, "neg": np.negative, "max": np.maximum, "min": np.minimum,
@@ -102,7 +94,7 @@ def _walk(jaxpr: Jaxpr, constants, inputs):
 def _apply(equation, operands):
     name, params = equation.primitive.name, equation.params
     inner = [p for p in params.values() if isinstance(p, (ClosedJaxpr, Jaxpr))]
-    if name in CALLS and len(inner) == 1:
+    if name in ENTERED and len(inner) == 1:
         jaxpr, constants = getattr(inner[0], "jaxpr", inner[0]), getattr(inner[0], "consts", ())
         if len(jaxpr.invars) == len(operands):
             return _walk(jaxpr, constants, operands)
@@ -290,7 +282,6 @@ RULES = {
     "broadcast_in_dim": _moving(_broadcast),
     "reshape": _moving(_reshape),
     "squeeze": _moving(lambda arrays, params: np.squeeze(arrays[0], tuple(params["dimensions"]))),
-    "expand_dims": _moving(lambda arrays, params: np.expand_dims(arrays[0], tuple(params["dimensions"]))),
     "transpose": _moving(lambda arrays, params: np.transpose(arrays[0], params["permutation"])),
     "rev": _moving(lambda arrays, params: np.flip(arrays[0], params["dimensions"])),
     "slice": _moving(_slice),

@@ -14,6 +14,7 @@ The jaxpr is walked once for each leaf of q. Every intermediate value is, as a f
 periodic (made of sines and cosines), or anything else; what a primitive makes of its operands follows from these.
 """
 
+from collections.abc import Iterator
 from enum import IntEnum
 from typing import NamedTuple
 
@@ -21,16 +22,15 @@ import equinox as eqx
 import jax
 import jax.tree_util as jtu
 import numpy as np
-from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 from jaxtyping import PyTree
 
+from lagjax.jax_internals.programs import ClosedJaxpr, Jaxpr, Literal, reached
 from lagjax.mechanics import constraints, coordinates
 from lagjax.mechanics.constraints import Holonomic
 from lagjax.mechanics.constraints import evaluate as constraint_value
 from lagjax.mechanics.in_numbers import Numbers, in_numbers
 from lagjax.mechanics.lagrangian import mass_and_forcing
 from lagjax.numerics import banded
-from lagjax.numerics.programs import reached
 
 # Coordinates and equations together: of larger systems the programs are not written out.
 UP_TO = 24
@@ -150,7 +150,7 @@ class Depends(IntEnum):
 
 
 ADDITIVE = {
-    "add", "add_any", "sub", "neg", "reduce_sum", "cumsum", "concatenate", "reshape", "squeeze", "expand_dims", "slice",
+    "add", "add_any", "sub", "neg", "reduce_sum", "cumsum", "concatenate", "reshape", "squeeze", "slice",
     "broadcast_in_dim", "transpose", "rev", "pad", "copy", "stack", "convert_element_type", "stop_gradient", "split",
 }  # fmt: skip
 # Linear in the first operand; the others only choose or scale, and must not depend on the leaf.
@@ -173,19 +173,37 @@ def angles(system, t, q, v, params) -> PyTree[bool]:
 
 def conserves_jacobi_integral(system, t, q, v, params) -> bool:
     """Whether the Jacobi integral is known to be constant: no explicit time, no force, only positions constrained."""
-    if system.force is not None or system.dissipation is not None:
-        return False
-    if not all(isinstance(c, Holonomic) for c in system.constraints.values()):
-        return False
-    of_time = [_dependence(f, (t, q, v, params), lambda args: args[0]) for f in _seen(system)]
-    return all(kind == Depends.NOT for kind in of_time)
+    return next(what_changes_jacobi_integral(system, t, q, v, params), None) is None
+
+
+def what_changes_jacobi_integral(system, t, q, v, params) -> Iterator[str]:
+    """What may change the Jacobi integral, in words."""
+    if system.force is not None:
+        yield "there is a force"
+    if system.dissipation is not None:
+        yield "there is dissipation"
+    for name, c in system.constraints.items():
+        if not isinstance(c, Holonomic):
+            yield f"constraint '{name}' is one of velocities"
+    if _sees_time(system.lagrangian, t, q, v, params):
+        yield "L depends on t"
+    for name, c in system.constraints.items():
+        if isinstance(c, Holonomic) and _sees_time(_of_state(c), t, q, v, params):
+            yield f"constraint '{name}' depends on t"
+
+
+def _sees_time(function, *state):
+    return _dependence(function, state, lambda args: args[0]) != Depends.NOT
+
+
+def _of_state(constraint):
+    return lambda t, q, v, params: constraint.g(t, q, params)
 
 
 def _seen(system):
     """All functions that the motion depends on, of (t, q, v, params)."""
     functions = [system.lagrangian, system.force, system.dissipation]
-    for c in system.constraints.values():
-        functions.append((lambda t, q, v, params, g=c.g: g(t, q, params)) if isinstance(c, Holonomic) else c.phi)
+    functions += [_of_state(c) if isinstance(c, Holonomic) else c.phi for c in system.constraints.values()]
     return [f for f in functions if f is not None]
 
 

@@ -1,6 +1,7 @@
 """A mechanical system: a Lagrangian, its constraints, and the forces that no potential gives."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Hashable, Mapping
+from dataclasses import fields
 
 import equinox as eqx
 
@@ -36,6 +37,8 @@ class System(eqx.Module):
     constraints: dict[str, Holonomic | Nonholonomic]
     force: Callable | None
     dissipation: Callable | None
+    # What these read from outside, as far as `outside.py` has looked.
+    read: Hashable = eqx.field(static=True)
 
     def __init__(
         self,
@@ -67,6 +70,14 @@ class System(eqx.Module):
         self.constraints = dict(sorted((constraints or {}).items()))
         self.force = force
         self.dissipation = dissipation
+        self.read = ()
+
+    def reading(self, values: Hashable) -> "System":
+        """The same system, other than one whose functions read other values from outside."""
+        same = object.__new__(System)
+        for field in fields(self):
+            object.__setattr__(same, field.name, values if field.name == "read" else getattr(self, field.name))
+        return same
 
     def __repr__(self):
         parts = [_name(self.lagrangian)]

@@ -22,6 +22,7 @@ import jax.tree_util as jtu
 from jax import lax
 from jaxtyping import Array
 
+from lagjax.jax_internals.plain import is_plain
 from lagjax.mechanics import constraints, coordinates
 from lagjax.mechanics.in_numbers import Numbers
 from lagjax.mechanics.lagrangian import mass_and_forcing
@@ -52,7 +53,7 @@ def is_small(system, t, q, v, params) -> bool:
     """Whether the equations of a system are to be written out."""
     size = sum(leaf.size for leaf in jtu.tree_leaves(q))
     count = constraints.count(system, t, q, v, params)
-    return size + count <= (CONSTRAINED_UP_TO if count else UP_TO)
+    return size + count <= (CONSTRAINED_UP_TO if count else UP_TO) and not is_plain()
 
 
 def write_out(system, t, q, v, params) -> WrittenOut | None:

@@ -7,7 +7,13 @@ evaluated by forward mode and transposed by the checkpointed reverse mode; where
 by forward mode too, along each of them. Undifferentiated, there is no trace of it in the compiled program.
 Differentiated, the plain solve runs beside the derivative's own; naming an `adjoint` saves that one solve.
 
-Second derivatives work forward over forward (`jacfwd` of `jacfwd`).
+Second derivatives are those of this map, which is bilinear in dx and in the direction dz in which x moves:
+
+    d(J dx) = H[dx, dz] + J d(dx)
+
+It is evaluated forward over forward, and bound as a linear map of (dz, d(dx)) in its turn: transposed, it is pushed
+along every axis of them. So `jacfwd(jacfwd)`, `jvp(grad)`, `grad(grad)` and the other orders all work, for as many
+pushes as there are numbers to differentiate by (squared, for `grad(grad)`); more than `PUSH_AT_MOST` are refused.
 """
 
 from collections.abc import Callable
@@ -22,13 +28,15 @@ import jax.tree_util as jtu
 import numpy as np
 from jax import lax
 from jax.core import ShapedArray
-from jax.extend.core import Primitive
-from jax.interpreters import ad, batching, mlir
 from jaxtyping import PyTree
+
+from lagjax.jax_internals.primitives import ad, primitive
 
 # Up to this many derivatives of one number, pushing all of them forward is cheaper than one pull back through the
 # checkpoints, to run and to compile.
 PUSH_UP_TO = 24
+# Second derivatives in reverse push along every axis, in one batch: beyond this it would not fit into memory.
+PUSH_AT_MOST = 2**14
 
 
 def solve_in_both_modes(solve: Callable, x: PyTree, fixed: PyTree) -> PyTree:
@@ -48,7 +56,8 @@ def _solve(inputs, *, solve):
 @_solve.def_jvp
 def _solve_jvp(primals, tangents, *, solve):
     ((x, fixed),), ((dx, _),) = primals, tangents
-    y = solve(x, fixed, diffrax.ForwardMode())
+    # By itself, so that a second derivative finds this rule again.
+    y = _solve((x, fixed), solve=solve)
     leaves, structure = jtu.tree_flatten((x, fixed))
     along = jtu.tree_structure(x).flatten_up_to(dx)
     # What is not moved is a constant: a tangent of zeros would go through every step.
@@ -90,17 +99,90 @@ def _tangent_shapes(*operands, shapes, size, many, **params):
 
 
 def _tangent_jvp(primals, tangents, **params):
-    tangents = tuple(None if isinstance(t, ad.Zero) else t for t in tangents)
-    dy, ddy = eqx.filter_jvp(partial(_tangent, **params), tuple(primals), tangents)
-    return dy, [eqxi.materialise_zeros(a, b) for a, b in zip(dy, ddy)]
+    return _linear(partial(_tangent, **params), primals, tangents, _tangent_p.bind(*primals, **params))
+
+
+def _linear(function, points, tangents, values):
+    """The derivative of `function` along `tangents`, as a linear map of these that can be transposed; and `values`."""
+    moved = [i for i, tangent in enumerate(tangents) if not isinstance(tangent, ad.Zero)]
+    if not moved:
+        return values, [ad.Zero(value.aval.to_tangent_aval()) for value in map(jnp.asarray, values)]
+
+    def along(*operands):
+        points, directions = operands[: -len(moved)], operands[-len(moved) :]
+        given = [None] * len(points)
+        for i, direction in zip(moved, directions):
+            given[i] = direction
+        found, derivative = eqx.filter_jvp(lambda *points: function(*points), tuple(points), tuple(given))
+        return [eqxi.materialise_zeros(a, b) for a, b in zip(found, derivative)]
+
+    derivative = _pushed_p.bind(*points, *(tangents[i] for i in moved), along=along, size=len(moved))
+    return values, derivative
+
+
+def _pushed(*operands, along, size):
+    return along(*operands)
+
+
+def _pushed_shapes(*operands, along, size):
+    like = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in operands]
+    return [ShapedArray(x.shape, x.dtype) for x in jax.eval_shape(along, *like)]
+
+
+def _pushed_jvp(primals, tangents, *, along, size):
+    return _linear(along, primals, tangents, _pushed_p.bind(*primals, along=along, size=size))
+
+
+def _pushed_transpose(cotangents, *operands, along, size):
+    points, directions = operands[:-size], operands[-size:]
+    wanted = [ad.is_undefined_primal(direction) for direction in directions]
+    like = [direction.aval if w else direction for direction, w in zip(directions, wanted)]
+    count = sum(a.size for a, w in zip(like, wanted) if w)
+    # Those of a gradient have their own axis of directions, one for each number.
+    _check_count(count, count**2 if count > PUSH_UP_TO else count)
+    push = lambda *axes: jax.vmap(lambda *axes: along(*points, *axes))(*axes)
+    slopes = _along_axes(like, wanted, push, [ad.instantiate_zeros(ct) for ct in cotangents])
+    found = iter(slopes)
+    return [None] * len(points) + [next(found) if w else None for w in wanted]
+
+
+def _pushed_batched(operands, axes, *, along, size):
+    lanes = next(x.shape[axis] for x, axis in zip(operands, axes) if axis is not None)
+    front = [
+        jnp.broadcast_to(x, (lanes, *x.shape)) if axis is None else jnp.moveaxis(x, axis, 0)
+        for x, axis in zip(operands, axes)
+    ]
+    found = _pushed_p.bind(*front, along=jax.vmap(along), size=size)
+    return found, [0] * len(found)
+
+
+def _along_axes(like, wanted, push, cotangents):
+    """The derivatives along the axes of all that is wanted, and their products with the cotangents."""
+    sizes = [a.size if w else 0 for a, w in zip(like, wanted)]
+    starts, total = np.cumsum([0, *sizes]), sum(sizes)
+    if not total:
+        return [jnp.zeros(a.shape, a.dtype) for a, w in zip(like, wanted) if w]
+    axes = [
+        jnp.eye(total, a.size, -start, dtype=a.dtype).reshape(total, *a.shape)
+        if w
+        else jnp.zeros((total, *a.shape), a.dtype)
+        for a, w, start in zip(like, wanted, starts)
+    ]
+    dy = push(*axes)
+    of_outputs = [jnp.sum((d * ct[None]).reshape(total, -1), axis=1) for d, ct in zip(dy, cotangents)]
+    slopes = reduce(jnp.add, of_outputs)
+    return [slopes[i : i + n].reshape(a.shape).astype(a.dtype) for i, n, a, w in zip(starts, sizes, like, wanted) if w]
 
 
 def _tangent_transpose(cotangents, *operands, size, many, **params):
     x, fixed, dx = _split(operands, size)
     cotangents = [ad.instantiate_zeros(ct) for ct in cotangents]
     wanted = [ad.is_undefined_primal(tangent) for tangent in dx]
-    pull = _pull_by_pushing if sum(a.size for a, w in zip(x, wanted) if w) <= PUSH_UP_TO else _pull
-    along = lambda cotangents: pull(x, fixed, wanted, cotangents, size=size, **params)
+    if sum(a.size for a, w in zip(x, wanted) if w) <= PUSH_UP_TO:
+        along = lambda cotangents: _pull_by_pushing(x, fixed, wanted, cotangents, size=size, **params)
+    else:
+        params = tuple({"size": size, **params}.items())
+        along = lambda cotangents: _pull_once(x, fixed, cotangents, wanted=tuple(wanted), params=params)
     found = iter(jax.vmap(along)(cotangents) if many else along(cotangents))
     return [None] * (len(operands) - size) + [next(found) if w else None for w in wanted]
 
@@ -114,20 +196,40 @@ def _pull(x, fixed, wanted, cotangents, *, outputs, **params):
     return jax.vjp(of_wanted, *[a for a, w in zip(x, wanted) if w])[1](cotangents)
 
 
+def _check_count(count, pushes):
+    """Raise where a second derivative by `count` numbers takes too many pushes."""
+    if pushes > PUSH_AT_MOST:
+        raise NotImplementedError(
+            f"a derivative of a gradient by {count} numbers: it takes {pushes} solves side by side, and no more than "
+            f"{PUSH_AT_MOST} are begun.\n"
+            "Usual cause: a Hessian, or its product with a vector, of a loss with a large network in L.\n"
+            "Fix: jax.jvp(lambda p: jax.jvp(loss, (p,), (u,))[1], (p,), (w,)) for u·H·w along given directions, or "
+            "(jax.grad(loss)(p + h * u) - jax.grad(loss)(p - h * u)) / (2 * h) for H·u."
+        )
+
+
+@eqx.filter_custom_jvp
+def _pull_once(x, fixed, cotangents, *, wanted, params):
+    return _pull(x, fixed, wanted, cotangents, **dict(params))
+
+
+@_pull_once.def_jvp
+def _pull_once_jvp(primals, tangents, *, wanted, params):
+    # The checkpoints can be pulled back through, and not pushed: the derivative is that of the same by pushing.
+    x, fixed, cotangents = primals
+    count = sum(a.size for a, w in zip(x, wanted) if w)
+    _check_count(count, count)
+    by_pushing = lambda x, cotangents: _pull_by_pushing(x, fixed, wanted, cotangents, **dict(params))
+    values = _pull(x, fixed, wanted, cotangents, **dict(params))
+    filled = lambda given, along: type(given)(eqxi.materialise_zeros(a, d) for a, d in zip(given, along))
+    along = filled(x, tangents[0]), filled(cotangents, tangents[2])
+    return values, type(values)(jax.jvp(by_pushing, (x, cotangents), along)[1])
+
+
 def _pull_by_pushing(x, fixed, wanted, cotangents, **params):
     """The derivatives along the axes of all that is wanted, and their products with the cotangents."""
-    sizes = [a.size if w else 0 for a, w in zip(x, wanted)]
-    starts, total = np.cumsum([0, *sizes]), sum(sizes)
-    axes = [
-        jnp.eye(total, a.size, -start, dtype=a.dtype).reshape(total, *a.shape)
-        if w
-        else jnp.zeros((total, *a.shape), a.dtype)
-        for a, w, start in zip(x, wanted, starts)
-    ]
-    dy = _tangent_p.bind(*x, *fixed, *axes, many=True, **params)
-    of_outputs = [jnp.sum((d * ct[None]).reshape(total, -1), axis=1) for d, ct in zip(dy, cotangents)]
-    slopes = reduce(jnp.add, of_outputs)
-    return [slopes[i : i + n].reshape(a.shape).astype(a.dtype) for i, n, a, w in zip(starts, sizes, x, wanted) if w]
+    push = lambda *axes: _tangent_p.bind(*x, *fixed, *axes, many=True, **params)
+    return _along_axes(x, wanted, push, cotangents)
 
 
 def _tangent_batched(operands, axes, *, outputs, shapes, size, many):
@@ -171,11 +273,11 @@ def _lanes(x, fixed, dx, batched_x, batched_fixed, lanes, params):
     return _tangent_p.bind(*x, *fixed, *dx, **{**params, "outputs": lane_outputs, "shapes": shapes, "many": False})
 
 
-_tangent_p = Primitive("lagjax_trajectory_tangent")
-_tangent_p.multiple_results = True
-_tangent_p.def_impl(_tangent)
-_tangent_p.def_abstract_eval(_tangent_shapes)
-mlir.register_lowering(_tangent_p, mlir.lower_fun(_tangent, multiple_results=True))
-ad.primitive_jvps[_tangent_p] = _tangent_jvp
-ad.primitive_transposes[_tangent_p] = _tangent_transpose
-batching.primitive_batchers[_tangent_p] = _tangent_batched
+_tangent_p = primitive(
+    "lagjax_trajectory_tangent", _tangent, _tangent_shapes,
+    several=True, jvp=_tangent_jvp, transpose=_tangent_transpose, batched=_tangent_batched,
+)  # fmt: skip
+_pushed_p = primitive(
+    "lagjax_trajectory_tangent_pushed", _pushed, _pushed_shapes,
+    several=True, jvp=_pushed_jvp, transpose=_pushed_transpose, batched=_pushed_batched,
+)  # fmt: skip

@@ -5,7 +5,8 @@ Nearest in the metric of the mass matrix M of the given state: the stationary po
     ½ (x - x0)ᵀ M (x - x0) + μᵀ g(t, x)        then        ½ (u - u0)ᵀ M (u - u0) + νᵀ phi(t, x, u)
 
 for positions x and velocities u; `g` and `phi` are called `r(y)` below. Held coordinates leave the problem: their rows
-and columns become those of the unit matrix.
+and columns become those of the unit matrix. A constraint of which nothing is left then depends on what is held: it is
+no equation for the others, and holds at the end or does not.
 
 Newton's method for a stationary point finds whichever is near, a farthest point as well as a nearest. So a
 state that satisfies the constraints is looked for first, by steps shortest in M; it is its own nearest point, with
@@ -24,7 +25,7 @@ from jax import lax
 
 from lagjax.mechanics import constraints, coordinates
 from lagjax.mechanics.diagnosis import describe, listed
-from lagjax.mechanics.first_call import check_functions
+from lagjax.mechanics.first_call import looked_at
 from lagjax.mechanics.lagrangian import mass_and_forcing
 from lagjax.mechanics.saddle_point import displacement_map, saddle_point_matrix
 from lagjax.motion.consistency import departures, stopped, within
@@ -70,7 +71,7 @@ def consistent_state(system, t, q, v, params, hold: str | Iterable[str] = ()):
     Source: Hairer, Lubich & Wanner, *Geometric Numerical Integration*, Eq. (IV.4.3).
     """
     s = coordinates.state(t, q, v, params)
-    check_functions(system, *s)
+    system = looked_at(system, s)
     free = free_coordinates(s.q, hold)
     if not system.constraints:
         return s.q, s.v
@@ -138,13 +139,20 @@ def _nearest(residual: Callable, problem, y0, metric, free):
     """The stationary point of `½ (y - y0)ᵀ M (y - y0) + μᵀ r(y)` near y0."""
     metric = jnp.where(free[:, None] & free[None, :], metric, jnp.diag(jnp.where(free, 0.0, 1.0)))
     n, fixed, fixed_metric, start = y0.size, stopped(problem), *stopped((metric, y0))
+    residual = _two_or_more(residual)
 
     def rows_at(problem, y):
-        return jnp.where(free[None, :], jax.jacfwd(lambda y: residual(problem, y))(y), 0.0)
+        rows = jax.jacfwd(lambda y: residual(problem, y))(y)
+        left = jnp.where(free[None, :], rows, 0.0)
+        size = lambda rows: jnp.max(jnp.abs(lax.stop_gradient(rows)), axis=1)
+        return jnp.where((size(left) > DEPENDENT_BELOW[np.dtype(y0.dtype)] * size(rows))[:, None], left, 0.0)
+
+    def solved_with(rows, dependent_below=None):
+        return independent_rows(rows, dependent_below) & jnp.any(rows != 0, axis=1)
 
     def to_displacement(y, dependent_below=None):
         rows = rows_at(fixed, y)
-        return displacement_map(fixed_metric, rows, independent_rows(rows, dependent_below))
+        return displacement_map(fixed_metric, rows, solved_with(rows, dependent_below))
 
     def shortest_step(y, dependent_below):
         slope = jnp.sum(jnp.abs(rows_at(fixed, y)), axis=1)
@@ -161,7 +169,7 @@ def _nearest(residual: Callable, problem, y0, metric, free):
         curvature = jax.jacfwd(lambda y: multipliers @ rows_at(fixed, y))(y)
         curvature = jnp.where(free[:, None] & free[None, :], curvature, 0.0)
         rows = rows_at(fixed, y)
-        return saddle_point_matrix(fixed_metric + curvature, rows, independent_rows(rows))
+        return saddle_point_matrix(fixed_metric + curvature, rows, solved_with(rows))
 
     def equations(problem, metric, target, y, multipliers):
         force = metric @ (y - target) + multipliers @ rows_at(problem, y)
@@ -171,7 +179,7 @@ def _nearest(residual: Callable, problem, y0, metric, free):
         target = reached + share * (start - reached)
         for _ in range(PER_STAGE):
             y, multipliers = state
-            independent = independent_rows(rows_at(fixed, y))
+            independent = solved_with(rows_at(fixed, y))
             left = equations(fixed, fixed_metric, target, y, multipliers)
             left = left.at[n:].set(jnp.where(independent, left[n:], 0.0))
             step = dense.solve(newton_matrix(y, multipliers), left)
@@ -194,3 +202,13 @@ def _nearest(residual: Callable, problem, y0, metric, free):
     off = jnp.max(jnp.abs(residual(fixed, nearest)))
     kept = (off <= jnp.sqrt(jnp.finfo(y0.dtype).eps)) & (length(nearest) <= length(near) * (1 + 1e-6))
     return jnp.where(kept, nearest, near)
+
+
+def _two_or_more(residual):
+    """The same equations, with one more that restricts nothing beside a single one: that alone is never left out."""
+
+    def padded(problem, y):
+        found = residual(problem, y)
+        return found if found.size > 1 else jnp.concatenate([found, jnp.zeros(2 - found.size, found.dtype)])
+
+    return padded

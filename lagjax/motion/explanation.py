@@ -1,6 +1,7 @@
 """`explain`: what a system amounts to at one state, in words and numbers."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -8,13 +9,14 @@ import numpy as np
 from lagjax.mechanics import constraints, coordinates
 from lagjax.mechanics.constraints import Holonomic
 from lagjax.mechanics.diagnosis import dependencies, describe, equation_names, explain_failure, listed
-from lagjax.mechanics.first_call import check_functions
+from lagjax.mechanics.first_call import looked_at
 from lagjax.mechanics.saddle_point import examined
 from lagjax.mechanics.sparse_plan import plan
 from lagjax.mechanics.structure import Structure, is_free_of_velocities, structure
 from lagjax.mechanics.system import System
 from lagjax.mechanics.written_out import is_small
 from lagjax.motion.consistency import departures, to_manifold, within
+from lagjax.motion.consistent_state import consistent_state
 from lagjax.numerics.dense import ELIMINATE_UP_TO
 from lagjax.numerics.rank import independent_rows
 
@@ -69,8 +71,8 @@ def explain(system: System, q, v, params=None, *, t=0.0) -> Explanation:
       cyclic in L         x, y
       solved              2 accelerations and 2 multipliers by elimination without the zeros
 
-    **Arguments:** `q` and `v` alike, `params` as the system takes it, `t` scalar. A state near the constraints is
-    moved onto them first: dependent constraints agree only there.
+    **Arguments:** `q` and `v` alike, `params` as the system takes it, `t` scalar. A state off the constraints is moved
+    onto them first, and told where it was not near: dependent constraints agree only there.
 
     **Returns:** an `Explanation`.
 
@@ -79,28 +81,27 @@ def explain(system: System, q, v, params=None, *, t=0.0) -> Explanation:
     Source: García de Jalón & Bayo, *Kinematic and Dynamic Simulation of Multibody Systems*, §3.2 (rank and freedoms).
     """
     s = coordinates.state(t, q, v, params)
-    check_functions(system, *s)
-    off = ""
-    if system.constraints:
-        s, off = _on_the_constraints(system, s)
+    system = looked_at(system, s)
+    place = _on_the_constraints(system, s) if system.constraints else _Place(s)
+    s = place.state
     found = examined(system, *s)
     names, equations = coordinates.names(s.q), equation_names(system, s)
     jacobian = found.rows.jacobian
     holonomic = constraints.holonomic_equations(system, *s)
     independent = int(found.independent.sum())
     groups = tuple(dependencies(jacobian, found.independent, equations)) if independent < len(equations) else ()
-    problem = explain_failure(system, s)
+    problem = place.unreachable or explain_failure(system, s)
     mass = _definiteness(np.asarray(found.linear.mass), names)
 
     rows = [("at", f"t = {float(s.t):.6g}, q = {describe(s.q)}, v = {describe(s.v)}")]
+    if place.off:
+        rows.append(("off the constraints", place.off))
     rows.append(("coordinates", f"{len(names)}: {', '.join(names)}"))
     if equations:
         kinds = {name: "position" if isinstance(c, Holonomic) else "velocity" for name, c in system.constraints.items()}
         rows.append(("constraints", ", ".join(f"'{name}' ({kind})" for name, kind in kinds.items())))
         rows.append(("equations", f"{len(equations)}, of which {independent} independent"))
     rows += [("dependent", _in_words(group)) for group in groups]
-    if off:
-        rows.append(("off the constraints", off))
     rows.append(("degrees of freedom", f"{len(names) - independent}"))
     found_structure = structure(system, *s)
     rows.append(("mass matrix", mass if found_structure is None else f"{mass}, {_of_mass(found_structure)}"))
@@ -125,13 +126,26 @@ def explain(system: System, q, v, params=None, *, t=0.0) -> Explanation:
     )
 
 
-def _on_the_constraints(system, s):
-    """The state, moved onto the constraints where it is near; and what it violates where it is not."""
+class _Place(NamedTuple):
+    """The state to judge at, what the given one violates, and why there is none on the constraints."""
+
+    state: coordinates.State
+    off: str = ""
+    unreachable: str | None = None
+
+
+def _on_the_constraints(system, s) -> _Place:
+    """The nearest state on the constraints: off them, dependent constraints contradict each other by that much."""
     tolerance = jnp.asarray(ROUNDED, s.t.dtype)
     if within(system, *s, tolerance, tolerance):
         moved = to_manifold(system, *s, tolerance, tolerance)
-        return s._replace(q=moved.q, v=moved.v), ""
-    return s, departures(system, s, ROUNDED, ROUNDED)
+        return _Place(s._replace(q=moved.q, v=moved.v))
+    off = departures(system, s, ROUNDED, ROUNDED)
+    try:
+        q, v = consistent_state(system, *s)
+    except ValueError as error:
+        return _Place(s, f"by {off}, and no state near it is on them", str(error))
+    return _Place(s._replace(q=q, v=v), f"by {off} as given; all that is said here is of the nearest state on them")
 
 
 def _in_words(group):

@@ -27,7 +27,7 @@ def film(
     """The frames of one trajectory, as they are drawn."""
     check_arguments(Call("positions", positions, ("t", "q", "params")), "an argument left out that is not needed")
     t, q, v = _reached(traj, ended_by_event)
-    seconds = float(np.clip(t[-1] - t[0], SHORTEST, LONGEST)) if seconds is None else seconds
+    seconds = float(np.clip(abs(t[-1] - t[0]), SHORTEST, LONGEST)) if seconds is None else seconds
     count = round(seconds * rate) + 1 if np.isfinite(seconds * rate) else 0
     if count < 2 or not trail >= 0:
         raise ValueError(
@@ -42,6 +42,8 @@ def film(
 
 def hermite(t, q, v, at):
     """q at the times `at`, from values and slopes at the times t; each leaf (T, ...) becomes (len(at), ...)."""
+    if t[-1] < t[0]:
+        t, q, v = jax.tree.map(lambda x: x[::-1], (t, q, v))
     i = np.clip(np.searchsorted(t, at, side="right") - 1, 0, len(t) - 2)
     h = t[i + 1] - t[i]
 
@@ -62,7 +64,7 @@ def _reached(traj, ended_by_event):
     outputs, end = jax.tree.map(np.asarray, (outputs, end))
     there = np.isfinite(np.concatenate([x.reshape(len(x), -1) for x in jax.tree.leaves(outputs)], axis=1)).all(axis=1)
     t, q, v = jax.tree.map(lambda x: x[there], outputs)
-    if ended_by_event and end[0] > t[-1]:
+    if ended_by_event and abs(end[0] - t[0]) > abs(t[-1] - t[0]):
         t, q, v = jax.tree.map(lambda x, last: np.concatenate([x, last[None]]), (t, q, v), end)
     if len(t) < 3:
         raise ValueError(

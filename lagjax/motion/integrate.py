@@ -6,22 +6,28 @@ All looking at values happens outside the compiled program (`motion/solve.py`), 
 batched and differentiated.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import diffrax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, PyTree
 
+from lagjax.jax_internals.tracing import WATCHED, is_eager
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.closures import lift
 from lagjax.mechanics.diagnosis import explain_failure
-from lagjax.mechanics.first_call import check_functions
+from lagjax.mechanics.first_call import looked_at, with_known_kinds
 from lagjax.mechanics.system import System
 from lagjax.motion import problem
+from lagjax.motion.backward import in_either_direction, runs_backward
+from lagjax.motion.crossings import Crossing, crossings_of, guards_of, left_to_diffrax, warn_of_events
+from lagjax.motion.no_lanes import raise_at_run_time
 from lagjax.motion.reported import patient, report
-from lagjax.motion.solve import START_TOLERANCES, Settings, trajectory_of
-from lagjax.motion.trajectory import RESULTS, Trajectory, ended_well, message
+from lagjax.motion.slips import warn_of_float32, warn_of_odd_dissipation
+from lagjax.motion.solve import START_TOLERANCES, Settings
+from lagjax.motion.stopped_early import stopped_early
+from lagjax.motion.trajectory import ENDED_WELL, RESULTS, Trajectory, is_among, message
 
 
 def integrate(
@@ -36,6 +42,9 @@ def integrate(
     method: diffrax.AbstractSolver | None = None,
     stepsize_controller: diffrax.AbstractStepSizeController | None = None,
     dt0: ArrayLike | None = None,
+    max_step: ArrayLike | None = None,
+    jump_ts: ArrayLike | Sequence[float] | None = None,
+    events: Mapping[str, Crossing] | None = None,
     event: diffrax.Event | None = None,
     adjoint: diffrax.AbstractAdjoint | None = None,
     max_steps: int | None = 2**20,
@@ -58,7 +67,8 @@ def integrate(
     - `q0`, `v0`: initial coordinates and velocities, any pytree of float arrays, alike; `[q]`, `[q]/[t]`. A start
       that is off the constraints by no more than about the tolerance is moved onto them.
     - `params`: what the Lagrangian takes; gradients flow to its floating arrays.
-    - `ts` (T,): increasing output times, `[t]`. Each is the end of a step of the method, not an interpolation.
+    - `ts` (T,): output times, `[t]`, increasing or, to run backward, decreasing. Each is the end of a step of the
+      method, not an interpolation. (Decreasing times have to be known while JAX is tracing: a NumPy array.)
     - `rtol`, `atol`: tolerances of the local error of each coordinate and velocity; by default 1e-9 in float64, 1e-5
       in float32. A pair is one for coordinates, `[q]`, and one for velocities, `[q]/[t]`. Of an angle (a coordinate
       that is seen through sines and cosines alone) at most one turn counts as its size.
@@ -68,12 +78,20 @@ def integrate(
     - `method`: any diffrax solver. By default `lj.Nystrom12()` where there are no constraints and accelerations do not
       depend on velocities (`lj.explain` says so), else `lj.Dopri8()`: the fastest way to an error between 1e-4 and
       1e-10 on nearly all scenes (`benchmarks/results/work_precision.json`). With these, with `lj.Nystrom8()` and
-      `lj.Tsit5()`, small systems run on equations that are written out number by number; diffrax's own methods take 2
-      to 10 times longer.
+      `lj.Tsit5()`, small systems run on equations that are written out number by number, and so they do with
+      `diffrax.Dopri8()` and `diffrax.Tsit5()`, which are taken for ours; diffrax's other methods take 2 to 10 times
+      longer. For stiff systems `lj.Radau5()` where something decays fast, and `lj.Radau5(step_powers=(0, 1))` where
+      springs are stiff and their oscillation does not matter.
     - `stepsize_controller`: any diffrax controller, in place of `diffrax.PIDController(rtol, atol)`.
-    - `dt0`: the first step, `[t]`; needed with `diffrax.ConstantStepSize()`.
-    - `event`: a `diffrax.Event` whose condition takes `(t, (q, v), params, **kwargs)`. Without a root finder of
-      its own, a real-valued condition is located to round-off.
+    - `dt0`: the length of the first step, `[t]`; needed with `diffrax.ConstantStepSize()`.
+    - `max_step`: the longest step, `[t]`. Adaptive steps pass over what is narrower than they are, such as a short push
+      or a thin barrier, and nothing tells: no step is longer than this, nor than the time between two outputs.
+    - `jump_ts` (J,): times at which a force jumps or has a kink, in any order, `[t]`. They become ends of steps, which
+      stay on their side of them; derivatives by these times are right.
+    - `events`: by name, a `lj.Crossing` each: where a function of the state crosses zero, recorded in `traj.events` or
+      ending the motion. Crossings are found also inside steps, several in one, and located to round-off.
+    - `event`: a `diffrax.Event` that ends the motion; its condition takes `(t, (q, v), params, **kwargs)`. It is found
+      as `events` are, under the name "event".
     - `adjoint`: any diffrax adjoint. Without one, forward and reverse mode both work.
     - `max_steps`: the largest number of steps, accepted and rejected.
     - `throw`: raise where the integration fails. With `throw=False` the trajectory carries the reason in
@@ -86,12 +104,13 @@ def integrate(
 
     **Raises:**
 
-    - `TypeError`, `ValueError` for arguments of the wrong kind, shape or dtype; `ts` that does not increase; a
+    - `TypeError`, `ValueError` for arguments of the wrong kind, shape or dtype; `ts` that goes to and fro; a
       tolerance below the dtype's reach.
     - `ValueError` for a start off the constraints, or one where L or its equations are singular or not finite.
     - `RuntimeError` where the integration stops early: `max_steps` reached, or a step size that collapsed.
     - Warns (`lj.AccuracyWarning`) where the Jacobi integral must be constant and changed by 1000 tolerances, or by less
       over thousands of steps, or by 1e-5 with fixed steps: where `departure` is above 1. In lanes look at that.
+    - Warns of what is hardly ever meant: a `dissipation` that is odd in v, as a force is; once, float32 by default.
 
     Order and accuracy: those of `method`; `tests/motion/test_orders.py` measures them.
 
@@ -99,28 +118,37 @@ def integrate(
     """
     problem.check_system(system)
     problem.check_method(method)
-    t0 = ts[0] if len(np.shape(ts)) == 1 and np.shape(ts)[0] else 0.0
-    start = coordinates.state(t0, q0, v0, params)
+    problem.check_controller(stepsize_controller, max_step, jump_ts)
+    ts = coordinates.numpy_of(ts).asarray(ts)
+    t0 = ts[0] if ts.ndim == 1 and ts.size else 0.0
+    start = coordinates.prepared(t0, q0, v0, params)
     dtype = start.t.dtype
-    check_functions(system, *start)
+    system = looked_at(system, start)
+    if is_eager():
+        start = with_known_kinds(system, start)
+    warn_of_float32(dtype, q0, v0)
+    warn_of_odd_dissipation(system.dissipation, start)
+    guards = guards_of(crossings_of(events, event), system, start)
     system = lift(system, start)
     drift = problem.check_drift(drift, system)
-    problem.check_adjoint(adjoint, drift)
+    problem.check_adjoint(adjoint, drift, jump_ts)
     settings = Settings(
         method=method,
         controller=stepsize_controller,
-        event=event,
+        event=left_to_diffrax(event),
         adjoint=adjoint,
         rtol=problem.tolerance(rtol, "rtol", dtype),
         atol=problem.tolerance(atol, "atol", dtype),
-        dt0=problem.first_step(dt0, dtype),
+        dt0=problem.step_length(dt0, "dt0", dtype),
+        max_step=problem.step_length(max_step, "max_step", dtype),
+        jump_ts=problem.jumps(jump_ts, dtype),
         apart=any(isinstance(tol, (tuple, list)) or jnp.ndim(tol) > 0 for tol in (rtol, atol) if tol is not None),
         max_steps=patient(max_steps),
         drift=drift,
         progress=progress,
     )
-    ts = problem.times(ts, dtype)
-    trajectory = trajectory_of(system, start.q, start.v, start.params, ts, settings)
+    ts, backward = problem.times(ts, dtype), runs_backward(ts)
+    trajectory = in_either_direction(system, start.q, start.v, start.params, ts, guards, settings, backward)
     trajectory = report(trajectory)
     if throw:
         trajectory = _raise_failure(trajectory, start._replace(t=ts[0]), settings)
@@ -129,17 +157,19 @@ def integrate(
 
 def _raise_failure(trajectory, start, settings):
     """Raise or warn in the user's words; while tracing, at run time with the result's own message."""
-    well = ended_well(trajectory.result)
     if coordinates.is_traced(trajectory):
-        return trajectory.result.error_if(trajectory, ~well)
-    system = trajectory.system
-    if not well:
-        if bool(trajectory.result == RESULTS.start_off_constraints):
+        # Who watches is told by the report.
+        return trajectory if WATCHED.value else raise_at_run_time(trajectory)
+    result = trajectory.result
+    if not is_among(result, ENDED_WELL):
+        system, start = trajectory.system, coordinates.as_arrays(start, start.t.dtype)
+        if is_among(result, [RESULTS.start_off_constraints]):
             tolerances = (START_TOLERANCES * np.asarray(tol) for tol in trajectory.tolerance)
             raise ValueError(problem.off_constraints(system, start, *tolerances))
-        if any(bool(trajectory.result == result) for result in problem.REFUSED):
+        if is_among(result, problem.REFUSED):
             problem.check_finite(start)
-            raise ValueError(explain_failure(system, start) or message(trajectory.result))
-        raise RuntimeError(problem.stopped_early(trajectory, settings))
+            raise ValueError(explain_failure(system, start) or message(result))
+        raise RuntimeError(stopped_early(trajectory, settings))
     problem.warn_of_drift(trajectory)
+    warn_of_events(trajectory.events)
     return trajectory

@@ -1,20 +1,17 @@
 """The questions that `integrate` asks of its arguments before it starts, in the user's words."""
 
 import warnings
+from functools import lru_cache
 from typing import Any
 
 import diffrax
-import jax
 import jax.numpy as jnp
 import numpy as np
 
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.coordinates import State
-from lagjax.mechanics.diagnosis import describe, explain_failure
-from lagjax.mechanics.saddle_point import equations_of_motion
 from lagjax.mechanics.system import System
 from lagjax.motion.consistency import departures
-from lagjax.motion.consistent_state import consistent_state
 from lagjax.motion.solve import ROUND_OFFS
 from lagjax.motion.trajectory import RESULTS, AccuracyWarning
 
@@ -58,8 +55,13 @@ def check_method(method: Any):
         )
 
 
-def check_adjoint(adjoint: Any, drift: str):
+def check_adjoint(adjoint: Any, drift: str, jump_ts: Any):
     """Raise where an adjoint cannot follow the motion."""
+    if isinstance(adjoint, diffrax.BacksolveAdjoint) and jump_ts is not None:
+        raise ValueError(
+            "BacksolveAdjoint goes back over the motion with steps of its own, which do not end at jump_ts.\n"
+            "Fix: leave adjoint out (both modes then work)."
+        )
     if isinstance(adjoint, diffrax.BacksolveAdjoint) and drift == "project":
         raise ValueError(
             "BacksolveAdjoint integrates backwards without returning to the constraints, so its gradients would "
@@ -76,12 +78,27 @@ def check_drift(drift: Any, system: System) -> str:
     return drift if system.constraints else "none"
 
 
+def check_controller(controller: Any, max_step: Any, jump_ts: Any):
+    """Raise where steps are to be limited that a controller of the user's chooses."""
+    if controller is None:
+        return
+    for name, given, fix in (
+        ("max_step", max_step, "stepsize_controller=diffrax.PIDController(rtol=1e-9, atol=1e-9, dtmax=0.1)"),
+        ("jump_ts", jump_ts, "stepsize_controller=diffrax.ClipStepSizeController(controller, jump_ts=jump_ts)"),
+    ):
+        if given is not None:
+            raise ValueError(
+                f"{name} is for lagjax's own choice of steps, and stepsize_controller replaces that.\n"
+                f"Fix: leave stepsize_controller out, or {fix}."
+            )
+
+
 def times(ts: Any, dtype):
-    """`ts` as an increasing vector of `dtype`, or an error."""
-    ts = jnp.asarray(ts)
-    if ts.ndim != 1 or ts.shape[0] < 2:
+    """`ts` as an increasing or decreasing vector of `dtype`, or an error."""
+    ts = coordinates.numpy_of(ts).asarray(ts)
+    if np.ndim(ts) != 1 or np.shape(ts)[0] < 2:
         raise ValueError(
-            f"ts must be a vector of at least two times, and has shape {ts.shape}.\n"
+            f"ts must be a vector of at least two times, and has shape {np.shape(ts)}.\n"
             "Usual cause: the last time alone; the motion starts at ts[0] with (q0, v0).\n"
             "Fix: ts=jnp.linspace(0.0, 10.0, 101)."
         )
@@ -89,44 +106,75 @@ def times(ts: Any, dtype):
     if not coordinates.is_traced(ts):
         if not np.all(np.isfinite(ts)):
             raise ValueError("ts contains NaN or infinity.\nFix: give finite times.")
-        late = np.flatnonzero(np.diff(np.asarray(ts, float)) <= 0)
-        if late.size:
-            i = int(late[0])
+        steps = np.diff(ts.astype(float))
+        backward = bool(np.sum(steps) < 0)
+        wrong = np.flatnonzero(steps >= 0 if backward else steps <= 0)
+        if wrong.size:
+            i = int(wrong[0])
             raise ValueError(
-                f"ts must increase, and ts[{i + 1}] = {float(ts[i + 1]):.9g} follows ts[{i}] = {float(ts[i]):.9g}.\n"
-                "Usual cause: times in descending order, a repeated time, or times closer than "
+                f"ts must {'decrease' if backward else 'increase'} throughout, as from its first time to its last, and "
+                f"ts[{i + 1}] = {float(ts[i + 1]):.9g} follows ts[{i}] = {float(ts[i]):.9g}.\n"
+                "Usual cause: times out of order, a repeated time, or times closer than "
                 f"{dtype} can tell apart.\n"
-                "Fix: ts=jnp.sort(ts). To run backwards, integrate L(-t, q, -v, params) forwards."
+                "Fix: ts=jnp.unique(ts), and ts=jnp.unique(ts)[::-1] to run backward in time."
             )
     return ts
 
 
-def first_step(dt0: Any, dtype):
-    """`dt0` as a number of `dtype`, or an error where it is not positive; None where it is to be chosen."""
-    if dt0 is None:
+def step_length(value: Any, name: str, dtype):
+    """`dt0` or `max_step` as a number of `dtype`, or an error where it is not positive; None where it is not given."""
+    if value is None:
         return None
-    if not coordinates.is_traced(dt0) and not (np.ndim(dt0) == 0 and float(dt0) > 0):
+    if not coordinates.is_traced(value) and not (np.ndim(value) == 0 and float(value) > 0):
+        fixed = ", or with fixed steps dt0=1e-3 for example" if name == "dt0" else ", or max_step=0.1 for example"
         raise ValueError(
-            f"dt0 must be one positive number, not {dt0}.\n"
-            "Fix: leave dt0 out, or with fixed steps dt0=1e-3 for example. To run backwards, integrate "
-            "L(-t, q, -v, params) forwards."
+            f"{name} must be one positive number, not {value}.\n"
+            "Usual cause: a step against the time; it is a length also where ts decreases.\n"
+            f"Fix: leave {name} out{fixed}."
         )
-    return jnp.asarray(dt0, dtype)
+    return coordinates.numpy_of(value).asarray(value, dtype)
+
+
+def jumps(jump_ts: Any, dtype):
+    """The times at which a force jumps, (J,) of `dtype`, or an error; None where there are none."""
+    if jump_ts is None:
+        return None
+    jump_ts = jnp.stack([*jump_ts]) if _holds_traced(jump_ts) else jump_ts
+    kind, shape = (jump_ts if hasattr(jump_ts, "dtype") else np.asarray(jump_ts)).dtype, np.shape(jump_ts)
+    if len(shape) > 1 or not np.issubdtype(kind, np.number) or np.issubdtype(kind, np.complexfloating):
+        raise ValueError(
+            f"jump_ts must be a vector of times, and is of {kind} and shape {shape}.\n"
+            "Fix: jump_ts=jnp.array([50.25, 50.35]), the times at which the force jumps or has a kink."
+        )
+    if not coordinates.is_traced(jump_ts) and not np.all(np.isfinite(jump_ts)):
+        raise ValueError("jump_ts contains NaN or infinity.\nFix: give finite times.")
+    return jnp.atleast_1d(jnp.asarray(jump_ts, dtype)) if np.prod(shape) else None
+
+
+def _holds_traced(times):
+    return isinstance(times, (list, tuple)) and coordinates.is_traced(times)
 
 
 def tolerance(value: Any, name: str, dtype):
     """A tolerance for coordinates and one for velocities, (2,) of `dtype`, or an error where it cannot be reached."""
     dtype = np.dtype(dtype)
     value = DEFAULT_TOLERANCE.get(dtype, 1e-2) if value is None else value
-    value = jnp.stack([jnp.asarray(x, dtype) for x in value]) if isinstance(value, (tuple, list)) else value
-    if jnp.ndim(value) and jnp.shape(value) != (2,):
+    if isinstance(value, (tuple, list)) and coordinates.is_traced(value):
+        value = jnp.stack([jnp.asarray(x, dtype) for x in value])
+    if np.ndim(value) and np.shape(value) != (2,):
         raise ValueError(
-            f"{name} must be one number, or two: for coordinates and for velocities. Its shape is {jnp.shape(value)}.\n"
+            f"{name} must be one number, or two: for coordinates and for velocities. Its shape is {np.shape(value)}.\n"
             f"Fix: {name}=1e-9, or {name}=(1e-9, 1e-6)."
         )
-    if not coordinates.is_traced(value):
-        _check_tolerance(np.min(np.asarray(value, float)), name, dtype)
-    return jnp.broadcast_to(jnp.asarray(value, dtype), 2)
+    if coordinates.is_traced(value):
+        return jnp.broadcast_to(jnp.asarray(value, dtype), 2)
+    return _tolerance(value if isinstance(value, float) else tuple(np.asarray(value, float).flat), name, dtype)
+
+
+@lru_cache(maxsize=64)
+def _tolerance(value, name, dtype):
+    _check_tolerance(np.min(value), name, dtype)
+    return np.full(2, value, dtype)
 
 
 def _check_tolerance(value, name, dtype):
@@ -174,7 +222,7 @@ def warn_of_drift(trajectory):
     if float(trajectory.departure) <= 1:
         return
     drift, rtol = float(trajectory.drift()), float(trajectory.tolerance[0][0])
-    span, steps = float(trajectory.end.t - trajectory.t[0]), int(trajectory.stats["num_accepted_steps"])
+    span, steps = abs(float(trajectory.end.t - trajectory.t[0])), int(trajectory.stats["num_accepted_steps"])
     off = f", and a constraint is off by {float(trajectory.residual()):.1g}" if trajectory.system.constraints else ""
     warnings.warn(
         f"over a time of {span:.6g} ({steps} steps) the Jacobi integral, which should stay, changed by {drift:.1g} of "
@@ -185,65 +233,3 @@ def warn_of_drift(trajectory):
         AccuracyWarning,
         stacklevel=4,
     )
-
-
-def stopped_early(trajectory, settings) -> str:
-    """Say where and why an integration stopped before its last output."""
-    end, t0, t1 = trajectory.end, float(trajectory.t[0]), float(trajectory.t[-1])
-    share = 100 * (float(end.t) - t0) / (t1 - t0)
-    accepted, rejected = (int(trajectory.stats[f"num_{kind}_steps"]) for kind in ("accepted", "rejected"))
-    what = (
-        f"the integration stopped at t = {float(end.t):.9g}, {share:.3g} % of the way to {t1:.6g}, after "
-        f"{accepted} accepted and {rejected} rejected steps"
-    )
-    reason = explain_failure(trajectory.system, State(end.t, end.q, end.v, trajectory.params)) or _beyond(trajectory)
-    if reason:
-        return f"{what}: {reason}"
-    if bool(trajectory.result == RESULTS.max_steps_reached) and rejected <= 10 * accepted:
-        return (
-            f"{what}: max_steps = {settings.max_steps} is used up. The last state is {describe(end.q)}.\n"
-            "Usual cause: a stiff system under an explicit method, or a span of very many periods.\n"
-            f"Fix: max_steps={4 * settings.max_steps}, a looser rtol, or method=lj.Radau5() where it is stiff."
-        )
-    if bool(trajectory.result == RESULTS.unsolved_step) and settings.controller is not None:
-        return (
-            f"{what}: {RESULTS[trajectory.result]} The last state is {describe(end.q)}.\n"
-            "Usual cause: a fixed step that is too long: for the method's stability, an implicit one's root finder, or "
-            "for the return to the constraints.\n"
-            "Fix: a smaller dt0, or leave stepsize_controller out: steps that fail are then taken again, shorter."
-        )
-    return (
-        f"{what}: {RESULTS[trajectory.result]} The last state is {describe(end.q)}{_fastest(trajectory)}.\n"
-        "Usual cause: a singularity of the motion (a collision, a singular configuration), a jump in a force, "
-        "or NaN from L beyond that state.\n"
-        "Fix: stop before it with event=diffrax.Event(...), or look at lj.accelerations at trajectory.end "
-        "with throw=False."
-    )
-
-
-def _beyond(trajectory):
-    """Whether the constraints can be met a little after the end; in words where they cannot."""
-    system, end = trajectory.system, trajectory.end
-    if not system.constraints:
-        return None
-    ahead = 1e-3 * (trajectory.t[-1] - trajectory.t[0])
-    q = jax.tree.map(lambda q, v: q + ahead * v, end.q, end.v)
-    try:
-        consistent_state(system, end.t + ahead, q, end.v, trajectory.params)
-    except ValueError as error:
-        return (
-            f"the constraints cannot be met a little later. {error}\n"
-            "(There: a loop that closes only so far, or one motion prescribed twice.)"
-        )
-    return None
-
-
-def _fastest(trajectory):
-    """The coordinate whose acceleration is largest at the end: that of a collision or a coordinate singularity."""
-    end = trajectory.end
-    values = np.abs(coordinates.flatten(equations_of_motion(trajectory.system, *end[:3], trajectory.params)[0])[0])
-    names = coordinates.names(end.q)
-    if len(names) == 0 or not np.all(np.isfinite(values)):
-        return ""
-    i = int(np.argmax(values))
-    return f", and the largest acceleration that of '{names[i]}', {values[i]:.2g}"

@@ -5,35 +5,25 @@ it traces the function, `integrate` passes every trajectory through a primitive 
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, Primitive
-from jax.interpreters import ad, batching, mlir
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, PyTree
 
+from lagjax.jax_internals.names import CALLS, CALLS_WITH_RULES
+from lagjax.jax_internals.one_function import poisoned
+from lagjax.jax_internals.primitives import primitive
+from lagjax.jax_internals.programs import ClosedJaxpr, Jaxpr, Literal, bodies, evaluate
+from lagjax.jax_internals.tracing import WATCHED
 from lagjax.motion.consistency import stopped, worst_residual
 from lagjax.motion.trajectory import RESULTS, Trajectory
-from lagjax.numerics.one_function import without_checks
-from lagjax.numerics.programs import bodies, evaluate
 
-# Whether somebody wants reports; and, in a program for many lanes that wait for each other, the steps after which a
-# motion is given up, to be run alone. Contexts of JAX's: under them what the user has jitted is traced again.
-WATCHED, PATIENCE = jax.make_user_context(default_value=False), jax.make_user_context(default_value=None)
-CALLS = {
-    "jit",
-    "pjit",
-    "closed_call",
-    "core_call",
-    "custom_jvp_call",
-    "custom_vjp_call",
-    "remat",
-    "remat2",
-    "checkpoint",
-}
+# In a program for many lanes that wait for each other, the steps after which a motion is given up, to be run alone.
+PATIENCE = jax.make_user_context(default_value=None)
 
 
 class Report(NamedTuple):
@@ -50,15 +40,27 @@ class Report(NamedTuple):
 
 def report(trajectory: Trajectory) -> Trajectory:
     """The trajectory, unchanged; where somebody watches, its report is put down in the program that is being traced."""
+
+    def of(trajectory):
+        t = stopped(trajectory)
+        residual = jnp.zeros_like(t.departure)
+        if t.system.constraints:
+            residual = worst_residual(t.system, t.t, t.q, t.v, t.params)
+        return Report(t.result._value, t.stats["num_steps"], t.departure, residual)
+
+    return reported(trajectory, of)
+
+
+def reported(found: PyTree, of: Callable[[Any], Report]) -> PyTree:
+    """What was found, unchanged; where somebody watches, `of(found)` is put down in the program."""
     if not WATCHED.value:
-        return trajectory
-    leaves, structure = jtu.tree_flatten(trajectory)
-    t = stopped(trajectory)
-    residual = jnp.zeros_like(t.departure)
-    if t.system.constraints:
-        residual = worst_residual(t.system, t.t, t.q, t.v, t.params)
-    told = (t.result._value, t.stats["num_steps"], t.departure, residual)
-    return jtu.tree_unflatten(structure, _report_p.bind(*map(jnp.asarray, (*leaves, *told)))[: -len(told)])
+        return found
+    # NumPy arrays stay what they are: windows of a fit, for example.
+    arrays, rest = eqx.partition(found, lambda x: isinstance(x, jax.Array))
+    leaves, structure = jtu.tree_flatten(arrays)
+    told = of(found)
+    kept = _report_p.bind(*map(jnp.asarray, (*leaves, *told)))[: -len(told)]
+    return eqx.combine(jtu.tree_unflatten(structure, kept), rest)
 
 
 def patient(max_steps: int | None) -> int | None:
@@ -70,7 +72,8 @@ def patient(max_steps: int | None) -> int | None:
 def reporting(function: Callable) -> Callable:
     """`function`, returning (what it returned, a `Report` of the integrations in it; None where there are none).
 
-    Checks that call the host (equinox's `error_if`) are left out: one lane must not end the others.
+    A check of the user's that calls the host (equinox's `error_if`) gives NaN where it fails: one lane must not end the
+    others.
     """
 
     def wrapped(*args):
@@ -89,7 +92,7 @@ def reporting(function: Callable) -> Callable:
             return [jnp.asarray(x) for x in found]
 
         with WATCHED(True):
-            program = without_checks(jax.make_jaxpr(of_leaves)(*leaves))
+            program = poisoned(jax.make_jaxpr(of_leaves)(*leaves))
         reports = []
         found = _told(program.jaxpr, program.consts, leaves, reports)
         return jtu.tree_unflatten(rest[0], found), _together(reports)
@@ -106,7 +109,7 @@ def _told(jaxpr: Jaxpr, constants, args, reports):
         if equation.primitive is _report_p:
             reports.append(Report(*operands[-len(Report._fields) :]))
             results = operands
-        elif equation.primitive.name in CALLS and _reports(equation):
+        elif equation.primitive.name in CALLS | CALLS_WITH_RULES and _reports(equation):
             inner = next(p for p in equation.params.values() if isinstance(p, (ClosedJaxpr, Jaxpr)))
             closed = inner if isinstance(inner, ClosedJaxpr) else ClosedJaxpr(inner, ())
             results = _told(closed.jaxpr, closed.consts, operands, reports)
@@ -140,10 +143,5 @@ def _jvp(primals, tangents):
     return _report_p.bind(*primals), list(tangents)
 
 
-_report_p = Primitive("report")
-_report_p.multiple_results = True
-_report_p.def_impl(lambda *operands: list(operands))
-_report_p.def_abstract_eval(lambda *avals: list(avals))
-ad.primitive_jvps[_report_p] = _jvp
-batching.primitive_batchers[_report_p] = _batched
-mlir.register_lowering(_report_p, lambda context, *operands: operands)
+_same = lambda *operands: list(operands)
+_report_p = primitive("report", _same, _same, several=True, jvp=_jvp, batched=_batched)

@@ -4,37 +4,43 @@ Nothing here looks at values: a start that cannot be integrated is refused insid
 within a few rejected steps, and the lane keeps the reason in its result.
 """
 
-import importlib.util
+import threading
+from collections import OrderedDict
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from functools import partial
+from typing import NamedTuple
 
 import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import optimistix as optx
-from jaxtyping import Array, Float
+import jax.tree_util as jtu
+import numpy as np
+from jaxtyping import Array, Bool, Float, PyTree
 
-from lagjax.mechanics import coordinates
+from lagjax.jax_internals.compiling import compiler_options
+from lagjax.jax_internals.one_function import called
+from lagjax.jax_internals.tracing import is_eager
+from lagjax.mechanics import constraints, coordinates
 from lagjax.mechanics.coordinates import State
-from lagjax.mechanics.in_numbers import Numbers, in_numbers
-from lagjax.mechanics.saddle_point import equations_of_motion, verdict
-from lagjax.mechanics.structure import angles, conserves_jacobi_integral, is_free_of_velocities
+from lagjax.mechanics.in_numbers import in_numbers
+from lagjax.mechanics.memory import Parted, filled_up, parted
+from lagjax.mechanics.saddle_point import equations_of_motion, is_regular, verdict
+from lagjax.mechanics.structure import conserves_jacobi_integral, is_free_of_velocities
 from lagjax.mechanics.written_out import is_small, write_out
-from lagjax.motion.arriving import Arriving
+from lagjax.motion.arriving import apart_from_jumps
 from lagjax.motion.both_modes import solve_in_both_modes
 from lagjax.motion.consistency import stopped, to_manifold, within, worst_residual
-from lagjax.motion.sign_change import SignChange
-from lagjax.motion.stepping import OnManifold, Quick, Stages, Tolerances, forward_differentiable
+from lagjax.motion.crossing_times import all_known, by_name, end_of
+from lagjax.motion.loop import solution_of
+from lagjax.motion.memory_maps import maps_used, warn_of_memory_maps
 from lagjax.motion.trajectory import RESULTS, Moment, Trajectory, ended_well, pack, worst_drift
 from lagjax.numerics.nystrom import Nystrom, Nystrom12
-from lagjax.numerics.one_function import called, one_function
-from lagjax.numerics.runge_kutta import Dopri8, ExplicitRungeKutta
-from lagjax.numerics.simplified_newton import SimplifiedNewton, with_tolerances
+from lagjax.numerics.runge_kutta import Dopri8, ExplicitRungeKutta, in_our_form
 
 # A start may be off the constraints by this many tolerances; it is then moved onto them.
 START_TOLERANCES = 100.0
-# Baumgarte's feedback decays a violation by e this many times over the time span.
-BAUMGARTE_DECAYS = 50.0
 # A motion of a hundred periods changes the Jacobi integral by ten to a hundred tolerances.
 DRIFT_TOLERANCES = 1e3
 # The same change times the number of steps is about twenty times the phase that it shifts, in radians: a hundredth.
@@ -43,6 +49,10 @@ PHASE_STEPS = 0.2
 FIXED_STEPS_ALLOW = 1e-5
 # The tightest tolerance that is not below round-off.
 ROUND_OFFS = 8
+# Motions whose programs are kept, of 10 to 130 MB each; fewer, where these use so much of the memory maps there are.
+KEPT, KEPT_AT_LEAST, MAPS_SHARE = 100, 8, 0.4
+# What the careful way would say, too.
+THE_SAME = RESULTS.max_steps_reached, RESULTS.start_off_constraints, RESULTS.tolerance_too_small, RESULTS.unordered
 # What diffrax reports, in the words of a motion.
 TRANSLATED = {
     "nonfinite_input": "not_finite",
@@ -51,11 +61,14 @@ TRANSLATED = {
 }
 
 
-# The operations of a right-hand side that is copied to each of the stages; longer ones are compiled once, in a loop.
-UNROLL_UP_TO = 250
+# What our methods can be differentiated by as diffrax's own can.
+FOLLOWED = type(None), diffrax.ForwardMode, diffrax.RecursiveCheckpointAdjoint, diffrax.DirectAdjoint
 
 
-class Settings(eqx.Module):
+# A module of equinox takes longer to make than a short motion to compute.
+@jtu.register_dataclass
+@dataclass(frozen=True)
+class Settings:
     """How to integrate: everything but the system, the state and the times."""
 
     method: diffrax.AbstractSolver | None
@@ -65,36 +78,116 @@ class Settings(eqx.Module):
     rtol: Float[Array, " 2"]
     atol: Float[Array, " 2"]
     dt0: Float[Array, ""] | None
+    max_step: Float[Array, ""] | None
+    jump_ts: Float[Array, " J"] | None
     apart: bool = eqx.field(static=True)
     max_steps: int | None = eqx.field(static=True)
     drift: str = eqx.field(static=True)
     progress: bool = eqx.field(static=True)
+    # False where the equations are taken for regular, until that turns out to be wrong.
+    careful: bool = eqx.field(static=True, default=True)
+
+
+def trajectory_of(*problem) -> Trajectory:
+    """The trajectory of a system, q0, v0, params, ts, guards, and settings; what went wrong is recorded in its result.
+
+    Where nothing is traced, the equations are first taken for regular, which compiles in two thirds of the time and is
+    all that most systems need; where that fails, the careful way is compiled too, and kept to. Equinox's wrapper of
+    `jit` takes longer than a short motion; it has better words for the checks that it puts into a program.
+    """
+    if not is_eager():
+        return _trajectory_of(*problem)
+    system, q0, v0, params, ts, guards, settings = problem
+    # Filled up by its last time.
+    many = np.append(ts, np.full(filled_up(len(ts)) - len(ts), ts[-1]))
+    static, arrays = parted((system, q0, v0, params, many, guards, settings))
+    programs = _kept(static, len(ts))
+    try:
+        if programs.regular is not None:
+            found, settled = programs.regular(arrays)
+            if settled:
+                return programs.first_outputs(found, len(ts))
+            programs.regular = None
+        return programs.first_outputs(jax.block_until_ready(programs.careful(arrays))[0], len(ts))
+    except jax.errors.JaxRuntimeError:
+        return _trajectory_of(*problem)
+
+
+class _Programs:
+    """The compiled programs of one kind of motion: of equations taken for regular (None where they are not), and with
+    the careful way. JAX keeps them as long as this object lives."""
+
+    def __init__(self, static, count):
+        jit = partial(jax.jit, compiler_options=compiler_options())
+        self.regular: Callable | None = jit(partial(_of_arrays, static, False))
+        self.careful: Callable = jit(partial(_of_arrays, static, True))
+        self._count = count
+        self._cut = jax.jit(lambda rows: [x[:count] for x in rows])
+
+    def first_outputs(self, found, count):
+        """The trajectory without the outputs that it was filled up by."""
+        if found.t.size == count:
+            return found
+        leaves, structure = jtu.tree_flatten(found)
+        size = len(jtu.tree_leaves((found.t, found.q, found.v, found.multipliers)))
+        rows = leaves[:size]
+        # A program for each number of outputs would be compiled; for the first one it is.
+        cut = self._cut(rows) if count == self._count else jax.device_put([np.asarray(x)[:count] for x in rows])
+        return jtu.tree_unflatten(structure, cut + leaves[size:])
+
+
+# What was integrated here, that used last at the end.
+_programs: OrderedDict[Parted, _Programs] = OrderedDict()
+_one_thread = threading.Lock()
+
+
+def _kept(static, count):
+    with _one_thread:
+        found = _programs.get(static)
+        if found is None:
+            found = _programs[static] = _Programs(static, count)
+            while len(_programs) > KEPT or len(_programs) > KEPT_AT_LEAST and maps_used() > MAPS_SHARE:
+                _programs.popitem(last=False)
+        _programs.move_to_end(static)
+        return found
+
+
+def _of_arrays(static, careful, arrays):
+    *motion, settings = static.together(arrays)
+    return _trajectory(*motion, replace(settings, careful=careful))
 
 
 @eqx.filter_jit
-def trajectory_of(system, q0, v0, params, ts, settings) -> Trajectory:
-    """The trajectory, whatever became of it."""
-    settings = eqx.tree_at(
-        lambda s: s.method, settings, _method(settings, system, ts[0], q0, v0, params), is_leaf=lambda x: x is None
-    )
+def _trajectory_of(*problem):
+    return _trajectory(*problem)[0]
+
+
+def _trajectory(system, q0, v0, params, ts, guards, settings):
+    """The trajectory, and whether it is settled: what was taken for regular failed for no other reason than that."""
+    # Here while it is traced, which is when something new is compiled.
+    warn_of_memory_maps()
+    asked, method = settings.method, method_of(settings, system, ts[0], q0, v0, params)
+    name = type(method).__name__ + ("" if asked is None or asked is method else " (diffrax's, in lagjax's form)")
+    settings = eqx.tree_at(lambda s: s.method, settings, method, is_leaf=lambda x: x is None)
     # Derivatives flow to the floating arrays of these; the settings are constants.
-    x, rest = eqx.partition((system, q0, v0, params, ts), eqx.is_inexact_array)
+    x, rest = eqx.partition((system, q0, v0, params, ts, guards, settings.jump_ts), eqx.is_inexact_array)
     fixed, static = eqx.partition((rest, settings), eqx.is_array)
 
     def solved(x, fixed, adjoint):
         rest, settings = eqx.combine(fixed, static)
-        return _solve_in_numbers(*eqx.combine(x, rest), settings, adjoint)
+        *motion, jump_ts = eqx.combine(x, rest)
+        return _solve_in_numbers(*motion, replace(settings, jump_ts=jump_ts), adjoint)
 
     if settings.adjoint is None:
         fields = solve_in_both_modes(solved, x, fixed)
     else:
         fields = solved(x, fixed, settings.adjoint)
-    arrays, described = pack(system, params, type(settings.method).__name__)
-    tolerance = (settings.rtol, settings.atol)
-    return Trajectory(t=ts, **fields, tolerance=tolerance, arrays=arrays, static=described)
+    arrays, described = pack(system, params, name)
+    tolerance, settled = (settings.rtol, settings.atol), fields.pop("settled")
+    return Trajectory(t=ts, **fields, tolerance=tolerance, arrays=arrays, static=described), settled
 
 
-def _method(settings, system, *state):
+def method_of(settings, system, *state):
     """The method asked for, if it can do it; by default the fastest that can."""
     chosen = settings.method
     if chosen is None:
@@ -109,103 +202,120 @@ def _method(settings, system, *state):
             "rotating frame.\n"
             "Fix: method=lj.Dopri8(), or leave method out: it is then chosen."
         )
-    return chosen
+    # With other adjoints, and for conditions that ask it, the solver stays the one that was given.
+    ours = in_our_form(chosen) if settings.event is None and isinstance(settings.adjoint, FOLLOWED) else None
+    return chosen if ours is None else ours
 
 
-def _solve_in_numbers(system, q0, v0, params, ts, settings, adjoint):
+def _solve_in_numbers(system, q0, v0, params, ts, guards, settings, adjoint):
     """The solve, of a small system with the coordinates one by one."""
     written = unflatten = None
-    if isinstance(settings.method, (ExplicitRungeKutta, Nystrom)) and is_small(system, ts[0], q0, v0, params):
+    ours = isinstance(settings.method, (ExplicitRungeKutta, Nystrom))
+    # A condition that asks diffrax evaluates the vector field at the state that it gets, the user's.
+    if ours and settings.event is None and is_small(system, ts[0], q0, v0, params):
         _, unflatten = coordinates.flatten(q0)
         system, q0, v0 = in_numbers(system, unflatten), coordinates.numbers(q0), coordinates.numbers(v0)
-        event = settings.event
-        if event is not None:
-            settings = eqx.tree_at(lambda s: s.event, settings, _event_in_numbers(event, unflatten))
+        guards = None if guards is None else guards.in_numbers(unflatten)
         written = write_out(system, ts[0], q0, v0, params)
-    fields = _solve(system, q0, v0, params, ts, settings, adjoint, written)
+    if written is None or not written.careful:
+        settings = replace(settings, careful=True)
+    fields = _solve(system, q0, v0, params, ts, guards, settings, adjoint, written)
     if unflatten is None:
         return fields
-    end, together = fields["end"], lambda numbers: unflatten(jnp.stack(numbers))
+    together = lambda numbers: unflatten(jnp.stack(numbers))
+    rows = jax.vmap(together)
+    end, events = fields["end"], fields["events"]
     return fields | {
-        "q": jax.vmap(together)(fields["q"]),
-        "v": jax.vmap(together)(fields["v"]),
+        "q": rows(fields["q"]),
+        "v": rows(fields["v"]),
         "end": end._replace(q=together(end.q), v=together(end.v)),
+        "events": {name: found.with_states(rows(found.q), rows(found.v)) for name, found in events.items()},
     }
 
 
-def _solve(system, q0, v0, params, ts, settings, adjoint, written):
-    off_constraints = _off_constraints(system, ts[0], q0, v0, params, settings)
+class Start(NamedTuple):
+    """The first state, moved onto the constraints, and what speaks against it."""
+
+    q: PyTree[Float[Array, "..."]]
+    v: PyTree[Float[Array, "..."]]
+    off_constraints: Bool[Array, ""]
+    contradictory: Bool[Array, ""]
+    singular: Bool[Array, ""]
+    finite: Bool[Array, ""]
+
+
+def _start(system, t, q, v, params, settings) -> Start:
+    off_constraints = _off_constraints(system, t, q, v, params, settings)
     projected = None
     if settings.drift == "project":
-        projected = to_manifold(system, ts[0], q0, v0, params, settings.rtol, settings.atol)
-        q0, v0 = projected.q, projected.v
-    start = stopped(verdict(system, ts[0], q0, v0, params))
-    finite, singular, contradictory = start.finite, start.singular, start.contradictory
+        projected = to_manifold(system, t, q, v, params, settings.rtol, settings.atol)
+        q, v = projected.q, projected.v
+    start = stopped(verdict(system, t, q, v, params))
     if projected is not None:
-        off_constraints = off_constraints | (finite & ~singular & ~projected.holds)
+        off_constraints = off_constraints | (start.finite & ~start.singular & ~projected.holds)
+    return Start(q, v, off_constraints, start.contradictory, start.singular, start.finite)
+
+
+def _regular_start(system, written, t, q, v, params, settings) -> Start:
+    """The same of a regular system; what speaks against another one is not told apart."""
+    off_constraints = _off_constraints(system, t, q, v, params, settings)
+    if settings.drift == "project":
+        q, v = called(written.project(system, t, q, v, params))
+    a, multipliers = called(written.equations(system, t, q, v, params))
+    numbers = coordinates.flatten((a, multipliers, system.lagrangian(t, q, v, params)))[0]
+    singular = ~is_regular(system, t, q, v, params)
+    return Start(q, v, off_constraints, jnp.asarray(False), singular, jnp.all(jnp.isfinite(numbers)))
+
+
+def _solve(system, q0, v0, params, ts, guards, settings, adjoint, written):
+    if settings.careful:
+        start = _start(system, ts[0], q0, v0, params, settings)
+    else:
+        start = _regular_start(system, written, ts[0], q0, v0, params, settings)
+    q0, v0, off_constraints, contradictory, singular, finite = start
     too_small = settings.rtol[0] < ROUND_OFFS * jnp.finfo(ts.dtype).eps if settings.controller is None else False
-    backwards = jnp.any(ts[1:] < ts[:-1])
-    if settings.dt0 is not None:
-        backwards = backwards | ~(settings.dt0 > 0)
-    refused = off_constraints | contradictory | singular | ~finite | too_small | backwards
+    unordered = jnp.any(ts[1:] < ts[:-1])
+    for length in (settings.dt0, settings.max_step):
+        if length is not None:
+            unordered = unordered | ~(length > 0)
+    refused = off_constraints | contradictory | singular | ~finite | too_small | unordered
     y0 = jax.tree.map(lambda x: jnp.where(refused, 0.0, x), (q0, v0))
-    terms = diffrax.ODETerm(_vector_field(system, ts, settings.drift))
-    quick = None
-    if written is not None and settings.drift != "baumgarte":
-        field = WrittenField(written.equations, written.equations.prepare(system, params))
-        project = written.project if settings.drift == "project" else None
-        prepared = () if project is None else project.prepare(system, params)
-        stages = settings.method if written.equations.length <= UNROLL_UP_TO else _in_a_loop(settings.method, adjoint)
-        quick = Quick(stages, diffrax.ODETerm(field), project, prepared, written.careful)
-    # BacksolveAdjoint integrates a larger state backwards: it takes the bare method, and no end beside the outputs.
-    bare = isinstance(adjoint, diffrax.BacksolveAdjoint)
-    settings = eqx.tree_at(lambda s: s.method, settings, _with_root_finder(settings))
-    at_ts, at_end = diffrax.SubSaveAt(ts=ts), diffrax.SubSaveAt(t1=True)
-    if bare:
-        solver, saveat = settings.method, diffrax.SaveAt(ts=ts)
-    else:
-        solver = _solver(system, terms, quick, State(ts[0], q0, v0, params), refused, settings, adjoint)
-        saveat = diffrax.SaveAt(subs=(at_ts, at_end))
-    solve = partial(_diffeqsolve, max_steps=settings.max_steps, adjoint=adjoint, progress=settings.progress)
-    arguments = (
-        terms if quick is None else quick.terms, solver, ts[0], ts[-1], settings.dt0, y0, params, saveat,
-        _controller(ts, settings, bare), _located_event(settings.event, ts),
-    )  # fmt: skip
-    # Reverse mode has to look inside.
-    if isinstance(adjoint, diffrax.ForwardMode):
-        solution = one_function(
-            solve, *arguments, checked=_has_no_checks_of_its_own(settings.controller), in_blocks=True
-        )
-    else:
-        solution = solve(*arguments)
-    if bare:
-        reached_ts, outputs = solution["ts"], solution["ys"]
-        end_t, end_y = jax.tree.map(lambda x: x[-1:], (reached_ts, outputs))
-    else:
-        (reached_ts, end_t), (outputs, end_y) = solution["ts"], solution["ys"]
+    start = State(ts[0], q0, v0, params)
+    solution = solution_of(system, written, start, y0, refused, ts, guards, settings, adjoint)
+    outputs, (end_t, end_y), located = solution.outputs, solution.end, solution.located
+    reached = jnp.isfinite(solution.reached) & ~refused
+    if located is not None:
+        end_t, end_y = end_of(guards, located, end_t, end_y)
+        # The step in which the motion ended went on to its own end.
+        reached = reached & (ts <= end_t)
 
     # What was not reached is evaluated at the start and masked afterwards: NaN times zero would poison gradients.
-    reached = jnp.isfinite(reached_ts) & ~refused
     outputs = jax.tree.map(lambda x, x0: jnp.where(_like(reached, x), x, x0[None]), outputs, (q0, v0))
+    if settings.jump_ts is not None:
+        outputs = apart_from_jumps(system, ts, settings.jump_ts, *outputs, params)
     # One compiled evaluation for the outputs and the end together.
     t, (q, v) = jax.tree.map(lambda x, last: jnp.concatenate([x, last]), (ts, outputs), (end_t, end_y))
-    everything = Moment(t, q, v, _multipliers(system, t, q, v, params))
+    everything = Moment(t, q, v, _multipliers(system, None if settings.careful else written, t, q, v, params))
     end = jax.tree.map(lambda x: jnp.where(refused, jnp.nan, x[-1]), everything)._replace(t=t[-1])
     _, q, v, multipliers = jax.tree.map(lambda x: jnp.where(_like(reached, x), x[:-1], jnp.nan), everything)
 
-    result = RESULTS.promote(solution["result"])
+    result = RESULTS.promote(solution.result)
     for reported, ours in TRANSLATED.items():
         result = RESULTS.where(result == getattr(RESULTS, reported), getattr(RESULTS, ours), result)
     # An output is a step of its own, and can fail where the steps of the solve did not.
     all_reached = jnp.all(jnp.isfinite(coordinates.flatten(outputs)[0]))
+    if not settings.careful:
+        all_reached = all_reached & jnp.all(jnp.isfinite(coordinates.flatten(everything.multipliers)[0]))
+        if located is not None:
+            all_reached = all_reached & all_known(located)
     result = RESULTS.where(ended_well(result) & ~all_reached, RESULTS.unsolved_step, result)
     result = RESULTS.where(singular, RESULTS.start_singular, result)
     result = RESULTS.where(finite, result, RESULTS.start_not_finite)
     result = RESULTS.where(contradictory, RESULTS.contradictory, result)
     result = RESULTS.where(off_constraints, RESULTS.start_off_constraints, result)
     result = RESULTS.where(too_small, RESULTS.tolerance_too_small, result)
-    result = RESULTS.where(backwards, RESULTS.backwards, result)
-    stats = {name: jnp.asarray(count) for name, count in solution["stats"].items() if name != "max_steps"}
+    result = RESULTS.where(unordered, RESULTS.unordered, result)
+    stats = {name: jnp.asarray(count) for name, count in solution.stats.items() if name != "max_steps"}
     departure = _departure(system, stopped((t, everything.q, everything.v, params)), stats, settings)
     return {
         "q": q,
@@ -215,20 +325,9 @@ def _solve(system, q0, v0, params, ts, settings, adjoint, written):
         "stats": stats,
         "departure": departure,
         "result": result,
+        "settled": settings.careful | ended_well(result) | _among(result, THE_SAME),
+        "events": {} if located is None else by_name(guards, located, end_t, ~refused),
     }
-
-
-def _diffeqsolve(terms, solver, t0, t1, dt0, y0, args, saveat, controller, event, *, max_steps, adjoint, progress):
-    solution = diffrax.diffeqsolve(
-        terms, solver, t0, t1, dt0, y0, args, saveat=saveat, stepsize_controller=controller, adjoint=adjoint,
-        event=event, max_steps=max_steps, throw=False, progress_meter=_progress_meter(progress),
-    )  # fmt: skip
-    return {name: getattr(solution, name) for name in ("ts", "ys", "stats", "result")}
-
-
-def _has_no_checks_of_its_own(controller):
-    # diffrax's own are about the times and the first step, which `_solve` looks at.
-    return controller is None or isinstance(controller, (diffrax.ConstantStepSize, diffrax.PIDController))
 
 
 def _departure(system, motion, stats, settings):
@@ -250,41 +349,12 @@ def _departure(system, motion, stats, settings):
     return jnp.maximum(jnp.maximum(drift, residual) / (DRIFT_TOLERANCES * rtol), phase)
 
 
-def _vector_field(system, ts, drift):
-    """d(q, v)/dt = (v, a), on the user's pytrees."""
-    rate = BAUMGARTE_DECAYS / (ts[-1] - ts[0]) if drift == "baumgarte" else None
+def _multipliers(system, written, t, q, v, params):
+    def at(t, q, v):
+        if written is None:
+            return equations_of_motion(system, t, q, v, params)[1]
+        return constraints.split(system, called(written.equations(system, t, q, v, params))[1], t, q, v, params)
 
-    def field(t, y, args):
-        q, v = y
-        params, independent = args if isinstance(args, Stages) else (args, None)
-        return v, called(equations_of_motion(system, t, q, v, params, rate, independent))[0]
-
-    return field
-
-
-class WrittenField(eqx.Module):
-    """The same from the equations written out, with what does not depend on the state computed before."""
-
-    equations: Numbers = eqx.field(static=True)
-    prepared: tuple
-
-    def __call__(self, t, y, params):
-        q, v = y
-        return v, called(self.equations.at(self.prepared, t, q, v))[0]
-
-
-def _event_in_numbers(event, unflatten):
-    def wrap(condition):
-        def of_numbers(t, y, *args, **kwargs):
-            return condition(t, tuple(unflatten(jnp.stack(x)) for x in y), *args, **kwargs)
-
-        return of_numbers
-
-    return diffrax.Event(jax.tree.map(wrap, event.cond_fn, is_leaf=callable), event.root_finder, event.direction)
-
-
-def _multipliers(system, t, q, v, params):
-    at = lambda t, q, v: equations_of_motion(system, t, q, v, params)[1]
     return jax.vmap(at)(t, q, v) if system.constraints else {}
 
 
@@ -294,77 +364,8 @@ def _off_constraints(system, t, q, v, params, settings):
     return ~within(system, t, q, v, params, START_TOLERANCES * settings.rtol, START_TOLERANCES * settings.atol)
 
 
-def _with_root_finder(settings):
-    """An implicit method with diffrax's default root finder gets ours; all get the solve's tolerances."""
-    method, tolerances = settings.method, (settings.rtol[0], settings.atol[0])
-    if isinstance(getattr(method, "root_finder", None), diffrax.VeryChord):
-        return eqx.tree_at(lambda method: method.root_finder, method, SimplifiedNewton(*tolerances))
-    return with_tolerances(method, *tolerances)
-
-
-def _solver(system, terms, quick, start, refused, settings, adjoint):
-    angle = tuple(jax.tree.leaves(angles(system, *start)))
-    return OnManifold(
-        solver=_in_a_loop(settings.method, adjoint),
-        system=system,
-        terms=terms,
-        quick=quick,
-        params=start.params,
-        refused=refused,
-        tolerances=Tolerances(settings.rtol, settings.atol),
-        angles=angle,
-        controlled=settings.controller is None,
-        weigh=settings.controller is None and (settings.apart or any(angle)),
-        project=settings.drift == "project",
-        arriving=_arriving(settings),
-    )
-
-
-def _in_a_loop(method, adjoint):
-    """The method with a loop over its stages, of the kind that the derivative needs."""
-    if isinstance(method, Nystrom):
-        return type(method)(in_a_loop=True)
-    ours = isinstance(method, ExplicitRungeKutta)
-    method = method.shipped if ours else method
-    if isinstance(adjoint, diffrax.RecursiveCheckpointAdjoint):
-        return forward_differentiable(method)
-    return eqx.tree_at(lambda s: s.scan_kind, method, "lax", is_leaf=lambda x: x is None) if ours else method
-
-
-def _arriving(settings):
-    # An event is looked for inside its step, and a controller of the user's chooses its steps itself.
-    return settings.controller is None and settings.event is None
-
-
-def _controller(ts, settings, bare):
-    if settings.controller is not None:
-        return settings.controller
-    # A step that small no longer moves t: the solution is singular there, or was NaN from the start.
-    dtmin = 16 * jnp.finfo(ts.dtype).eps * jnp.maximum(jnp.abs(ts[0]), jnp.abs(ts[-1]))
-    # The largest error counts, not the mean: more coordinates should not loosen the tolerance of each.
-    controller = diffrax.PIDController(
-        rtol=settings.rtol[0], atol=settings.atol[0], norm=optx.max_norm, dtmin=dtmin, force_dtmin=False
-    )
-    return Arriving(controller, ts) if _arriving(settings) and not bare else controller
-
-
-def _located_event(event, ts):
-    """The user's event, located to round-off in t where no root finder is named."""
-    if event is None:
-        return None
-    tolerance = 4 * jnp.finfo(ts.dtype).eps * jnp.maximum(jnp.abs(ts[0]), jnp.abs(ts[-1]))
-    finder = SignChange(rtol=0.0, atol=tolerance) if event.root_finder is None else event.root_finder
-    # diffrax passes `args` by keyword; by position the user may call it `params`.
-    by_position = lambda condition: lambda t, y, args, **kwargs: condition(t, y, args, **kwargs)
-    return diffrax.Event(jax.tree.map(by_position, event.cond_fn, is_leaf=callable), finder, event.direction)
-
-
-def _progress_meter(progress):
-    if not progress:
-        return diffrax.NoProgressMeter()
-    if importlib.util.find_spec("tqdm") is None:
-        return diffrax.TextProgressMeter()
-    return diffrax.TqdmProgressMeter()
+def _among(result, others):
+    return jnp.any(jnp.stack([result == other for other in others]))
 
 
 def _like(mask, x):

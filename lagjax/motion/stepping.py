@@ -19,12 +19,14 @@ from jax import lax
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, PyTree
 
+from lagjax.jax_internals.one_function import called
+from lagjax.mechanics import constraints
 from lagjax.mechanics.in_numbers import Numbers
-from lagjax.mechanics.saddle_point import independent_equations
+from lagjax.mechanics.saddle_point import equations_of_motion, independent_equations
 from lagjax.mechanics.system import System
+from lagjax.motion.arriving import between_jumps
 from lagjax.motion.consistency import to_manifold
 from lagjax.numerics.interpolation import Interpolation
-from lagjax.numerics.one_function import called
 from lagjax.numerics.radau import Radau5
 
 # Without projection a state drifts off its constraints, and dependent ones then disagree by that much.
@@ -55,14 +57,22 @@ class Stages(NamedTuple):
 class Quick(eqx.Module):
     """A step on equations that are written out, which may give NaN where the careful one does not.
 
-    `project` is None where a step is not returned to constraints.
+    `project` is None where a step is not returned to constraints. `inside` is the same method for steps to times inside
+    another one; with a loop over its stages it is slower, and compiled in a fraction of the time.
     """
 
     solver: diffrax.AbstractSolver
+    inside: diffrax.AbstractSolver
     terms: PyTree[diffrax.AbstractTerm]
     project: Numbers | None = eqx.field(static=True)
     prepared: tuple
     careful: bool = eqx.field(static=True)
+
+    def flow(self, t0, t1, y0, args):
+        """The state at t1, by one step."""
+        state = self.inside.init(self.terms, t0, t1, y0, args)
+        y, *_ = self.inside.step(self.terms, t0, t1, y0, args, state, True)
+        return y if self.project is None else called(self.project.at(self.prepared, t1, *y))
 
 
 class OnManifold(diffrax.AbstractWrappedSolver):
@@ -71,7 +81,8 @@ class OnManifold(diffrax.AbstractWrappedSolver):
     A step that cannot be returned to the constraints is rejected; with a fixed step the solve ends there. `controlled`
     says that steps are chosen by the tolerances. `weigh` rescales the error for a controller that knows one tolerance:
     coordinates and velocities are judged each by their own, and the `angles` among the leaves of q by at most a turn.
-    `arriving` says that outputs are wanted at the ends of steps only.
+    `arriving` says that outputs are wanted at the ends of steps only. `jump_ts` become ends of steps by the controller;
+    here each step stays on its side of them.
 
     What the dense output needs of the problem (`terms`, `params`) belongs to the solver, since diffrax hands
     an interpolation only times and states. Where `refused`, and where a step is not finite, its error is infinite: an
@@ -90,6 +101,7 @@ class OnManifold(diffrax.AbstractWrappedSolver):
     weigh: bool = eqx.field(static=True)
     project: bool = eqx.field(static=True)
     arriving: bool = eqx.field(static=True)
+    jump_ts: Float[Array, " J"] | None = None
 
     @property
     def term_structure(self):
@@ -144,6 +156,8 @@ class OnManifold(diffrax.AbstractWrappedSolver):
         return jtu.tree_map(lambda f: jnp.where(self.refused | ~jnp.isfinite(f), 0.0, f), rate)
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
+        if self.jump_ts is not None:
+            t0, t1, made_jump = between_jumps(t0, t1, self.jump_ts, made_jump)
         if self.quick is None:
             y1, error, solver_state, result = self._careful_step(terms, t0, t1, y0, args, solver_state, made_jump)
         else:
@@ -196,6 +210,42 @@ class OnManifold(diffrax.AbstractWrappedSolver):
             error = jtu.tree_map(lambda x: jnp.where(projected.holds, x, jnp.inf), error)
             result = diffrax.RESULTS.where(projected.holds, result, diffrax.RESULTS.nonlinear_divergence)
         return y1, error, solver_state, result
+
+    def flow(self, t0, y0, t, args):
+        """The state at t, by one step from t0."""
+        begin, end = (t0, t) if self.jump_ts is None else between_jumps(t0, t, self.jump_ts, True)[:2]
+        # Asked seldom: one kind of step compiles in a third of the time of both.
+        if self.quick is not None and self._is_regular:
+            y = self.quick.flow(begin, end, y0, args)
+        else:
+            y = self._careful_step(self.terms, begin, end, y0, args, None, True)[0]
+        return jtu.tree_map(lambda y, y0: jnp.where(t > t0, y, y0), y, y0)
+
+    def multipliers(self, t, y, args):
+        """The multipliers by name, for outputs: derivatives flow through them."""
+        if not self.system.constraints:
+            return {}
+        return self.rates(t, y, args)[1] if self._is_regular else equations_of_motion(self.system, t, *y, args)[1]
+
+    @property
+    def _is_regular(self):
+        """Whether the careful way is not to be had."""
+        return self.quick is not None and not self.quick.careful
+
+    def rates(self, t, y, args, believe=False):
+        """The accelerations, and the multipliers by name; with `believe` of a quick result, which may be NaN."""
+
+        def carefully():
+            a = self.terms.vf(t, y, args)[1]
+            return a, equations_of_motion(self.system, t, *y, args)[1] if self.system.constraints else {}
+
+        if self.quick is None:
+            return carefully()
+        a, stacked = self.quick.terms.vector_field.solved(t, y)
+        quickly = a, constraints.split(self.system, stacked, t, *y, args)
+        if believe or not self.quick.careful:
+            return quickly
+        return lax.cond(eqxi.unvmap_all(_all_finite(quickly)), lambda: quickly, carefully)
 
     def acceptable(self, y0, y1, error):
         """Whether an output's error is not far above the tolerance; a step to it has not passed the controller.
@@ -254,7 +304,10 @@ class SteppedTo(Interpolation):
         s = self.solver
         # Three places of diffrax's program ask, and each is compiled: the careful step alone takes a third of the time
         # of both, and costs little at run time, since most outputs are ends of steps.
-        y, error, _, result = s._careful_step(s.terms, self.t0, t, self.y0, s.params, self.state, made_jump=False)
+        t0, made_jump = self.t0, False
+        if s.jump_ts is not None:
+            t0, t, made_jump = between_jumps(t0, t, s.jump_ts, made_jump)
+        y, error, _, result = s._careful_step(s.terms, t0, t, self.y0, s.params, self.state, made_jump)
         believed = (result == diffrax.RESULTS.successful) & s.acceptable(self.y0, y, error)
         return jtu.tree_map(lambda x: jnp.where(believed, x, jnp.nan), y)
 

@@ -13,15 +13,16 @@ from jaxtyping import Array, Bool, Float, PyTree
 from lagjax import plot
 from lagjax.animation import Animation
 from lagjax.mechanics import coordinates
-from lagjax.mechanics.structure import angles
+from lagjax.mechanics.structure import angles, what_changes_jacobi_integral
 from lagjax.mechanics.system import System
 from lagjax.motion import frames
 from lagjax.motion.consistency import worst_residual
+from lagjax.motion.crossings import Crossings
 
 
 # For checkers equinox's enumerations are Python's, of which none can have more items than its parent.
 class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
-    """How an integration ended: diffrax's results, and a start that could not be integrated."""
+    """How an integration or a fit ended: diffrax's results, and what they have no word for."""
 
     start_off_constraints = "The initial state does not satisfy the constraints."
     contradictory = "Constraints that depend on each other ask for different accelerations at the initial state."
@@ -32,8 +33,18 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
         "A step could not be solved, could not be returned to the constraints, or lost the state in its error."
     )
     tolerance_too_small = "The tolerance is below the round-off of the state's dtype."
-    backwards = "The times do not increase, or the first step dt0 is not positive."
+    unordered = (
+        "The times do not increase throughout, or dt0 or max_step is not positive. (Times that decrease are taken "
+        "where they are known while JAX is tracing: a NumPy array.)"
+    )
     drifted = "The motion was computed, but what must stay constant changed by more than 1000 tolerances."
+    not_converged = "The search of a fit did not converge."
+    misfit = "The residuals of a fit are no errors of measurement: they contradict sigma, or follow a curve."
+
+
+# Diffrax has no words for a success, and equinox no other place for them.
+RESULTS._index_to_message[int(RESULTS.successful._value)] = "successful"
+ENDED_WELL = RESULTS.successful, RESULTS.event_occurred
 
 
 class AccuracyWarning(UserWarning):
@@ -56,11 +67,20 @@ class Static(NamedTuple):
     structure: object
     method: str
 
+    def __reduce__(self):
+        # Equinox knows a marker in the structure by its identity, which a copy of the structure would lose.
+        return _static, (jax.tree.unflatten(self.structure, self.parts), self.method)
+
+
+def _static(tree, method):
+    parts, structure = jax.tree.flatten(tree)
+    return Static(tuple(parts), structure, method)
+
 
 class Trajectory(eqx.Module):
     """A motion at the requested times. It prints its own quality, and plots and plays itself.
 
-    - `t` (T,): the times asked for.
+    - `t` (T,): the times asked for, which increase or decrease.
     - `q`, `v`: in the structure of the initial state, each leaf with a leading axis T. NaN after an event
       or a failure ended the motion.
     - `multipliers`: by constraint name, (T, *shape of the constraint), from the projected states.
@@ -70,6 +90,7 @@ class Trajectory(eqx.Module):
       the tolerance lets expect; above 1 the motion is less accurate than that, and `integrate` warns. 0 where nothing
       must stay.
     - `result`: a `RESULTS` item; `lj.RESULTS.successful`, `event_occurred`, or what went wrong.
+    - `events`: by name, the `Crossings` of what was asked for.
     - `params`, `system`: what was integrated. `tolerance`: (rtol, atol), each (2,):
       for coordinates and for velocities.
 
@@ -84,6 +105,7 @@ class Trajectory(eqx.Module):
     stats: dict[str, Array]
     departure: Float[Array, ""]
     result: RESULTS
+    events: dict[str, Crossings]
     tolerance: tuple[Array, Array]
     arrays: PyTree
     static: Static = eqx.field(static=True)
@@ -106,10 +128,12 @@ class Trajectory(eqx.Module):
 
     def drift(self) -> Float[Array, ""]:
         """The largest change of the Jacobi integral, relative to the largest `|v·p| + |L|`."""
-        return worst_drift(self.system, self.t, self.q, self.v, self.params)
+        return _worst_drift(self.system, self.t, self.q, self.v, self.params)
 
     def residual(self) -> Float[Array, ""]:
-        """The worst constraint residual over all outputs, positions and velocities, relative."""
+        """The worst constraint residual over all outputs, positions and velocities, relative; 0 without constraints."""
+        if not self.system.constraints:
+            return jnp.zeros_like(self.departure)
         return _worst_residual(self.system, self.t, self.q, self.v, self.params)
 
     def plot(self):
@@ -208,8 +232,7 @@ def worst_drift(system, t, q, v, params):
 def pack(system, params, method: str) -> tuple[PyTree, Static]:
     """Split (system, params) into arrays and hashable rest."""
     arrays, static = eqx.partition((system, params), eqx.is_array)
-    parts, structure = jax.tree.flatten(static)
-    return arrays, Static(tuple(parts), structure, method)
+    return arrays, _static(static, method)
 
 
 def ended_well(result) -> Bool[Array, "..."]:
@@ -217,11 +240,14 @@ def ended_well(result) -> Bool[Array, "..."]:
     return (result == RESULTS.successful) | (result == RESULTS.event_occurred)
 
 
+def is_among(result, others) -> bool:
+    """Whether a result that is known is one of some others; without JAX, which takes ten times as long."""
+    return int(result._value) in [int(other._value) for other in others]
+
+
 def message(result) -> str:
     """A result in words."""
-    if bool(result == RESULTS.successful):
-        return "successful"
-    if bool(result == RESULTS.event_occurred):
+    if is_among(result, [RESULTS.event_occurred]):
         return "ended by its event"
     return RESULTS[result]
 
@@ -242,7 +268,11 @@ def _lines(traj):
     ]
     if traj.system.constraints:
         rows.append(("worst constraint residual", f"{float(traj.residual()):.1e} (relative)"))
-    rows.append(("change of the Jacobi integral", f"{float(traj.drift()):.1e} (relative)"))
+    first = jax.tree.map(lambda x: np.asarray(x)[0], (traj.t, traj.q, traj.v))
+    changed_by = next(what_changes_jacobi_integral(traj.system, *first, traj.params), None)
+    as_it_may = "" if changed_by is None else f"; need not be conserved: {changed_by}"
+    rows.append(("change of the Jacobi integral", f"{float(traj.drift()):.1e} (relative){as_it_may}"))
+    rows += [(f"event '{name}'", found.in_words()) for name, found in traj.events.items()]
     if float(traj.departure) > 1:
         rows.append(("WARNING", f"drifted {float(traj.departure):.2g} times as far as the tolerance lets expect"))
     rows += _shape_rows(traj)
@@ -250,7 +280,7 @@ def _lines(traj):
 
 
 def _pair(tolerance):
-    of_q, of_v = (f"{float(value):.3g}" for value in tolerance)
+    of_q, of_v = (f"{float(value):.3g}" for value in np.asarray(tolerance))
     return of_q if of_q == of_v else f"{of_q} (q), {of_v} (v)"
 
 
@@ -263,7 +293,7 @@ def _batch_lines(traj, lanes):
         ("lanes", " x ".join(map(str, lanes))),
         ("results", "; ".join(words)),
         *([("WARNING", f"{drifted} lanes drifted farther than the tolerance lets expect")] if drifted else []),
-        ("steps a lane", f"{steps.min()} to {steps.max()}, {int(steps.sum())} in all"),
+        ("steps a lane", f"{steps.min()} to {steps.max()}, {int(steps.sum())} in all" if steps.size else "no lanes"),
         *_shape_rows(traj),
     ]
     return ["Trajectory, a batch", *_aligned(rows)]
@@ -274,8 +304,8 @@ def _item(result, value):
 
 
 def _ended(traj):
-    last = float(traj.t[-1])
-    return "" if float(traj.end.t) >= last else f" (at t = {float(traj.end.t):.9g} of {last:.6g})"
+    first, last, end = *np.asarray(traj.t)[[0, -1]], float(traj.end.t)
+    return "" if abs(end - first) >= abs(last - first) else f" (at t = {end:.9g} of {last:.6g})"
 
 
 def _shape_rows(traj):
@@ -315,6 +345,11 @@ def _columns(values):
     if values.ndim == 1:
         return [("", values)]
     return [(f"[{i}]", column) for i, column in enumerate(values.T)]
+
+
+@eqx.filter_jit
+def _worst_drift(system, t, q, v, params):
+    return worst_drift(system, t, q, v, params)
 
 
 @eqx.filter_jit

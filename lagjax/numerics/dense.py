@@ -19,9 +19,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jax.extend.core import Primitive
-from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array, Float
+
+from lagjax.jax_internals.primitives import primitive
 
 ELIMINATE_UP_TO = 6
 # Where a library cannot be called; beyond, a program is better off with it.
@@ -110,12 +110,14 @@ def _inverse_batched(operands, axes, **params):
 
 
 # A primitive, so that a program that is compiled as one function can have it without the library.
-_inverse_p = Primitive("inverse")
-_inverse_p.def_impl(lambda matrix, eliminate: jax.jit(_inverse, static_argnums=1)(matrix, eliminate))
-_inverse_p.def_abstract_eval(lambda matrix, eliminate: matrix)
-ad.primitive_jvps[_inverse_p] = _inverse_jvp
-batching.primitive_batchers[_inverse_p] = _inverse_batched
-mlir.register_lowering(_inverse_p, mlir.lower_fun(_inverse, multiple_results=False))
+_inverse_p = primitive(
+    "inverse",
+    lambda matrix, eliminate: jax.jit(_inverse, static_argnums=1)(matrix, eliminate),
+    lambda matrix, eliminate: matrix,
+    compiled=_inverse,
+    jvp=_inverse_jvp,
+    batched=_inverse_batched,
+)
 
 
 def reciprocal_condition(matrix: Float[Array, "n n"]) -> Float[Array, ""]:

@@ -24,9 +24,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jax.extend.core import Primitive
-from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array, Float
+
+from lagjax.jax_internals.primitives import primitive
 
 
 class Arithmetic(NamedTuple):
@@ -175,10 +175,7 @@ def _polynomial(z, coefficients):
     return functools.reduce(lambda rest, pair: pair + z * z * rest, reversed(pairs))
 
 
-_sincos_p = Primitive("sincos")
-_sincos_p.multiple_results = True
-_sincos_p.def_impl(lambda x: list(_by_library(x)))
-_sincos_p.def_abstract_eval(lambda x: [x, x])
-ad.primitive_jvps[_sincos_p] = _sincos_jvp
-batching.primitive_batchers[_sincos_p] = _sincos_batched
-mlir.register_lowering(_sincos_p, mlir.lower_fun(_by_library, multiple_results=True))
+_sincos_p = primitive(
+    "sincos", lambda x: list(_by_library(x)), lambda x: [x, x],
+    several=True, jvp=_sincos_jvp, batched=_sincos_batched,
+)  # fmt: skip

@@ -85,7 +85,10 @@ class Radau5(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptiveSolver):
 
     `step_powers` (a prefix of the state; 0 by default) multiplies the error of each leaf by that power of h before it
     is judged: 1 for velocities, `Radau5(step_powers=(0, 1))`, as RADAU5 does with variables of index 2. In the limit of
-    infinite stiffness velocities are such variables, and the number of steps is then independent of the stiffness.
+    infinite stiffness velocities are such variables, and the number of steps is then independent of the stiffness: a
+    pendulum on a spring of 1e8 takes 520 steps in place of 3,400 at rtol 1e-6, and 2,000 in place of 62,000 at 1e-9. It
+    is not the default: the weight depends on the unit of time, and fast velocities are judged too mildly where no
+    spring brings them back: at the same tolerance dry friction (`tanh(v / 1e-3)`) is 40 to 750 times less accurate.
 
     **Order** 5 in the steps' ends, 3 (with a uniform error of h^4) in `diffrax`'s interpolation between them, where
     `lagjax.integrate` makes steps of order 5 instead; the error estimate is of order 3. **Stability**: A- and L-stable,

@@ -14,6 +14,7 @@ from collections.abc import Callable
 from typing import ClassVar
 
 import diffrax
+import equinox as eqx
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from equinox import AbstractClassVar
@@ -106,3 +107,13 @@ class Dopri8(ExplicitRungeKutta):
     def order(self, terms):
         """8."""
         return 8
+
+
+def in_our_form(method: diffrax.AbstractSolver) -> ExplicitRungeKutta | None:
+    """Ours of the same name as one of diffrax's methods, as it is shipped; None of any other, or of one with options.
+
+    >>> import diffrax
+    >>> type(in_our_form(diffrax.Tsit5())) is Tsit5, in_our_form(diffrax.Heun())
+    (True, None)
+    """
+    return next((kind() for kind in (Tsit5, Dopri8) if eqx.tree_equal(kind.shipped, method) is True), None)

@@ -15,20 +15,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jax.extend.core import ClosedJaxpr, Literal
 
+from lagjax.jax_internals.names import CALLS, ELEMENTWISE
+from lagjax.jax_internals.programs import ClosedJaxpr, Literal, evaluate, written
 from lagjax.numerics.elementary import sincos_in_lanes
-from lagjax.numerics.programs import evaluate, written
 
 LARGE = 512
-ELEMENTWISE = {
-    "abs", "acos", "acosh", "add", "add_any", "and", "asin", "asinh", "atan", "atan2", "atanh", "cbrt", "ceil",
-    "clamp", "cos", "cosh", "convert_element_type", "digamma", "div", "eq", "erf", "erf_inv", "erfc", "exp", "exp2",
-    "expm1", "floor", "ge", "gt", "integer_pow", "is_finite", "le", "lgamma", "log", "log1p", "logistic", "lt",
-    "max", "min", "mul", "ne", "neg", "nextafter", "not", "or", "pow", "rem", "round", "rsqrt", "select_n", "sign",
-    "sin", "sinh", "sqrt", "square", "stop_gradient", "sub", "tan", "tanh", "xor",
-}  # fmt: skip
-CALLS = {"jit", "pjit", "closed_call", "core_call"}
 
 
 def written_out(closed: ClosedJaxpr, *args) -> list:
@@ -40,7 +32,9 @@ def written_out(closed: ClosedJaxpr, *args) -> list:
     >>> print([str(equation.primitive) for equation in numbers.jaxpr.eqns].count("mul"))
     1
     """
-    results = _evaluate(closed, [_split(x) if _small(x.aval) else x for x in map(_Value, args)], pairs={})
+    # What is known beforehand follows the same rules as in the compiled program: 1/0 is infinite, and nobody is warned.
+    with np.errstate(all="ignore"):
+        results = _evaluate(closed, [_split(x) if _small(x.aval) else x for x in map(_Value, args)], pairs={})
     return [_joined(x, aval) for x, aval in zip(results, closed.out_avals)]
 
 
@@ -171,6 +165,8 @@ def _simplified(equation, dtype, pairs, *x):
             return x[0]
     if name in ("sin", "cos") and not isinstance(x[0], np.generic):
         return _pair(x[0], pairs)[name == "cos"]
+    if name == "div" and jnp.issubdtype(dtype, jnp.floating) and all(isinstance(y, np.generic) for y in x):
+        return np.divide(*x)
     if name in KNOWN and all(isinstance(y, np.generic) for y in x):
         return np.asarray(KNOWN[name](*x), dtype)[()]
     return equation.primitive.bind(*x, **equation.params)
@@ -179,7 +175,7 @@ def _simplified(equation, dtype, pairs, *x):
 KNOWN = {
     "sub": np.subtract, "max": np.maximum, "min": np.minimum, "eq": np.equal, "ne": np.not_equal, "lt": np.less,
     "le": np.less_equal, "gt": np.greater, "ge": np.greater_equal, "and": np.bitwise_and, "or": np.bitwise_or,
-    "not": np.invert, "abs": np.abs, "square": np.square, "div": lambda x, y: np.divide(x, y) if y != 0 else np.nan * x,
+    "not": np.invert, "abs": np.abs, "square": np.square,
 }  # fmt: skip
 
 
@@ -213,6 +209,11 @@ def _negative(x):
 def _arrays(x, y):
     dtype = (y if isinstance(x, np.generic) else x).dtype
     return tuple(np.asarray(z, dtype) if isinstance(z, np.generic) else z for z in (x, y))
+
+
+def _converted(entries, dtype):
+    one = lambda x: x.astype(dtype) if isinstance(x, np.generic) else jax.lax.convert_element_type(x, dtype)
+    return _filled(entries.shape, [x if x.dtype == dtype else one(x) for x in entries.reshape(-1)])
 
 
 def _total(entries, zero):
@@ -281,6 +282,8 @@ def _product(params, variables, x, y):
     free_x = [i for i in range(x.ndim) if i not in (*contract_x, *batch_x)]
     free_y = [i for i in range(y.ndim) if i not in (*contract_y, *batch_y)]
     sizes = lambda z, axes: int(np.prod([z.shape[i] for i in axes]))
+    # The operands may be of other kinds than the result: integers, or of lower precision.
+    x, y = (_converted(z, variables[0].aval.dtype) for z in (x, y))
     inner, batch = sizes(x, contract_x), sizes(x, batch_x)
     x = x.transpose([*batch_x, *free_x, *contract_x]).reshape(batch, -1, inner)
     y = y.transpose([*batch_y, *free_y, *contract_y]).reshape(batch, -1, inner)
@@ -314,11 +317,9 @@ MOVES: dict[str, Callable] = {
     "broadcast_in_dim": _broadcast,
     "concatenate": lambda params, variables, *x: [np.concatenate(x, params["dimension"])],
     "copy": lambda params, variables, x: [x],
-    "copy_p": lambda params, variables, x: [x],
     "cumsum": _cumulative_sum,
     "dot_general": _product,
     "dynamic_slice": _dynamic_slice,
-    "expand_dims": lambda params, variables, x: [x.reshape(variables[0].aval.shape)],
     "iota": _counted,
     "pad": _padded,
     "reduce_sum": _sum,

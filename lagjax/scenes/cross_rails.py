@@ -26,6 +26,7 @@ both. The even powers of B have two eigenvalues only, and Sylvester's formula gi
 for any time, through the critical speeds (where there is no equilibrium) and beyond them.
 """
 
+import functools
 import math
 from typing import NamedTuple
 
@@ -316,12 +317,17 @@ def stability_map(over_K, over_k, **settings):
     return sweep(distance, {"over_K": over_K, "over_k": over_k}, progress=False, **settings)
 
 
+@functools.cache
+def _mapped():
+    """144 pairs of springs and what became of each, for the case and for the picture."""
+    sides = np.geomspace(0.08, 12.5, 12)
+    return *np.meshgrid(sides, sides, indexing="ij"), stability_map(sides, sides)
+
+
 def _map_case():
     """The whole plane, above both critical speeds too, where the rotation alone holds the carriage."""
-    sides = np.geomspace(0.08, 12.5, 12)
-    swept = stability_map(sides, sides)
+    over_K, over_k, swept = _mapped()
     squared = PARAMS["m"] * PARAMS["omega"] ** 2
-    over_K, over_k = np.meshgrid(sides, sides, indexing="ij")
     stable = np.asarray(is_stable(PARAMS | {"K": squared / over_K, "k": squared / over_k}))
     # A motion that failed is NaN, and would pass for one that leaves.
     wrong = int(np.sum(((swept.values < LEAVES) != stable) | ~swept.ok))
@@ -368,9 +374,8 @@ def _draw_map(axis):
         axis.text(x, y, words, ha="center", va="center", fontsize=9, bbox=plot.ON_MARKS)
     axis.text(1.0, 0.06, r"$\omega^2 = K/m$", fontsize=8, rotation=90, ha="center", va="bottom", bbox=plot.ON_MARKS)
     axis.text(0.052, 1.0, r"$\omega^2 = k/m$", fontsize=8, va="center", bbox=plot.ON_MARKS)
-    sides = np.geomspace(0.08, 12.5, 12)
-    far = ~(stability_map(sides, sides).values < LEAVES)
-    p, q = np.meshgrid(sides, sides, indexing="ij")
+    p, q, swept = _mapped()
+    far = ~(swept.values < LEAVES)
     axis.loglog(p[~far], q[~far], plot.MARKERS[0], color=plot.COLOURS[0], markersize=3, label="integrated: stays")
     axis.loglog(p[far], q[far], plot.MARKERS[6], color=plot.COLOURS[1], markersize=4, label="integrated: leaves")
     axis.set(xlabel=r"$m\omega^2/K$", ylabel=r"$m\omega^2/k$", title="Two critical speeds")

@@ -31,18 +31,17 @@ which keeps its digits where the Legendre form cancels: starts very close to the
 
 from typing import NamedTuple
 
-import diffrax
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from scipy import special
 
 from lagjax import plot
+from lagjax.mechanics.compiled import compiled
 from lagjax.mechanics.constraints import Holonomic, Nonholonomic
 from lagjax.mechanics.multipliers import accelerations
-from lagjax.mechanics.saddle_point import equations_of_motion
 from lagjax.mechanics.system import System
+from lagjax.motion.crossings import Crossing
 from lagjax.motion.integrate import integrate
 from lagjax.motion.trajectory import RESULTS
 from lagjax.report import Case, Run, Scene, relative_error
@@ -52,6 +51,8 @@ TOP = np.pi / 2
 BOTTOM = -np.pi / 2
 # I / (m a²) of what may roll; the point slides without friction.
 SHAPES = {"hoop": 1.0, "disk": 0.5, "sphere": 0.4, "shell": 2.0 / 3.0, "point": 0.0}
+# Of every batch of `departures` in the main job, so that it compiles once.
+LANES = len(SHAPES) + 5
 
 MISPRINTS = (
     "§2 says 'at the bottom, when θ = 0, a negative value': θ = 0 is the side, λ = -m g; the bottom is θ = -π/2, "
@@ -87,12 +88,8 @@ system = System(lagrangian, constraints={"contact": Holonomic(contact), "rolling
 in_flight = System(lagrangian)
 
 
-def normal_force(t, y, params, **kwargs):
-    """λ as the condition of a diffrax event: the hoop leaves where it falls through zero."""
-    return equations_of_motion(system, t, *y, params)[1]["contact"]
-
-
-DEPARTURE = diffrax.Event(normal_force, direction=False)
+# The hoop leaves where the normal force falls through zero.
+DEPARTURE = {"departure": Crossing(lambda t, q, v, multipliers, params: multipliers["contact"], direction=-1)}
 
 
 def start(params, theta, theta_rate=0.0):
@@ -117,7 +114,7 @@ def roll(params, theta, theta_rate, ts, **options):
             f"the normal force is {force + 0.0:.6g}, so it is in flight from the start.\n"
             "Fix: start higher or slower, or integrate rolling_hoop.in_flight."
         )
-    return integrate(system, q, v, params, ts=ts, event=DEPARTURE, **options)
+    return integrate(system, q, v, params, ts=ts, events=DEPARTURE, **options)
 
 
 class Multipliers(NamedTuple):
@@ -236,7 +233,7 @@ def _down(theta0):
 
     q0, v0 = start(PARAMS, theta0)
     measured = "q, v, and the time and angle of the departure"
-    return Run("until it leaves", system, PARAMS, q0, v0, ts, error, measured, event=DEPARTURE)
+    return Run("until it leaves", system, PARAMS, q0, v0, ts, error, measured, events=DEPARTURE)
 
 
 def _in_the_air():
@@ -262,25 +259,24 @@ def _about_the_bottom(theta0, periods):
     return Run(f"{periods} swings", system, PARAMS, q0, v0, ts, error, "q and v against Jacobi's functions")
 
 
-@eqx.filter_jit
-def departures(params, theta, theta_rate, tolerance, until=10.0):
-    """Roll a batch of starts, each with its own tolerance, until it leaves or `until`: (t, θ, left?)."""
+@compiled
+def departures(params, theta, theta_rate, tolerance, until):
+    """Roll a batch of starts, each with its own tolerance, until it leaves or `until`: (t, θ, left?, θ on the way)."""
 
-    def lane(params, theta, theta_rate, tolerance):
+    def lane(params, theta, theta_rate, tolerance, until):
         q, v = start(params, theta, theta_rate)
-        ts = jnp.stack([0.0 * theta, until + 0.0 * theta])
-        tolerances = {"rtol": tolerance, "atol": tolerance}
-        rolled = integrate(system, q, v, params, ts=ts, **tolerances, event=DEPARTURE, throw=False)
-        return rolled.end.t, rolled.end.q["theta"], rolled.result == RESULTS.event_occurred
+        ts, tolerances = jnp.linspace(0.0, until, 41), {"rtol": tolerance, "atol": tolerance}
+        rolled = integrate(system, q, v, params, ts=ts, **tolerances, events=DEPARTURE, throw=False)
+        return rolled.end.t, rolled.end.q["theta"], rolled.result == RESULTS.event_occurred, rolled.q["theta"]
 
-    return jax.vmap(lane)(params, theta, theta_rate, tolerance)
+    return jax.vmap(lane)(params, theta, theta_rate, tolerance, until)
 
 
-def batch(starts):
+def batch(starts, until=10.0):
     """Stack starts (β, θ₀, θ̇₀, tolerance) into the arguments of `departures`."""
     beta, theta, theta_rate, tolerance = (np.array(column) for column in zip(*starts))
     shared = {name: np.full(len(beta), value) for name, value in PARAMS.items()}
-    return shared | {"beta": beta}, theta, theta_rate, tolerance
+    return shared | {"beta": beta}, theta, theta_rate, tolerance, np.full(len(beta), until)
 
 
 def cases():
@@ -294,7 +290,7 @@ def cases():
         "from rest 2^-10 off the top": (1.0, TOP - 2.0**-10, 0.0, 1e-12),
         "from rest 2^-20 off the top": (1.0, TOP - 2.0**-20, 0.0, 1e-13),
     }
-    times, angles, left = map(np.asarray, departures(*batch(starts.values())))
+    times, angles, left, _ = map(np.asarray, departures(*batch(starts.values())))
     rows = []
     for i, (name, (beta, theta0, theta_rate0, _)) in enumerate(starts.items()):
         params = PARAMS | {"beta": beta}
@@ -307,17 +303,17 @@ def cases():
             error = max(error, abs(times[i] - time) / time)
         happened = f"leaves at {np.degrees(angle):.4f} deg, t = {times[i]:.6f}" if left[i] else "DOES NOT LEAVE"
         rows.append(Case(name, happened, error, 1e-9))
-    rows.append(_top(lanes=len(starts)))
+    rows.append(_top())
     rows.append(_refusal("too fast at the start, rate -3", 1.25, -3.0))
     rows.append(_refusal("at rest on the side, theta = 0", 0.0, 0.0))
     return [*rows, _no_inertia(), _hundred_swings()]
 
 
-def _top(lanes):
+def _top(lanes=LANES):
     """An equilibrium. The double nearest to π/2 is 6e-17 short of it, which grows like cosh(w t): 1e-8 in 10 s."""
     # A batch of its own, of the size already compiled: optimistix's bisection raises for a lane without an event
     # in a batch where others have one.
-    _, angles, left = departures(*batch([(1.0, TOP, 0.0, 1e-10)] * lanes))
+    _, angles, left, _ = departures(*batch([(1.0, TOP, 0.0, 1e-10)] * lanes))
     off = np.inf if left[0] else abs(float(angles[0]) - TOP)
     return Case("at rest on the top for 10 s", "stays; pi/2 is rounded, and that grows", off, 1e-7)
 
@@ -369,10 +365,11 @@ def picture():
 
 
 def _draw_path(axis):
-    ts, theta0 = np.linspace(0.0, 2.0, 41), TOP - 2.0**-3
-    rolled = roll(PARAMS, theta0, 0.0, ts, rtol=1e-9, atol=1e-9)
-    theta = np.asarray(rolled.q["theta"])
-    theta = np.append(theta[np.isfinite(theta)], rolled.end.q["theta"])
+    theta0 = TOP - 2.0**-3
+    # As many lanes as in the cases, for which it is compiled.
+    rolled = departures(*batch([(1.0, theta0, 0.0, 1e-9)] * LANES, until=2.0))
+    time, last, _, theta = (np.asarray(x)[0] for x in rolled)
+    theta = np.append(theta[np.isfinite(theta)], last)
     l, a = PARAMS["R"] + PARAMS["a"], PARAMS["a"]
     around = np.linspace(0.0, 2 * np.pi, 181)
     axis.fill(np.cos(around), np.sin(around), facecolor="0.85", edgecolor="0.4")
@@ -385,7 +382,7 @@ def _draw_path(axis):
     for x, y, i in hoops:
         axis.plot(x + a * np.cos(around), y + a * np.sin(around), color=plot.COLOURS[i], linewidth=0.9)
     axis.axhline(-1.0, color="0.4")
-    axis.set(xlabel="x", ylabel="y", title=f"Leaves at t = {float(rolled.end.t):.4f}", aspect="equal", xlim=(-1.1, 2.1))
+    axis.set(xlabel="x", ylabel="y", title=f"Leaves at t = {time:.4f}", aspect="equal", xlim=(-1.1, 2.1))
     axis.legend(fontsize=8, frameon=False)
 
 

@@ -28,12 +28,12 @@ angles are carried with their round-off. (arccos(p₁ · p₂) loses all of them
 
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from lagjax import plot
+from lagjax.mechanics.compiled import compiled
 from lagjax.mechanics.constraints import Holonomic
 from lagjax.mechanics.multipliers import accelerations
 from lagjax.mechanics.system import System
@@ -247,7 +247,7 @@ def _over_the_poles():
     return Run("embedded, over both poles", embedded, PARAMS, q0, v0, ts, error, "r and dr/ds against the circle")
 
 
-@eqx.filter_jit
+@compiled
 def arrivals(q0, v0, arc):
     """Where a batch of starts in r is after its arc lengths: (N, 3)."""
     ends = lambda q, v, s: integrate(
@@ -256,7 +256,7 @@ def arrivals(q0, v0, arc):
     return jax.vmap(ends)(q0, v0, arc)
 
 
-@eqx.filter_jit
+@compiled
 def colatitudes(psi, slope, theta1, theta2, atol):
     """ψ(θ₂) for a batch of starts (ψ, ψ') at θ₁, over the azimuth."""
     ends = lambda q, v, a, b, atol: integrate(

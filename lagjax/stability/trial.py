@@ -15,13 +15,13 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import diffrax
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
 from lagjax.mechanics import coordinates
+from lagjax.mechanics.compiled import compiled
 from lagjax.mechanics.system import System
 from lagjax.motion.integrate import integrate
 from lagjax.motion.trajectory import Trajectory
@@ -175,7 +175,7 @@ class Trial:
         return relative_error(_gathered(got), _gathered(wanted))
 
 
-@eqx.filter_jit
+@compiled
 def _derivative(system, point, tangents, ts, options, observed):
     """The directional derivative of what is observed, in forward mode."""
 

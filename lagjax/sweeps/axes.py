@@ -1,11 +1,11 @@
 """What varies in a sweep: named axes, as a grid or zipped, and the point at each flat index."""
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
@@ -42,13 +42,12 @@ class Axes(eqx.Module):
     @property
     def size(self) -> int:
         """How many points there are."""
-        return int(np.prod(self.shape, dtype=np.int64))
+        return math.prod(self.shape)
 
     def at(self, index) -> dict[str, Any]:
-        """The point at a flat index, traced or not."""
-        places = [index] * len(self.names) if self.zipped else _unravelled(index, self.shape)
-        take = lambda x, i: x[i] if isinstance(i, int) else jax.lax.dynamic_index_in_dim(x, i, keepdims=False)
-        return {name: take(x, i) for name, x, i in zip(self.names, self.arrays, places)}
+        """The point at a flat index, or of several indices (n,) their values (n, ...) by name."""
+        places = [index] * len(self.names) if self.zipped else np.unravel_index(index, self.shape)
+        return {name: x[i] for name, x, i in zip(self.names, self.arrays, places)}
 
     def words(self, index: int) -> str:
         """The point at a flat index as a person writes it."""
@@ -56,14 +55,6 @@ class Axes(eqx.Module):
         return ", ".join(
             f"{name} = {x:.6g}" if x.ndim == 0 else f"{name} of shape {x.shape}" for name, x in point.items()
         )
-
-
-def _unravelled(index, shape):
-    places = []
-    for length in reversed(shape):
-        places.append(index % length)
-        index = index // length
-    return places[::-1]
 
 
 def axes_of(axes: Any, zipped: bool) -> Axes:
@@ -84,6 +75,10 @@ def axes_of(axes: Any, zipped: bool) -> Axes:
                 f"axis '{name}' must be an array of at least one number, and is {given!r:.60}.\n{example} "
                 "What does not vary belongs into run."
             )
+        if str(name) in values:
+            raise ValueError(
+                f"two axes are named '{name}', by a text and by a number.\nFix: one of them by another text."
+            )
         # In the dtype that JAX would give it: float64 where that is enabled.
         values[str(name)] = x.astype(jax.dtypes.canonicalize_dtype(x.dtype))
     lengths = {name: len(x) for name, x in values.items()}
@@ -93,15 +88,4 @@ def axes_of(axes: Any, zipped: bool) -> Axes:
             f"zipped axes must be of one length: {told}.\n"
             "Usual cause: a grid was meant.\nFix: leave zipped=True out, or cut the axes to one length."
         )
-    found = Axes(tuple(values), tuple(values.values()), zipped)
-    if found.size > jnp.iinfo(index_dtype()).max:
-        raise ValueError(
-            f"{found.size} points are more than {index_dtype()} can count.\n"
-            'Fix: jax.config.update("jax_enable_x64", True) before the first array.'
-        )
-    return found
-
-
-def index_dtype():
-    """The dtype of flat indices."""
-    return jax.dtypes.canonicalize_dtype(np.int64)
+    return Axes(tuple(values), tuple(values.values()), zipped)

@@ -15,13 +15,16 @@ import jax
 import numpy as np
 from jaxtyping import ArrayLike
 
+from lagjax.jax_internals.one_function import TOGETHER
 from lagjax.meter import meter
 from lagjax.motion.trajectory import RESULTS
-from lagjax.numerics.one_function import TOGETHER
 from lagjax.sweeps.axes import axes_of
-from lagjax.sweeps.lanes import LAYOUTS, NOT_RUN, STATUS_TYPES, Status, compiled
+from lagjax.sweeps.fingerprint import check_file_names, in_words, named_leaves, versions
+from lagjax.sweeps.lanes import GOOD, LAYOUTS, NOT_RUN, STATUS_TYPES, Status
+from lagjax.sweeps.memory import bytes_of, check_memory
+from lagjax.sweeps.remembered import program_for
 from lagjax.sweeps.result import Stored, Sweep
-from lagjax.sweeps.store import chunk_of, open_store
+from lagjax.sweeps.store import chunk_of, open_store, tell
 
 # Points for one call of the compiled program. On a CPU a call costs 0.2 ms, and more gains nothing; a GPU is filled.
 CHUNK = {"cpu": 1024, "gpu": 65536}
@@ -36,8 +39,8 @@ ALIKE = 1.5
 # Lanes together wait for the longest: one that takes more steps than this is run again, alone.
 PATIENCE = 2**15
 MAX_STEPS = int(RESULTS.max_steps_reached._value)
-# Of the memory that is free.
-FILL_AT_MOST = 0.8
+# Two versions may differ by so much, relative to the largest value, before it is told.
+ALIKE_VERSIONS = 1e-6
 
 
 def sweep(
@@ -46,6 +49,7 @@ def sweep(
     *,
     zipped: bool = False,
     store: str | os.PathLike | None = None,
+    accept_versions: bool = False,
     part: tuple[int, int] | None = None,
     chunk: int | None = None,
     layout: str = "together",
@@ -77,7 +81,10 @@ def sweep(
     **Long sweeps:**
 
     - `store`: a directory, to which blocks of points are written as they are finished (zarr). Called again with the
-      same sweep, only what is missing is computed; a store of another sweep is refused.
+      same sweep, only what is missing is computed; a store of another sweep is refused. What is there is read once and
+      checked against its checksums; what is not whole is told, and computed again.
+    - `accept_versions`: go on with a store that other versions of lagjax, jax or diffrax have begun. Whether `run` is
+      still the same function cannot be told then: a few points are computed again, and told if they differ.
     - `part`: (k, n): this process computes every n-th block from the k-th on; by default as `jax.distributed` says.
     - `progress`: show points done, rate and time left (tqdm); by default where somebody may look.
 
@@ -90,6 +97,9 @@ def sweep(
       rest; by default for lanes together, from 16,000 points on.
     - `devices`: JAX devices to split each chunk between; by default all.
     - `workers`: chunks at a time; by default the cores of the CPU, or two.
+
+    Called again for the same function, or one that is written anew and reads the same from outside, over axes of the
+    same names, shapes and dtypes, it compiles nothing, whatever their values and lengths.
 
     **Returns:** a `Sweep`. Interrupted (Ctrl-C) it has what was done, and `swept.resweep()` does the rest.
 
@@ -112,25 +122,35 @@ def sweep(
         # What was begun on other cores goes on as it was begun.
         chunk = chunk_of(store)
     elif chunk is None:
-        each = max(math.ceil(grid.size / (CHUNKS_EACH * workers)), min(TOGETHER, math.ceil(grid.size / workers)))
-        chunk = min(CHUNK.get(platform, CHUNK["gpu"]), each)
-    chunk = math.ceil(chunk / len(devices)) * len(devices)
-    engine = _Engine(run, grid, chunk, workers, sort, layout, devices)
-    _check_memory(grid, engine.program, workers, store, devices)
+        chunk = _length(grid.size, workers, CHUNK.get(platform, CHUNK["gpu"]))
+    engine = _Engine(run, grid, chunk, workers, sort, layout, devices, progress)
+    if store is not None:
+        check_file_names("axis", list(grid.names))
+        check_file_names("value", [name for name, _ in named_leaves(engine.program.values)])
+    check_memory(grid, engine.program, workers, store, devices)
     if store is None:
-        return _in_memory(engine, np.arange(grid.size), None, progress)
-    return _in_store(engine, grid, store, part, progress)
+        return _in_memory(engine, np.arange(grid.size), None)
+    return _in_store(engine, grid, Path(store), part, accept_versions)
 
 
 class _Engine:
     """A compiled program and how it is called."""
 
-    def __init__(self, run, axes, chunk, workers, sort, layout, devices):
-        self.run, self.axes, self.chunk = run, axes, chunk
+    def __init__(self, run, axes, chunk, workers, sort, layout, devices, progress):
+        self.run, self.axes, self.chunk = run, axes, math.ceil(chunk / len(devices)) * len(devices)
         self.workers, self.sort, self.layout, self.devices = workers, sort, layout, devices
+        self.progress = progress
         patience = PATIENCE if layout == "together" else None
-        self.program = compiled(run, axes, chunk, devices, layout, patience)
+        self.program, seconds = program_for(run, axes, self.chunk, devices, layout, patience, progress)
+        # Before anything runs, and since then.
+        self._compiling = [seconds, 0.0]
         self._lock, self._one = threading.Lock(), None
+
+    def seconds_since(self, started):
+        """The seconds of compiling and of computing since then; what was compiled before it for that, too."""
+        spent, (earlier, later) = time.perf_counter() - started, self._compiling
+        self._compiling = [0.0, 0.0]
+        return earlier + later, spent - later
 
     @property
     def words(self):
@@ -142,18 +162,22 @@ class _Engine:
 
     def with_run(self, run, count):
         """The same for another run, over `count` points."""
-        devices = len(self.devices)
-        chunk = min(self.chunk, math.ceil(count / self.workers / devices) * devices)
-        return _Engine(run, self.axes, chunk, self.workers, self.sort, self.layout, self.devices)
+        chunk = _length(count, self.workers, self.chunk)
+        return _Engine(run, self.axes, chunk, self.workers, self.sort, self.layout, self.devices, self.progress)
+
+    def first(self, indices):
+        """(values, status) at no more than `chunk` indices, as the program of many lanes has them."""
+        return self.program.call(self.axes.at(np.resize(indices, self.chunk)), len(indices))
 
     def at(self, indices):
         """(values, status) at no more than `chunk` indices; lanes that were given up are run alone."""
-        values, status = self.program.call(indices)
+        values, status = self.first(indices)
         given_up = (status.result == MAX_STEPS) & (status.steps >= PATIENCE) & (self.layout == "together")
         if given_up.any():
             values, status = jax.tree.map(np.array, (values, status))
             for i in np.flatnonzero(given_up):
-                for every, one in zip(*map(jax.tree.leaves, ((values, status), self._alone.call(indices[i : i + 1])))):
+                alone = self._alone.call(self.axes.at(indices[i : i + 1]), 1)
+                for every, one in zip(*map(jax.tree.leaves, ((values, status), alone))):
                     every[i] = one[0]
         return values, status
 
@@ -161,7 +185,9 @@ class _Engine:
     def _alone(self):
         # Compiled only where a lane needs it.
         with self._lock:
-            self._one = self._one or compiled(self.run, self.axes, 1, self.devices[:1], "in turn")
+            if self._one is None:
+                self._one, seconds = program_for(self.run, self.axes, 1, self.devices[:1], "in turn")
+                self._compiling[1] += seconds
         return self._one
 
     def over(self, indices):
@@ -191,17 +217,17 @@ class _Engine:
         if not worth:
             return places
         few = places[:: max(1, len(indices) // min(self.chunk, PILOTS))][: self.chunk]
-        steps = self.program.call(indices[few])[1].steps
+        steps = self.first(indices[few])[1].steps
         if self.sort is None and steps.max() <= ALIKE * steps.mean():
             return places
         return np.argsort(np.interp(places, few, steps), kind="stable")
 
 
-def _in_memory(engine, indices, before, progress):
+def _in_memory(engine, indices, before):
     started, axes = time.perf_counter(), engine.axes
     values, status = _not_run(engine.program, axes.size) if before is None else jax.tree.map(np.copy, before)
     done = 0
-    with _meter(len(indices), progress) as shown:
+    with _meter(len(indices), engine.progress) as shown:
         try:
             for places, found, how in engine.over(indices):
                 at = indices[places]
@@ -213,7 +239,7 @@ def _in_memory(engine, indices, before, progress):
                 shown.update(len(places))
         except KeyboardInterrupt:
             _tell_interrupted(done, len(indices), "swept.resweep() does the rest.")
-    seconds = time.perf_counter() - started
+    compiling, seconds = engine.seconds_since(started)
 
     def again(swept, other, which):
         if len(which) == 0:
@@ -225,9 +251,9 @@ def _in_memory(engine, indices, before, progress):
                 f"this run returns another structure than the sweep has: {jax.tree.structure(rerun.program.values)}, "
                 f"not {jax.tree.structure(engine.program.values)}.\nFix: return the same, computed with other settings."
             )
-        return _in_memory(rerun, which, flat, progress)
+        return _in_memory(rerun, which, flat)
 
-    return Sweep(axes, values, status, engine.words, done, seconds, again)
+    return Sweep(axes, values, status, engine.words, done, compiling, seconds, again)
 
 
 def _not_run(program, count):
@@ -238,18 +264,19 @@ def _not_run(program, count):
     return values, Status(*(np.full(count, fill, dtype) for fill, dtype in zip(fills, STATUS_TYPES)))
 
 
-def _in_store(engine, axes, path, part, progress):
+def _in_store(engine, axes, path, part, accept_versions):
     started = time.perf_counter()
-    block = None if Path(path).exists() else _block(engine, axes, part)
-    store = open_store(path, axes, engine.program, engine.layout, block)
-    (k, n), block = part, store.block
+    block = None if path.exists() else _block(engine, axes, part)
+    store = open_store(path, axes, engine.program, engine.layout, block, part, accept_versions)
+    _compare_versions(engine, store)
+    k, n = part
     missing = [number for number in store.missing().tolist() if number % n == k]
-    length = lambda number: min(block, axes.size - number * block)
+    length = lambda number: store.points(number).stop - store.points(number).start
     done = 0
-    with _meter(sum(map(length, missing)), progress) as shown:
+    with _meter(sum(map(length, missing)), engine.progress) as shown:
         try:
             for number in missing:
-                indices = np.arange(number * block, number * block + length(number))
+                indices = np.r_[store.points(number)]
                 values, status = _not_run(engine.program, len(indices))
                 for places, found, how in engine.over(indices):
                     for whole, some in zip(jax.tree.leaves((values, status)), jax.tree.leaves((found, how))):
@@ -267,8 +294,36 @@ def _in_store(engine, axes, path, part, progress):
         )
 
     here = f"{engine.words}, in {path}"
-    seconds = time.perf_counter() - started
-    return Sweep(axes, Stored(store, engine.program.values), store.status(), here, done, seconds, again)
+    status, _, lost = store.status()
+    if lost:
+        tell(path, lost.values(), "Fix: this call without part, or with the part that they belong to.", stacklevel=3)
+    compiling, seconds = engine.seconds_since(started)
+    return Sweep(axes, Stored(store, engine.program.values), status, here, done, compiling, seconds, again)
+
+
+def _compare_versions(engine, store):
+    """Where other versions have begun a store, compute some of its points again and tell how they differ."""
+    there, number = store.about["fingerprint"], store.first()
+    if there["program"] == engine.program.digest or number is None:
+        return
+    indices = np.r_[store.points(number)][: engine.program.chunk]
+    found, status = engine.first(indices)
+    worst, name = 0.0, None
+    for (leaf, x), before in zip(named_leaves(found), store.read(indices)):
+        good = np.isin(status.result, GOOD)
+        x, before = x[good].astype(complex), before[good].astype(complex)
+        largest = np.max(np.abs(before), initial=0.0)
+        off = np.max(np.abs(x - before), initial=0.0) / (largest if largest > 0 else 1.0)
+        if not off <= worst:
+            worst, name = off, leaf
+    if not worst <= ALIKE_VERSIONS:
+        warnings.warn(
+            f"{store.path} was begun with {in_words(there['versions'])}, and is continued with {in_words(versions())}: "
+            f"computed again, '{name}' of {len(indices):,} of its points differs by {worst:.1e} of its largest value.\n"
+            "Usual cause: run is another function than it was; or a motion that amplifies round-off.\n"
+            "Fix: another path, to compute all of it anew.",
+            stacklevel=4,
+        )
 
 
 def _block(engine, axes, part):
@@ -276,18 +331,12 @@ def _block(engine, axes, part):
     chunk = engine.program.chunk
     first = np.arange(min(chunk, axes.size))
     started = time.perf_counter()
-    engine.program.call(first)
+    engine.first(first)
     seconds = max(time.perf_counter() - started, 1e-6)
     wanted = max(1, round(BLOCK_SECONDS * engine.workers / seconds)) * chunk
     fair = max(1, axes.size // (CHUNKS_EACH * part[1] * chunk)) * chunk
-    fits = max(1, int(BLOCK_BYTES / (_bytes(engine.program) * chunk))) * chunk
+    fits = max(1, int(BLOCK_BYTES / (bytes_of(engine.program) * chunk))) * chunk
     return min(wanted, fair, fits)
-
-
-def _bytes(program):
-    """What one point's values and status take."""
-    of_status = sum(dtype.itemsize for dtype in STATUS_TYPES)
-    return of_status + sum(math.prod(x.shape) * x.dtype.itemsize for x in jax.tree.leaves(program.values))
 
 
 def _check(layout, part, store):
@@ -303,33 +352,17 @@ def _check(layout, part, store):
         )
 
 
-def _check_memory(axes, program, workers, store, devices):
-    on_host, free = devices[0].platform == "cpu", _free_memory()
-    of_device = None if on_host else (devices[0].memory_stats() or {}).get("bytes_limit")
-    if of_device is not None and workers * program.working > of_device:
-        raise MemoryError(
-            f"a chunk of {program.chunk:,} points works with {program.working / 1e9:.3g} GB on each device, and "
-            f"{workers} at a time do not fit into its {of_device / 1e9:.3g} GB.\nFix: chunk={program.chunk // 4}."
-        )
-    kept = 0 if store is not None else axes.size * _bytes(program)
-    needed = kept + (workers * program.working if on_host else 0)
-    if free is not None and needed > FILL_AT_MOST * free:
-        raise MemoryError(
-            f"this sweep needs {needed / 1e9:.3g} GB: {axes.size:,} points of {_bytes(program):,} bytes, and "
-            f"{workers} x {program.working / 1e9:.2g} GB to work in. {free / 1e9:.3g} GB are free.\n"
-            "Usual cause: run returns whole trajectories, or a grid with one axis too many.\n"
-            'Fix: return less of each point (a final state, a period), or store="directory"; chunk= for less at a time.'
-        )
+def _length(count, workers, most):
+    """The points of a chunk: of few lengths, so that a sweep of some points more is served by the same program.
 
-
-def _free_memory():
-    """Bytes that can be had without swapping, where the system tells."""
-    try:
-        lines = Path("/proc/meminfo").read_text().splitlines()
-    except OSError:
-        return None
-    told = {line.split(":")[0]: int(line.split()[1]) * 1024 for line in lines}
-    return told.get("MemAvailable")
+    Large chunks are shortened, which costs more calls; small ones are filled with points of which nobody asks.
+    """
+    each = max(math.ceil(count / (CHUNKS_EACH * workers)), min(TOGETHER, math.ceil(count / workers)))
+    each = min(each, most)
+    if each >= TOGETHER:
+        return 2 ** (each.bit_length() - 1)
+    step = 2 ** max(0, each.bit_length() - 4)
+    return min(math.ceil(each / step) * step, most)
 
 
 def _cores():

@@ -1,33 +1,34 @@
-"""The compiled program of a sweep: some points, by their flat indices, to values and statuses.
+"""The compiled program of a sweep: the values that its axes have at some points, to values and statuses.
 
 Lanes run together, under `vmap`, each with its own steps; on a CPU `integrate` takes 256 of them at a time. `"in turn"`
 takes one after the other, which measures slower nearly everywhere (`benchmarks/sweep.py`), and needs the least memory.
 """
 
 from collections.abc import Callable, Sequence
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.sharding import Mesh, PartitionSpec
+from jax.sharding import Mesh, NamedSharding, PartitionSpec, SingleDeviceSharding
 from jaxtyping import PyTree
 
 from lagjax.mechanics.first_call import Call, check_arguments, in_words
 from lagjax.motion.reported import PATIENCE, reporting
-from lagjax.motion.trajectory import RESULTS, Trajectory
-from lagjax.sweeps.axes import POINT, Axes, index_dtype
+from lagjax.motion.trajectory import ENDED_WELL, RESULTS, Trajectory
+from lagjax.sweeps.axes import POINT, Axes
+from lagjax.sweeps.digests import program_digest
 
-NOT_RUN = -1
+NOT_RUN, LOST = -1, -2
 LAYOUTS = ("together", "in turn")
 
 
 class Status(NamedTuple):
     """How each point went, arrays in the shape of the sweep.
 
-    `result` is the code of a `RESULTS` item, or -1 where the point was not run; `steps` those of all its integrations;
-    `departure` and `residual` the worst (`Trajectory`), 0 where nothing was integrated.
+    `result` is the code of a `RESULTS` item, -1 where the point was not run, -2 where it is lost from its store;
+    `steps` those of all its integrations; `departure` and `residual` the worst (`Trajectory`), 0 where nothing was
+    integrated.
     """
 
     result: Any
@@ -37,17 +38,23 @@ class Status(NamedTuple):
 
 
 STATUS_TYPES = Status(np.dtype(np.int8), np.dtype(np.int32), np.dtype(np.float32), np.dtype(np.float32))
-GOOD = tuple(int(item._value) for item in (RESULTS.successful, RESULTS.event_occurred, RESULTS.drifted))
+# What is to be trusted, and what there is a value of.
+TRUSTED = tuple(int(item._value) for item in ENDED_WELL)
+GOOD = (*TRUSTED, *(int(item._value) for item in (RESULTS.drifted, RESULTS.not_converged, RESULTS.misfit)))
 
 
 class Program(NamedTuple):
-    """A compiled program for `chunk` indices: one point's shapes, the bytes that it works with, what was traced."""
+    """A compiled program for `chunk` points: one point's shapes, the bytes that it works with, a digest of its text.
+
+    `call(point, count)`: (values, status) of no more than `chunk` points, as NumPy arrays; `point` has the values of so
+    many by axis.
+    """
 
     call: Callable
     chunk: int
     values: PyTree
     working: int
-    traced: Any
+    digest: str
 
 
 def point_of(run: Callable) -> Callable:
@@ -78,35 +85,31 @@ def point_of(run: Callable) -> Callable:
 def compiled(run: Callable, axes: Axes, chunk: int, devices: Sequence, layout: str, patience=None) -> Program:
     """Compile a sweep's program for chunks of some length, split between the devices.
 
-    With `patience`, motions in it are given up after so many steps.
+    Of the axes only names, shapes and dtypes matter. With `patience`, motions in it are given up after so many steps.
     """
     point = point_of(run)
 
-    def lanes(axes, indices):
-        at = lambda index: point(axes.at(index))
-        return jax.lax.map(at, indices) if layout == "in turn" else jax.vmap(at)(indices)
+    def lanes(values):
+        at = lambda values: point(dict(zip(axes.names, values)))
+        return jax.lax.map(at, values) if layout == "in turn" else jax.vmap(at)(values)
 
-    function = lanes
+    function, placed = lanes, SingleDeviceSharding(devices[0])
     if len(devices) > 1:
         mesh, split = Mesh(np.asarray(devices), ("lanes",)), PartitionSpec("lanes")
-        function = jax.shard_map(lanes, mesh=mesh, in_specs=(PartitionSpec(), split), out_specs=split, check_vma=False)
-    shaped = partial(jax.tree.map, lambda x: jax.ShapeDtypeStruct(np.shape(x), x.dtype))
-    indices = jax.ShapeDtypeStruct((chunk,), index_dtype())
+        function = jax.shard_map(lanes, mesh=mesh, in_specs=split, out_specs=split, check_vma=False)
+        placed = NamedSharding(mesh, split)
+    shaped = tuple(jax.ShapeDtypeStruct((chunk, *x.shape[1:]), x.dtype, sharding=placed) for x in axes.arrays)
     of_user = Call("run", run, (POINT,))
     check_arguments(of_user, "the axes taken one by one; a point is one dictionary")
     with PATIENCE(patience), in_words(of_user, {POINT: axes.values}):
-        traced = jax.jit(function).trace(shaped(axes), indices)
+        traced = jax.jit(function).trace(shaped)
     shapes, _ = traced.out_info
     program = traced.lower().compile()
     memory = program.memory_analysis()
     working = 0 if memory is None else memory.temp_size_in_bytes + memory.output_size_in_bytes
-    placed = jax.device_put(axes, None if len(devices) > 1 else devices[0])
 
-    def call(indices):
-        """(values, status) at some flat indices, as NumPy arrays; no more than `chunk`."""
-        count = len(indices)
-        filled = np.resize(indices, chunk).astype(index_dtype())
-        return jax.tree.map(lambda x: np.asarray(x)[:count], program(placed, filled))
+    def call(point, count):
+        return jax.tree.map(lambda x: np.asarray(x)[:count], program(tuple(point.values())))
 
     one = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), shapes)
-    return Program(call, chunk, one, working, traced)
+    return Program(call, chunk, one, working, program_digest(traced.jaxpr))

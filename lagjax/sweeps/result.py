@@ -1,6 +1,8 @@
 """The answer of a sweep: values and statuses by axis, printed, plotted, exported, and what failed run again."""
 
+import os
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -9,10 +11,18 @@ from jaxtyping import PyTree
 
 from lagjax import plot
 from lagjax.mechanics import coordinates
-from lagjax.motion.trajectory import RESULTS, Trajectory, in_words
+from lagjax.motion.trajectory import Trajectory, in_words
 from lagjax.sweeps.axes import POINT, Axes
-from lagjax.sweeps.lanes import GOOD, NOT_RUN, Status
-from lagjax.sweeps.store import Store, named_leaves
+from lagjax.sweeps.fingerprint import in_words as versions_in_words
+from lagjax.sweeps.fingerprint import named_leaves, versions
+from lagjax.sweeps.lanes import LOST, NOT_RUN, TRUSTED, Status
+from lagjax.sweeps.metadata import restore
+from lagjax.sweeps.store import Store, nothing, tell
+
+COMPUTED_AGAIN = (
+    "These points are lost in status, and NaN or 0 in values.\n"
+    "Fix: lj.sweep(run, axes, store=path), which computes them again."
+)
 
 
 class Sweep:
@@ -20,18 +30,31 @@ class Sweep:
 
     - `axes`: the names and values of what varied; `dims` the dimensions and their lengths.
     - `values`: what `run` returned, each leaf with the axes in front (NumPy). NaN where a point failed. Of a sweep with
-      a store they are read from it when asked for.
+      a store they are read from it when asked for; what cannot be read is told, and lost in `status`.
     - `status`: a `Status` of arrays in the shape of the axes; `ok` where the values are to be trusted.
-    - `how`: what ran it, in words; `ran` how many points this call computed, in how many `seconds`.
+    - `how`: what ran it, in words; `ran` how many points this call computed, in how many `seconds`, after so many of
+      `compiling`: 0 where a sweep before it had done that.
     """
 
     def __init__(
-        self, axes: Axes, values: "PyTree | Stored", status: Status, how: str, ran: int, seconds: float, again: Callable
+        self,
+        axes: Axes,
+        values: "PyTree | Stored",
+        status: Status,
+        how: str,
+        ran: int,
+        compiling: float,
+        seconds: float,
+        again: Callable,
     ):
         self.axes = axes
         self.status = Status(*(x.reshape(axes.shape) for x in status))
-        self.how, self.ran, self.seconds = how, ran, seconds
+        self.how, self.ran, self.compiling, self.seconds = how, ran, compiling, seconds
         self._values, self._again = values, again
+
+    def __getstate__(self):
+        # What ran it is a compiled program, which stays where it was compiled.
+        return self.__dict__ | {"_again": _cannot}
 
     @property
     def dims(self) -> dict[str, int]:
@@ -41,14 +64,16 @@ class Sweep:
     @property
     def values(self) -> PyTree:
         """What `run` returned, each leaf with the axes in front."""
-        flat = self._values() if isinstance(self._values, Stored) else self._values
+        flat = self._values
+        if isinstance(flat, Stored):
+            flat, lost = flat.read(self.status.result.reshape(-1) == LOST)
+            self.status.result.reshape(-1)[lost] = LOST
         return jax.tree.map(lambda x: x.reshape(self.axes.shape + x.shape[1:]), flat)
 
     @property
     def ok(self) -> np.ndarray:
-        """Which points were computed to their end and drifted no farther than the tolerance lets expect."""
-        trusted = [code for code in GOOD if code != int(RESULTS.drifted._value)]
-        return np.isin(self.status.result, trusted)
+        """Which points were computed to their end, drifting no more than the tolerance lets expect, or fitted well."""
+        return np.isin(self.status.result, TRUSTED)
 
     def counts(self) -> dict[str, int]:
         """How many points went which way, in words, the most frequent first."""
@@ -71,7 +96,7 @@ class Sweep:
 
         The outputs of a `Trajectory` have the dimension `t`, where all points share their times.
 
-        **Raises:** `ImportError` without xarray.
+        **Raises:** `ImportError` without xarray; `ValueError` for two values of one name.
         """
         try:
             import xarray
@@ -79,7 +104,11 @@ class Sweep:
             raise ImportError('this needs xarray, an optional extra.\nFix: pip install "lagjax[data]"') from error
         coords, variables = self._coordinates(), {}
         for name, dims, x in self._labelled(coords):
-            variables[name] = ((*self.dims, *dims), x)
+            # An axis of that name is a coordinate.
+            free = f"value_{name}" if name in coords else name
+            if free in variables:
+                raise ValueError(f"two of the values are named '{name}'.\nFix: another key in what run returns.")
+            variables[free] = ((*self.dims, *dims), x)
         for name, x in zip(Status._fields, self.status):
             variables[f"status_{name}" if name in variables else name] = (tuple(self.dims), x)
         dataset = xarray.Dataset(variables, coords)
@@ -187,8 +216,10 @@ class Sweep:
         if residual.any():
             rows.append(("worst constraint residual", f"{residual.max():.1e} (relative)"))
         rows.append(("values", ", ".join(self._shapes())))
-        speed = f"; {self.seconds:.3g} s, {self.ran / self.seconds:,.0f} points/s" if self.ran else ""
-        rows.append(("run", f"{self.how}{speed}"))
+        rows.append(("run", self.how))
+        if self.ran:
+            compiled = f"compiled in {self.compiling:.3g} s" if self.compiling else "nothing had to be compiled"
+            rows.append(("", f"{compiled}; computed in {self.seconds:.3g} s, {self.ran / self.seconds:,.0f} points/s"))
         width = max(len(label) for label, _ in rows)
         return "\n".join(["Sweep", *(f"  {label:<{width}}  {value}" for label, value in rows)])
 
@@ -214,28 +245,41 @@ def _without_motion(part):
 
 
 def _words(code):
-    return "not run" if code == NOT_RUN else in_words(code)
+    return {NOT_RUN: "not run", LOST: "lost from the store"}.get(int(code)) or in_words(code)
 
 
-def open_sweep(path) -> Sweep:
-    """The sweep in a store, without what ran it: its values are a dictionary by name."""
-    store = Store(path)
-    status = store.status()
-    values = Stored(store, None)
-    missing = len(store.missing())
-    how = f"from {path}" + (f", of which {missing} blocks are missing" if missing else "")
-    return Sweep(store.axes(), values, status, how, 0, 0.0, _cannot)
+def open_sweep(path: str | os.PathLike) -> Sweep:
+    """Open the sweep in a store, without what ran it: its values are a dictionary by name.
+
+    Any version of lagjax, jax and diffrax may have written it. Statuses are read now, values when they are asked for.
+    A file that is missing, cut off or of another block is seen now, without reading the values; one that has changed
+    inside, when they are read. Either is told by name, and from then on its points are "lost from the store" in
+    `status`, and not `ok`; `lj.sweep(run, axes, store=path)` computes them again.
+
+    **Raises:** `ValueError` where there is no store, or nothing can be told of it.
+    """
+    path = Path(path)
+    if wrong := restore(path):
+        tell(path, wrong, "It is put back; nothing needs to be done.", stacklevel=2)
+    store = Store(path, "r")
+    axes, (status, missing, lost) = store.axes(), store.status()
+    if lost:
+        tell(path, lost.values(), COMPUTED_AGAIN, stacklevel=2)
+    how = f"from {path}" + (f", of which {len(missing)} blocks are missing" if missing else "")
+    if (by := store.about["fingerprint"]["versions"]) != versions():
+        how += f", written by {versions_in_words(by)}"
+    return Sweep(axes, Stored(store, None), status, how, 0, 0.0, 0.0, _cannot)
 
 
 def _cannot(swept, run, indices):
     raise ValueError(
-        "a sweep that was opened from its store does not know what ran it.\n"
-        "Fix: lj.sweep(run, axes, store=path), which computes what is missing."
+        "a sweep that was opened from its store, or copied, does not know what ran it.\n"
+        "Fix: lj.sweep(run, axes, store=path), which computes what is missing; without a store lj.sweep(run, axes)."
     )
 
 
 class Stored:
-    """The values of a store, read when called; `like` has the shapes of one point."""
+    """The values of a store, read when asked for; `like` has the shapes of one point."""
 
     def __init__(self, store: Store, like: PyTree):
         self.store, self._like = store, like
@@ -245,5 +289,16 @@ class Stored:
         """One point's values, as shapes."""
         return self.store.one() if self._like is None else self._like
 
-    def __call__(self):
-        return self.store.values(self._like)
+    def read(self, known: np.ndarray) -> tuple[PyTree, np.ndarray]:
+        """(the values, which points are lost); those that are not `known` to be are told."""
+        values, lost = self.store.values(self._like)
+        where, new = known.copy(), []
+        for number, wrong in lost.items():
+            here = self.store.points(number)
+            new += [] if known[here].all() else [wrong]
+            where[here] = True
+        if new:
+            tell(self.store.path, new, COMPUTED_AGAIN, stacklevel=3)
+        for x in jax.tree.leaves(values):
+            x[where] = nothing(x.dtype)
+        return values, where

@@ -3,203 +3,345 @@
     axes/NAME     the values of the axes
     values/NAME   (points, ...) in blocks along the flat index, by name of what `run` returns
     status/NAME   result, steps, departure, residual
-    done          one byte a block, written last
+    done          (blocks, arrays, 2): of each block the length and the checksum of its file in each array; written last
 
-A block that is not marked is computed again, whatever of it was written. The group is made under another name and then
-renamed, so that several processes may open one store at the same time. Needs zarr (`pip install "lagjax[data]"`).
+A block that is not marked is computed again, whatever of it was written. To zarr a file that is not there is a block of
+fill values, so that the marks must tell what belongs there. They are looked at in two ways:
+
+- a glance, whenever a store is opened: each file is there, is as long as it was and ends as it did. It reads 4 bytes a
+  file, and sees what is missing, cut off, or of another block;
+- a full check, of its own part, when a sweep goes on: each file is read and has its checksum (crc32c).
+
+What neither has seen yet, zarr sees when values are read. Format 1 had one byte a block for a mark and no checksums: in
+it a file that is not there is lost if there should be numbers in it, and one of fill values looks alike.
+
+Needs zarr (`pip install "lagjax[data]"`). A transactional store made for object stores (icechunk 1.1) was tried: of 64
+blocks that 8 processes had committed on a file system 16 were gone, as it warns.
 """
 
-import hashlib
-import json
+import math
 import os
-import re
-import shutil
-import uuid
-from importlib.metadata import version
+import warnings
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
-from jax.core import Tracer
-from jax.extend.core import ClosedJaxpr
 
-from lagjax.numerics.programs import bodies
 from lagjax.sweeps.axes import Axes
-from lagjax.sweeps.lanes import NOT_RUN, STATUS_TYPES, Program, Status
+from lagjax.sweeps.fingerprint import ANOTHER_FUNCTION, differences, fingerprint, named_leaves, of_axis
+from lagjax.sweeps.lanes import GOOD, LOST, NOT_RUN, Program, Status
+from lagjax.sweeps.metadata import DONE, about, create, import_zarr, remove_leftovers, restore
 
-FORMAT = 1
-
-
-def import_zarr():
-    """Import zarr, or say how to get it."""
-    try:
-        import zarr
-    except ImportError as error:
-        raise ImportError(
-            'stores need zarr, which is an optional extra.\nFix: pip install "lagjax[data]", or leave store out.'
-        ) from error
-    return zarr
-
-
-def fingerprint(axes: Axes, program: Program, layout: str) -> dict[str, Any]:
-    """What must be the same for two runs to belong to one store, in words where that is possible."""
-    return {
-        "format": FORMAT,
-        "points": ", ".join(f"{name}: {n}" for name, n in axes.dims.items()),
-        "axes": {name: f"{x.dtype}{list(x.shape)} {_digest(x.tobytes())}" for name, x in axes.values.items()},
-        "values": {name: f"{x.dtype}{list(x.shape)}" for name, x in named_leaves(program.values)},
-        "chunk": program.chunk,
-        "layout": layout,
-        "program": _digest(_text(program.traced.jaxpr).encode()),
-        "versions": {name: version(name) for name in ("lagjax", "jax", "diffrax")},
-    }
-
-
-def named_leaves(tree) -> list[tuple[str, Any]]:
-    """The leaves of what `run` returns, each with a name: its path, or "value" where it is alone."""
-    key = lambda path: jax.tree_util.keystr(path, simple=True, separator=".").lstrip(".") or "value"
-    return [(key(path), leaf) for path, leaf in jax.tree_util.tree_leaves_with_path(tree)]
-
-
-def _digest(data):
-    return hashlib.sha256(data).hexdigest()[:16]
-
-
-def _text(closed: ClosedJaxpr):
-    """A program as text that is the same in every process: without addresses, with the constants of its parts."""
-    constants = "".join(_digest(np.asarray(x).tobytes()) for x in closed.consts if not isinstance(x, Tracer))
-    return re.sub(r"0x[0-9a-f]+", "", str(closed.jaxpr)) + constants + "".join(_constants(closed.jaxpr))
-
-
-def _constants(jaxpr):
-    for equation in jaxpr.eqns:
-        for value in equation.params.values():
-            for part in value if isinstance(value, (tuple, list)) else (value,):
-                if isinstance(part, ClosedJaxpr):
-                    yield from (_digest(np.asarray(x).tobytes()) for x in part.consts)
-        for body in bodies(equation):
-            yield from _constants(body)
+# What zarr and its codecs raise for files that are not what they were.
+UNREADABLE = (ValueError, RuntimeError, TypeError, OSError)
+# The bytes of a checksum.
+CHECKSUM = 4
+# Files that a message names, of many.
+SHOWN = 5
 
 
 class Store:
-    """A sweep's store, open."""
+    """A sweep's store, open. Its metadata are whole: `metadata.restore` comes first."""
 
-    def __init__(self, path):
+    def __init__(self, path: str | os.PathLike, mode: str = "r+"):
         self.path = Path(path)
-        self.group: Any = import_zarr().open_group(str(path), mode="r+")
-        self.about: dict[str, Any] = dict(self.group.attrs["lagjax"])
+        self.about: dict[str, Any] = about(self.path)
+        self.format: int = self.about["fingerprint"]["format"]
+        self._values = [f"values/{name}" for name in self.about["fingerprint"]["values"]]
+        self._status = [f"status/{name}" for name in Status._fields]
+        zarr = import_zarr()
+        # A block of nothing but fill values has a file like any other.
+        with zarr.config.set({"array.write_empty_chunks": True}):
+            group: Any = zarr.open_group(str(path), mode=mode)
+            self.group = group
+            self.arrays: dict[str, Any] = {name: group[name] for name in (*self._values, *self._status)}
+            self._done = group[DONE]
 
     @property
     def block(self) -> int:
         """How many points are written together."""
         return self.about["block"]
 
+    @property
+    def blocks(self) -> int:
+        """How many blocks there are, written or not."""
+        return self._done.shape[0]
+
+    @property
+    def size(self) -> int:
+        """How many points there are."""
+        return self.arrays[self._status[0]].shape[0]
+
+    def points(self, number: int) -> slice:
+        """The flat indices of a block."""
+        return slice(number * self.block, min((number + 1) * self.block, self.size))
+
     def missing(self) -> np.ndarray:
-        """The numbers of the blocks that are not there."""
-        return np.flatnonzero(np.asarray(self.group["done"][:]) == 0)
+        """The numbers of the blocks that are not marked."""
+        return self._missing(self._marks()[0])
+
+    def _marks(self):
+        """(the marks of all blocks, 0 where there is none; the numbers of the blocks whose mark is damaged)."""
+        return _read(self._done, lambda number: slice(number, number + 1), self.blocks)
+
+    def _missing(self, marks):
+        return np.flatnonzero(marks.reshape(self.blocks, -1).max(axis=1) == 0)
 
     def write(self, number: int, values, status: Status):
         """Write a block, and then mark it."""
-        here = slice(number * self.block, number * self.block + len(status.result))
-        for name, x in named_leaves(values):
-            self.group[f"values/{name}"][here] = x
-        for name, x in zip(Status._fields, status):
-            self.group[f"status/{name}"][here] = x
-        self.group["done"][number] = 1
+        here = self.points(number)
+        flat = [x for _, x in named_leaves(values)] + list(status)
+        for array, x in zip(self.arrays.values(), flat):
+            array[here] = x
+        self._done[number] = 1 if self.format == 1 else [_mark(self._file(name, number)) for name in self.arrays]
+
+    def unmark(self, numbers: Iterable[int]):
+        """Forget that some blocks were written."""
+        for number in numbers:
+            self._done[number] = 0
+
+    def damage(self, numbers: Iterable[int], read: bool, marks=None) -> dict[int, str]:
+        """What of some blocks is not whole: by the block's number the file, and what is wrong with it.
+
+        A glance, or with `read` a full check. Blocks that are not marked are not looked at.
+        """
+        marks, unreadable = self._marks() if marks is None else marks
+        found = {}
+        for number in numbers:
+            if number in unreadable:
+                found[number] = f"{self._file(DONE, number)} is damaged"
+            elif np.any(marks[number]):
+                look = self._damage_unchecked if self.format == 1 else self._damage
+                wrong = next(look(number, marks[number], read), None)
+                if wrong is not None:
+                    found[number] = wrong
+        return found
+
+    def first(self) -> int | None:
+        """The number of the first block that is there."""
+        missing = set(self.missing().tolist())
+        return next((number for number in range(self.blocks) if number not in missing), None)
+
+    def read(self, indices: np.ndarray) -> list[np.ndarray]:
+        """The values at some neighbouring points, in order."""
+        return [np.asarray(self.arrays[name][indices[0] : indices[-1] + 1]) for name in self._values]
+
+    def _damage(self, number, mark, read):
+        for name, (length, checksum) in zip(self.arrays, mark.tolist()):
+            if length == 0:
+                continue
+            file = self._file(name, number)
+            try:
+                with open(file, "rb") as content:
+                    there = os.fstat(content.fileno()).st_size
+                    if there != length:
+                        yield f"{file} has {there:,} bytes of {length:,}"
+                        continue
+                    if not read:
+                        content.seek(-CHECKSUM, os.SEEK_END)
+                    data = content.read()
+            except FileNotFoundError:
+                yield f"{file} is missing"
+            except OSError as error:
+                yield f"{file} cannot be read ({error.strerror})"
+            else:
+                if _number(data[-CHECKSUM:]) != checksum or read and _crc32c()(data[:-CHECKSUM]) != checksum:
+                    yield f"{file} is not as it was written"
+
+    def _damage_unchecked(self, number, mark, read):
+        result, here = self.arrays[self._status[0]], self.points(number)
+        for name, array in self.arrays.items():
+            file = self._file(name, number)
+            if file is not None and not file.exists():
+                # Steps and the like that are all 0 had no file; results never were like what fills them.
+                if array is result or name in self._values and np.isin(result[here], GOOD).any():
+                    yield f"{file} is missing"
+            elif read:
+                try:
+                    array[here]
+                except UNREADABLE:
+                    yield f"{file} is damaged"
+
+    def _file(self, name, number):
+        """The file of a block; None where an array has no numbers."""
+        shape = self._done.shape if name == DONE else self.arrays[name].shape
+        return None if math.prod(shape) == 0 else self.path.joinpath(name, "c", str(number), *"0" * (len(shape) - 1))
 
     def axes(self) -> Axes:
-        """The axes as they were written."""
-        read = lambda name: np.asarray(self.group[f"axes/{name}"][...])
-        names = tuple(self.about["names"])
-        return Axes(names, tuple(map(read, names)), self.about["zipped"])
+        """The axes as they were written.
 
-    def values(self, like=None):
-        """The values of all points (points, ...): in the structure of `like`, or in a dictionary by name."""
-        names = list(self.about["fingerprint"]["values"])
-        found = {name: np.asarray(self.group[f"values/{name}"][...]) for name in names}
-        if like is None:
-            return found
-        return jax.tree.unflatten(jax.tree.structure(like), [found[name] for name, _ in named_leaves(like)])
+        **Raises:** `ValueError` where their values are not.
+        """
+        names = tuple(self.about["names"])
+        return Axes(names, tuple(map(self._axis, names)), self.about["zipped"])
+
+    def _axis(self, name):
+        folder = self.path / "axes" / name
+        try:
+            x = np.asarray(self.group[f"axes/{name}"][...])
+        except UNREADABLE:
+            x = None
+        if x is None or of_axis(x) != self.about["fingerprint"]["axes"][name]:
+            raise ValueError(
+                f"the values of the axis '{name}' in {folder} are damaged.\n"
+                "Usual cause: a file that was lost in a copy.\n"
+                f"Fix: lj.sweep(run, axes, store='{self.path}'), which writes them again."
+            )
+        return x
+
+    def write_axes(self, axes: Axes) -> list[str]:
+        """Write the axes again where they are damaged, which are told, by the folder."""
+        damaged = []
+        for name, x in axes.values.items():
+            try:
+                self._axis(name)
+            except ValueError:
+                self.group[f"axes/{name}"][...] = x
+                damaged.append(f"{self.path / 'axes' / name} was damaged")
+        return damaged
+
+    def values(self, like=None) -> tuple[Any, dict[int, str]]:
+        """(the values of all points, what is lost: by the block's number, what is wrong with it).
+
+        Each is (points, ...), in the structure of `like` or in a dictionary by name; NaN or 0 where there is no block.
+        """
+        found, (missing, lost) = {}, self._glance()
+        for name in self._values:
+            found[name], unreadable = _read(self.arrays[name], self.points, self.blocks)
+            lost.update({number: f"{self._file(name, number)} is damaged" for number in unreadable})
+        lost = {number: wrong for number, wrong in lost.items() if number not in missing}
+        for number in missing:
+            for x in found.values():
+                x[self.points(number)] = nothing(x.dtype)
+        named = {name.removeprefix("values/"): x for name, x in found.items()}
+        if like is not None:
+            named = jax.tree.unflatten(jax.tree.structure(like), [named[name] for name, _ in named_leaves(like)])
+        return named, lost
 
     def one(self) -> dict[str, jax.ShapeDtypeStruct]:
         """The shapes of one point's values by name, without reading any."""
-        arrays = {name: self.group[f"values/{name}"] for name in self.about["fingerprint"]["values"]}
+        arrays = {name.removeprefix("values/"): self.arrays[name] for name in self._values}
         return {name: jax.ShapeDtypeStruct(x.shape[1:], x.dtype) for name, x in arrays.items()}
 
-    def status(self) -> Status:
-        """The statuses of all points."""
-        return Status(*(np.asarray(self.group[f"status/{name}"][...]) for name in Status._fields))
+    def status(self) -> tuple[Status, set[int], dict[int, str]]:
+        """(the statuses of all points, the blocks that are not marked, what is lost of the others)."""
+        status, (missing, lost) = [], self._glance()
+        for name in self._status:
+            x, unreadable = _read(self.arrays[name], self.points, self.blocks)
+            status.append(x)
+            lost.update({number: f"{self._file(name, number)} is damaged" for number in unreadable})
+        lost = {number: wrong for number, wrong in lost.items() if number not in missing}
+        for numbers, code in ((missing, NOT_RUN), (lost, LOST)):
+            for number in numbers:
+                for x, fill in zip(status, (code, 0, np.nan, np.nan)):
+                    x[self.points(number)] = fill
+        return Status(*status), missing, lost
+
+    def _glance(self):
+        """(the blocks that are not marked, what is lost of the others)."""
+        marks, unreadable = self._marks()
+        lost = self.damage(range(self.blocks), False, (marks, unreadable))
+        return set(self._missing(marks).tolist()) - set(unreadable), lost
 
 
-def chunk_of(path) -> int:
-    """The points of a call of the program that a store was begun with."""
-    return _existing(path).about["fingerprint"]["chunk"]
+def tell(path: Path, wrong: Iterable[str], then: str, stacklevel: int):
+    """Warn of what is not whole in a store."""
+    wrong = list(wrong)
+    more = [f"and {len(wrong) - SHOWN:,} more"] if len(wrong) > SHOWN else []
+    lines = "\n".join(f"    {line}" for line in [*wrong[:SHOWN], *more])
+    warnings.warn(
+        f"the store {path} is not whole:\n{lines}\n"
+        "Usual cause: a copy that was cut short, files removed, a disk or its network that failed.\n" + then,
+        stacklevel=stacklevel + 1,
+    )
 
 
-def _existing(path):
+def _read(array, points, blocks):
+    """(all of an array, the numbers of the blocks that cannot be read)."""
     try:
-        return Store(path)
-    except (KeyError, FileNotFoundError, ValueError) as error:
-        raise ValueError(
-            f"{path} exists, and is no store of a sweep.\nFix: another path, or remove it if it is not needed."
-        ) from error
+        return np.asarray(array[...]), []
+    except UNREADABLE:
+        found, unreadable = np.full(array.shape, nothing(array.dtype), array.dtype), []
+        for number in range(blocks):
+            try:
+                found[points(number)] = array[points(number)]
+            except UNREADABLE:
+                unreadable.append(number)
+        return found, unreadable
 
 
-def open_store(path, axes: Axes, program: Program, layout: str, block: int) -> Store:
-    """Open the store of a sweep, made where there is none; refuse one that belongs to another sweep."""
+def nothing(dtype):
+    """What stands where there is no value."""
+    return np.nan if np.issubdtype(dtype, np.inexact) else 0
+
+
+def _mark(file):
+    """The length of a file and the checksum at its end."""
+    if file is None:
+        return 0, 0
+    with open(file, "rb") as content:
+        length = content.seek(0, os.SEEK_END)
+        content.seek(-CHECKSUM, os.SEEK_END)
+        return length, _number(content.read())
+
+
+def _number(data):
+    return int.from_bytes(data, "little")
+
+
+def _crc32c():
+    # Zarr has it, for the same use.
+    from google_crc32c import value
+
+    return value
+
+
+def chunk_of(path: str | os.PathLike) -> int:
+    """The points of a call of the program that a store was begun with."""
+    return about(Path(path))["fingerprint"]["chunk"]
+
+
+def open_store(
+    path: Path, axes: Axes, program: Program, layout: str, block: int | None, part: tuple[int, int], accept: bool
+) -> Store:
+    """Open the store of a sweep, made where there is none; refuse one that belongs to another sweep.
+
+    What of it is not whole is told, put back or, of this part, marked as missing.
+    """
     wanted = fingerprint(axes, program, layout)
-    if not Path(path).exists():
-        _create(Path(path), axes, program, wanted, block)
-    store = _existing(path)
-    if differences := _differences(store.about["fingerprint"], wanted):
-        raise ValueError(
-            f"{path} belongs to another sweep, and is left as it is:\n"
-            + "\n".join(f"    {line}" for line in differences)
-            + "\nUsual cause: run, the axes or a setting has changed since it was begun.\n"
-            "Fix: another path; or change back what differs, to go on with this one."
-        )
+    if not path.exists():
+        create(path, axes, program, wanted, block)
+    _check_belongs(path, about(path)["fingerprint"], wanted, accept)
+    remove_leftovers(path)
+    wrong = restore(path)
+    store = Store(path)
+    wrong += store.write_axes(axes)
+    lost = store.damage(range(part[0], store.blocks, part[1]), read=True)
+    if wrong or lost:
+        again = f"Blocks that are computed again: {len(lost):,} of {store.blocks:,}" if lost else "It is put back"
+        tell(path, [*wrong, *lost.values()], f"{again}; nothing needs to be done.", stacklevel=4)
+    store.unmark(lost)
     return store
 
 
-def _differences(there, here, under=""):
-    found = []
-    for key in dict.fromkeys((*there, *here)):
-        a, b, name = there.get(key), here.get(key), f"{under}{key}"
-        if isinstance(a, dict) and isinstance(b, dict):
-            found += _differences(a, b, f"{name} ")
-        elif name == "program" and a != b:
-            found.append("run is another function")
-        elif (
-            a != b and under == "axes " and isinstance(a, str) and isinstance(b, str) and a.split()[:1] == b.split()[:1]
-        ):
-            found.append(f"axis '{key}' has other values")
-        elif a != b:
-            found.append(f"{name}: {a} there, {b} here")
-    return found
-
-
-def _create(path, axes, program, wanted, block):
-    zarr = import_zarr()
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}")
-    group = zarr.create_group(str(temporary))
-    for name, x in axes.values.items():
-        group.create_array(f"axes/{name}", data=x)
-    size, inner = axes.size, lambda n: [f"dim_{i}" for i in range(n)]
-    for name, x in named_leaves(program.values):
-        fill = np.nan if np.issubdtype(x.dtype, np.inexact) else 0
-        group.create_array(
-            f"values/{name}", shape=(size, *x.shape), chunks=(block, *(max(1, n) for n in x.shape)), dtype=x.dtype,
-            fill_value=fill, dimension_names=["index", *inner(len(x.shape))],
-        )  # fmt: skip
-    for name, dtype, fill in zip(Status._fields, STATUS_TYPES, (NOT_RUN, 0, np.nan, np.nan)):
-        group.create_array(f"status/{name}", shape=(size,), chunks=(block,), dtype=dtype, fill_value=fill)
-    group.create_array("done", shape=(-(-size // block),), chunks=(1,), dtype="uint8", fill_value=0, compressors=None)
-    about = {"fingerprint": wanted, "block": block, "names": list(axes.values), "zipped": axes.zipped}
-    group.attrs["lagjax"] = json.loads(json.dumps(about))
-    try:
-        os.rename(temporary, path)
-    except OSError:
-        # Another process was first; the check of the fingerprint follows.
-        shutil.rmtree(temporary)
+def _check_belongs(path, there, here, accept):
+    found = differences(there, here)
+    older = [line for line in found if line.startswith(("versions", "format"))]
+    # Another version traces another program of the same function.
+    rest = [line for line in found if line not in older and not (older and line == ANOTHER_FUNCTION)]
+    shown = lambda lines: "".join(f"    {line}\n" for line in lines)
+    if rest:
+        raise ValueError(
+            f"{path} belongs to another sweep, and is left as it is:\n{shown(found)}"
+            "Usual cause: run, the axes or a setting has changed since it was begun.\n"
+            "Fix: another path; or change back what differs, to go on with this one."
+        )
+    if older and not accept:
+        raise ValueError(
+            f"{path} was written by other versions, and is left as it is:\n{shown(older)}"
+            "What it has can be read: lj.open_sweep(path).\n"
+            "Fix: lj.sweep(..., accept_versions=True) goes on with it where run is still the same function, which "
+            "cannot be told across versions; or another path."
+        )

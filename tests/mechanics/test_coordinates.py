@@ -2,6 +2,7 @@
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -44,3 +45,11 @@ def test_python_numbers_that_are_not_floats_stay_static():
     """An int or a string in params is left alone: it may choose a shape or a branch."""
     params = coordinates.state(0.0, 1.0, 0.0, {"order": 3, "name": "a"}).params
     assert params == {"order": 3, "name": "a"}
+
+
+def test_a_float_is_one_in_whatever_it_comes():
+    """Of one type for JAX, so that none is compiled again. Twin: an array of another dtype stays what it is."""
+    of = lambda g: jax.typeof(coordinates.state(0.0, 1.0, 0.0, {"g": g}).params["g"])
+    assert of(9.81) == of(jnp.array(9.81)) == of(np.float64(9.81)) == of(jnp.asarray(9.81, jnp.float64))
+    assert not of(jnp.array(9.81)).weak_type and jnp.array(9.81).weak_type
+    assert of(jnp.asarray(9.81, jnp.float32)).dtype == jnp.float32

@@ -16,6 +16,11 @@ STATE = (
 )
 
 
+def rod_square(q):
+    """The squared distance from the pivot."""
+    return q["x"] ** 2 + q["y"] ** 2
+
+
 def twice(factor):
     """The rod given once more, in another scale."""
     again = lj.Holonomic(lambda t, q, params: factor * rod(t, q, params))
@@ -109,6 +114,32 @@ def test_report_of_a_rounded_state():
     assert "18, of which 11 independent" in repr(report)
     rounded = {"corner": np.round(DOOR_STATE[1]["corner"], 6)}
     assert lj.explain(door, rounded, DOOR_STATE[2], DOOR_STATE[3]).degrees_of_freedom == 1
+
+
+@pytest.mark.slow
+def test_report_of_a_state_with_other_velocities():
+    """Off its constraints by the velocity: that is said first, and the nearest state on them judged: no contradiction.
+
+    `accelerations` takes the state as it is and says the same. Where nothing is on them, that is the problem.
+    """
+    length = lj.Holonomic(lambda t, q, params: jnp.sqrt(rod_square(q)) - params["l"])
+    pair = lj.System(cartesian_lagrangian, {"rod": lj.Holonomic(rod), "length": length})
+    along = {"x": STATE[2]["x"] + np.sin(2.0), "y": STATE[2]["y"] - np.cos(2.0)}
+    report = lj.explain(pair, STATE[1], along, PARAMS)
+    assert report.problem is None and report.degrees_of_freedom == 1
+    labels = [label for label, _ in report.rows]
+    assert labels[:2] == ["at", "off the constraints"]
+    assert "d/dt 'length' = 1" in dict(report.rows)["off the constraints"]
+    with pytest.raises(ValueError, match="(?s)is off them: d/dt 'length' = 1.*Fix: q, v = lj.consistent_state"):
+        lj.accelerations(pair, 0.0, STATE[1], along, PARAMS)
+    longer = lj.Holonomic(lambda t, q, params: rod_square(q) - 4.0 * params["l"] ** 2)
+    torn = lj.System(cartesian_lagrangian, {"rod": lj.Holonomic(rod), "longer": longer})
+    report = lj.explain(torn, *STATE[1:])
+    assert "no state near it is on them" in repr(report) and "no consistent state" in str(report.problem)
+    # On the velocities of both, with a path that only one of them follows: these do contradict each other.
+    moved = lj.Holonomic(lambda t, q, params: rod_square(q) - (params["l"] + t**2) ** 2)
+    against = lj.System(cartesian_lagrangian, {"rod": lj.Holonomic(rod), "moved": moved})
+    assert "contradict each other" in str(lj.explain(against, *STATE[1:]).problem)
 
 
 @pytest.mark.slow

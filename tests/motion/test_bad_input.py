@@ -140,22 +140,43 @@ def test_unreachable_constraint():
     ("ts", "words"),
     [
         ([0.0, 1.0, 0.5], r"ts\[2\] = 0.5 follows ts\[1\] = 1"),
-        ([1.0, 0.0], "must increase"),
+        ([2.0, 0.0, 1.0], r"must decrease throughout.*ts\[2\] = 1 follows ts\[1\] = 0"),
         ([0.0, 1.0, 1.0], "must increase"),
         ([0.0], "at least two times"),
         (3.0, "at least two times"),
     ],
 )
 def test_times(ts, words):
-    """ts that does not increase, or is no vector."""
+    """ts that goes to and fro, or is no vector."""
     with refusal(ValueError, words):
         lj.integrate(pendulum, 1.0, 0.0, PARAMS, ts=ts)
 
 
-def test_first_step_backwards():
-    """dt0 that is not positive."""
-    with refusal(ValueError, "dt0 must be one positive number, not -0.1", "To run backwards"):
-        lj.integrate(pendulum, 1.0, 0.0, PARAMS, ts=TS, dt0=-0.1)
+@pytest.mark.parametrize("name", ("dt0", "max_step"))
+def test_lengths_of_steps(name):
+    """dt0 and max_step that are not positive; while tracing, in the result."""
+    with refusal(ValueError, f"{name} must be one positive number, not -0.1", "where ts decreases"):
+        lj.integrate(pendulum, 1.0, 0.0, PARAMS, ts=TS, **{name: -0.1})
+    run = jax.jit(lambda x: lj.integrate(pendulum, 1.0, 0.0, PARAMS, ts=TS, throw=False, **{name: x}).result)
+    assert run(-0.1) == lj.RESULTS.unordered
+
+
+def test_times_of_jumps():
+    """jump_ts that is no vector of finite times."""
+    for jump_ts, words in ((np.ones((2, 2)), "vector of times"), ([0.5, np.nan], "NaN or infinity"), (["a"], "vector")):
+        with refusal(ValueError, "jump_ts", words):
+            lj.integrate(pendulum, 1.0, 0.0, PARAMS, ts=TS, jump_ts=jump_ts)
+
+
+def test_limits_on_steps_that_another_controller_chooses():
+    """max_step and jump_ts beside a controller, with what the controller itself takes."""
+    given = {"stepsize_controller": diffrax.PIDController(rtol=1e-6, atol=1e-6)}
+    with refusal(ValueError, "max_step", "dtmax"):
+        lj.integrate(pendulum, 1.0, 0.0, PARAMS, ts=TS, **given, max_step=0.1)
+    with refusal(ValueError, "jump_ts", "ClipStepSizeController"):
+        lj.integrate(pendulum, 1.0, 0.0, PARAMS, ts=TS, **given, jump_ts=[0.5])
+    with refusal(ValueError, "jump_ts", "BacksolveAdjoint"):
+        lj.integrate(pendulum, 1.0, 0.0, PARAMS, ts=TS, adjoint=diffrax.BacksolveAdjoint(), jump_ts=[0.5])
 
 
 def test_solver_class():
@@ -176,9 +197,10 @@ def test_adjoint_that_leaves_the_constraints():
         lj.integrate(rod_pendulum, *HORIZONTAL, PARAMS, ts=TS, adjoint=diffrax.BacksolveAdjoint())
 
 
+@pytest.mark.slow
 def test_max_steps():
-    """Where it stopped, after how many steps, and three ways out."""
-    with refusal(RuntimeError, "stopped at t = 0", "max_steps = 5", "max_steps=20"):
+    """Where it stopped, after how many steps, how many are missing, and what to do."""
+    with refusal(RuntimeError, "stopped at t = 0", "max_steps = 5", "needs 2 more", "max_steps=8, or a looser rtol"):
         lj.integrate(pendulum, 1.0, 0.0, PARAMS, ts=TS, max_steps=5)
 
 

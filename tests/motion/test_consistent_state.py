@@ -137,3 +137,27 @@ def test_redundant_constraints_are_no_obstacle():
     twice = lj.System(lagrangian, {"ellipse": lj.Holonomic(ellipse), "again": again})
     found = flat(lj.consistent_state(twice, *FAR, PARAMS))
     np.testing.assert_allclose(found, nearest_by_angle(*FAR, PARAMS), atol=1e-12)
+
+
+@pytest.mark.slow
+def test_a_held_coordinate_that_a_constraint_fixes():
+    """Where the value held is the one that is asked for, the constraint is one dependent equation more."""
+    particle = lambda t, q, v, params: 0.5 * (v["x"] ** 2 + v["y"] ** 2 + v["z"] ** 2)
+    wall = lj.Holonomic(lambda t, q, params: q["x"] - jnp.sin(t))
+    sphere = lj.Holonomic(lambda t, q, params: q["x"] ** 2 + q["y"] ** 2 + q["z"] ** 2 - 1.0)
+    moving = {"x": 1.0, "y": 0.5, "z": 0.0}
+    alone, both = lj.System(particle, {"wall": wall}), lj.System(particle, {"wall": wall, "sphere": sphere})
+    on_it = {"x": 0.0, "y": 1.5, "z": 0.25}
+    q, v = lj.consistent_state(alone, 0.0, on_it, moving, None, hold="x")
+    assert (q, v) == (on_it, moving)
+    # With the wall held or found, the nearest point of the sphere is the same.
+    found, held = (lj.consistent_state(both, 0.0, on_it, moving, None, hold=hold) for hold in ((), "x"))
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-12), held, found)
+    length = np.hypot(1.5, 0.25)
+    np.testing.assert_allclose([held[0]["y"], held[0]["z"]], [1.5 / length, 0.25 / length], atol=1e-12)
+    with pytest.raises(ValueError, match="with 'x' held: at the best one constraint 'wall' = 0.3"):
+        lj.consistent_state(alone, 0.0, on_it | {"x": 0.3}, moving, None, hold="x")
+    with pytest.raises(ValueError, match="with 'x' held: at the best one constraint d/dt 'wall' = -0.75"):
+        lj.consistent_state(both, 0.0, on_it, moving | {"x": 0.25}, None, hold="x")
+    slope = jax.jacfwd(lambda y: lj.consistent_state(both, 0.0, on_it | {"y": y}, moving, None, hold="x")[0]["z"])(1.5)
+    np.testing.assert_allclose(slope, -1.5 * 0.25 / length**3, atol=1e-9)

@@ -101,25 +101,22 @@ def within(order, measured):
 NEWTON = optx.Newton(rtol=1e-10, atol=1e-12, norm=optx.max_norm)
 
 # Steps a unit of time: errors from 1e-1 (Euler) down to 7e-12 (Tsit5, free), 50 times the reference's.
-FAST = [
-    (diffrax.Tsit5(), 5, (112, 160, 224)),
-    (diffrax.Dopri8(), 8, (18, 22, 28)),
-]
+FAST = [(lj.Tsit5(), 5, (112, 160, 224)), (lj.Dopri8(), 8, (18, 22, 28))]
+
+
+class ShippedDopri8(diffrax.Dopri8):
+    """Diffrax's own: as it is shipped it would run in our form."""
+
+
+# One of each kind that diffrax has: the rest differ in their numbers alone.
 SLOW = [
+    (ShippedDopri8(), 8, (18, 22, 28)),
     (diffrax.Kvaerno5(root_finder=NEWTON), 5, (28, 40, 56)),
     (lj.Radau5(root_finder=SimplifiedNewton(rtol=1e-12, atol=1e-12)), 5, (28, 40, 56)),
     (diffrax.Euler(), 1, (800, 1600, 3200)),
-    (diffrax.ImplicitEuler(root_finder=NEWTON), 1, (800, 1600, 3200)),
-    (diffrax.Heun(), 2, (100, 200, 400)),
-    (diffrax.Midpoint(), 2, (100, 200, 400)),
-    (diffrax.Ralston(), 2, (100, 200, 400)),
     (diffrax.LeapfrogMidpoint(), 2, (200, 400, 800)),
     (diffrax.ReversibleHeun(), 2, (200, 400, 800)),
     (diffrax.HalfSolver(diffrax.Heun()), 2, (100, 200, 400)),
-    (diffrax.Bosh3(), 3, (100, 200, 400)),
-    (diffrax.Kvaerno3(root_finder=NEWTON), 3, (50, 100, 200)),
-    (diffrax.Kvaerno4(root_finder=NEWTON), 4, (40, 80, 160)),
-    (diffrax.Dopri5(), 5, (56, 80, 112, 160)),
 ]
 slow = lambda cases: [pytest.param(*case, marks=pytest.mark.slow) for case in cases]
 name_of = lambda value: type(value).__name__ if isinstance(value, diffrax.AbstractSolver) else None

@@ -2,11 +2,13 @@
 
 import diffrax
 import jax
+import jax.numpy as jnp
 import matplotlib
 import numpy as np
 import pytest
 
 import lagjax as lj
+from lagjax.mechanics.structure import what_changes_jacobi_integral
 from tests.systems import HORIZONTAL, PARAMS, TS, pendulum, rod_pendulum
 
 matplotlib.use("agg")
@@ -33,6 +35,33 @@ def test_prints_like_an_instrument(traj):
         "rod (4,)",
     ):
         assert part in text, part
+
+
+def test_says_what_need_not_be_conserved(traj):
+    """Where the Jacobi integral may change, its change is no error, and the print says why; a result has words."""
+    assert "need not be conserved" not in repr(traj)
+    driven = lj.System(lambda t, q, v, params: 0.5 * v**2 - 0.5 * q**2 + jnp.cos(t) * q)
+    swing = lj.integrate(driven, 1.0, 0.0, None, ts=TS)
+    assert "(relative); need not be conserved: L depends on t" in repr(swing)
+    assert "L depends on t" in repr(jax.tree.map(np.asarray, swing)), "of a sweep's trajectories, too"
+    assert "RESULTS<successful>" in repr(traj.result)
+
+
+CHANGES = {
+    "there is a force": {"force": lambda t, q, v, params: -q},
+    "there is dissipation": {"dissipation": lambda t, q, v, params: v**2},
+    "constraint 'c' is one of velocities": {"constraints": {"c": lj.Nonholonomic(lambda t, q, v, params: v)}},
+    "constraint 'c' depends on t": {"constraints": {"c": lj.Holonomic(lambda t, q, params: q - t)}},
+}
+
+
+@pytest.mark.parametrize("words", CHANGES)
+def test_what_changes_the_jacobi_integral(words):
+    """Each cause by its name, and none of a system that conserves it."""
+    state = jnp.asarray(0.0), jnp.asarray(1.0), jnp.asarray(1.0), None
+    free = lambda t, q, v, params: 0.5 * v**2
+    assert list(what_changes_jacobi_integral(lj.System(free, **CHANGES[words]), *state)) == [words]
+    assert not list(what_changes_jacobi_integral(lj.System(free), *state))
 
 
 def test_carries_its_system_and_parameters(traj):

@@ -9,11 +9,12 @@ import pytest
 from jax import lax
 from jax.extend.core import jaxpr_as_fun
 
-from lagjax.numerics.programs import needed, staged
+from lagjax.jax_internals.programs import needed, staged
 from lagjax.numerics.scalars import written_out
 
 X = jnp.array([0.3, -1.2, 0.7, 2.0])
 MATRIX = jnp.arange(12.0).reshape(3, 4) / 7
+INTEGERS = jnp.arange(16).reshape(4, 4)
 
 
 def numbers(function, *args):
@@ -49,6 +50,9 @@ FUNCTIONS = {
     "rules": lambda x: doubled(x) + jax.nn.softplus(x),
     "mixed": lambda x: jnp.diag(x) @ x + jnp.eye(4)[1] + jnp.where(jnp.eye(4) > 0, x, 0).sum(0),
     "updates": lambda x: x.at[1].set(x[2]).at[2:].add(1.0),
+    "known infinities": lambda x: x * jnp.minimum(1 / jnp.array([1.0, 0.0, -2.0, -0.0]), 5.0).clip(-7.0),
+    "products of mixed kinds": lambda x: INTEGERS @ x + x @ (INTEGERS > 3).T + INTEGERS.astype(jnp.float32) @ x,
+    "integers": lambda x: x * ((INTEGERS[0] + 29) // 10) + x[(INTEGERS[1] + 3) % 4] * lax.div(INTEGERS[2], 3),
 }
 
 
@@ -83,3 +87,15 @@ def test_two_stages():
     late = jax.make_jaxpr(then)(first(args[0]), args[1])
     assert Counter(e.primitive.name for e in late.jaxpr.eqns)["mul"] == 2
     assert not {"sin", "div", "integer_pow"} & {e.primitive.name for e in late.jaxpr.eqns}
+
+
+def test_integers_are_divided_as_integers():
+    """By a number that is known before: 29 by 10 is 2, and an index made so is one."""
+
+    def function(n, x):
+        count = (jnp.floor(x) + 29).astype(int)
+        return x * lax.div(count, n) + X[count // n]
+
+    args = (jnp.asarray(10), jnp.asarray(0.7))
+    first, then = staged(numbers(function, *args), [0], [1])
+    assert then(first(args[0]), args[1])[0] == 0.7 * 2 + X[2]

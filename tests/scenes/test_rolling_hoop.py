@@ -142,7 +142,7 @@ def test_departures_of_other_starts():
         "downhill": (1.0, 1.25, -1.5, 1e-10),
         "uphill": (1.0, 1.25, 0.75, 1e-10),
     }
-    times, angles, left = map(np.asarray, hoop.departures(*hoop.batch(starts.values())))
+    times, angles, left, _ = map(np.asarray, hoop.departures(*hoop.batch(starts.values())))
     assert left.all()
     for (key, (beta, theta0, rate0, _)), t, angle in zip(starts.items(), times, angles):
         sine = hoop.departure_sine(PARAMS | {"beta": beta}, theta0, rate0)
@@ -251,7 +251,7 @@ def test_gradients_of_the_departure_time():
 
     def when(params, **options):
         q, v = hoop.start(params, 1.25)
-        options = {"rtol": 1e-10, "atol": 1e-10, "event": hoop.DEPARTURE} | options
+        options = {"rtol": 1e-10, "atol": 1e-10, "events": hoop.DEPARTURE} | options
         return integrate(hoop.system, q, v, params, ts=ts, **options).end.t
 
     t, length = reference("s2.hoop.tdep.start_theta0=1.25"), PARAMS["R"] + PARAMS["a"]

@@ -11,15 +11,15 @@ GRID = {"a": np.array([1.0, 2.0]), "b": np.array([10.0, 20.0, 30.0]), "c": np.ar
 
 
 def test_the_last_axis_is_the_fastest():
-    """As NumPy's indices run; traced and not; the slices of an axis of vectors."""
+    """As the loops run, one point and several; the slices of an axis of vectors."""
     axes = axes_of(GRID, zipped=False)
     assert axes.shape == (2, 3, 4) and axes.size == 24
-    at = jax.jit(lambda index: axes.at(index))
-    for index in (0, 7, 23):
-        i, j, k = np.unravel_index(index, axes.shape)
-        for point in (axes.at(index), at(index)):
-            assert (point["a"], point["b"]) == (GRID["a"][i], GRID["b"][j])
-            assert np.array_equal(point["c"], GRID["c"][k])
+    points = [(a, b, c) for a in GRID["a"] for b in GRID["b"] for c in GRID["c"]]
+    several = axes.at(np.array([0, 7, 23]))
+    for n, index in enumerate((0, 7, 23)):
+        for point in (axes.at(index), {name: x[n] for name, x in several.items()}):
+            assert (point["a"], point["b"]) == points[index][:2]
+            assert np.array_equal(point["c"], points[index][2])
 
 
 def test_zipped_axes_move_together():

@@ -1,6 +1,7 @@
 """Sweeps on disk: resumed, refused, killed, shared."""
 
 import os
+import shutil
 import signal
 import socket
 import subprocess
@@ -91,7 +92,7 @@ def test_another_sweep_is_refused(tmp_path):
 
 def blocks_there(path):
     """How many blocks are marked, 0 before there is a store."""
-    return 0 if not path.exists() else int(np.sum(Store(path).group["done"][:]))
+    return 0 if not path.exists() else Store(path).blocks - len(Store(path).missing())
 
 
 def wait_for(process, path, count):
@@ -126,12 +127,15 @@ def test_killed_and_resumed(tmp_path):
 @pytest.mark.slow
 def test_interrupted_from_the_keyboard(tmp_path):
     """The process ends well, with what it had, and says so."""
-    path = tmp_path / "sweep"
-    process = started(path)
-    wait_for(process, path, 1)
-    process.send_signal(signal.SIGINT)
-    computed = int(process.communicate()[0])
-    assert process.returncode == 0 and 0 < computed < POINTS
+    path, computed = tmp_path / "sweep", POINTS
+    while computed == POINTS:
+        # On a busy machine a sweep may be over before it is interrupted, and is tried again.
+        shutil.rmtree(path, ignore_errors=True)
+        process = started(path)
+        wait_for(process, path, 1)
+        process.send_signal(signal.SIGINT)
+        computed = int(process.communicate()[0])
+        assert process.returncode == 0 and computed > 0
     assert blocks_there(path) * Store(path).block == computed
     same(swept(worker.run, path), swept(worker.run))
 

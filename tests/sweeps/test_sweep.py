@@ -136,6 +136,25 @@ def test_starts_that_cannot_be_integrated():
     assert "does not satisfy the constraints" in repr(swept)
 
 
+def test_a_check_that_fails_ends_its_lane_alone():
+    """`error_if` in a force, and in `run` itself: NaN and a status there; twin: without it the lanes go on."""
+    deep = {"wall": jnp.array([0.5, 0.9, 1.1, 2.0])}
+
+    def swing(point, checked):
+        wall = lambda t, q, v, params: eqx.error_if(0.0 * q, checked & (q < -params["wall"]), "through the wall")
+        spring = lj.System(lambda t, q, v, params: 0.5 * v**2 - 0.5 * q**2, force=wall)
+        end = lj.integrate(spring, 1.0, 0.0, point, ts=TS).q[-1]
+        return end, eqx.error_if(point["wall"], checked & (point["wall"] > 1.5), "too far away")
+
+    swept, twin = (quiet(lambda point, checked=checked: swing(point, checked), deep) for checked in (True, False))
+    there = np.cos(float(TS[-1]))
+    np.testing.assert_allclose(swept.values[0], [np.nan, np.nan, there, there], atol=1e-7)
+    np.testing.assert_array_equal(swept.values[1], [np.nan, np.nan, 1.1, np.nan])
+    assert (swept.status.result[:2] != OK).all() and swept.status.result[2] == OK
+    np.testing.assert_allclose(twin.values[0], np.full(4, there), atol=1e-7)
+    assert (twin.status.result == OK).all()
+
+
 def test_a_drifting_motion_is_marked():
     """Fixed steps that are too long: the values stay, `ok` says not to trust them."""
     settings = {"stepsize_controller": diffrax.ConstantStepSize(), "dt0": jnp.asarray(0.5), "method": diffrax.Heun()}

@@ -1,11 +1,18 @@
 """JAX programs (jaxprs) as data: one equation of them, what depends on what, one program as two."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import cast
 
+import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jax.core import ShapedArray
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, jaxpr_as_fun
+
+# Calls in a row that are worth a loop.
+LONG_CHAIN = 16
 
 
 def bodies(equation) -> list[Jaxpr]:
@@ -20,23 +27,106 @@ def bodies(equation) -> list[Jaxpr]:
 
 def rewritten(closed: ClosedJaxpr, change: Callable) -> ClosedJaxpr:
     """The program with each of its equations changed, those inside loops, branches and functions too."""
+    return _rewritten(closed, lambda jaxpr: jaxpr.replace(eqns=list(map(change, jaxpr.eqns))))
+
+
+def _rewritten(closed: ClosedJaxpr, change: Callable[[Jaxpr], Jaxpr]) -> ClosedJaxpr:
+    """The program with its list of equations changed, and the lists inside loops, branches and functions.
+
+    What is the same in several places stays so, and what does not change stays the object that it is: JAX knows
+    functions that it has compiled by their identity.
+    """
+    # Each with what it was made of, whose number another object could have later.
+    found = {}
+
+    def once(value, make):
+        if id(value) not in found:
+            found[id(value)] = value, make()
+        return found[id(value)][1]
 
     def inside(value):
-        if isinstance(value, tuple) and any(isinstance(item, ClosedJaxpr) for item in value):
+        # From jax 0.12 on a program is closed by itself: then both names are one class.
+        if isinstance(value, ClosedJaxpr) and value.jaxpr is not value:
+            jaxpr = inside(value.jaxpr)
+            return value if jaxpr is value.jaxpr else once(value, lambda: value.replace(jaxpr=jaxpr))
+        if isinstance(value, Jaxpr):
+            return once(value, lambda: of_program(value))
+        if isinstance(value, tuple):
+            new = [inside(item) for item in value]
             # A named one keeps its names.
-            return type(value)(*map(inside, value)) if hasattr(value, "_fields") else tuple(map(inside, value))
-        return rewritten(value, change) if isinstance(value, ClosedJaxpr) else value
+            make = type(value) if not hasattr(value, "_fields") else lambda items: type(value)(*items)
+            return value if _same(new, value) else make(new)
+        return value
 
     def of_equation(equation):
-        equation = change(equation)
-        return equation.replace(params={name: inside(value) for name, value in equation.params.items()})
+        params = equation.params
+        new = [inside(value) for value in params.values()]
+        return equation if _same(new, params.values()) else equation.replace(params=dict(zip(params, new)))
 
-    return closed.replace(jaxpr=closed.jaxpr.replace(eqns=list(map(of_equation, closed.jaxpr.eqns))))
+    def of_program(jaxpr):
+        new = [of_equation(equation) for equation in change(jaxpr).eqns]
+        return jaxpr if _same(new, jaxpr.eqns) else jaxpr.replace(eqns=new)
+
+    return cast(ClosedJaxpr, inside(closed))
+
+
+def _same(new, old):
+    return len(new) == len(old) and all(one is other for one, other in zip(new, old))
+
+
+def without_chains(closed: ClosedJaxpr) -> ClosedJaxpr:
+    """The program with long chains f(f(f(... x))) of one and the same call as loops.
+
+    (diffrax takes the hundredth floating number before the last time, one after the other.)
+    """
+    return _rewritten(closed, _chains_as_loops)
+
+
+def _chains_as_loops(jaxpr):
+    uses = Counter(x for e in jaxpr.eqns for x in variables(e))
+    uses.update(x for x in jaxpr.outvars if not isinstance(x, Literal))
+    # By the variable that it ends with, each chain so far: its equations.
+    chains = {}
+    for equation in jaxpr.eqns:
+        if not bodies(equation) or equation.effects or len(variables(equation)) != 1 or len(equation.outvars) != 1:
+            continue
+        (operand,), (result,) = variables(equation), equation.outvars
+        if operand.aval != result.aval:
+            continue
+        before = chains.get(operand, [])
+        if not (before and uses[operand] == 1 and _alike(before[-1], equation)):
+            before = []
+        chains.pop(operand, None)
+        chains[result] = [*before, equation]
+    loops = {id(chain[-1]): chain for chain in chains.values() if len(chain) >= LONG_CHAIN}
+    gone = {id(e) for chain in loops.values() for e in chain[:-1]}
+    kept = [e if id(e) not in loops else _loop(jaxpr, loops[id(e)]) for e in jaxpr.eqns if id(e) not in gone]
+    return jaxpr.replace(eqns=kept)
+
+
+def _alike(one, other):
+    return one.primitive is other.primitive and list(map(str, bodies(one))) == list(map(str, bodies(other)))
+
+
+def _loop(jaxpr, chain):
+    (x,), last = variables(chain[0]), chain[-1]
+    step = lambda _, value: evaluate(jaxpr, chain[0], {x: value})[0]
+    looped = jax.jit(lambda value: lax.fori_loop(0, len(chain), step, value))
+    (call,) = jax.make_jaxpr(looped)(x.aval).eqns
+    return call.replace(invars=[x], outvars=last.outvars)
+
+
+def equations(jaxpr: Jaxpr) -> Iterator:
+    """All equations of a program, those inside its loops, branches and functions included."""
+    for equation in jaxpr.eqns:
+        yield equation
+        for body in bodies(equation):
+            yield from equations(body)
 
 
 def length(jaxpr: Jaxpr) -> int:
     """How many operations a program consists of, those inside its loops and functions included."""
-    return sum(1 + sum(map(length, bodies(equation))) for equation in jaxpr.eqns)
+    return sum(1 for _ in equations(jaxpr))
 
 
 def variables(equation) -> list:
@@ -84,7 +174,7 @@ def needed(jaxpr: Jaxpr) -> list:
 def staged(program: ClosedJaxpr, first: Sequence[int], then: Sequence[int]):
     """A program as two functions: of the inputs `first`, and of what that returns and the inputs `then`.
 
-    A division of numbers by what the first one knows becomes a multiplication by its inverse.
+    A division of floating numbers by what the first one knows becomes a multiplication by its inverse.
     """
     jaxpr = program.jaxpr
     late = reached(jaxpr, (jaxpr.invars[i] for i in then))
@@ -118,4 +208,5 @@ def staged(program: ClosedJaxpr, first: Sequence[int], then: Sequence[int]):
 
 
 def _divides_numbers(equation):
-    return equation.primitive.name == "div" and not equation.outvars[0].aval.shape
+    result = equation.outvars[0].aval
+    return equation.primitive.name == "div" and not result.shape and jnp.issubdtype(result.dtype, jnp.floating)

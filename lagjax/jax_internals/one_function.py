@@ -10,8 +10,7 @@ What can be asked for is limited: no library call (LAPACK, the host), no large r
 `fits` reads off the jaxpr whether a program is of that kind, and what is not runs as it always did. In a batch the
 operations are long enough to be kernels, and the request is dropped; on a CPU a large batch is taken in blocks.
 
-The request is two attributes of the call: `inlineable="false"` and `xla_cpu_small_call="true"`, XLA's own mark for
-loops that its pass `small-while-loop-hoisting` has chosen. An XLA that does not know them ignores them.
+The request is made by attributes of the call (`marks.py`).
 """
 
 import math
@@ -23,11 +22,22 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from jax import lax
-from jax.experimental.xla_metadata import set_xla_metadata
 from jax.extend.core import ClosedJaxpr, Jaxpr, Primitive, jaxpr_as_fun
 from jax.interpreters import ad, batching, mlir
 
-from lagjax.numerics.programs import bodies, rewritten
+from lagjax.jax_internals.marks import ONE_KERNEL, STAYS_A_CALL, marked
+from lagjax.jax_internals.names import (
+    ACCUMULATING,
+    CALLS,
+    CALLS_WITH_RULES,
+    CONTROL_FLOW,
+    ELEMENTWISE,
+    MOVING,
+    OF_EQUINOX,
+    REDUCING,
+)
+from lagjax.jax_internals.plain import is_plain
+from lagjax.jax_internals.programs import bodies, equations, rewritten, without_chains
 
 # Reductions and products above this become calls of a library.
 LARGE = 1024
@@ -36,26 +46,11 @@ LARGE = 1024
 TOGETHER = 256
 # The multiplications of a product of matrices above which the library is worth more than one function.
 PRODUCT = 4096
-AT_ANY_SIZE = {
-    "abs", "acos", "acosh", "add", "add_any", "and", "asin", "asinh", "atan", "atan2", "atanh", "bessel_i0e",
-    "bessel_i1e", "broadcast_in_dim", "cbrt", "ceil", "clamp", "concatenate", "convert_element_type", "copy",
-    "copy_p", "cos", "cosh", "digamma", "div", "dynamic_slice", "dynamic_update_slice", "eq", "erf", "erf_inv",
-    "erfc", "exp", "exp2", "expand_dims", "expm1", "floor", "gather", "ge", "gt", "integer_pow", "iota",
-    "is_finite", "le", "lgamma", "log", "log1p", "logistic", "lt", "max", "min", "mul", "ne", "neg", "nextafter",
-    "not", "or", "pad", "pow", "rem", "reshape", "rev", "round", "rsqrt", "select_n", "sign", "sin", "sincos", "sinh",
-    "slice", "split", "sqrt", "square", "squeeze", "stack", "stop_gradient", "sub", "tan", "tanh", "transpose",
-    "unstack", "xor", "reduce_precision", "tile", "maybe_set", "nonbatchable", "nondifferentiable",
-    "nondifferentiable_backward", "select_if_vmap", "unvmap_all", "unvmap_any", "unvmap_max", "vprim",
-    "xla_metadata_value",
+AT_ANY_SIZE = ELEMENTWISE | MOVING | OF_EQUINOX | {
+    "bessel_i0e", "bessel_i1e", "dynamic_update_slice", "reduce_precision", "sincos", "tile", "xla_metadata_value",
 }  # fmt: skip
-SMALL = {
-    "argmax", "argmin", "cummax", "cummin", "cumprod", "cumsum", "reduce_and", "reduce_max", "reduce_min",
-    "reduce_or", "reduce_prod", "reduce_sum",
-}  # fmt: skip
-WITH_BODIES = {
-    "closed_call", "cond", "core_call", "custom_jvp_call", "custom_vjp_call", "jit", "pjit", "remat", "remat2",
-    "checkpoint", "scan", "while", "one_function",
-}  # fmt: skip
+SMALL = REDUCING | ACCUMULATING - {"cumlogsumexp"} | {"argmax", "argmin"}
+WITH_BODIES = CALLS | CALLS_WITH_RULES | CONTROL_FLOW | {"one_function"}
 
 
 def one_function(function: Callable, *args, checked: bool = False, in_blocks: bool = False):
@@ -66,12 +61,14 @@ def one_function(function: Callable, *args, checked: bool = False, in_blocks: bo
     6.0
 
     **Arguments:** pytrees, of which the arrays are passed and all else is compiled in; what `function` returns may
-    contain anything too. It must not close over traced values. `checked` says that the checks of equinox
-    (`error_if`, calls of the host) in it are known to pass: they are left out. In a batch on a CPU, with `in_blocks`, a
-    few hundred lanes are taken at a time.
+    contain anything too. It must not close over traced values. `checked` says that all checks of
+    equinox (`error_if`, a call of the host) in it are known to pass: they are left out. In a batch on a CPU, with
+    `in_blocks`, a few hundred lanes are taken at a time.
 
     Its forward derivative is one function too, also along many directions. Reverse mode needs the function as it is.
     """
+    if is_plain():
+        return function(*args)
     arrays, static = eqx.partition(args, eqx.is_array)
     leaves, structure = jtu.tree_flatten(arrays)
     rest = []
@@ -83,8 +80,7 @@ def one_function(function: Callable, *args, checked: bool = False, in_blocks: bo
         return arrays
 
     jaxpr, shapes = jax.make_jaxpr(of_leaves, return_shape=True)(*leaves)
-    if checked:
-        jaxpr = without_checks(jaxpr)
+    jaxpr = without_chains(without_checks(jaxpr) if checked else jaxpr)
     found = _one_function_p.bind(
         *leaves, jaxpr=jaxpr, in_blocks=in_blocks, points=len(leaves), values=0, checked=checked
     )
@@ -93,15 +89,14 @@ def one_function(function: Callable, *args, checked: bool = False, in_blocks: bo
 
 def called(results):
     """`results` of a jitted function that stays a call; else XLA computes it anew for each of those who need them."""
-    if jax.default_backend() != "cpu":
+    if jax.default_backend() != "cpu" or is_plain():
         return results
     first, *others = jtu.tree_leaves(results)
-    marked = set_xla_metadata(first, inlineable="false")
-    return jtu.tree_unflatten(jtu.tree_structure(results), [marked, *others])
+    return jtu.tree_unflatten(jtu.tree_structure(results), [marked(first, STAYS_A_CALL), *others])
 
 
 def fits(jaxpr: Jaxpr) -> bool:
-    """Whether XLA can compile a program as one function."""
+    """Whether XLA can compile a program, `without_library` if it can be, as one function."""
     return all(_equation_fits(equation) for equation in jaxpr.eqns)
 
 
@@ -113,7 +108,7 @@ def _equation_fits(equation):
         return True
     if name == "inverse":
         return equation.params["eliminate"]
-    if name in ("dot_general", "product"):
+    if name == "product":
         (contracted, _), _ = equation.params["dimension_numbers"]
         summed = math.prod(equation.invars[0].aval.shape[i] for i in contracted)
         return equation.outvars[0].aval.size * summed <= PRODUCT
@@ -127,19 +122,64 @@ def _equation_fits(equation):
 
 
 def without_checks(closed: ClosedJaxpr) -> ClosedJaxpr:
-    """The program with each branch that calls the host replaced by the one beside it that does not."""
-    return rewritten(closed, _without_check) if _calls_host(closed.jaxpr) else closed
+    """The program without the checks of equinox (`error_if`); what else calls the host stays."""
+    return rewritten(closed, _without_check) if calls_host(closed.jaxpr) else closed
+
+
+def poisoned(closed: ClosedJaxpr) -> ClosedJaxpr:
+    """The program in which a check of equinox that fails gives NaN, in its lane alone, and ends nothing."""
+    return without_checks(rewritten(closed, _poisoned)) if calls_host(closed.jaxpr) else closed
+
+
+def _poisoned(equation):
+    """A call of equinox's `branched_error_if_impl(x, condition, ...)`, with NaN for x where the condition is true."""
+    if equation.params.get("name") != "branched_error_if_impl" or "jaxpr" not in equation.params:
+        return equation
+    inner = equation.params["jaxpr"]
+    inside = inner.jaxpr
+    # Of all lanes together it asks one question, about what says for each whether it fails.
+    asked = [e.invars[0] for e in inside.eqns if e.primitive.name == "unvmap_any"]
+    places = [i for i, x in enumerate(inside.invars) if any(x is y for y in asked)]
+    silent = jaxpr_as_fun(without_checks(inner))
+
+    def of(*operands):
+        fails = jnp.any(jnp.stack([jnp.any(operands[i]) for i in places]))
+        nan = lambda x: jnp.where(fails, jnp.nan, x) if jnp.issubdtype(x.dtype, jnp.inexact) else x
+        return [nan(x) for x in silent(*operands)]
+
+    if not places:
+        return equation
+    made = jax.make_jaxpr(of)(*(jax.ShapeDtypeStruct(x.aval.shape, x.aval.dtype) for x in inside.invars))
+    return equation.replace(params={**equation.params, "jaxpr": made})
 
 
 def _without_check(equation):
+    """A branch that calls the host for nothing but raising an error is replaced by the one beside it that does not."""
     branches = equation.params.get("branches", ())
-    silent = [branch for branch in branches if not _calls_host(branch.jaxpr)]
-    if len(silent) != 1:
+    silent = [branch for branch in branches if not calls_host(branch.jaxpr)]
+    raising = [branch for branch in branches if calls_host(branch.jaxpr) and _only_raises(branch.jaxpr)]
+    if len(silent) != 1 or len(raising) + 1 != len(branches):
         return equation
     return equation.replace(params={**equation.params, "branches": tuple(silent * len(branches))})
 
 
-def _without_library(equation):
+def calls_host(jaxpr: Jaxpr) -> bool:
+    """Whether a program calls functions of Python while it runs."""
+    return any("callback" in equation.primitive.name for equation in equations(jaxpr))
+
+
+def _only_raises(jaxpr):
+    calls = [equation for equation in equations(jaxpr) if "callback" in equation.primitive.name]
+    called = [getattr(equation.params.get("callback"), "callback_func", None) for equation in calls]
+    return all(getattr(function, "__module__", None) == "equinox._errors" for function in called)
+
+
+def without_library(closed: ClosedJaxpr) -> ClosedJaxpr:
+    """The program with products of matrices and eliminations as loops of ours."""
+    return rewritten(closed, _equation_without_library)
+
+
+def _equation_without_library(equation):
     name = equation.primitive.name
     if name == "inverse":
         return equation.replace(params={**equation.params, "eliminate": True})
@@ -152,7 +192,10 @@ def _without_library(equation):
 
 
 def _product(left, right, dimension_numbers, like):
-    """A product of matrices by sums of multiplications, which XLA does not pass on to a library."""
+    """A product of matrices that XLA does not pass on to a library, as it does with sums of many multiplications.
+
+    Those are added up in a loop over the terms of each sum.
+    """
     (of_left, of_right), (left_lanes, right_lanes) = dimension_numbers
 
     def arranged(x, contracted, lanes):
@@ -162,15 +205,19 @@ def _product(left, right, dimension_numbers, like):
             [math.prod(x.shape[i] for i in group) for group in groups]
         )
 
-    left, right = arranged(left, of_left, left_lanes), arranged(right, of_right, right_lanes)
-    return jnp.sum(left[:, :, None] * right[:, None], axis=-1, dtype=like.dtype).reshape(like.shape)
+    left = arranged(left.astype(like.dtype), of_left, left_lanes)
+    right = arranged(right.astype(like.dtype), of_right, right_lanes)
+    lanes, rows, columns, summed = *left.shape[:2], *right.shape[1:]
+    if lanes * rows * columns * summed <= LARGE:
+        return jnp.sum(left[:, :, None] * right[:, None], axis=-1, dtype=like.dtype).reshape(like.shape)
 
+    def added(i, total):
+        entries = [lax.dynamic_index_in_dim(x, i, axis=2, keepdims=False) for x in (left, right)]
+        return total + entries[0][:, :, None] * entries[1][:, None]
 
-def _calls_host(jaxpr):
-    return any(
-        equation.primitive.name == "pure_callback" or any(_calls_host(body) for body in bodies(equation))
-        for equation in jaxpr.eqns
-    )
+    zero = jnp.zeros((lanes, rows, columns), like.dtype)
+    # Four terms at a time are twice as fast as one, and sixteen no faster.
+    return lax.fori_loop(0, summed, added, zero, unroll=4).reshape(like.shape)
 
 
 def _plainly(*operands, jaxpr, **params):
@@ -178,19 +225,19 @@ def _plainly(*operands, jaxpr, **params):
 
 
 def _marked(*operands, jaxpr, **params):
-    original = jaxpr
-    jaxpr = rewritten(jaxpr, _without_library)
+    original, jaxpr = jaxpr, without_library(jaxpr)
     if not fits(jaxpr.jaxpr):
         return _plainly(*operands, jaxpr=original)
 
+    # XLA ends the process where an operand of such a call is not used in it: one that is never used, one that it finds
+    # out not to need, and one that it knows and writes into the function, above 10 kB. So each of them is a result
+    # too, and none of them is known.
     def function(*operands):
-        # XLA ends the process where an operand of such a call is never used, also one that it finds out not to need:
-        # each of them is a result too.
         return *jaxpr_as_fun(jaxpr)(*operands), *map(jnp.copy, operands)
 
     # The mark of a result is put on what makes it: the call.
-    first, *others = jax.jit(function)(*operands)
-    return [set_xla_metadata(first, inlineable="false", xla_cpu_small_call="true"), *others][: len(jaxpr.out_avals)]
+    first, *others = jax.jit(function)(*lax.optimization_barrier(operands))
+    return [marked(first, ONE_KERNEL), *others][: len(jaxpr.out_avals)]
 
 
 def _pushed(jaxpr, known, checked):
@@ -247,7 +294,10 @@ def _batched(operands, axes, *, jaxpr, in_blocks, points, values, checked):
     return results, [0] * len(results)
 
 
-def _lanes_together(*operands, jaxpr, batched, **params):
+def _lanes_together(*operands, jaxpr, batched, lanes=None, **params):
+    if lanes == 0:
+        # A loop that waits for the slowest of no lanes has none to ask.
+        return [jnp.zeros((0, *aval.shape), aval.dtype) for aval in jaxpr.out_avals]
     return jax.vmap(jaxpr_as_fun(jaxpr), [0 if b else None for b in batched])(*operands)
 
 
@@ -255,8 +305,8 @@ def _lanes_in_blocks(*operands, jaxpr, batched, lanes, **params):
     """A loop over blocks of lanes, as few as fit and all of one length: the last lane fills the last block."""
     together = partial(_lanes_together, jaxpr=jaxpr, batched=batched)
     blocks = -(-lanes // TOGETHER)
-    if blocks == 1:
-        return together(*operands)
+    if blocks <= 1:
+        return together(*operands, lanes=lanes)
     length = -(-lanes // blocks)
 
     def in_blocks(x):

@@ -1,0 +1,54 @@
+"""Whether the measurements have the shapes of what a motion says, or an error in the user's words."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+
+from lagjax.fitting.equations import Problem
+from lagjax.fitting.records import channel_name
+from lagjax.mechanics import constraints
+from lagjax.mechanics.diagnosis import listed
+
+
+def check_predicted(problem: Problem):
+    """Raise where the measurements do not have the shape of what the motion says."""
+    begin = jax.tree.map(lambda x: x[0], (problem.starts.q.guess, problem.starts.v.guess))
+    q, v = (jax.eval_shape(problem.unflatten, x) for x in begin)
+    t, params = jax.ShapeDtypeStruct((), problem.windows.ts.dtype), problem.found.params
+
+    def one_time(t, q, v, params):
+        shapes = constraints.shapes(problem.system, t, q, v, params)
+        said = {"q": q, "v": v, "multipliers": {name: jnp.zeros(shape) for name, shape in shapes.items()}}
+        if problem.observe is not None:
+            said["observed"] = problem.observe(t, q, v, params)
+        return said | {"end": {"t": t, **said}}
+
+    said = eqx.filter_eval_shape(one_time, t, q, v, params)
+    for kind, tree in problem.measured.items():
+        _match(kind, said[kind], tree, 1 if kind == "end" else 2)
+
+
+def _match(kind: str, said: Any, measured: Any, axes: int, path=()):
+    if isinstance(measured, dict) and isinstance(said, dict):
+        for name, part in measured.items():
+            if name not in said:
+                raise ValueError(
+                    f"'{name}' was measured as {kind}, and there {listed(list(said))}.\n"
+                    f"Fix: name what the motion has: {kind}={{{list(said)[0]!r}: ...}}."
+                )
+            _match(kind, said[name], part, axes, (*path, jtu.DictKey(name)))
+        return
+    found, wanted = jtu.tree_structure(said), jtu.tree_structure(measured)
+    if found != wanted:
+        raise ValueError(
+            f"{kind} was measured as {wanted}, and the motion has {found}.\nFix: give it in that structure."
+        )
+    for x, y in zip(jtu.tree_leaves(said), jtu.tree_leaves(measured)):
+        if x.shape != y.shape[axes:]:
+            raise ValueError(
+                f"'{channel_name(kind, path)}' was measured with the shape {y.shape[axes:]} at each time, and the "
+                f"motion has {x.shape}.\nUsual cause: an array of one entry where a number is meant."
+            )

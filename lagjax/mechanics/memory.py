@@ -1,0 +1,81 @@
+"""What was found of an object, for as long as the object lives."""
+
+import math
+import weakref
+from collections.abc import Callable, Hashable
+from typing import Any, NamedTuple, TypeVar
+
+import equinox as eqx
+import jax
+import jax.tree_util as jtu
+import numpy as np
+from jaxtyping import PyTree
+
+T = TypeVar("T")
+# Of one object. Shapes that never end are a user's loop, and the first of them are not asked for again.
+AT_MOST = 256
+_found: dict[int, tuple[weakref.ref, dict]] = {}
+
+
+def remembered(thing: Any, key: Hashable, find: Callable[[], T]) -> T:
+    """`find()`, or what it found before for this very object and this key."""
+    try:
+        hash(key)
+    except TypeError:
+        return find()
+    reference, found = _found.get(id(thing), (None, {}))
+    if reference is None or reference() is not thing:
+        number, found = id(thing), {}
+        _found[number] = weakref.ref(thing, lambda _: _found.pop(number, None)), found
+    if key not in found:
+        value = find()
+        if len(found) >= AT_MOST:
+            found.clear()
+        found[key] = value
+    return found[key]
+
+
+def kinds(tree: PyTree):
+    """Structure, shapes and dtypes of a tree, and what in it is no array: what a program is compiled for."""
+    leaves, structure = jtu.tree_flatten(tree)
+    return structure, *((x.shape, x.dtype) if is_array(x) else (type(x), x) for x in leaves)
+
+
+class Parted(NamedTuple):
+    """What of a tree is no array: what a program of its arrays is compiled for."""
+
+    rest: tuple
+    structure: Any
+
+    def together(self, arrays):
+        """The tree again."""
+        arrays = iter(arrays)
+        return jtu.tree_unflatten(self.structure, [next(arrays) if x is None else x for x in self.rest])
+
+
+def parted(tree: PyTree) -> tuple[Parted, list]:
+    """A tree as what is no array, and the arrays, among which is a number of NumPy's: it is another one each time."""
+    leaves, structure = jtu.tree_flatten(tree)
+    goes = [is_array(x) or isinstance(x, np.generic) for x in leaves]
+    rest = tuple(None if array else x for x, array in zip(leaves, goes))
+    return Parted(rest, structure), [x for x, array in zip(leaves, goes) if array]
+
+
+def is_array(x) -> bool:
+    """Whether something is an array of JAX or of NumPy."""
+    return isinstance(x, jax.Array | np.ndarray)
+
+
+def shape_of(function: Callable, *args):
+    """What a function returns of arrays of JAX or NumPy, as shapes; nothing is computed."""
+    shaped = lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype) if isinstance(x, np.ndarray) else x
+    return eqx.filter_eval_shape(function, *jtu.tree_map(shaped, args))
+
+
+def filled_up(count: int) -> int:
+    """One of few numbers that is not below `count`: a program of that length serves all that are filled up to it.
+
+    No more than 7 are filled up, or an eighth of them.
+    """
+    step = 2 ** max(3, count.bit_length() - 4)
+    return math.ceil(count / step) * step

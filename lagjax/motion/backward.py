@@ -1,0 +1,119 @@
+"""Motions that run backward in time: the reflected system, which runs forward.
+
+With τ = -t and w = dq/dτ = -v the action of L(t, q, v) is that of L(-τ, q, -w), and Lagrange's equations keep their
+form, with the same accelerations and multipliers, for
+
+    L'(τ, q, w) = L(-τ, q, -w)        Q'(τ, q, w) = Q(-τ, q, -w)        R'(τ, q, w) = -R(-τ, q, -w)
+    g'(τ, q)    = g(-τ, q)          phi'(τ, q, w) = -phi(-τ, q, -w)
+
+(R and phi change their sign so that ∂R'/∂w = ∂R/∂v and ∂phi'/∂w = ∂phi/∂v.) What steps, projects and locates events
+then knows one direction of time alone, and who runs forward pays nothing. Times and velocities are reflected on the way
+in and on the way out, both exactly.
+
+The direction is part of the program: it has to be known when the program is traced. A sign as an argument would cost
+all who pass their times through `jit` (a pendulum of mass 1 takes 1.25 times as long with a mass that is the square of
+a sign).
+
+Source: Lamb & Roberts, Physica D 112 (1998) 1, §2 (reversing symmetries).
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import diffrax
+import equinox as eqx
+import jax
+import numpy as np
+
+from lagjax.mechanics.constraints import Holonomic, Nonholonomic
+from lagjax.mechanics.coordinates import is_traced
+from lagjax.mechanics.system import System
+from lagjax.motion.solve import trajectory_of
+from lagjax.motion.trajectory import Moment, Trajectory, pack
+
+
+class Reflected(eqx.Module):
+    """A function of (t, q, v, ...), or of (t, q, ...) alone, at the reflected time and velocities."""
+
+    function: Callable
+    of_velocities: bool = eqx.field(static=True, default=True)
+    odd: bool = eqx.field(static=True, default=False)
+
+    def __call__(self, t, q, *rest):
+        if self.of_velocities:
+            v, *rest = rest
+            rest = (_negative(v), *rest)
+        value = self.function(-t, q, *rest)
+        return _negative(value) if self.odd else value
+
+
+class ReflectedCondition(eqx.Module):
+    """The condition of a `diffrax.Event` at the reflected time and velocities."""
+
+    condition: Callable
+
+    def __call__(self, t, y, args, **kwargs):
+        q, v = y
+        return self.condition(-t, (q, _negative(v)), args, **kwargs)
+
+
+def in_either_direction(system, q0, v0, params, ts, guards, settings, backward: bool) -> Trajectory:
+    """`trajectory_of`, for times that increase, or decrease."""
+    if not backward:
+        return trajectory_of(system, q0, v0, params, ts, guards, settings)
+    if guards is not None:
+        # Their directions stay: those along the run of the motion, as in SciPy.
+        guards = replace(guards, functions=tuple(map(Reflected, guards.functions)))
+    reflected = trajectory_of(
+        reflect_system(system), q0, _negative(v0), params, -ts, guards, _reflect_settings(settings)
+    )
+    arrays, static = pack(system, params, reflected.static.method)
+    events = {name: replace(found, t=-found.t, v=_negative(found.v)) for name, found in reflected.events.items()}
+    v, end = _negative(reflected.v), reflect_moment(reflected.end)
+    return replace(reflected, t=ts, v=v, end=end, events=events, arrays=arrays, static=static)
+
+
+def runs_backward(ts) -> bool:
+    """Whether times decrease, as far as that is known already: while JAX is tracing them they are taken to increase."""
+    ts = ts if is_traced(ts) else np.asarray(ts)
+    try:
+        return bool(ts[-1] < ts[0])
+    except jax.errors.TracerBoolConversionError:
+        return False
+
+
+def reflect_system(system: System) -> System:
+    """The system whose motion forward is the motion of `system` backward."""
+    constraints = {
+        name: Holonomic(Reflected(c.g, of_velocities=False))
+        if isinstance(c, Holonomic)
+        else Nonholonomic(Reflected(c.phi, odd=True))
+        for name, c in system.constraints.items()
+    }
+    force = None if system.force is None else Reflected(system.force)
+    dissipation = None if system.dissipation is None else Reflected(system.dissipation, odd=True)
+    return System(Reflected(system.lagrangian), constraints, force, dissipation)
+
+
+def reflect_moment(moment: Moment) -> Moment:
+    """An instant of the reflected motion, or several, as instants of the motion itself."""
+    return moment._replace(t=-moment.t, v=_negative(moment.v))
+
+
+def _reflect_settings(settings):
+    controller, event, jump_ts = settings.controller, settings.event, settings.jump_ts
+    return replace(
+        settings,
+        controller=None if controller is None else controller.wrap(-1),
+        event=None if event is None else _reflect_event(event),
+        jump_ts=None if jump_ts is None else -jump_ts,
+    )
+
+
+def _reflect_event(event):
+    conditions = jax.tree.map(ReflectedCondition, event.cond_fn, is_leaf=callable)
+    return diffrax.Event(conditions)
+
+
+def _negative(tree):
+    return jax.tree.map(lambda x: -x, tree)

@@ -1,0 +1,198 @@
+"""When exactly a guard is zero, and what the state is then: the root on the flow, with its derivatives.
+
+`locate` finds the time, between two that enclose it, at which the state that the method steps to is on the guard. Times
+are not differentiated there, states are. `_exact` gives both what follows from g(t, y(t)) = 0,
+
+    dt = -dg / (dg/dt),    dy = ∂y + (dy/dt) dt.
+
+Source: Hairer, Nørsett & Wanner, *Solving ODEs I*, §II.6 (event location); Chen, Amos & Nickel, arXiv:2011.03902,
+App. A (its derivative).
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import equinox.internal as eqxi
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int, PyTree
+
+from lagjax.mechanics.saddle_point import equations_of_motion
+from lagjax.motion.consistency import stopped
+from lagjax.motion.crossings import Crossings, Guards
+from lagjax.motion.pieces import Watched
+from lagjax.motion.watching import Watching, uneven
+
+# Steps to find a root: by Newton's formula four; by halves fifty.
+LOOKS = 100
+# A guard that is this much farther from zero where it changes its sign than time can resolve jumps there.
+JUMPS = 64
+
+
+class Located(NamedTuple):
+    """Where guards are zero: times (S,), NaN where there is no crossing, the states there, and the multipliers.
+
+    `count`, `uncertain`: see `Crossings`, of each guard.
+    """
+
+    t: Float[Array, " S"]
+    y: PyTree[Float[Array, "S ..."]]
+    multipliers: dict[str, Array]
+    count: Int[Array, " m"]
+    uncertain: Bool[Array, " m"]
+
+
+def locate(watching: Watching, watched: Watched, params) -> Located:
+    """The roots of what was enclosed."""
+    motion, guards = watching.motion, watching.guards
+
+    def found(owner, kept):
+        t, y = _root(watching, owner, kept, params)
+        t, y = _exact((guards, motion.system, params), lax.stop_gradient(t), y, owner, watching.resolution)
+        return t, y, motion.multipliers(t, y, params)
+
+    t, y, multipliers = _each(found, guards, jnp.isfinite(watched.kept.enclosed.before), watched.kept)
+    counts, uncertain = (jnp.stack([getattr(f, name) for f in watched.followed]) for name in ("count", "uncertain"))
+    return Located(t, y, multipliers, counts, uncertain)
+
+
+def at_known_times(guards: Guards, system, resolution, located: Located, y, params) -> Located:
+    """The same from the states `y` (S, ...) at the times that were found, in place of their roots."""
+
+    def found(owner, known):
+        t, y = _exact((guards, system, params), lax.stop_gradient(known[0]), known[1], owner, resolution)
+        return t, y, equations_of_motion(system, t, *y, params)[1] if system.constraints else {}
+
+    t, y, multipliers = _each(found, guards, jnp.isfinite(located.t), (located.t, y))
+    return located._replace(t=t, y=y, multipliers=multipliers)
+
+
+def _each(function, guards, there, rows):
+    """`function(owner, row)` of each place where there is a crossing; NaN elsewhere."""
+    owners = jnp.asarray(guards.owners)
+    shapes = jax.eval_shape(function, owners[0], jtu.tree_map(lambda x: x[0], rows))
+    nothing = jtu.tree_map(lambda x: jnp.full(x.shape, jnp.nan, x.dtype), shapes)
+
+    def one(place):
+        owner, there, row = place
+        found = lax.cond(eqxi.unvmap_any(there), lambda: function(owner, row), lambda: nothing)
+        return jtu.tree_map(lambda x, y: jnp.where(there, x, y), found, nothing)
+
+    return lax.map(one, (owners, there, rows))
+
+
+class _Bracket(NamedTuple):
+    """The search for a root between two times: where it was asked last and what it moved by, and the slope there."""
+
+    t: Float[Array, ""]
+    y: PyTree
+    low: Float[Array, ""]
+    high: Float[Array, ""]
+    g: Float[Array, ""]
+    slope: Float[Array, ""]
+    moved: Float[Array, ""]
+    looks: Int[Array, ""]
+    done: Bool[Array, ""]
+
+
+def _root(watching, owner, kept, args):
+    """The root on the flow, and the state there: by secants, and by halves where these do not get on."""
+    fixed, resolution = stopped(watching), watching.resolution
+    t0, y0, enclosed = kept
+
+    def look(s: _Bracket) -> _Bracket:
+        y = watching.motion.flow(t0, y0, s.t, args)
+        g = jnp.stack(fixed.value(s.t, *stopped((y, args))))[owner]
+        crossed = g * enclosed.sign >= 0
+        low, high = jnp.where(crossed, s.low, s.t), jnp.where(crossed, s.t, s.high)
+        secant = (g - s.g) / jnp.where(s.moved != 0, s.moved, 1.0)
+        slope = jnp.where((s.looks > 0) & (s.moved != 0) & (secant != 0), secant, s.slope)
+        step = -g / jnp.where(slope != 0, slope, jnp.nan)
+        narrow = high - low <= resolution
+        # A secant that halves its steps, and stays inside.
+        nearer = (s.t + step > low) & (s.t + step < high) & ((s.looks == 0) | (jnp.abs(step) <= 0.5 * jnp.abs(s.moved)))
+        # What jumps is zero nowhere: the first time after it counts.
+        following = jnp.where(narrow, high, jnp.where(nearer, s.t + step, low + 0.5 * (high - low)))
+        done = (jnp.abs(step) <= resolution) | (narrow & crossed) | (s.looks >= LOOKS)
+        t = jnp.where(done, s.t, following)
+        return _Bracket(t, y, low, high, g, slope, t - s.t, s.looks + 1, done)
+
+    zero = jnp.zeros_like(enclosed.guess)
+    start = _Bracket(
+        enclosed.guess, y0, enclosed.before, enclosed.after, zero, enclosed.slope, zero, jnp.asarray(0),
+        jnp.asarray(False),
+    )  # fmt: skip
+    found = lax.while_loop(lambda s: ~s.done, look, start)
+    return found.t, found.y
+
+
+def first_end(guards: Guards, t):
+    """The first time in `t` (S,) at which a terminal guard is zero; infinite if at none."""
+    return jnp.min(jnp.where(guards.terminal[guards.owners] & jnp.isfinite(t), t, jnp.inf))
+
+
+def end_of(guards: Guards, located: Located, t, y):
+    """The end of the motion, (1,): the first terminal crossing, or else the end that is given."""
+    ends = jnp.where(guards.terminal[guards.owners] & jnp.isfinite(located.t), located.t, jnp.inf)
+    first = jnp.argmin(ends)
+    ended = jnp.isfinite(ends[first])
+    return jtu.tree_map(lambda x, last: jnp.where(ended, x[first][None], last), (located.t, located.y), (t, y))
+
+
+def all_known(located: Located) -> Bool[Array, ""]:
+    """Whether nothing at the crossings is NaN, and none is uncertain."""
+    there, known = jnp.isfinite(located.t), ~jnp.any(located.uncertain)
+    for x in jtu.tree_leaves((located.y, located.multipliers)):
+        known = known & jnp.all(jnp.isfinite(x) | ~_like(there, x))
+    return known
+
+
+def by_name(guards: Guards, located: Located, end, valid) -> dict[str, Crossings]:
+    """What was found up to the end of the motion, by the name of the event; nothing if the motion is not `valid`."""
+    there, found = valid & (located.t <= end), {}
+    for i, kind in enumerate(guards.kinds):
+        mine = guards.owners == i
+        rows = jtu.tree_map(lambda x: x[mine], (located.t, *located.y, located.multipliers))
+        masked = jtu.tree_map(lambda x: jnp.where(_like(there[mine], x), x, jnp.nan), rows)
+        # The step in which the motion ended may have gone on to more.
+        count = located.count[i] - jnp.sum(jnp.isfinite(rows[0]) & ~there[mine])
+        found[kind.name] = Crossings(*masked, count, located.uncertain[i])
+    return found
+
+
+@eqx.filter_custom_jvp
+def _exact(live, t, y, owner, resolution):
+    """A time and a state on a guard as they are; with the derivatives that follow from staying on it."""
+    return t, y
+
+
+@_exact.def_jvp
+def _exact_jvp(primals, tangents):
+    (live, t, y, owner, resolution), (moves, _, dy, *_) = primals, tangents
+    dy = jtu.tree_map(lambda x, dx: jnp.zeros_like(x) if dx is None else dx, y, dy, is_leaf=lambda x: x is None)
+
+    def value(live, t, y):
+        guards, system, params = live
+        return jnp.stack(guards(t, *y, equations_of_motion(system, t, *y, params)[1], params))[owner]
+
+    _, system, params = live
+    a = equations_of_motion(system, t, *y, params)[0]
+    g, rate = jax.jvp(lambda t, y: value(live, t, y), (t, y), (jnp.ones_like(t), (y[1], a)))
+    _, dg = eqx.filter_jvp(value, (live, t, y), (moves, jnp.zeros_like(t), dy))
+    # Where it jumps, nothing follows.
+    jumps = jnp.abs(g) > JUMPS * (jnp.abs(rate) * resolution + jnp.finfo(t.dtype).eps * _terms(live, t, y, value))
+    dt = -dg / jnp.where(jumps, jnp.nan, rate)
+    along = lambda dx, rate: dx + rate * dt
+    return (t, y), (dt, (jtu.tree_map(along, dy[0], y[1]), jtu.tree_map(along, dy[1], a)))
+
+
+def _terms(live, t, y, value):
+    """How large the terms are whose sum the guard is."""
+    _, change = jax.jvp(lambda t, y: value(live, t, y), (t, y), (t, uneven(y)))
+    return jnp.abs(change)
+
+
+def _like(mask, x):
+    return mask.reshape(mask.shape + (1,) * (x.ndim - 1))

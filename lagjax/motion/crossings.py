@@ -1,0 +1,345 @@
+"""Events: functions of the state that cross zero, and what is known of each crossing.
+
+A guard `g(t, q, v, params)` says where something happens: an apex (`v["y"]`), a floor (`q["y"]`), a section of phase
+space, a contact that lets go (its multiplier). `watching.py` follows its sign along the motion.
+"""
+
+import inspect
+import warnings
+from collections.abc import Callable, Hashable, Mapping
+from functools import partial
+from typing import Any, NamedTuple
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array, Bool, Float, Int, PyTree
+
+from lagjax.jax_internals.programs import length
+from lagjax.jax_internals.tracing import is_eager
+from lagjax.mechanics.closures import lift_function
+from lagjax.mechanics.constraints import zero_multipliers
+from lagjax.mechanics.coordinates import State
+from lagjax.mechanics.first_call import Call, check_arguments, in_words
+from lagjax.mechanics.memory import is_array, kinds, remembered, shape_of
+from lagjax.mechanics.outside import first_guard_alike, read_by
+from lagjax.mechanics.system import System
+
+OF_STATE = ("t", "q", "v", "params")
+WITH_MULTIPLIERS = ("t", "q", "v", "multipliers", "params")
+# The operations of a guard that is compiled once for all places where it is looked at.
+LONG = 100
+DIRECTIONS = {None: 0, 0: 0, 1: 1, -1: -1}
+
+
+class Crossing(eqx.Module):
+    """An event: the motion crosses the surface where a guard is zero.
+
+    >>> import jax.numpy as jnp
+    >>> import lagjax as lj
+    >>> stone = lj.System(lambda t, q, v, params: 0.5 * v**2 - 10.0 * q)
+    >>> floor = Crossing(lambda t, q, v, params: q, direction=-1)
+    >>> apex = Crossing(lambda t, q, v, params: v, terminal=False)
+    >>> ts = jnp.array([0.0, 10.0])
+    >>> traj = lj.integrate(stone, 0.0, 5.0, ts=ts, events={"floor": floor, "apex": apex})
+    >>> print(traj.end.t.round(9), traj.events["apex"].t[0].round(9), traj.events["apex"].q[0].round(9))
+    1.0 0.5 1.25
+
+    **Arguments:**
+
+    - `guard`: `guard(t, q, v, params)` -> a number, of any unit, or true and false; or, where it takes five arguments,
+      `guard(t, q, v, multipliers, params)`, with the multipliers by constraint name. What it closes over is
+      differentiated too.
+    - `direction`: 1 for crossings from below zero to above, -1 for those from above, 0 for both; along the run of the
+      motion, also where that runs backward.
+    - `terminal`: end the motion at the first one (`traj.end`, and NaN in the outputs after it).
+    - `most`: how many crossings are kept; more are counted, and said. Of a terminal one, one is.
+
+    A start on the surface is not a crossing; leaving it and coming back is one.
+
+    **Raises:** `TypeError`, `ValueError` for a guard that cannot be called so, and for other directions.
+    """
+
+    guard: Callable
+    direction: int = eqx.field(static=True)
+    terminal: bool = eqx.field(static=True)
+    most: int = eqx.field(static=True)
+
+    def __init__(self, guard: Callable, direction: int | None = 0, terminal: bool = True, most: int = 32):
+        if not callable(guard):
+            raise TypeError(
+                f"a guard must be a function of (t, q, v, params), not {type(guard).__name__}.\n"
+                'Fix: lj.Crossing(lambda t, q, v, params: q["y"]).'
+            )
+        if direction not in DIRECTIONS or isinstance(direction, bool):
+            raise ValueError(
+                f"direction must be 1 (from below), -1 (from above) or 0 (both), not {direction!r}.\nFix: direction=-1."
+            )
+        if not (isinstance(most, int) and most > 0):
+            raise ValueError(f"most must be a whole number above zero, not {most!r}.\nFix: most=1000.")
+        self.guard = guard
+        self.direction = DIRECTIONS[direction]
+        self.terminal = bool(terminal)
+        self.most = 1 if terminal else most
+
+
+class Crossings(eqx.Module):
+    """The crossings of one guard that a motion came to, in the order of time; it prints itself.
+
+    - `t` (K,): their times, `[t]`; NaN beyond the last one. K is `most` of the `Crossing`.
+    - `q`, `v`: the states there, each leaf with a leading axis K; `multipliers` by constraint name, likewise.
+    - `count`: how many there were, also of those that were not kept.
+    - `uncertain`: whether some may be missing: the guard touched zero within round-off, or changed too fast between
+      steps to be followed.
+
+    Under `vmap` every array has the batch's axes in front.
+    """
+
+    t: Float[Array, " K"]
+    q: PyTree[Float[Array, "K ..."]]
+    v: PyTree[Float[Array, "K ..."]]
+    multipliers: dict[str, Array]
+    count: Int[Array, ""]
+    uncertain: Bool[Array, ""]
+
+    def with_states(self, q, v) -> "Crossings":
+        """The same with q and v in another structure."""
+        return Crossings(self.t, q, v, self.multipliers, self.count, self.uncertain)
+
+    def found(self) -> "Crossings":
+        """The same without the room that was not used, in NumPy. Not while JAX is tracing."""
+        kept = np.isfinite(np.asarray(self.t))
+        of_rows = (self.t, self.q, self.v, self.multipliers)
+        return Crossings(*jax.tree.map(lambda x: np.asarray(x)[kept], of_rows), self.count, self.uncertain)
+
+    def __repr__(self):
+        if not eqx.is_array(self.t) and not isinstance(self.t, np.ndarray) or isinstance(self.t, Tracer):
+            return "Crossings, being traced"
+        if np.ndim(self.count):
+            low, high = int(np.min(self.count)), int(np.max(self.count))
+            return f"Crossings of {np.size(self.count)} lanes, {low} to {high} each"
+        return f"Crossings: {self.in_words()}"
+
+    def in_words(self) -> str:
+        """How many, and the first of their times, on one line."""
+        times = np.asarray(self.t)[np.isfinite(np.asarray(self.t))]
+        shown = ", ".join(f"{t:.9g}" for t in times[:4]) + (", ..." if len(times) > 4 else "")
+        count = int(self.count)
+        kept = f", of which the first {len(times)} are kept" if count > len(times) else ""
+        doubt = "; some may be missing" if bool(self.uncertain) else ""
+        return f"{count}{kept}{f', at t = {shown}' if shown else ''}{doubt}"
+
+
+class Kind(NamedTuple):
+    """What of a guard is not a function: see `Crossing`; `long` where it takes long to compile; what it has `read`."""
+
+    name: str
+    direction: int
+    terminal: bool
+    most: int
+    takes_multipliers: bool
+    long: bool
+    read: Hashable
+
+
+class Guards(eqx.Module):
+    """All guards of a motion as one function to as many numbers."""
+
+    functions: tuple[Callable, ...]
+    kinds: tuple[Kind, ...] = eqx.field(static=True)
+    # In a system of numbers: puts q, and v, back into the user's structure.
+    together: Callable | None = eqx.field(static=True, default=None)
+
+    @property
+    def take_multipliers(self) -> bool:
+        return any(kind.takes_multipliers for kind in self.kinds)
+
+    @property
+    def long(self) -> bool:
+        return any(kind.long for kind in self.kinds)
+
+    @property
+    def terminal(self) -> np.ndarray:
+        return np.array([kind.terminal for kind in self.kinds])
+
+    @property
+    def direction(self) -> np.ndarray:
+        return np.array([kind.direction for kind in self.kinds])
+
+    @property
+    def owners(self) -> np.ndarray:
+        """Of each place where a crossing is kept, its guard."""
+        return np.repeat(np.arange(len(self.kinds)), [kind.most for kind in self.kinds])
+
+    @property
+    def ranks(self) -> np.ndarray:
+        """And which of its guard's crossings, from the first on, is kept there."""
+        return np.concatenate([np.arange(kind.most) for kind in self.kinds])
+
+    def in_numbers(self, unflatten: Callable) -> "Guards":
+        """The same for states that are tuples of numbers."""
+        return Guards(self.functions, self.kinds, lambda numbers: unflatten(jnp.stack(numbers)))
+
+    def __call__(self, t, q, v, multipliers, params) -> tuple[Float[Array, ""], ...]:
+        """The value of each; a condition that is true or false is one or minus one."""
+        q, v = (q, v) if self.together is None else (self.together(q), self.together(v))
+        of = lambda kind: (t, q, v, multipliers, params) if kind.takes_multipliers else (t, q, v, params)
+        return tuple(_number(f(*of(kind)), t) for f, kind in zip(self.functions, self.kinds))
+
+
+class Condition(eqx.Module):
+    """The condition of a `diffrax.Event` as a guard."""
+
+    condition: Callable
+
+    def __call__(self, t, q, v, params):
+        return self.condition(t, (q, v), params)
+
+
+def _number(value, t):
+    value = jnp.asarray(value)
+    value = jnp.where(value, 1.0, -1.0) if jnp.issubdtype(value.dtype, jnp.bool_) else value
+    return value.astype(t.dtype)
+
+
+def crossings_of(events: Any, event: Any) -> dict[str, Crossing]:
+    """What is asked for as `events`, and by the conditions of `event`, by name; raise where either is no event."""
+    if events is not None and not isinstance(events, Mapping):
+        raise TypeError(
+            f"events must be given by name, not as {type(events).__name__}.\n"
+            'Fix: events={"apex": lj.Crossing(lambda t, q, v, params: v["y"])}.'
+        )
+    for name, crossing in (events or {}).items():
+        if not isinstance(crossing, Crossing):
+            raise TypeError(
+                f"event '{name}' is {type(crossing).__name__}.\n"
+                f'Fix: "{name}": lj.Crossing(lambda t, q, v, params: q["y"]).'
+            )
+    found = dict(sorted((events or {}).items()))
+    if event is None:
+        return found
+    if not isinstance(event, diffrax.Event):
+        raise TypeError(
+            f"event must be a diffrax.Event, not {type(event).__name__}.\n"
+            "Usual cause: the condition itself.\n"
+            'Fix: events={"down": lj.Crossing(lambda t, q, v, params: q["y"])}.'
+        )
+    of_diffrax = {None: 0, True: 1, False: -1}
+    conditions = jtu.tree_leaves_with_path(event.cond_fn, is_leaf=callable)
+    directions = jtu.tree_leaves(event.direction, is_leaf=lambda x: x is None)
+    for (path, condition), direction in zip(conditions, directions):
+        if not asks_diffrax(condition):
+            name = "event" + jtu.keystr(path)
+            if name in found:
+                raise ValueError(
+                    f"two events have the name '{name}': that of the diffrax.Event is given here.\n"
+                    "Fix: another name in events=, or give both there, as lj.Crossing."
+                )
+            found[name] = Crossing(Condition(condition), of_diffrax[direction])
+    return found
+
+
+def asks_diffrax(condition: Callable) -> bool:
+    """Whether the condition of a `diffrax.Event` needs what diffrax alone knows, as `diffrax.steady_state_event`."""
+    parameters = inspect.signature(condition).parameters.values()
+    return any(p.kind is p.KEYWORD_ONLY and p.default is p.empty for p in parameters)
+
+
+def left_to_diffrax(event: diffrax.Event | None) -> diffrax.Event | None:
+    """The event of those conditions that ask diffrax, at ends of steps; None where there are none."""
+    if event is None:
+        return None
+    asking = [condition for condition in jtu.tree_leaves(event.cond_fn, is_leaf=callable) if asks_diffrax(condition)]
+    return diffrax.Event(asking) if asking else None
+
+
+def guards_of(crossings: Mapping[str, Crossing], system: System, start: State) -> Guards | None:
+    """The guards of all crossings, called once on shapes; None where there are none. `start` is the first state."""
+    if not crossings:
+        return None
+    functions, of_guards = [], []
+    for name, crossing in crossings.items():
+        guard, read = first_guard_alike(crossing.guard) if is_eager() else (crossing.guard, read_by(crossing.guard))
+        look = partial(_looked_at, name, guard, system, start)
+        takes, multipliers, long = remembered(system, (guards_of, guard, read, kinds(start)), look)
+        given = dict(zip(OF_STATE, start)) | {"multipliers": multipliers}
+        functions.append(lift_function(guard, tuple(given[name] for name in takes)))
+        of_crossing = crossing.direction, crossing.terminal, crossing.most
+        of_guards.append(Kind(name, *of_crossing, takes is WITH_MULTIPLIERS, long, read))
+    return Guards(tuple(functions), tuple(of_guards))
+
+
+def _looked_at(name, guard, system, start):
+    """What a guard takes, multipliers for it, and whether it takes long to compile; raise where it is none."""
+    takes, multipliers = _takes(guard), zero_multipliers(system, start)
+    given = dict(zip(OF_STATE, start)) | {"multipliers": multipliers}
+    call = Call("guard", guard, takes, f" of event '{name}'")
+    _check(call, given)
+    # The equations give the multipliers.
+    return takes, multipliers, takes is WITH_MULTIPLIERS or _length(call, given) > LONG
+
+
+def _length(call, given):
+    arrays, static = eqx.partition([given[name] for name in call.takes], is_array)
+    return length(jax.make_jaxpr(lambda arrays: call.function(*eqx.combine(arrays, static)))(arrays).jaxpr)
+
+
+def _takes(guard):
+    try:
+        inspect.signature(guard).bind(*WITH_MULTIPLIERS)
+        with_multipliers = not _binds(guard, OF_STATE)
+    except (TypeError, ValueError):
+        with_multipliers = False
+    return WITH_MULTIPLIERS if with_multipliers else OF_STATE
+
+
+def _binds(function, arguments):
+    try:
+        inspect.signature(function).bind(*arguments)
+    except TypeError:
+        return False
+    return True
+
+
+def _check(call, given):
+    check_arguments(call, "the arguments of a condition of diffrax, (t, y, args)")
+    with in_words(call, given):
+        value = shape_of(call.function, *(given[name] for name in call.takes))
+    shape, dtype = getattr(value, "shape", ()), getattr(value, "dtype", np.dtype(type(value)))
+    if shape != () or not (jnp.issubdtype(dtype, jnp.floating) or jnp.issubdtype(dtype, jnp.bool_)):
+        raise ValueError(
+            f"{call} must return one real number, or true or false, and returned "
+            f"{'nothing' if value is None else f'shape {shape}, {dtype}'}.\n"
+            "Usual cause: a vector left as it is, or a function without return.\n"
+            "Fix: return one coordinate of it, and give each of several an event of its own."
+        )
+
+
+class EventWarning(UserWarning):
+    """Crossings of a guard may be missing, or were not kept."""
+
+
+def warn_of_events(events: Mapping[str, Crossings]):
+    """Warn where crossings may be missing, and where there were more than are kept."""
+    for name, found in events.items():
+        if bool(found.uncertain):
+            warnings.warn(
+                f"crossings of event '{name}' may be missing: its guard touches zero within round-off, or changes too "
+                "fast between steps to be followed.\n"
+                "Usual cause: a guard that is zero all along (a conserved quantity), grazes its surface, or oscillates "
+                "far faster than the motion.\n"
+                "Fix: shift the level of the guard a little; or let the motion take shorter steps, max_step=.",
+                EventWarning,
+                stacklevel=4,
+            )
+        elif int(found.count) > found.t.shape[-1] > 1:
+            warnings.warn(
+                f"event '{name}' happened {int(found.count)} times, and the first {found.t.shape[-1]} are kept.\n"
+                f"Fix: lj.Crossing(..., most={int(found.count)}), or terminal=True to end at the first.",
+                EventWarning,
+                stacklevel=4,
+            )

@@ -1,0 +1,270 @@
+"""diffrax's loop: how a motion is stepped through, with outputs at given times and guards followed on the way."""
+
+import importlib.util
+from dataclasses import replace
+from functools import partial
+from typing import NamedTuple, cast
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+from jaxtyping import Array, Float, PyTree
+
+from lagjax.jax_internals.one_function import called, calls_host, one_function
+from lagjax.mechanics import constraints
+from lagjax.mechanics.coordinates import State
+from lagjax.mechanics.in_numbers import Numbers
+from lagjax.mechanics.saddle_point import equations_of_motion
+from lagjax.mechanics.structure import angles
+from lagjax.mechanics.system import System
+from lagjax.motion.arriving import Arriving, together
+from lagjax.motion.consistency import stopped
+from lagjax.motion.crossing_times import Located, at_known_times, first_end, locate
+from lagjax.motion.stepping import OnManifold, Quick, Stages, Tolerances, forward_differentiable
+from lagjax.motion.watching import Watching
+from lagjax.numerics.nystrom import Nystrom
+from lagjax.numerics.runge_kutta import ExplicitRungeKutta
+from lagjax.numerics.simplified_newton import SimplifiedNewton, with_tolerances
+
+# The packages whose checks are known to pass: `solve` looks at what they are about.
+LOOKED_AT = {"lagjax", "diffrax", "optimistix"}
+# Baumgarte's feedback decays a violation by e this many times over the time span.
+BAUMGARTE_DECAYS = 50.0
+# The operations of a right-hand side that is copied to each of the stages; longer ones are compiled once, in a loop.
+UNROLL_UP_TO = 250
+# The same where steps are taken to times inside another one, at two places, to find a crossing.
+UNROLL_INSIDE = 60
+
+
+class Solution(NamedTuple):
+    """What the loop came to: times that it reached (infinite elsewhere), states there, its last time and state, (1,).
+
+    `located`: where guards are zero; None without guards.
+    """
+
+    reached: Float[Array, " T"]
+    outputs: PyTree[Float[Array, "T ..."]]
+    end: tuple[Float[Array, " 1"], PyTree[Float[Array, "1 ..."]]]
+    stats: dict[str, Array]
+    result: diffrax.RESULTS
+    located: Located | None
+
+
+def solution_of(system, written, start: State, y0, refused, ts, guards, settings, adjoint) -> Solution:
+    """Step through a motion by diffrax; where `refused`, end within a few steps."""
+    problem = (system, written, start, y0, refused)
+    if guards is None or isinstance(adjoint, diffrax.ForwardMode):
+        return _loop(*problem, settings, ts, adjoint, guards)
+    # In reverse mode diffrax differentiates outputs alone: once the crossings' times are known, they are outputs.
+    found = _loop(*stopped((*problem, settings, ts)), diffrax.ForwardMode(), stopped(guards))
+    end = jnp.minimum(found.end[0][0], first_end(guards, found.located.t))
+    times = jnp.concatenate([ts, found.located.t])
+    times = jnp.minimum(jnp.where(jnp.isfinite(times), times, end), end)
+    order = jnp.argsort(times)
+    without = eqx.tree_at(lambda s: s.event, settings, None, is_leaf=lambda x: x is None)
+    again = _loop(*problem, without, times[order], adjoint, repeated=True)
+    place = jnp.argsort(order)
+    of_outputs, of_crossings = (
+        jax.tree.map(lambda x: x[place[part]], again.outputs) for part in (slice(ts.size), slice(ts.size, None))
+    )
+    return found._replace(
+        reached=jnp.where(jnp.isfinite(again.reached[place[: ts.size]]), found.reached, jnp.inf),
+        outputs=of_outputs,
+        end=again.end,
+        located=at_known_times(guards, system, resolution(ts), found.located, of_crossings, start.params),
+    )
+
+
+def _loop(system, written, start, y0, refused, settings, ts, adjoint, guards=None, repeated=False):
+    rate = BAUMGARTE_DECAYS / (ts[-1] - ts[0]) if settings.drift == "baumgarte" else None
+    terms, params = diffrax.ODETerm(Field(system, rate)), start.params
+    quick = None
+    if written is not None and settings.drift != "baumgarte":
+        field = WrittenField(written.equations, written.equations.prepare(system, params))
+        project = written.project if settings.drift == "project" else None
+        prepared = () if project is None else project.prepare(system, params)
+        in_a_loop, length = _in_a_loop(settings.method, adjoint), written.equations.length
+        stages, inside = (settings.method if length <= least else in_a_loop for least in (UNROLL_UP_TO, UNROLL_INSIDE))
+        careful = written.careful and settings.careful
+        quick = Quick(stages, inside, diffrax.ODETerm(field), project, prepared, careful)
+    # BacksolveAdjoint integrates a larger state backwards: it takes the bare method, and no end beside the outputs.
+    bare = isinstance(adjoint, diffrax.BacksolveAdjoint)
+    settings = eqx.tree_at(lambda s: s.method, settings, _with_root_finder(settings))
+    controller = _controller(ts, settings, bare, repeated)
+    if bare:
+        solver, saveat = settings.method, diffrax.SaveAt(ts=ts)
+    else:
+        solver = _solver(system, terms, quick, start, refused, settings, adjoint)
+        subs = diffrax.SubSaveAt(ts=ts), diffrax.SubSaveAt(t1=True)
+        saveat = diffrax.SaveAt(subs=subs, controller_state=guards is not None)
+    if guards is not None:
+        controller = Watching(controller, guards, solver, resolution(ts))
+    arguments = (
+        terms if quick is None else quick.terms, solver, ts[0], ts[-1], settings.dt0, y0, params, saveat, controller,
+        _by_position(settings.event),
+    )  # fmt: skip
+    solve = partial(_diffeqsolve, max_steps=settings.max_steps, adjoint=adjoint, progress=settings.progress)
+    # Reverse mode has to look inside.
+    if isinstance(adjoint, diffrax.ForwardMode):
+        own = _own_calls_of_the_host(system, terms, written, start, guards, settings, controller)
+        reached, outputs, *rest = one_function(solve, *arguments, checked=not own, in_blocks=True)
+    else:
+        reached, outputs, *rest = solve(*arguments)
+    assert reached is not None and outputs is not None
+    if bare:
+        end = jax.tree.map(lambda x: x[-1:], (reached, outputs))
+    else:
+        (reached, end_t), (outputs, end_y) = reached, outputs
+        end = end_t, end_y
+    return Solution(reached, outputs, end, *rest)
+
+
+class Field(eqx.Module):
+    """d(q, v)/dt = (v, a), on the user's pytrees; what JAX traces of it is a leaf, so that a program may contain it."""
+
+    system: System
+    baumgarte_rate: Float[Array, ""] | None
+
+    def __call__(self, t, y, args):
+        q, v = y
+        params, independent = args if isinstance(args, Stages) else (args, None)
+        return v, called(equations_of_motion(self.system, t, q, v, params, self.baumgarte_rate, independent))[0]
+
+
+class WrittenField(eqx.Module):
+    """The same from the equations written out, with what does not depend on the state computed before."""
+
+    equations: Numbers = eqx.field(static=True)
+    prepared: tuple
+
+    def __call__(self, t, y, params):
+        return y[1], self.solved(t, y)[0]
+
+    def solved(self, t, y):
+        """The accelerations, and the multipliers in one vector."""
+        return called(self.equations.at(self.prepared, t, *y))
+
+
+def _diffeqsolve(terms, solver, t0, t1, dt0, y0, args, saveat, controller, event, *, max_steps, adjoint, progress):
+    solution = diffrax.diffeqsolve(
+        terms, solver, t0, t1, dt0, y0, args, saveat=saveat, stepsize_controller=controller, adjoint=adjoint,
+        event=event, max_steps=max_steps, throw=False, progress_meter=_progress_meter(progress),
+    )  # fmt: skip
+    watching = isinstance(controller, Watching)
+    located = locate(controller, cast(tuple, solution.controller_state)[1], args) if watching else None
+    return solution.ts, solution.ys, solution.stats, solution.result, located
+
+
+def _own_calls_of_the_host(system, terms, written, start, guards, settings, controller):
+    """Whether the user's functions, method or controller may call Python at run time, if only to check something.
+
+    What is left then are diffrax's checks. They are about the times and the first step, which `solve` looks at.
+    """
+    parts = (settings.method, settings.controller)
+    if any(part is not None and type(part).__module__.split(".")[0] not in LOOKED_AT for part in parts):
+        return True
+    t, q, v, params = start
+    if written is None:
+        traced = [jax.make_jaxpr(lambda t, y: terms.vf(t, y, params))(t, (q, v))]
+    else:
+        traced = []
+        if any(numbers.calls_host for numbers in (written.equations, written.project) if numbers is not None):
+            return True
+    if guards is not None:
+        multipliers = constraints.zero_multipliers(system, start)
+        traced.append(jax.make_jaxpr(lambda t, q, v: guards(t, q, v, multipliers, params))(t, q, v))
+    conditions = jax.tree.leaves(settings.event.cond_fn, is_leaf=callable) if settings.event is not None else ()
+    given = dict(terms=terms, solver=settings.method, t0=t, t1=t, dt0=None, max_steps=settings.max_steps)
+    given |= dict(saveat=None, stepsize_controller=controller)
+    for condition in conditions:
+        traced.append(jax.make_jaxpr(lambda t, y, condition=condition: condition(t, y, params, **given))(t, (q, v)))
+    return any(calls_host(program.jaxpr) for program in traced)
+
+
+def method_alone(settings, method):
+    """A method as a motion is stepped with it, on equations that are not written out."""
+    return _in_a_loop(_with_root_finder(replace(settings, method=method)), diffrax.ForwardMode())
+
+
+def _with_root_finder(settings):
+    """An implicit method with diffrax's default root finder gets ours; all get the solve's tolerances."""
+    method, tolerances = settings.method, (settings.rtol[0], settings.atol[0])
+    if isinstance(getattr(method, "root_finder", None), diffrax.VeryChord):
+        return eqx.tree_at(lambda method: method.root_finder, method, SimplifiedNewton(*tolerances))
+    return with_tolerances(method, *tolerances)
+
+
+def _solver(system, terms, quick, start, refused, settings, adjoint):
+    angle = tuple(jax.tree.leaves(angles(system, *start)))
+    return OnManifold(
+        solver=_in_a_loop(settings.method, adjoint),
+        system=system,
+        terms=terms,
+        quick=quick,
+        params=start.params,
+        refused=refused,
+        tolerances=Tolerances(settings.rtol, settings.atol),
+        angles=angle,
+        controlled=settings.controller is None,
+        weigh=settings.controller is None and (settings.apart or any(angle)),
+        project=settings.drift == "project",
+        arriving=_arriving(settings),
+        jump_ts=settings.jump_ts,
+    )
+
+
+def _in_a_loop(method, adjoint):
+    """The method with a loop over its stages, of the kind that the derivative needs."""
+    if isinstance(method, Nystrom):
+        return type(method)(in_a_loop=True)
+    ours = isinstance(method, ExplicitRungeKutta)
+    method = method.shipped if ours else method
+    if isinstance(adjoint, diffrax.RecursiveCheckpointAdjoint | diffrax.DirectAdjoint):
+        return forward_differentiable(method)
+    return eqx.tree_at(lambda s: s.scan_kind, method, "lax", is_leaf=lambda x: x is None) if ours else method
+
+
+def _arriving(settings):
+    # A controller of the user's chooses its steps itself; a condition that asks diffrax may ask it for the tolerances.
+    return settings.controller is None and settings.event is None
+
+
+def _controller(ts, settings, bare, repeated):
+    if settings.controller is not None:
+        return settings.controller
+    # A step that small no longer moves t: the solution is singular there, or was NaN from the start.
+    dtmin = 16 * jnp.finfo(ts.dtype).eps * jnp.maximum(jnp.abs(ts[0]), jnp.abs(ts[-1]))
+    # The largest error counts, not the mean: more coordinates should not loosen the tolerance of each.
+    controller = diffrax.PIDController(
+        rtol=settings.rtol[0], atol=settings.atol[0], norm=optx.max_norm, dtmin=dtmin, dtmax=settings.max_step,
+        force_dtmin=False,
+    )  # fmt: skip
+    arriving = _arriving(settings) and not bare
+    if settings.jump_ts is None and not repeated:
+        return Arriving(controller, ts) if arriving else controller
+    jumps = ts[-1:] if settings.jump_ts is None else settings.jump_ts
+    return Arriving(controller, together(ts if arriving else ts[np.array([0, -1])], jumps))
+
+
+def resolution(ts):
+    """How near to each other two times can be told apart."""
+    return 4 * jnp.finfo(ts.dtype).eps * jnp.maximum(jnp.abs(ts[0]), jnp.abs(ts[-1]))
+
+
+def _by_position(event):
+    """The user's event, whose conditions get by position what diffrax passes by name: there it may be `params`."""
+    if event is None:
+        return None
+    wrap = lambda condition: lambda t, y, args, **kwargs: condition(t, y, args, **kwargs)
+    return diffrax.Event(jax.tree.map(wrap, event.cond_fn, is_leaf=callable))
+
+
+def _progress_meter(progress):
+    if not progress:
+        return diffrax.NoProgressMeter()
+    if importlib.util.find_spec("tqdm") is None:
+        return diffrax.TextProgressMeter()
+    return diffrax.TqdmProgressMeter()

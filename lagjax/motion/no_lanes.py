@@ -1,0 +1,28 @@
+"""Failures raised at run time, also of a batch in which there is nobody.
+
+Equinox raises where any lane of a batch fails, with the largest of their codes, and an empty batch has none.
+"""
+
+import equinox as eqx
+import jax.numpy as jnp
+
+from lagjax.jax_internals.primitives import primitive
+from lagjax.motion.trajectory import RESULTS, Trajectory, ended_well
+
+
+def raise_at_run_time(trajectory: Trajectory) -> Trajectory:
+    """The trajectory; where it failed, the program that computes it ends with the message of its result."""
+    code = _code_p.bind(jnp.asarray(trajectory.result._value))
+    result = eqx.tree_at(lambda result: result._value, trajectory.result, code)
+    return result.error_if(trajectory, ~ended_well(result))
+
+
+def _batched(operands, axes):
+    (code,), (axis,) = operands, axes
+    if code.shape[axis] == 0:
+        return jnp.full(code.shape[:axis] + code.shape[axis + 1 :], RESULTS.successful._value), None
+    return _code_p.bind(code), axis
+
+
+_same = lambda code: code
+_code_p = primitive("result_code", _same, _same, batched=_batched)

@@ -1,0 +1,223 @@
+"""What is known of guards: at a time, between two times at which the motion is known, and so far.
+
+See `watching.py` for how they are used, and for the source.
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, PyTree
+
+# Where an interval is parted. Not in the middle: half a period after an extremum there is another one.
+SHARES = (0.0, 0.45, 1.0)
+PIECES, INNER = len(SHARES) - 1, SHARES[1:-1]
+# What a cubic over the whole interval leaves out of a guard, times this, is what those over its pieces may leave out.
+BENT = 0.5
+# The polynomials that weigh (q0, h v0, h² a0, h² a1, h v1, q1), and of a cubic (x0, h dx0, h dx1, x1).
+QUINTIC = np.array([
+    [1, 0, 0, -10, 15, -6], [0, 1, 0, -6, 8, -3], [0, 0, 0.5, -1.5, 1.5, -0.5],
+    [0, 0, 0, 0.5, -1, 0.5], [0, 0, 0, -4, 7, -3], [0, 0, 0, 10, -15, 6],
+])  # fmt: skip
+CUBIC = np.array([[1, 0, -3, 2], [0, 1, -2, 1], [0, 0, -1, 1], [0, 0, 3, -2]])
+
+
+class Value(NamedTuple):
+    """A guard at a time: its value, its rate, what of the value is rounding; whether it is known to turn there."""
+
+    g: Float[Array, ""]
+    rate: Float[Array, ""]
+    noise: Float[Array, ""]
+    turns: Bool[Array, ""]
+
+
+class Node(NamedTuple):
+    """The motion at a time, and each guard."""
+
+    t: Float[Array, ""]
+    y: PyTree
+    a: PyTree
+    values: tuple[Value, ...]
+
+
+class Enclosed(NamedTuple):
+    """Two times around a crossing, NaN where there is none; the sign after it; a cubic's root, and its slope there."""
+
+    before: Float[Array, " S"]
+    after: Float[Array, " S"]
+    sign: Float[Array, " S"]
+    guess: Float[Array, " S"]
+    slope: Float[Array, " S"]
+
+
+class Kept(NamedTuple):
+    """Room for crossings, S in all: the start of the step in which one is, and where in there."""
+
+    t0: Float[Array, " S"]
+    y0: PyTree[Float[Array, "S ..."]]
+    enclosed: Enclosed
+
+
+class Followed(NamedTuple):
+    """What is known of one guard so far: its sign, 0 if not known yet; its crossings; whether some may be missing."""
+
+    sign: Float[Array, ""]
+    count: Int[Array, ""]
+    uncertain: Bool[Array, ""]
+
+
+class Watched(NamedTuple):
+    """What is known up to the end of the last step; nothing yet where not `begun`."""
+
+    begun: Bool[Array, ""]
+    end: Node
+    followed: tuple[Followed, ...]
+    kept: Kept
+
+
+class Pieces(NamedTuple):
+    """One guard between two nodes: values and rates at all nodes, and whether the rates are `known`; the signs at all
+    nodes but the first, 0 where not known; which pieces are in `doubt`."""
+
+    g: list
+    rate: list
+    known: list
+    sign: list
+    doubt: list
+
+
+def pieces_of(begin: Value, inner, off, end: Value, h, touches) -> Pieces:
+    """The pieces of an interval of length h, between exact ends; inner nodes (value, rate) are `off` by so much.
+
+    A piece that comes nearer to zero than `touches` is not clear.
+    """
+    zero, yes, lengths = jnp.zeros_like(h), jnp.asarray(True), [h * float(x) for x in np.diff(SHARES)]
+    g = [begin.g, *(x for x, _ in inner), end.g]
+    rate = [jnp.where(v.turns, 0.0, v.rate) for v in (begin, end)]
+    rate = [rate[0], *(x for _, x in inner), rate[1]]
+    error = [zero, *(x for x, _ in off), zero]
+    # An end is known to all digits: where its rate is zero, it turns there.
+    known = [yes, *(jnp.abs(dx) > d for (_, dx), (_, d) in zip(inner, off)), yes]
+    sign = [jnp.where(jnp.abs(x) > e, jnp.sign(x), 0.0) for x, e in zip(g, error)]
+    sign[-1] = jnp.where(jnp.abs(end.g) > end.noise, sign[-1], 0.0)
+    way = [jnp.sign(x) for x in rate]
+    monotone, direction, doubt = [], [], []
+    bent = BENT * _bend(g, rate, h)
+    for i in range(PIECES):
+        third = lengths[i] / 3
+        one, two, three, four = g[i], g[i] + third * rate[i], g[i + 1] - third * rate[i + 1], g[i + 1]
+        largest = jnp.maximum(error[i], error[i + 1]) + touches + bent
+        lowest = jnp.minimum(jnp.minimum(one, two), jnp.minimum(three, four))
+        highest = jnp.maximum(jnp.maximum(one, two), jnp.maximum(three, four))
+        clear = (lowest > largest) | (highest < -largest)
+        direction.append(jnp.sign(way[i] + way[i + 1]))
+        same = known[i] & known[i + 1] & (direction[i] != 0) & (way[i] * way[i + 1] >= 0)
+        monotone.append(same & ((three - two) * direction[i] >= bent))
+        doubt.append(~(clear | monotone[i]))
+    for i in range(1, PIECES):
+        # Where one run ends and another begins, the sign must be known; not inside a run.
+        inside = monotone[i - 1] & monotone[i] & (direction[i - 1] == direction[i])
+        unknown = (sign[i] == 0) & ~inside
+        doubt[i - 1], doubt[i] = doubt[i - 1] | unknown, doubt[i] | unknown
+    return Pieces(g, rate, known, sign[1:], doubt)
+
+
+def _bend(g, rate, h):
+    """How far a guard and its rate at the inner nodes are from the cubic through both ends: what that leaves out."""
+    off = jnp.zeros_like(h)
+    ends = g[0], h * rate[0], h * rate[-1], g[-1]
+    for x, dx, share in zip(g[1:-1], rate[1:-1], INNER):
+        powers = share ** np.arange(4)
+        value, slope = CUBIC @ powers, np.polynomial.polynomial.polyder(CUBIC, axis=1) @ powers[:3]
+        by = lambda weights: sum(w * x for w, x in zip(weights.tolist(), ends))
+        off = jnp.maximum(off, jnp.maximum(jnp.abs(x - by(value)), jnp.abs(h * dx - by(slope))))
+    return off
+
+
+def between(left: Node, right: Node, h):
+    """(state, acceleration) at the inner nodes: by the quintic; and by the cubics through (q, v) and (v, a)."""
+    (q0, v0), (q1, v1), a0, a1 = left.y, right.y, left.a, right.a
+    inverse = 1 / jnp.where(h > 0, h, 1.0)
+    scaled = lambda c, x: jtu.tree_map(lambda x: c * x, x)
+
+    def by(coefficients, derivatives, share, *ends):
+        powers = np.polynomial.polynomial.polyder(coefficients, derivatives, axis=1)
+        weights = powers @ share ** np.arange(powers.shape[1])
+        return jtu.tree_map(lambda *x: sum(w * x for w, x in zip(weights.tolist(), x) if w), *ends)
+
+    of_q = q0, scaled(h, v0), scaled(h * h, a0), scaled(h * h, a1), scaled(h, v1), q1
+    of_v = v0, scaled(h, a0), scaled(h, a1), v1
+    fine, coarse = [], []
+    for share in INNER:
+        v, a = scaled(inverse, by(QUINTIC, 1, share, *of_q)), scaled(inverse**2, by(QUINTIC, 2, share, *of_q))
+        fine.append(((by(QUINTIC, 0, share, *of_q), v), a))
+        q, v = by(CUBIC, 0, share, q0, of_q[1], of_q[4], q1), by(CUBIC, 0, share, *of_v)
+        coarse.append(((q, v), scaled(inverse, by(CUBIC, 1, share, *of_v))))
+    return fine, coarse
+
+
+def root_of_cubic(begin, end):
+    """Where the cubic through two (t, g, dg/dt) is zero, and its slope there."""
+    (t0, g0, rate0), (t1, g1, rate1) = begin, end
+    h = t1 - t0
+    c1, c2, c3 = h * rate0, 3 * (g1 - g0) - h * (2 * rate0 + rate1), 2 * (g0 - g1) + h * (rate0 + rate1)
+    slope_at = lambda x: c1 + x * (2 * c2 + x * 3 * c3)
+    x = jnp.clip(g0 / jnp.where(g0 != g1, g0 - g1, 1.0), 0.0, 1.0)
+    for _ in range(3):
+        slope = slope_at(x)
+        x = jnp.clip(x - (g0 + x * (c1 + x * (c2 + x * c3))) / jnp.where(slope != 0, slope, 1.0), 0.0, 1.0)
+    return t0 + x * h, slope_at(x) / jnp.where(h > 0, h, 1.0)
+
+
+def changes(sign, signs):
+    """At which nodes a known sign is another than the one known last, which is `sign` to begin with."""
+    found = []
+    for there in signs:
+        found.append((there != 0) & (sign != 0) & (there != sign))
+        sign = jnp.where(there != 0, there, sign)
+    return found
+
+
+def last_known(sign, signs):
+    """The last sign that is known."""
+    for there in signs:
+        sign = jnp.where(there != 0, there, sign)
+    return sign
+
+
+class Next(NamedTuple):
+    """Where to look next, see `Search`; or which guards are found to turn at an end that is known."""
+
+    look: Bool[Array, ""]
+    at: Float[Array, ""]
+    asked: Int[Array, ""]
+    curvature: Float[Array, ""]
+    turns_left: tuple[Bool[Array, ""], ...]
+    turns_right: tuple[Bool[Array, ""], ...]
+
+
+def next_look(left_end: Node, right_end: Node, times, of_guards, resolution) -> Next:
+    """Where to look for the first guard in doubt, in its first piece in doubt: at the extremum, or halfway."""
+    none, halfway = jnp.asarray(False), left_end.t + 0.5 * (right_end.t - left_end.t)
+    found = Next(jnp.asarray(True), halfway, jnp.asarray(-1), jnp.ones_like(halfway), (), ())
+    turns_left, turns_right = [none] * len(of_guards), [none] * len(of_guards)
+    still_open = jnp.asarray(True)
+    for i, p in enumerate(of_guards):
+        for j, doubt in enumerate(p.doubt):
+            mine, still_open = still_open & doubt, still_open & ~doubt
+            left, right, length = p.rate[j], p.rate[j + 1], times[j + 1] - times[j]
+            turning = mine & p.known[j] & p.known[j + 1] & (left * right < 0)
+            at = times[j] + length * left / jnp.where(turning, left - right, 1.0)
+            # An extremum at an end that is known is that end.
+            at_left = turning & (at - left_end.t <= resolution)
+            at_right = turning & ~at_left & (right_end.t - at <= resolution)
+            turns_left[i], turns_right[i] = turns_left[i] | at_left, turns_right[i] | at_right
+            inside = turning & ~(at_left | at_right)
+            found = found._replace(
+                look=found.look & ~(at_left | at_right),
+                at=jnp.where(inside, at, found.at),
+                asked=jnp.where(inside, i, found.asked),
+                curvature=jnp.where(inside, (right - left) / length, found.curvature),
+            )
+    return found._replace(turns_left=tuple(turns_left), turns_right=tuple(turns_right))

@@ -1,0 +1,386 @@
+"""Why an integration stopped before its last output, in the user's words.
+
+Where steps collapse or `max_steps` is used up, the motion is taken up again for some steps from where it ended, one by
+one, and these are looked at:
+
+- The rate of progress at the end, not on the average, says how many steps are missing.
+- A step that was rejected, however short it had become, is halved where the acceleration changes more, again and
+  again: a smooth function changes by nothing any more in the end, one that jumps by its jump. In the same way the
+  derivative of the acceleration finds a kink. Time, position or velocity alone on the other side say what it is by.
+- Steps that shrink while accelerations grow approach a singularity.
+- Eigenvalues of d(v, a)/d(q, v) that are long compared with one over a step limit it: those that are real and negative
+  by the stability of an explicit method (a stiff system), those that are imaginary as frequencies to be resolved.
+
+This takes a compilation and some seconds, and only who has failed waits for it.
+
+Source: Hairer & Wanner, *Solving ODEs II*, §IV.2 (stiffness and its detection).
+"""
+
+from typing import NamedTuple
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lagjax.mechanics import coordinates
+from lagjax.mechanics.coordinates import State
+from lagjax.mechanics.diagnosis import describe, explain_failure
+from lagjax.mechanics.saddle_point import equations_of_motion
+from lagjax.motion.consistent_state import consistent_state
+from lagjax.motion.loop import Field, method_alone
+from lagjax.motion.solve import method_of
+from lagjax.motion.trajectory import RESULTS
+
+# The steps that are looked at; the first of them only find their length.
+LOOKED_AT, SETTLED = 160, 40
+# diffrax's choice of the next step.
+SAFETY, SHORTEST, LONGEST = 0.9, 0.2, 10.0
+# Rejected steps that are halved, and how often.
+HALVED, HALVINGS = 12, 44
+# A change over 2^-44 of a rejected step counts as a jump from this share of the largest acceleration in it on.
+JUMP, KINK = 1e-4, 1e-2
+# The velocities of a motion that sticks agree to this share.
+HELD = 1e-6
+# A step times the largest eigenvalue, where that limits it; and eigenvalues so different that some are fast.
+LIMITED, FAST = 0.3, 30.0
+# The same where it limits an explicit method's stability, at two to six.
+UNSTABLE = 1.5
+# Accelerations grew and steps shrank by these factors.
+GREW, SHRANK = 3.0, 0.3
+# More steps than this are no advice, and this many times as many only the last one.
+TOO_MANY, MANY_TIMES = 1e8, 10
+# What keeps steps short where nothing else does.
+SPAN = "a span that takes more steps: of very many periods, or at a tight tolerance", "a looser rtol and atol"
+
+
+class Steps(NamedTuple):
+    """The steps from where a motion ended: of each its start, its length, and whether it was accepted."""
+
+    t: np.ndarray
+    y: list
+    h: np.ndarray
+    accepted: np.ndarray
+    left: float
+
+    @property
+    def rate(self) -> float:
+        """How far a step goes, rejected ones included, after the first have found their length."""
+        settled = slice(SETTLED if len(self.h) > 2 * SETTLED else 0, None)
+        return abs(float(np.sum((self.h * self.accepted)[settled]))) / len(self.h[settled])
+
+    @property
+    def missing(self) -> float:
+        """How many steps there are to the end."""
+        return len(self.h) + (self.left / self.rate if self.rate > 0 else np.inf)
+
+    @property
+    def kept(self) -> np.ndarray:
+        """Which steps were accepted, but for the first, whose length was guessed."""
+        return np.flatnonzero(self.accepted)[1:]
+
+
+def stopped_early(trajectory, settings) -> str:
+    """Say where and why an integration stopped before its last output."""
+    end, t0, t1 = trajectory.end, float(trajectory.t[0]), float(trajectory.t[-1])
+    share = 100 * (float(end.t) - t0) / (t1 - t0)
+    accepted, rejected = (int(trajectory.stats[f"num_{kind}_steps"]) for kind in ("accepted", "rejected"))
+    what = (
+        f"the integration stopped at t = {float(end.t):.9g}, {share:.3g} % of the way to {t1:.6g}, after "
+        f"{accepted} accepted and {rejected} rejected steps"
+    )
+    reason = explain_failure(trajectory.system, State(end.t, end.q, end.v, trajectory.params)) or _beyond(trajectory)
+    if reason:
+        return f"{what}: {reason}"
+    if bool(trajectory.result == RESULTS.max_steps_reached):
+        return f"{what}: max_steps = {settings.max_steps} is used up. {_used_up(trajectory, settings)}"
+    if bool(trajectory.result == RESULTS.unsolved_step) and settings.controller is not None:
+        return (
+            f"{what}: {RESULTS[trajectory.result]} The last state is {describe(end.q)}.\n"
+            "Usual cause: a fixed step that is too long: for the method's stability, an implicit one's root finder, or "
+            "for the return to the constraints.\n"
+            "Fix: a smaller dt0, or leave stepsize_controller out: steps that fail are then taken again, shorter."
+        )
+    cause, fix = (
+        "a singularity of the motion (a collision, a singular configuration), a jump in a force, or NaN from L beyond "
+        "that state",
+        'stop before it with events={"near": lj.Crossing(...)}, or look at lj.accelerations at trajectory.end with '
+        "throw=False",
+    )
+    if settings.controller is None:
+        steps, path = look(trajectory, settings), _Path(trajectory)
+        cause, fix = _jump(path, steps) or _singularity(path, steps) or (cause, fix)
+    return (
+        f"{what}: {RESULTS[trajectory.result]} The last state is {describe(end.q)}{_fastest(trajectory)}.\n"
+        f"Usual cause: {cause}.\nFix: {fix}."
+    )
+
+
+def _used_up(trajectory, settings):
+    """The rate of progress, what keeps the steps short, and what to do."""
+    end, taken = trajectory.end, int(trajectory.stats["num_steps"])
+    last = f"The last state is {describe(end.q)}, v = {describe(end.v)}."
+    if settings.controller is not None or not taken:
+        rate = abs(float(end.t - trajectory.t[0])) / max(1, taken)
+        missing = abs(float(trajectory.t[-1] - end.t)) / rate if rate > 0 else np.inf
+        cause, fix = "steps that are short for the span", "longer steps"
+    else:
+        steps, path = look(trajectory, settings), _Path(trajectory)
+        rate, missing = steps.rate, steps.missing
+        cause, fix = _jump(path, steps) or _singularity(path, steps) or _fast(path, steps) or SPAN
+    if not missing < TOO_MANY:
+        progress = f"At the rate of its last steps ({rate:.2g} each) it does not arrive"
+        return f"{last} {progress}.\nUsual cause: {cause}.\nFix: {fix}."
+    # Half as many again: the rate is that of one place.
+    more = f"max_steps={_rounded_up(taken + 1.5 * missing)}"
+    fix = f"{fix}; else {more}" if missing > MANY_TIMES * taken and fix is not SPAN[1] else f"{more}, or {fix}"
+    progress = f"At the rate of its last steps ({rate:.2g} each) it needs {missing:.2g} more"
+    return f"{last} {progress}.\nUsual cause: {cause}.\nFix: {fix}."
+
+
+def _rounded_up(count):
+    """Two digits."""
+    unit = 10 ** max(0, int(np.log10(count)) - 1)
+    return int(-(-count // unit) * unit)
+
+
+def look(trajectory, settings) -> Steps:
+    """Take up the motion where it ended, and put down each step."""
+    system, params, end = trajectory.system, trajectory.params, trajectory.end
+    state = (end.t, end.q, end.v, params)
+    method, terms = method_alone(settings, method_of(settings, system, *state)), diffrax.ODETerm(Field(system, None))
+    order = float(method.error_order(terms))
+    way, last = np.sign(float(trajectory.t[-1] - end.t)), float(trajectory.t[-1])
+    t, y = float(end.t), (end.q, end.v)
+    size = abs(t - float(trajectory.t[0])) / max(1, int(trajectory.stats["num_accepted_steps"]))
+    size = size or 1e-3 * abs(last - t)
+    put_down = []
+    while len(put_down) < LOOKED_AT and abs(last - t) > 0:
+        # The end is reached exactly.
+        size = min(size, abs(last - t), np.inf if settings.max_step is None else float(settings.max_step))
+        times = jnp.asarray(t), jnp.asarray(t + way * size)
+        after, error = _attempt(method, terms, *times, y, params, trajectory.tolerance)
+        error = float(error)
+        put_down.append((t, y, way * size, error < 1))
+        if error < 1:
+            t, y = (last if size == abs(last - t) else t + way * size), after
+        factor = SAFETY * error ** (-1 / order) if error > 0 else LONGEST
+        size *= np.clip(factor if np.isfinite(error) else 0.0, *((1.0, LONGEST) if error < 1 else (SHORTEST, SAFETY)))
+        if size < 4 * np.finfo(float).eps * max(abs(t), 1e-300):
+            break
+    ts, ys, h, accepted = zip(*put_down)
+    return Steps(np.array(ts), list(ys), np.array(h), np.array(accepted), abs(last - t))
+
+
+@eqx.filter_jit
+def _attempt(method, terms, t0, t1, y, params, tolerance):
+    """One step, and its error in units of the tolerance."""
+    after, error, _, _, result = method.step(terms, t0, t1, y, params, method.init(terms, t0, t1, y, params), True)
+    (rtol, _), (atol, _) = tolerance
+    scaled = jax.tree.map(
+        lambda a, b, e: jnp.max(jnp.abs(e) / (atol + rtol * jnp.maximum(jnp.abs(a), jnp.abs(b)))), y, after, error
+    )
+    largest = jnp.max(jnp.stack(jax.tree.leaves(scaled)))
+    return after, jnp.where((result == diffrax.RESULTS.successful) & jnp.isfinite(largest), largest, jnp.inf)
+
+
+class _Path:
+    """Accelerations on the path with the velocity and acceleration of a state: q + s v + s² a/2, v + s a."""
+
+    def __init__(self, trajectory):
+        self.system, self.params = trajectory.system, trajectory.params
+        self.names = coordinates.names(trajectory.end.q)
+
+    def at(self, t, y, s, order=0):
+        """The acceleration (order 0) or its derivative by s (1), of t, q and v those at s, or s[0], s[1], s[2]."""
+        s = jnp.broadcast_to(jnp.asarray(s, dtype=float), 3)
+        return np.asarray(_on_path(self.system, self.params, jnp.asarray(t), y, s, order))
+
+    def rates(self, t, y):
+        """The eigenvalues of d(v, a)/d(q, v)."""
+        return np.linalg.eigvals(np.asarray(_jacobian(self.system, self.params, jnp.asarray(t), y)))
+
+
+def _acceleration(system, params, t, q, v):
+    return equations_of_motion(system, t, q, v, params)[0]
+
+
+@eqx.filter_jit
+def _on_path(system, params, t, y, s, order):
+    q, v = y
+    a = _acceleration(system, params, t, q, v)
+    by = lambda scale, x, dx: jax.tree.map(lambda x, dx: x + scale * dx, x, dx)
+
+    def at(s):
+        place, velocity = by(0.5 * s[1] ** 2, by(s[1], q, v), a), by(s[2], v, a)
+        return coordinates.flatten(_acceleration(system, params, t + s[0], place, velocity))[0]
+
+    return at(s) if order == 0 else jax.jvp(at, (s,), (jnp.ones_like(s),))[1]
+
+
+@eqx.filter_jit
+def _jacobian(system, params, t, y):
+    x, unflatten = coordinates.flatten(y)
+
+    def rates(x):
+        q, v = unflatten(x)
+        return coordinates.flatten((v, _acceleration(system, params, t, q, v)))[0]
+
+    return jax.jacfwd(rates)(x)
+
+
+class _Break(NamedTuple):
+    """Where an acceleration or its derivative breaks: of which coordinate, from what to what, with what it changes."""
+
+    t: float
+    name: str
+    before: float
+    after: float
+    velocity: float
+    by: str
+
+
+def _jump(path, steps):
+    """A jump of the acceleration, or of its derivative, inside steps that were rejected."""
+    rejected = np.flatnonzero(~steps.accepted)
+    # The shortest of them: there the least else happens.
+    shortest = rejected[np.argsort(np.abs(steps.h[rejected]))][:HALVED]
+    for order in (0, 1):
+        breaks = [found for i in shortest if (found := _halved(path, steps, i, order)) is not None]
+        if len(breaks) > len(shortest) // 2:
+            return _of_breaks(breaks, order, f"{len(rejected)} of {len(steps.h)} steps were rejected")
+    return None
+
+
+def _of_breaks(breaks, order, rejected):
+    first, velocities = breaks[0], np.array([found.velocity for found in breaks])
+    what = "has a kink" if order else f"jumps from {first.before:.3g} to {first.after:.3g}"
+    where = f"the acceleration of '{first.name}' {what} with the {first.by} at t = {first.t:.9g}"
+    if first.by == "velocity":
+        held = np.ptp(velocities) <= HELD * np.max(np.abs(velocities)) + 1e-9
+        sticks = ", and the motion stays there, pushed from both sides: it sticks" if held and not order else ""
+        return (
+            f"{where}, where its velocity is {first.velocity:.6g}{sticks} (dry friction, a sign of a velocity); "
+            f"{rejected}",
+            "a steep slope in place of the jump, jnp.tanh(v / 1e-3) for jnp.sign(v), with method=lj.Radau5()",
+        )
+    if first.by == "time":
+        return (
+            f"{where} (a force that is switched); {rejected}",
+            "name the times at which it does, jump_ts=jnp.array([...])",
+        )
+    return (
+        f"{where} (a contact, an end stop, a table that is interpolated); {rejected}",
+        "a smooth function in its place, or an event there and a new start from where it ended",
+    )
+
+
+def _halved(path, steps, i, order):
+    """Where the acceleration (order 0) or its derivative (1) breaks on a rejected step, if it does."""
+    t, y, low, high = steps.t[i], steps.y[i], 0.0, float(steps.h[i])
+    below, above = path.at(t, y, low, order), path.at(t, y, high, order)
+    size = max(np.max(np.abs(below)), np.max(np.abs(above)))
+    for _ in range(HALVINGS):
+        middle = 0.5 * (low + high)
+        between = path.at(t, y, middle, order)
+        if not np.all(np.isfinite([below, between, above])):
+            return None
+        size = max(size, np.max(np.abs(between)))
+        if np.max(np.abs(between - below)) > np.max(np.abs(above - between)):
+            high, above = middle, between
+        else:
+            low, below = middle, between
+    which = int(np.argmax(np.abs(above - below)))
+    change = abs(above - below)[which]
+    if not change > (KINK if order else JUMP) * size:
+        return None
+    # With t, q or v alone on the other side of it.
+    alone = [path.at(t, y, np.where(np.arange(3) == k, high, low), order)[which] for k in range(3)]
+    by = ("time", "position", "velocity")[int(np.argmax(np.abs(alone - below[which])))]
+    velocity = float(coordinates.flatten(y[1])[0][which])
+    return _Break(t + low, path.names[which], below[which], above[which], velocity, by)
+
+
+def _singularity(path, steps):
+    """Steps that shrink where accelerations grow."""
+    kept = steps.kept
+    if len(kept) < 6:
+        return None
+    first, last, lengths = kept[0], kept[-1], np.abs(steps.h[kept])
+    at = lambda i: np.abs(path.at(steps.t[i], steps.y[i], 0.0))
+    if not (np.max(at(last)) > GREW * np.max(at(first)) and lengths[-1] < SHRANK * lengths[0]):
+        return None
+    if not np.mean(np.diff(lengths) < 0) > 0.8:
+        return None
+    # Steps in a geometric series end at its limit.
+    ratio = min(np.median(lengths[1:] / lengths[:-1]), 1 - 1e-9)
+    limit = steps.t[last] + np.sign(steps.h[last]) * lengths[-1] / (1 - ratio)
+    return (
+        f"a singularity of the motion near t = {limit:.6g}: steps shrink and the acceleration of "
+        f"'{path.names[int(np.argmax(at(last)))]}' grows (a collision, a motion that runs away)",
+        f"ts that end before {limit:.6g}, an event on the way there, or a softer potential",
+    )
+
+
+def _fast(path, steps):
+    """Eigenvalues that are long compared with one over a step."""
+    kept = steps.kept
+    if not kept.size:
+        return None
+    t, y, step = steps.t[kept[-1]], steps.y[kept[-1]], float(np.median(np.abs(steps.h[kept])))
+    # Backward in time what decays grows.
+    rates = np.sign(steps.h[kept[-1]]) * path.rates(t, y)
+    if not np.all(np.isfinite(rates)) or np.max(np.abs(rates)) * step < LIMITED:
+        return None
+    fastest = rates[np.argmax(np.abs(rates))]
+    if -fastest.real > abs(fastest.imag):
+        if -fastest.real * step < UNSTABLE:
+            return None
+        return (
+            f"a stiff system: something decays at a rate of {-fastest.real:.2g} per unit of time, and an explicit "
+            "method takes steps as short as that also after it is over",
+            "method=lj.Radau5(), whose steps follow the motion alone",
+        )
+    if fastest.real > abs(fastest.imag):
+        return (
+            f"a motion that grows at a rate of {fastest.real:.2g} per unit of time",
+            "a shorter span, or a looser rtol",
+        )
+    period = 2 * np.pi / abs(fastest.imag)
+    cause = f"an oscillation of period {period:.3g}, of which {steps.left / period:.2g} are left"
+    if not np.any(np.abs(rates) < abs(fastest) / FAST):
+        return cause, SPAN[1]
+    return (
+        f"{cause}: a stiff spring, or another high frequency beside the motion",
+        "a constraint in place of the stiff spring, or, where that oscillation does not matter, "
+        "method=lj.Radau5(step_powers=(0, 1)), which does not follow it",
+    )
+
+
+def _beyond(trajectory):
+    """Whether the constraints can be met a little after the end; in words where they cannot."""
+    system, end = trajectory.system, trajectory.end
+    if not system.constraints:
+        return None
+    ahead = 1e-3 * (trajectory.t[-1] - trajectory.t[0])
+    q = jax.tree.map(lambda q, v: q + ahead * v, end.q, end.v)
+    try:
+        consistent_state(system, end.t + ahead, q, end.v, trajectory.params)
+    except ValueError as error:
+        return (
+            f"the constraints cannot be met a little later. {error}\n"
+            "(There: a loop that closes only so far, or one motion prescribed twice.)"
+        )
+    return None
+
+
+def _fastest(trajectory):
+    """The coordinate whose acceleration is largest at the end: that of a collision or a coordinate singularity."""
+    end = trajectory.end
+    values = np.abs(coordinates.flatten(equations_of_motion(trajectory.system, *end[:3], trajectory.params)[0])[0])
+    names = coordinates.names(end.q)
+    if len(names) == 0 or not np.all(np.isfinite(values)):
+        return ""
+    i = int(np.argmax(values))
+    return f", and the largest acceleration that of '{names[i]}', {values[i]:.2g}"

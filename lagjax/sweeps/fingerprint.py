@@ -1,0 +1,100 @@
+"""What a store belongs to: the axes, the values' names and kinds, the program, the versions that wrote it."""
+
+from importlib.metadata import version
+from typing import Any
+
+import jax
+import numpy as np
+
+from lagjax.sweeps.axes import Axes
+from lagjax.sweeps.digests import digest
+from lagjax.sweeps.lanes import Program
+
+# 1 had no checksums. It is read, and continued as it is.
+FORMAT = 2
+ANOTHER_FUNCTION = "run is another function"
+# Names that zarr keeps for itself.
+RESERVED = ("", ".", "..", "zarr.json")
+
+
+def fingerprint(axes: Axes, program: Program, layout: str) -> dict[str, Any]:
+    """What must be the same for two runs to belong to one store, in words where that is possible."""
+    return {
+        "format": FORMAT,
+        "points": ", ".join(f"{name}: {n}" for name, n in axes.dims.items()),
+        "axes": {name: of_axis(x) for name, x in axes.values.items()},
+        "values": {name: f"{x.dtype}{list(x.shape)}" for name, x in named_leaves(program.values)},
+        "chunk": program.chunk,
+        "layout": layout,
+        "program": program.digest,
+        "versions": versions(),
+    }
+
+
+def versions() -> dict[str, str]:
+    """What writes a store, here."""
+    return {name: version(name) for name in ("lagjax", "jax", "diffrax")}
+
+
+def in_words(of_versions: dict[str, str]) -> str:
+    """Versions, as a person says them."""
+    return ", ".join(f"{name} {number}" for name, number in of_versions.items())
+
+
+def of_axis(x: np.ndarray) -> str:
+    """The kind of an axis and a digest of its values."""
+    return f"{x.dtype}{list(x.shape)} {digest(x.tobytes())}"
+
+
+def named_leaves(tree) -> list[tuple[str, Any]]:
+    """The leaves of what `run` returns, each with a name: its path, or "value" where it is alone.
+
+    **Raises:** `ValueError` where two have the same.
+    """
+    key = lambda path: jax.tree_util.keystr(path, simple=True, separator=".").lstrip(".") or "value"
+    found = [(key(path), path, leaf) for path, leaf in jax.tree_util.tree_leaves_with_path(tree)]
+    places = {}
+    for name, path, _ in found:
+        places.setdefault(name, []).append(jax.tree_util.keystr(path) or "the value itself")
+    for name, alike in places.items():
+        if len(alike) > 1:
+            raise ValueError(
+                f"run returns {len(alike)} values of the name '{name}': {', '.join(alike)}.\n"
+                f"Usual cause: a key with a dot in it. Fix: another key, as '{name.replace('.', '_')}'."
+            )
+    return [(name, leaf) for name, _, leaf in found]
+
+
+def check_file_names(kind: str, names: list[str]) -> None:
+    """Raise `ValueError` for names that cannot be folders beside each other."""
+    for name in names:
+        parts = name.split("/")
+        if any(part in RESERVED or part.startswith("__") for part in parts) or "\\" in name:
+            raise ValueError(
+                f"{kind} '{name}' cannot be kept in a store: zarr has no place for such a name.\n"
+                "Fix: another key, of letters, digits and underscores."
+            )
+        inside = next((other for other in names if other.startswith(f"{name}/")), None)
+        if inside is not None:
+            raise ValueError(
+                f"{kind}s '{name}' and '{inside}' cannot be kept in one store: one would lie inside of the other.\n"
+                f"Fix: another key, as '{inside.replace('/', '_')}'."
+            )
+
+
+def differences(there: dict, here: dict, under: str = "") -> list[str]:
+    """What differs between two fingerprints, a line each."""
+    found = []
+    for key in dict.fromkeys((*there, *here)):
+        a, b, name = there.get(key), here.get(key), f"{under}{key}"
+        if isinstance(a, dict) and isinstance(b, dict):
+            found += differences(a, b, f"{name} ")
+        elif name == "program" and a != b:
+            found.append(ANOTHER_FUNCTION)
+        elif (
+            a != b and under == "axes " and isinstance(a, str) and isinstance(b, str) and a.split()[:1] == b.split()[:1]
+        ):
+            found.append(f"axis '{key}' has other values")
+        elif a != b:
+            found.append(f"{name}: {a} there, {b} here")
+    return found

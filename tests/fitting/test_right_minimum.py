@@ -1,0 +1,135 @@
+"""Fits find the global minimum from guesses that are off, and say where they did not."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+import lagjax as lj
+from lagjax.fitting import engine
+from lagjax.fitting.equations import dampened
+from lagjax.fitting.misfit import CHANCE, _beyond, _undampened, misfit
+from lagjax.fitting.problem import problem_of
+from lagjax.numerics.chained import Equations
+
+TS, SIGMA = np.linspace(0.0, 15.0, 200), 0.02
+TRUE = {"w2": 9.0, "c": 0.3, "A": 1.2, "W": 2.0}
+GUESS = {"w2": 8.0, "c": 0.2, "A": 1.0, "W": 1.9}
+VALUES = np.array([TRUE[name] for name in sorted(TRUE)])
+
+
+def pushed(t, q, v, p):
+    """L of a pendulum that a force in time pushes: the first part of a record hardly shows what the force is."""
+    return 0.5 * v**2 + p["w2"] * jnp.cos(q) + p["A"] * jnp.cos(p["W"] * t) * q
+
+
+driven = lj.System(pushed, dissipation=lambda t, q, v, p: 0.5 * p["c"] * v**2)
+
+
+@pytest.fixture(scope="module")
+def clean():
+    """The driven pendulum's angle."""
+    return lj.integrate(driven, 0.8, 0.0, TRUE, ts=TS).q
+
+
+def measured(clean, seed):
+    """With errors."""
+    return clean + SIGMA * jax.random.normal(jax.random.key(seed), clean.shape)
+
+
+def test_a_stage_does_not_move_what_it_cannot_see(clean, monkeypatch):
+    """Of this record the growing part once sent the drive to a negative frequency; now its first search is right."""
+    record = lj.Record(TS, q=measured(clean, 11), sigma=SIGMA)
+    found = lj.fit(driven, record, GUESS)
+    assert bool(found.converged) and found.result == lj.RESULTS.successful
+    assert np.all(np.abs(found.values - VALUES) < 4 * found.sd) and np.max(found.sd) < 0.05
+    assert np.isfinite(found.costs[0]) and np.all(np.isnan(found.costs[1:]))
+    # Twin: without a hold it is lost; then the whole record, from the guess itself, is searched and is right.
+    monkeypatch.setattr(engine, "REACH", 1e9)
+    again = lj.fit(driven, record, GUESS)
+    assert float(again.costs[0]) > 10 * float(found.cost) and np.all(np.isnan(again.costs[2:]))
+    np.testing.assert_allclose(again.costs[1], found.cost, rtol=1e-6)
+    np.testing.assert_allclose(again.values, found.values, rtol=1e-5)
+    assert bool(again.converged) and "1 of 2 starts ended here" in repr(again)
+
+
+def test_what_contradicts_sigma_is_no_success(clean):
+    """Something that the system leaves out, an error in size: not converged, in words, from whatever start."""
+    data = measured(clean, 3) + SIGMA * np.sin(7 * TS)
+    with pytest.warns(lj.FitWarning, match="residuals of 'q' are no errors of measurement"):
+        found = lj.fit(driven, lj.Record(TS, q=data, sigma=SIGMA), GUESS)
+    assert bool(found.rested) and not bool(found.converged) and found.result == lj.RESULTS.misfit
+    assert "NO errors of measurement" in repr(found) and np.all(np.isfinite(found.costs))
+    larger = lambda times: clean + times * (measured(clean, 3) - clean)
+    with pytest.warns(lj.FitWarning, match="of 'q' are 2 times as large as sigma says"):
+        found = lj.fit(driven, lj.Record(TS, q=larger(2.0), sigma=SIGMA), GUESS)
+    assert not bool(found.converged)
+    # Twin: errors that are a little larger than sigma are not worth a word.
+    assert bool(lj.fit(driven, lj.Record(TS, q=larger(1.2), sigma=SIGMA), GUESS).converged)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("known", [True, False])
+def test_in_a_sweep(clean, known):
+    """50 repeats from guesses up to 30 % off, and as many of something else: the status tells them apart."""
+
+    def run(point):
+        random = jax.random.split(jax.random.key(point["seed"]))
+        data = clean + SIGMA * jax.random.normal(random[0], clean.shape)
+        data = jnp.where(point["other"], data + 0.3 * jnp.sin(7 * TS), data)
+        off = 1 + 0.3 * jax.random.uniform(random[1], (4,), minval=-1.0, maxval=1.0)
+        guess = {name: TRUE[name] * factor for name, factor in zip(sorted(TRUE), off)}
+        found = lj.fit(driven, lj.Record(TS, q=data, sigma=SIGMA if known else None), guess)
+        return found.values, found.sd, found.converged
+
+    swept = lj.sweep(run, {"other": np.array([False, True]), "seed": np.arange(50)}, progress=False)
+    values, sd, converged = swept.values
+    np.testing.assert_array_equal(swept.ok, [[True] * 50, [False] * 50])
+    np.testing.assert_array_equal(converged, swept.ok)
+    assert np.all(np.abs(values[0] - VALUES) < 5 * sd[0]) and np.all(sd[0] < 0.05)
+    # What was found is there, for those who know what their system leaves out.
+    assert np.all(np.isfinite(values[1])) and swept.counts()["successful"] == 50
+    assert any("no errors of measurement" in words for words in swept.counts())
+
+
+def spring_problem(count, sigma, loss="squares"):
+    """A fit of a spring, whose residuals are made up by the tests."""
+    spring = lj.System(lambda t, q, v, p: 0.5 * v**2 - 0.5 * p["k"] * q**2)
+    t = np.linspace(0.0, 10.0, count)
+    record = lj.Record(t, q=np.cos(t), sigma=sigma)
+    return problem_of(spring, record, {"k": 1.0}, None, None, None, None, loss, None, {})
+
+
+@pytest.mark.parametrize("loss", ["squares", pytest.param("huber", marks=pytest.mark.slow), "cauchy"])
+def test_false_alarms(loss):
+    """Of thousands of fits with errors as they were said to be none is doubted, and next to none looked at again."""
+    problem = spring_problem(104, 0.01, loss)
+    rows = jnp.asarray(dampened(np.random.default_rng(0).normal(size=(3000, 1, 104)), loss))
+    zero = jnp.zeros((1, 0)), jnp.zeros(1)
+    judged = jax.jit(jax.vmap(lambda rows: misfit(problem, Equations(rows, *zero))))
+    assert not np.any(judged(rows).any) and np.mean(judged(rows).doubtful) < 0.02
+    # Twins: twice as large (three times with outliers), and on a curve of the same size, one and all.
+    plain = np.random.default_rng(1).normal(size=(300, 1, 104))
+    larger = dampened(jnp.asarray((2.5 if loss == "squares" else 4.5) * plain), loss)
+    assert np.all(judged(larger).large)
+    curve = 1.5 * np.sin(np.linspace(0.0, 20.0, 104))
+    assert np.all(judged(dampened(jnp.asarray(plain + 2 * curve), loss)).any)
+
+
+def test_quantiles_and_inverses():
+    """Chance is that of SciPy's chi-squared distribution; what a loss makes of a residual is undone."""
+    for n in (1.0, 4.0, 10.0, 300.0):
+        exact = chi2.isf(2.87e-7, n) / n
+        assert abs(float(_beyond(n, CHANCE)) / exact - 1) < 0.2
+    r = np.geomspace(1e-6, 1e4, 50)
+    for loss in ("huber", "soft_l1", "cauchy"):
+        np.testing.assert_allclose(_undampened(dampened(r, loss), loss), r, rtol=1e-6)
+
+
+@pytest.mark.slow
+def test_a_start_read_off_traced_measurements(clean):
+    """In a program the start is read off as it is outside."""
+    fit = lambda data: lj.fit(driven, lj.Record(TS, q=data, sigma=SIGMA), TRUE).values
+    data = measured(clean, 0)
+    np.testing.assert_allclose(jax.jit(fit)(data), fit(data), rtol=1e-6)

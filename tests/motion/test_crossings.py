@@ -1,0 +1,438 @@
+"""Crossings of guards: none missed, none invented, in order, with their states, multipliers and derivatives."""
+
+import warnings
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import lagjax as lj
+from lagjax.motion import watching
+from tests.systems import PARAMS, pendulum, rod_pendulum
+
+G = 10.0
+ball = lj.System(lambda t, q, v, p: 0.5 * v**2 - G * q)
+HIT = diffrax.Event(lambda t, y, p, **kwargs: y[0], direction=False)
+oscillator = lj.System(lambda t, q, v, p: 0.5 * v**2 - 0.5 * q**2)
+# One program for most of what follows: all that differs is a number.
+EVENTS = {
+    "level": lj.Crossing(lambda t, q, v, p: q - p["level"], terminal=False, most=6),
+    "stop": lj.Crossing(lambda t, q, v, p: v - p["stop"], direction=-1),
+    "up": lj.Crossing(lambda t, q, v, p: q - p["level"], direction=1, terminal=False),
+}
+doubt = pytest.warns(lj.EventWarning, match="may be missing")
+
+
+def swing(q0, v0, level, ts, stop=2.0, rtol=1e-9, **options):
+    """The oscillator of period 2π, its crossings of a level recorded; it stops where v falls below `stop`."""
+    params = {"level": level, "stop": stop}
+    return lj.integrate(oscillator, q0, v0, params, ts=ts, events=EVENTS, rtol=rtol, atol=rtol, **options)
+
+
+def times(traj, name="level"):
+    """The times of what was found."""
+    return traj.events[name].found().t
+
+
+# The plainest uses.
+
+
+def test_a_ball_bounces_fifty_times():
+    """The floor is met within the first step, and after each bounce down to heights of 1e-12: none is missed."""
+    end = lj.integrate(ball, 0.0, 0.05, ts=jnp.array([0.0, 10.0]), event=HIT).end
+    assert float(end.t) == pytest.approx(0.01, abs=1e-15)
+    assert float(end.q) == pytest.approx(0.0, abs=1e-17)
+    t, q, v, restitution = 0.0, 0.0, 3.0, 0.75
+    for bounce in range(50):
+        traj = lj.integrate(ball, q, v, ts=jnp.array([t, t + 10.0]), event=HIT)
+        assert bool(traj.result == lj.RESULTS.event_occurred), bounce
+        t, q, v = float(traj.end.t), float(traj.end.q), -restitution * float(traj.end.v)
+    np.testing.assert_allclose(v, 3.0 * restitution**50, rtol=1e-6)
+    np.testing.assert_allclose(t, 2 * 3.0 / G * (1 - restitution**50) / (1 - restitution), rtol=1e-12)
+
+
+def test_the_first_of_two_crossings_in_a_step_ends_the_motion():
+    """q = sin t passes 0.9 at arcsin 0.9 and comes back within a step; outputs are NaN from there on."""
+    level = diffrax.Event(lambda t, y, p, **kwargs: y[0] - 0.9)
+    ts = jnp.linspace(0.0, 20.0, 401)
+    traj = lj.integrate(oscillator, 0.0, 1.0, ts=ts, event=level)
+    assert float(traj.end.t) == pytest.approx(np.arcsin(0.9), abs=1e-9)
+    assert np.array_equal(np.isfinite(traj.q), ts <= np.arcsin(0.9))
+    assert traj.events["event"].found().t.shape == (1,)
+
+
+# Where crossings lie.
+
+
+@pytest.mark.parametrize("rtol", [1e-4, 1e-9, 1e-12])
+def test_levels_just_below_the_extremum(rtol):
+    """Two crossings in one step, from 0.3 to 1e-8 below the top; their times to what the motion's error lets expect."""
+    for below in 10.0 ** -np.arange(0.5, 8.5, 0.5):
+        first = np.arcsin(1 - below)
+        with warnings.catch_warnings():
+            # Above the top or below it: nearer than the tolerance that is not known.
+            warnings.simplefilter("default" if below > 100 * rtol else "ignore", lj.EventWarning)
+            traj = swing(0.0, 1.0, 1 - below, [0.0, 3.0, 6.0], rtol=rtol)
+        if below > 100 * rtol:
+            np.testing.assert_allclose(times(traj), [first, np.pi - first], atol=20 * rtol / np.cos(first))
+        elif len(times(traj)) != 2:
+            assert bool(traj.events["level"].uncertain)
+    assert len(times(swing(0.0, 1.0, 1.001 + 100 * rtol, [0.0, 3.0, 6.0], rtol=rtol))) == 0
+
+
+def test_a_start_on_the_guard_does_not_fire():
+    """Nor a hair to either side, nor at a top; the motion that comes back through it does."""
+    for hair in (0.0, 1e-16, -1e-16, 1e-15, -1e-15):
+        traj = swing(0.5 * (1 + hair), np.sqrt(0.75), 0.5, [0.0, 3.0, 6.5])
+        np.testing.assert_allclose(times(traj), [2 * np.pi / 3, 2 * np.pi], atol=1e-8)
+        np.testing.assert_allclose(times(traj, "up"), [2 * np.pi], atol=1e-8)
+        assert len(times(swing(1.0 + hair, 0.0, 1.0, [0.0, 3.0, 6.0]))) == 0
+    with doubt:
+        swing(1.0, 0.0, 1.0, [0.0, 3.0, 7.0])
+    # Twin: a start that is off by more is before the guard.
+    assert len(times(swing(0.5 * (1 - 1e-9), np.sqrt(0.75), 0.5, [0.0, 3.0, 6.5]))) == 3
+
+
+def test_a_section_by_going_on_where_it_ended():
+    """Each turn ends once: ten tops are ten periods apart."""
+    t, q, v = 0.0, 0.0, 1.0
+    for turn in range(10):
+        end = swing(q, v, 3.0, [t, t + 5.0, t + 10.0], stop=0.0).end
+        t, q, v = (float(x) for x in (end.t, end.q, end.v))
+        assert t == pytest.approx((2 * turn + 0.5) * np.pi, abs=1e-7)
+
+
+def test_recorded_until_a_terminal_one():
+    """Those in the step that ends the motion are known up to there, with the states; the outputs too."""
+    for end in (1.0, 1.5, 2.5, 3.1):
+        traj = swing(0.0, 1.0, 0.9, [0.0, 1.2, 10.0], stop=np.cos(end))
+        before = [t for t in (np.arcsin(0.9), np.pi - np.arcsin(0.9)) if t < end]
+        np.testing.assert_allclose(times(traj), before, atol=1e-8)
+        assert int(traj.events["level"].count) == len(before)
+        np.testing.assert_allclose(times(traj, "stop"), [end], atol=1e-8)
+        assert np.isfinite(traj.q).tolist() == [True, end > 1.2, False]
+        found = traj.events["level"].found()
+        np.testing.assert_allclose(found.q, 0.9, atol=1e-14)
+        np.testing.assert_allclose(found.v, np.cos(before), atol=1e-8)
+
+
+def test_more_than_are_kept():
+    """The count goes on, the first are kept, and it is said."""
+    with pytest.warns(lj.EventWarning, match="happened 8 times, and the first 6 are kept"):
+        found = swing(0.0, 1.0, 0.3, [0.0, 10.0, 25.0]).events["level"]
+    assert int(found.count) == 8 and found.t.shape == (6,)
+    assert "8, of which the first 6" in repr(found)
+    first, k = np.arcsin(0.3), np.arange(6)
+    np.testing.assert_allclose(found.t, np.pi * k + first * (-1.0) ** k, atol=1e-7)
+
+
+def test_what_is_printed():
+    """How many, and when."""
+    traj = swing(0.0, 1.0, 0.9, [0.0, 3.0, 6.0])
+    assert repr(traj.events["level"]) == "Crossings: 2, at t = 1.11976951, 2.02182314"
+    assert repr(traj.events["stop"]) == "Crossings: 0"
+    assert "event 'level'" in str(traj)
+    t = np.arcsin(0.9)
+    assert len(times(swing(0.0, 1.0, 0.9, [0.0, t, 3.0]))) == 2
+
+
+REFUSED = {
+    "no names": ([EVENTS["level"]], TypeError, "by name"),
+    "a function": ({"level": lambda t, q, v, p: q}, TypeError, "lj.Crossing"),
+    "wrong arguments": ({"level": lj.Crossing(lambda t, y: y[0])}, TypeError, "guard"),
+    "a vector": ({"level": lj.Crossing(lambda t, q, v, p: jnp.stack([q, v]))}, ValueError, "one real number"),
+    "nothing": ({"level": lj.Crossing(lambda t, q, v, p: None)}, ValueError, "one real number"),
+    "an integer": ({"level": lj.Crossing(lambda t, q, v, p: 1)}, ValueError, "one real number"),
+    "complex": ({"level": lj.Crossing(lambda t, q, v, p: 1j * q)}, ValueError, "one real number"),
+    "a key": ({"level": lj.Crossing(lambda t, q, v, p: p["lvl"])}, (KeyError, TypeError, ValueError), "lvl"),
+}
+
+
+@pytest.mark.parametrize("events, error, words", REFUSED.values(), ids=REFUSED)
+def test_refused_in_words(events, error, words):
+    """What is no event, and guards that cannot be called, before anything is compiled."""
+    with pytest.raises(error, match=words) as raised:
+        lj.integrate(oscillator, 0.0, 1.0, {"level": 0.5}, ts=[0.0, 1.0], events=events)
+    assert "Fix:" in str(raised.value) or isinstance(raised.value, KeyError)
+
+
+def test_one_name_for_two():
+    """An event called as that of diffrax is called here."""
+    with pytest.raises(ValueError, match="two events have the name 'event'"):
+        lj.integrate(ball, 0.0, 1.0, ts=[0.0, 1.0], events={"event": EVENTS["level"]}, event=HIT)
+
+
+def test_refused_crossings():
+    """Directions, numbers and guards that are none."""
+    guard = lambda t, q, v, p: q
+    for direction in (2, "up", True, 0.5):
+        with pytest.raises(ValueError, match="direction"):
+            lj.Crossing(guard, direction=direction)
+    for most in (0, -1, 1.5, None):
+        with pytest.raises(ValueError, match="most"):
+            lj.Crossing(guard, most=most)
+    with pytest.raises(TypeError, match="a function of"):
+        lj.Crossing(1.0)
+    for event in (lambda t, y: y[0], EVENTS["level"], EVENTS):
+        with pytest.raises(TypeError, match="diffrax.Event"):
+            lj.integrate(oscillator, 0.0, 1.0, ts=[0.0, 1.0], event=event)
+
+
+# Slow: a program each.
+
+
+def at_ends_of_steps(begin, inner, off, end, h, touches, pieces=watching.pieces_of):
+    """The twin: nothing is known or in doubt between the ends of steps."""
+    found = pieces(begin, inner, off, end, h, touches)
+    no = jnp.asarray(False)
+    return found._replace(sign=[0.0 * h] * (len(found.sign) - 1) + found.sign[-1:], doubt=[no] * len(found.doubt))
+
+
+@pytest.mark.slow
+def test_twin_ends_of_steps(monkeypatch):
+    """Looking at the ends of steps alone misses both of two crossings in a step."""
+    run = lambda guard: lj.integrate(
+        oscillator, 0.0, 1.0, ts=[0.0, 6.0], events={"level": lj.Crossing(guard, terminal=False)}
+    )
+    assert len(times(run(lambda t, q, v, p: q - 0.99))) == 2
+    monkeypatch.setattr(watching, "pieces_of", at_ends_of_steps)
+    # Another guard: the program of the first would serve an equal one.
+    assert len(times(run(lambda t, q, v, p: q - 0.991))) == 0
+
+
+@pytest.mark.slow
+def test_lanes():
+    """Lanes with two crossings, with none, from a start on the guard, refused, and ended: each as if it were alone."""
+    q0, v0 = jnp.array([0.0, 0.0, 0.5, jnp.nan, 0.0]), jnp.array([1.0, 0.1, 0.75**0.5, 1.0, 1.0])
+    levels, stops = jnp.array([0.999999, 0.9, 0.5, 0.9, 0.5]), jnp.array([2.0, 2.0, 2.0, 2.0, 0.0])
+    one = lambda *start: swing(*start[:3], jnp.array([0.0, 3.0, 6.0]), start[3], throw=False)
+    lanes = jax.jit(jax.vmap(one))(q0, v0, levels, stops)
+    found = lanes.events["level"]
+    assert found.count.tolist() == [2, 0, 1, 0, 1]
+    assert np.isfinite(found.t).sum(axis=1).tolist() == [2, 0, 1, 0, 1]
+    assert not found.uncertain.any()
+    top = np.arcsin(0.999999)
+    np.testing.assert_allclose(found.t[0, :2], [top, np.pi - top], atol=1e-6)
+    np.testing.assert_allclose(np.asarray(found.t)[[2, 4], 0], [2 * np.pi / 3, np.pi / 6], atol=1e-8)
+    np.testing.assert_allclose(np.asarray(lanes.end.t)[[0, 1, 2, 4]], [6.0, 6.0, 6.0, np.pi / 2], atol=1e-8)
+    assert "5 lanes, 0 to 2 each" in repr(found)
+
+
+@pytest.mark.slow
+def test_pendulum_by_its_elliptic_integral():
+    """A Poincaré section by going on where it ended, and one recorded; bottoms are half a period apart."""
+    special = pytest.importorskip("scipy.special")
+    half = 2 * special.ellipk(np.sin(0.75) ** 2) * np.sqrt(PARAMS["l"] / PARAMS["g"])
+    bottom = {"bottom": lj.Crossing(lambda t, q, v, p: q)}
+    recorded = {"bottom": lj.Crossing(lambda t, q, v, p: q, terminal=False, direction=-1)}
+    t, q, v = 0.0, 1.5, 0.0
+    for k in range(8):
+        end = lj.integrate(pendulum, q, v, PARAMS, ts=[t, t + 10.0], events=bottom).end
+        t, q, v = float(end.t), float(end.q), float(end.v)
+        assert t == pytest.approx((k + 0.5) * half, rel=1e-8)
+    many = lj.integrate(pendulum, 1.5, 0.0, PARAMS, ts=[0.0, 8.2 * half], events=recorded)
+    np.testing.assert_allclose(times(many, "bottom"), half * (2 * np.arange(4) + 0.5), rtol=1e-8)
+
+
+@pytest.mark.slow
+def test_multipliers_in_a_guard():
+    """A mass on a string goes slack where its tension vanishes, at the height that the energy gives."""
+    tension = lj.Crossing(lambda t, q, v, multipliers, p: multipliers["rod"])
+    loaded = lj.Crossing(lambda t, q, v, multipliers, p: multipliers["rod"] + p["load"], terminal=False)
+    l, g = PARAMS["l"], PARAMS["g"]
+
+    def slack(v0, load=1e9):
+        return lj.integrate(
+            rod_pendulum, {"x": 0.0 * v0, "y": -l + 0.0 * v0}, {"x": v0, "y": 0.0 * v0}, PARAMS | {"load": load},
+            ts=jnp.array([0.0, 5.0]), events={"slack": tension, "loaded": loaded}, rtol=1e-11, atol=1e-11,
+        )  # fmt: skip
+
+    # Slack at the height y where v² = g y, and v² = v0² - 2 g (y + l).
+    height = lambda v0: (v0**2 - 2 * g * l) / (3 * g)
+    v0 = np.sqrt(3.5 * g * l)
+    end = slack(v0).end
+    np.testing.assert_allclose(end.q["y"], height(v0), rtol=1e-9)
+    assert abs(float(end.multipliers["rod"])) < 1e-12
+    slope = jax.jacfwd(lambda v0: slack(v0).end.q["y"])(v0)
+    np.testing.assert_allclose(slope, 2 * v0 / (3 * g), rtol=1e-7)
+    load = float(-slack(v0).multipliers["rod"][0]) / 2
+    found = slack(v0, load).events["loaded"]
+    np.testing.assert_allclose(found.multipliers["rod"][0], -load, rtol=1e-12)
+    assert int(found.count) == 1
+
+
+@pytest.mark.slow
+def test_derivatives():
+    """Times and states at recorded and terminal crossings: forward and reverse, by all that they depend on."""
+
+    def crossed(x, which=slice(2)):
+        level = lambda t, q, v, p: q - x["level"]
+        events = {
+            "level": lj.Crossing(level, terminal=False, most=3),
+            "end": lj.Crossing(lambda t, q, v, p: v + p["stop"], direction=-1),
+        }
+        system = lj.System(lambda t, q, v, p: 0.5 * v**2 - 0.5 * p["w"] ** 2 * q**2)
+        params = {"w": x["w"], "stop": x["stop"], "many": x.get("many", jnp.zeros(()))}
+        traj = lj.integrate(
+            system, x["q0"], x["v0"], params, ts=jnp.array([0.0, 4.0]), events=events, rtol=1e-11, atol=1e-11
+        )
+        found = traj.events["level"]
+        return jnp.concatenate([found.t[which], found.v[which], jnp.stack([traj.end.t, traj.end.q])])
+
+    x = {"level": 0.6, "w": 1.3, "q0": 0.1, "v0": 1.2, "stop": 1.1}
+
+    def exact(x):
+        # q = A sin(w t + phase)
+        amplitude = jnp.sqrt(x["q0"] ** 2 + (x["v0"] / x["w"]) ** 2)
+        phase = jnp.arctan2(x["q0"], x["v0"] / x["w"])
+        up = jnp.arcsin(x["level"] / amplitude)
+        last = jnp.arccos(-x["stop"] / amplitude / x["w"])
+        angles = jnp.stack([up, jnp.pi - up])
+        state = jnp.stack([(last - phase) / x["w"], amplitude * jnp.sin(last)])
+        return jnp.concatenate([(angles - phase) / x["w"], amplitude * x["w"] * jnp.cos(angles), state])
+
+    np.testing.assert_allclose(crossed(x), exact(x), rtol=1e-9)
+    close = lambda a, b: jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-7, atol=1e-8), a, b)
+    close(jax.jacfwd(crossed)(x), jax.jacfwd(exact)(x))
+    weights = jnp.array([1.0, -0.5, 0.25, 2.0, 0.75, -1.5])
+    total = lambda function: jax.grad(lambda x: jnp.dot(weights, function(x)))
+    close(total(crossed)(x), total(exact)(x))
+    # More than 24 numbers go backward.
+    many = x | {"many": jnp.ones(30)}
+    close(total(crossed)(many), total(exact)(many))
+
+
+@pytest.mark.slow
+def test_derivative_by_many_numbers():
+    """Reverse mode through a recorded crossing, where the guard and L read forty numbers."""
+    weights = jnp.linspace(0.5, 1.5, 40) / 40
+    system = lj.System(lambda t, q, v, p: 0.5 * v**2 - 0.5 * jnp.sum(p) * q**2)
+    events = {"level": lj.Crossing(lambda t, q, v, p: q - 0.5 * jnp.sum(p), terminal=False)}
+
+    def second(p):
+        return lj.integrate(system, 0.0, 1.0, p, ts=jnp.array([0.0, 3.0]), events=events).events["level"].t[1]
+
+    # At Σp = 1: t = (π - arcsin(w · w²/2)) / w with w² = Σp.
+    by_sum = lambda s: (jnp.pi - jnp.arcsin(0.5 * s**1.5)) / jnp.sqrt(s)
+    np.testing.assert_allclose(second(weights), by_sum(jnp.sum(weights)), rtol=1e-8)
+    np.testing.assert_allclose(jax.grad(second)(weights), np.full(40, jax.grad(by_sum)(1.0)), rtol=1e-6)
+
+
+@pytest.mark.slow
+def test_what_jumps():
+    """A sign and a condition that is true or false cross where they jump, to the resolution of time."""
+    events = {
+        "early": lj.Crossing(lambda t, q, v, p: t > p, terminal=False),
+        "sign": lj.Crossing(lambda t, q, v, p: jnp.sign(q - 0.9), terminal=False),
+        "true": lj.Crossing(lambda t, q, v, p: q > 0.9, direction=-1, terminal=False),
+    }
+    with warnings.catch_warnings():
+        # Several in one step are found, and said to be doubtful.
+        warnings.simplefilter("ignore", lj.EventWarning)
+        traj = lj.integrate(oscillator, 0.0, 1.0, 0.123, ts=[0.0, 6.0], events=events)
+    np.testing.assert_allclose(times(traj, "early"), [0.123], atol=1e-14)
+    top = np.arcsin(0.9)
+    np.testing.assert_allclose(times(traj, "sign"), [top, np.pi - top], atol=1e-8)
+    np.testing.assert_allclose(times(traj, "true"), [np.pi - top], atol=1e-8)
+
+
+SAID = {
+    "zero": lambda t, q, v, p: 0.0 * q,
+    "conserved": lambda t, q, v, p: 0.5 * v**2 + 0.5 * q**2 - 0.5,
+    "a touch": lambda t, q, v, p: q - 1.0,
+    "a square": lambda t, q, v, p: (q - 0.5) ** 2,
+    "not a number": lambda t, q, v, p: jnp.sqrt(q - 0.5),
+    "far above": lambda t, q, v, p: jnp.sin(3e3 * t),
+    "by the state": lambda t, q, v, p: jnp.sin(1e3 * q) + 0.5,
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("guard", SAID.values(), ids=SAID)
+def test_found_or_said(guard):
+    """What cannot be resolved is said, or it is found after all."""
+    exact = {SAID["far above"]: 3e3 * 6 // np.pi}.get(guard)
+    with warnings.catch_warnings(record=True) as raised:
+        warnings.simplefilter("always")
+        traj = lj.integrate(oscillator, 0.0, 1.0, ts=[0.0, 6.0], events={"guard": lj.Crossing(guard, terminal=False)})
+    found = traj.events["guard"]
+    said = bool(found.uncertain)
+    assert said == any("may be missing" in str(warning.message) for warning in raised)
+    if guard is SAID["by the state"]:
+        t = np.linspace(0.0, 6.0, 10**6)
+        exact = np.count_nonzero(np.diff(np.sign(np.sin(1e3 * np.sin(t)) + 0.5)))
+    assert said or int(found.count) == exact, found
+
+
+OPTIONS = {
+    "fixed steps": {"stepsize_controller": diffrax.ConstantStepSize(), "dt0": 0.2},
+    "a controller": {"stepsize_controller": diffrax.PIDController(rtol=1e-8, atol=1e-8, pcoeff=0.2, icoeff=0.4)},
+    "Tsit5": {"method": lj.Tsit5()},
+    "Radau5": {"method": lj.Radau5()},
+    "diffrax": {"method": diffrax.Dopri5()},
+    "implicit": {"method": diffrax.Kvaerno5()},
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("options", OPTIONS.values(), ids=OPTIONS)
+def test_methods_and_controllers(options):
+    """Two crossings near the top, and then the one that ends the motion, with any of them."""
+    traj = swing(0.0, 1.0, 0.9999, [0.0, 1.2, 12.0], np.cos(2.5), rtol=1e-8, **options)
+    top = np.arcsin(0.9999)
+    np.testing.assert_allclose(times(traj), [top, np.pi - top], atol=2e-5)
+    np.testing.assert_allclose(traj.end.t, 2.5, atol=1e-6)
+    assert np.isfinite(traj.q).tolist() == [True, True, False]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("drift", ["project", "none", "baumgarte"])
+def test_constrained_whatever_keeps_it_there(drift):
+    """The rod pendulum is at its bottom at odd quarters of its period."""
+    special = pytest.importorskip("scipy.special")
+    quarter = special.ellipk(0.5) * np.sqrt(PARAMS["l"] / PARAMS["g"])
+    start = {"x": 1.25, "y": 0.0}, {"x": 0.0, "y": 0.0}
+    bottom = {"bottom": lj.Crossing(lambda t, q, v, p: q["x"], terminal=False)}
+    traj = lj.integrate(rod_pendulum, *start, PARAMS, ts=[0.0, 6.0 * quarter], events=bottom, drift=drift)
+    np.testing.assert_allclose(times(traj, "bottom"), quarter * np.array([1.0, 3.0, 5.0]), rtol=1e-6)
+
+
+@pytest.mark.slow
+def test_float32():
+    """In float32, to its own tolerance."""
+    single = np.float32
+    params = {"level": single(0.9), "stop": single(-0.9)}
+    traj = lj.integrate(oscillator, single(0), single(1), params, ts=[0.0, 1.0, 6.0], events=EVENTS)
+    top = np.arcsin(0.9)
+    found = traj.events["level"]
+    assert found.t.dtype == found.q.dtype == jnp.float32
+    np.testing.assert_allclose(times(traj), [top, np.pi - top], atol=1e-3)
+    np.testing.assert_allclose(traj.end.t, np.arccos(-0.9), atol=1e-3)
+
+
+floor = {"floor": lj.Crossing(lambda t, q, v, p: q - p)}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("level", [0.0, 1e-15, 1e-14, 1e-12, -1e-11])
+def test_at_the_last_time(level):
+    """A crossing at `ts[-1]` is found there, or by going on from there: q = 5 (1 - t²) is zero at 1."""
+    first = lj.integrate(ball, 5.0, 0.0, level, ts=[0.0, 1.0], events=floor)
+    found, end = int(first.events["floor"].count), first.end
+    if not found:
+        found = int(lj.integrate(ball, end.q, end.v, level, ts=[1.0, 2.0], events=floor).events["floor"].count)
+    assert found == 1
+    through = lj.integrate(ball, 5.0, 0.0, level, ts=[0.0, 2.0], events=floor)
+    assert float(through.end.t) == pytest.approx(np.sqrt(1.0 - level / 5.0), abs=1e-14)
+
+
+@pytest.mark.slow
+def test_count_of_what_is_not_kept():
+    """Only crossings up to the end of the motion count, also where there is no room for them."""
+    events = EVENTS | {"level": lj.Crossing(lambda t, q, v, p: q - p["level"], terminal=False, most=1)}
+    params = {"level": 0.9, "stop": np.cos(1.5)}
+    found = lj.integrate(oscillator, 0.0, 1.0, params, ts=[0.0, 6.0], events=events).events["level"]
+    assert len(found.found().t) == 1
+    assert int(found.count) == 1

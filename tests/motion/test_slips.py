@@ -1,0 +1,90 @@
+"""What is hardly ever meant is told: a force in place of R, and single precision that nobody asked for."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import lagjax as lj
+from lagjax.mechanics import coordinates
+from lagjax.motion.slips import warn_of_odd_dissipation
+
+ODD = {
+    "a force": lambda t, q, v, p: -p["c"] * v,
+    "its opposite": lambda t, q, v, p: p["c"] * v * jnp.cos(q),
+    "of the square": lambda t, q, v, p: -p["c"] * v * jnp.abs(v),
+    "of a constant size": lambda t, q, v, p: -p["c"] * jnp.sign(v),
+}
+RIGHT = {
+    "linear friction": lambda t, q, v, p: 0.5 * p["c"] * v**2,
+    "in a wind": lambda t, q, v, p: 0.5 * p["c"] * (v - 3.0) ** 2,
+    "on a belt": lambda t, q, v, p: p["c"] * jnp.sqrt(1e-6 + (v - jnp.sin(t) - 0.1) ** 2),
+    "easier one way": lambda t, q, v, p: jnp.where(v > 0, 0.5, 0.1) * v**2,
+    "in the other direction none": lambda t, q, v, p: jnp.maximum(v, 0.0) ** 2,
+    "of air": lambda t, q, v, p: p["c"] * jnp.abs(v) ** 3,
+    "that feeds": lambda t, q, v, p: 0.5 * (q**2 - 1.0) * v**2,
+    "none here": lambda t, q, v, p: 0.0 * v,
+}
+STARTS = [(0.3, 0.0), (0.3, 1.7), (0.0, -2.0), (2.0, 1e-3)]
+
+
+@pytest.mark.parametrize("q, v", STARTS)
+@pytest.mark.parametrize("which", ODD)
+def test_a_force_in_place_of_a_dissipation(which, q, v):
+    """Told at rest, too, with both ways out."""
+    with pytest.warns(UserWarning, match=r"changes its sign with v(.|\n)*force=f(.|\n)*R = 0.5 c v²"):
+        warn_of_odd_dissipation(ODD[which], coordinates.state(0.5, q, v, {"c": 0.3}))
+
+
+@pytest.mark.parametrize("q, v", STARTS)
+@pytest.mark.parametrize("which", RIGHT)
+def test_what_dissipates_is_left_alone(which, q, v):
+    """The twin: no warning, which would be an error here."""
+    new = lambda *of_state: RIGHT[which](*of_state)
+    warn_of_odd_dissipation(new, coordinates.state(0.5, q, v, {"c": 0.3}))
+
+
+def test_integrate_tells_and_goes_on():
+    """Of one coordinate, by a function with a name: as R it is a constant force of 0.5. Traced values are let be."""
+
+    def drag(t, q, v, params):
+        return -0.5 * v["x"]
+
+    free = lj.System(lambda t, q, v, params: 0.5 * (v["x"] ** 2 + v["y"] ** 2), dissipation=drag)
+    start = {"x": 0.0, "y": 0.0}, {"x": 0.0, "y": 1.0}
+    with pytest.warns(UserWarning, match="Fix: force=drag"):
+        motion = lj.integrate(free, *start, None, ts=jnp.array([0.0, 2.0]))
+    np.testing.assert_allclose(motion.q["x"][-1], 0.5 * 0.5 * 2.0**2, rtol=1e-12)
+
+    def traced(y, c):
+        closed = lj.System(free.lagrangian, dissipation=lambda t, q, v, params: c * v["x"])
+        ts = jnp.array([0.0, 2.0])
+        of_start = lj.integrate(free, start[0] | {"y": y}, start[1], None, ts=ts)
+        return of_start.q["x"] + lj.integrate(closed, *start, None, ts=ts).q["x"]
+
+    assert jax.eval_shape(traced, 0.5, 0.5).shape == (2,)
+
+
+@pytest.mark.slow
+def test_single_precision_is_told_once():
+    """Without x64: by the first start that is none of NumPy's float32; with it never."""
+    code = """
+import sys, warnings, numpy as np, jax, jax.numpy as jnp, lagjax as lj
+jax.config.update("jax_enable_x64", sys.argv[1] == "64")
+free = lj.System(lambda t, q, v, params: 0.5 * v**2)
+for one in (np.float32(1.0), 1.0, jnp.asarray(1.0)):
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        motion = lj.integrate(free, one, one, None, ts=np.linspace(0.0, 1.0, 2))
+    print(motion.t.dtype, len(told), "jax_enable_x64" in str([x.message for x in told]), [x.filename for x in told])
+"""
+    root = Path(lj.__file__).parents[1]
+    for bits, counts in (("32", [0, 1, 0]), ("64", [0, 0, 0])):
+        command = [sys.executable, "-c", code, bits]
+        found = subprocess.run(command, cwd=root, capture_output=True, text=True, check=True).stdout.splitlines()
+        assert [line.split()[1:3] for line in found] == [[str(n), str(n == 1)] for n in counts], found
+        assert "<string>" in found[1] or bits == "64", "the warning shows the user's line"

@@ -1,0 +1,329 @@
+"""Stores that were damaged: nothing of them is returned as good, all of it is told, and the same call mends it."""
+
+import json
+import shutil
+import warnings
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import zarr
+
+import lagjax as lj
+from lagjax.sweeps import fingerprint, metadata
+from lagjax.sweeps.lanes import LOST, NOT_RUN
+from lagjax.sweeps.store import Store
+
+AXES = {"x": np.linspace(0.1, 1.0, 8), "k": np.arange(1, 6)}
+EXACT = {
+    "n": 10 * np.ones((8, 1), int) + AXES["k"],
+    "y": np.stack([AXES["x"][:, None] * AXES["k"] + 0 * AXES["k"]] * 2, -1),
+}
+
+
+def run(point):
+    """A whole number and two others, in closed form."""
+    return {"n": 10 + point["k"], "y": jnp.stack([point["x"] * point["k"]] * 2)}
+
+
+def swept(path, of=run, axes=AXES, **settings):
+    """The sweep into a store, of five blocks of eight points."""
+    return lj.sweep(of, axes, store=path, chunk=8, workers=1, progress=False, **settings)
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """A store that is whole."""
+    path = tmp_path_factory.mktemp("whole") / "store"
+    assert swept(path).ran == 40 and Store(path).block == 8
+    return path
+
+
+@pytest.fixture
+def store(whole, tmp_path):
+    """A copy of it, to be damaged."""
+    return shutil.copytree(whole, tmp_path / "store")
+
+
+def told(call):
+    """(what a call returns, what it warned of)."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        return call(), "\n".join(str(x.message) for x in caught)
+
+
+def same(values, where=...):
+    """The closed form."""
+    for name, exact in EXACT.items():
+        np.testing.assert_allclose(values[name][where], exact[where], rtol=1e-15)
+
+
+def removed(file):
+    """A file or a folder."""
+    if file.is_dir():
+        shutil.rmtree(file)
+    else:
+        file.unlink()
+
+
+def cut(file):
+    """To its first half."""
+    file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+
+
+def emptied(file):
+    """As after a power cut."""
+    file.write_bytes(b"")
+
+
+def flipped(at):
+    """One bit."""
+
+    def flip(file):
+        data = bytearray(file.read_bytes())
+        data[at] ^= 4
+        file.write_bytes(data)
+
+    return flip
+
+
+def exchanged(file):
+    """For that of another block."""
+    shutil.copy(file.parents[1] / "3" / file.name, file)
+
+
+BLOCKS = {
+    "values gone": ("values/y/c/1/0", removed),
+    "whole numbers gone": ("values/n/c/1", removed),
+    "result gone": ("status/result/c/1", removed),
+    "values cut": ("values/y/c/1/0", cut),
+    "values empty": ("values/n/c/1", emptied),
+    "a bit of values": ("values/y/c/1/0", flipped(8)),
+    "a bit of whole numbers": ("values/n/c/1", flipped(20)),
+    "a bit of the checksum": ("values/y/c/1/0", flipped(-1)),
+    "a bit of the result": ("status/result/c/1", flipped(8)),
+    "a bit of the steps": ("status/steps/c/1", flipped(8)),
+    "another block's": ("values/y/c/1/0", exchanged),
+    "a bit of the mark": ("done/c/1/0/0", flipped(8)),
+    "the mark cut": ("done/c/1/0/0", cut),
+}
+
+
+@pytest.mark.parametrize("case", BLOCKS)
+def test_a_damaged_block(store, case):
+    """Its points are lost when they are read, never good; the same call names the file and computes them again."""
+    name, damage = BLOCKS[case]
+    damage(store / name)
+    (opened, values), words = told(lambda: (opened := lj.open_sweep(store), opened.values))
+    lost = np.arange(40).reshape(8, 5) // 8 == 1
+    np.testing.assert_array_equal(opened.status.result == LOST, lost)
+    np.testing.assert_array_equal(opened.ok, ~lost)
+    same(values, ~lost)
+    assert np.isnan(values["y"][lost]).all() and opened.counts() == {"successful": 32, "lost from the store": 8}
+    assert str(store / name) in words and "lj.sweep(run, axes, store=path)" in words
+    mended, words = told(lambda: swept(store))
+    assert mended.ran == 8 and mended.ok.all() and str(store / name) in words and "computed again: 1 of 5" in words
+    same(mended.values)
+
+
+def test_nothing_is_told_of_a_whole_store(whole):
+    """The twin: no warning (which would be an error here), nothing computed."""
+    assert swept(whole).ran == 0 and lj.open_sweep(whole).ok.all()
+    same(lj.open_sweep(whole).values)
+
+
+def test_a_block_without_mark_was_not_run(store):
+    """Whatever values it has."""
+    removed(store / "done/c/1/0/0")
+    opened = lj.open_sweep(store)
+    assert opened.counts() == {"successful": 32, "not run": 8} and np.isnan(opened.values["y"]).sum() == 16
+    assert swept(store).ran == 8
+
+
+METADATA = {
+    "the group's": ("zarr.json", lambda file: file.write_text("{")),
+    "the group's gone": ("zarr.json", removed),
+    "what it says changed": (
+        "zarr.json",
+        lambda file: file.write_text(file.read_text().replace('"block": 8', '"block": 9')),
+    ),
+    "an array's": ("values/y/zarr.json", lambda file: file.write_text('{"zarr_format": 3')),
+    "an array's gone": ("values/n/zarr.json", removed),
+    "an array's empty": ("status/result/zarr.json", emptied),
+    "a shape": ("values/n/zarr.json", lambda file: file.write_text(file.read_text().replace("40", "41"))),
+    "of marks": ("done/zarr.json", cut),
+}
+
+
+@pytest.mark.parametrize("case", METADATA)
+def test_damaged_metadata_are_put_back(store, case):
+    """By whoever opens the store first, and no value is lost."""
+    name, damage = METADATA[case]
+    damage(store / name)
+    opened, words = told(lambda: lj.open_sweep(store))
+    assert opened.ok.all() and str(store / name) in words and "put back" in words
+    same(opened.values)
+    assert swept(store).ran == 0
+
+
+@pytest.mark.parametrize("name", ["values/y", "values", "status", "status/steps", "done"])
+def test_missing_arrays(store, name):
+    """All of them are computed again."""
+    removed(store / name)
+    opened, words = told(lambda: lj.open_sweep(store))
+    assert not opened.ok.any() and str(store / name) in words
+    mended, _ = told(lambda: swept(store))
+    assert mended.ran == 40 and mended.ok.all() and swept(store).ran == 0
+    same(mended.values)
+
+
+@pytest.mark.parametrize("damage", [removed, cut, flipped(20)])
+def test_damaged_axes(store, damage):
+    """Alone such a store does not know its points; the same call does."""
+    damage(store / "axes/x/c/0")
+    with pytest.raises(ValueError, match="values of the axis 'x' in .*axes/x are damaged"):
+        lj.open_sweep(store)
+    mended, words = told(lambda: swept(store))
+    assert mended.ran == 0 and "axes/x was damaged" in words
+    np.testing.assert_array_equal(lj.open_sweep(store).axes.values["x"], AXES["x"])
+
+
+def test_nothing_known(store, tmp_path):
+    """Both copies of what a store belongs to damaged, or no store at all: in words."""
+    cut(store / "zarr.json")
+    cut(store / "done/zarr.json")
+    for call in (swept, lj.open_sweep):
+        with pytest.raises(ValueError, match="zarr.json are both damaged"):
+            call(store)
+    with pytest.raises(ValueError, match="there is no .*nowhere"):
+        lj.open_sweep(tmp_path / "nowhere")
+
+
+def test_parts_look_after_their_own(store):
+    """What is lost of another part is told, and lost in what a part returns."""
+    removed(store / "values/y/c/1/0")
+    part, words = told(lambda: swept(store, part=(0, 2)))
+    assert part.ran == 0 and np.sum(part.status.result == LOST) == 8 and "this call without part" in words
+    assert told(lambda: swept(store, part=(1, 2)))[0].ran == 8
+    assert swept(store).ok.all()
+
+
+NAMES = [
+    (lambda x: {"a": {"b": x}, "a.b": x}, r"2 values of the name 'a.b': \['a'\]\['b'\], \['a.b'\]"),
+    (lambda x: {"a": x, "a/b": x}, "values 'a' and 'a/b' cannot be kept in one store"),
+    (lambda x: {"zarr.json": x}, "value 'zarr.json' cannot be kept in a store"),
+    (lambda x: {"a/../b": x}, "cannot be kept in a store"),
+    (lambda x: x.astype(jnp.bfloat16), "the value 'value' is bfloat16"),
+]
+
+
+@pytest.mark.parametrize("values, words", NAMES)
+def test_a_failed_creation_leaves_nothing(tmp_path, values, words):
+    """Names that collide, and numbers for which there is no place."""
+    with pytest.raises((ValueError, TypeError), match=words):
+        swept(tmp_path / "new" / "store", lambda point: values(point["x"]))
+    assert not list(tmp_path.iterdir())
+
+
+def test_names_that_look_like_folders(tmp_path):
+    """Beside each other they are kept; in xarray an axis and a value of one name, too."""
+    both = swept(tmp_path / "store", lambda point: {"a/b": point["x"], "a/c": point["k"], "x": 2 * point["x"]})
+    opened = lj.open_sweep(tmp_path / "store")
+    np.testing.assert_array_equal(opened.values["a/c"], both.values["a/c"])
+    np.testing.assert_allclose(opened.to_xarray()["value_x"][:, 0], 2 * AXES["x"])
+    with pytest.raises(ValueError, match="two of the values are named 'a.b'"):
+        lj.sweep(lambda point: {"a": {"b": point["x"]}, "a.b": 1.0}, AXES, progress=False).to_xarray()
+    with pytest.raises(ValueError, match="two axes are named '1'"):
+        lj.sweep(run, {1: AXES["x"], "1": AXES["x"]}, progress=False)
+
+
+def test_what_killed_processes_left(store):
+    """Folders of a creation that was killed are removed; files of others beside them are not."""
+    left, other = store.with_name(".store.0123abcd"), store.with_name(".store.notes")
+    for folder in (left, other):
+        folder.mkdir()
+    (store / "values/n/c/1.0123.partial").write_bytes(b"half")
+    assert swept(store).ran == 0 and not left.exists() and other.exists()
+
+
+def rewritten(path, change):
+    """What a store says about itself, changed in both copies."""
+    said = json.loads((path / "zarr.json").read_text())["attributes"]["lagjax"]
+    change(said)
+    said["digest"] = metadata._digest(said)
+    for file in (path / "zarr.json", path / "done/zarr.json"):
+        there = json.loads(file.read_text())
+        file.write_text(json.dumps(there | {"attributes": {"lagjax": said}}))
+
+
+def by_another_version(said):
+    """Another version traces another program."""
+    said["fingerprint"] |= {"versions": fingerprint.versions() | {"jax": "0.9.0"}, "program": "0" * 16}
+
+
+def test_other_versions(store):
+    """Are read always, and continued when that is asked for; a run that is another is told by its values."""
+    rewritten(store, by_another_version)
+    removed(store / "done/c/4/0/0")
+    opened = lj.open_sweep(store)
+    assert opened.counts() == {"successful": 32, "not run": 8} and "written by lagjax" in opened.how
+    with pytest.raises(ValueError, match="written by other versions(.|\n)*jax: 0.9.0 there(.|\n)*accept_versions=True"):
+        swept(store)
+    with pytest.warns(UserWarning, match="'y' of 8 of its points differs by 1.0e"):
+        swept(store, lambda point: {"n": run(point)["n"], "y": 2 * run(point)["y"]}, accept_versions=True, part=(0, 9))
+    continued = swept(store, accept_versions=True)
+    assert continued.ran == 8
+    same(continued.values)
+    with pytest.raises(ValueError, match="axis 'x' has other values"):
+        swept(store, axes=AXES | {"x": AXES["x"] + 1}, accept_versions=True)
+    rewritten(store, lambda said: said["fingerprint"].update(format=99))
+    with pytest.raises(ValueError, match="which is newer"):
+        lj.open_sweep(store)
+
+
+def as_format_1(path, to):
+    """A store as it once was: one byte a block for a mark, no checksums, no copies, no files of fill values."""
+    there = Store(path)
+    said = {key: there.about[key] for key in ("fingerprint", "block", "names", "zipped")}
+    said["fingerprint"] |= {"format": 1}
+    group = zarr.create_group(str(to))
+    for name in said["names"]:
+        group.create_array(f"axes/{name}", data=there.group[f"axes/{name}"][...])
+    for name, x in there.arrays.items():
+        array = group.create_array(name, shape=x.shape, chunks=x.chunks, dtype=x.dtype, fill_value=x.fill_value)
+        array[...] = x[...]
+    done = group.create_array("done", shape=(5,), chunks=(1,), dtype="uint8", fill_value=0, compressors=None)
+    done[:] = 1
+    group.attrs["lagjax"] = json.loads(json.dumps(said))
+    return to
+
+
+def test_a_store_without_checksums(whole, tmp_path):
+    """It is read, continued when that is asked for, and what is seen to be missing or cut is mended."""
+    first = as_format_1(whole, tmp_path / "first")
+    assert not (first / "status/steps/c/0").exists(), "all of them are 0"
+    same(lj.open_sweep(first).values)
+    with pytest.raises(ValueError, match="format: 1 there, 2 here"):
+        swept(first)
+    assert swept(first, accept_versions=True).ran == 0
+    for name, damage in [("values/n/c/1", removed), ("values/y/c/1/0", cut), ("status/result/c/1", removed)]:
+        damage(first / name)
+        (opened, _), words = told(lambda: (opened := lj.open_sweep(first), opened.values))
+        assert np.sum(opened.status.result == LOST) == 8 and str(first / name) in words
+        mended, words = told(lambda: swept(first, accept_versions=True))
+        assert mended.ran == 8 and mended.ok.all() and str(first / name) in words
+        same(mended.values)
+    removed(first / "done/c/2")
+    assert swept(first, accept_versions=True).ran == 8
+    assert np.sum(lj.open_sweep(first).status.result == NOT_RUN) == 0
+    emptied(first / "values/n/zarr.json")
+    with pytest.raises(ValueError, match="values/n/zarr.json is damaged"):
+        lj.open_sweep(first)
+
+
+def test_checksums_stand_in_every_array(whole):
+    """So that whoever reads a store with zarr sees what is not whole."""
+    files = list(whole.rglob("zarr.json"))
+    arrays = [x for x in (json.loads(file.read_text()) for file in files) if x["node_type"] == "array"]
+    assert len(arrays) == 2 + 2 + 4 + 1
+    assert all(array["codecs"][-1]["name"] == "crc32c" for array in arrays)

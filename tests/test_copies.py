@@ -1,0 +1,103 @@
+"""Copies and pickles: what the library returns works as well after `copy`, `pickle` and in another process."""
+
+import copy
+import multiprocessing
+import pickle
+import warnings
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import lagjax as lj
+
+TS = np.linspace(0.0, 1.0, 4)
+WAYS = {
+    "copy": copy.copy,
+    "deepcopy": copy.deepcopy,
+    "pickle": lambda x: pickle.loads(pickle.dumps(x)),
+    "tree.map": lambda x: jax.tree.map(lambda leaf: leaf, x),
+}
+
+
+def spring(t, q, v, params):
+    """Of a mass of 1, and a number in params that is no array."""
+    return 0.5 * v["x"] ** 2 - 0.5 * params["k"] ** params["power"] * q["x"] ** 2
+
+
+system = lj.System(spring)
+
+
+def swing(k):
+    """The spring let go at 1: x = cos k t."""
+    return lj.integrate(system, {"x": 1.0}, {"x": 0.0}, {"k": k, "power": 2}, ts=TS)
+
+
+def at(point):
+    """A point of a sweep."""
+    return {"motion": swing(point["k"]), "k": point["k"]}
+
+
+def in_float64():
+    """As `conftest.py` sets it for the tests' own process."""
+    jax.config.update("jax_enable_x64", True)
+
+
+def shown(motion):
+    """What a trajectory says of itself, which takes its system."""
+    return repr(motion), float(motion.drift()), float(motion.residual())
+
+
+def same(found, motion):
+    """The closed form, in the same words and structure."""
+    assert shown(found) == shown(motion) and found.residual() == 0
+    assert jax.tree.structure(found) == jax.tree.structure(motion)
+    assert found.params["power"] == 2 and bool(found.result == lj.RESULTS.successful)
+    np.testing.assert_allclose(found.q["x"], np.cos(2.0 * TS), atol=1e-8)
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_trajectories(way):
+    """It knows its system, and passes for the same in JAX."""
+    motion = swing(2.0)
+    same(WAYS[way](motion), motion)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("stored", [False, True])
+def test_sweeps(stored, tmp_path):
+    """Values, statuses and words stay; what ran it does not go along, and is told."""
+    store = tmp_path / "store" if stored else None
+    swept = lj.sweep(at, {"k": np.array([1.0, 2.0])}, store=store, progress=False)
+    for way in ("copy", "deepcopy", "pickle"):
+        found = WAYS[way](swept)
+        assert repr(found) == repr(swept) and found.ok.all()
+        lane = lambda swept: jax.tree.map(lambda x: jnp.asarray(x[1]), swept.values["motion"])
+        same(lane(found), lane(swept))
+    with pytest.raises(ValueError, match="or copied, does not know what ran it"):
+        found.resweep(where=True)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("way", WAYS)
+def test_fits(way):
+    """The table, the starts and the standard deviations."""
+    record = lj.Record(TS, q={"x": np.cos(2.0 * TS)}, sigma=1e-3)
+    with warnings.catch_warnings():
+        # That the residuals are smaller than sigma says.
+        warnings.simplefilter("ignore")
+        fitted = lj.fit(system, record, {"k": 1.9, "power": 2})
+        found = WAYS[way](fitted)
+        assert repr(found) == repr(fitted)
+    np.testing.assert_allclose(found.values, [2.0], rtol=1e-6)
+    np.testing.assert_array_equal(found.sd, fitted.sd)
+
+
+@pytest.mark.slow
+def test_another_process():
+    """A trajectory goes there and comes back."""
+    with multiprocessing.get_context("spawn").Pool(1, initializer=in_float64) as pool:
+        motion = pool.apply(swing, (2.0,))
+        same(motion, swing(2.0))
+        assert pool.apply(shown, (motion,)) == shown(motion)

@@ -1,0 +1,42 @@
+"""Random systems of `benchmarks/fuzz.py` that once ended the process, raised or came out wrong; its failing twin."""
+
+import subprocess
+import sys
+
+import pytest
+
+
+def fuzzed(*options):
+    """The fuzzer's output and status."""
+    run = [sys.executable, "benchmarks/fuzz.py", "--seconds", 800, "--cases", 1, *options]
+    return subprocess.run(list(map(str, run)), capture_output=True, text=True, timeout=900)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seeds", [(2, 4, 70, 97, 147, 187), (196, 210, 219, 257, 288)])
+def test_what_once_failed(seeds):
+    """Ended by tables of more than 10 kB; 1/0 known beforehand; mixed kinds; 4,096 multiplications (257)."""
+    # One command: it forks a process for each.
+    ended = fuzzed("--quick", "--only", *seeds)
+    assert ended.returncode == 0 and ended.stdout.count(" ok: ") == len(seeds), ended.stdout + ended.stderr
+
+
+@pytest.mark.slow
+def test_what_once_came_out_wrong_on_the_way():
+    """Integers divided by a parameter, 29 // 7, in the whole path: once 29 / 7, in silence."""
+    ended = fuzzed("--seed", 704)
+    assert ended.returncode == 0 and " ok: " in ended.stdout, ended.stdout
+
+
+@pytest.mark.slow
+def test_the_fuzzer_can_fail():
+    """Accelerations that are wrong by a millionth are found."""
+    script = (
+        "import sys; sys.path[:0] = ['benchmarks', '.']\n"
+        "import fuzz, jax\n"
+        "kept = fuzz.lj.accelerations\n"
+        "fuzz.lj.accelerations = lambda *x: jax.tree.map(lambda a: 1.000001 * a, kept(*x))\n"
+        "print(fuzz.in_a_process(fuzz.run_quickly, 97, False))\n"
+    )
+    ended = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=900)
+    assert ended.stdout.startswith("WRONG"), ended.stdout + ended.stderr
