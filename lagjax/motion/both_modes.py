@@ -40,17 +40,17 @@ PUSH_AT_MOST = 2**14
 
 
 def solve_in_both_modes(solve: Callable, x: PyTree, fixed: PyTree) -> PyTree:
-    """`solve(x, fixed, adjoint)` for a diffrax adjoint, differentiable in both modes in `x`.
+    """`solve(x, fixed, adjoint, differentiated)` for a diffrax adjoint, differentiable in both modes in `x`.
 
     All leaves of `x` are floating arrays, all leaves of `fixed` and of the result are arrays, and `solve`
-    closes over no traced value.
+    closes over no traced value. `differentiated` says whether this solve is for a derivative.
     """
     return _solve((x, fixed), solve=solve)
 
 
 @eqx.filter_custom_jvp
 def _solve(inputs, *, solve):
-    return solve(*inputs, diffrax.ForwardMode())
+    return solve(*inputs, diffrax.ForwardMode(), False)
 
 
 @_solve.def_jvp
@@ -67,7 +67,7 @@ def _solve_jvp(primals, tangents, *, solve):
 
     def float_outputs(adjoint, *operands):
         x, fixed = jtu.tree_unflatten(structure, [operands[order.index(i)] for i in range(len(order))])
-        return jtu.tree_leaves(eqx.filter(solve(x, fixed, adjoint), eqx.is_inexact_array))
+        return jtu.tree_leaves(eqx.filter(solve(x, fixed, adjoint, True), eqx.is_inexact_array))
 
     floats, rest = eqx.partition(y, eqx.is_inexact_array)
     shapes = tuple((leaf.shape, leaf.dtype) for leaf in jtu.tree_leaves(floats))

@@ -33,10 +33,6 @@ from lagjax.numerics.simplified_newton import SimplifiedNewton, with_tolerances
 LOOKED_AT = {"lagjax", "diffrax", "optimistix"}
 # Baumgarte's feedback decays a violation by e this many times over the time span.
 BAUMGARTE_DECAYS = 50.0
-# The operations of a right-hand side that is copied to each of the stages; longer ones are compiled once, in a loop.
-UNROLL_UP_TO = 250
-# The same where steps are taken to times inside another one, at two places, to find a crossing.
-UNROLL_INSIDE = 60
 
 
 class Solution(NamedTuple):
@@ -86,10 +82,10 @@ def _loop(system, written, start, y0, refused, settings, ts, adjoint, guards=Non
         field = WrittenField(written.equations, written.equations.prepare(system, params))
         project = written.project if settings.drift == "project" else None
         prepared = () if project is None else project.prepare(system, params)
-        in_a_loop, length = _in_a_loop(settings.method, adjoint), written.equations.length
-        stages, inside = (settings.method if length <= least else in_a_loop for least in (UNROLL_UP_TO, UNROLL_INSIDE))
+        in_a_loop = _in_a_loop(settings.method, adjoint)
+        stages = settings.method if written.equations.length <= settings.unroll_up_to else in_a_loop
         careful = written.careful and settings.careful
-        quick = Quick(stages, inside, diffrax.ODETerm(field), project, prepared, careful)
+        quick = Quick(stages, in_a_loop, diffrax.ODETerm(field), project, prepared, careful)
     # BacksolveAdjoint integrates a larger state backwards: it takes the bare method, and no end beside the outputs.
     bare = isinstance(adjoint, diffrax.BacksolveAdjoint)
     settings = eqx.tree_at(lambda s: s.method, settings, _with_root_finder(settings))

@@ -57,8 +57,8 @@ class Stages(NamedTuple):
 class Quick(eqx.Module):
     """A step on equations that are written out, which may give NaN where the careful one does not.
 
-    `project` is None where a step is not returned to constraints. `inside` is the same method for steps to times inside
-    another one; with a loop over its stages it is slower, and compiled in a fraction of the time.
+    `project` is None where a step is not returned to constraints. `inside` is the same method with a loop over its
+    stages, for steps to times inside another one, which are asked for at two places.
     """
 
     solver: diffrax.AbstractSolver

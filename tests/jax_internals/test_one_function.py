@@ -166,16 +166,21 @@ def layer(x, w):
 
 
 def check_products(sizes):
-    """Products of these sizes in one function are those of JAX."""
+    """Products of these sizes, each in one function, are those of NumPy; of twenty sizes in one program."""
     rng = np.random.default_rng(0)
-    for size in sizes:
-        x, w = jnp.asarray(rng.normal(size=size)), jnp.asarray(rng.normal(size=(size, size)) / size)
-        one = jax.jit(lambda x, w: one_function(layer, x, w))(x, w)
-        np.testing.assert_allclose(one, layer(x, w), rtol=1e-12, atol=1e-14)
-        small = int(size**0.5) + 1
-        a = jnp.asarray(rng.normal(size=(small, small)))
-        one = jax.jit(lambda a: one_function(lambda a: a @ a @ a.T, a))(a)
-        np.testing.assert_allclose(one, a @ a @ a.T, rtol=1e-12, atol=1e-12)
+    square = lambda a: a @ a @ a.T
+    for some in (sizes[i : i + 20] for i in range(0, len(sizes), 20)):
+        layers = [(rng.normal(size=size), rng.normal(size=(size, size)) / size) for size in some]
+        squares = [rng.normal(size=2 * (int(size**0.5) + 1,)) for size in some]
+        of_all = lambda layers, squares: (
+            [one_function(layer, x, w) for x, w in layers], [one_function(square, a) for a in squares]
+        )  # fmt: skip
+        found = jax.jit(of_all)(*jax.tree.map(jnp.asarray, (layers, squares)))
+        for one, (x, w) in zip(found[0], layers):
+            once = np.tanh(w.T @ (w @ x))
+            np.testing.assert_allclose(one, np.tanh(w.T @ (w @ once)), rtol=1e-12, atol=1e-14)
+        for one, a in zip(found[1], squares):
+            np.testing.assert_allclose(one, square(a), rtol=1e-12, atol=1e-12)
 
 
 @pytest.mark.parametrize("size", [16, 63, 64, 65])

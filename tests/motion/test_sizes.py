@@ -41,7 +41,8 @@ def survives(script):
 @pytest.mark.parametrize("how", TRANSFORMED)
 def test_any_number_of_outputs(how):
     """2 times (one output after the start) to 100,000; XLA ended the process above 10 kB that it knew."""
-    lines = ["for size in (2, 3, 1000, 1024, 1025, 1251, 5000, 100_000):", "    print(size, flush=True)"]
+    sizes = (2, 3, 1000, 1024, 1025, 1251, 5000, 100_000) if how == "closed over" else (2, 1251, 100_000)
+    lines = [f"for size in {sizes}:", "    print(size, flush=True)"]
     lines += ["    ts = np.linspace(0.0, 3.0, size)", "    known = jnp.asarray(ts)", "    " + TRANSFORMED[how]]
     survives("\n".join(lines))
 
