@@ -32,8 +32,8 @@ from lagjax.mechanics.written_out import is_small, write_out
 from lagjax.motion.arriving import apart_from_jumps
 from lagjax.motion.both_modes import solve_in_both_modes
 from lagjax.motion.consistency import stopped, to_manifold, within, worst_residual
-from lagjax.motion.crossing_times import all_known, by_name, end_of
-from lagjax.motion.loop import solution_of
+from lagjax.motion.crossing_times import Located, all_known, by_name, end_of
+from lagjax.motion.loop import Solution, solution_of
 from lagjax.motion.memory_maps import maps_used, warn_of_memory_maps
 from lagjax.motion.trajectory import RESULTS, Moment, Trajectory, ended_well, pack, worst_drift
 from lagjax.numerics.nystrom import Nystrom, Nystrom12
@@ -52,9 +52,9 @@ ROUND_OFFS = 8
 # Motions whose programs are kept, of 10 to 130 MB each; fewer, where these use so much of the memory maps there are.
 KEPT, KEPT_AT_LEAST, MAPS_SHARE = 100, 8, 0.4
 # The operations of a right-hand side that is copied to each of a method's stages; a longer one is compiled once, in a
-# loop. In lanes of a rod or a double pendulum copies are twice as fast. By itself a step is a fifth longer without them,
-# and the first answer of a rod comes an eighth sooner, of eight coupled masses in half the time. Where derivatives are
-# taken there are none: two thirds of the time to the first of them, a fifth more for each of the next ones.
+# loop. In lanes of a rod or a double pendulum copies are twice as fast. By itself a step takes a fifth longer in a loop,
+# but the first answer of a rod comes an eighth sooner, of eight coupled masses in half the time. Where derivatives are
+# taken there are no copies: two thirds of the time to the first of them, a fifth more for each of the next ones.
 UNROLL_UP_TO, UNROLL_AT_ONCE_UP_TO = 250, 30
 # What the careful way would say, too.
 THE_SAME = RESULTS.max_steps_reached, RESULTS.start_off_constraints, RESULTS.tolerance_too_small, RESULTS.unordered
@@ -243,99 +243,111 @@ def _solve_in_numbers(system, q0, v0, params, ts, guards, settings, adjoint):
 
 
 class Start(NamedTuple):
-    """The first state, moved onto the constraints, and what speaks against it."""
+    """The first state, moved onto the constraints, and what speaks against it, by names of `RESULTS`."""
 
     q: PyTree[Float[Array, "..."]]
     v: PyTree[Float[Array, "..."]]
-    off_constraints: Bool[Array, ""]
-    contradictory: Bool[Array, ""]
-    singular: Bool[Array, ""]
-    finite: Bool[Array, ""]
+    against: dict[str, Bool[Array, ""]]
+    refused: Bool[Array, ""]
 
 
-def _start(system, t, q, v, params, settings) -> Start:
-    off_constraints = _off_constraints(system, t, q, v, params, settings)
-    projected = None
-    if settings.drift == "project":
-        projected = to_manifold(system, t, q, v, params, settings.rtol, settings.atol)
-        q, v = projected.q, projected.v
-    start = stopped(verdict(system, t, q, v, params))
-    if projected is not None:
-        off_constraints = off_constraints | (start.finite & ~start.singular & ~projected.holds)
-    return Start(q, v, off_constraints, start.contradictory, start.singular, start.finite)
+class Outputs(NamedTuple):
+    """The motion at the outputs and, last, at its end, where nothing is NaN; and which outputs were reached."""
 
-
-def _regular_start(system, written, t, q, v, params, settings) -> Start:
-    """The same of a regular system; what speaks against another one is not told apart."""
-    off_constraints = _off_constraints(system, t, q, v, params, settings)
-    if settings.drift == "project":
-        q, v = called(written.project(system, t, q, v, params))
-    a, multipliers = called(written.equations(system, t, q, v, params))
-    numbers = coordinates.flatten((a, multipliers, system.lagrangian(t, q, v, params)))[0]
-    singular = ~is_regular(system, t, q, v, params)
-    return Start(q, v, off_constraints, jnp.asarray(False), singular, jnp.all(jnp.isfinite(numbers)))
+    motion: Moment
+    reached: Bool[Array, " T"]
+    located: Located | None
 
 
 def _solve(system, q0, v0, params, ts, guards, settings, adjoint, written):
-    if settings.careful:
-        start = _start(system, ts[0], q0, v0, params, settings)
+    regular = None if settings.careful else written
+    start = _start(system, q0, v0, params, ts, settings, regular)
+    solution = _stepped(system, start, params, ts, guards, settings, adjoint, written)
+    outputs = _outputs(system, start, solution, params, ts, guards, settings, regular)
+    return _result(system, start, solution, outputs, params, guards, settings)
+
+
+def _start(system, q, v, params, ts, settings, regular) -> Start:
+    """What speaks against a start comes in rising order: the last of what holds is the result."""
+    t, off_constraints = ts[0], jnp.asarray(False)
+    if system.constraints:
+        tolerances = START_TOLERANCES * settings.rtol, START_TOLERANCES * settings.atol
+        off_constraints = ~within(system, t, q, v, params, *tolerances)
+    holds, projects = True, settings.drift == "project"
+    if regular is not None:
+        # What speaks against one that is not regular is not told apart.
+        q, v = called(regular.project(system, t, q, v, params)) if projects else (q, v)
+        solution = (*called(regular.equations(system, t, q, v, params)), system.lagrangian(t, q, v, params))
+        finite, contradictory = jnp.all(jnp.isfinite(coordinates.flatten(solution)[0])), jnp.asarray(False)
+        singular = ~is_regular(system, t, q, v, params)
     else:
-        start = _regular_start(system, written, ts[0], q0, v0, params, settings)
-    q0, v0, off_constraints, contradictory, singular, finite = start
-    too_small = settings.rtol[0] < ROUND_OFFS * jnp.finfo(ts.dtype).eps if settings.controller is None else False
-    unordered = jnp.any(ts[1:] < ts[:-1])
-    for length in (settings.dt0, settings.max_step):
-        if length is not None:
-            unordered = unordered | ~(length > 0)
-    refused = off_constraints | contradictory | singular | ~finite | too_small | unordered
-    y0 = jax.tree.map(lambda x: jnp.where(refused, 0.0, x), (q0, v0))
-    start = State(ts[0], q0, v0, params)
-    solution = solution_of(system, written, start, y0, refused, ts, guards, settings, adjoint)
-    outputs, (end_t, end_y), located = solution.outputs, solution.end, solution.located
-    reached = jnp.isfinite(solution.reached) & ~refused
-    if located is not None:
-        end_t, end_y = end_of(guards, located, end_t, end_y)
-        # The step in which the motion ended went on to its own end.
-        reached = reached & (ts <= end_t)
+        if projects:
+            projected = to_manifold(system, t, q, v, params, settings.rtol, settings.atol)
+            q, v, holds = projected.q, projected.v, projected.holds
+        _, _, finite, singular, contradictory = stopped(verdict(system, t, q, v, params))
+    too_small = settings.controller is None and settings.rtol[0] < ROUND_OFFS * jnp.finfo(ts.dtype).eps
+    lengths = [length for length in (settings.dt0, settings.max_step) if length is not None]
+    against = {
+        "start_singular": singular,
+        "start_not_finite": ~finite,
+        "contradictory": contradictory,
+        "start_off_constraints": off_constraints | (finite & ~singular & ~jnp.asarray(holds)),
+        "tolerance_too_small": jnp.asarray(too_small),
+        "unordered": jnp.any(ts[1:] < ts[:-1]) | ~jnp.all(jnp.asarray([True, *(length > 0 for length in lengths)])),
+    }
+    return Start(q, v, against, jnp.any(jnp.stack([*against.values()])))
 
+
+def _stepped(system, start, params, ts, guards, settings, adjoint, written) -> Solution:
+    y0 = jax.tree.map(lambda x: jnp.where(start.refused, 0.0, x), (start.q, start.v))
+    first = State(ts[0], start.q, start.v, params)
+    solution = solution_of(system, written, first, y0, start.refused, ts, guards, settings, adjoint)
+    if solution.located is None:
+        return solution
+    end = end_of(guards, solution.located, *solution.end)
+    # The step in which the motion ended went on to its own end.
+    return solution._replace(end=end, reached=jnp.where(ts <= end[0], solution.reached, jnp.inf))
+
+
+def _outputs(system, start, solution, params, ts, guards, settings, regular) -> Outputs:
     # What was not reached is evaluated at the start and masked afterwards: NaN times zero would poison gradients.
-    outputs = jax.tree.map(lambda x, x0: jnp.where(_like(reached, x), x, x0[None]), outputs, (q0, v0))
+    reached = jnp.isfinite(solution.reached) & ~start.refused
+    states = jax.tree.map(lambda x, x0: jnp.where(_like(reached, x), x, x0[None]), solution.outputs, (start.q, start.v))
     if settings.jump_ts is not None:
-        outputs = apart_from_jumps(system, ts, settings.jump_ts, *outputs, params)
+        states = apart_from_jumps(system, ts, settings.jump_ts, *states, params)
     # One compiled evaluation for the outputs and the end together.
-    t, (q, v) = jax.tree.map(lambda x, last: jnp.concatenate([x, last]), (ts, outputs), (end_t, end_y))
-    everything = Moment(t, q, v, _multipliers(system, None if settings.careful else written, t, q, v, params))
-    end = jax.tree.map(lambda x: jnp.where(refused, jnp.nan, x[-1]), everything)._replace(t=t[-1])
-    _, q, v, multipliers = jax.tree.map(lambda x: jnp.where(_like(reached, x), x[:-1], jnp.nan), everything)
+    t, (q, v) = jax.tree.map(lambda x, last: jnp.concatenate([x, last]), (ts, states), solution.end)
+    multipliers = _multipliers(system, regular, t, q, v, params)
+    return Outputs(Moment(t, q, v, multipliers), reached, solution.located)
 
+
+def _result(system, start, solution, outputs, params, guards, settings):
+    """The fields of the trajectory: NaN where it did not come, and why."""
+    motion, reached, located = outputs
     result = RESULTS.promote(solution.result)
     for reported, ours in TRANSLATED.items():
         result = RESULTS.where(result == getattr(RESULTS, reported), getattr(RESULTS, ours), result)
     # An output is a step of its own, and can fail where the steps of the solve did not.
-    all_reached = jnp.all(jnp.isfinite(coordinates.flatten(outputs)[0]))
+    known = jnp.all(jnp.isfinite(coordinates.flatten(jax.tree.map(lambda x: x[:-1], (motion.q, motion.v)))[0]))
     if not settings.careful:
-        all_reached = all_reached & jnp.all(jnp.isfinite(coordinates.flatten(everything.multipliers)[0]))
-        if located is not None:
-            all_reached = all_reached & all_known(located)
-    result = RESULTS.where(ended_well(result) & ~all_reached, RESULTS.unsolved_step, result)
-    result = RESULTS.where(singular, RESULTS.start_singular, result)
-    result = RESULTS.where(finite, result, RESULTS.start_not_finite)
-    result = RESULTS.where(contradictory, RESULTS.contradictory, result)
-    result = RESULTS.where(off_constraints, RESULTS.start_off_constraints, result)
-    result = RESULTS.where(too_small, RESULTS.tolerance_too_small, result)
-    result = RESULTS.where(unordered, RESULTS.unordered, result)
+        known = known & jnp.all(jnp.isfinite(coordinates.flatten(motion.multipliers)[0]))
+        known = known if located is None else known & all_known(located)
+    result = RESULTS.where(ended_well(result) & ~known, RESULTS.unsolved_step, result)
+    for name, holds in start.against.items():
+        result = RESULTS.where(holds, getattr(RESULTS, name), result)
     stats = {name: jnp.asarray(count) for name, count in solution.stats.items() if name != "max_steps"}
-    departure = _departure(system, stopped((t, everything.q, everything.v, params)), stats, settings)
+    masked = jax.tree.map(lambda x: jnp.where(_like(reached, x), x[:-1], jnp.nan), motion)
+    end = jax.tree.map(lambda x: jnp.where(start.refused, jnp.nan, x[-1]), motion)._replace(t=motion.t[-1])
     return {
-        "q": q,
-        "v": v,
-        "multipliers": multipliers,
+        "q": masked.q,
+        "v": masked.v,
+        "multipliers": masked.multipliers,
         "end": end,
         "stats": stats,
-        "departure": departure,
+        "departure": _departure(system, stopped((motion.t, motion.q, motion.v, params)), stats, settings),
         "result": result,
         "settled": settings.careful | ended_well(result) | _among(result, THE_SAME),
-        "events": {} if located is None else by_name(guards, located, end_t, ~refused),
+        "events": {} if located is None else by_name(guards, located, motion.t[-1:], ~start.refused),
     }
 
 
@@ -358,19 +370,13 @@ def _departure(system, motion, stats, settings):
     return jnp.maximum(jnp.maximum(drift, residual) / (DRIFT_TOLERANCES * rtol), phase)
 
 
-def _multipliers(system, written, t, q, v, params):
+def _multipliers(system, regular, t, q, v, params):
     def at(t, q, v):
-        if written is None:
+        if regular is None:
             return equations_of_motion(system, t, q, v, params)[1]
-        return constraints.split(system, called(written.equations(system, t, q, v, params))[1], t, q, v, params)
+        return constraints.split(system, called(regular.equations(system, t, q, v, params))[1], t, q, v, params)
 
     return jax.vmap(at)(t, q, v) if system.constraints else {}
-
-
-def _off_constraints(system, t, q, v, params, settings):
-    if not system.constraints:
-        return jnp.asarray(False)
-    return ~within(system, t, q, v, params, START_TOLERANCES * settings.rtol, START_TOLERANCES * settings.atol)
 
 
 def _among(result, others):
