@@ -52,9 +52,9 @@ ROUND_OFFS = 8
 # Motions whose programs are kept, of 10 to 130 MB each; fewer, where these use so much of the memory maps there are.
 KEPT, KEPT_AT_LEAST, MAPS_SHARE = 100, 8, 0.4
 # The operations of a right-hand side that is copied to each of a method's stages; a longer one is compiled once, in a
-# loop. In lanes of a rod or a double pendulum copies are twice as fast. A step by itself is a fifth slower in a loop, and
-# the first answer of a rod comes an eighth sooner, that of eight coupled masses in half the time. Where derivatives are
-# taken there are no copies: two thirds of the time to the first of them, a fifth more for each of the next ones.
+# loop. In lanes of a rod or a double pendulum copies are twice as fast. A step by itself is a fifth slower in a loop,
+# but the first answer of a rod comes an eighth sooner, that of eight coupled masses in half the time. Derivatives are
+# taken without copies: two thirds of the time to the first of them, a fifth more for each of the next ones.
 UNROLL_UP_TO, UNROLL_AT_ONCE_UP_TO = 250, 30
 # What the careful way would say, too.
 THE_SAME = RESULTS.max_steps_reached, RESULTS.start_off_constraints, RESULTS.tolerance_too_small, RESULTS.unordered
