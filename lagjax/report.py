@@ -1,9 +1,9 @@
 """Error against run time, and what happens in the extremes: the tables that `python -m lagjax` prints.
 
-A scene offers `Run`s (motions with a known answer) and `Case`s (stiff and extreme inputs, tried once). Times
-are medians of the compiled program alone, after warm-up; the first answer stands apart. Tolerances and states
-enter as arrays, so that one compilation serves a method at all its tolerances. What a person waits for the first answer
-is a run time too: from the call to the result, tracing and compiling included.
+A scene offers `Run`s (motions with a known answer) and `Case`s (stiff and extreme inputs, tried once). Times are
+medians of whole calls of `integrate` after the first, of which a few tenths of a millisecond are the call's own; one
+compilation serves a method at all its tolerances. What a person waits for the first answer is a run time too, and
+stands apart: from the call to the result, tracing and compiling included.
 """
 
 import time
@@ -13,12 +13,10 @@ from typing import Any
 
 import diffrax
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
 from lagjax.mechanics import coordinates
-from lagjax.mechanics.compiled import compiled
 from lagjax.mechanics.structure import is_free_of_velocities
 from lagjax.mechanics.system import System
 from lagjax.motion.crossings import Crossing
@@ -122,20 +120,19 @@ def work_precision(
     **Arguments:** `methods` by name (by default Tsit5, Dopri8 and, where it can be used, Nystrom12); `tolerances`, each
     used as rtol and atol; `repeats`, of which the median time is kept.
 
-    **Returns:** one `Row` a method and tolerance, `seconds` for the compiled program with results ready.
+    **Returns:** one `Row` a method and tolerance, `seconds` for a call with results ready.
     """
     methods = _methods_for(run) if methods is None else methods
     rows = []
     for name, method in methods.items():
-        solve = compiled(_solver_of(run, method))
+        solve = _solver_of(run, method)
         compile_seconds = None
         for tolerance in tolerances:
-            tol = jnp.asarray(tolerance, float)
             started = time.perf_counter()
-            trajectory = jax.block_until_ready(solve(tol))
+            trajectory = jax.block_until_ready(solve(tolerance))
             if compile_seconds is None:
                 compile_seconds = time.perf_counter() - started
-            seconds = np.median([_seconds(solve, tol) for _ in range(repeats)])
+            seconds = np.median([_seconds(solve, tolerance) for _ in range(repeats)])
             judged = name == JUDGED_METHOD and tolerance == JUDGED_AT
             rows.append(_row(run, name, tolerance, trajectory, seconds, compile_seconds, judged))
     return rows

@@ -4,6 +4,7 @@
 of the system and its state, writes it out, and parts it in what depends on the parameters alone and the rest.
 """
 
+import math
 from collections.abc import Callable
 
 import equinox as eqx
@@ -52,10 +53,10 @@ class Numbers:
     """A function of (system, t, q, v, params), traced once and written out.
 
     What depends on the system and the parameters alone is computed by `prepare`, once; `at` does the rest. `calls_host`
-    says whether a function of the user's calls Python at run time.
+    says whether a function of the user's calls Python at run time. Beyond about `most` operations it raises `TooLong`.
     """
 
-    def __init__(self, function, args):
+    def __init__(self, function, args, most=math.inf):
         arrays, static = eqx.partition(args, eqx.is_array)
         self.shapes = []
 
@@ -70,8 +71,9 @@ class Numbers:
         self.calls_host = calls_host(program.jaxpr)
         if WATCHED.value:
             program = poisoned(program)
-        full = jax.make_jaxpr(lambda *leaves: written_out(program, *leaves))(*like)
-        self.program = full.replace(jaxpr=full.jaxpr.replace(eqns=needed(full.jaxpr)))
+        program = _with_needed(program)
+        full = jax.make_jaxpr(lambda *leaves: written_out(program, *leaves, most=most))(*like)
+        self.program = _with_needed(full)
         of_problem, of_state = _leaves_of(arrays, (0, 4)), _leaves_of(arrays, (1, 2, 3))
         self.state_variables = [self.program.jaxpr.invars[i] for i in of_state]
         early, late = staged(self.program, of_problem, of_state)
@@ -93,6 +95,10 @@ class Numbers:
     def __call__(self, system, t, q, v, params):
         """The function's result."""
         return self.at(self.prepare(system, params), t, q, v)
+
+
+def _with_needed(program):
+    return program.replace(jaxpr=program.jaxpr.replace(eqns=needed(program.jaxpr)))
 
 
 def _leaves_of(arguments, places):

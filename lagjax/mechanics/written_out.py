@@ -28,12 +28,14 @@ from lagjax.mechanics.in_numbers import Numbers
 from lagjax.mechanics.lagrangian import mass_and_forcing
 from lagjax.mechanics.structure import is_diagonal
 from lagjax.numerics import dense
+from lagjax.numerics.scalars import TooLong
 
 # Coordinates and constraint equations together. Measured on chains: a full mass matrix of nine is as fast in arrays;
 # with constraints, whose matrix is mostly zeros, a step is seven times faster up to here, for twice the compile time.
 UP_TO, CONSTRAINED_UP_TO = 8, 16
-# Operations of a program that takes long to compile, as of an L with tables in it.
-LONG = 2000
+# Operations of a program that takes long to compile, as of an L with tables or a quadrature in it. Up to twice as many
+# are written before it is known which are needed; to write a hundred thousand only to leave them takes 15 s.
+LONG, WRITTEN = 2000, 6000
 # Two iterations are enough where the second one moves the state by less than this part of its size.
 SMALL_CORRECTION = 1e-7
 
@@ -61,7 +63,10 @@ def write_out(system, t, q, v, params) -> WrittenOut | None:
     count = constraints.count(system, t, q, v, params)
     args = (system, t, q, v, params)
     diagonal = count == 0 and is_diagonal(*args)
-    equations = Numbers(partial(_equations, diagonal), args)
+    try:
+        equations = Numbers(partial(_equations, diagonal), args, most=WRITTEN)
+    except TooLong:
+        return None
     if equations.length > LONG:
         return None
     return WrittenOut(equations, Numbers(_projected, args) if count else None, careful=not diagonal)

@@ -9,6 +9,7 @@ A known zero counts as zero whatever it multiplies, also infinity or NaN. Primit
 flow, and arrays of more than `LARGE` entries are left as they are.
 """
 
+import math
 from collections.abc import Callable
 
 import jax
@@ -23,8 +24,12 @@ from lagjax.numerics.elementary import sincos_in_lanes
 LARGE = 512
 
 
-def written_out(closed: ClosedJaxpr, *args) -> list:
-    """Evaluate a program on its (flat) arguments, number by number.
+class TooLong(Exception):
+    """A program becomes more operations than it was to have."""
+
+
+def written_out(closed: ClosedJaxpr, *args, most: float = math.inf) -> list:
+    """Evaluate a program on its (flat) arguments, number by number; raise `TooLong` beyond about `most` of them.
 
     >>> import jax, jax.numpy as jnp
     >>> program = jax.make_jaxpr(lambda x: jnp.diag(jnp.array([2.0, 0.0])) @ x)(jnp.ones(2))
@@ -34,8 +39,21 @@ def written_out(closed: ClosedJaxpr, *args) -> list:
     """
     # What is known beforehand follows the same rules as in the compiled program: 1/0 is infinite, and nobody is warned.
     with np.errstate(all="ignore"):
-        results = _evaluate(closed, [_split(x) if _small(x.aval) else x for x in map(_Value, args)], pairs={})
+        results = _evaluate(closed, [_split(x) if _small(x.aval) else x for x in map(_Value, args)], _Book(most))
     return [_joined(x, aval) for x, aval in zip(results, closed.out_avals)]
+
+
+class _Book:
+    """What was written: sine and cosine by their argument; and how many numbers may be."""
+
+    def __init__(self, most):
+        self.pairs, self.left = {}, most
+
+    def enter(self, entries):
+        """Count what is not known beforehand."""
+        self.left -= sum(not isinstance(x, np.generic) for x in entries)
+        if self.left < 0:
+            raise TooLong
 
 
 class _Value:
@@ -81,7 +99,7 @@ def _joined(value, aval):
     return jnp.stack(entries).reshape(aval.shape) if entries else jnp.zeros(aval.shape, aval.dtype)
 
 
-def _evaluate(closed, args, pairs):
+def _evaluate(closed, args, book):
     jaxpr = closed.jaxpr
     values = dict(zip(jaxpr.invars, args))
     for variable, constant in zip(jaxpr.constvars, closed.consts):
@@ -94,17 +112,17 @@ def _evaluate(closed, args, pairs):
         return values[x]
 
     for equation in jaxpr.eqns:
-        values.update(zip(equation.outvars, _apply(equation, [read(x) for x in equation.invars], jaxpr, pairs)))
+        values.update(zip(equation.outvars, _apply(equation, [read(x) for x in equation.invars], jaxpr, book)))
     return [read(x) for x in jaxpr.outvars]
 
 
-def _apply(equation, operands, jaxpr, pairs):
+def _apply(equation, operands, jaxpr, book):
     name, params = equation.primitive.name, equation.params
     apart = all(isinstance(x, np.ndarray) for x in operands) and all(_small(x.aval) for x in equation.outvars)
     if name in CALLS and len(_programs(params)) == 1:
-        return _evaluate(_programs(params)[0], operands, pairs)
+        return _evaluate(_programs(params)[0], operands, book)
     if apart and name in ELEMENTWISE:
-        return [_elementwise(equation, operands, pairs)]
+        return [_elementwise(equation, operands, book)]
     if apart and name in MOVES:
         found = MOVES[name](params, equation.outvars, *operands)
         if found is not None:
@@ -125,12 +143,13 @@ def _pair(x, pairs):
     return pairs[id(x)][1:]
 
 
-def _elementwise(equation, operands, pairs):
+def _elementwise(equation, operands, book):
     (variable,) = equation.outvars
     shape, dtype = variable.aval.shape, variable.aval.dtype
     rows = [np.broadcast_to(x, shape).reshape(-1) for x in operands]
-    one = lambda *x: _simplified(equation, dtype, pairs, *x)
-    return _filled(shape, [one(*column) for column in zip(*rows)])
+    entries = [_simplified(equation, dtype, book.pairs, *x) for x in zip(*rows)]
+    book.enter(entries)
+    return _filled(shape, entries)
 
 
 def _is(x, number):

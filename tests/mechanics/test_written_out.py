@@ -127,3 +127,14 @@ def test_changed_numbers_do_not_compile_again():
     with compiles() as longer:
         lj.integrate(system, 0.5, 0.1, {"k": 2.0}, ts=np.linspace(0.0, 2.0, 20), rtol=1e-8, atol=1e-7)
     assert not again and longer
+
+
+def test_a_long_program_is_not_written_out():
+    """A potential by quadrature of 256 nodes stays as it is; a short one is written out."""
+    nodes = jnp.linspace(0.0, 6.0, 256)
+    wire = lambda q: jnp.sum(1 / jnp.sqrt((q[0] - jnp.cos(nodes)) ** 2 + (q[1] - jnp.sin(nodes)) ** 2 + q[2] ** 2))
+    system = lj.System(lambda t, q, v, params: 0.5 * v @ v + wire(q))
+    s = coordinates.state(0.0, np.array([2.0, 0.0, 0.3]), np.zeros(3), None)
+    assert is_small(system, *s) and write_out(system, *s) is None
+    short = lj.System(lambda t, q, v, params: 0.5 * v @ v + 1 / jnp.sqrt(q @ q))
+    assert write_out(short, *s) is not None

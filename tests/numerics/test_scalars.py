@@ -10,7 +10,7 @@ from jax import lax
 from jax.extend.core import jaxpr_as_fun
 
 from lagjax.jax_internals.programs import needed, staged
-from lagjax.numerics.scalars import written_out
+from lagjax.numerics.scalars import TooLong, written_out
 
 X = jnp.array([0.3, -1.2, 0.7, 2.0])
 MATRIX = jnp.arange(12.0).reshape(3, 4) / 7
@@ -99,3 +99,13 @@ def test_integers_are_divided_as_integers():
     args = (jnp.asarray(10), jnp.asarray(0.7))
     first, then = staged(numbers(function, *args), [0], [1])
     assert then(first(args[0]), args[1])[0] == 0.7 * 2 + X[2]
+
+
+def test_what_becomes_too_long_is_left_early():
+    """A sum over 200 nodes is 600 operations; what is known beforehand is none."""
+    nodes = jnp.linspace(0.0, 1.0, 200)
+    program = jax.make_jaxpr(lambda x: jnp.exp(nodes * x[0]) + jnp.square(nodes))(X)
+    written = lambda most: jax.make_jaxpr(lambda x: written_out(program, x, most=most))(X)
+    assert 600 <= len(written(650).jaxpr.eqns) <= 1200
+    with pytest.raises(TooLong):
+        written(550)
