@@ -9,7 +9,11 @@ bare program is what a careful person writes for the same problem: accelerations
     programs, traced        what that second call still compiles and traces: nothing
     a step                  a call's time by its number of steps
     kept programs           the first answer of a second process that shares JAX's compilation cache with a first one
-    instructions            of the program before XLA optimises it: the volume that is compiled
+    instructions            of the largest program before XLA optimises it: the volume that is compiled
+    import                  `import lagjax` after `import jax, diffrax`
+
+Programs are kept by `jax.config.update("jax_compilation_cache_dir", FOLDER)` and, since JAX leaves out what compiled in
+less than a second, `jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)`.
 
     python benchmarks/first_answer.py [--json FILE] [--only TEXT] [--processor-time]
 """
@@ -76,10 +80,22 @@ if AGAIN:
     result["a step"] = None if steps is None else result["again"] / int(steps)
 print(json.dumps(result))
 """
+IMPORT = """
+import json, time
+import jax, diffrax
+started = time.perf_counter()
+import lagjax
+print(json.dumps(time.perf_counter() - started))
+"""
+# XLA itself writes down what it is given.
+DUMPED = """
+import os
+os.environ["XLA_FLAGS"] = f"--xla_dump_to={FOLDER} --xla_dump_hlo_as_text"
+"""
 COUNT = """
-motion = lambda start, params: lj.integrate(system, *start, params, ts=ts, throw=False, **options)
-program = jax.jit(motion).lower(*jax.tree.map(jnp.asarray, (start, params)))
-print(json.dumps(program.as_text(dialect="hlo").count(" = ")))
+done(answer(1.0))
+from pathlib import Path
+print(json.dumps(max(p.read_text().count(" = ") for p in Path(FOLDER).glob("*before_optimizations.txt"))))
 """
 
 
@@ -173,6 +189,7 @@ QUESTIONS = {
     "hoop until it leaves": Question(
         HOOP, SOLVED, BARE.replace("params, ts", "params, ts, left"), 3.0, kept=1.2, instructions=8_000
     ),
+    "pendulum on a rod by Radau5": Question(ROD + "options = {'method': lj.Radau5()}\n", SOLVED, None, 6.0),
     "slider-crank": Question(SLIDER_CRANK, SOLVED, None, 6.0),
     "accelerations of a vehicle": Question(VEHICLE, ACCELERATIONS, None, 4.0),
     "motion of a vehicle": Question(VEHICLE, SOLVED, None, 15.0, step=0.2e-3),
@@ -206,7 +223,9 @@ def measured(definition, answer, again=False, cache=None):
 
 
 def rows(wanted):
-    """Each question, by the rows about it that are wanted."""
+    """The import, then each question, by the rows about it that are wanted."""
+    if wanted("import lagjax"):
+        yield row("import lagjax", statistics.median(in_new_process(IMPORT) for _ in range(REPEATS)), 0.3)
     for name, question in QUESTIONS.items():
         if wanted(f"{name}: first answer") or wanted(f"{name}: compiled and traced, again, a step"):
             yield from first_and_next(name, question)
@@ -216,8 +235,9 @@ def rows(wanted):
             before, *kept = (result["first"] for result in found)
             yield row(f"{name}: first answer from kept programs", statistics.median(kept), question.kept, before=before)
         if question.instructions is not None and wanted(f"{name}: instructions"):
-            source = f"CLOCK, AGAIN, CACHE = 'perf_counter', False, None\n{START}{question.definition}{COUNT}"
-            count = in_new_process(source)
+            with tempfile.TemporaryDirectory() as folder:
+                begin = f"FOLDER, CLOCK, AGAIN, CACHE = {folder!r}, 'perf_counter', False, None\n{DUMPED}{START}"
+                count = in_new_process(f"{begin}{question.definition}{question.ours}{COUNT}")
             yield row(f"{name}: instructions before optimisation", count, question.instructions)
 
 
