@@ -216,7 +216,8 @@ def _in_a_loop(method, adjoint):
     """The method with a loop over its stages, of the kind that the derivative needs."""
     if isinstance(method, Nystrom):
         return type(method)(in_a_loop=True)
-    ours = isinstance(method, ExplicitRungeKutta)
+    # A subclass may have a tableau of its own, which diffrax's implementation does not know.
+    ours = isinstance(method, ExplicitRungeKutta) and method.tableau is method.shipped.tableau
     method = method.shipped if ours else method
     if isinstance(adjoint, diffrax.RecursiveCheckpointAdjoint | diffrax.DirectAdjoint):
         return forward_differentiable(method)
