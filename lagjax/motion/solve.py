@@ -301,6 +301,9 @@ def _start(system, q, v, params, ts, settings, regular) -> Start:
 def _stepped(system, start, params, ts, guards, settings, adjoint, written) -> Solution:
     y0 = jax.tree.map(lambda x: jnp.where(start.refused, 0.0, x), (start.q, start.v))
     first = State(ts[0], start.q, start.v, params)
+    if settings.dt0 is not None:
+        # A start with another one is refused; diffrax would end the program.
+        settings = replace(settings, dt0=jnp.where(settings.dt0 > 0, settings.dt0, 1.0))
     solution = solution_of(system, written, first, y0, start.refused, ts, guards, settings, adjoint)
     if solution.located is None:
         return solution
