@@ -32,7 +32,7 @@ from lagjax.mechanics.written_out import is_small, write_out
 from lagjax.motion.arriving import apart_from_jumps
 from lagjax.motion.both_modes import solve_in_both_modes
 from lagjax.motion.consistency import stopped, to_manifold, within, worst_residual
-from lagjax.motion.crossing_times import Located, all_known, by_name, end_of
+from lagjax.motion.crossing_times import all_known, by_name, end_of
 from lagjax.motion.loop import Solution, solution_of
 from lagjax.motion.memory_maps import maps_used, warn_of_memory_maps
 from lagjax.motion.trajectory import RESULTS, Moment, Trajectory, ended_well, pack, worst_drift
@@ -256,7 +256,6 @@ class Outputs(NamedTuple):
 
     motion: Moment
     reached: Bool[Array, " T"]
-    located: Located | None
 
 
 def _solve(system, q0, v0, params, ts, guards, settings, adjoint, written):
@@ -302,7 +301,7 @@ def _stepped(system, start, params, ts, guards, settings, adjoint, written) -> S
     y0 = jax.tree.map(lambda x: jnp.where(start.refused, 0.0, x), (start.q, start.v))
     first = State(ts[0], start.q, start.v, params)
     if settings.dt0 is not None:
-        # A start with another one is refused; diffrax would end the program.
+        # Where it is not positive the motion is refused; diffrax's own check would end the program.
         settings = replace(settings, dt0=jnp.where(settings.dt0 > 0, settings.dt0, 1.0))
     solution = solution_of(system, written, first, y0, start.refused, ts, guards, settings, adjoint)
     if solution.located is None:
@@ -321,12 +320,12 @@ def _outputs(system, start, solution, params, ts, guards, settings, regular) -> 
     # One compiled evaluation for the outputs and the end together.
     t, (q, v) = jax.tree.map(lambda x, last: jnp.concatenate([x, last]), (ts, states), solution.end)
     multipliers = _multipliers(system, regular, t, q, v, params)
-    return Outputs(Moment(t, q, v, multipliers), reached, solution.located)
+    return Outputs(Moment(t, q, v, multipliers), reached)
 
 
 def _result(system, start, solution, outputs, params, guards, settings):
     """The fields of the trajectory: NaN where it did not come, and why."""
-    motion, reached, located = outputs
+    (motion, reached), located = outputs, solution.located
     result = RESULTS.promote(solution.result)
     for reported, ours in TRANSLATED.items():
         result = RESULTS.where(result == getattr(RESULTS, reported), getattr(RESULTS, ours), result)

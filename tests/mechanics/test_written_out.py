@@ -129,9 +129,10 @@ def test_changed_numbers_do_not_compile_again():
     assert not again and longer
 
 
-def test_a_long_program_is_not_written_out():
-    """A potential by quadrature of 256 nodes stays as it is; a short one is written out."""
-    nodes = jnp.linspace(0.0, 6.0, 256)
+def test_a_long_program_is_not_written_out(monkeypatch):
+    """A potential by quadrature of 500 nodes is left before it is written to its end; a short one is written out."""
+    monkeypatch.setattr("lagjax.mechanics.written_out.LONG", np.inf)
+    nodes = jnp.linspace(0.0, 6.0, 500)
     wire = lambda q: jnp.sum(1 / jnp.sqrt((q[0] - jnp.cos(nodes)) ** 2 + (q[1] - jnp.sin(nodes)) ** 2 + q[2] ** 2))
     system = lj.System(lambda t, q, v, params: 0.5 * v @ v + wire(q))
     s = coordinates.state(0.0, np.array([2.0, 0.0, 0.3]), np.zeros(3), None)
