@@ -26,7 +26,7 @@ from measure import compiled, in_turn, main, row  # noqa: E402
 
 import lagjax as lj  # noqa: E402
 from lagjax.mechanics.coordinates import state  # noqa: E402
-from lagjax.mechanics.saddle_point import equations_of_motion, independent_equations  # noqa: E402
+from lagjax.mechanics.equations import equations_of  # noqa: E402
 
 jax.config.update("jax_enable_x64", True)
 
@@ -127,11 +127,12 @@ def evaluations(system, q, v, params):
     """A compiled loop of evaluations, each at a state that depends on the last."""
 
     def loop(t, q, v, params):
-        independent = independent_equations(system, t, q, v, params)
+        equations = equations_of(system, t, q, v, params)
+        independent = equations.independent(t, q, v)
 
         def once(state, _):
             q, v = state
-            a, _ = equations_of_motion(system, t, q, v, params, None, independent)
+            a, _ = equations.accelerations(t, q, v, None, independent)
             return (q + 1e-12 * v, v + 1e-12 * a), None
 
         return jax.lax.scan(once, (q, v), length=EVALUATIONS)[0]

@@ -10,6 +10,10 @@ below stand in the order of the physics. Worked systems are in `lagjax.scenes`.
 T + V only for natural, time-independent coordinates.
 """
 
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+# isort: split
 # A system: its Lagrangian and its constraints.
 from lagjax.mechanics.constraints import Holonomic, Nonholonomic
 from lagjax.mechanics.system import System
@@ -48,9 +52,20 @@ from lagjax.fitting.result import Fit, FitWarning
 # Error against run time.
 from lagjax.report import Run, work_precision
 
-# isort: split
-# Worked systems.
-from lagjax import scenes
+if TYPE_CHECKING:
+    from lagjax import scenes
+
+
+def __getattr__(name: str):
+    """The worked systems, imported when they are first asked for."""
+    if name != "scenes":
+        raise AttributeError(f"module 'lagjax' has no attribute '{name}'.")
+    return import_module("lagjax.scenes")
+
+
+def __dir__():
+    return sorted({*globals(), *__all__})
+
 
 __all__ = [
     "System",

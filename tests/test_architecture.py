@@ -5,6 +5,8 @@ import doctest
 import importlib
 import inspect
 import pkgutil
+import subprocess
+import sys
 from pathlib import Path
 
 import lagjax
@@ -16,7 +18,7 @@ LAYERS = (
     *("jax_internals", "numerics", "mechanics", "plot", "animation", "meter", "motion", "sweeps"),
     *("fitting", "report", "mechanisms", "scenes", "stability"),
 )
-TOP = {"__init__", "__main__"}
+TOP = {"__init__", "__main__", "job"}
 FINDER = doctest.DocTestFinder()
 PRIVATE = ("jax._src", "jax.experimental", "jax.extend", "jax.interpreters", "jaxlib")
 OPTIONAL = {"google_crc32c", "matplotlib", "tqdm", "xarray", "zarr"}
@@ -205,7 +207,19 @@ def test_import_computes_nothing():
         arrays = [name for name, value in vars(module).items() if isinstance(value, jax.Array)]
         assert arrays == [], f"{info.name}: {arrays}"
     for path in FILES:
-        if path.name != "__main__.py":
+        if path.name != "job.py":
             assert "jax.config.update" not in path.read_text().replace(
                 'jax.config.update("jax_enable_x64", True) before', ""
             )
+
+
+def test_import_waits_for_nothing_that_few_need():
+    """Scenes, and the packages that only fits and scenes use, are imported when asked for; twin: then they are."""
+    ask = "import sys, jax, diffrax; before = set(sys.modules); import lagjax as lj; {}; "
+    tell = "print(*sorted({'.'.join(m.split('.')[:2]) for m in set(sys.modules) - before}))"
+    new = lambda asked: subprocess.run(
+        [sys.executable, "-c", ask.format(asked) + tell], check=True, capture_output=True, text=True
+    ).stdout.split()
+    late = {"lagjax.scenes", "scipy.special", "scipy.linalg", "matplotlib.pyplot"}
+    assert not late & set(new("assert 'scenes' in dir(lj)"))
+    assert {"lagjax.scenes", "scipy.special"} <= set(new("lj.scenes"))

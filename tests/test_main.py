@@ -6,8 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lagjax import __main__ as job
-from lagjax import plot, report, stability
+from lagjax import job, plot, report, stability
 from tests.systems import PARAMS, pendulum
 
 TS = np.array([0.0, 0.5])
@@ -36,7 +35,7 @@ def run(monkeypatch, tmp_path, capsys):
     def with_scene(scene, *options):
         monkeypatch.setattr(job, "SCENES", {"tiny": scene})
         monkeypatch.setattr(stability, "trials", lambda tier: [])
-        status = job.main(["-o", str(tmp_path), *options])
+        status = job.main(["-o", str(tmp_path), "-j", "1", *options])
         return status, capsys.readouterr().out, tmp_path
 
     return with_scene
@@ -87,3 +86,19 @@ def test_unknown_scene(run, capsys):
     with pytest.raises(SystemExit):
         run(SCENE, "tinny")
     assert "no scene named tinny; there are: tiny, and stability" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_side_by_side_prints_the_same_in_order(tmp_path, capsys, monkeypatch):
+    """Two scenes in processes of their own: what is printed and kept is that of one after the other, but for times."""
+    monkeypatch.setattr(job, "_machine", lambda: "here")
+
+    def done(jobs):
+        folder = tmp_path / jobs
+        status = job.main(["bead_on_hoop", "stability", "--quick", "-o", str(folder), "-j", jobs])
+        report, rows = (json.loads((folder / f"{name}.json").read_text()) for name in ("report", "stability"))
+        errors = [(row["run"], row["method"], row["error"]) for row in report["scenes"]["bead_on_hoop"]["runs"]]
+        titles = [line for line in capsys.readouterr().out.splitlines() if line and set(line) == {"="}]
+        return status, errors, [(row["name"], row["verdict"]) for row in rows["rows"]], titles
+
+    assert done("2") == done("1")

@@ -8,8 +8,7 @@ import jax
 import numpy as np
 import pytest
 
-from lagjax import __main__ as job
-from lagjax import stability
+from lagjax import job, stability
 from lagjax.stability import oscillator
 from lagjax.stability.trial import ACCURATE, DEGRADED, REFUSED, SILENTLY_WRONG, Outcome, Trial
 
@@ -108,7 +107,7 @@ def test_tiers(monkeypatch, tmp_path):
     monkeypatch.setattr(stability, "trials", lambda tier: asked.append(tier) or [])
     monkeypatch.setattr(job, "SCENES", {})
     for arguments in (["stability"], ["--quick"], []):
-        job.main([*arguments, "-o", str(tmp_path)])
+        job.main([*arguments, "-o", str(tmp_path), "-j", "1"])
     assert asked == [stability.FULL, stability.QUICK, stability.REDUCED]
 
 

@@ -14,10 +14,10 @@ from itertools import combinations
 
 import equinox as eqx
 import numpy as np
-import scipy.linalg
 from jaxtyping import Array, Float
 
 from lagjax.mechanics.diagnosis import listed
+from lagjax.numerics.rank import null_space
 
 # A combination whose exponents are these, after scaling, is a power product: m/M, k/m², not m^0.37 M^-1.2.
 LARGEST_DENOMINATOR, EXPONENT_ERROR = 4, 1e-3
@@ -94,7 +94,7 @@ def _simplest(rows):
     rank, p = rows.shape
     if rank in (0, p) or p > ENUMERATE_UP_TO:
         return np.eye(p) if rank == p else rows
-    unseen = scipy.linalg.null_space(rows)
+    unseen = null_space(rows)
     basis = np.zeros((0, p))
     for size in range(1, p + 1):
         for support in combinations(range(p), size):

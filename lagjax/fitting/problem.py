@@ -10,7 +10,7 @@ import numpy as np
 
 from lagjax.fitting.equations import LOSSES, Problem, replace
 from lagjax.fitting.parameters import find, leaf_name
-from lagjax.fitting.records import KINDS, Record, cut, spread
+from lagjax.fitting.records import KINDS, Record, channels, cut, spread
 from lagjax.fitting.result import FitWarning
 from lagjax.fitting.starts import starts
 from lagjax.mechanics import coordinates
@@ -190,7 +190,7 @@ def _broadcast(record, kind):
 
 def _warn_of_wrapped(records: Sequence[Record]):
     for r, record in enumerate(records):
-        for name, x in record.channels():
+        for name, x in channels(record.measured):
             if name.startswith("end") or "q" not in record.measured or coordinates.is_traced(x):
                 continue
             jumps = np.abs(np.diff(np.asarray(x), axis=0))

@@ -88,7 +88,7 @@ class Record(eqx.Module):
                 'a record holds no measurement.\nFix: lj.Record(t, q={"theta": angles}), or v=, multipliers=, '
                 "observed=, end=."
             )
-        for name, x in self.channels():
+        for name, x in channels(self.measured):
             _check(name, x, len(self.t))
         self.q0, self.v0 = q0, v0
         self.hold_q, self.hold_v = _held(hold_q), _held(hold_v)
@@ -102,17 +102,19 @@ class Record(eqx.Module):
 
     def channels(self) -> list[tuple[str, Array]]:
         """What was measured, by name: `theta`, `v.theta`, `contact`, ..."""
-        found = []
-        for kind, tree in self.measured.items():
-            for path, x in jtu.tree_leaves_with_path(tree):
-                found.append((channel_name(kind, path), x))
-        return found
+        return channels(self.measured)
 
     def __repr__(self):
         of = {kind: ", ".join(jtu.keystr(p, simple=True, separator=".") for p, _ in jtu.tree_leaves_with_path(tree))
               for kind, tree in self.measured.items()}  # fmt: skip
         told = "; ".join(f"{kind}: {names}" if names else kind for kind, names in of.items())
         return f"Record({len(self.t)} times from {self.t[0]:.6g} to {self.t[-1]:.6g}, {told})"
+
+
+def channels(measured: Mapping[str, PyTree]) -> list[tuple[str, Array]]:
+    """What was measured, by name."""
+    leaves = [(kind, *leaf) for kind, tree in measured.items() for leaf in jtu.tree_leaves_with_path(tree)]
+    return [(channel_name(kind, path), x) for kind, path, x in leaves]
 
 
 def channel_name(kind: str, path) -> str:

@@ -1,12 +1,14 @@
 """The answer of a fit: estimates, how certain they are, and whether the residuals look like measurement errors."""
 
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple, cast
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
@@ -41,7 +43,10 @@ class Channel(NamedTuple):
     residuals: np.ndarray
 
 
-class Fit(eqx.Module):
+# No module of equinox: that wraps a method each time it is looked up.
+@jtu.register_dataclass
+@dataclass(frozen=True, eq=False, repr=False)
+class Fit:
     """Estimates from measured motion. It prints itself as a table and plots data, fit and residuals.
 
     - `params`: with the estimates in place. `q0`, `v0`: the start of each record, a list.

@@ -12,27 +12,28 @@ Source: Hairer, Lubich & Wanner, *Geometric Numerical Integration*, §IV.5.3 (ta
 """
 
 from collections.abc import Callable, Sequence
-from functools import lru_cache
+from functools import lru_cache, partial
 from itertools import combinations
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.linalg
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from lagjax.fitting.records import Record, Windows, spread
 from lagjax.mechanics import constraints, coordinates
+from lagjax.mechanics.compiled import compiled
 from lagjax.mechanics.coordinates import State
 from lagjax.mechanics.diagnosis import listed
+from lagjax.mechanics.equations import equations_of
 from lagjax.mechanics.first_call import check_functions
 from lagjax.mechanics.memory import kinds, remembered
-from lagjax.motion.consistency import departures, stopped
+from lagjax.motion.consistency import departures, stopped, within
 from lagjax.motion.consistent_state import free_coordinates
 from lagjax.motion.integrate import integrate
+from lagjax.numerics.rank import null_space
 
 # Samples from whose parabola position and velocity are read.
 SAMPLES = 7
@@ -272,33 +273,29 @@ def _free(q, hold):
     return free_coordinates(q, hold)
 
 
-def _charts(system, s: State, free_q, free_v, r) -> tuple[Chart, Chart]:
+def _charts(system, s: State, free_q, free_v, r) -> Starts:
     x, u = _vector(s.q), _vector(s.v)
     if not system.constraints:
         nothing = np.zeros((len(free_q), 0))
-        return Chart(x, np.eye(len(free_q))[:, free_q], nothing), Chart(u, np.eye(len(free_v))[:, free_v], nothing)
+        return Starts(*(Chart(y, np.eye(len(f))[:, f], nothing) for y, f in ((x, free_q), (u, free_v))))
     with jax.ensure_compile_time_eval():
         unflatten = _unflatten(kinds(s.q))
 
-        def charts(x, u):
-            of_q, of_v = _rows(system, s.t, x, u, s.params, unflatten)
-            return _chart(x, of_q, free_q), _chart(u, of_v, free_v)
+        def charts(x, u, of_q, of_v):
+            return Starts(_chart(x, of_q, free_q), _chart(u, of_v, free_v))
 
-        q, v = charts(x, u)
-        zeros = np.zeros(q.along.shape[1]), np.zeros(v.along.shape[1])
-        x, u = eqx.filter_jit(Starts.vectors)(Starts(q, v), *zeros, system, s.t, s.params, unflatten)
+        near = charts(x, u, *_rows(system, s.t, x, u, s.params, unflatten))
+        moved = _moved(near, system, s.t, s.params, unflatten)
+        if not moved.holds:
+            found = State(s.t, unflatten(moved.x), unflatten(moved.u), s.params)
+            raise ValueError(
+                f"the start of record {r} cannot be moved onto the constraints: at the best one "
+                f"{departures(system, found, OFF, OFF)}.\n"
+                "Usual cause: a guess too far off, or too much held.\n"
+                "Fix: q0, v0 = lj.consistent_state(system, t[0], q0, v0, params), and hold less."
+            )
         # The directions are those of the guess after it was moved onto the constraints.
-        q, v = charts(x, u)
-        found = State(s.t, unflatten(x), unflatten(u), s.params)
-        left = departures(system, found, OFF, OFF)
-    if left:
-        raise ValueError(
-            f"the start of record {r} cannot be moved onto the constraints: at the best one {left}.\n"
-            "Usual cause: a guess too far off, or too much held.\n"
-            "Fix: q0, v0 = lj.consistent_state(system, t[0], q0, v0, params), and hold less."
-        )
-    return (Chart(np.asarray(x), np.asarray(q.along), np.asarray(q.across)),
-            Chart(np.asarray(u), np.asarray(v.along), np.asarray(v.across)))  # fmt: skip
+        return charts(moved.x, moved.u, moved.of_q, moved.of_v)
 
 
 def _chart(y, rows, free):
@@ -306,8 +303,8 @@ def _chart(y, rows, free):
     rows = np.asarray(rows)[:, free]
     along, across = np.zeros((len(free), int(free.sum()))), np.zeros((len(free), 0))
     if len(rows) and free.any():
-        inner = scipy.linalg.null_space(rows, rcond=1e-9)
-        normal = scipy.linalg.null_space(inner.T) if inner.shape[1] else np.eye(len(inner))
+        inner = null_space(rows, 1e-9)
+        normal = null_space(inner.T) if inner.shape[1] else np.eye(len(inner))
         along, across = np.zeros((len(free), inner.shape[1])), np.zeros((len(free), normal.shape[1]))
         along[free], across[free] = inner, normal
     elif free.any():
@@ -315,7 +312,26 @@ def _chart(y, rows, free):
     return Chart(np.asarray(y), along.astype(y.dtype), across.astype(y.dtype))
 
 
-@eqx.filter_jit
+class Moved(NamedTuple):
+    """A guess moved onto the constraints, the rows of these there, and whether it holds them."""
+
+    x: Float[np.ndarray, " n"]
+    u: Float[np.ndarray, " n"]
+    of_q: Float[np.ndarray, "p n"]
+    of_v: Float[np.ndarray, "m n"]
+    holds: Bool[np.ndarray, ""]
+
+
+@partial(compiled, in_numpy=True)
+def _moved(near: Starts, system, t, params, unflatten) -> Moved:
+    nothing = (jnp.zeros(chart.along.shape[1], t.dtype) for chart in near)
+    x, u = near.vectors(*nothing, system, t, params, unflatten)
+    state = t, unflatten(x), unflatten(u)
+    holds = within(equations_of(system, *state, params), *state, OFF, OFF)
+    return Moved(x, u, *_rows(system, t, x, u, params, unflatten), holds)
+
+
+@partial(compiled, in_numpy=True)
 def _rows(system, t, x, u, params, unflatten):
     of_q = jax.jacfwd(lambda x: constraints.position_residual(system, t, x, params, unflatten))(x)
     of_v = jax.jacfwd(lambda u: constraints.velocity_residual(system, t, x, u, params, unflatten))(u)

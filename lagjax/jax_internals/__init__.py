@@ -6,7 +6,7 @@
 - `trial.py`: whether marked programs survive and are right with an XLA that is not known.
 - `one_function.py`: a program as one machine function.
 - `programs.py`: JAX programs (jaxprs) as data. `names.py`: the primitives that they are made of, by name.
-- `primitives.py`: primitives of our own. `tracing.py`: whether JAX is tracing.
+- `primitives.py`: primitives of our own. `tracing.py`: whether JAX is tracing, and what it keeps of that.
 
 No other package imports such modules, which `tests/test_architecture.py` asserts.
 """

@@ -3,6 +3,8 @@
 What is no name here is treated as unknown by all of them, which is slower and never wrong.
 """
 
+import numpy as np
+
 # Entry by entry, of numbers alone.
 ELEMENTWISE = {
     "abs", "acos", "acosh", "add", "add_any", "and", "asin", "asinh", "atan", "atan2", "atanh", "cbrt", "ceil",
@@ -11,6 +13,13 @@ ELEMENTWISE = {
     "max", "min", "mul", "ne", "neg", "nextafter", "not", "or", "pow", "rem", "round", "rsqrt", "select_n", "sign",
     "sin", "sinh", "sqrt", "square", "stop_gradient", "sub", "tan", "tanh", "xor",
 }  # fmt: skip
+# Of these, what NumPy does the same way: constants are computed by it.
+IN_NUMPY = {
+    "abs": np.abs, "add": np.add, "and": np.bitwise_and, "eq": np.equal, "ge": np.greater_equal, "gt": np.greater,
+    "le": np.less_equal, "lt": np.less, "max": np.maximum, "min": np.minimum, "mul": np.multiply, "ne": np.not_equal,
+    "neg": np.negative, "not": np.bitwise_not, "or": np.bitwise_or, "square": np.square, "sub": np.subtract,
+    "select_n": lambda which, *cases: np.choose(which.astype(int), cases),
+}  # fmt: skip
 REDUCING = {"reduce_sum", "reduce_max", "reduce_min", "reduce_prod", "reduce_and", "reduce_or"}
 ACCUMULATING = {"cumsum", "cumprod", "cummax", "cummin", "cumlogsumexp"}
 # What moves entries, and makes none.
@@ -18,6 +27,14 @@ MOVING = {
     "broadcast_in_dim", "concatenate", "copy", "dynamic_slice", "gather", "iota", "pad", "reshape", "rev", "slice",
     "split", "squeeze", "stack", "transpose", "unstack",
 }  # fmt: skip
+# Sums of what they take, linear in all of it; in the first operand, where the others choose or scale; in each of two.
+ADDITIVE = {
+    "add", "add_any", "broadcast_in_dim", "concatenate", "convert_element_type", "copy", "cumsum", "neg", "pad",
+    "reduce_sum", "reshape", "rev", "slice", "split", "squeeze", "stack", "stop_gradient", "sub", "transpose",
+}  # fmt: skip
+LINEAR_IN_FIRST = {"div", "dynamic_slice", "gather"}
+BILINEAR = {"dot_general", "mul"}
+PERIODIC = {"cos", "sin"}
 # Primitives that stand for the program that they carry; the second kind has rules of its own for derivatives.
 CALLS = {"jit", "closed_call"}
 CALLS_WITH_RULES = {"custom_jvp_call", "custom_vjp_call", "remat2"}

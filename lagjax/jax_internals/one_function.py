@@ -70,11 +70,15 @@ def one_function(function: Callable, *args, checked: bool = False, in_blocks: bo
     if is_plain():
         return function(*args)
     arrays, static = eqx.partition(args, eqx.is_array)
-    leaves, structure = jtu.tree_flatten(arrays)
+    given, structure = jtu.tree_flatten(arrays)
+    # What is passed twice, as by a solver and by the controller that asks it, is one operand.
+    leaves = list({id(x): x for x in given}.values())
+    places = {id(x): i for i, x in enumerate(leaves)}
     rest = []
 
     def of_leaves(*leaves):
-        result = function(*eqx.combine(jtu.tree_unflatten(structure, leaves), static))
+        every = [leaves[places[id(x)]] for x in given]
+        result = function(*eqx.combine(jtu.tree_unflatten(structure, every), static))
         arrays, others = eqx.partition(result, eqx.is_array)
         rest.append(others)
         return arrays

@@ -11,6 +11,8 @@ from jax import lax
 from jax.core import ShapedArray
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, jaxpr_as_fun
 
+from lagjax.jax_internals.names import CALLS, CALLS_WITH_RULES
+
 # Calls in a row that are worth a loop.
 LONG_CHAIN = 16
 
@@ -150,6 +152,44 @@ def evaluate(jaxpr: Jaxpr, equation, values) -> list:
     operands = variables(equation)
     alone = jaxpr.replace(constvars=[], invars=operands, outvars=equation.outvars, eqns=[equation])
     return jaxpr_as_fun(ClosedJaxpr(alone, ()))(*(values[x] for x in operands))
+
+
+def applied(jaxpr: Jaxpr, equation, operands) -> list:
+    """The same, with its operands in their order."""
+    return evaluate(
+        jaxpr, equation, {x: value for x, value in zip(equation.invars, operands) if not isinstance(x, Literal)}
+    )
+
+
+def interpreted(
+    closed: ClosedJaxpr, inputs: Sequence, rule: Callable, of_constant: Callable, enters: Callable | None = None
+) -> list:
+    """The results of a program with values of any kind in place of its arrays.
+
+    `rule(equation, operands)` returns what a primitive makes of such values; what a call stands for is interpreted in
+    its turn, unless `enters(equation)` says no. `of_constant(x, aval)` turns what is known beforehand into a value.
+    """
+    jaxpr = closed.jaxpr
+    values = {x: of_constant(constant, x.aval) for x, constant in zip(jaxpr.constvars, closed.consts)}
+    values.update(zip(jaxpr.invars, inputs))
+    read = lambda x: of_constant(x.val, x.aval) if isinstance(x, Literal) else values[x]
+    for equation in jaxpr.eqns:
+        operands, inner = [read(x) for x in equation.invars], stands_for(equation)
+        if inner is None or not (enters is None or enters(equation)):
+            results = rule(equation, operands)
+        else:
+            results = interpreted(inner, operands, rule, of_constant, enters)
+        values.update(zip(equation.outvars, results))
+    return [read(x) for x in jaxpr.outvars]
+
+
+def stands_for(equation) -> ClosedJaxpr | None:
+    """The program that a primitive stands for; None of others: a reduction carries one for pairs of entries."""
+    inner = [p for p in equation.params.values() if isinstance(p, (ClosedJaxpr, Jaxpr))]
+    if equation.primitive.name not in CALLS | CALLS_WITH_RULES or len(inner) != 1:
+        return None
+    closed = inner[0] if isinstance(inner[0], ClosedJaxpr) else ClosedJaxpr(inner[0], ())
+    return closed if len(closed.jaxpr.invars) == len(equation.invars) else None
 
 
 def reached(jaxpr: Jaxpr, inputs: Iterable) -> set:

@@ -1,7 +1,7 @@
 """Programs that are called from Python: equinox's wrapper of `jit` takes longer than a short motion or fit."""
 
 from collections.abc import Callable
-from functools import lru_cache, partial, wraps
+from functools import partial, wraps
 
 import equinox as eqx
 import jax
@@ -11,6 +11,7 @@ import numpy as np
 from lagjax.jax_internals.compiling import compiler_options
 from lagjax.jax_internals.tracing import is_eager
 from lagjax.mechanics import coordinates
+from lagjax.mechanics.kept import kept
 from lagjax.mechanics.memory import parted
 
 
@@ -27,7 +28,7 @@ def compiled(function: Callable, in_numpy: bool = False) -> Callable:
             return inside(*args)
         static, arrays = parted(args)
         try:
-            return done(_jitted()(function, static, arrays))
+            return done(kept((function, static), lambda: _jitted(function, static))(arrays))
         except jax.errors.JaxRuntimeError:
             # Equinox has better words for the checks that it puts into a program.
             return done(inside(*args))
@@ -35,9 +36,8 @@ def compiled(function: Callable, in_numpy: bool = False) -> Callable:
     return program
 
 
-@lru_cache
-def _jitted():
-    return jax.jit(_of_arrays, static_argnums=(0, 1), compiler_options=compiler_options())
+def _jitted(function, static):
+    return jax.jit(partial(_of_arrays, function, static), compiler_options=compiler_options())
 
 
 def _of_arrays(function, static, arrays):

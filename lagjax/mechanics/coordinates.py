@@ -20,6 +20,8 @@ from jaxtyping import Array, Float, PyTree
 
 from lagjax.jax_internals.tracing import is_eager
 
+FLOAT64 = np.dtype("float64")
+
 
 class State(NamedTuple):
     """A time, a position and a velocity, made of arrays of one dtype, with the parameters."""
@@ -88,9 +90,15 @@ def given_state(t, q, v, params) -> State:
     if not given:
         raise ValueError("q has no coordinates: give at least one, such as q = {'theta': 0.1}.")
     # A Python float has the dtype of those beside it.
-    dtype = jnp.result_type(*given)
+    dtype = _dtype_of(given)
     q, v = (jtu.tree_map(lambda x: _of_dtype(x, dtype), tree) for tree in (q, v))
     return State(_of_dtype(_as_array(t), dtype), q, v, given_params(params, dtype))
+
+
+def _dtype_of(given):
+    """The dtype of numbers beside each other: JAX's own answer, which takes a tenth of a short call."""
+    plain = all(isinstance(x, float) or isinstance(x, np.ndarray | np.float64) and x.dtype == FLOAT64 for x in given)
+    return FLOAT64 if plain and jax.config.read("jax_enable_x64") else jnp.result_type(*given)
 
 
 def prepared(t, q, v, params) -> State:

@@ -6,7 +6,8 @@ Everything here looks at values, and so happens outside compiled programs.
 import numpy as np
 
 from lagjax.mechanics import constraints, coordinates
-from lagjax.mechanics.saddle_point import SINGULAR_BELOW, Examined, combinations, examined, row_sizes
+from lagjax.mechanics.equations import equations_of
+from lagjax.mechanics.saddle_point import SINGULAR_BELOW, Examined, combinations, examined
 
 # A row counts as part of a combination where it makes up more than this share of it.
 SHARE = 1e-6
@@ -104,7 +105,8 @@ def _velocities_off(system, s, names):
     x, unflatten = coordinates.flatten(s.q)
     u, _ = coordinates.flatten(s.v)
     residual = np.asarray(constraints.velocity_residual(system, s.t, x, u, s.params, unflatten))
-    allowed = OFF_ABOVE * np.asarray(row_sizes(system, *s)) * max(1e-300, float(np.max(np.abs(u))))
+    slopes = np.asarray(equations_of(system, *s).row_sizes(s.t, s.q, s.v))
+    allowed = OFF_ABOVE * slopes * max(1e-300, float(np.max(np.abs(u))))
     rows = zip(equation_names(system, s), constraints.holonomic_equations(system, *s), residual, allowed)
     return ", ".join(
         f"{'d/dt ' if holonomic else ''}'{name}' = {r:.3g}"

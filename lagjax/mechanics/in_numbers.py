@@ -21,6 +21,10 @@ from lagjax.mechanics.constraints import Holonomic, Nonholonomic
 from lagjax.mechanics.system import System
 from lagjax.numerics.scalars import written_out
 
+# Up to so many operations are written before it is known which are needed. To write a hundred thousand, as of an L with
+# tables or a quadrature in it, only to leave them takes 15 s.
+WRITTEN = 6000
+
 
 class InNumbers(eqx.Module):
     """A function of (t, q, v, params) or (t, q, params), taking each state as a tuple of numbers."""
@@ -84,13 +88,13 @@ class Numbers:
         """How many operations it consists of."""
         return length(self.program.jaxpr)
 
-    def prepare(self, system, params) -> tuple:
-        """What does not depend on the state."""
-        return tuple(self._early(*jtu.tree_leaves(eqx.filter((system, params), eqx.is_array))))
+    def prepare(self, system, params) -> tuple | None:
+        """What does not depend on the state; None where that is nothing, since equinox takes `()` amiss."""
+        return tuple(self._early(*jtu.tree_leaves(eqx.filter((system, params), eqx.is_array)))) or None
 
     def at(self, prepared, t, q, v):
         """The function's result at a state."""
-        return jtu.tree_unflatten(self.shapes[0], self._late(prepared, *jtu.tree_leaves((t, q, v))))
+        return jtu.tree_unflatten(self.shapes[0], self._late(prepared or (), *jtu.tree_leaves((t, q, v))))
 
     def __call__(self, system, t, q, v, params):
         """The function's result."""

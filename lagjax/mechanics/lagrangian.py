@@ -13,12 +13,12 @@ Source: Goldstein, *Classical Mechanics*, Eq. (1.57), (1.70), (2.53).
 
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
 from lagjax.mechanics import coordinates
+from lagjax.mechanics.compiled import compiled
 from lagjax.mechanics.first_call import looked_at
 
 
@@ -130,19 +130,19 @@ def _checked(system, t, q, v, params):
     return looked_at(system, s), s
 
 
-@eqx.filter_jit
+@compiled
 def _momentum(system, t, q, v, params):
     return jax.grad(system.lagrangian, argnums=2)(t, q, v, params)
 
 
-@eqx.filter_jit
+@compiled
 def _mass_matrix(system, t, q, v, params):
     x, unflatten = coordinates.flatten(q)
     u, _ = coordinates.flatten(v)
     return mass_and_forcing(system, t, x, u, params, unflatten).mass
 
 
-@eqx.filter_jit
+@compiled
 def _jacobi_integral(system, t, q, v, params):
     value, p = jax.value_and_grad(system.lagrangian, argnums=2)(t, q, v, params)
     return coordinates.flatten(v)[0] @ coordinates.flatten(p)[0] - value

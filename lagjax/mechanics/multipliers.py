@@ -4,20 +4,21 @@ The equations and their solution are those of `saddle_point.py`.
 """
 
 import equinox as eqx
-import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from jaxtyping import Array, PyTree
 
+from lagjax.jax_internals.tracing import is_eager
 from lagjax.mechanics import constraints, coordinates
+from lagjax.mechanics.closures import lift
+from lagjax.mechanics.compiled import compiled
 from lagjax.mechanics.diagnosis import explain_failure, explain_singular, where
+from lagjax.mechanics.equations import equations_of
 from lagjax.mechanics.first_call import looked_at
 from lagjax.mechanics.outside import up_to_date
-from lagjax.mechanics.saddle_point import examined, verdict
-from lagjax.mechanics.sparse_plan import plan
-from lagjax.mechanics.written_out import is_small, write_out
+from lagjax.mechanics.saddle_point import examined
+from lagjax.mechanics.sparse_saddle_point import Banded
 
 
 def accelerations(system, t, q, v, params) -> tuple[PyTree[Array], dict[str, Array]]:
@@ -49,43 +50,22 @@ def accelerations(system, t, q, v, params) -> tuple[PyTree[Array], dict[str, Arr
     """
     s = coordinates.prepared(t, q, v, params)
     system = looked_at(system, s)
-    traced = coordinates.is_traced((s, eqx.filter(system, eqx.is_array)))
-    if plan(system, *s) is not None:
-        found = verdict(system, *s)
-        believed = ~(found.singular | found.contradictory)
-        if traced:
-            return jax.tree.map(lambda x: jnp.where(believed, x, jnp.nan), (found.a, found.multipliers))
-        if found.finite and believed:
+    # What a function closes over may be traced where nothing that is passed is.
+    if not is_eager() or coordinates.is_traced((s, eqx.filter(system, eqx.is_array))):
+        equations = equations_of(lift(system, s), *s, quickly=True)
+        a, multipliers = equations.believed(s.t, equations.inside(s.q), equations.inside(s.v))
+        return equations.outside(a), multipliers
+    equations = equations_of(system, *s)
+    if isinstance(equations.form, Banded):
+        found = equations.verdict(s.t, s.q, s.v)
+        if found.finite and not found.singular and not found.contradictory:
             return found.a, found.multipliers
-    if traced:
-        return _quickly(system, *s) if is_small(system, *s) else _believed(system, *s)
     found = examined(system, *s)
     solution = found.a, found.multipliers
     finite = all(np.all(np.isfinite(x)) for x in jax.tree.leaves((solution, found.lagrangian)))
     if not finite or np.any(np.asarray(found.contradictory)) or explain_singular(np.asarray(found.matrix), system, s):
         raise ValueError(explain_failure(system, s) or f"the accelerations are not finite {where(s)}.")
     return solution
-
-
-def _believed(system, t, q, v, params):
-    """The solution, NaN where constraints contradict each other."""
-    found = examined(system, t, q, v, params)
-    believed = ~jnp.any(found.contradictory)
-    return jax.tree.map(lambda x: jnp.where(believed, x, jnp.nan), (found.a, found.multipliers))
-
-
-def _quickly(system, t, q, v, params):
-    """The same from the equations written out, where these suffice."""
-    written = write_out(system, t, q, v, params)
-    if written is None:
-        return _believed(system, t, q, v, params)
-    a, stacked = written.equations(system, t, q, v, params)
-    solution = a, constraints.split(system, stacked, t, q, v, params)
-    if not written.careful:
-        return solution
-    sure = jnp.all(jnp.isfinite(coordinates.flatten(a)[0]))
-    # A branch also in a batch, where it is taken for all lanes or none.
-    return lax.cond(eqxi.unvmap_all(sure), lambda: solution, lambda: _believed(system, t, q, v, params))
 
 
 def constraint_force(system, t, q, v, params) -> dict[str, PyTree[Array]]:
@@ -136,7 +116,7 @@ def constraint_residual(system, t, q, v, params, level: str = "constraint") -> d
     return _constraint_residual(system, *s, level)
 
 
-@eqx.filter_jit
+@compiled
 def _constraint_force(system, t, q, v, params, multipliers):
     x, unflatten = coordinates.flatten(q)
     u, _ = coordinates.flatten(v)
@@ -148,7 +128,7 @@ def _constraint_force(system, t, q, v, params, multipliers):
     return forces
 
 
-@eqx.filter_jit
+@compiled
 def _constraint_residual(system, t, q, v, params, level):
     if level == "velocity":
         x, unflatten = coordinates.flatten(q)

@@ -27,61 +27,74 @@ Gutiérrez-López, Multibody Syst. Dyn. 30 (2013) 311 (uniqueness of a, minimum-
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
-from lagjax.mechanics import constraints, coordinates, sparse_plan, sparse_saddle_point
+from lagjax.mechanics import constraints, coordinates
 from lagjax.mechanics.compiled import compiled
 from lagjax.mechanics.lagrangian import Linear, mass_and_forcing
+from lagjax.mechanics.verdict import Verdict, acceleration_round_off, slightly_off, vanishing
 from lagjax.numerics import dense
 from lagjax.numerics.rank import DEPENDENT_BELOW, independent_rows, unit_rows
 
 # Below this reciprocal condition, after scaling, the matrix counts as singular.
 SINGULAR_BELOW = {np.dtype("float64"): 1e-13, np.dtype("float32"): 1e-6}
-# A constraint whose derivative is this much smaller than near by has none: it is written as a square.
-VANISHES_BELOW = {np.dtype("float64"): 1e-10, np.dtype("float32"): 1e-4}
 
 
-# Jitted, so that JAX traces L once for all the places of a compiled trajectory that need accelerations.
-@eqx.filter_jit
-def equations_of_motion(system, t, q, v, params, baumgarte_rate=None, independent=None):
-    """The accelerations, like q, and the multipliers by name.
+class Dense(NamedTuple):
+    """The equations solved in one matrix, of so many rows. A state is given as (system, t, x, u, params, unflatten)."""
 
-    `independent` (m,) says which constraint equations to solve with; chosen at this state if None.
-    """
-    x, unflatten = coordinates.flatten(q)
-    u, _ = coordinates.flatten(v)
-    if (plan := sparse_plan.plan(system, t, q, v, params)) is not None:
-        a, multipliers = sparse_saddle_point.accelerations(
-            plan, system, t, x, u, params, unflatten, baumgarte_rate, independent
-        )
-        return unflatten(a), constraints.split(system, multipliers, t, q, v, params)
-    linear = mass_and_forcing(system, t, x, u, params, unflatten)
-    if not system.constraints:
-        return unflatten(dense.solve(linear.mass, linear.forcing)), {}
-    jacobian, gamma = constraints.acceleration_rows(system, t, x, u, params, unflatten)
-    if baumgarte_rate is not None:
-        gamma = gamma + constraints.baumgarte_feedback(system, t, x, u, params, unflatten, baumgarte_rate)
-    independent = independent_rows(jacobian) if independent is None else independent
-    a, multipliers = saddle_point(linear.mass, jacobian, linear.forcing, gamma, independent)
-    return unflatten(a), constraints.split(system, multipliers, t, q, v, params)
+    unknowns: int
 
+    def accelerations(self, system, t, x, u, params, unflatten, baumgarte_rate=None, independent=None):
+        """The accelerations and the stacked multipliers, as vectors; `independent` (m,): which equations to solve with.
 
-@eqx.filter_jit
-def independent_equations(system, t, q, v, params, dependent_below=None) -> Bool[Array, " m"] | None:
-    """Which constraint equations to solve with near a state; None where one or none leaves no choice."""
-    if constraints.count(system, t, q, v, params) < 2:
-        return None
-    x, unflatten = coordinates.flatten(q)
-    u, _ = coordinates.flatten(v)
-    if (plan := sparse_plan.plan(system, t, q, v, params)) is not None:
-        return sparse_saddle_point.independent(plan, system, t, x, u, params, unflatten, dependent_below)
-    return independent_rows(constraints.jacobian(system, t, x, u, params, unflatten), dependent_below)
+        Those are chosen at this state if None.
+        """
+        linear = mass_and_forcing(system, t, x, u, params, unflatten)
+        if not system.constraints:
+            return dense.solve(linear.mass, linear.forcing), jnp.zeros(0, x.dtype)
+        jacobian, gamma = constraints.acceleration_rows(system, t, x, u, params, unflatten)
+        if baumgarte_rate is not None:
+            gamma = gamma + constraints.baumgarte_feedback(system, t, x, u, params, unflatten, baumgarte_rate)
+        independent = independent_rows(jacobian) if independent is None else independent
+        return saddle_point(linear.mass, jacobian, linear.forcing, gamma, independent)
+
+    def independent(self, system, t, x, u, params, unflatten, dependent_below=None) -> Bool[Array, " m"]:
+        """Which constraint equations to solve with."""
+        return independent_rows(constraints.jacobian(system, t, x, u, params, unflatten), dependent_below)
+
+    def displacement(self, *state) -> Callable:
+        """`displacement(which, r)`, the shortest in the metric of M that changes the residuals `which` by r."""
+        jacobian = constraints.jacobian(*state)
+        # Chosen here and not at the step's start: the step may have come near a singular position.
+        matrix = displacement_map(mass_and_forcing(*state).mass, jacobian, independent_rows(jacobian))
+        return lambda which, r: matrix[:, which] @ r
+
+    def row_sizes(self, *state) -> Float[Array, " m"]:
+        """`Σ_j |A_ij|` of each constraint equation."""
+        return jnp.sum(jnp.abs(constraints.jacobian(*state)), axis=1)
+
+    def verdict(self, *state) -> Verdict:
+        """Solve the equations at one state, and say whether they are finite, regular, and agree with each other."""
+        found = _examined(*state)
+        solution = jnp.concatenate([found.a, found.multipliers, jnp.ravel(found.lagrangian)])
+        singular = dense.reciprocal_condition(found.matrix) <= SINGULAR_BELOW[np.dtype(found.matrix.dtype)]
+        finite, against = jnp.all(jnp.isfinite(solution)), jnp.any(found.contradictory)
+        return Verdict(found.a, found.multipliers, finite, singular, against)
+
+    def believed(self, *state):
+        """The solution as vectors, NaN where constraints contradict each other."""
+        found = _examined(*state)
+        believed = ~jnp.any(found.contradictory)
+        return tuple(jnp.where(believed, x, jnp.nan) for x in (found.a, found.multipliers))
+
+    def __str__(self):
+        return f"{self.unknowns} equations by {'elimination' if self.unknowns <= dense.ELIMINATE_UP_TO else 'LAPACK'}"
 
 
 def saddle_point(mass, jacobian, forcing, gamma, independent):
@@ -106,38 +119,6 @@ def displacement_map(mass, jacobian, independent):
     n = mass.shape[0]
     inverted = dense.inverse(saddle_point_matrix(mass, jacobian, independent))
     return _spread(inverted[:n, n:], independent)
-
-
-def row_sizes(system, t, q, v, params) -> Float[Array, " m"]:
-    """`Σ_j |A_ij|` of each constraint equation."""
-    x, unflatten = coordinates.flatten(q)
-    u, _ = coordinates.flatten(v)
-    if (plan := sparse_plan.plan(system, t, q, v, params)) is not None:
-        return sparse_saddle_point.row_sizes(plan, system, t, x, u, params, unflatten)
-    return jnp.sum(jnp.abs(constraints.jacobian(system, t, x, u, params, unflatten)), axis=1)
-
-
-class Return(NamedTuple):
-    """How to return to the constraints near a state: displacements by residuals of some equations, and the slopes."""
-
-    displacement: Callable
-    slope: Float[Array, " m"]
-
-
-def returning(system, t, q, v, params) -> Return:
-    """`displacement(which, r)` changes the residuals of the equations `which` by r; `slope` is `Σ_j |A_ij|`."""
-    x, unflatten = coordinates.flatten(q)
-    u, _ = coordinates.flatten(v)
-    state = (system, t, x, u, params, unflatten)
-    if (plan := sparse_plan.plan(system, t, q, v, params)) is not None:
-        kept = sparse_saddle_point.independent(plan, *state)
-        displacement = sparse_saddle_point.displacement(plan, *state, kept)
-        placed = lambda which, r: jnp.zeros(which.size, r.dtype).at[np.flatnonzero(which)].set(r)
-        return Return(lambda which, r: displacement(placed(which, r)), sparse_saddle_point.row_sizes(plan, *state))
-    jacobian = constraints.jacobian(*state)
-    # Chosen here and not at the step's start: the step may have come near a singular position.
-    matrix = displacement_map(mass_and_forcing(*state).mass, jacobian, independent_rows(jacobian))
-    return Return(lambda which, r: matrix[:, which] @ r, jnp.sum(jnp.abs(jacobian), axis=1))
 
 
 def _pick(x, independent, n):
@@ -190,40 +171,19 @@ def combinations(jacobian: Float[Array, "m n"], independent: Bool[Array, " m"]) 
     return jnp.where(independent[:, None], unit, scaled)
 
 
-@eqx.filter_jit
-def verdict(system, t, q, v, params) -> sparse_saddle_point.Verdict:
-    """Solve the equations at one state, and say whether the solution is to be believed."""
-    plan = sparse_plan.plan(system, t, q, v, params)
-    if plan is not None:
-        x, unflatten = coordinates.flatten(q)
-        u, _ = coordinates.flatten(v)
-        least = VANISHES_BELOW[np.dtype(x.dtype)]
-        found = sparse_saddle_point.verdict(plan, system, t, x, u, params, unflatten, least)
-        return found._replace(
-            a=unflatten(found.a), multipliers=constraints.split(system, found.multipliers, t, q, v, params)
-        )
-    found = examined(system, t, q, v, params)
-    finite = jnp.all(jnp.isfinite(coordinates.flatten((found.a, found.multipliers, found.lagrangian))[0]))
-    singular = dense.reciprocal_condition(found.matrix) <= SINGULAR_BELOW[np.dtype(t.dtype)]
-    return sparse_saddle_point.Verdict(found.a, found.multipliers, finite, singular, jnp.any(found.contradictory))
-
-
-def is_regular(system, t, q, v, params) -> Bool[Array, ""]:
+def is_regular(*state) -> Bool[Array, ""]:
     """Whether the equations at one state are regular: no constraint depends on others, and nothing is undetermined."""
-    x, unflatten = coordinates.flatten(q)
-    u, _ = coordinates.flatten(v)
-    mass = mass_and_forcing(system, t, x, u, params, unflatten).mass
-    jacobian = _without_vanishing(system, t, x, u, params, unflatten).jacobian
+    mass, jacobian = mass_and_forcing(*state).mass, _without_vanishing(*state).jacobian
     independent = independent_rows(jacobian)
     matrix = saddle_point_matrix(mass, jacobian, independent)
-    return jnp.all(independent) & (dense.reciprocal_condition(matrix) > SINGULAR_BELOW[np.dtype(x.dtype)])
+    return jnp.all(independent) & (dense.reciprocal_condition(matrix) > SINGULAR_BELOW[np.dtype(mass.dtype)])
 
 
 class Examined(NamedTuple):
     """A solution of the equations beside what tells whether to believe it."""
 
     a: PyTree[Array]
-    multipliers: dict[str, Array]
+    multipliers: Any
     linear: Linear
     rows: constraints.Rows
     independent: Bool[Array, " m"]
@@ -236,23 +196,26 @@ class Examined(NamedTuple):
 def examined(system, t, q, v, params) -> Examined:
     """Solve the equations at one state, and keep their matrix and which dependent constraints disagree."""
     x, unflatten = coordinates.flatten(q)
-    u, _ = coordinates.flatten(v)
+    found = _examined(system, t, x, coordinates.flatten(v)[0], params, unflatten)
+    by_name = constraints.split(system, found.multipliers, t, q, v, params)
+    return found._replace(a=unflatten(found.a), multipliers=by_name)
+
+
+def _examined(system, t, x, u, params, unflatten) -> Examined:
+    """The same in vector form."""
     linear = mass_and_forcing(system, t, x, u, params, unflatten)
     rows = _without_vanishing(system, t, x, u, params, unflatten)
     independent = independent_rows(rows.jacobian)
     a, multipliers = saddle_point(linear.mass, rows.jacobian, linear.forcing, rows.gamma, independent)
-    against = _contradictory(linear, rows, independent, a, multipliers, x, u)
-    matrix = saddle_point_matrix(linear.mass, rows.jacobian, independent)
-    lagrangian = jnp.asarray(system.lagrangian(t, q, v, params))
     return Examined(
-        a=unflatten(a),
-        multipliers=constraints.split(system, multipliers, t, q, v, params),
+        a=a,
+        multipliers=multipliers,
         linear=linear,
         rows=rows,
         independent=independent,
-        lagrangian=lagrangian,
-        matrix=matrix,
-        contradictory=against,
+        lagrangian=jnp.asarray(system.lagrangian(t, unflatten(x), unflatten(u), params)),
+        matrix=saddle_point_matrix(linear.mass, rows.jacobian, independent),
+        contradictory=_contradictory(linear, rows, independent, a, multipliers, x, u),
     )
 
 
@@ -261,11 +224,9 @@ def _without_vanishing(system, t, x, u, params, unflatten):
     rows = constraints.acceleration_rows(system, t, x, u, params, unflatten)
     if not rows.gamma.size:
         return rows
-    x, u = map(sparse_saddle_point.slightly_off, (x, u))
-    nearby = constraints.jacobian(system, t, x, u, params, unflatten)
+    nearby = constraints.jacobian(system, t, *map(slightly_off, (x, u)), params, unflatten)
     size = lambda rows: jnp.max(jnp.abs(rows), axis=1)
-    least = VANISHES_BELOW[np.dtype(x.dtype)]
-    vanishes = size(rows.jacobian) <= least * jnp.nan_to_num(size(nearby), posinf=0.0)
+    vanishes = vanishing(size(rows.jacobian), size(nearby))
     return rows._replace(jacobian=jnp.where(vanishes[:, None], 0.0, rows.jacobian))
 
 
@@ -277,5 +238,5 @@ def _contradictory(linear, rows, independent, a, multipliers, x, u):
     forces = jnp.abs(linear.forcing) + jnp.abs(jacobian).T @ jnp.abs(multipliers)
     inertia = jnp.max(jnp.abs(linear.mass), axis=1)
     slopes = jnp.sum(jnp.abs(jacobian), axis=1)
-    round_off = slopes * sparse_saddle_point.acceleration_round_off(inertia, forces, x, u)
+    round_off = slopes * acceleration_round_off(inertia, forces, x, u)
     return ~independent & (disagreement > DEPENDENT_BELOW[np.dtype(x.dtype)] * terms + round_off)

@@ -5,8 +5,8 @@ blocks, the matrix S = A M⁻¹ Aᵀ of the multipliers couples equations that a
 Nothing here depends on values, so that a plan holds at every state.
 """
 
+from dataclasses import dataclass
 from functools import lru_cache
-from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -27,7 +27,8 @@ BLOCK_AT_MOST = dense.ELIMINATE_UP_TO
 BAND_AT_MOST = 0.5
 
 
-class Plan(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Plan:
     """What is known of a system before any value: blocks of M, colours of M and A, the band of S."""
 
     members: Int[np.ndarray, "blocks size"]

@@ -21,17 +21,18 @@ Source: as for `saddle_point.py`; Benzi, Golub & Liesen, Acta Numerica 14 (2005)
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Float, PyTree
+from jaxtyping import Array, Bool, Float
 
 from lagjax.mechanics import constraints
 from lagjax.mechanics.lagrangian import forcing_and_inertia
 from lagjax.mechanics.sparse_plan import Plan
+from lagjax.mechanics.verdict import Verdict, acceleration_round_off, slightly_off, vanishing
 from lagjax.numerics import banded, dense
 
 # The sine of a dependent row; it is seen through its square, which round-off reaches sooner than in `rank.py`.
@@ -55,88 +56,88 @@ class Operators(NamedTuple):
     kept: Bool[Array, " m"]
 
 
-def accelerations(plan: Plan, system, t, x, u, params, unflatten, baumgarte_rate=None, kept=None):
-    """The accelerations and the stacked multipliers, in vector form; `kept` (m,) says which equations to solve with."""
-    forcing, inertia = forcing_and_inertia(system, t, x, u, params, unflatten)
-    if plan.band is None:
-        return _unconstrained(plan, inertia, forcing), jnp.zeros(0, x.dtype)
-    push, pull, rate = _rows(system, t, x, u, params, unflatten)
-    gamma = -rate
-    if baumgarte_rate is not None:
-        gamma = gamma + constraints.baumgarte_feedback(system, t, x, u, params, unflatten, baumgarte_rate)
-    kept = _independent(plan, push, pull, x.dtype) if kept is None else kept
-    operators = Operators(inertia, *_mass_inverse(plan, inertia, x), push, pull, kept)
-    a, multipliers = _solve(plan, operators, forcing, gamma)
-    shortest = partial(_shortest, plan, push, pull)
-    return a, lax.cond(jnp.all(kept), lambda x: x, shortest, multipliers)
+class Banded(NamedTuple):
+    """The equations solved by way of S, by a plan. A state is given as (system, t, x, u, params, unflatten)."""
 
+    plan: Plan
 
-def independent(plan: Plan, system, t, x, u, params, unflatten, dependent_below=None) -> Bool[Array, " m"]:
-    """Which constraint equations to solve with; see `numerics.banded.independent`."""
-    push, pull, _ = _rows(system, t, x, u, params, unflatten)
-    return _independent(plan, push, pull, x.dtype, dependent_below)
-
-
-def displacement(plan: Plan, system, t, x, u, params, unflatten, kept) -> Callable:
-    """The function from residuals to the shortest displacement in the metric of M that changes them by as much."""
-    _, inertia = forcing_and_inertia(system, t, x, u, params, unflatten)
-    push, pull, _ = _rows(system, t, x, u, params, unflatten)
-    operators = Operators(inertia, *_mass_inverse(plan, inertia, x), push, pull, kept)
-    schur, invert = _schur(plan, operators, x.dtype)
-
-    def of_residual(r):
-        r = jnp.where(kept, r, 0.0)
-        return operators.mass_inverse(pull(lax.custom_linear_solve(schur, r, lambda _, r: invert(r), symmetric=True)))
-
-    return of_residual
-
-
-def row_sizes(plan: Plan, system, t, x, u, params, unflatten, norm=jnp.sum) -> Float[Array, " m"]:
-    """`Σ_j |A_ij|` of each constraint equation, or another norm: columns of one colour share no row."""
-    if plan.band is None:
-        return jnp.zeros(0, x.dtype)
-    push, _, _ = _rows(system, t, x, u, params, unflatten)
-    return norm(jnp.abs(banded.compressed(push, plan.of_rows, x.dtype)), axis=0)
-
-
-class Verdict(NamedTuple):
-    """A solution of the equations at one state, as vectors or by name, and whether it is to be believed."""
-
-    a: PyTree[Array]
-    multipliers: Any
-    finite: Bool[Array, ""]
-    singular: Bool[Array, ""]
-    contradictory: Bool[Array, ""]
-
-
-def verdict(plan: Plan, system, t, x, u, params, unflatten, vanishes_below) -> Verdict:
-    """Solve the equations at one state, and say whether they are finite, regular, and agree with each other.
-
-    A row of A that is `vanishes_below` times what it is a little way off counts as none: the equations are singular.
-    """
-    a, multipliers = accelerations(plan, system, t, x, u, params, unflatten)
-    forcing, inertia = forcing_and_inertia(system, t, x, u, params, unflatten)
-    known = [forcing, system.lagrangian(t, unflatten(x), unflatten(u), params)]
-    singular, contradictory = jnp.zeros((), bool), jnp.zeros((), bool)
-    if plan.band is not None:
+    def accelerations(self, system, t, x, u, params, unflatten, baumgarte_rate=None, kept=None):
+        """The accelerations and the stacked multipliers, as vectors; `kept` (m,) says which equations to solve with."""
+        plan = self.plan
+        forcing, inertia = forcing_and_inertia(system, t, x, u, params, unflatten)
+        if plan.band is None:
+            return _unconstrained(plan, inertia, forcing), jnp.zeros(0, x.dtype)
         push, pull, rate = _rows(system, t, x, u, params, unflatten)
-        known.append(rate)
-        kept = _independent(plan, push, pull, x.dtype)
-        at = lambda x, u: row_sizes(plan, system, t, x, u, params, unflatten, jnp.max)
-        off = at(*map(slightly_off, (x, u)))
-        vanishes = at(x, u) <= vanishes_below * jnp.nan_to_num(off, posinf=0.0)
+        gamma = -rate
+        if baumgarte_rate is not None:
+            gamma = gamma + constraints.baumgarte_feedback(system, t, x, u, params, unflatten, baumgarte_rate)
+        kept = _independent(plan, push, pull, x.dtype) if kept is None else kept
         operators = Operators(inertia, *_mass_inverse(plan, inertia, x), push, pull, kept)
-        singular = jnp.any(vanishes) | _undetermined(plan, operators, x.dtype)
-        # |A| |a| and |A|ᵀ |λ|, colour by colour.
-        terms = _by_colours(push, plan.of_rows, a) + jnp.abs(rate)
-        forces = jnp.abs(forcing) + _by_colours(pull, plan.of_columns, multipliers)
-        slopes = row_sizes(plan, system, t, x, u, params, unflatten)
-        round_off = slopes * acceleration_round_off(_largest_inertia(plan, inertia, x), forces, x, u)
-        tolerance = DEPENDENT_BELOW[np.dtype(x.dtype)] * terms + round_off
-        contradictory = jnp.any(~kept & (jnp.abs(push(a) + rate) > tolerance))
-    finite = jnp.all(jnp.isfinite(jnp.concatenate([jnp.ravel(x) for x in known])))
-    solved = jnp.all(jnp.isfinite(jnp.concatenate([a, multipliers])))
-    return Verdict(a, multipliers, finite, finite & (singular | ~solved), contradictory)
+        a, multipliers = _solve(plan, operators, forcing, gamma)
+        shortest = partial(_shortest, plan, push, pull)
+        return a, lax.cond(jnp.all(kept), lambda x: x, shortest, multipliers)
+
+    def independent(self, system, t, x, u, params, unflatten, dependent_below=None) -> Bool[Array, " m"]:
+        """Which constraint equations to solve with; see `numerics.banded.independent`."""
+        push, pull, _ = _rows(system, t, x, u, params, unflatten)
+        return _independent(self.plan, push, pull, x.dtype, dependent_below)
+
+    def displacement(self, system, t, x, u, params, unflatten) -> Callable:
+        """`displacement(which, r)`, the shortest in the metric of M that changes the residuals `which` by r."""
+        plan = self.plan
+        _, inertia = forcing_and_inertia(system, t, x, u, params, unflatten)
+        push, pull, _ = _rows(system, t, x, u, params, unflatten)
+        kept = _independent(plan, push, pull, x.dtype)
+        operators = Operators(inertia, *_mass_inverse(plan, inertia, x), push, pull, kept)
+        schur, invert = _schur(plan, operators, x.dtype)
+
+        def of_residuals(which, r):
+            r = jnp.where(kept, jnp.zeros(which.size, r.dtype).at[np.flatnonzero(which)].set(r), 0.0)
+            multipliers = lax.custom_linear_solve(schur, r, lambda _, r: invert(r), symmetric=True)
+            return operators.mass_inverse(pull(multipliers))
+
+        return of_residuals
+
+    def row_sizes(self, system, t, x, u, params, unflatten, norm=jnp.sum) -> Float[Array, " m"]:
+        """`Σ_j |A_ij|` of each constraint equation, or another norm: columns of one colour share no row."""
+        if self.plan.band is None:
+            return jnp.zeros(0, x.dtype)
+        push, _, _ = _rows(system, t, x, u, params, unflatten)
+        return norm(jnp.abs(banded.compressed(push, self.plan.of_rows, x.dtype)), axis=0)
+
+    def verdict(self, system, t, x, u, params, unflatten) -> Verdict:
+        """Solve the equations at one state, and say whether they are finite, regular, and agree with each other."""
+        plan, state = self.plan, (system, t, x, u, params, unflatten)
+        a, multipliers = self.accelerations(*state)
+        forcing, inertia = forcing_and_inertia(*state)
+        known = [forcing, system.lagrangian(t, unflatten(x), unflatten(u), params)]
+        singular, contradictory = jnp.zeros((), bool), jnp.zeros((), bool)
+        if plan.band is not None:
+            push, pull, rate = _rows(*state)
+            known.append(rate)
+            kept = _independent(plan, push, pull, x.dtype)
+            at = lambda x, u: self.row_sizes(system, t, x, u, params, unflatten, jnp.max)
+            vanishes = vanishing(at(x, u), at(*map(slightly_off, (x, u))))
+            operators = Operators(inertia, *_mass_inverse(plan, inertia, x), push, pull, kept)
+            singular = jnp.any(vanishes) | _undetermined(plan, operators, x.dtype)
+            # |A| |a| and |A|ᵀ |λ|, colour by colour.
+            terms = _by_colours(push, plan.of_rows, a) + jnp.abs(rate)
+            forces = jnp.abs(forcing) + _by_colours(pull, plan.of_columns, multipliers)
+            round_off = acceleration_round_off(_largest_inertia(plan, inertia, x), forces, x, u)
+            tolerance = DEPENDENT_BELOW[np.dtype(x.dtype)] * terms + self.row_sizes(*state) * round_off
+            contradictory = jnp.any(~kept & (jnp.abs(push(a) + rate) > tolerance))
+        finite = jnp.all(jnp.isfinite(jnp.concatenate([jnp.ravel(x) for x in known])))
+        solved = jnp.all(jnp.isfinite(jnp.concatenate([a, multipliers])))
+        return Verdict(a, multipliers, finite, finite & (singular | ~solved), contradictory)
+
+    def believed(self, *state):
+        """The solution as vectors, NaN where it is not to be believed."""
+        found = self.verdict(*state)
+        believed = ~(found.singular | found.contradictory)
+        return tuple(jnp.where(believed, x, jnp.nan) for x in (found.a, found.multipliers))
+
+    def __str__(self):
+        return str(self.plan)
 
 
 def _undetermined(plan, operators, dtype):
@@ -144,20 +145,6 @@ def _undetermined(plan, operators, dtype):
     some = jnp.cos(jnp.arange(operators.added.size, dtype=dtype))
     moved, _ = _eliminated(plan, operators, dtype)(operators.added * some, jnp.zeros(operators.kept.size, dtype))
     return jnp.max(jnp.abs(moved)) > CORRECTION_AT_MOST**0.5
-
-
-def slightly_off(y):
-    """A state off by a thousandth, differently in each coordinate."""
-    size = jnp.max(jnp.abs(y))
-    return y + 1e-3 * jnp.cos(jnp.arange(y.size, dtype=y.dtype)) * jnp.where(size > 0, size, 1.0)
-
-
-def acceleration_round_off(inertia, forces, x, u):
-    """What of an acceleration is round-off, in equilibrium and in uniform motion: all its terms nearly cancel."""
-    by_force = jnp.max(jnp.where(inertia > 0, forces / jnp.where(inertia > 0, inertia, 1.0), 0.0))
-    extent = jnp.max(jnp.abs(x))
-    by_velocity = jnp.max(jnp.abs(u)) ** 2 / jnp.where(extent > 0, extent, 1.0)
-    return 1e4 * jnp.finfo(x.dtype).eps * (by_force + by_velocity)
 
 
 def _by_colours(push, coloured, y):

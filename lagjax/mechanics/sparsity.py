@@ -20,8 +20,8 @@ from jax import lax
 from jax.core import Tracer
 from jaxtyping import Bool
 
-from lagjax.jax_internals.names import ACCUMULATING, CALLS, CALLS_WITH_RULES, ELEMENTWISE, REDUCING
-from lagjax.jax_internals.programs import ClosedJaxpr, Jaxpr, Literal
+from lagjax.jax_internals.names import ACCUMULATING, ELEMENTWISE, IN_NUMPY, REDUCING
+from lagjax.jax_internals.programs import interpreted
 
 
 class Value(NamedTuple):
@@ -32,15 +32,6 @@ class Value(NamedTuple):
 
 
 ENTRYWISE = ELEMENTWISE | {"copy", "reduce_precision"}
-# Primitives that stand for the jaxpr that they carry; others, such as a reduction, carry one for pairs of entries.
-ENTERED = CALLS | CALLS_WITH_RULES
-# What indices are made of.
-EVALUATED = {
-    "add": np.add, "sub": np.subtract, "mul": np.multiply, "neg": np.negative, "max": np.maximum, "min": np.minimum,
-    "lt": np.less, "le": np.less_equal, "gt": np.greater, "ge": np.greater_equal, "eq": np.equal, "ne": np.not_equal,
-    "and": np.bitwise_and, "or": np.bitwise_or, "not": np.bitwise_not,
-    "select_n": lambda which, *cases: np.choose(which.astype(int), cases),
-}  # fmt: skip
 # Products of matrices larger than this are not searched for zeros.
 TERMS = 2_000_000
 
@@ -63,7 +54,7 @@ def pattern(function: Callable, vector, *rest) -> Bool[np.ndarray, "m n"]:
     n = shaped[0].size
     inputs = [Value(_empty(x.aval.shape)) for x in closed.jaxpr.invars]
     inputs[0] = Value(np.array([1 << i for i in range(n)], object))
-    (found,) = _walk(closed.jaxpr, closed.consts, inputs)
+    (found,) = interpreted(closed, inputs, _apply, _constant)
     return _as_booleans(found.sets, n)
 
 
@@ -74,7 +65,7 @@ def _as_booleans(sets, count):
     return np.unpackbits(rows, axis=1, bitorder="little")[:, :count].astype(bool)
 
 
-def _constant(x):
+def _constant(x, aval):
     known = None if isinstance(x, Tracer) else np.asarray(x)
     return Value(_empty(np.shape(x)), known)
 
@@ -83,21 +74,8 @@ def _empty(shape):
     return np.full(shape, 0, object)
 
 
-def _walk(jaxpr: Jaxpr, constants, inputs):
-    values = dict(zip(jaxpr.constvars, map(_constant, constants))) | dict(zip(jaxpr.invars, inputs))
-    value_of = lambda x: _constant(x.val) if isinstance(x, Literal) else values[x]
-    for equation in jaxpr.eqns:
-        values.update(zip(equation.outvars, _apply(equation, [value_of(x) for x in equation.invars])))
-    return [value_of(x) for x in jaxpr.outvars]
-
-
 def _apply(equation, operands):
     name, params = equation.primitive.name, equation.params
-    inner = [p for p in params.values() if isinstance(p, (ClosedJaxpr, Jaxpr))]
-    if name in ENTERED and len(inner) == 1:
-        jaxpr, constants = getattr(inner[0], "jaxpr", inner[0]), getattr(inner[0], "consts", ())
-        if len(jaxpr.invars) == len(operands):
-            return _walk(jaxpr, constants, operands)
     shapes = [x.aval.shape for x in equation.outvars]
     results = None
     if name in ENTRYWISE:
@@ -141,7 +119,7 @@ def _evaluated(name, equation, operands):
         return None
     if name == "convert_element_type":
         return known[0].astype(equation.outvars[0].aval.dtype)
-    return EVALUATED[name](*known) if name in EVALUATED else None
+    return IN_NUMPY[name](*known) if name in IN_NUMPY else None
 
 
 def _moving(move):

@@ -24,13 +24,15 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import PyTree
 
-from lagjax.jax_internals.programs import ClosedJaxpr, Jaxpr, Literal, reached
+from lagjax.jax_internals.names import ADDITIVE, BILINEAR, LINEAR_IN_FIRST, PERIODIC
+from lagjax.jax_internals.programs import Literal, interpreted, reached
 from lagjax.mechanics import constraints, coordinates
 from lagjax.mechanics.constraints import Holonomic
 from lagjax.mechanics.constraints import evaluate as constraint_value
-from lagjax.mechanics.in_numbers import Numbers, in_numbers
+from lagjax.mechanics.in_numbers import WRITTEN, Numbers, in_numbers
 from lagjax.mechanics.lagrangian import mass_and_forcing
 from lagjax.numerics import banded
+from lagjax.numerics.scalars import TooLong
 
 # Coordinates and equations together: of larger systems the programs are not written out.
 UP_TO = 24
@@ -64,19 +66,25 @@ class Structure(NamedTuple):
 
 
 def structure(system, t, q, v, params) -> Structure | None:
-    """The structure of a system, of whose state only names and shapes count; None where it is too large."""
+    """The structure of a system, of whose state only names and shapes count; None where it or its program is large."""
     names = coordinates.names(q)
     if len(names) + constraints.count(system, t, q, v, params) > UP_TO:
         return None
     _, unflatten = coordinates.flatten(q)
     system = in_numbers(system, unflatten)
-    args = (system, t, coordinates.numbers(q), coordinates.numbers(v), params)
-    n = len(names)
-    mass = Numbers(_mass, args)
+    try:
+        return _structure((system, t, coordinates.numbers(q), coordinates.numbers(v), params), names)
+    except TooLong:
+        return None
+
+
+def _structure(args, names):
+    system, n = args[0], len(names)
+    mass = _numbers(_mass, args)
     nonzero = np.array([not is_zero(x) for x in mass.program.jaxpr.outvars]).reshape(n, n)
-    lagrangian = Numbers(lambda system, *state: system.lagrangian(*state), args)
-    linear = Numbers(_momentum_at_rest, args)
-    seen = [Numbers(lambda _, *state, f=f: f(*state), args) for f in _seen(system)]
+    lagrangian = _numbers(lambda system, *state: system.lagrangian(*state), args)
+    linear = _numbers(_momentum_at_rest, args)
+    seen = [_numbers(lambda _, *state, f=f: f(*state), args) for f in _seen(system)]
     return Structure(
         mass_depends_on=_depends_on(mass, names),
         blocks=tuple(tuple(names[i] for i in block) for block in banded.blocks(nonzero)),
@@ -92,7 +100,10 @@ def is_diagonal(system, t, q, v, params) -> bool:
     x, _ = coordinates.flatten(q)
     if x.size == 1:
         return True
-    mass = Numbers(_mass, (system, t, q, v, params))
+    try:
+        mass = _numbers(_mass, (system, t, q, v, params))
+    except TooLong:
+        return False
     off = ~np.eye(x.size, dtype=bool).reshape(-1)
     return all(is_zero(x) for x, outside in zip(mass.program.jaxpr.outvars, off) if outside)
 
@@ -110,6 +121,10 @@ def is_free_of_velocities(system, t, q, v, params) -> bool:
 def is_zero(x) -> bool:
     """Whether a result of a written-out program is a zero that is written in it."""
     return isinstance(x, Literal) and x.val == 0
+
+
+def _numbers(function, args):
+    return Numbers(function, args, most=WRITTEN)
 
 
 def _mass(system, t, q, v, params):
@@ -135,8 +150,10 @@ def _depends_on(numbers, names):
 
 def _of_constraint(constraint, args, names):
     by = 1 if isinstance(constraint, Holonomic) else 2
-    value = Numbers(lambda _, *state: constraint_value(constraint, *state), args)
-    slope = Numbers(lambda _, *state: jax.jacfwd(lambda *s: constraint_value(constraint, *s), argnums=by)(*state), args)
+    value = _numbers(lambda _, *state: constraint_value(constraint, *state), args)
+    slope = _numbers(
+        lambda _, *state: jax.jacfwd(lambda *s: constraint_value(constraint, *s), argnums=by)(*state), args
+    )
     return ConstraintStructure(linear=not _depends_on(slope, names), moving="t" in _depends_on(value, names))
 
 
@@ -147,16 +164,6 @@ class Depends(IntEnum):
     LINEARLY = 1
     PERIODICALLY = 2
     OTHERWISE = 3
-
-
-ADDITIVE = {
-    "add", "add_any", "sub", "neg", "reduce_sum", "cumsum", "concatenate", "reshape", "squeeze", "slice",
-    "broadcast_in_dim", "transpose", "rev", "pad", "copy", "stack", "convert_element_type", "stop_gradient", "split",
-}  # fmt: skip
-# Linear in the first operand; the others only choose or scale, and must not depend on the leaf.
-BY_FIRST = {"div", "dynamic_slice", "gather"}
-BILINEAR = {"mul", "dot_general"}
-PERIODIC = {"sin", "cos"}
 
 
 def angles(system, t, q, v, params) -> PyTree[bool]:
@@ -214,30 +221,16 @@ def _dependence(function, args, leaf_of):
     def of_arrays(arrays):
         return eqx.filter(function(*eqx.combine(arrays, static)), eqx.is_array)
 
-    jaxpr = jax.make_jaxpr(of_arrays)(arrays).jaxpr
-    count, structure = len(jaxpr.invars), jtu.tree_structure(arrays)
+    program = jax.make_jaxpr(of_arrays)(arrays)
+    count, structure = len(program.jaxpr.invars), jtu.tree_structure(arrays)
     chosen = leaf_of(jtu.tree_unflatten(structure, range(count)))
     kinds = [Depends.LINEARLY if i == chosen else Depends.NOT for i in range(count)]
-    return max(_walk(jaxpr, kinds), default=Depends.NOT)
-
-
-def _walk(jaxpr: Jaxpr, kinds):
-    known = dict(zip(jaxpr.invars, kinds))
-    kind_of = lambda x: Depends.NOT if isinstance(x, Literal) else known.get(x, Depends.NOT)
-    for equation in jaxpr.eqns:
-        result = _apply(equation, [kind_of(x) for x in equation.invars])
-        known.update(zip(equation.outvars, result))
-    return [kind_of(x) for x in jaxpr.outvars]
+    return max(interpreted(program, kinds, _apply, lambda *_: Depends.NOT), default=Depends.NOT)
 
 
 def _apply(equation, kinds):
     """What a primitive makes of operands of these kinds, one for each of its results."""
     name, worst, count = equation.primitive.name, max(kinds, default=Depends.NOT), len(equation.outvars)
-    inner = [p for p in equation.params.values() if isinstance(p, (ClosedJaxpr, Jaxpr))]
-    if len(inner) == 1 and name not in ("while", "scan"):
-        jaxpr = getattr(inner[0], "jaxpr", inner[0])
-        if len(jaxpr.invars) == len(kinds):
-            return _walk(jaxpr, kinds)
     if worst in (Depends.NOT, Depends.OTHERWISE):
         return [worst] * count
     linear = Depends.LINEARLY in kinds
@@ -247,7 +240,7 @@ def _apply(equation, kinds):
     pure = Depends.PERIODICALLY not in kinds
     if name in ADDITIVE and pure:
         return [Depends.LINEARLY] * count
-    if name in BY_FIRST and pure and worst == kinds[0] and max(kinds[1:], default=Depends.NOT) == Depends.NOT:
+    if name in LINEAR_IN_FIRST and pure and worst == kinds[0] and max(kinds[1:], default=Depends.NOT) == Depends.NOT:
         return [Depends.LINEARLY] * count
     if name in BILINEAR and pure and kinds.count(Depends.LINEARLY) == 1:
         return [Depends.LINEARLY] * count

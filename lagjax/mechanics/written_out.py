@@ -24,7 +24,7 @@ from jaxtyping import Array
 
 from lagjax.jax_internals.plain import is_plain
 from lagjax.mechanics import constraints, coordinates
-from lagjax.mechanics.in_numbers import Numbers
+from lagjax.mechanics.in_numbers import WRITTEN, Numbers
 from lagjax.mechanics.lagrangian import mass_and_forcing
 from lagjax.mechanics.structure import is_diagonal
 from lagjax.numerics import dense
@@ -33,9 +33,8 @@ from lagjax.numerics.scalars import TooLong
 # Coordinates and constraint equations together. Measured on chains: a full mass matrix of nine is as fast in arrays;
 # with constraints, whose matrix is mostly zeros, a step is seven times faster up to here, for twice the compile time.
 UP_TO, CONSTRAINED_UP_TO = 8, 16
-# Operations of a program that takes long to compile, as of an L with tables or a quadrature in it. Up to twice as many
-# are written before it is known which are needed; to write a hundred thousand only to leave them takes 15 s.
-LONG, WRITTEN = 2000, 6000
+# Operations of a program that takes long to compile.
+LONG = 2000
 # Two iterations are enough where the second one moves the state by less than this part of its size.
 SMALL_CORRECTION = 1e-7
 
@@ -49,6 +48,11 @@ class WrittenOut(NamedTuple):
     equations: Numbers
     project: Numbers | None
     careful: bool
+
+    def prepare(self, system, params) -> tuple[tuple | None, tuple | None]:
+        """What does not depend on the state: of the equations, and of the return to the constraints."""
+        of = lambda numbers: None if numbers is None else numbers.prepare(system, params)
+        return of(self.equations), of(self.project)
 
 
 def is_small(system, t, q, v, params) -> bool:

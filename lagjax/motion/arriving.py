@@ -15,7 +15,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from lagjax.mechanics.saddle_point import equations_of_motion
+from lagjax.mechanics.equations import Equations
 
 # The distance kept from a jump, in round-offs of the time: a user computes the same time in two ways.
 BESIDE = 4
@@ -77,7 +77,7 @@ def between_jumps(t0, t1, jump_ts, made_jump):
     return jnp.where(starts & room, t0 + beside, t0), t1, starts | made_jump
 
 
-def apart_from_jumps(system, ts, jump_ts, q, v, params):
+def apart_from_jumps(equations: Equations, ts, jump_ts, q, v):
     """The outputs; one at the time of a jump does not move with the jump, as the end of its step does.
 
     `late` is zero, and its derivative that of the difference.
@@ -85,7 +85,7 @@ def apart_from_jumps(system, ts, jump_ts, q, v, params):
     same = ts[:, None] == jump_ts[None, :]
     late = jnp.where(jnp.any(same, axis=1), ts - jump_ts[jnp.argmax(same, axis=1)], 0.0)
     before = ts - _round_off(jnp.abs(ts))
-    a = jax.vmap(lambda t, q, v: equations_of_motion(system, t, q, v, params)[0])(before, q, v)
+    a = jax.vmap(lambda t, q, v: equations.accelerations(t, q, v)[0])(before, q, v)
     along = lambda x, rate: x + late.reshape(-1, *[1] * (x.ndim - 1)) * lax.stop_gradient(rate)
     return jax.tree.map(along, q, v), jax.tree.map(along, v, a)
 

@@ -13,6 +13,7 @@ Source: Hairer, Lubich & Wanner, *Geometric Numerical Integration*, §IV.4 and �
 
 from collections.abc import Callable
 from functools import partial
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -22,8 +23,9 @@ from jax import lax
 from jaxtyping import Array, Bool, PyTree
 
 from lagjax.mechanics import constraints, coordinates
+from lagjax.mechanics.compiled import compiled
 from lagjax.mechanics.diagnosis import equation_names
-from lagjax.mechanics.saddle_point import returning, row_sizes
+from lagjax.mechanics.equations import Equations, equations_of
 
 # With the matrix kept, an iteration multiplies the residual by about the first one: one is enough from 1e-8 of the
 # size of the state, and a crude fixed step of 0.1 takes eight.
@@ -31,7 +33,7 @@ ITERATIONS = 12
 ONE_IS_ENOUGH_BELOW = 1e-8
 
 
-class Projected(eqx.Module):
+class Projected(NamedTuple):
     """A state returned to the constraints, and whether it satisfies them to the tolerance."""
 
     q: PyTree[Array]
@@ -39,8 +41,15 @@ class Projected(eqx.Module):
     holds: Bool[Array, ""]
 
 
-@eqx.filter_jit
-def to_manifold(system, t, q, v, params, rtol, atol) -> Projected:
+def returned(equations: Equations, t, q, v, rtol, atol) -> Projected:
+    """A state moved onto the constraints; NaN where equations that are taken for regular do not do."""
+    if equations.are_taken_for_regular:
+        return Projected(*equations.projected(t, q, v), jnp.asarray(True))
+    return to_manifold(equations, t, q, v, rtol, atol)
+
+
+@compiled
+def to_manifold(equations: Equations, t, q, v, rtol, atol) -> Projected:
     """The nearest state that satisfies all constraints, for a state near it: Newton with a fixed matrix.
 
     It holds where a displacement of `atol + rtol |y|` makes up for what is left of each residual, also of those
@@ -49,8 +58,10 @@ def to_manifold(system, t, q, v, params, rtol, atol) -> Projected:
     x, unflatten = coordinates.flatten(q)
     u, _ = coordinates.flatten(v)
     # Not differentiated: where the residual vanishes the derivative of the matrix does not count.
-    displacement, slope = returning(*stopped((system, t, q, v, params)))
+    still, at = stopped(equations), stopped((t, q, v))
+    displacement, slope = still.displacement(*at), still.row_sizes(*at)
     of_q, of_v = _allowed(jnp.abs(jnp.concatenate([x, u])), rtol, atol)
+    system, params = equations.system, equations.params
     live = (system, t, params)
     fixed = stopped(live)
 
@@ -106,7 +117,8 @@ def worst_residual(system, t, q, v, params):
     A residual counts as its size over `Σ_j |A_ij| Q`, Q the largest coordinate on the trajectory (the largest
     velocity for the velocity level): what a displacement as large as the motion would make of it.
     """
-    residual, slope, size = jax.vmap(lambda t, q, v: residuals_and_slopes(system, t, q, v, params))(t, q, v)
+    equations = equations_of(system, *jax.tree.map(lambda x: x[0], (t, q, v)), params)
+    residual, slope, size = jax.vmap(partial(residuals_and_slopes, equations))(t, q, v)
     # Outputs after an event or a failure are NaN and say nothing about the constraints.
     scale = slope @ level_size(jnp.nanmax(size, axis=0))
     return jnp.nanmax(jnp.abs(residual) / jnp.where(scale > 0, scale, 1.0))
@@ -117,9 +129,9 @@ def level_size(size):
     return jnp.max(size.reshape(2, -1), axis=1)
 
 
-def within(system, t, q, v, params, rtol, atol) -> Bool[Array, ""]:
+def within(equations: Equations, t, q, v, rtol, atol) -> Bool[Array, ""]:
     """Whether a displacement of `atol + rtol |y|` makes up for every residual, of positions and velocities."""
-    residual, slope, size = residuals_and_slopes(system, t, q, v, params)
+    residual, slope, size = residuals_and_slopes(equations, t, q, v)
     return jnp.all(jnp.abs(residual) <= slope @ _allowed(size, rtol, atol))
 
 
@@ -128,14 +140,15 @@ def _allowed(size, rtol, atol):
     return jnp.broadcast_to(atol, 2) + jnp.broadcast_to(rtol, 2) * level_size(size)
 
 
-@eqx.filter_jit
-def residuals_and_slopes(system, t, q, v, params):
+@compiled
+def residuals_and_slopes(equations: Equations, t, q, v):
     """Residuals of both levels, the sums of their slopes over q and over v (two columns), and `|(q, v)|`."""
+    system, params = equations.system, equations.params
     x, unflatten = coordinates.flatten(q)
     u, _ = coordinates.flatten(v)
     position = constraints.position_residual(system, t, x, params, unflatten)
     velocity = constraints.velocity_residual(system, t, x, u, params, unflatten)
-    slope = row_sizes(system, t, q, v, params)
+    slope = equations.row_sizes(t, q, v)
     # ∂(dg/dt)/∂v = ∂g/∂q: the holonomic rows serve both levels.
     of_q = slope[constraints.holonomic_equations(system, t, q, v, params)]
     columns = [jnp.concatenate([of_q, jnp.zeros_like(slope)]), jnp.concatenate([jnp.zeros_like(of_q), slope])]
@@ -144,7 +157,7 @@ def residuals_and_slopes(system, t, q, v, params):
 
 def departures(system, s: coordinates.State, rtol, atol) -> str:
     """Name the constraints that a state violates by more than a displacement `atol + rtol |y|`; else ''."""
-    residual, slope, size = (np.asarray(part) for part in residuals_and_slopes(system, *s))
+    residual, slope, size = (np.asarray(part) for part in residuals_and_slopes(equations_of(system, *s), *s[:3]))
     allowed = np.asarray(_allowed(size, rtol, atol))
     # NaN is a violation too.
     off = np.flatnonzero(~(np.abs(residual) <= slope @ allowed))

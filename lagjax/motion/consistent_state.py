@@ -17,14 +17,15 @@ Source: Nocedal & Wright, *Numerical Optimization*, §18.1 (Newton-KKT) and §11
 
 from collections.abc import Callable, Iterable, Mapping
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
 from lagjax.mechanics import constraints, coordinates
+from lagjax.mechanics.compiled import compiled
 from lagjax.mechanics.diagnosis import describe, listed
+from lagjax.mechanics.equations import equations_of
 from lagjax.mechanics.first_call import looked_at
 from lagjax.mechanics.lagrangian import mass_and_forcing
 from lagjax.mechanics.saddle_point import displacement_map, saddle_point_matrix
@@ -115,7 +116,7 @@ def _round_off(t):
     return 1e3 * float(jnp.finfo(t.dtype).eps)
 
 
-@eqx.filter_jit
+@compiled
 def _consistent_state(system, t, q, v, params, free):
     x0, unflatten = coordinates.flatten(q)
     u0, _ = coordinates.flatten(v)
@@ -132,7 +133,7 @@ def _consistent_state(system, t, q, v, params, free):
     u = _nearest(velocity, (live, x), u0, metric, free)
     q, v = unflatten(x), unflatten(u)
     tolerance = _round_off(t)
-    return q, v, within(system, t, q, v, params, tolerance, tolerance)
+    return q, v, within(equations_of(system, t, q, v, params), t, q, v, tolerance, tolerance)
 
 
 def _nearest(residual: Callable, problem, y0, metric, free):

@@ -19,7 +19,7 @@ import jax.tree_util as jtu
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from lagjax.mechanics.saddle_point import equations_of_motion
+from lagjax.mechanics.equations import Equations
 from lagjax.motion.consistency import stopped
 from lagjax.motion.crossings import Crossings, Guards
 from lagjax.motion.pieces import Watched
@@ -50,20 +50,20 @@ def locate(watching: Watching, watched: Watched, params) -> Located:
 
     def found(owner, kept):
         t, y = _root(watching, owner, kept, params)
-        t, y = _exact((guards, motion.system, params), lax.stop_gradient(t), y, owner, watching.resolution)
-        return t, y, motion.multipliers(t, y, params)
+        t, y = _exact((guards, motion.equations), lax.stop_gradient(t), y, owner, watching.resolution)
+        return t, y, motion.equations.multipliers(t, *y)
 
     t, y, multipliers = _each(found, guards, jnp.isfinite(watched.kept.enclosed.before), watched.kept)
     counts, uncertain = (jnp.stack([getattr(f, name) for f in watched.followed]) for name in ("count", "uncertain"))
     return Located(t, y, multipliers, counts, uncertain)
 
 
-def at_known_times(guards: Guards, system, resolution, located: Located, y, params) -> Located:
+def at_known_times(guards: Guards, equations: Equations, resolution, located: Located, y) -> Located:
     """The same from the states `y` (S, ...) at the times that were found, in place of their roots."""
 
     def found(owner, known):
-        t, y = _exact((guards, system, params), lax.stop_gradient(known[0]), known[1], owner, resolution)
-        return t, y, equations_of_motion(system, t, *y, params)[1] if system.constraints else {}
+        t, y = _exact((guards, equations), lax.stop_gradient(known[0]), known[1], owner, resolution)
+        return t, y, equations.accelerations(t, *y)[1]
 
     t, y, multipliers = _each(found, guards, jnp.isfinite(located.t), (located.t, y))
     return located._replace(t=t, y=y, multipliers=multipliers)
@@ -103,7 +103,7 @@ def _root(watching, owner, kept, args):
     t0, y0, enclosed = kept
 
     def look(s: _Bracket) -> _Bracket:
-        y = watching.motion.flow(t0, y0, s.t, args)
+        y = watching.motion.flow(t0, y0, s.t)
         g = jnp.stack(fixed.value(s.t, *stopped((y, args))))[owner]
         crossed = g * enclosed.sign >= 0
         low, high = jnp.where(crossed, s.low, s.t), jnp.where(crossed, s.t, s.high)
@@ -174,11 +174,10 @@ def _exact_jvp(primals, tangents):
     dy = jtu.tree_map(lambda x, dx: jnp.zeros_like(x) if dx is None else dx, y, dy, is_leaf=lambda x: x is None)
 
     def value(live, t, y):
-        guards, system, params = live
-        return jnp.stack(guards(t, *y, equations_of_motion(system, t, *y, params)[1], params))[owner]
+        guards, equations = live
+        return jnp.stack(guards(t, *y, equations.accelerations(t, *y)[1], equations.params))[owner]
 
-    _, system, params = live
-    a = equations_of_motion(system, t, *y, params)[0]
+    a = live[1].accelerations(t, *y)[0]
     g, rate = jax.jvp(lambda t, y: value(live, t, y), (t, y), (jnp.ones_like(t), (y[1], a)))
     _, dg = eqx.filter_jvp(value, (live, t, y), (moves, jnp.zeros_like(t), dy))
     # Where it jumps, nothing follows.

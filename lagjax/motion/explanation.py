@@ -9,15 +9,13 @@ import numpy as np
 from lagjax.mechanics import constraints, coordinates
 from lagjax.mechanics.constraints import Holonomic
 from lagjax.mechanics.diagnosis import dependencies, describe, equation_names, explain_failure, listed
+from lagjax.mechanics.equations import equations_of
 from lagjax.mechanics.first_call import looked_at
 from lagjax.mechanics.saddle_point import examined
-from lagjax.mechanics.sparse_plan import plan
 from lagjax.mechanics.structure import Structure, is_free_of_velocities, structure
 from lagjax.mechanics.system import System
-from lagjax.mechanics.written_out import is_small
 from lagjax.motion.consistency import departures, to_manifold, within
 from lagjax.motion.consistent_state import consistent_state
-from lagjax.numerics.dense import ELIMINATE_UP_TO
 from lagjax.numerics.rank import independent_rows
 
 # A state is taken for one on the constraints that was rounded, and moved there, where it is this near.
@@ -32,7 +30,7 @@ class Explanation:
     - `degrees_of_freedom`: velocities left free, coordinates less independent constraint equations.
     - `position_freedoms`: positions left free; more than the former where velocities alone are constrained.
     - `dependent`: each dependent equation, followed by those that it is a combination of.
-    - `structure`: what holds at every state, a `Structure`; None for large systems.
+    - `structure`: what holds at every state, a `Structure`; None for large systems and long programs.
     - `mass_matrix`: its definiteness in words; `problem`: why the equations fail there, or None.
     """
 
@@ -108,7 +106,7 @@ def explain(system: System, q, v, params=None, *, t=0.0) -> Explanation:
     if found_structure is not None:
         rows += _of_structure(found_structure)
     rows += [(name, "yes") for name in ("force", "dissipation") if getattr(system, name) is not None]
-    rows.append(("solved", _how_solved(system, s, found_structure)))
+    rows.append(("solved", _how_solved(equations_of(system, *s, quickly=True), found_structure)))
     if is_free_of_velocities(system, *s):
         rows.append(("velocities", "accelerations do not depend on them: stepped by Nystrom12"))
     if problem:
@@ -137,8 +135,9 @@ class _Place(NamedTuple):
 def _on_the_constraints(system, s) -> _Place:
     """The nearest state on the constraints: off them, dependent constraints contradict each other by that much."""
     tolerance = jnp.asarray(ROUNDED, s.t.dtype)
-    if within(system, *s, tolerance, tolerance):
-        moved = to_manifold(system, *s, tolerance, tolerance)
+    equations = equations_of(system, *s)
+    if within(equations, *s[:3], tolerance, tolerance):
+        moved = to_manifold(equations, *s[:3], tolerance, tolerance)
         return _Place(s._replace(q=moved.q, v=moved.v))
     off = departures(system, s, ROUNDED, ROUNDED)
     try:
@@ -175,13 +174,12 @@ def _of_structure(found):
     return rows
 
 
-def _how_solved(system, s, found):
+def _how_solved(equations, found):
     """What the compiled program does at each evaluation."""
-    n, m = coordinates.flatten(s.q)[0].size, constraints.count(system, *s)
-    if (sparse := plan(system, *s)) is not None:
-        return str(sparse)
-    if not is_small(system, *s):
-        return f"{n + m} equations by {'elimination' if n + m <= ELIMINATE_UP_TO else 'LAPACK'}"
+    if not equations.are_written or found is None:
+        return str(equations.form)
+    n = sum(map(len, found.blocks))
+    m = equations.form.unknowns - n
     if n == 1 and not m:
         return "one division"
     if m:

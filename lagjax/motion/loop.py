@@ -13,17 +13,15 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float, PyTree
 
-from lagjax.jax_internals.one_function import called, calls_host, one_function
+from lagjax.jax_internals.one_function import calls_host, one_function
 from lagjax.mechanics import constraints
 from lagjax.mechanics.coordinates import State
-from lagjax.mechanics.in_numbers import Numbers
-from lagjax.mechanics.saddle_point import equations_of_motion
+from lagjax.mechanics.equations import Equations
 from lagjax.mechanics.structure import angles
-from lagjax.mechanics.system import System
 from lagjax.motion.arriving import Arriving, together
 from lagjax.motion.consistency import stopped
 from lagjax.motion.crossing_times import Located, at_known_times, first_end, locate
-from lagjax.motion.stepping import OnManifold, Quick, Stages, Tolerances, forward_differentiable
+from lagjax.motion.stepping import Field, OnManifold, Quick, QuickField, Tolerances, forward_differentiable
 from lagjax.motion.watching import Watching
 from lagjax.numerics.nystrom import Nystrom
 from lagjax.numerics.runge_kutta import ExplicitRungeKutta
@@ -49,9 +47,9 @@ class Solution(NamedTuple):
     located: Located | None
 
 
-def solution_of(system, written, start: State, y0, refused, ts, guards, settings, adjoint) -> Solution:
+def solution_of(equations: Equations, start: State, y0, refused, ts, guards, settings, adjoint) -> Solution:
     """Step through a motion by diffrax; where `refused`, end within a few steps."""
-    problem = (system, written, start, y0, refused)
+    problem = (equations, start, y0, refused)
     if guards is None or isinstance(adjoint, diffrax.ForwardMode):
         return _loop(*problem, settings, ts, adjoint, guards)
     # In reverse mode diffrax differentiates outputs alone: once the crossings' times are known, they are outputs.
@@ -70,42 +68,37 @@ def solution_of(system, written, start: State, y0, refused, ts, guards, settings
         reached=jnp.where(jnp.isfinite(again.reached[place[: ts.size]]), found.reached, jnp.inf),
         outputs=of_outputs,
         end=again.end,
-        located=at_known_times(guards, system, resolution(ts), found.located, of_crossings, start.params),
+        located=at_known_times(guards, equations, resolution(ts), found.located, of_crossings),
     )
 
 
-def _loop(system, written, start, y0, refused, settings, ts, adjoint, guards=None, repeated=False):
-    rate = BAUMGARTE_DECAYS / (ts[-1] - ts[0]) if settings.drift == "baumgarte" else None
-    terms, params = diffrax.ODETerm(Field(system, rate)), start.params
-    quick = None
-    if written is not None and settings.drift != "baumgarte":
-        field = WrittenField(written.equations, written.equations.prepare(system, params))
-        project = written.project if settings.drift == "project" else None
-        prepared = () if project is None else project.prepare(system, params)
+def _loop(equations, start, y0, refused, settings, ts, adjoint, guards=None, repeated=False):
+    feedback = BAUMGARTE_DECAYS / (ts[-1] - ts[0]) if settings.drift == "baumgarte" else None
+    quick, written = None, equations.written
+    if written is not None and feedback is None:
         in_a_loop = _in_a_loop(settings.method, adjoint)
         stages = settings.method if written.equations.length <= settings.unroll_up_to else in_a_loop
-        careful = written.careful and settings.careful
-        quick = Quick(stages, in_a_loop, diffrax.ODETerm(field), project, prepared, careful)
+        quick = Quick(stages, in_a_loop)
     # BacksolveAdjoint integrates a larger state backwards: it takes the bare method, and no end beside the outputs.
     bare = isinstance(adjoint, diffrax.BacksolveAdjoint)
     settings = eqx.tree_at(lambda s: s.method, settings, _with_root_finder(settings))
     controller = _controller(ts, settings, bare, repeated)
+    terms = diffrax.ODETerm(Field(equations, feedback) if quick is None else QuickField(equations))
     if bare:
         solver, saveat = settings.method, diffrax.SaveAt(ts=ts)
     else:
-        solver = _solver(system, terms, quick, start, refused, settings, adjoint)
+        solver = _solver(equations, quick, feedback, start, refused, settings, adjoint)
         subs = diffrax.SubSaveAt(ts=ts), diffrax.SubSaveAt(t1=True)
         saveat = diffrax.SaveAt(subs=subs, controller_state=guards is not None)
     if guards is not None:
         controller = Watching(controller, guards, solver, resolution(ts))
     arguments = (
-        terms if quick is None else quick.terms, solver, ts[0], ts[-1], settings.dt0, y0, params, saveat, controller,
-        _by_position(settings.event),
+        terms, solver, ts[0], ts[-1], settings.dt0, y0, start.params, saveat, controller, _by_position(settings.event),
     )  # fmt: skip
     solve = partial(_diffeqsolve, max_steps=settings.max_steps, adjoint=adjoint, progress=settings.progress)
     # Reverse mode has to look inside.
     if isinstance(adjoint, diffrax.ForwardMode):
-        own = _own_calls_of_the_host(system, terms, written, start, guards, settings, controller)
+        own = _own_calls_of_the_host(equations, terms, start, guards, settings, controller)
         reached, outputs, *rest = one_function(solve, *arguments, checked=not own, in_blocks=True)
     else:
         reached, outputs, *rest = solve(*arguments)
@@ -118,32 +111,6 @@ def _loop(system, written, start, y0, refused, settings, ts, adjoint, guards=Non
     return Solution(reached, outputs, end, *rest)
 
 
-class Field(eqx.Module):
-    """d(q, v)/dt = (v, a), on the user's pytrees; what JAX traces of it is a leaf, so that a program may contain it."""
-
-    system: System
-    baumgarte_rate: Float[Array, ""] | None
-
-    def __call__(self, t, y, args):
-        q, v = y
-        params, independent = args if isinstance(args, Stages) else (args, None)
-        return v, called(equations_of_motion(self.system, t, q, v, params, self.baumgarte_rate, independent))[0]
-
-
-class WrittenField(eqx.Module):
-    """The same from the equations written out, with what does not depend on the state computed before."""
-
-    equations: Numbers = eqx.field(static=True)
-    prepared: tuple
-
-    def __call__(self, t, y, params):
-        return y[1], self.solved(t, y)[0]
-
-    def solved(self, t, y):
-        """The accelerations, and the multipliers in one vector."""
-        return called(self.equations.at(self.prepared, t, *y))
-
-
 def _diffeqsolve(terms, solver, t0, t1, dt0, y0, args, saveat, controller, event, *, max_steps, adjoint, progress):
     solution = diffrax.diffeqsolve(
         terms, solver, t0, t1, dt0, y0, args, saveat=saveat, stepsize_controller=controller, adjoint=adjoint,
@@ -154,7 +121,7 @@ def _diffeqsolve(terms, solver, t0, t1, dt0, y0, args, saveat, controller, event
     return solution.ts, solution.ys, solution.stats, solution.result, located
 
 
-def _own_calls_of_the_host(system, terms, written, start, guards, settings, controller):
+def _own_calls_of_the_host(equations, terms, start, guards, settings, controller):
     """Whether the user's functions, method or controller may call Python at run time, if only to check something.
 
     What is left then are diffrax's checks. They are about the times and the first step, which `solve` looks at.
@@ -162,7 +129,7 @@ def _own_calls_of_the_host(system, terms, written, start, guards, settings, cont
     parts = (settings.method, settings.controller)
     if any(part is not None and type(part).__module__.split(".")[0] not in LOOKED_AT for part in parts):
         return True
-    t, q, v, params = start
+    (t, q, v, params), written = start, equations.written
     if written is None:
         traced = [jax.make_jaxpr(lambda t, y: terms.vf(t, y, params))(t, (q, v))]
     else:
@@ -170,7 +137,7 @@ def _own_calls_of_the_host(system, terms, written, start, guards, settings, cont
         if any(numbers.calls_host for numbers in (written.equations, written.project) if numbers is not None):
             return True
     if guards is not None:
-        multipliers = constraints.zero_multipliers(system, start)
+        multipliers = constraints.zero_multipliers(equations.system, start)
         traced.append(jax.make_jaxpr(lambda t, q, v: guards(t, q, v, multipliers, params))(t, q, v))
     conditions = jax.tree.leaves(settings.event.cond_fn, is_leaf=callable) if settings.event is not None else ()
     given = dict(terms=terms, solver=settings.method, t0=t, t1=t, dt0=None, max_steps=settings.max_steps)
@@ -193,14 +160,13 @@ def _with_root_finder(settings):
     return with_tolerances(method, *tolerances)
 
 
-def _solver(system, terms, quick, start, refused, settings, adjoint):
-    angle = tuple(jax.tree.leaves(angles(system, *start)))
+def _solver(equations, quick, feedback, start, refused, settings, adjoint):
+    angle = tuple(jax.tree.leaves(angles(equations.system, *start)))
     return OnManifold(
         solver=_in_a_loop(settings.method, adjoint),
-        system=system,
-        terms=terms,
+        equations=equations,
         quick=quick,
-        params=start.params,
+        feedback=feedback,
         refused=refused,
         tolerances=Tolerances(settings.rtol, settings.atol),
         angles=angle,

@@ -106,11 +106,10 @@ def times(ts: Any, dtype):
     if not coordinates.is_traced(ts):
         if not np.all(np.isfinite(ts)):
             raise ValueError("ts contains NaN or infinity.\nFix: give finite times.")
-        steps = np.diff(ts.astype(float))
-        backward = bool(np.sum(steps) < 0)
-        wrong = np.flatnonzero(steps >= 0 if backward else steps <= 0)
-        if wrong.size:
-            i = int(wrong[0])
+        backward = bool(ts[-1] < ts[0])
+        wrong = ts[1:] >= ts[:-1] if backward else ts[1:] <= ts[:-1]
+        if wrong.any():
+            i = int(np.argmax(wrong))
             raise ValueError(
                 f"ts must {'decrease' if backward else 'increase'} throughout, as from its first time to its last, and "
                 f"ts[{i + 1}] = {float(ts[i + 1]):.9g} follows ts[{i}] = {float(ts[i]):.9g}.\n"

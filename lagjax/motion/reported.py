@@ -12,13 +12,12 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array, Float, Int, PyTree
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from lagjax.jax_internals.names import CALLS, CALLS_WITH_RULES
 from lagjax.jax_internals.one_function import poisoned
 from lagjax.jax_internals.primitives import primitive
-from lagjax.jax_internals.programs import ClosedJaxpr, Jaxpr, Literal, bodies, evaluate
-from lagjax.jax_internals.tracing import WATCHED
+from lagjax.jax_internals.programs import applied, bodies, equations, interpreted, stands_for
+from lagjax.jax_internals.tracing import REGULAR_FIRST, WATCHED
 from lagjax.motion.consistency import stopped, worst_residual
 from lagjax.motion.trajectory import RESULTS, Trajectory
 
@@ -38,6 +37,12 @@ class Report(NamedTuple):
     residual: Float[Array, ""]
 
 
+class Settled(NamedTuple):
+    """Whether a motion that was taken for regular would be the same with the careful way."""
+
+    settled: Bool[Array, ""]
+
+
 def report(trajectory: Trajectory) -> Trajectory:
     """The trajectory, unchanged; where somebody watches, its report is put down in the program that is being traced."""
 
@@ -51,7 +56,12 @@ def report(trajectory: Trajectory) -> Trajectory:
     return reported(trajectory, of)
 
 
-def reported(found: PyTree, of: Callable[[Any], Report]) -> PyTree:
+def report_settled(trajectory: Trajectory, settled: Bool[Array, ""]) -> Trajectory:
+    """The trajectory of what was taken for regular, unchanged; whether it is settled is put down in the program."""
+    return reported(trajectory, lambda _: Settled(settled))
+
+
+def reported(found: PyTree, of: Callable[[Any], Report | Settled]) -> PyTree:
     """What was found, unchanged; where somebody watches, `of(found)` is put down in the program."""
     if not WATCHED.value:
         return found
@@ -59,7 +69,7 @@ def reported(found: PyTree, of: Callable[[Any], Report]) -> PyTree:
     arrays, rest = eqx.partition(found, lambda x: isinstance(x, jax.Array))
     leaves, structure = jtu.tree_flatten(arrays)
     told = of(found)
-    kept = _report_p.bind(*map(jnp.asarray, (*leaves, *told)))[: -len(told)]
+    kept = _report_p.bind(*map(jnp.asarray, (*leaves, *told)), kind=type(told))[: -len(told)]
     return eqx.combine(jtu.tree_unflatten(structure, kept), rest)
 
 
@@ -70,7 +80,11 @@ def patient(max_steps: int | None) -> int | None:
 
 
 def reporting(function: Callable) -> Callable:
-    """`function`, returning (what it returned, a `Report` of the integrations in it; None where there are none).
+    """`function`, returning what it returned, a `Report` of the integrations in it, and whether those are settled.
+
+    The report is None where there are no integrations. With `REGULAR_FIRST` integrations are taken for regular; where
+    they are not settled, what was returned is not to be used. It is None where none was taken for regular: also where
+    one is inside a loop or a branch, from which nobody is told.
 
     A check of the user's that calls the host (equinox's `error_if`) gives NaN where it fails: one lane must not end the
     others.
@@ -92,35 +106,41 @@ def reporting(function: Callable) -> Callable:
             return [jnp.asarray(x) for x in found]
 
         with WATCHED(True):
-            program = poisoned(jax.make_jaxpr(of_leaves)(*leaves))
-        reports = []
-        found = _told(program.jaxpr, program.consts, leaves, reports)
-        return jtu.tree_unflatten(rest[0], found), _together(reports)
+            program = jax.make_jaxpr(of_leaves)(*leaves)
+            if _hides(program.jaxpr):
+                with REGULAR_FIRST(False):
+                    program = jax.make_jaxpr(of_leaves)(*leaves)
+        program, marks = poisoned(program), []
+
+        def told(equation, operands):
+            if equation.primitive is _report_p:
+                kind = equation.params["kind"]
+                marks.append(kind(*operands[-len(kind._fields) :]))
+                return operands
+            return applied(program.jaxpr, equation, operands)
+
+        found = interpreted(program, leaves, told, lambda x, _: x, _reports)
+        reports = [x for x in marks if isinstance(x, Report)]
+        settled = [jnp.all(x.settled) for x in marks if isinstance(x, Settled)]
+        all_settled = jnp.all(jnp.stack(settled)) if settled else None
+        return jtu.tree_unflatten(rest[0], found), _together(reports), all_settled
 
     return wrapped
 
 
-def _told(jaxpr: Jaxpr, constants, args, reports):
-    """Evaluate a program; calls that contain reports are entered."""
-    values = dict(zip(jaxpr.constvars, constants)) | dict(zip(jaxpr.invars, args))
-    read = lambda x: x.val if isinstance(x, Literal) else values[x]
-    for equation in jaxpr.eqns:
-        operands = [read(x) for x in equation.invars]
-        if equation.primitive is _report_p:
-            reports.append(Report(*operands[-len(Report._fields) :]))
-            results = operands
-        elif equation.primitive.name in CALLS | CALLS_WITH_RULES and _reports(equation):
-            inner = next(p for p in equation.params.values() if isinstance(p, (ClosedJaxpr, Jaxpr)))
-            closed = inner if isinstance(inner, ClosedJaxpr) else ClosedJaxpr(inner, ())
-            results = _told(closed.jaxpr, closed.consts, operands, reports)
-        else:
-            results = evaluate(jaxpr, equation, values)
-        values.update(zip(equation.outvars, results))
-    return [read(x) for x in jaxpr.outvars]
-
-
 def _reports(equation):
-    return any(inner.primitive is _report_p or _reports(inner) for body in bodies(equation) for inner in body.eqns)
+    return any(inner.primitive is _report_p for body in bodies(equation) for inner in equations(body))
+
+
+def _hides(jaxpr):
+    """Whether a motion that was taken for regular is in a part of a program that is not entered."""
+    entered = [(equation, stands_for(equation)) for equation in jaxpr.eqns]
+    return any(_reports_settled(equation) if inner is None else _hides(inner.jaxpr) for equation, inner in entered)
+
+
+def _reports_settled(equation):
+    inside = (inner for body in bodies(equation) for inner in equations(body))
+    return any(inner.primitive is _report_p and inner.params["kind"] is Settled for inner in inside)
 
 
 def _together(reports):
@@ -135,13 +155,13 @@ def _together(reports):
     return Report(result, jnp.sum(steps), departure, jnp.nanmax(residuals))
 
 
-def _batched(operands, axes):
-    return _report_p.bind(*operands), axes
+def _batched(operands, axes, kind):
+    return _report_p.bind(*operands, kind=kind), axes
 
 
-def _jvp(primals, tangents):
-    return _report_p.bind(*primals), list(tangents)
+def _jvp(primals, tangents, kind):
+    return _report_p.bind(*primals, kind=kind), list(tangents)
 
 
-_same = lambda *operands: list(operands)
+_same = lambda *operands, kind: list(operands)
 _report_p = primitive("report", _same, _same, several=True, jvp=_jvp, batched=_batched)

@@ -4,8 +4,6 @@ Nothing here looks at values: a start that cannot be integrated is refused insid
 within a few rejected steps, and the lane keeps the reason in its result.
 """
 
-import threading
-from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
@@ -20,21 +18,20 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
 from lagjax.jax_internals.compiling import compiler_options
-from lagjax.jax_internals.one_function import called
-from lagjax.jax_internals.tracing import is_eager
-from lagjax.mechanics import constraints, coordinates
+from lagjax.jax_internals.tracing import is_eager, takes_for_regular
+from lagjax.mechanics import coordinates
 from lagjax.mechanics.coordinates import State
-from lagjax.mechanics.in_numbers import in_numbers
-from lagjax.mechanics.memory import Parted, filled_up, parted
-from lagjax.mechanics.saddle_point import equations_of_motion, is_regular, verdict
+from lagjax.mechanics.equations import Equations, equations_of
+from lagjax.mechanics.kept import kept
+from lagjax.mechanics.memory import filled_up, parted
+from lagjax.mechanics.memory_maps import share_used
 from lagjax.mechanics.structure import conserves_jacobi_integral, is_free_of_velocities
-from lagjax.mechanics.written_out import is_small, write_out
 from lagjax.motion.arriving import apart_from_jumps
 from lagjax.motion.both_modes import solve_in_both_modes
-from lagjax.motion.consistency import stopped, to_manifold, within, worst_residual
+from lagjax.motion.consistency import returned, stopped, within, worst_residual
 from lagjax.motion.crossing_times import all_known, by_name, end_of
 from lagjax.motion.loop import Solution, solution_of
-from lagjax.motion.memory_maps import maps_used, warn_of_memory_maps
+from lagjax.motion.reported import report_settled
 from lagjax.motion.trajectory import RESULTS, Moment, Trajectory, ended_well, pack, worst_drift
 from lagjax.numerics.nystrom import Nystrom, Nystrom12
 from lagjax.numerics.runge_kutta import Dopri8, ExplicitRungeKutta, in_our_form
@@ -49,8 +46,6 @@ PHASE_STEPS = 0.2
 FIXED_STEPS_ALLOW = 1e-5
 # The tightest tolerance that is not below round-off.
 ROUND_OFFS = 8
-# Motions whose programs are kept, of 10 to 130 MB each; fewer, where these use so much of the memory maps there are.
-KEPT, KEPT_AT_LEAST, MAPS_SHARE = 100, 8, 0.4
 # The operations of a right-hand side that is copied to each of a method's stages; a longer one is compiled once, in a
 # loop. In lanes of a rod or a double pendulum copies are twice as fast. A step by itself is a fifth slower in a loop,
 # but the first answer of a rod comes an eighth sooner, that of eight coupled masses in half the time. Derivatives are
@@ -103,21 +98,33 @@ def trajectory_of(*problem) -> Trajectory:
     `jit` takes longer than a short motion; it has better words for the checks that it puts into a program.
     """
     if not is_eager():
-        return _trajectory_of(*problem)
+        # A program of the user's, which is not kept here.
+        share_used()
+        return _inside(*problem)
     system, q0, v0, params, ts, guards, settings = problem
     # Filled up by its last time.
     many = np.append(ts, np.full(filled_up(len(ts)) - len(ts), ts[-1]))
     static, arrays = parted((system, q0, v0, params, many, guards, settings))
-    programs = _kept(static, len(ts))
+    programs = kept((_Programs, static), lambda: _Programs(static, len(ts)))
     try:
         if programs.regular is not None:
-            found, settled = programs.regular(arrays)
+            found, rows, settled = programs.regular(arrays)
             if settled:
-                return programs.first_outputs(found, len(ts))
+                return programs.first_outputs(found, rows, len(ts))
             programs.regular = None
-        return programs.first_outputs(jax.block_until_ready(programs.careful(arrays))[0], len(ts))
+        found, rows, _ = jax.block_until_ready(programs.careful(arrays))
+        return programs.first_outputs(found, rows, len(ts))
     except jax.errors.JaxRuntimeError:
-        return _trajectory_of(*problem)
+        return _trajectory_of(*problem)[0]
+
+
+def _inside(*problem):
+    """The trajectory in a program that is being traced; who takes it for regular there is told whether it is."""
+    *motion, settings = problem
+    # An adjoint that was asked for is there to be differentiated through.
+    regular = takes_for_regular() and settings.adjoint is None
+    found, settled = _trajectory_of(*motion, replace(settings, careful=not regular))
+    return report_settled(found, settled) if regular else found
 
 
 class _Programs:
@@ -126,53 +133,33 @@ class _Programs:
 
     def __init__(self, static, count):
         jit = partial(jax.jit, compiler_options=compiler_options())
-        self.regular: Callable | None = jit(partial(_of_arrays, static, False))
-        self.careful: Callable = jit(partial(_of_arrays, static, True))
+        self.regular: Callable | None = jit(partial(_of_arrays, static, False, count))
+        self.careful: Callable = jit(partial(_of_arrays, static, True, count))
         self._count = count
-        self._cut = jax.jit(lambda rows: [x[:count] for x in rows])
 
-    def first_outputs(self, found, count):
-        """The trajectory without the outputs that it was filled up by."""
-        if found.t.size == count:
+    def first_outputs(self, found, rows, count):
+        """The trajectory with so many outputs, of `rows` that were filled up."""
+        if count == self._count:
             return found
-        leaves, structure = jtu.tree_flatten(found)
-        size = len(jtu.tree_leaves((found.t, found.q, found.v, found.multipliers)))
-        rows = leaves[:size]
-        # A program for each number of outputs would be compiled; for the first one it is.
-        cut = self._cut(rows) if count == self._count else jax.device_put([np.asarray(x)[:count] for x in rows])
-        return jtu.tree_unflatten(structure, cut + leaves[size:])
+        # A program for each number of outputs would be compiled.
+        return replace(found, **jax.device_put(jtu.tree_map(lambda x: np.asarray(x)[:count], rows)))
 
 
-# What was integrated here, that used last at the end.
-_programs: OrderedDict[Parted, _Programs] = OrderedDict()
-_one_thread = threading.Lock()
-
-
-def _kept(static, count):
-    with _one_thread:
-        found = _programs.get(static)
-        if found is None:
-            found = _programs[static] = _Programs(static, count)
-            while len(_programs) > KEPT or len(_programs) > KEPT_AT_LEAST and maps_used() > MAPS_SHARE:
-                _programs.popitem(last=False)
-        _programs.move_to_end(static)
-        return found
-
-
-def _of_arrays(static, careful, arrays):
+def _of_arrays(static, careful, count, arrays):
+    """The trajectory with the number of outputs that was asked for first, all outputs, and whether it is settled."""
     *motion, settings = static.together(arrays)
-    return _trajectory(*motion, replace(settings, careful=careful, unroll_up_to=UNROLL_AT_ONCE_UP_TO))
+    found, settled = _trajectory(*motion, replace(settings, careful=careful, unroll_up_to=UNROLL_AT_ONCE_UP_TO))
+    rows = {"t": found.t, "q": found.q, "v": found.v, "multipliers": found.multipliers}
+    return replace(found, **jtu.tree_map(lambda x: x[:count], rows)), rows, settled
 
 
 @eqx.filter_jit
 def _trajectory_of(*problem):
-    return _trajectory(*problem)[0]
+    return _trajectory(*problem)
 
 
 def _trajectory(system, q0, v0, params, ts, guards, settings):
     """The trajectory, and whether it is settled: what was taken for regular failed for no other reason than that."""
-    # Here while it is traced, which is when something new is compiled.
-    warn_of_memory_maps()
     asked, method = settings.method, method_of(settings, system, ts[0], q0, v0, params)
     name = type(method).__name__ + ("" if asked is None or asked is method else " (diffrax's, in lagjax's form)")
     settings = eqx.tree_at(lambda s: s.method, settings, method, is_leaf=lambda x: x is None)
@@ -184,8 +171,9 @@ def _trajectory(system, q0, v0, params, ts, guards, settings):
         rest, settings = eqx.combine(fixed, static)
         *motion, jump_ts = eqx.combine(x, rest)
         unroll_up_to = 0 if differentiated else settings.unroll_up_to
-        settings = replace(settings, jump_ts=jump_ts, unroll_up_to=unroll_up_to)
-        return _solve_in_numbers(*motion, settings, adjoint)
+        careful = settings.careful or differentiated and settings.adjoint is None
+        settings = replace(settings, jump_ts=jump_ts, unroll_up_to=unroll_up_to, careful=careful)
+        return _solve(*motion, settings, adjoint)
 
     if settings.adjoint is None:
         fields = solve_in_both_modes(solved, x, fixed)
@@ -216,28 +204,23 @@ def method_of(settings, system, *state):
     return chosen if ours is None else ours
 
 
-def _solve_in_numbers(system, q0, v0, params, ts, guards, settings, adjoint):
-    """The solve, of a small system with the coordinates one by one."""
-    written = unflatten = None
+def _solve(system, q0, v0, params, ts, guards, settings, adjoint):
     ours = isinstance(settings.method, (ExplicitRungeKutta, Nystrom))
     # A condition that asks diffrax evaluates the vector field at the state that it gets, the user's.
-    if ours and settings.event is None and is_small(system, ts[0], q0, v0, params):
-        _, unflatten = coordinates.flatten(q0)
-        system, q0, v0 = in_numbers(system, unflatten), coordinates.numbers(q0), coordinates.numbers(v0)
-        guards = None if guards is None else guards.in_numbers(unflatten)
-        written = write_out(system, ts[0], q0, v0, params)
-    if written is None or not written.careful:
-        settings = replace(settings, careful=True)
-    fields = _solve(system, q0, v0, params, ts, guards, settings, adjoint, written)
-    if unflatten is None:
-        return fields
-    together = lambda numbers: unflatten(jnp.stack(numbers))
-    rows = jax.vmap(together)
+    quickly = ours and settings.event is None
+    equations = equations_of(system, ts[0], q0, v0, params, quickly=quickly, fallback=settings.careful)
+    if guards is not None and equations.unflatten is not None:
+        guards = guards.in_numbers(equations.unflatten)
+    start = _start(equations, equations.inside(q0), equations.inside(v0), ts, settings)
+    solution = _stepped(equations, start, ts, guards, settings, adjoint)
+    outputs = _outputs(equations, start, solution, ts, settings)
+    fields = _result(equations, start, solution, outputs, guards, settings)
+    rows = jax.vmap(equations.outside)
     end, events = fields["end"], fields["events"]
     return fields | {
         "q": rows(fields["q"]),
         "v": rows(fields["v"]),
-        "end": end._replace(q=together(end.q), v=together(end.v)),
+        "end": end._replace(q=equations.outside(end.q), v=equations.outside(end.v)),
         "events": {name: found.with_states(rows(found.q), rows(found.v)) for name, found in events.items()},
     }
 
@@ -258,52 +241,35 @@ class Outputs(NamedTuple):
     reached: Bool[Array, " T"]
 
 
-def _solve(system, q0, v0, params, ts, guards, settings, adjoint, written):
-    regular = None if settings.careful else written
-    start = _start(system, q0, v0, params, ts, settings, regular)
-    solution = _stepped(system, start, params, ts, guards, settings, adjoint, written)
-    outputs = _outputs(system, start, solution, params, ts, guards, settings, regular)
-    return _result(system, start, solution, outputs, params, guards, settings)
-
-
-def _start(system, q, v, params, ts, settings, regular) -> Start:
+def _start(equations: Equations, q, v, ts, settings) -> Start:
     """What speaks against a start comes in rising order: the last of what holds is the result."""
-    t, off_constraints = ts[0], jnp.asarray(False)
-    if system.constraints:
+    t, off_constraints, holds = ts[0], jnp.asarray(False), jnp.asarray(True)
+    if equations.system.constraints:
         tolerances = START_TOLERANCES * settings.rtol, START_TOLERANCES * settings.atol
-        off_constraints = ~within(system, t, q, v, params, *tolerances)
-    holds, projects = True, settings.drift == "project"
-    if regular is not None:
-        # What speaks against one that is not regular is not told apart.
-        q, v = called(regular.project(system, t, q, v, params)) if projects else (q, v)
-        solution = (*called(regular.equations(system, t, q, v, params)), system.lagrangian(t, q, v, params))
-        finite, contradictory = jnp.all(jnp.isfinite(coordinates.flatten(solution)[0])), jnp.asarray(False)
-        singular = ~is_regular(system, t, q, v, params)
-    else:
-        if projects:
-            projected = to_manifold(system, t, q, v, params, settings.rtol, settings.atol)
-            q, v, holds = projected.q, projected.v, projected.holds
-        _, _, finite, singular, contradictory = stopped(verdict(system, t, q, v, params))
+        off_constraints = ~within(equations, t, q, v, *tolerances)
+    if settings.drift == "project":
+        q, v, holds = returned(equations, t, q, v, settings.rtol, settings.atol)
+    _, _, finite, singular, contradictory = stopped(equations.verdict(t, q, v))
     too_small = settings.controller is None and settings.rtol[0] < ROUND_OFFS * jnp.finfo(ts.dtype).eps
     lengths = [length for length in (settings.dt0, settings.max_step) if length is not None]
     against = {
         "start_singular": singular,
         "start_not_finite": ~finite,
         "contradictory": contradictory,
-        "start_off_constraints": off_constraints | (finite & ~singular & ~jnp.asarray(holds)),
+        "start_off_constraints": off_constraints | (finite & ~singular & ~holds),
         "tolerance_too_small": jnp.asarray(too_small),
         "unordered": jnp.any(ts[1:] < ts[:-1]) | ~jnp.all(jnp.asarray([True, *(length > 0 for length in lengths)])),
     }
     return Start(q, v, against, jnp.any(jnp.stack([*against.values()])))
 
 
-def _stepped(system, start, params, ts, guards, settings, adjoint, written) -> Solution:
+def _stepped(equations, start, ts, guards, settings, adjoint) -> Solution:
     y0 = jax.tree.map(lambda x: jnp.where(start.refused, 0.0, x), (start.q, start.v))
-    first = State(ts[0], start.q, start.v, params)
+    first = State(ts[0], start.q, start.v, equations.params)
     if settings.dt0 is not None:
         # Where it is not positive the motion is refused; diffrax's own check would end the program.
         settings = replace(settings, dt0=jnp.where(settings.dt0 > 0, settings.dt0, 1.0))
-    solution = solution_of(system, written, first, y0, start.refused, ts, guards, settings, adjoint)
+    solution = solution_of(equations, first, y0, start.refused, ts, guards, settings, adjoint)
     if solution.located is None:
         return solution
     end = end_of(guards, solution.located, *solution.end)
@@ -311,19 +277,18 @@ def _stepped(system, start, params, ts, guards, settings, adjoint, written) -> S
     return solution._replace(end=end, reached=jnp.where(ts <= end[0], solution.reached, jnp.inf))
 
 
-def _outputs(system, start, solution, params, ts, guards, settings, regular) -> Outputs:
+def _outputs(equations, start, solution, ts, settings) -> Outputs:
     # What was not reached is evaluated at the start and masked afterwards: NaN times zero would poison gradients.
     reached = jnp.isfinite(solution.reached) & ~start.refused
     states = jax.tree.map(lambda x, x0: jnp.where(_like(reached, x), x, x0[None]), solution.outputs, (start.q, start.v))
     if settings.jump_ts is not None:
-        states = apart_from_jumps(system, ts, settings.jump_ts, *states, params)
+        states = apart_from_jumps(equations, ts, settings.jump_ts, *states)
     # One compiled evaluation for the outputs and the end together.
     t, (q, v) = jax.tree.map(lambda x, last: jnp.concatenate([x, last]), (ts, states), solution.end)
-    multipliers = _multipliers(system, regular, t, q, v, params)
-    return Outputs(Moment(t, q, v, multipliers), reached)
+    return Outputs(Moment(t, q, v, jax.vmap(equations.multipliers)(t, q, v)), reached)
 
 
-def _result(system, start, solution, outputs, params, guards, settings):
+def _result(equations, start, solution, outputs, guards, settings):
     """The fields of the trajectory: NaN where it did not come, and why."""
     (motion, reached), located = outputs, solution.located
     result = RESULTS.promote(solution.result)
@@ -331,7 +296,8 @@ def _result(system, start, solution, outputs, params, guards, settings):
         result = RESULTS.where(result == getattr(RESULTS, reported), getattr(RESULTS, ours), result)
     # An output is a step of its own, and can fail where the steps of the solve did not.
     known = jnp.all(jnp.isfinite(coordinates.flatten(jax.tree.map(lambda x: x[:-1], (motion.q, motion.v)))[0]))
-    if not settings.careful:
+    regular = equations.are_taken_for_regular
+    if regular:
         known = known & jnp.all(jnp.isfinite(coordinates.flatten(motion.multipliers)[0]))
         known = known if located is None else known & all_known(located)
     result = RESULTS.where(ended_well(result) & ~known, RESULTS.unsolved_step, result)
@@ -346,21 +312,20 @@ def _result(system, start, solution, outputs, params, guards, settings):
         "multipliers": masked.multipliers,
         "end": end,
         "stats": stats,
-        "departure": _departure(system, stopped((motion.t, motion.q, motion.v, params)), stats, settings),
+        "departure": _departure(stopped(equations), *stopped((motion.t, motion.q, motion.v)), stats, settings),
         "result": result,
-        "settled": settings.careful | ended_well(result) | _among(result, THE_SAME),
+        "settled": ended_well(result) | _among(result, THE_SAME) if regular else jnp.asarray(True),
         "events": {} if located is None else by_name(guards, located, motion.t[-1:], ~start.refused),
     }
 
 
-def _departure(system, motion, stats, settings):
+def _departure(equations, t, q, v, stats, settings):
     """How far what must stay constant has changed at the outputs, in units of what the tolerance lets expect.
 
     An error of the Jacobi integral that grows steadily shifts the phase by about its size a radian, so that over very
     many steps less of it is allowed. With steps that the tolerance does not choose it counts for itself.
     """
-    t, q, v, params = motion
-    drift = residual = jnp.zeros_like(t[0])
+    system, params, drift, residual = equations.system, equations.params, jnp.zeros_like(t[0]), jnp.zeros_like(t[0])
     if conserves_jacobi_integral(system, t[0], *jax.tree.map(lambda x: x[0], (q, v)), params):
         drift = worst_drift(system, t, q, v, params)
     if system.constraints and settings.drift != "project":
@@ -370,15 +335,6 @@ def _departure(system, motion, stats, settings):
     rtol = jnp.maximum(settings.rtol[0], jnp.finfo(t.dtype).eps)
     phase = drift * stats["num_accepted_steps"] / PHASE_STEPS
     return jnp.maximum(jnp.maximum(drift, residual) / (DRIFT_TOLERANCES * rtol), phase)
-
-
-def _multipliers(system, regular, t, q, v, params):
-    def at(t, q, v):
-        if regular is None:
-            return equations_of_motion(system, t, q, v, params)[1]
-        return constraints.split(system, called(regular.equations(system, t, q, v, params))[1], t, q, v, params)
-
-    return jax.vmap(at)(t, q, v) if system.constraints else {}
 
 
 def _among(result, others):

@@ -20,10 +20,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, PyTree
 
 from lagjax.jax_internals.one_function import called
-from lagjax.mechanics import constraints
-from lagjax.mechanics.in_numbers import Numbers
-from lagjax.mechanics.saddle_point import equations_of_motion, independent_equations
-from lagjax.mechanics.system import System
+from lagjax.mechanics.equations import Equations, all_finite
 from lagjax.motion.arriving import between_jumps
 from lagjax.motion.consistency import to_manifold
 from lagjax.numerics.interpolation import Interpolation
@@ -50,29 +47,38 @@ class Tolerances(NamedTuple):
 class Stages(NamedTuple):
     """What the vector field gets in the stages of one step: the constraint equations to solve with do not change."""
 
-    params: PyTree
     independent: Bool[Array, " m"] | None
 
 
-class Quick(eqx.Module):
-    """A step on equations that are written out, which may give NaN where the careful one does not.
+class Field(eqx.Module):
+    """d(q, v)/dt = (v, a), the careful way; with Baumgarte's feedback, if there is a rate of it."""
 
-    `project` is None where a step is not returned to constraints. `inside` is the same method with a loop over its
-    stages, for steps to times inside another one, which are asked for at two places.
+    equations: Equations
+    feedback: Float[Array, ""] | None = None
+
+    def __call__(self, t, y, args):
+        independent = args.independent if isinstance(args, Stages) else None
+        return y[1], called(self.equations.accelerations(t, *y, self.feedback, independent))[0]
+
+
+class QuickField(eqx.Module):
+    """The same from the equations written out, which may give NaN where the careful way does not."""
+
+    equations: Equations
+
+    def __call__(self, t, y, args):
+        return y[1], self.equations.quickly(t, *y)[0]
+
+
+class Quick(NamedTuple):
+    """The methods of steps on equations that are written out.
+
+    `inside` is the same method with a loop over its stages, for steps to times inside another one, which are asked for
+    at two places.
     """
 
     solver: diffrax.AbstractSolver
     inside: diffrax.AbstractSolver
-    terms: PyTree[diffrax.AbstractTerm]
-    project: Numbers | None = eqx.field(static=True)
-    prepared: tuple
-    careful: bool = eqx.field(static=True)
-
-    def flow(self, t0, t1, y0, args):
-        """The state at t1, by one step."""
-        state = self.inside.init(self.terms, t0, t1, y0, args)
-        y, *_ = self.inside.step(self.terms, t0, t1, y0, args, state, True)
-        return y if self.project is None else called(self.project.at(self.prepared, t1, *y))
 
 
 class OnManifold(diffrax.AbstractWrappedSolver):
@@ -84,16 +90,16 @@ class OnManifold(diffrax.AbstractWrappedSolver):
     `arriving` says that outputs are wanted at the ends of steps only. `jump_ts` become ends of steps by the controller;
     here each step stays on its side of them.
 
-    What the dense output needs of the problem (`terms`, `params`) belongs to the solver, since diffrax hands
-    an interpolation only times and states. Where `refused`, and where a step is not finite, its error is infinite: an
-    adaptive solve ends within a few steps at the smallest step size, one with fixed steps at once.
+    The equations belong to the solver, since diffrax hands an interpolation only times and states; with `quick` it
+    steps on those that are written out. `feedback` is the rate of Baumgarte's. Where `refused`, and where a step is not
+    finite, its error is infinite: an adaptive solve ends within a few steps at the smallest step size, one with fixed
+    steps at once.
     """
 
     solver: diffrax.AbstractSolver
-    system: System
-    terms: PyTree[diffrax.AbstractTerm]
+    equations: Equations
     quick: Quick | None
-    params: PyTree
+    feedback: Float[Array, ""] | None
     refused: Bool[Array, ""]
     tolerances: Tolerances
     angles: tuple[bool, ...] = eqx.field(static=True)
@@ -128,6 +134,16 @@ class OnManifold(diffrax.AbstractWrappedSolver):
     def interpolation_cls(self) -> Callable:
         return self._between
 
+    @property
+    def terms(self) -> diffrax.AbstractTerm:
+        """The vector field the careful way."""
+        return diffrax.ODETerm(Field(self.equations, self.feedback))
+
+    @property
+    def quick_terms(self) -> diffrax.AbstractTerm:
+        """The vector field as it is written out."""
+        return diffrax.ODETerm(QuickField(self.equations))
+
     def _between(self, *, t0, t1, y0, y1=None, state=None):
         if self.arriving:
             return Arrived(t0=t0, t1=t1, y0=y0, y1=y1)
@@ -144,26 +160,26 @@ class OnManifold(diffrax.AbstractWrappedSolver):
 
     def init(self, terms, t0, t1, y0, args):
         if self.quick is not None:
-            return self.quick.solver.init(self.quick.terms, t0, t1, y0, args)
-        return self.solver.init(terms, t0, t1, y0, self._stages(t0, y0, args))
+            return self.quick.solver.init(self.quick_terms, t0, t1, y0, args)
+        return self.solver.init(self.terms, t0, t1, y0, self._stages(t0, y0))
 
     def func(self, terms, t0, y0, args):
         # Only used to choose the first step, which has to be finite even where the motion is refused.
         if self.quick is not None:
-            rate = self.quick.terms.vf(t0, y0, args)
+            rate = self.quick_terms.vf(t0, y0, args)
         else:
-            rate = self.solver.func(terms, t0, y0, self._stages(t0, y0, args))
+            rate = self.solver.func(self.terms, t0, y0, self._stages(t0, y0))
         return jtu.tree_map(lambda f: jnp.where(self.refused | ~jnp.isfinite(f), 0.0, f), rate)
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         if self.jump_ts is not None:
             t0, t1, made_jump = between_jumps(t0, t1, self.jump_ts, made_jump)
         if self.quick is None:
-            y1, error, solver_state, result = self._careful_step(terms, t0, t1, y0, args, solver_state, made_jump)
+            y1, error, solver_state, result = self._careful_step(t0, t1, y0, solver_state, made_jump)
         else:
-            y1, error, solver_state, result = self._quick_step(t0, t1, y0, args, solver_state, made_jump)
+            y1, error, solver_state, result = self._quick_step(t0, t1, y0, solver_state, made_jump)
         # Infinite, a state would make its own error relative to it zero.
-        failed = self.refused | ~_all_finite((y1, error))
+        failed = self.refused | ~all_finite((y1, error))
         y1 = jtu.tree_map(lambda y1, y0: jnp.where(failed, y0, y1), y1, y0)
         error = jtu.tree_map(lambda x: jnp.where(failed, jnp.inf, x), error)
         result = diffrax.RESULTS.where(failed & (result == diffrax.RESULTS.successful), NOT_FINITE, result)
@@ -175,77 +191,60 @@ class OnManifold(diffrax.AbstractWrappedSolver):
 
     # Jitted, so that it is traced once: diffrax traces the body of its loop three times.
     @eqx.filter_jit
-    def _quick_step(self, t0, t1, y0, args, solver_state, made_jump):
-        quick = self.quick
+    def _quick_step(self, t0, t1, y0, solver_state, made_jump):
+        quick, terms = self.quick, self.quick_terms
         assert quick is not None
-        jumped = made_jump if quick.project is None else True
-        y1, error, _, solver_state, result = quick.solver.step(quick.terms, t0, t1, y0, args, solver_state, jumped)
-        if quick.project is not None:
-            y1 = called(quick.project.at(quick.prepared, t1, *y1))
+        jumped = True if self.project else made_jump
+        y1, error, _, solver_state, result = quick.solver.step(terms, t0, t1, y0, None, solver_state, jumped)
+        if self.project:
+            y1 = self.equations.projected(t1, *y1)
         if self.weigh:
             error = self._weighed(y0, y1, error)
-        if not quick.careful:
+        if not self.equations.fallback:
             return y1, error, solver_state, result
-        believed = _all_finite((y1, error))
+        believed = all_finite((y1, error))
 
         def again():
-            y1, error, _, result = self._careful_step(self.terms, t0, t1, y0, args, None, True)
-            return y1, error, quick.solver.init(quick.terms, t1, t1, y1, args), result
+            y1, error, _, result = self._careful_step(t0, t1, y0, None, True)
+            return y1, error, quick.solver.init(terms, t1, t1, y1, None), result
 
         # A branch also in a batch, where it is taken for all lanes or none.
         return lax.cond(eqxi.unvmap_all(believed), lambda: (y1, error, solver_state, result), again)
 
-    def _careful_step(self, terms, t0, t1, y0, args, solver_state, made_jump):
+    def _careful_step(self, t0, t1, y0, solver_state, made_jump):
         # The projection moves the state, so a derivative kept from the last step's end is stale.
         jumped = True if self.project else made_jump
-        stages = self._stages(t0, y0, args)
+        terms, stages = self.terms, self._stages(t0, y0)
         if solver_state is None:
             solver_state = self.solver.init(terms, t0, t1, y0, stages)
         y1, error, _, solver_state, result = self.solver.step(terms, t0, t1, y0, stages, solver_state, jumped)
         if self.weigh and error is not None:
             error = self._weighed(y0, y1, error)
         if self.project:
-            projected = to_manifold(self.system, t1, *y1, args, *self.tolerances)
+            projected = to_manifold(self.equations, t1, *y1, *self.tolerances)
             y1 = (projected.q, projected.v)
             error = jtu.tree_map(lambda x: jnp.where(projected.holds, x, jnp.inf), error)
             result = diffrax.RESULTS.where(projected.holds, result, diffrax.RESULTS.nonlinear_divergence)
         return y1, error, solver_state, result
 
-    def flow(self, t0, y0, t, args):
+    def flow(self, t0, y0, t):
         """The state at t, by one step from t0."""
         begin, end = (t0, t) if self.jump_ts is None else between_jumps(t0, t, self.jump_ts, True)[:2]
         # Asked seldom: one kind of step compiles in a third of the time of both.
-        if self.quick is not None and self._is_regular:
-            y = self.quick.flow(begin, end, y0, args)
+        if self.quick is None or self.equations.fallback:
+            y = self._careful_step(begin, end, y0, None, True)[0]
         else:
-            y = self._careful_step(self.terms, begin, end, y0, args, None, True)[0]
+            method, terms = self.quick.inside, self.quick_terms
+            y, *_ = method.step(terms, begin, end, y0, None, method.init(terms, begin, end, y0, None), True)
+            y = self.equations.projected(end, *y) if self.project else y
         return jtu.tree_map(lambda y, y0: jnp.where(t > t0, y, y0), y, y0)
 
-    def multipliers(self, t, y, args):
-        """The multipliers by name, for outputs: derivatives flow through them."""
-        if not self.system.constraints:
-            return {}
-        return self.rates(t, y, args)[1] if self._is_regular else equations_of_motion(self.system, t, *y, args)[1]
-
-    @property
-    def _is_regular(self):
-        """Whether the careful way is not to be had."""
-        return self.quick is not None and not self.quick.careful
-
-    def rates(self, t, y, args, believe=False):
+    def rates(self, t, y, believe=False):
         """The accelerations, and the multipliers by name; with `believe` of a quick result, which may be NaN."""
-
-        def carefully():
-            a = self.terms.vf(t, y, args)[1]
-            return a, equations_of_motion(self.system, t, *y, args)[1] if self.system.constraints else {}
-
-        if self.quick is None:
-            return carefully()
-        a, stacked = self.quick.terms.vector_field.solved(t, y)
-        quickly = a, constraints.split(self.system, stacked, t, *y, args)
-        if believe or not self.quick.careful:
-            return quickly
-        return lax.cond(eqxi.unvmap_all(_all_finite(quickly)), lambda: quickly, carefully)
+        a, multipliers = self.equations.rates(t, *y, believe)
+        if self.feedback is not None:
+            a, _ = self.equations.accelerations(t, *y, self.feedback)
+        return a, multipliers
 
     def acceptable(self, y0, y1, error):
         """Whether an output's error is not far above the tolerance; a step to it has not passed the controller.
@@ -274,9 +273,9 @@ class OnManifold(diffrax.AbstractWrappedSolver):
         dq = jtu.tree_map(lambda a, b, e, angle: weighed(a, b, e, rtol_q, atol_q, angle), q0, q1, dq, angles)
         return dq, jtu.tree_map(lambda a, b, e: weighed(a, b, e, rtol_v, atol_v, False), v0, v1, dv)
 
-    def _stages(self, t, y, params):
+    def _stages(self, t, y):
         threshold = None if self.project else DEPENDENT_BELOW_WHILE_DRIFTING
-        return Stages(params, independent_equations(self.system, t, *y, params, threshold))
+        return Stages(self.equations.independent(t, *y, threshold))
 
 
 class Arrived(Interpolation):
@@ -307,14 +306,9 @@ class SteppedTo(Interpolation):
         t0, made_jump = self.t0, False
         if s.jump_ts is not None:
             t0, t, made_jump = between_jumps(t0, t, s.jump_ts, made_jump)
-        y, error, _, result = s._careful_step(s.terms, t0, t, self.y0, s.params, self.state, made_jump)
+        y, error, _, result = s._careful_step(t0, t, self.y0, self.state, made_jump)
         believed = (result == diffrax.RESULTS.successful) & s.acceptable(self.y0, y, error)
         return jtu.tree_map(lambda x: jnp.where(believed, x, jnp.nan), y)
-
-
-def _all_finite(tree):
-    # One sum instead of a reduction a leaf: zero times NaN or infinity is NaN.
-    return sum(jnp.sum(0 * x) for x in jtu.tree_leaves(tree)) == 0
 
 
 def forward_differentiable(method):

@@ -27,10 +27,11 @@ import numpy as np
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.coordinates import State
 from lagjax.mechanics.diagnosis import describe, explain_failure
-from lagjax.mechanics.saddle_point import equations_of_motion
+from lagjax.mechanics.equations import equations_of
 from lagjax.motion.consistent_state import consistent_state
-from lagjax.motion.loop import Field, method_alone
+from lagjax.motion.loop import method_alone
 from lagjax.motion.solve import method_of
+from lagjax.motion.stepping import Field
 from lagjax.motion.trajectory import RESULTS
 
 # The steps that are looked at; the first of them only find their length.
@@ -149,7 +150,8 @@ def look(trajectory, settings) -> Steps:
     """Take up the motion where it ended, and put down each step."""
     system, params, end = trajectory.system, trajectory.params, trajectory.end
     state = (end.t, end.q, end.v, params)
-    method, terms = method_alone(settings, method_of(settings, system, *state)), diffrax.ODETerm(Field(system, None))
+    method = method_alone(settings, method_of(settings, system, *state))
+    terms = diffrax.ODETerm(Field(equations_of(system, *state)))
     order = float(method.error_order(terms))
     way, last = np.sign(float(trajectory.t[-1] - end.t)), float(trajectory.t[-1])
     t, y = float(end.t), (end.q, end.v)
@@ -203,7 +205,7 @@ class _Path:
 
 
 def _acceleration(system, params, t, q, v):
-    return equations_of_motion(system, t, q, v, params)[0]
+    return equations_of(system, t, q, v, params).accelerations(t, q, v)[0]
 
 
 @eqx.filter_jit
@@ -378,7 +380,8 @@ def _beyond(trajectory):
 def _fastest(trajectory):
     """The coordinate whose acceleration is largest at the end: that of a collision or a coordinate singularity."""
     end = trajectory.end
-    values = np.abs(coordinates.flatten(equations_of_motion(trajectory.system, *end[:3], trajectory.params)[0])[0])
+    a = _acceleration(trajectory.system, trajectory.params, *end[:3])
+    values = np.abs(coordinates.flatten(a)[0])
     names = coordinates.names(end.q)
     if len(names) == 0 or not np.all(np.isfinite(values)):
         return ""

@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Float, PyTree
 from lagjax import plot
 from lagjax.animation import Animation
 from lagjax.mechanics import coordinates
+from lagjax.mechanics.compiled import compiled
 from lagjax.mechanics.structure import angles, what_changes_jacobi_integral
 from lagjax.mechanics.system import System
 from lagjax.motion import frames
@@ -347,11 +348,11 @@ def _columns(values):
     return [(f"[{i}]", column) for i, column in enumerate(values.T)]
 
 
-@eqx.filter_jit
+@compiled
 def _worst_drift(system, t, q, v, params):
     return worst_drift(system, t, q, v, params)
 
 
-@eqx.filter_jit
+@compiled
 def _worst_residual(system, t, q, v, params):
     return worst_residual(system, t, q, v, params)

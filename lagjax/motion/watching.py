@@ -151,7 +151,7 @@ class Watching(diffrax.AbstractStepSizeController):
     def _at_a_glance(self, keep, t0, t1, y0, y1, args, watched: Watched):
         """Whether a step is seen at once to have no crossing; and then its end, and what is known of the guards."""
         # What is not finite is in doubt.
-        a, _ = self.motion.rates(t1, y1, args, believe=True)
+        a, _ = self.motion.rates(t1, y1, believe=True)
         values, _, inner = self._seen(watched.end, self._unseen(t1, y1, a), args)
         of_guards = self._judged(watched.end, Node(t1, y1, a, values), inner)
         signs = [(f.sign, p.sign) for f, p in zip(watched.followed, of_guards)]
@@ -190,10 +190,10 @@ class Watching(diffrax.AbstractStepSizeController):
         def look(s: Search) -> Search:
             looks = s.look & ~s.done
             begins, ends, inside = (looks & (s.where == kind) for kind in (AT_START, AT_END, INSIDE))
-            flow = lambda: self.motion.flow(t0, y0, s.at, args)
+            flow = lambda: self.motion.flow(t0, y0, s.at)
             y = lax.cond(eqxi.unvmap_any(inside), flow, lambda: y1)
             y = _where(begins, y0, _where(ends, y1, y))
-            a = lax.cond(eqxi.unvmap_any(looks), lambda: self.motion.rates(s.at, y, args)[0], lambda: s.right.a)
+            a = lax.cond(eqxi.unvmap_any(looks), lambda: self.motion.rates(s.at, y)[0], lambda: s.right.a)
             right = _where(looks, self._unseen(s.at, y, a), s.right)
             values, times, inner = self._seen(s.left, right, args, with_noise=True)
             right = right._replace(values=_where(looks, values, right.values))
@@ -218,7 +218,7 @@ class Watching(diffrax.AbstractStepSizeController):
 
     def value(self, t, y, args):
         """Each guard at one state."""
-        multipliers = self.motion.rates(t, y, args)[1] if self.guards.take_multipliers else {}
+        multipliers = self.motion.rates(t, y)[1] if self.guards.take_multipliers else {}
         return self.guards(t, *y, multipliers, args)
 
     def _seen(self, left: Node, right: Node, args, with_noise=False):

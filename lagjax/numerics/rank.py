@@ -67,3 +67,17 @@ def unit_rows(rows: Float[Array, "m n"]) -> tuple[Float[Array, "m n"], Float[Arr
     shape = rows / jnp.where(largest > 0, largest, 1.0)[:, None]
     length = largest * jnp.sqrt(jnp.sum(shape**2, axis=1))
     return rows / jnp.where(length > 0, length, 1.0)[:, None], length
+
+
+def null_space(rows: np.ndarray, smallest: float | None = None) -> np.ndarray:
+    """An orthonormal basis (n, k) of the vectors that the rows (m, n) take to zero, outside of compiled programs.
+
+    >>> print(abs(null_space(np.array([[1.0, 1.0, 0.0]]))).round(3).sum(axis=1))
+    [0.707 0.707 1.   ]
+
+    Singular values up to `smallest` times the largest count as zero, by default round-off. (SciPy's function of the
+    same name takes longer to import than all of lagjax.)
+    """
+    _, sizes, directions = np.linalg.svd(rows)
+    least = max(rows.shape) * np.finfo(sizes.dtype).eps if smallest is None else smallest
+    return directions[np.sum(sizes > least * np.max(sizes, initial=0.0)) :].T

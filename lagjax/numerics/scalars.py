@@ -11,14 +11,15 @@ flow, and arrays of more than `LARGE` entries are left as they are.
 
 import math
 from collections.abc import Callable
+from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
-from lagjax.jax_internals.names import CALLS, ELEMENTWISE
-from lagjax.jax_internals.programs import ClosedJaxpr, Literal, evaluate, written
+from lagjax.jax_internals.names import CALLS, ELEMENTWISE, IN_NUMPY
+from lagjax.jax_internals.programs import ClosedJaxpr, applied, interpreted
 from lagjax.numerics.elementary import sincos_in_lanes
 
 LARGE = 512
@@ -39,7 +40,8 @@ def written_out(closed: ClosedJaxpr, *args, most: float = math.inf) -> list:
     """
     # What is known beforehand follows the same rules as in the compiled program: 1/0 is infinite, and nobody is warned.
     with np.errstate(all="ignore"):
-        results = _evaluate(closed, [_split(x) if _small(x.aval) else x for x in map(_Value, args)], _Book(most))
+        inputs = [_split(x) if _small(x.aval) else x for x in map(_Value, args)]
+        results = interpreted(closed, inputs, partial(_apply, closed.jaxpr, _Book(most)), _constant, _is_plain_call)
     return [_joined(x, aval) for x, aval in zip(results, closed.out_avals)]
 
 
@@ -99,41 +101,27 @@ def _joined(value, aval):
     return jnp.stack(entries).reshape(aval.shape) if entries else jnp.zeros(aval.shape, aval.dtype)
 
 
-def _evaluate(closed, args, book):
-    jaxpr = closed.jaxpr
-    values = dict(zip(jaxpr.invars, args))
-    for variable, constant in zip(jaxpr.constvars, closed.consts):
-        value = _Value(constant)
-        values[variable] = _split(value) if _small(variable.aval) else value
-
-    def read(x):
-        if isinstance(x, Literal):
-            return _known(written(x))
-        return values[x]
-
-    for equation in jaxpr.eqns:
-        values.update(zip(equation.outvars, _apply(equation, [read(x) for x in equation.invars], jaxpr, book)))
-    return [read(x) for x in jaxpr.outvars]
+def _constant(x, aval):
+    if not _small(aval):
+        return _Value(x)
+    return _split(_Value(x)) if isinstance(x, Tracer) else _known(np.asarray(x, aval.dtype))
 
 
-def _apply(equation, operands, jaxpr, book):
+def _is_plain_call(equation):
+    return equation.primitive.name in CALLS
+
+
+def _apply(jaxpr, book, equation, operands):
     name, params = equation.primitive.name, equation.params
     apart = all(isinstance(x, np.ndarray) for x in operands) and all(_small(x.aval) for x in equation.outvars)
-    if name in CALLS and len(_programs(params)) == 1:
-        return _evaluate(_programs(params)[0], operands, book)
     if apart and name in ELEMENTWISE:
         return [_elementwise(equation, operands, book)]
     if apart and name in MOVES:
         found = MOVES[name](params, equation.outvars, *operands)
         if found is not None:
             return found
-    whole = {v: _joined(x, v.aval) for x, v in zip(operands, equation.invars) if not isinstance(v, Literal)}
-    results = evaluate(jaxpr, equation, whole)
+    results = applied(jaxpr, equation, [_joined(x, v.aval) for x, v in zip(operands, equation.invars)])
     return [_split(x) if _small(v.aval) else x for x, v in zip(map(_Value, results), equation.outvars)]
-
-
-def _programs(params):
-    return [p for p in params.values() if isinstance(p, ClosedJaxpr)]
 
 
 def _pair(x, pairs):
@@ -186,16 +174,9 @@ def _simplified(equation, dtype, pairs, *x):
         return _pair(x[0], pairs)[name == "cos"]
     if name == "div" and jnp.issubdtype(dtype, jnp.floating) and all(isinstance(y, np.generic) for y in x):
         return np.divide(*x)
-    if name in KNOWN and all(isinstance(y, np.generic) for y in x):
-        return np.asarray(KNOWN[name](*x), dtype)[()]
+    if name in IN_NUMPY and all(isinstance(y, np.generic) for y in x):
+        return np.asarray(IN_NUMPY[name](*x), dtype)[()]
     return equation.primitive.bind(*x, **equation.params)
-
-
-KNOWN = {
-    "sub": np.subtract, "max": np.maximum, "min": np.minimum, "eq": np.equal, "ne": np.not_equal, "lt": np.less,
-    "le": np.less_equal, "gt": np.greater, "ge": np.greater_equal, "and": np.bitwise_and, "or": np.bitwise_or,
-    "not": np.invert, "abs": np.abs, "square": np.square,
-}  # fmt: skip
 
 
 def _add(x, y):

@@ -19,9 +19,10 @@ from lagjax.jax_internals.one_function import TOGETHER
 from lagjax.meter import meter
 from lagjax.motion.trajectory import RESULTS
 from lagjax.sweeps.axes import axes_of
-from lagjax.sweeps.fingerprint import check_file_names, in_words, named_leaves, versions
-from lagjax.sweeps.lanes import GOOD, LAYOUTS, NOT_RUN, STATUS_TYPES, Status
-from lagjax.sweeps.memory import bytes_of, check_memory
+from lagjax.sweeps.blocks import block_of, compare_versions
+from lagjax.sweeps.fingerprint import check_file_names, named_leaves
+from lagjax.sweeps.lanes import LAYOUTS, NOT_RUN, STATUS_TYPES, Status
+from lagjax.sweeps.memory import check_memory
 from lagjax.sweeps.remembered import program_for
 from lagjax.sweeps.result import Stored, Sweep
 from lagjax.sweeps.store import chunk_of, open_store, tell
@@ -30,17 +31,15 @@ from lagjax.sweeps.store import chunk_of, open_store, tell
 CHUNK = {"cpu": 1024, "gpu": 65536}
 # On a CPU each core gets so many chunks or more, so that none waits long for the last.
 CHUNKS_EACH = 4
-# A block of a store is written about so often, and holds no more than this.
-BLOCK_SECONDS, BLOCK_BYTES = 2.0, 256e6
 # Points whose steps tell the order of the rest.
 PILOTS = 256
 # The longest of which takes no more than this times the mean: nothing is gained by sorting.
 ALIKE = 1.5
 # Lanes together wait for the longest: one that takes more steps than this is run again, alone.
 PATIENCE = 2**15
+# Where more points of a chunk than this part are not settled, the next ones are not taken for regular.
+MOSTLY = 0.25
 MAX_STEPS = int(RESULTS.max_steps_reached._value)
-# Two versions may differ by so much, relative to the largest value, before it is told.
-ALIKE_VERSIONS = 1e-6
 
 
 def sweep(
@@ -116,7 +115,7 @@ def sweep(
     part = (jax.process_index(), jax.process_count()) if part is None else part
     _check(layout, part, store)
     platform = devices[0].platform
-    cores = _cores() if platform == "cpu" else 2
+    cores = usable_cores() if platform == "cpu" else 2
     workers = (cores if len(devices) == 1 else 2) if workers is None else workers
     if chunk is None and store is not None and Path(store).exists():
         # What was begun on other cores goes on as it was begun.
@@ -134,17 +133,21 @@ def sweep(
 
 
 class _Engine:
-    """A compiled program and how it is called."""
+    """A compiled program and how it is called.
+
+    It takes motions for regular, which compiles in two thirds of the time: the careful program is compiled when a point
+    turns out to need it.
+    """
 
     def __init__(self, run, axes, chunk, workers, sort, layout, devices, progress):
         self.run, self.axes, self.chunk = run, axes, math.ceil(chunk / len(devices)) * len(devices)
         self.workers, self.sort, self.layout, self.devices = workers, sort, layout, devices
         self.progress = progress
-        patience = PATIENCE if layout == "together" else None
-        self.program, seconds = program_for(run, axes, self.chunk, devices, layout, patience, progress)
+        self._patience = PATIENCE if layout == "together" else None
+        self.program, seconds = self._program(careful=False, progress=progress)
         # Before anything runs, and since then.
         self._compiling = [seconds, 0.0]
-        self._lock, self._one = threading.Lock(), None
+        self._lock, self._one, self._slow = threading.Lock(), None, None
 
     def seconds_since(self, started):
         """The seconds of compiling and of computing since then; what was compiled before it for that, too."""
@@ -165,21 +168,41 @@ class _Engine:
         chunk = _length(count, self.workers, self.chunk)
         return _Engine(run, self.axes, chunk, self.workers, self.sort, self.layout, self.devices, self.progress)
 
+    def _program(self, careful, progress=False):
+        chunk, devices, layout = self.chunk, self.devices, self.layout
+        return program_for(self.run, self.axes, chunk, devices, layout, self._patience, careful, progress)
+
+    def seconds_of(self, indices):
+        """The seconds of computing at no more than `chunk` indices."""
+        started, (_, compiling) = time.perf_counter(), self._compiling
+        self.first(indices)
+        return time.perf_counter() - started - (self._compiling[1] - compiling)
+
     def first(self, indices):
-        """(values, status) at no more than `chunk` indices, as the program of many lanes has them."""
-        return self.program.call(self.axes.at(np.resize(indices, self.chunk)), len(indices))
+        """(values, status) at no more than `chunk` indices, as the programs of many lanes have them."""
+        if self.program.irregular.is_set():
+            return self._carefully(indices)
+        values, status, settled = self._called(self.program, indices)
+        if settled is None or settled.all():
+            return values, status
+        if np.mean(~settled) > MOSTLY:
+            self.program.irregular.set()
+        return _replaced((values, status), ~settled, self._carefully(indices[~settled]))
+
+    def _carefully(self, indices):
+        return self._called(self._careful, indices)[:2]
+
+    def _called(self, program, indices):
+        return program.call(self.axes.at(np.resize(indices, self.chunk)), len(indices))
 
     def at(self, indices):
         """(values, status) at no more than `chunk` indices; lanes that were given up are run alone."""
         values, status = self.first(indices)
         given_up = (status.result == MAX_STEPS) & (status.steps >= PATIENCE) & (self.layout == "together")
-        if given_up.any():
-            values, status = jax.tree.map(np.array, (values, status))
-            for i in np.flatnonzero(given_up):
-                alone = self._alone.call(self.axes.at(indices[i : i + 1]), 1)
-                for every, one in zip(*map(jax.tree.leaves, ((values, status), alone))):
-                    every[i] = one[0]
-        return values, status
+        if not given_up.any():
+            return values, status
+        alone = [self._alone.call(self.axes.at(indices[i : i + 1]), 1)[:2] for i in np.flatnonzero(given_up)]
+        return _replaced((values, status), given_up, jax.tree.map(lambda *x: np.concatenate(x), *alone))
 
     @property
     def _alone(self):
@@ -189,6 +212,14 @@ class _Engine:
                 self._one, seconds = program_for(self.run, self.axes, 1, self.devices[:1], "in turn")
                 self._compiling[1] += seconds
         return self._one
+
+    @property
+    def _careful(self):
+        with self._lock:
+            if self._slow is None:
+                self._slow, seconds = self._program(careful=True)
+                self._compiling[1] += seconds
+        return self._slow
 
     def over(self, indices):
         """(places among some indices, values, status) of chunks of them as they are finished, in any order."""
@@ -221,6 +252,14 @@ class _Engine:
         if self.sort is None and steps.max() <= ALIKE * steps.mean():
             return places
         return np.argsort(np.interp(places, few, steps), kind="stable")
+
+
+def _replaced(found, places, others):
+    """Values and statuses with those of some places from elsewhere."""
+    found = jax.tree.map(np.array, found)
+    for every, some in zip(*map(jax.tree.leaves, (found, others))):
+        every[places] = some
+    return found
 
 
 def _in_memory(engine, indices, before):
@@ -266,9 +305,9 @@ def _not_run(program, count):
 
 def _in_store(engine, axes, path, part, accept_versions):
     started = time.perf_counter()
-    block = None if path.exists() else _block(engine, axes, part)
+    block = None if path.exists() else block_of(engine, axes, CHUNKS_EACH * part[1])
     store = open_store(path, axes, engine.program, engine.layout, block, part, accept_versions)
-    _compare_versions(engine, store)
+    compare_versions(engine, store)
     k, n = part
     missing = [number for number in store.missing().tolist() if number % n == k]
     length = lambda number: store.points(number).stop - store.points(number).start
@@ -285,6 +324,8 @@ def _in_store(engine, axes, path, part, accept_versions):
                 store.write(number, values, status)
                 done += len(indices)
         except KeyboardInterrupt:
+            # A block that was written in this moment is there, too.
+            done = sum(map(length, set(missing) - set(store.missing().tolist())))
             _tell_interrupted(done, sum(map(length, missing)), "the same call goes on from there.")
 
     def again(swept, other, which):
@@ -299,44 +340,6 @@ def _in_store(engine, axes, path, part, accept_versions):
         tell(path, lost.values(), "Fix: this call without part, or with the part that they belong to.", stacklevel=3)
     compiling, seconds = engine.seconds_since(started)
     return Sweep(axes, Stored(store, engine.program.values), status, here, done, compiling, seconds, again)
-
-
-def _compare_versions(engine, store):
-    """Where other versions have begun a store, compute some of its points again and tell how they differ."""
-    there, number = store.about["fingerprint"], store.first()
-    if there["program"] == engine.program.digest or number is None:
-        return
-    indices = np.r_[store.points(number)][: engine.program.chunk]
-    found, status = engine.first(indices)
-    worst, name = 0.0, None
-    for (leaf, x), before in zip(named_leaves(found), store.read(indices)):
-        good = np.isin(status.result, GOOD)
-        x, before = x[good].astype(complex), before[good].astype(complex)
-        largest = np.max(np.abs(before), initial=0.0)
-        off = np.max(np.abs(x - before), initial=0.0) / (largest if largest > 0 else 1.0)
-        if not off <= worst:
-            worst, name = off, leaf
-    if not worst <= ALIKE_VERSIONS:
-        warnings.warn(
-            f"{store.path} was begun with {in_words(there['versions'])}, and is continued with {in_words(versions())}: "
-            f"computed again, '{name}' of {len(indices):,} of its points differs by {worst:.1e} of its largest value.\n"
-            "Usual cause: run is another function than it was; or a motion that amplifies round-off.\n"
-            "Fix: another path, to compute all of it anew.",
-            stacklevel=4,
-        )
-
-
-def _block(engine, axes, part):
-    """Points to write together: some seconds' worth, some for each process, no more than fits."""
-    chunk = engine.program.chunk
-    first = np.arange(min(chunk, axes.size))
-    started = time.perf_counter()
-    engine.first(first)
-    seconds = max(time.perf_counter() - started, 1e-6)
-    wanted = max(1, round(BLOCK_SECONDS * engine.workers / seconds)) * chunk
-    fair = max(1, axes.size // (CHUNKS_EACH * part[1] * chunk)) * chunk
-    fits = max(1, int(BLOCK_BYTES / (bytes_of(engine.program) * chunk))) * chunk
-    return min(wanted, fair, fits)
 
 
 def _check(layout, part, store):
@@ -365,7 +368,7 @@ def _length(count, workers, most):
     return min(math.ceil(each / step) * step, most)
 
 
-def _cores():
+def usable_cores() -> int:
     """The cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 

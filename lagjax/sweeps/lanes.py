@@ -4,6 +4,7 @@ Lanes run together, under `vmap`, each with its own steps; on a CPU `integrate` 
 takes one after the other, which measures slower nearly everywhere (`benchmarks/sweep.py`), and needs the least memory.
 """
 
+import threading
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -13,6 +14,7 @@ import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec, SingleDeviceSharding
 from jaxtyping import PyTree
 
+from lagjax.jax_internals.tracing import REGULAR_FIRST
 from lagjax.mechanics.first_call import Call, check_arguments, in_words
 from lagjax.motion.reported import PATIENCE, reporting
 from lagjax.motion.trajectory import ENDED_WELL, RESULTS, Trajectory
@@ -46,8 +48,9 @@ GOOD = (*TRUSTED, *(int(item._value) for item in (RESULTS.drifted, RESULTS.not_c
 class Program(NamedTuple):
     """A compiled program for `chunk` points: one point's shapes, the bytes that it works with, a digest of its text.
 
-    `call(point, count)`: (values, status) of no more than `chunk` points, as NumPy arrays; `point` has the values of so
-    many by axis.
+    `call(point, count)`: (values, status, settled) of no more than `chunk` points, as NumPy arrays; `point` has the
+    values of so many by axis. Points that are not settled belong to the careful program; None where this one is that.
+    `irregular` is set when most points turn out to belong there.
     """
 
     call: Callable
@@ -55,14 +58,18 @@ class Program(NamedTuple):
     values: PyTree
     working: int
     digest: str
+    irregular: threading.Event
 
 
 def point_of(run: Callable) -> Callable:
-    """A function of one point that returns (values, `Status`); the numbers of a point that failed are NaN."""
+    """A function of one point that returns (values, `Status`, whether these are settled: `reporting`).
+
+    The numbers of a point that failed are NaN.
+    """
     told = reporting(run)
 
     def point(at):
-        values, report = told(at)
+        values, report, settled = told(at)
         if report is None:
             floats = [x for x in jax.tree.leaves(values) if jnp.issubdtype(x.dtype, jnp.inexact)]
             finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in floats])) if floats else jnp.asarray(True)
@@ -77,15 +84,18 @@ def point_of(run: Callable) -> Callable:
                 return x
             return jnp.where(well, x, jnp.nan)
 
-        return jax.tree.map(masked, values, is_leaf=lambda x: isinstance(x, Trajectory)), status
+        return jax.tree.map(masked, values, is_leaf=lambda x: isinstance(x, Trajectory)), status, settled
 
     return point
 
 
-def compiled(run: Callable, axes: Axes, chunk: int, devices: Sequence, layout: str, patience=None) -> Program:
+def compiled(
+    run: Callable, axes: Axes, chunk: int, devices: Sequence, layout: str, patience=None, careful=True
+) -> Program:
     """Compile a sweep's program for chunks of some length, split between the devices.
 
     Of the axes only names, shapes and dtypes matter. With `patience`, motions in it are given up after so many steps.
+    Where not `careful`, they are taken for regular.
     """
     point = point_of(run)
 
@@ -101,9 +111,9 @@ def compiled(run: Callable, axes: Axes, chunk: int, devices: Sequence, layout: s
     shaped = tuple(jax.ShapeDtypeStruct((chunk, *x.shape[1:]), x.dtype, sharding=placed) for x in axes.arrays)
     of_user = Call("run", run, (POINT,))
     check_arguments(of_user, "the axes taken one by one; a point is one dictionary")
-    with PATIENCE(patience), in_words(of_user, {POINT: axes.values}):
+    with PATIENCE(patience), REGULAR_FIRST(not careful), in_words(of_user, {POINT: axes.values}):
         traced = jax.jit(function).trace(shaped)
-    shapes, _ = traced.out_info
+    shapes, *_ = traced.out_info
     program = traced.lower().compile()
     memory = program.memory_analysis()
     working = 0 if memory is None else memory.temp_size_in_bytes + memory.output_size_in_bytes
@@ -112,4 +122,4 @@ def compiled(run: Callable, axes: Axes, chunk: int, devices: Sequence, layout: s
         return jax.tree.map(lambda x: np.asarray(x)[:count], program(tuple(point.values())))
 
     one = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), shapes)
-    return Program(call, chunk, one, working, program_digest(traced.jaxpr))
+    return Program(call, chunk, one, working, program_digest(traced.jaxpr), threading.Event())

@@ -5,19 +5,21 @@ import sys
 import diffrax  # noqa: F401  (with the primitives of equinox that it uses)
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
+from jax import lax
 from jax.extend.core import Primitive
 
-from lagjax.jax_internals import names, one_function
+from lagjax.jax_internals import names, one_function, programs
 from lagjax.jax_internals.marks import STAYS_A_CALL, marked
-from lagjax.mechanics import sparsity, structure
+from lagjax.mechanics import sparsity
 from lagjax.numerics import scalars
 
 # jax 0.12 makes none of these any more.
 UP_TO_0_11 = {"closed_call"}
 TABLES = {
     f"{module.__name__.removeprefix('lagjax.')}.{name}": set(table)
-    for module in (names, one_function, scalars, sparsity, structure)
+    for module in (names, one_function, scalars, sparsity)
     for name, table in vars(module).items()
     if name.isupper() and name not in ("ONE_KERNEL", "STAYS_A_CALL") and isinstance(table, (set, dict))
 }
@@ -49,6 +51,82 @@ def test_each_name_is_one(table):
 def test_the_tables_are_found():
     """Twin: there are tables in all of the modules, and a misspelt name is seen."""
     assert {name.rsplit(".", 1)[0].split(".")[-1] for name in TABLES} == {
-        "names", "one_function", "scalars", "sparsity", "structure",
+        "names", "one_function", "scalars", "sparsity",
     }  # fmt: skip
     assert unknown({"sin", "sine"}) == ["sine"]
+
+
+OTHERWISE_CALLED = {"and": lax.bitwise_and, "or": lax.bitwise_or, "not": lax.bitwise_not}
+OF_WHOLE_NUMBERS = {"and", "or", "not"}
+
+
+def the_same_in_numpy(name, by_jax):
+    """Whether a primitive makes of some numbers what the table says, and is the one that is meant."""
+    numbers = np.array([-3, 0, 2, 5]), np.array([4, -1, 2, -2])
+    operands = numbers if name in OF_WHOLE_NUMBERS else tuple(0.7 * x for x in numbers)
+    if name == "select_n":
+        operands = np.array([True, False, True, False]), *operands
+    if name in ("abs", "neg", "not", "square"):
+        operands = operands[:1]
+    assert [e.primitive.name for e in jax.make_jaxpr(by_jax)(*operands).eqns] == [name]
+    return np.array_equal(by_jax(*operands), names.IN_NUMPY[name](*operands))
+
+
+@pytest.mark.parametrize("name", names.IN_NUMPY)
+def test_numpy_does_the_same(name):
+    """On numbers of both signs, equal ones among them."""
+    assert the_same_in_numpy(name, OTHERWISE_CALLED[name] if name in OTHERWISE_CALLED else getattr(lax, name))
+
+
+def test_another_function_would_be_seen(monkeypatch):
+    """Twin: "less" in place of "less or equal"."""
+    monkeypatch.setitem(names.IN_NUMPY, "le", np.less)
+    assert not the_same_in_numpy("le", lax.le)
+
+
+FACTOR = np.array([[1.0, 2.0], [3.0, 4.0]])
+LINEAR = {
+    "add": lambda x: lax.add(x, x),
+    "add_any": lambda x: jax.linear_transpose(lambda y: (y, y), x)((x, x))[0],
+    "broadcast_in_dim": lambda x: lax.broadcast_in_dim(x, (2, 2, 2), (1, 2)),
+    "concatenate": lambda x: lax.concatenate([x, x], 0),
+    "convert_element_type": lambda x: lax.convert_element_type(x, np.float32),
+    "copy": lambda x: lax.copy_p.bind(x),
+    "cumsum": lambda x: lax.cumsum(x, 0),
+    "neg": lax.neg,
+    "pad": lambda x: lax.pad(x, 0.0, [(1, 0, 0), (0, 1, 0)]),
+    "reduce_sum": lambda x: lax.reduce_sum_p.bind(x, axes=(0,), out_sharding=None),
+    "reshape": lambda x: lax.reshape(x, (4,)),
+    "rev": lambda x: lax.rev(x, (0,)),
+    "slice": lambda x: lax.slice(x, (0, 1), (2, 2)),
+    "split": lambda x: lax.split(x, (1, 1))[1],
+    "squeeze": lambda x: lax.squeeze(lax.slice(x, (0, 0), (1, 2)), (0,)),
+    "sub": lambda x: lax.sub(x, lax.mul(x, FACTOR)),
+    "transpose": lambda x: lax.transpose(x, (1, 0)),
+    "div": lambda x: lax.div(x, FACTOR),
+    "dynamic_slice": lambda x: lax.dynamic_slice(x, (1, 0), (1, 2)),
+    "gather": lambda x: x[np.array([1, 0]), np.array([1, 1])],
+    "dot_general": lambda x: x @ FACTOR,
+    "mul": lambda x: lax.mul(x, FACTOR),
+}
+
+
+def is_linear(function):
+    """Whether a function of a matrix doubles with it, and leaves sums alone."""
+    x, y = np.array([[0.3, -1.2], [2.5, 0.7]]), np.array([[1.1, 0.4], [-0.6, 3.0]])
+    of = lambda x: np.asarray(function(jnp.asarray(x)), float)
+    return np.allclose(of(x + y), of(x) + of(y), atol=1e-6) and np.allclose(of(2 * x), 2 * of(x), atol=1e-6)
+
+
+@pytest.mark.parametrize("name", LINEAR)
+def test_linear_primitives(name):
+    """In their first operand, as the dependence of a result on a coordinate takes them."""
+    found = [equation.primitive.name for equation in programs.equations(jax.make_jaxpr(LINEAR[name])(FACTOR).jaxpr)]
+    assert name in found and is_linear(LINEAR[name])
+
+
+def test_all_linear_primitives_are_tried():
+    """Twin: what is none is seen; and which of the table are not tried is known."""
+    assert not is_linear(lambda x: lax.mul(x, x)) and not is_linear(jnp.sin)
+    untried = names.ADDITIVE | names.LINEAR_IN_FIRST | names.BILINEAR - set(LINEAR)
+    assert untried - set(LINEAR) == {"stack", "stop_gradient"}

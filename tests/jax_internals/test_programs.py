@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from jax.extend.core import jaxpr_as_fun
 
-from lagjax.jax_internals.programs import length, without_chains
+from lagjax.jax_internals.programs import applied, interpreted, length, without_chains
 
 
 def below(x, count=100):
@@ -52,3 +52,44 @@ def test_what_is_no_chain_stays():
     for function in (lambda x: below(x, 15), used, other, lambda x: x):
         program = jax.make_jaxpr(function)(1.0)
         assert without_chains(program) is program
+
+
+@jax.custom_jvp
+def sine(x):
+    """A call with a rule of its own."""
+    return jnp.sin(x)
+
+
+sine.defjvps(lambda dx, value, x: jnp.cos(x) * dx)
+TABLE = np.arange(3.0)
+
+
+def calls(x):
+    """Calls of both kinds, one inside of the other, a constant, and a loop, which is none."""
+    inner = jax.jit(lambda x: sine(x) + TABLE)
+    return inner(x) * 2.0, jax.lax.fori_loop(0, 3, lambda _, x: 2.0 * x, x)
+
+
+def entered(enters=None):
+    """The results of a program by `interpreted`, beside which primitives it met; and what JAX finds."""
+    program, x, met = jax.make_jaxpr(calls)(jnp.ones(3)), jnp.array([0.1, 0.2, 0.3]), []
+
+    def rule(equation, operands):
+        met.append(equation.primitive.name)
+        return applied(program.jaxpr, equation, operands)
+
+    return interpreted(program, [x], rule, lambda x, aval: jnp.asarray(x, aval.dtype), enters), met, calls(x)
+
+
+def test_a_program_is_interpreted():
+    """With arrays for values it is the program itself; calls are entered, a loop is one primitive."""
+    found, met, expected = entered()
+    np.testing.assert_allclose(found, expected, rtol=1e-15)
+    assert {"sin", "add", "mul"} <= set(met) and not {"jit", "custom_jvp_call"} & set(met)
+    assert {"scan", "while"} & set(met)
+
+
+def test_calls_that_are_not_entered():
+    """Twin: those stay primitives of which the rule says what they make."""
+    _, met, _ = entered(lambda equation: equation.primitive.name == "jit")
+    assert "custom_jvp_call" in met and "sin" not in met

@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 
 from lagjax import System, accelerations, jacobi_integral, mass_matrix, momentum
-from lagjax.mechanics.saddle_point import equations_of_motion
+from lagjax.mechanics.equations import equations_of
 
 rng = np.random.default_rng(20)
 
 
 def a_of(system, t, q, v, params):
     """The accelerations of an unconstrained system."""
-    return equations_of_motion(system, t, q, v, params)[0]
+    return equations_of(system, t, q, v, params).accelerations(t, q, v)[0]
 
 
 def double_pendulum(t, q, v, params):

@@ -7,7 +7,8 @@ import pytest
 from jax.extend.core import jaxprs_in_params
 
 import lagjax as lj
-from lagjax.mechanics import constraints, coordinates, saddle_point, sparse_plan
+from lagjax.mechanics import constraints, coordinates, sparse_plan
+from lagjax.mechanics.equations import equations_of
 from lagjax.mechanics.lagrangian import mass_and_forcing
 from tests.large_systems import bars, chain, links, loop, net, particles
 
@@ -129,7 +130,8 @@ def acceleration(system, q, v):
     """The sparse solution as a function of gravity and of the length, and the dense one."""
 
     def sparse(params):
-        a, multipliers = saddle_point.equations_of_motion(system, jnp.asarray(0.0), q, v, params)
+        state = jnp.asarray(0.0), q, v
+        a, multipliers = equations_of(system, *state, params).accelerations(*state)
         return jnp.concatenate([a.ravel(), multipliers["links"]])
 
     def dense(params):
@@ -181,7 +183,7 @@ def largest_array(function, *args):
 def running(system, q, v, params):
     """One evaluation of the equations of motion, and its arguments."""
     s = coordinates.state(0.0, q, v, params)
-    return lambda t, q, v, params: saddle_point.equations_of_motion(system, t, q, v, params), *s
+    return lambda t, q, v, params: equations_of(system, t, q, v, params).accelerations(t, q, v), *s
 
 
 def test_nothing_dense_is_formed():

@@ -6,7 +6,8 @@ import pytest
 
 import lagjax as lj
 from lagjax.mechanics import coordinates
-from lagjax.mechanics.structure import angles, conserves_jacobi_integral, structure
+from lagjax.mechanics.structure import angles, conserves_jacobi_integral, is_diagonal, structure
+from tests.plain import not_plain
 
 free = lambda t, q, v, params: 0.5 * (v["a"] ** 2 + v["b"] ** 2)
 
@@ -122,3 +123,33 @@ def test_constraints():
 def test_a_large_system_is_not_taken_apart():
     """Beyond two dozen coordinates there is no structure of this kind."""
     assert of(lambda t, q, v, params: 0.5 * jnp.sum(v**2), jnp.ones(25)) is None
+
+
+@not_plain
+@pytest.mark.parametrize(("nodes", "known"), [(4, True), (500, False)])
+def test_a_long_program_is_not_taken_apart(nodes, known):
+    """Nothing is known of a potential by quadrature of many nodes, and `explain` does without; twin: of a few it is."""
+    angles = jnp.linspace(0.0, 6.0, nodes)
+    wire = lambda q: jnp.sum(1 / jnp.sqrt((q[0] - jnp.cos(angles)) ** 2 + (q[1] - jnp.sin(angles)) ** 2 + q[2] ** 2))
+    system = lj.System(lambda t, q, v, params: 0.5 * v @ v + q[0] * v[1] * wire(q))
+    s = coordinates.state(0.0, np.array([2.0, 0.0, 0.3]), np.ones(3), None)
+    assert (structure(system, *s) is not None) == known
+    report = dict(lj.explain(system, *s[1:3]).rows)
+    assert report["mass matrix"] == "positive definite" + ", diagonal, constant" * known
+    assert report["solved"] == ("3 divisions before the loop" if known else "3 equations by elimination")
+
+
+def test_a_long_mass_matrix_is_not_known_to_be_diagonal():
+    """Its program is left before it is written to its end; the twin's is short."""
+
+    def of(count):
+        def lagrangian(t, q, v, params):
+            mass = jnp.arange(float(count)) * q[0]
+            for _ in range(20):
+                mass = 1.0 + jnp.sin(mass)
+            return jnp.sum(mass) * v @ v
+
+        return lj.System(lagrangian)
+
+    s = coordinates.state(0.0, np.ones(2), np.ones(2), None)
+    assert is_diagonal(of(4), *s) and not is_diagonal(of(500), *s)

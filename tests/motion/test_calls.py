@@ -10,7 +10,7 @@ import pytest
 
 import lagjax as lj
 from lagjax.jax_internals.tracing import is_eager
-from lagjax.motion import solve
+from lagjax.mechanics import kept
 from tests.counting import compiles
 from tests.systems import HORIZONTAL, PARAMS, TS, cartesian_lagrangian, pendulum, rod, rod_pendulum
 
@@ -100,7 +100,7 @@ def test_another_function_is_looked_at():
 def test_equations_are_taken_for_regular_first():
     """A rod is; a rod that is there twice is not, and the same motion is found the careful way."""
     once = lj.integrate(rod_pendulum, *HORIZONTAL, PARAMS, ts=TS)
-    irregular = lambda: sum(programs.regular is None for programs in solve._programs.values())
+    irregular = lambda: sum(getattr(program, "regular", True) is None for program in kept._programs.values())
     before = irregular()
     twice = lj.System(cartesian_lagrangian, {name: lj.Holonomic(rod) for name in ("rod", "spare")})
     both, again = (lj.integrate(twice, *HORIZONTAL, PARAMS, ts=TS) for _ in range(2))
@@ -116,9 +116,9 @@ import jax
 jax.config.update("jax_enable_x64", True)
 import numpy as np
 import lagjax as lj
-from lagjax.motion import solve
-from lagjax.motion.memory_maps import LIMIT, maps_used
-solve.KEPT = int(sys.argv[1])
+from lagjax.mechanics import kept
+from lagjax.mechanics.memory_maps import LIMIT, share_used
+kept.AT_MOST = int(sys.argv[1])
 used = []
 for i in [*range(6), 0]:
     system = lj.System(lambda t, q, v, p, g=1.0 + i: 0.5 * p["m"] * v**2 - p["m"] * g * q)
@@ -126,7 +126,7 @@ for i in [*range(6), 0]:
     # What was dropped is compiled again.
     assert abs(float(last) - (1.0 - (1.0 + i) / 2)) < 1e-8
     gc.collect()
-    used.append(maps_used() * int(LIMIT.read_text()))
+    used.append(share_used() * int(LIMIT.read_text()))
 print(used[5] - used[2])
 """
 

@@ -9,6 +9,7 @@ import pytest
 
 import lagjax as lj
 from lagjax.jax_internals.programs import length
+from tests.plain import not_plain
 from tests.systems import HORIZONTAL, PARAMS, TS, pendulum, pendulum_lagrangian, rod_pendulum
 
 # Swinging hard, from 2 rad at 3 rad/s: nonlinear, and no symmetry that would raise an order.
@@ -321,6 +322,7 @@ def by_method(method, **options):
     return lambda g: lj.integrate(rod_pendulum, *HORIZONTAL, PARAMS | {"g": g}, **settings)
 
 
+@not_plain
 @pytest.mark.parametrize(("shipped", "ours", "own"), SHIPPED, ids=["Dopri8", "Tsit5"])
 def test_methods_of_diffrax_run_in_our_form(shipped, ours, own):
     """As it is shipped, one gives our program, and says so; a subclass runs as it is, to the same answer."""

@@ -17,6 +17,7 @@ import pytest
 
 import lagjax as lj
 from lagjax.mechanics import constraints, saddle_point
+from lagjax.mechanics.equations import equations_of
 from lagjax.motion.consistency import to_manifold
 
 LOOSE, TIGHT = 1e-5, 1e-11
@@ -648,7 +649,8 @@ def test_returning_to_a_velocity_constraint_leaves_positions():
     x, u = rng.normal(size=(2, 4))
     names = ("angle", "heading", "x", "y")
     q, v = dict(zip(names, x)), dict(zip(names, u))
-    projected = to_manifold(vertical_disk, 0.0, q, v, DISK, 1e-12, 1e-12)
+    state = 0.0, q, v
+    projected = to_manifold(equations_of(vertical_disk, *state, DISK), *state, 1e-12, 1e-12)
     assert [float(projected.q[name]).hex() for name in names] == [float(q[name]).hex() for name in names]
     mass, _, rows, *_ = (np.asarray(part) for part in disk_by_hand(DISK)(0.0, x, u))
     nearest = u - np.linalg.solve(mass, rows.T @ np.linalg.solve(rows @ np.linalg.solve(mass, rows.T), rows @ u))
@@ -660,7 +662,8 @@ def test_returning_to_the_plane_rolls():
     """With both kinds, positions move only as the rolling allows: a disk lifted off its plane does not slide."""
     q, v = coin_state(COIN, 0.25, 1.25, 0.375, 1.5, -6.0)
     lifted = q | {"z": q["z"] + 1e-4}
-    moved = to_manifold(tilting_disk, 0.0, lifted, v, COIN, 1e-12, 1e-12).q
+    state = 0.0, lifted, v
+    moved = to_manifold(equations_of(tilting_disk, *state, COIN), *state, 1e-12, 1e-12).q
     step = {name: float(moved[name]) - lifted[name] for name in q}
     slid = np.asarray(contact_at_rest(0.0, lifted, step, COIN))
     assert abs(float(touches(0.0, moved, COIN))) < ROUND_OFF

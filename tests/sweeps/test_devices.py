@@ -10,6 +10,7 @@ import pytest
 
 import lagjax as lj
 from tests.sweeps import worker
+from tests.sweeps.test_regular_first import BOTH, exact
 
 PROGRAM = """
 import jax, numpy as np, sys
@@ -17,7 +18,9 @@ jax.config.update("jax_num_cpu_devices", 2)
 import lagjax as lj
 from tests.sweeps import worker
 swept = lj.sweep(worker.run, worker.axes(170), progress=False)
-np.savez(sys.argv[1], values=swept.values, steps=swept.status.steps, how=swept.how)
+from tests.sweeps.test_regular_first import BOTH, first_coordinate
+irregular = lj.sweep(first_coordinate, BOTH, progress=False).values
+np.savez(sys.argv[1], values=swept.values, steps=swept.status.steps, how=swept.how, irregular=irregular)
 """
 
 
@@ -32,3 +35,5 @@ def test_two_devices(tmp_path):
     # Split, the program is compiled otherwise, and where an error is no more than round-off the next step differs.
     np.testing.assert_allclose(two["steps"], one.status.steps, rtol=0.2)
     np.testing.assert_allclose(two["values"], one.values, atol=1e-7)
+    # Half of the lanes belong to the careful program.
+    np.testing.assert_allclose(two["irregular"], exact(BOTH["k"]), rtol=1e-7)

@@ -167,7 +167,7 @@ def test_a_drifting_motion_is_marked():
 def test_reports_are_found_in_every_kind_of_program():
     """Plain, under jit, grad, vmap and in a branch of a check; the worst of several counts."""
     program = lambda wrap: jax.jit(reporting(lambda point: wrap(lambda g: swing({"g": g, "angle": 1.0}).q[-1])(point)))
-    (_, alone) = program(lambda f: f)(4.0)
+    _, alone, _ = program(lambda f: f)(4.0)
     assert int(alone.steps) > 0
     for wrap in (jax.jit, jax.grad, lambda f: jax.jit(jax.jit(f)), jax.value_and_grad):
         assert int(program(wrap)(4.0)[1].steps) == int(alone.steps)

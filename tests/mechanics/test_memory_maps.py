@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 import lagjax as lj
-from lagjax.motion import memory_maps
+from lagjax.mechanics import memory_maps
 from tests.systems import PARAMS, TS
 
 
@@ -34,10 +34,10 @@ def test_told_where_something_is_compiled(process):
         integrated(system)
     integrated(system)
     process[0].write_text("7f00-7f01 r-xp\n" * 749)
-    memory_maps.warn_of_memory_maps()
+    memory_maps.share_used()
     for file in process:
         file.unlink()
-        memory_maps.warn_of_memory_maps()
+        memory_maps.share_used()
 
 
 @pytest.mark.skipif(not memory_maps.MAPS.exists(), reason="only Linux tells")

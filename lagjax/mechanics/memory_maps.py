@@ -1,8 +1,6 @@
 """A process's memory maps, of which Linux allows 65,530: each compiled program keeps some, and at the limit it dies.
 
 XLA maps the machine code of each of its kernels by itself: a system integrated for the first time takes 50 to 500 maps.
-`integrate` drops the programs that were used longest ago; those of the user's own `jax.jit` stay in JAX's caches, and
-`jax.clear_caches()` gives them back.
 """
 
 import warnings
@@ -13,14 +11,11 @@ MAPS, LIMIT = Path("/proc/self/maps"), Path("/proc/sys/vm/max_map_count")
 TELL_FROM = 0.75
 
 
-def maps_used() -> float:
-    """The share of the limit that is used. It counts lines, 1 ms a thousand: for calls that compile."""
-    there, limit = _counted()
-    return there / limit
+def share_used(stacklevel: int = 2) -> float:
+    """The share of the limit that is used, with a warning where it is near: for calls that compile something new.
 
-
-def warn_of_memory_maps(stacklevel: int = 2) -> None:
-    """Warn where a process comes near the limit."""
+    It counts lines, 1 ms a thousand.
+    """
     there, limit = _counted()
     if there > TELL_FROM * limit:
         warnings.warn(
@@ -30,6 +25,7 @@ def warn_of_memory_maps(stacklevel: int = 2) -> None:
             "what differs into params, so that one compiled program serves all.",
             stacklevel=stacklevel + 1,
         )
+    return there / limit
 
 
 def _counted():

@@ -1,0 +1,216 @@
+"""`python -m lagjax`: every scene, checked, timed and drawn; then the stability report.
+
+For each scene: error against run time by method and tolerance, how long its first answer took, then what happened in
+stiff and extreme cases; work-precision diagrams and a picture as PNG, all numbers as JSON. `python -m lagjax stability`
+prints the whole stability report, the main job a part of it. The exit status is 1 where a scene misses its accuracy, or
+a row of the stability report is silently wrong or not as it should be. Scenes run side by side, one a core: they are
+mostly compiled, one thread each.
+"""
+
+import argparse
+import json
+import platform
+import sys
+import time
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict
+from multiprocessing import get_context, parent_process
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import diffrax
+import jax
+
+from lagjax import plot, report, stability
+from lagjax.numerics.runge_kutta import Dopri8
+from lagjax.scenes import SCENES
+from lagjax.sweeps.engine import usable_cores
+
+STABILITY = "stability"
+
+FULL = {
+    "methods": None,
+    "tolerances": (1e-4, 1e-6, 1e-8, 1e-10, 1e-12),
+    "repeats": 25,
+}
+QUICK = {"methods": {"Dopri8": Dopri8()}, "tolerances": (1e-6, 1e-10), "repeats": 3}
+
+
+class Part(NamedTuple):
+    """A scene, or the stability report: what is printed of it, its numbers, and what was missed."""
+
+    printed: str
+    numbers: Any
+    missed: list[str]
+
+
+def main(arguments=None) -> int:
+    """Run the job; returns the exit status."""
+    options = _parse(arguments)
+    folder = Path(options.output)
+    folder.mkdir(parents=True, exist_ok=True)
+    started = time.perf_counter()
+    beside = f"; {_at_a_time(options)} scenes at a time, which disturb each other" if _at_a_time(options) > 1 else ""
+    print(f"{_machine()}{beside}\n", flush=True)
+    numbers, missed, rows = {}, [], None
+    for name, part in zip(options.scenes, _parts(options, folder)):
+        print(part.printed, end="\n\n", flush=True)
+        missed += part.missed
+        if name == STABILITY:
+            rows = part.numbers
+        else:
+            numbers[name] = part.numbers
+    if numbers:
+        (folder / "report.json").write_text(json.dumps({"machine": _machine(), "scenes": numbers}, indent=1))
+    if rows is not None:
+        (folder / "stability.json").write_text(json.dumps({"machine": _machine(), "rows": rows}, indent=1))
+    print(f"{time.perf_counter() - started:.0f} s; pictures and numbers are in {folder}/")
+    for line in missed:
+        print(f"MISSED  {line}")
+    return 1 if missed else 0
+
+
+def _parts(options, folder) -> Iterator[Part]:
+    """All that was asked for, in that order; some at a time, each in a process of its own."""
+    tasks = [(name, options.quick, options.tier, folder) for name in options.scenes]
+    at_a_time = _at_a_time(options)
+    if at_a_time == 1:
+        yield from (_part(*task) for task in tasks)
+        return
+    pool = ProcessPoolExecutor(at_a_time, get_context("spawn"))
+    try:
+        running = [pool.submit(_part, *task) for task in tasks]
+        for task, future in zip(tasks, running):
+            _progress(f"{task[0]}: {sum(f.done() for f in running)} of {len(tasks)} done")
+            part = future.result()
+            _progress("")
+            yield part
+    finally:
+        # What was interrupted does not begin the rest.
+        pool.shutdown(cancel_futures=True)
+
+
+def _at_a_time(options):
+    return max(1, min(options.jobs, len(options.scenes)))
+
+
+def _part(name, quick, tier, folder) -> Part:
+    # The job is the application here: the library itself never sets JAX's options.
+    jax.config.update("jax_enable_x64", True)
+    return _stability(tier) if name == STABILITY else _scene(SCENES[name], quick, folder)
+
+
+def _parse(arguments):
+    parser = argparse.ArgumentParser(
+        prog="python -m lagjax", description="Check, time and draw the scenes: error against run time."
+    )
+    parser.add_argument(
+        "scenes",
+        nargs="*",
+        metavar="SCENE",
+        help=f"which scenes, or {STABILITY} for the whole stability report; by default all scenes and a part of it: "
+        f"{', '.join(SCENES)}",
+    )
+    parser.add_argument("-o", "--output", default="lagjax-report", help="folder for pictures and numbers")
+    parser.add_argument(
+        "--quick",
+        action="store_true",
+        help="one run a scene, one method, two tolerances, no scene pictures, few stability rows; under a minute",
+    )
+    parser.add_argument(
+        "-j", "--jobs", type=int, default=usable_cores(), metavar="N",
+        help="scenes at a time, each in a process of its own; by default one a core. Alone (-j 1) times vary less",
+    )  # fmt: skip
+    options = parser.parse_args(arguments)
+    unknown = [name for name in options.scenes if name not in (*SCENES, STABILITY)]
+    if unknown:
+        parser.error(f"no scene named {', '.join(unknown)}; there are: {', '.join(SCENES)}, and {STABILITY}")
+    asked = stability.FULL if options.scenes else stability.REDUCED
+    options.tier = stability.QUICK if options.quick else asked
+    options.scenes = options.scenes or [*SCENES, STABILITY]
+    return options
+
+
+def _stability(tier) -> Part:
+    """The stability report, with what is not as it should be."""
+    _progress("stability")
+    rows, outcomes = stability.trials(tier), []
+    for i, row in enumerate(rows):
+        _progress(f"stability, row {i + 1} of {len(rows)}")
+        outcomes.append(row.attempt())
+    _progress("")
+    title = "Stability: accurate, degraded with a warning, or refused with a reason"
+    printed = f"{title}\n{'=' * len(title)}\n\n{stability.stability_table(outcomes)}"
+    numbers = [asdict(outcome) | {"verdict": outcome.verdict} for outcome in outcomes]
+    missed = [
+        f"stability: {o.family}, {o.name}, {o.method}: {o.verdict}, error {o.error:.1e}"
+        for o in outcomes
+        if not o.passed
+    ]
+    return Part(printed, numbers, missed)
+
+
+def _scene(scene, quick, folder) -> Part:
+    """A scene: checked, timed and drawn."""
+    rows, cases = _run_scene(scene, quick)
+    _draw(scene, rows, folder, with_picture=not quick)
+    _progress("")
+    missed = [f"{scene.name}: {row.run}, error {row.error:.1e} > {row.required:.0e}" for row in rows if not row.passed]
+    missed += [
+        f"{scene.name}: {case.name}, error {case.error:.1e} > {case.allowed:.0e}" for case in cases if not case.passed
+    ]
+    numbers = {"runs": [asdict(row) for row in rows], "cases": [asdict(case) for case in cases]}
+    return Part(_described(scene, rows, cases), numbers, missed)
+
+
+def _run_scene(scene, quick):
+    settings = QUICK if quick else FULL
+    runs, rows = scene.runs(), []
+    for run in runs[:1] if quick else runs:
+        _progress(f"{scene.name}: {run.name}")
+        rows += report.work_precision(run, **settings)
+    _progress(f"{scene.name}: stiff and extreme cases")
+    return rows, scene.cases()
+
+
+def _draw(scene, rows, folder, with_picture):
+    _progress(f"{scene.name}: pictures")
+    try:
+        plot.import_matplotlib()
+    except ImportError as error:
+        print(f"no pictures: {error}", file=sys.stderr)
+        return
+    curves = {}
+    for row in rows:
+        seconds, errors = curves.setdefault(f"{row.run}, {row.method}", ([], []))
+        seconds.append(row.seconds)
+        errors.append(row.error)
+    plot.work_precision(scene.title, curves).savefig(folder / f"{scene.name}_work_precision.png")
+    if with_picture:
+        scene.picture().savefig(folder / f"{scene.name}.png")
+
+
+def _described(scene, rows, cases):
+    of_errors = [
+        f"error of '{run}': {measured}" for run, measured in dict.fromkeys((row.run, row.measured) for row in rows)
+    ]
+    return "\n".join([
+        f"{scene.title}\n{'=' * len(scene.title)}\n{scene.source}\n",
+        report.work_precision_table(rows), report.first_answer(rows), *of_errors, "",
+        report.case_table(cases), "",
+        "Where the source is wrong:", *(f"- {line}" for line in scene.misprints),
+    ])  # fmt: skip
+
+
+def _progress(text):
+    """One line that is overwritten, on a terminal only."""
+    if sys.stderr.isatty() and parent_process() is None:
+        print(f"\r\033[K{text}", end="", file=sys.stderr, flush=True)
+
+
+def _machine():
+    return (
+        f"lagjax on {jax.devices()[0].platform}, {platform.machine()}, Python {platform.python_version()}, "
+        f"JAX {jax.__version__}, diffrax {diffrax.__version__}, float64; times are medians, first answers apart"
+    )

@@ -1,0 +1,223 @@
+"""The equations of a system: all that is asked of them at a state, and the one place that knows how they are solved.
+
+There are three ways. In arrays the equations are one matrix (`saddle_point.py`), or a band where the system is large
+and its parts touch few others (`sparse_saddle_point.py`): the careful way, which exchanges rows, leaves dependent
+constraints out and says what is wrong. Those of a small system are written out number by number besides
+(`written_out.py`), which is many times as fast, and NaN where that does not do.
+
+Who asks has an `Equations` and does not choose between them.
+"""
+
+from collections.abc import Callable
+from functools import lru_cache
+
+import equinox as eqx
+import equinox.internal as eqxi
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jax import lax
+from jaxtyping import Array, Bool, Float, PyTree
+
+from lagjax.jax_internals.one_function import called
+from lagjax.jax_internals.tracing import WATCHED
+from lagjax.mechanics import constraints, coordinates
+from lagjax.mechanics.compiled import compiled
+from lagjax.mechanics.in_numbers import in_numbers
+from lagjax.mechanics.saddle_point import Dense, is_regular
+from lagjax.mechanics.sparse_plan import plan
+from lagjax.mechanics.sparse_saddle_point import Banded
+from lagjax.mechanics.system import System
+from lagjax.mechanics.verdict import Verdict
+from lagjax.mechanics.written_out import WrittenOut, is_small, write_out
+
+
+class Equations(eqx.Module):
+    """The equations of a system with its parameters, for states of one shape.
+
+    `form` solves them in arrays. `written` are the same number by number, with what does not depend on the state
+    `prepared`; None of a system that is not small. `fallback`: whether programs contain the careful way for where these
+    fail. `unflatten` puts the coordinates, one by one in a small system, back into the user's structure.
+    """
+
+    system: System
+    params: PyTree
+    prepared: tuple[tuple | None, tuple | None]
+    form: Dense | Banded = eqx.field(static=True)
+    written: WrittenOut | None = eqx.field(static=True)
+    fallback: bool = eqx.field(static=True)
+    unflatten: Callable | None = eqx.field(static=True)
+
+    @property
+    def are_written(self) -> bool:
+        """Whether the quick way exists."""
+        return self.written is not None
+
+    @property
+    def are_taken_for_regular(self) -> bool:
+        """Whether what fails the quick way gives NaN, and nothing says why."""
+        return self.written is not None and self.written.careful and not self.fallback
+
+    def inside(self, y):
+        """A position or velocity of the user's as these equations take it."""
+        return y if self.unflatten is None else coordinates.numbers(y)
+
+    def outside(self, y):
+        """The same back in the user's structure."""
+        return y if self.unflatten is None else self.unflatten(jnp.stack(y))
+
+    def rates(self, t, q, v, believe=False) -> tuple[PyTree[Array], dict[str, Array]]:
+        """The accelerations, and the multipliers by name; with `believe` of the quick way alone, which may be NaN."""
+        if self.written is None:
+            return self.accelerations(t, q, v)
+        a, stacked = self.quickly(t, q, v)
+        quickly = a, constraints.split(self.system, stacked, t, q, v, self.params)
+        if believe or not self.fallback:
+            return quickly
+        # A branch also in a batch, where it is taken for all lanes or none.
+        return lax.cond(eqxi.unvmap_all(all_finite(quickly)), lambda: quickly, lambda: self.accelerations(t, q, v))
+
+    def multipliers(self, t, q, v) -> dict[str, Array]:
+        """The multipliers by name, one way for all states of a batch: derivatives flow through them."""
+        if not self.system.constraints:
+            return {}
+        return self.rates(t, q, v)[1] if self.are_taken_for_regular else self.accelerations(t, q, v)[1]
+
+    def believed(self, t, q, v) -> tuple[PyTree[Array], dict[str, Array]]:
+        """Accelerations and multipliers, NaN where they are not to be believed."""
+        if self.written is None:
+            return _believed(self.form, self.system, t, q, v, self.params)
+        a, stacked = self.quickly(t, q, v)
+        quickly = a, constraints.split(self.system, stacked, t, q, v, self.params)
+        if not self.written.careful:
+            return quickly
+        carefully = lambda: _believed(self.form, self.system, t, q, v, self.params)
+        return lax.cond(eqxi.unvmap_all(all_finite(a)), lambda: quickly, carefully)
+
+    def verdict(self, t, q, v) -> Verdict:
+        """Solve the equations at one state, and say whether the solution is to be believed."""
+        if not self.are_taken_for_regular:
+            return _verdict(self.form, self.system, t, q, v, self.params)
+        # What speaks against one that is not regular is not told apart.
+        a, multipliers = self.rates(t, q, v)
+        lagrangian = self.system.lagrangian(t, q, v, self.params)
+        finite = jnp.all(jnp.isfinite(coordinates.flatten((a, multipliers, lagrangian))[0]))
+        singular = ~is_regular(*_vectors(self.system, t, q, v, self.params))
+        return Verdict(a, multipliers, finite, singular, jnp.asarray(False))
+
+    def quickly(self, t, q, v):
+        """The accelerations, and the multipliers in one vector, as they are written out."""
+        assert self.written is not None
+        return called(self.written.equations.at(self.prepared[0], t, q, v))
+
+    def projected(self, t, q, v):
+        """The state returned to the constraints, as it is written out; NaN where it is not near them."""
+        assert self.written is not None and self.written.project is not None
+        return called(self.written.project.at(self.prepared[1], t, q, v))
+
+    def accelerations(self, t, q, v, baumgarte_rate=None, independent=None):
+        """The accelerations, and the multipliers by name, the careful way.
+
+        `independent` (m,) says which constraint equations to solve with; chosen at this state if None.
+        """
+        return _accelerations(self.form, self.system, t, q, v, self.params, baumgarte_rate, independent)
+
+    def independent(self, t, q, v, dependent_below=None) -> Bool[Array, " m"] | None:
+        """Which constraint equations to solve with near a state; None where one or none leaves no choice."""
+        if constraints.count(self.system, t, q, v, self.params) < 2:
+            return None
+        return _independent(self.form, self.system, t, q, v, self.params, dependent_below)
+
+    def displacement(self, t, q, v):
+        """`displacement(which, r)`, the shortest in the metric of M that changes the residuals `which` by r."""
+        return self.form.displacement(*_vectors(self.system, t, q, v, self.params))
+
+    def row_sizes(self, t, q, v) -> Float[Array, " m"]:
+        """`Σ_j |A_ij|` of each constraint equation."""
+        return self.form.row_sizes(*_vectors(self.system, t, q, v, self.params))
+
+
+def equations_of(system, t, q, v, params, *, quickly=False, fallback=True) -> Equations:
+    """The equations of a system, for states like this one, of which only shapes and dtypes count.
+
+    With `quickly` those of a small system are written out, too, and take states number by number (`Equations.inside`).
+    Without `fallback` they are taken for regular; that is settled by who asks.
+    """
+    written, unflatten = None, None
+    if quickly and is_small(system, t, q, v, params):
+        _, unflatten = coordinates.flatten(q)
+        system, q, v = in_numbers(system, unflatten), coordinates.numbers(q), coordinates.numbers(v)
+        written = _written_for(system, t, q, v, params)
+    prepared = (None, None) if written is None else written.prepare(system, params)
+    fallback = fallback and written is not None and written.careful
+    return Equations(system, params, prepared, _form(system, t, q, v, params), written, fallback, unflatten)
+
+
+def _form(system, t, q, v, params):
+    unknowns = sum(jnp.size(x) for x in jtu.tree_leaves(q)) + constraints.count(system, t, q, v, params)
+    sparse = plan(system, t, q, v, params)
+    return Dense(unknowns) if sparse is None else Banded(sparse)
+
+
+def _written_for(*problem) -> WrittenOut | None:
+    leaves, structure = jtu.tree_flatten(problem)
+    leaves = tuple(jax.ShapeDtypeStruct(x.shape, x.dtype) if eqx.is_array(x) else x for x in leaves)
+    # Who watches has a failed check of the user's put into the equations as NaN.
+    kind = structure, leaves, WATCHED.value
+    try:
+        hash(kind)
+    except TypeError:
+        return _written.__wrapped__(*kind)
+    return _written(*kind)
+
+
+# A motion is traced with and without the careful way, for its derivatives, in lanes: the equations are the same.
+@lru_cache(maxsize=64)
+def _written(structure, leaves, watched) -> WrittenOut | None:
+    found = []
+
+    def at(arrays):
+        filled = [leaf if x is None else x for x, leaf in zip(arrays, leaves)]
+        found.append(write_out(*jtu.tree_unflatten(structure, filled)))
+
+    jax.eval_shape(at, [x if isinstance(x, jax.ShapeDtypeStruct) else None for x in leaves])
+    return found[0]
+
+
+# Jitted, so that JAX traces L once for all the places of a compiled trajectory that need it.
+@eqx.filter_jit
+def _accelerations(form, system, t, q, v, params, baumgarte_rate, independent):
+    state = _vectors(system, t, q, v, params)
+    a, multipliers = form.accelerations(*state, baumgarte_rate, independent)
+    return state[-1](a), constraints.split(system, multipliers, t, q, v, params)
+
+
+@eqx.filter_jit
+def _independent(form, system, t, q, v, params, dependent_below):
+    return form.independent(*_vectors(system, t, q, v, params), dependent_below)
+
+
+@compiled
+def _verdict(form, system, t, q, v, params) -> Verdict:
+    state = _vectors(system, t, q, v, params)
+    found = form.verdict(*state)
+    by_name = constraints.split(system, found.multipliers, t, q, v, params)
+    return found._replace(a=state[-1](found.a), multipliers=by_name)
+
+
+def _believed(form, system, t, q, v, params):
+    state = _vectors(system, t, q, v, params)
+    a, multipliers = form.believed(*state)
+    return state[-1](a), constraints.split(system, multipliers, t, q, v, params)
+
+
+def _vectors(system, t, q, v, params):
+    """A state in vector form, as `Dense` and `Banded` take it."""
+    x, unflatten = coordinates.flatten(q)
+    return system, t, x, coordinates.flatten(v)[0], params, unflatten
+
+
+def all_finite(tree) -> Bool[Array, ""]:
+    """Whether nothing in a tree of floats is NaN or infinite."""
+    # One sum instead of a reduction a leaf: zero times NaN or infinity is NaN.
+    return jnp.asarray(sum(jnp.sum(0 * x) for x in jtu.tree_leaves(tree)) == 0)

@@ -1,0 +1,125 @@
+"""One object is the equations: its three ways say the same, and one place chooses between them."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import lagjax as lj
+from lagjax.mechanics import coordinates, equations, sparse_plan
+from lagjax.mechanics.equations import equations_of
+from lagjax.mechanics.saddle_point import Dense
+from lagjax.mechanics.sparse_saddle_point import Banded
+from tests.large_systems import chain
+from tests.plain import not_plain
+from tests.systems import HORIZONTAL, PARAMS, rod_pendulum
+
+# Two links: small enough to be written out, and a band where that is allowed.
+SYSTEM, Q, V, OF_CHAIN = chain(2)
+
+
+def in_three_ways(monkeypatch):
+    """The equations of the chain in one matrix, as a band, and number by number; and its state."""
+    s = coordinates.state(0.0, Q, V, OF_CHAIN)
+    dense, written = equations_of(SYSTEM, *s), equations_of(SYSTEM, *s, quickly=True, fallback=False)
+    monkeypatch.setattr(sparse_plan, "UNKNOWNS_AT_LEAST", 2)
+    monkeypatch.setattr(sparse_plan, "BAND_AT_MOST", 1.0)
+    banded = equations_of(SYSTEM, *s)
+    assert isinstance(dense.form, Dense) and isinstance(banded.form, Banded)
+    assert written.are_taken_for_regular and not dense.are_written
+    return dense, banded, written, s
+
+
+def flat(tree):
+    """All numbers of a tree."""
+    return np.asarray(coordinates.flatten(tree)[0])
+
+
+@not_plain
+def test_the_three_ways_say_the_same(monkeypatch):
+    """Accelerations, multipliers, verdicts; slopes and displacements; twin: another state's are others."""
+    dense, banded, written, s = in_three_ways(monkeypatch)
+    r = jnp.array([1e-3, -2e-3])
+
+    def said(one, t, q, v):
+        slopes, moved = one.row_sizes(t, q, v), one.displacement(t, q, v)(np.ones(2, bool), r)
+        return one.accelerations(t, q, v), slopes, moved, one.independent(t, q, v), one.verdict(t, q, v)[2:]
+
+    @jax.jit
+    def everything(t, q, v):
+        numbers = t, written.inside(q), written.inside(v)
+        a, multipliers = written.rates(*numbers)
+        quickly = (written.outside(a), multipliers), written.verdict(*numbers)[2:]
+        return said(dense, t, q, v), said(banded, t, q, v), quickly
+
+    expected, found, quickly = everything(*s[:3])
+    for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(expected)):
+        np.testing.assert_allclose(one, other, rtol=1e-11, atol=1e-11)
+    np.testing.assert_allclose(flat(quickly[0]), flat(expected[0]), rtol=1e-11, atol=1e-11)
+    assert list(map(bool, quickly[1])) == list(map(bool, expected[-1])) == [True, False, False]
+    elsewhere, *_ = everything(s.t, jax.tree.map(lambda x: 1.001 * x, s.q), s.v)
+    assert np.max(np.abs(flat(elsewhere[0]) - flat(expected[0]))) > 1e-4
+    assert np.max(np.abs(elsewhere[2] - expected[2])) > 1e-9
+
+
+@not_plain
+def test_the_careful_way_is_there_unless_they_are_taken_for_regular():
+    """Where what is written out gives NaN the fallback finds out why; without it NaN stays, and a verdict says so."""
+    same = lambda t, q, params: jnp.stack([q["x"] ** 2 + q["y"] ** 2 - params["l"] ** 2] * 2)
+    twice = lj.System(rod_pendulum.lagrangian, {"rod": lj.Holonomic(same)})
+    s = coordinates.state(0.0, *HORIZONTAL, PARAMS)
+    careful, regular = (equations_of(twice, *s, quickly=True, fallback=fallback) for fallback in (True, False))
+    numbers = s.t, careful.inside(s.q), careful.inside(s.v)
+    of = lambda one: jax.jit(lambda t, q, v: (one.rates(t, q, v), one.verdict(t, q, v).finite))(*numbers)
+    ((a, multipliers), finite), ((unknown, _), nowhere) = of(careful), of(regular)
+    assert np.all(np.isfinite(flat(a))) and np.all(np.isnan(flat(unknown)))
+    assert bool(finite) and not bool(nowhere)
+    # Dependent equations share their force.
+    np.testing.assert_allclose(*multipliers["rod"], rtol=1e-12)
+
+
+@not_plain
+def test_equations_are_written_out_once_for_all_traces():
+    """Again in another program, in lanes, in a derivative; anew for another shape or another function."""
+    s = coordinates.state(0.0, *HORIZONTAL, PARAMS)
+    written = []
+
+    def put_down(x):
+        q = {"x": x, "y": s.q["y"]}
+        written.append(equations_of(rod_pendulum, s.t, q, s.v, s.params, quickly=True).written)
+        return x
+
+    x = s.q["x"]
+    jax.make_jaxpr(put_down)(x)
+    jax.make_jaxpr(jax.grad(put_down))(x)
+    jax.make_jaxpr(jax.vmap(put_down))(x[None])
+    assert len({id(found) for found in written}) == 1 and written[0] is not None
+    another = lj.System(lambda *state: 2.0 * rod_pendulum.lagrangian(*state), rod_pendulum.constraints)
+    assert equations_of(another, *s, quickly=True).written is not written[0]
+
+
+@pytest.mark.parametrize("change", ["closed over", "given"])
+def test_what_is_written_does_not_outlive_a_value(change):
+    """A value that L closes over, traced and changed between traces, is that of the trace that asks."""
+    held = {"g": 9.81}
+
+    def lagrangian(t, q, v, params):
+        return 0.5 * v**2 - (held["g"] if change == "closed over" else params["g"]) * q
+
+    system = lj.System(lagrangian)
+
+    def falls(g):
+        held["g"] = g
+        return lj.accelerations(system, 0.0, 1.0, 0.0, {"g": 0.0 if change == "closed over" else g})[0]
+
+    slope = jax.grad(falls)
+    assert float(jax.jit(falls)(2.0)) == -2.0 and float(jax.jit(lambda g: falls(2 * g))(2.0)) == -4.0
+    assert float(slope(1.0)) == -1.0 and float(jax.vmap(falls)(jnp.array([5.0, 7.0]))[1]) == -7.0
+
+
+@not_plain
+def test_explain_prints_the_choice(monkeypatch):
+    """What is printed is the form that the equations have, not another judgement of it."""
+    assert "elimination without the zeros" in repr(lj.explain(rod_pendulum, *HORIZONTAL, PARAMS))
+    monkeypatch.setattr(equations, "is_small", lambda *problem: False)
+    assert "3 equations by elimination" in repr(lj.explain(rod_pendulum, *HORIZONTAL, PARAMS))

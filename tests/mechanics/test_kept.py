@@ -1,0 +1,122 @@
+"""Programs of many systems in one process: no more than so many are kept, whatever they compute."""
+
+import gc
+import weakref
+from importlib import import_module
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from lagjax.jax_internals.tracing import TRACES
+from lagjax.mechanics import kept, memory_maps
+from lagjax.mechanics.compiled import compiled
+from tests.counting import compiles
+from tests.plain import not_plain
+
+MANY = 40
+
+
+@eqx.filter_jit
+def inside(function, x):
+    """A part of a program, of which JAX keeps the traces for itself."""
+    return function(x)
+
+
+@compiled
+def called(function, x):
+    """A function of the user's."""
+    return inside(function, x)
+
+
+def waves(number):
+    """A function like no other, of more than one kernel."""
+    return lambda x: jnp.cumsum(jnp.sin(x + number)) @ jnp.sort(jnp.cos(number * x))
+
+
+def maps():
+    """The memory maps of this process."""
+    gc.collect()
+    return memory_maps.MAPS.read_bytes().count(b"\n") if memory_maps.MAPS.exists() else 0
+
+
+def call(number, x):
+    """Call a function that is then gone; a weak reference to it."""
+    function = waves(number)
+    called(function, x)
+    return weakref.ref(function)
+
+
+def after_many(x):
+    """How many functions are still there after many calls of one each, and by how many maps the later ones grew."""
+    functions = [call(number, x) for number in range(MANY // 2)]
+    before = maps()
+    functions += [call(number, x) for number in range(MANY // 2, MANY)]
+    grown = maps() - before
+    return sum(function() is not None for function in functions), grown
+
+
+@not_plain
+def test_programs_are_bounded(monkeypatch):
+    """Functions are let go of, and maps given back; the twin, with no limit, keeps all."""
+    monkeypatch.setattr(kept, "_programs", kept.OrderedDict())
+    there, grown_at_all = after_many(np.ones(8))
+    assert there == MANY
+    monkeypatch.setattr(kept, "AT_MOST", 5)
+    there, grown = after_many(np.ones(9))
+    assert there <= 5 >= len(kept._programs)
+    if memory_maps.MAPS.exists():
+        assert grown_at_all > MANY / 2 and grown < grown_at_all / 3
+
+
+def test_traces_would_keep_functions(monkeypatch):
+    """Twin: dropped alone, a program leaves them with JAX."""
+    monkeypatch.setattr(kept, "AT_MOST", 5)
+    monkeypatch.setattr(kept, "forget_traces", lambda: None)
+    assert after_many(np.ones(7))[0] == MANY
+
+
+def test_the_last_ones_stay(monkeypatch):
+    """What was used last is compiled once, also after others were dropped; the twin is what was used longest ago."""
+    monkeypatch.setattr(kept, "_programs", kept.OrderedDict())
+    monkeypatch.setattr(kept, "AT_MOST", 5)
+    x, functions = np.ones(10), [waves(number) for number in range(9)]
+    for function in functions:
+        called(functions[0], x)
+        called(function, x)
+    with compiles() as found:
+        called(functions[0], x)
+        called(functions[-1], x)
+    assert not found
+    with compiles() as found:
+        called(functions[1], x)
+    assert found
+
+
+def test_scarce_maps_drop_more(monkeypatch):
+    """Half of them, where there are many; the last ones stay even then."""
+    monkeypatch.setattr(kept, "_programs", kept.OrderedDict((number, object()) for number in range(100)))
+    monkeypatch.setattr(kept, "share_used", lambda: 0.9)
+    counts = []
+    for number in range(100, 105):
+        assert kept.kept(number, lambda number=number: number) == number
+        counts.append(len(kept._programs))
+    assert counts == [51, 26, 14, 9, 9] and [*kept._programs][-5:] == [100, 101, 102, 103, 104]
+    monkeypatch.setattr(kept, "share_used", lambda: 0.1)
+    assert kept.kept("another", object) and len(kept._programs) == counts[-1] + 1
+
+
+@pytest.mark.parametrize("of", ["function", "argument"])
+def test_a_key_is_all_that_a_program_is_compiled_for(of):
+    """The same function of other static arguments, and another function of the same, are others."""
+    other = compiled(lambda function, x: -function(x)) if of == "function" else called
+    one, two = waves(1), waves(1 if of == "function" else 2)
+    x = np.ones(4)
+    assert float(called(one, x)) != float(other(one if of == "function" else two, x))
+
+
+@pytest.mark.parametrize(("module", "name"), TRACES)
+def test_what_is_forgotten_is_there(module, name):
+    """A cache that JAX has given another name would be left out in silence."""
+    assert callable(getattr(import_module(module), name).cache_clear)
