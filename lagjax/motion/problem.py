@@ -11,8 +11,9 @@ import numpy as np
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.coordinates import State
 from lagjax.mechanics.system import System
+from lagjax.motion.account import account_of, warning_of
 from lagjax.motion.consistency import departures
-from lagjax.motion.solve import ROUND_OFFS
+from lagjax.motion.global_error import ROUND_OFFS
 from lagjax.motion.trajectory import RESULTS, AccuracyWarning
 
 # Tolerances that each dtype reaches with room to spare.
@@ -216,19 +217,23 @@ def off_constraints(system: System, s: State, rtol, atol) -> str:
     )
 
 
-def warn_of_drift(trajectory):
-    """Warn where something that must stay constant has changed by more than the tolerance lets expect."""
+def warn_of_inaccuracy(trajectory):
+    """Warn where the error, or the change of something that must stay, is more than the tolerance lets expect."""
     if float(trajectory.departure) <= 1:
         return
+    estimated = trajectory.error is not None and account_of(trajectory) is not None
+    words = warning_of(trajectory) if estimated else _of_drift(trajectory)
+    warnings.warn(words, AccuracyWarning, stacklevel=4)
+
+
+def _of_drift(trajectory):
     drift, rtol = float(trajectory.drift()), float(trajectory.tolerance[0][0])
     span, steps = abs(float(trajectory.end.t - trajectory.t[0])), int(trajectory.stats["num_accepted_steps"])
     off = f", and a constraint is off by {float(trajectory.residual()):.1g}" if trajectory.system.constraints else ""
-    warnings.warn(
+    return (
         f"over a time of {span:.6g} ({steps} steps) the Jacobi integral, which should stay, changed by {drift:.1g} of "
         f"its size{off}, at rtol = {rtol:.1g}.\n"
         "Usual cause: a span of very many periods, over which small errors add up, an unstable motion, steps that are "
         "too long, or round-off (float32, or a tolerance near its limit).\n"
-        "Fix: a tighter rtol and atol (in float64), a method of higher order, or a shorter span.",
-        AccuracyWarning,
-        stacklevel=4,
+        "Fix: a tighter rtol and atol (in float64), a method of higher order, or a shorter span."
     )

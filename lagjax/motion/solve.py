@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array, Bool, Float, PyTree
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from lagjax.jax_internals.compiling import compiler_options
 from lagjax.jax_internals.tracing import is_eager, takes_for_regular
@@ -30,11 +30,12 @@ from lagjax.motion.arriving import apart_from_jumps
 from lagjax.motion.both_modes import solve_in_both_modes
 from lagjax.motion.consistency import returned, stopped, within, worst_residual
 from lagjax.motion.crossing_times import all_known, by_name, end_of
+from lagjax.motion.global_error import ROUND_OFFS, with_errors, with_errors_inside
 from lagjax.motion.loop import Solution, solution_of
 from lagjax.motion.reported import report_settled
-from lagjax.motion.trajectory import RESULTS, Moment, Trajectory, ended_well, pack, worst_drift
+from lagjax.motion.trajectory import RESULTS, How, Moment, Trajectory, ended_well, pack, worst_drift
 from lagjax.numerics.nystrom import Nystrom, Nystrom12
-from lagjax.numerics.runge_kutta import Dopri8, ExplicitRungeKutta, in_our_form
+from lagjax.numerics.runge_kutta import Dopri8, ExplicitRungeKutta, evaluations, in_our_form
 
 # A start may be off the constraints by this many tolerances; it is then moved onto them.
 START_TOLERANCES = 100.0
@@ -44,8 +45,6 @@ DRIFT_TOLERANCES = 1e3
 PHASE_STEPS = 0.2
 # With fixed steps no tolerance says how much is expected.
 FIXED_STEPS_ALLOW = 1e-5
-# The tightest tolerance that is not below round-off.
-ROUND_OFFS = 8
 # The operations of a right-hand side that is copied to each of a method's stages; a longer one is compiled once, in a
 # loop. In lanes of a rod or a double pendulum copies are twice as fast. A step by itself is a fifth slower in a loop,
 # but the first answer of a rod comes an eighth sooner, that of eight coupled masses in half the time. Derivatives are
@@ -78,8 +77,11 @@ class Settings:
     rtol: Float[Array, " 2"]
     atol: Float[Array, " 2"]
     dt0: Float[Array, ""] | None
-    max_step: Float[Array, ""] | None
+    # Infinite where steps are of any length.
+    max_step: Float[Array, ""]
     jump_ts: Float[Array, " J"] | None
+    # The most steps of a motion that is integrated again, for its error.
+    repeated_up_to: Int[Array, ""]
     apart: bool = eqx.field(static=True)
     max_steps: int | None = eqx.field(static=True)
     drift: str = eqx.field(static=True)
@@ -101,19 +103,16 @@ def trajectory_of(*problem) -> Trajectory:
         # A program of the user's, which is not kept here.
         share_used()
         return _inside(*problem)
-    system, q0, v0, params, ts, guards, settings = problem
+    *motion, ts, guards, settings = problem
     # Filled up by its last time.
     many = np.append(ts, np.full(filled_up(len(ts)) - len(ts), ts[-1]))
-    static, arrays = parted((system, q0, v0, params, many, guards, settings))
+    of = lambda settings: parted((*motion, many, guards, settings))
+    static, arrays = of(settings)
     programs = kept((_Programs, static), lambda: _Programs(static, len(ts)))
     try:
-        if programs.regular is not None:
-            found, rows, settled = programs.regular(arrays)
-            if settled:
-                return programs.first_outputs(found, rows, len(ts))
-            programs.regular = None
-        found, rows, _ = jax.block_until_ready(programs.careful(arrays))
-        return programs.first_outputs(found, rows, len(ts))
+        found = programs.run(arrays, len(ts))
+        again = lambda closer: programs.run(of(closer)[1], len(ts), settled=True)
+        return with_errors(again, found, settings, ts) if settings.repeated_up_to else found
     except jax.errors.JaxRuntimeError:
         return _trajectory_of(*problem)[0]
 
@@ -123,7 +122,11 @@ def _inside(*problem):
     *motion, settings = problem
     # An adjoint that was asked for is there to be differentiated through.
     regular = takes_for_regular() and settings.adjoint is None
-    found, settled = _trajectory_of(*motion, replace(settings, careful=not regular))
+    settings = replace(settings, careful=not regular)
+    found, settled = _trajectory_of(*motion, settings)
+    if settings.repeated_up_to:
+        again = lambda closer: _trajectory_of(*stopped(motion), closer)[0]
+        found = with_errors_inside(again, found, settings, motion[4])
     return report_settled(found, settled) if regular else found
 
 
@@ -137,7 +140,17 @@ class _Programs:
         self.careful: Callable = jit(partial(_of_arrays, static, True, count))
         self._count = count
 
-    def first_outputs(self, found, rows, count):
+    def run(self, arrays, count, settled=False):
+        """The trajectory with so many outputs; where it is not settled, by the careful way, but if `settled`."""
+        if self.regular is not None:
+            found, rows, well = self.regular(arrays)
+            if settled or well:
+                return self._first_outputs(found, rows, count)
+            self.regular = None
+        found, rows, _ = jax.block_until_ready(self.careful(arrays))
+        return self._first_outputs(found, rows, count)
+
+    def _first_outputs(self, found, rows, count):
         """The trajectory with so many outputs, of `rows` that were filled up."""
         if count == self._count:
             return found
@@ -161,7 +174,7 @@ def _trajectory_of(*problem):
 def _trajectory(system, q0, v0, params, ts, guards, settings):
     """The trajectory, and whether it is settled: what was taken for regular failed for no other reason than that."""
     asked, method = settings.method, method_of(settings, system, ts[0], q0, v0, params)
-    name = type(method).__name__ + ("" if asked is None or asked is method else " (diffrax's, in lagjax's form)")
+    how = _how(method, asked, settings)
     settings = eqx.tree_at(lambda s: s.method, settings, method, is_leaf=lambda x: x is None)
     # Derivatives flow to the floating arrays of these; the settings are constants.
     x, rest = eqx.partition((system, q0, v0, params, ts, guards, settings.jump_ts), eqx.is_inexact_array)
@@ -179,9 +192,16 @@ def _trajectory(system, q0, v0, params, ts, guards, settings):
         fields = solve_in_both_modes(solved, x, fixed)
     else:
         fields = solved(x, fixed, settings.adjoint, True)
-    arrays, described = pack(system, params, name)
+    arrays, described = pack(system, params, how)
     tolerance, settled = (settings.rtol, settings.atol), fields.pop("settled")
     return Trajectory(t=ts, **fields, tolerance=tolerance, arrays=arrays, static=described), settled
+
+
+def _how(method, asked, settings):
+    name = type(method).__name__ + ("" if asked is None or asked is method else " (diffrax's, in lagjax's form)")
+    terms = diffrax.ODETerm(lambda t, y, args: y)
+    chosen = "fixed" if isinstance(settings.controller, diffrax.ConstantStepSize) else "controller"
+    return How(name, method.error_order(terms), evaluations(method), chosen if settings.controller else "tolerance")
 
 
 def method_of(settings, system, *state):
@@ -251,7 +271,7 @@ def _start(equations: Equations, q, v, ts, settings) -> Start:
         q, v, holds = returned(equations, t, q, v, settings.rtol, settings.atol)
     _, _, finite, singular, contradictory = stopped(equations.verdict(t, q, v))
     too_small = settings.controller is None and settings.rtol[0] < ROUND_OFFS * jnp.finfo(ts.dtype).eps
-    lengths = [length for length in (settings.dt0, settings.max_step) if length is not None]
+    lengths = [settings.max_step, *([] if settings.dt0 is None else [settings.dt0])]
     against = {
         "start_singular": singular,
         "start_not_finite": ~finite,

@@ -160,7 +160,7 @@ def look(trajectory, settings) -> Steps:
     put_down = []
     while len(put_down) < LOOKED_AT and abs(last - t) > 0:
         # The end is reached exactly.
-        size = min(size, abs(last - t), np.inf if settings.max_step is None else float(settings.max_step))
+        size = min(size, abs(last - t), float(settings.max_step))
         times = jnp.asarray(t), jnp.asarray(t + way * size)
         after, error = _attempt(method, terms, *times, y, params, trajectory.tolerance)
         error = float(error)

@@ -16,7 +16,8 @@ from lagjax.mechanics import coordinates
 from lagjax.mechanics.compiled import compiled
 from lagjax.mechanics.structure import angles, what_changes_jacobi_integral
 from lagjax.mechanics.system import System
-from lagjax.motion import frames
+from lagjax.motion import account, frames
+from lagjax.motion.accuracy import Errors
 from lagjax.motion.consistency import worst_residual
 from lagjax.motion.crossings import Crossings
 
@@ -38,8 +39,14 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
         "The times do not increase throughout, or dt0 or max_step is not positive. (Times that decrease are taken "
         "where they are known while JAX is tracing: a NumPy array.)"
     )
-    drifted = "The motion was computed, but what must stay constant changed by more than 1000 tolerances."
+    drifted = (
+        "The motion was computed, but its error, or the change of what must stay constant, is above what is allowed."
+    )
     not_converged = "The search of a fit did not converge."
+    not_estimated = (
+        "The error was not estimated: it was not asked for, and the motion takes more than 20,000 steps; or how to "
+        "shorten the steps of its controller is not known."
+    )
     misfit = "The residuals of a fit are no errors of measurement: they contradict sigma, or follow a curve."
 
 
@@ -61,21 +68,38 @@ class Moment(NamedTuple):
     multipliers: dict[str, Array]
 
 
+class How(NamedTuple):
+    """How a motion was stepped through.
+
+    `order`: of the error that chooses steps; `evaluations`: of the equations in a step, None for an implicit method;
+    `steps`: chosen by the "tolerance", "fixed", or by the user's "controller".
+    """
+
+    method: str
+    order: int
+    evaluations: int | None
+    steps: str
+
+
 class Static(NamedTuple):
     """What of a trajectory is not an array: it must be hashable, so that JAX can carry it along."""
 
     parts: tuple
     structure: object
-    method: str
+    how: How
+
+    @property
+    def method(self) -> str:
+        return self.how.method
 
     def __reduce__(self):
         # Equinox knows a marker in the structure by its identity, which a copy of the structure would lose.
-        return _static, (jax.tree.unflatten(self.structure, self.parts), self.method)
+        return _static, (jax.tree.unflatten(self.structure, self.parts), self.how)
 
 
-def _static(tree, method):
+def _static(tree, how):
     parts, structure = jax.tree.flatten(tree)
-    return Static(tuple(parts), structure, method)
+    return Static(tuple(parts), structure, how)
 
 
 class Trajectory(eqx.Module):
@@ -87,9 +111,12 @@ class Trajectory(eqx.Module):
     - `multipliers`: by constraint name, (T, *shape of the constraint), from the projected states.
     - `end`: the last instant reached (`t`, `q`, `v`, `multipliers`): the event, where one ended the motion.
     - `stats`: `num_steps`, `num_accepted_steps`, `num_rejected_steps`.
-    - `departure`: how far the Jacobi integral, where it must be constant, and the constraints changed, in units of what
-      the tolerance lets expect; above 1 the motion is less accurate than that, and `integrate` warns. 0 where nothing
-      must stay.
+    - `error`: estimates of the errors of `q`, `v`, `multipliers` and of the times of `events` (`Errors`); None where
+      they were not made.
+    - `departure`: the worst error in units of what is allowed (10,000 tolerances, and a thousandth of each number);
+      above 1 the motion is less accurate than that, and `integrate` warns. Without `error` it is how far the Jacobi
+      integral, where it must be constant, and the constraints changed, in units of what the tolerance lets expect; 0
+      where nothing must stay.
     - `result`: a `RESULTS` item; `lj.RESULTS.successful`, `event_occurred`, or what went wrong.
     - `events`: by name, the `Crossings` of what was asked for.
     - `params`, `system`: what was integrated. `tolerance`: (rtol, atol), each (2,):
@@ -110,6 +137,7 @@ class Trajectory(eqx.Module):
     tolerance: tuple[Array, Array]
     arrays: PyTree
     static: Static = eqx.field(static=True)
+    error: Errors | None = None
 
     @property
     def system(self) -> System:
@@ -230,10 +258,10 @@ def worst_drift(system, t, q, v, params):
     return jnp.nanmax(jnp.abs(h - h[0])) / jnp.where(largest > 0, largest, 1.0)
 
 
-def pack(system, params, method: str) -> tuple[PyTree, Static]:
+def pack(system, params, how: How) -> tuple[PyTree, Static]:
     """Split (system, params) into arrays and hashable rest."""
     arrays, static = eqx.partition((system, params), eqx.is_array)
-    return arrays, _static(static, method)
+    return arrays, _static(static, how)
 
 
 def ended_well(result) -> Bool[Array, "..."]:
@@ -262,10 +290,8 @@ def _lines(traj):
     rows = [
         ("method", f"{traj.static.method}, rtol {_pair(traj.tolerance[0])}, atol {_pair(traj.tolerance[1])}"),
         ("result", message(traj.result) + _ended(traj)),
-        (
-            "steps",
-            f"{int(traj.stats['num_accepted_steps'])} accepted, {int(traj.stats['num_rejected_steps'])} rejected",
-        ),
+        *account.of_cost(traj),
+        *(account.of_error(traj) or _not_estimated(traj)),
     ]
     if traj.system.constraints:
         rows.append(("worst constraint residual", f"{float(traj.residual()):.1e} (relative)"))
@@ -275,9 +301,13 @@ def _lines(traj):
     rows.append(("change of the Jacobi integral", f"{float(traj.drift()):.1e} (relative){as_it_may}"))
     rows += [(f"event '{name}'", found.in_words()) for name, found in traj.events.items()]
     if float(traj.departure) > 1:
-        rows.append(("WARNING", f"drifted {float(traj.departure):.2g} times as far as the tolerance lets expect"))
+        rows.append(("WARNING", f"the error is {float(traj.departure):.2g} times what the tolerance lets expect"))
     rows += _shape_rows(traj)
     return ["Trajectory", *_aligned(rows)]
+
+
+def _not_estimated(traj):
+    return [] if traj.error is None else [("error", message(traj.error.result))]
 
 
 def _pair(tolerance):
@@ -293,7 +323,7 @@ def _batch_lines(traj, lanes):
         ("method", traj.static.method),
         ("lanes", " x ".join(map(str, lanes))),
         ("results", "; ".join(words)),
-        *([("WARNING", f"{drifted} lanes drifted farther than the tolerance lets expect")] if drifted else []),
+        *([("WARNING", f"{drifted} lanes are less accurate than the tolerance lets expect")] if drifted else []),
         ("steps a lane", f"{steps.min()} to {steps.max()}, {int(steps.sum())} in all" if steps.size else "no lanes"),
         *_shape_rows(traj),
     ]

@@ -1,0 +1,81 @@
+"""What the estimated errors of a motion mean: how many digits are left, from when on they are lost, and to what.
+
+An error of up to ten thousand tolerances is as expected of many steps, as long as three digits are left. What exceeds
+that is in `departure`, in units of it.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Array, Float, Int, PyTree
+
+from lagjax.mechanics.structure import angles
+
+# An error is as expected up to so many tolerances, as long as this share of the number is not lost.
+EXPECTED, DIGITS_LEFT = 1e4, 1e-3
+# A coordinate that stays within so many tolerances of zero, and at this share of the others, has no digits to lose.
+NOTHING, SMALL = 100.0, 1e-6
+# Of an angle at most one turn counts as its size.
+TURN = 2 * np.pi
+# Errors that a motion has made this many times what the steps' errors add up to are amplified.
+AMPLIFIED = 100.0
+
+
+class Errors(NamedTuple):
+    """Estimates of the errors of a motion: how far each number may be from the true one, in its own unit.
+
+    - `q`, `v`, `multipliers`: like those of the trajectory; NaN where that is NaN.
+    - `events`: by name, those of the crossings' times, (K,); infinite for a crossing that only one of two runs found.
+    - `result`: `lj.RESULTS.successful`, or why there is no estimate, which is then NaN.
+    - `steps`: how many steps the second run accepted.
+    """
+
+    q: PyTree[Float[Array, "T ..."]]
+    v: PyTree[Float[Array, "T ..."]]
+    multipliers: dict[str, Array]
+    events: dict[str, Array]
+    result: Any
+    steps: Int[Array, ""]
+
+
+def columns(xp, tree, rows) -> Any:
+    """The leaves of a tree beside each other."""
+    return xp.concatenate([xp.asarray(x).reshape(rows, -1) for x in jax.tree.leaves(tree)], axis=1)
+
+
+def allowed(xp, size, is_angle, span, tolerance):
+    """What errors of coordinates and velocities may be, (2, n), by their sizes, (2, n), in a motion of a time `span`.
+
+    `is_angle` (n,) or one truth for all; `tolerance`: (rtol, atol), each (2,).
+    """
+    of_q = np.array([[True], [False]])
+    size = xp.where(of_q & is_angle, xp.minimum(size, TURN), size)
+    rtol, atol = tolerance
+    tolerances = atol[:, None] + rtol[:, None] * size
+    largest = xp.max(size, axis=1, keepdims=True)
+    others = xp.maximum(largest, largest[::-1] * xp.where(of_q, span, 1 / span))
+    nothing = (size <= NOTHING * tolerances) & (size <= SMALL * others)
+    return xp.minimum(EXPECTED * tolerances, xp.where(nothing, np.inf, DIGITS_LEFT * size))
+
+
+def departure(xp, worst, size, trajectory, ts, tolerance):
+    """The worst errors, (2, n), in units of what is allowed; what it was before where there is no estimate."""
+
+    def by(is_angle):
+        limit = allowed(xp, size, is_angle, abs(ts[-1] - ts[0]), tolerance)
+        # A number that is zero throughout has an error of zero.
+        share = worst / xp.where(limit > 0, limit, 1.0)
+        unknown = xp.isnan(share)
+        return xp.where(unknown.all(), trajectory.departure, xp.where(unknown, 0.0, share).max()).astype(ts.dtype)
+
+    # Which coordinates are angles takes long to say, and counts only where much is lost.
+    at_most = by(True) if xp is np else np.inf
+    return at_most if at_most <= 1 else by(angle_mask(trajectory))
+
+
+def angle_mask(trajectory) -> np.ndarray:
+    """Which coordinates are angles."""
+    first = jax.tree.map(lambda x: x[0], (trajectory.t, trajectory.q, trajectory.v))
+    found = angles(trajectory.system, *first, trajectory.params)
+    return np.concatenate([np.full(np.size(x), yes) for yes, x in zip(*map(jax.tree.leaves, (found, first[1])))])
