@@ -130,8 +130,8 @@ def warning_of(trajectory) -> str:
     cause, fix = _cause(trajectory, found, row, column, rtol)
     return (
         f"over a time of {span:.6g} ({steps} steps) the error of '{found.names[column]}' grows to about {error:.1g}, "
-        f"where {'a turn' if turn else 'the largest value'} is {size:.3g}: {_left(error, size)}. From t = {since:.6g} on it is more than "
-        f"{_expected(size, found.limit[column])} at rtol = {rtol:.1g}.\nUsual cause: {cause}.\nFix: {fix}."
+        f"where {'a turn' if turn else 'the largest value'} is {size:.3g}: {_left(error, size)}. From t = {since:.6g} "
+        f"on it is more than {_expected(size, found.limit[column])} at rtol = {rtol:.1g}.\nUsual cause: {cause}.\nFix: {fix}."
     )
 
 
@@ -165,8 +165,8 @@ def _cause(trajectory, found, row, column, rtol):
         return (
             f"the motion itself amplifies errors, here {times:.0e} times (a chaotic or an unstable motion, or a phase "
             "that runs away over many periods)",
-            f"{'float64 where this is float32' if round_off else tighter}, which gains some digits for some time; beyond "
-            "that look at what does not depend on one motion: averages, sections, energies",
+            f"{'float64 where this is float32' if round_off else tighter}, which gains some digits for some time; "
+            "beyond that look at what does not depend on one motion: averages, sections, energies",
         )
     if round_off:
         return "round-off: the tolerance is near its limit", "a shorter span, or float64 where this is float32"

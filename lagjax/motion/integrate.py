@@ -115,8 +115,9 @@ def integrate(
     - `ValueError` for a start off the constraints, or one where L or its equations are singular or not finite.
     - `RuntimeError` where the integration stops early: `max_steps` reached, or a step size that collapsed.
     - Warns (`lj.AccuracyWarning`) where `departure` is above 1: where the estimated error is more than 10,000
-      tolerances or leaves fewer than three digits; without an estimate, where the Jacobi integral must be constant and
-      changed by 1000 tolerances, or by less over thousands of steps, or by 1e-5 with fixed steps. In lanes look at that.
+      tolerances or leaves fewer than three digits; without an estimate, where the Jacobi integral must be constant
+      and changed by 1000 tolerances, or by less over thousands of steps, or by 1e-5 with fixed steps. In lanes look at
+      that.
     - Warns of what is hardly ever meant: a `dissipation` that is odd in v, as a force is; once, float32 by default.
 
     Order and accuracy: those of `method`; `tests/motion/test_orders.py` measures them.
