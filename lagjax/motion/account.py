@@ -131,7 +131,8 @@ def warning_of(trajectory) -> str:
     return (
         f"over a time of {span:.6g} ({steps} steps) the error of '{found.names[column]}' grows to about {error:.1g}, "
         f"where {'a turn' if turn else 'the largest value'} is {size:.3g}: {_left(error, size)}. From t = {since:.6g} "
-        f"on it is more than {_expected(size, found.limit[column])} at rtol = {rtol:.1g}.\nUsual cause: {cause}.\nFix: {fix}."
+        f"on it is more than {_expected(size, found.limit[column])} at rtol = {rtol:.1g}.\n"
+        f"Usual cause: {cause}.\nFix: {fix}."
     )
 
 
