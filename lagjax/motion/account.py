@@ -6,7 +6,7 @@ import jax
 import numpy as np
 
 from lagjax.mechanics import coordinates
-from lagjax.motion.accuracy import AMPLIFIED, DIGITS_LEFT, EXPECTED, TURN, allowed, angle_mask, columns
+from lagjax.motion.accuracy import AMPLIFIED, DIGITS_LEFT, EXPECTED, TURN, allowed, angle_mask, columns, sizes_of
 
 # A velocity that grows to so many times its median has passed near a singularity.
 PEAK = 30.0
@@ -53,12 +53,15 @@ def account_of(trajectory) -> Account | None:
     t, value, error = t[reached], value[reached], error[reached]
     names = coordinates.names(jax.tree.map(lambda x: np.asarray(x)[0], trajectory.q))
     tolerance = tuple(np.asarray(x) for x in trajectory.tolerance)
-    size, mask = abs(value).max(axis=0), angle_mask(trajectory)
-    limit = allowed(np, size.reshape(2, -1), mask, abs(t[-1] - t[0]), tolerance).ravel()
-    size = np.where(np.concatenate([mask, np.zeros_like(mask)]), np.minimum(size, TURN), size)
+    seen, span, steps = (
+        abs(value).max(axis=0).reshape(2, -1),
+        abs(t[-1] - t[0]),
+        int(trajectory.stats["num_accepted_steps"]),
+    )
+    size = sizes_of(np, seen, angle_mask(trajectory), span, steps, len(trajectory.t))
+    limit, size = allowed(np, size, span, tolerance).ravel(), size.ravel()
     of_a_step = np.repeat(tolerance[1], len(names)) + np.repeat(tolerance[0], len(names)) * size
-    steps = np.maximum(1.0, int(trajectory.stats["num_accepted_steps"]) * abs(t - t[0]) / abs(t[-1] - t[0]))
-    amplified = error / (of_a_step * steps[:, None])
+    amplified = error / (of_a_step * np.maximum(1.0, steps * abs(t - t[0]) / span)[:, None])
     return Account([*names, *(f"v of {name}" for name in names)], t, value, error, size, limit, amplified)
 
 
@@ -142,7 +145,7 @@ def _left(error, size):
 
 
 def _expected(size, limit):
-    return "a thousandth of that" if limit >= 0.999 * DIGITS_LEFT * size else f"{EXPECTED:,.0f} tolerances"
+    return "three digits allow" if limit >= 0.999 * DIGITS_LEFT * size else f"{EXPECTED:,.0f} tolerances"
 
 
 def _cause(trajectory, found, row, column, rtol):

@@ -13,11 +13,13 @@ from jaxtyping import Array, Float, Int, PyTree
 from lagjax.mechanics.structure import angles
 
 # An error is as expected up to so many tolerances, as long as this share of the number is not lost.
-EXPECTED, DIGITS_LEFT = 1e4, 1e-3
+EXPECTED, DIGITS_LEFT = 1e4, 5e-4
 # A coordinate that stays within so many tolerances of zero, and at this share of the others, has no digits to lose.
 NOTHING, SMALL = 100.0, 1e-6
 # Of an angle at most one turn counts as its size.
 TURN = 2 * np.pi
+# Steps to an output from which on outputs are far from each other, and those of a motion to and fro.
+SPARSE, TO_AND_FRO = 1.5, 10.0
 # Errors that a motion has made this many times what the steps' errors add up to are amplified.
 AMPLIFIED = 100.0
 
@@ -44,26 +46,34 @@ def columns(xp, tree, rows) -> Any:
     return xp.concatenate([xp.asarray(x).reshape(rows, -1) for x in jax.tree.leaves(tree)], axis=1)
 
 
-def allowed(xp, size, is_angle, span, tolerance):
-    """What errors of coordinates and velocities may be, (2, n), by their sizes, (2, n), in a motion of a time `span`.
+def sizes_of(xp, seen, is_angle, span, steps, outputs):
+    """How large coordinates and velocities are, (2, n), by the largest of them that were `seen` at outputs, (2, n).
 
-    `is_angle` (n,) or one truth for all; `tolerance`: (rtol, atol), each (2,).
+    Outputs that are far from each other may all be where a velocity is zero, or a coordinate: it is then at least what
+    the other makes of it in a step, or in ten. `is_angle` (n,) or one truth for all.
     """
-    of_q = np.array([[True], [False]])
-    size = xp.where(of_q & is_angle, xp.minimum(size, TURN), size)
+    q, v = xp.where(is_angle, xp.minimum(seen[0], TURN), seen[0]), seen[1]
+    step = xp.where(steps > SPARSE * outputs, span / (1.0 + steps), 0.0)
+    between = xp.where(step > 0, q / xp.where(step > 0, TO_AND_FRO * step, 1.0), 0.0)
+    return xp.stack([xp.maximum(q, v * step), xp.maximum(v, between)])
+
+
+def allowed(xp, size, span, tolerance):
+    """What errors of coordinates and velocities may be, (2, n), by their sizes; `tolerance` is (rtol, atol)."""
     rtol, atol = tolerance
     tolerances = atol[:, None] + rtol[:, None] * size
     largest = xp.max(size, axis=1, keepdims=True)
-    others = xp.maximum(largest, largest[::-1] * xp.where(of_q, span, 1 / span))
+    others = xp.maximum(largest, largest[::-1] * xp.asarray([[span], [1 / span]]))
     nothing = (size <= NOTHING * tolerances) & (size <= SMALL * others)
     return xp.minimum(EXPECTED * tolerances, xp.where(nothing, np.inf, DIGITS_LEFT * size))
 
 
-def departure(xp, worst, size, trajectory, ts, tolerance):
+def departure(xp, worst, seen, trajectory, ts, tolerance):
     """The worst errors, (2, n), in units of what is allowed; what it was before where there is no estimate."""
+    span, steps = abs(ts[-1] - ts[0]), xp.asarray(trajectory.stats["num_accepted_steps"])
 
     def by(is_angle):
-        limit = allowed(xp, size, is_angle, abs(ts[-1] - ts[0]), tolerance)
+        limit = allowed(xp, sizes_of(xp, seen, is_angle, span, steps, len(ts)), span, tolerance)
         # A number that is zero throughout has an error of zero.
         share = worst / xp.where(limit > 0, limit, 1.0)
         unknown = xp.isnan(share)

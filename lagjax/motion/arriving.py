@@ -17,25 +17,32 @@ from jaxtyping import Array, Float
 
 from lagjax.mechanics.equations import Equations
 
+# The first step as it is proposed, and no longest one. Infinite, the share of an empty pause would be no number.
+WHOLE_STEPS = 1.0, 1e30
 # The distance kept from a jump, in round-offs of the time: a user computes the same time in two ways.
 BESIDE = 4
 
 
 class Arriving(diffrax.AbstractStepSizeController):
-    """Wrap `controller`: each of the increasing times `ts` is the end of a step."""
+    """Wrap `controller`: each of the increasing times `ts` is the end of a step.
+
+    `shares`: of the first step that is proposed, that which is taken; and of the time from one of `ts` to the next, the
+    longest step.
+    """
 
     controller: diffrax.PIDController
     ts: Float[Array, " T"]
+    shares: Float[Array, " 2"]
 
     def wrap(self, direction):
         """The same for time in this direction, which is always forward."""
-        return Arriving(self.controller.wrap(direction), self.ts)
+        return Arriving(self.controller.wrap(direction), self.ts, self.shares)
 
     def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
         """The first step."""
         proposed, state = self.controller.init(terms, t0, t1, y0, dt0, args, func, error_order)
-        index = jnp.minimum(1, self.ts.size - 1)
-        return self._toward(index, t0, proposed - t0), (state, index, proposed - t0)
+        index, step = jnp.minimum(1, self.ts.size - 1), self.shares[0] * (proposed - t0)
+        return self._toward(index, t0, step), (state, index, step)
 
     def adapt_step_size(self, t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state):
         """Whether to keep a step, and the next one."""
@@ -55,6 +62,7 @@ class Arriving(diffrax.AbstractStepSizeController):
 
     def _toward(self, index, t, step):
         left = self.ts[index] - t
+        step = jnp.minimum(step, self.shares[1] * (self.ts[index] - self.ts[index - 1]))
         halfway = t + jnp.where(step < 0.5 * left, step, 0.5 * left)
         # At the last time there is nothing left, and diffrax ends the solve.
         return jnp.where((step < left) | (left <= 0), jnp.where(left > 0, halfway, t + step), self.ts[index])

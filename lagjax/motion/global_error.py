@@ -6,7 +6,7 @@ first, but for a tenth of it. Also where the motion amplifies errors until nothi
 difference alike, and round-off, which differs in the two as the steps do.
 
 Where something else chooses the steps, both runs would take the same ones. Fixed steps are halved, and so are those
-that outputs or `max_step` shorten: by a longest step that leaves one more between two outputs than there were.
+that `max_step` shortens; outputs are reached in one step more than there were; the first step is a shorter one.
 
 Source: Hairer, Nørsett & Wanner, *Solving ODEs I*, §II.4 (global error by a second tolerance).
 """
@@ -33,6 +33,8 @@ STEPS_AT_MOST = 20_000
 # Steps from one output to the next up to which outputs may have chosen them. The first steps are short: so much of a
 # step to an output does not count.
 FEW, BUT_FOR = 4, 0.2
+# The least steps to an output where most take more, and the share of the first step that is taken.
+MANY, FIRST = 3.0, 0.7
 # Steps that are nearly as long as `max_step` all the way.
 LIMITED = 0.7
 # Of the size of a number and the square root of the steps: what round-off adds at least.
@@ -83,12 +85,13 @@ def _closer(xp, settings, steps, ts):
         return replace(settings, dt0=settings.dt0 / 2)
     # Below round-off the other way: the difference is then what the looser run is off, and more than this one.
     scale = xp.where(settings.rtol / TIGHTER >= ROUND_OFFS * np.finfo(ts.dtype).eps, 1 / TIGHTER, TIGHTER)
-    gaps, longest = abs(ts[1:] - ts[:-1]), settings.max_step
-    few = xp.ceil(steps / len(gaps) - BUT_FOR)
-    longest = xp.where(steps * longest * LIMITED <= xp.sum(gaps), longest, longest / 2)
-    longest = xp.where(few <= FEW, xp.minimum(longest, xp.max(gaps) / (few + 1)), longest)
-    rtol, atol, longest = (x.astype(ts.dtype) for x in (settings.rtol * scale, settings.atol * scale, longest))
-    return replace(settings, rtol=rtol, atol=atol, max_step=longest)
+    span, an_output = abs(ts[-1] - ts[0]), steps / (len(ts) - 1)
+    limited = steps * settings.max_step * LIMITED <= span
+    longest = xp.where(limited, settings.max_step / 2, settings.max_step)
+    pieces = xp.where(an_output <= FEW, xp.ceil(an_output - BUT_FOR) + 1, MANY)
+    values = settings.rtol * scale, settings.atol * scale, longest, xp.stack([xp.asarray(FIRST), 1 / pieces])
+    rtol, atol, longest, shares = (x.astype(ts.dtype) for x in values)
+    return replace(settings, rtol=rtol, atol=atol, max_step=longest, shares=shares)
 
 
 def _compared(xp, first, second, settings, ts) -> Trajectory:

@@ -20,6 +20,7 @@ from lagjax.mechanics.diagnosis import explain_failure
 from lagjax.mechanics.first_call import looked_at, with_known_kinds
 from lagjax.mechanics.system import System
 from lagjax.motion import problem
+from lagjax.motion.arriving import WHOLE_STEPS
 from lagjax.motion.backward import in_either_direction, runs_backward
 from lagjax.motion.crossings import Crossing, crossings_of, guards_of, left_to_diffrax, warn_of_events
 from lagjax.motion.global_error import steps_to_repeat
@@ -154,6 +155,7 @@ def integrate(
         max_steps=patient(max_steps),
         drift=drift,
         progress=progress,
+        shares=np.array(WHOLE_STEPS, dtype),
         repeated_up_to=steps_to_repeat(estimate_error, stepsize_controller, progress),
     )
     ts, backward = problem.times(ts, dtype), runs_backward(ts)

@@ -207,9 +207,9 @@ def _controller(ts, settings, bare, repeated):
     )  # fmt: skip
     arriving = _arriving(settings) and not bare
     if settings.jump_ts is None and not repeated:
-        return Arriving(controller, ts) if arriving else controller
+        return Arriving(controller, ts, settings.shares) if arriving else controller
     jumps = ts[-1:] if settings.jump_ts is None else settings.jump_ts
-    return Arriving(controller, together(ts if arriving else ts[np.array([0, -1])], jumps))
+    return Arriving(controller, together(ts if arriving else ts[np.array([0, -1])], jumps), settings.shares)
 
 
 def resolution(ts):

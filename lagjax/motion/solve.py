@@ -80,6 +80,8 @@ class Settings:
     # Infinite where steps are of any length.
     max_step: Float[Array, ""]
     jump_ts: Float[Array, " J"] | None
+    # Of the first step, and of the time from one output to the next for all: see `Arriving`.
+    shares: Float[Array, " 2"]
     # The most steps of a motion that is integrated again, for its error.
     repeated_up_to: Int[Array, ""]
     apart: bool = eqx.field(static=True)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import lagjax as lj
-from lagjax.motion.arriving import Arriving
+from lagjax.motion.arriving import WHOLE_STEPS, Arriving
 from tests.systems import PARAMS, pendulum
 
 
@@ -35,7 +35,9 @@ def test_outputs_shorten_few_steps():
 
 def test_the_size_proposed_before_is_kept():
     """After a step shortened to an output the next one is as long as had been proposed."""
-    controller = Arriving(diffrax.PIDController(rtol=1e-6, atol=1e-6), jnp.array([0.0, 1.0, 1.001, 5.0]))
+    controller = Arriving(
+        diffrax.PIDController(rtol=1e-6, atol=1e-6), jnp.array([0.0, 1.0, 1.001, 5.0]), jnp.array(WHOLE_STEPS)
+    )
     before = jnp.asarray(0.4)
     state = (controller.controller.init(None, 0.0, 5.0, 1.0, 0.4, None, lambda *a: 0.0, 5)[1], jnp.asarray(2), before)
     keep, t0, t1, _, (_, index, proposed), _ = controller.adapt_step_size(

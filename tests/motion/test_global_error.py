@@ -1,0 +1,166 @@
+"""Estimated errors against true ones: Kepler's motion, whose equation gives the place at any time, and chaos."""
+
+import warnings
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import lagjax as lj
+from lagjax.motion.account import warning_of
+
+ECCENTRICITY = 0.6
+kepler = lj.System(lambda t, q, v, p: 0.5 * (v["x"] ** 2 + v["y"] ** 2) + p["k"] / jnp.sqrt(q["x"] ** 2 + q["y"] ** 2))
+near_pericentre = lj.Crossing(lambda t, q, v, p: q["y"], direction=1, terminal=False)
+swing = lj.System(lambda t, q, v, p: 0.5 * v**2 - p["g"] * (1 - jnp.cos(q)))
+
+
+def exact(t, e=ECCENTRICITY):
+    """The place and the velocity on an orbit with k = a = 1, by Newton's method for Kepler's equation."""
+    mean = np.asarray(t) % (2 * np.pi)
+    anomaly = mean + e * np.sin(mean)
+    for _ in range(20):
+        anomaly -= (anomaly - e * np.sin(anomaly) - mean) / (1 - e * np.cos(anomaly))
+    b, rate = np.sqrt(1 - e**2), 1 / (1 - e * np.cos(anomaly))
+    q = {"x": np.cos(anomaly) - e, "y": b * np.sin(anomaly)}
+    return q, {"x": -np.sin(anomaly) * rate, "y": b * np.cos(anomaly) * rate}
+
+
+def orbit(ts, e=ECCENTRICITY, **settings):
+    """Some turns from the pericentre; what is said aloud is looked at elsewhere."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", lj.AccuracyWarning)
+        return lj.integrate(kepler, *exact(ts[0], e), {"k": 1.0}, ts=ts, **settings)
+
+
+def ratios(traj, e=ECCENTRICITY):
+    """True errors in units of the estimated ones, the largest of the coordinates, and of the velocities, each.
+
+    At the first outputs round-off is all that there is.
+    """
+    found = []
+    for got, true, error in zip((traj.q, traj.v), exact(np.asarray(traj.t), e), (traj.error.q, traj.error.v)):
+        off = np.max([abs(got[name] - true[name]) for name in got], axis=0)
+        found.append((off / np.max([error[name] for name in got], axis=0))[2:])
+    return np.concatenate(found)
+
+
+FEW, MANY = np.linspace(0.0, 40.0, 9), np.linspace(0.0, 20.0, 101)
+CASES = {
+    "default, loose": (FEW, dict(rtol=1e-5, atol=1e-5)),
+    "default": (FEW, dict()),
+    "outputs choose the steps": (MANY, dict(method=lj.Dopri8())),
+}
+OTHERS = {
+    "a longest step": (FEW, dict(max_step=0.1, method=lj.Dopri8())),
+    "backward": (FEW[::-1], dict(rtol=1e-7, atol=1e-7)),
+    "Tsit5": (FEW, dict(method=lj.Tsit5(), rtol=1e-6, atol=1e-6)),
+    "implicit": (FEW, dict(method=lj.Radau5(), rtol=1e-7, atol=1e-7)),
+    "fixed steps": (FEW, dict(method=diffrax.Heun(), stepsize_controller=diffrax.ConstantStepSize(), dt0=0.01)),
+}
+
+
+@pytest.mark.parametrize("name", [*CASES, *(pytest.param(name, marks=pytest.mark.slow) for name in OTHERS)])
+def test_estimated_as_they_are(name):
+    """Within ten of the true errors nearly everywhere; a thousandth of the estimate would not be."""
+    ts, settings = (CASES | OTHERS)[name]
+    found = ratios(orbit(ts, **settings))
+    within = lambda x: np.mean((x > 0.1) & (x < 10.0))
+    assert within(found) > 0.85 and found.max() < 20.0, found
+    assert within(1e3 * found) < 0.1
+
+
+@pytest.mark.slow
+def test_steps_of_another_controller():
+    """How to make them shorter nobody knows: there is no estimate, also where one is asked for."""
+    given = dict(stepsize_controller=diffrax.PIDController(rtol=1e-9, atol=1e-9), estimate_error=True)
+    found = orbit(np.array([0.0, 10.0]), **given)
+    assert bool(found.error.result == lj.RESULTS.not_estimated) and np.isnan(found.error.q["x"]).all()
+    assert "how to shorten the steps of its controller" in repr(found)
+
+
+@pytest.mark.slow
+def test_times_of_events():
+    """Each crossing's time with its error."""
+    traj = orbit(np.array([0.0, 40.0]), rtol=1e-7, atol=1e-7, events={"up": near_pericentre})
+    found = traj.events["up"]
+    turns = 2 * np.pi * np.arange(1, int(found.count) + 1)
+    off, error = abs(np.asarray(found.t)[: len(turns)] - turns), traj.error.events["up"]
+    assert len(turns) == 6 and np.isnan(error[6:]).all()
+    np.testing.assert_array_less(off, 10 * error[:6])
+    np.testing.assert_array_less(error[:6], 100 * off)
+    assert "error of 'up'" in repr(traj)
+
+
+def test_what_chaos_leaves():
+    """Where no digit is left, that is said, with the coordinate, the time and the cause; not where all are."""
+    lagrangian = lambda t, q, v, p: (
+        v["a"] ** 2
+        + 0.5 * v["b"] ** 2
+        + v["a"] * v["b"] * jnp.cos(q["a"] - q["b"])
+        + p["g"] * (2 * jnp.cos(q["a"]) + jnp.cos(q["b"]))
+    )
+    double, start = lj.System(lagrangian), ({"a": 2.5, "b": 2.0}, {"a": 0.0, "b": 0.0})
+    run = lambda end: lj.integrate(double, *start, {"g": 9.81}, ts=np.linspace(0.0, end, 41))
+    with pytest.warns(
+        lj.AccuracyWarning, match=r"the error of '(v of )?[ab]' grows .* From t = [\s\S]* amplifies errors"
+    ):
+        long = run(60.0)
+    assert long.departure > 1 and long.error.q["b"][-1] > 0.3 and "has cost" in repr(long) and "WARNING" in repr(long)
+    short = run(1.0)
+    assert short.departure < 0.1 and short.error.q["b"][-1] < 1e-7 and "WARNING" not in repr(short)
+    # The Jacobi integral, which was all that was looked at before, sees nothing.
+    assert long.drift() < 1e-7
+
+
+def test_passing_a_singularity():
+    """What is lost near it is said to be lost there."""
+    traj = orbit(np.linspace(0.0, 125.0, 201), e=0.999)
+    assert traj.departure > 1 and "near a singularity" in warning_of(traj)
+
+
+def test_by_default_and_when_asked():
+    """Eager calls are estimated, traced ones when they ask; derivatives are those of the motion alone."""
+    run = lambda g, **asked: lj.integrate(swing, 1.0, 0.0, {"g": g}, ts=np.linspace(0.0, 20.0, 5), rtol=1e-6, **asked)
+    eager, refused = run(9.81), run(9.81, estimate_error=False)
+    assert refused.error is None and "  error  " not in repr(refused) and "  error  " in repr(eager)
+    np.testing.assert_array_equal(refused.q, eager.q)
+    inside = jax.jit(lambda g: run(g, estimate_error=True))
+    close = lambda found: np.testing.assert_allclose(found, eager.error.q, rtol=0.3)
+    close(inside(9.81).error.q)
+    assert jax.jit(run)(9.81).error is None
+    lanes = jax.vmap(inside)(jnp.array([9.81, 5.0]))
+    close(lanes.error.q[0])
+    slope = lambda asked: jax.grad(lambda g: run(g, estimate_error=asked).q[-1])(9.81)
+    assert slope(True) == slope(None)
+    of_estimate = jax.jacfwd(lambda g: run(g, estimate_error=True).error.q[-1])(9.81)
+    assert of_estimate == 0.0
+
+
+def test_what_cannot_be_estimated():
+    """NaN with its reason; the motion itself is kept."""
+    ts = np.array([0.0, 10.0])
+    steps = int(orbit(ts).stats["num_steps"])
+    short = orbit(ts, max_steps=steps + 3)
+    assert bool(short.error.result == lj.RESULTS.max_steps_reached) and np.isnan(short.error.q["x"][-1])
+    assert bool(short.result == lj.RESULTS.successful) and np.isfinite(short.q["x"]).all()
+    assert "maximum number of" in repr(short)
+    long = orbit(np.array([0.0, 8e3]))
+    assert int(long.stats["num_steps"]) > 20_000 and bool(long.error.result == lj.RESULTS.not_estimated)
+    assert np.isnan(long.error.q["x"]).all() and "more than 20,000 steps" in repr(long)
+    with pytest.raises(TypeError, match="estimate_error must be True, False or None, not 'yes'"):
+        orbit(ts, estimate_error="yes")
+
+
+def test_what_chose_the_steps():
+    """Outputs, tolerances, a longest step, stability; and how often the equations were asked."""
+    said = lambda traj: next(line for line in repr(traj).splitlines() if "steps chosen by" in line)
+    dense = np.linspace(0.0, 2.0, 101)
+    assert "the outputs" in said(lj.integrate(swing, 1.0, 0.0, {"g": 9.81}, ts=dense))
+    assert "the tolerance" in said(orbit(FEW)) and "max_step" in said(orbit(FEW, max_step=0.05))
+    drag = lj.System(lambda t, q, v, p: 0.5 * v**2 - 0.5 * q**2, dissipation=lambda t, q, v, p: 0.5 * p * v**2)
+    assert "stability" in said(lj.integrate(drag, 1.0, 0.0, 1e4, ts=np.array([0.0, 0.5]), method=lj.Tsit5()))
+    traj = orbit(FEW, method=lj.Dopri8())
+    assert f"{13 * int(traj.stats['num_steps']):,} evaluations" in repr(traj)
