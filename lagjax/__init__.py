@@ -50,7 +50,8 @@ from lagjax.fitting.result import Fit, FitWarning
 
 # isort: split
 # Error against run time.
-from lagjax.report import Run, work_precision
+from lagjax.comparison.diagram import WorkPrecision
+from lagjax.comparison.work_precision import work_precision
 
 if TYPE_CHECKING:
     from lagjax import scenes
@@ -104,7 +105,7 @@ __all__ = [
     "FitWarning",
     "identifiability",
     "Identifiability",
-    "Run",
+    "WorkPrecision",
     "work_precision",
     "scenes",
 ]

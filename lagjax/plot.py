@@ -1,7 +1,9 @@
 """One look for every picture. Needs matplotlib (`pip install "lagjax[plot]"`)."""
 
 import io
+from collections.abc import Sequence
 from fractions import Fraction
+from typing import NamedTuple
 
 import numpy as np
 
@@ -149,26 +151,81 @@ def _ticks_in_pi(axis):
     axis.xaxis.set_major_formatter(FuncFormatter(label))
 
 
-def work_precision(title: str, curves: dict[str, tuple[np.ndarray, np.ndarray]]):
-    """Draw error against run time, one curve a method; returns a matplotlib `Figure`.
+class Drawn(NamedTuple):
+    """One panel of a work-precision diagram.
 
-    **Arguments:** `curves` by method: (run times in seconds, relative errors). Zero errors are left out.
+    - `label`: of the axis of work. `floor`: what the reference may be off by; 0 where that is not known.
+    - `curves`: by name: work (N,), relative errors (N,), which of them are to be trusted (N,), and the measured order.
     """
-    fig, axes = figure(size=(7.2, 3.6))
-    axis = axes[0, 0]
-    for i, (method, (seconds, errors)) in enumerate(curves.items()):
-        shown = np.asarray(errors) > 0
-        axis.loglog(
-            1e3 * np.asarray(seconds)[shown],
-            np.asarray(errors)[shown],
-            marker=MARKERS[i % len(MARKERS)],
-            markersize=4,
-            label=method,
-            **style(i),
-        )
-    axis.set(xlabel="run time / ms (median)", ylabel="relative error", title=title)
-    axis.legend(fontsize=8, frameon=False, loc="center left", bbox_to_anchor=(1.0, 0.5))
+
+    title: str
+    label: str
+    curves: dict[str, tuple[np.ndarray, np.ndarray, np.ndarray, float]]
+    floor: float
+
+
+def work_precision(panels: Sequence[Drawn]):
+    """Draw error against work, a panel each; the number beside a curve is its order. Returns a matplotlib `Figure`.
+
+    Errors of zero are drawn at half a unit of round-off; what is not to be trusted is hollow, on grey.
+    """
+    columns = min(3, len(panels))
+    fig, axes = figure(-(-len(panels) // columns), columns, size=(4.9, 3.9))
+    names = list(dict.fromkeys(name for panel in panels for name in panel.curves))
+    for axis, panel in zip(axes.flat, panels):
+        _draw_work(axis, panel, names)
+    for axis in axes.flat[len(panels) :]:
+        axis.set_visible(False)
+    found = {label: line for axis in axes.flat for line, label in zip(*axis.get_legend_handles_labels())}
+    shown = [name for name in names if name in found]
+    fig.legend(
+        [found[name] for name in shown], shown, fontsize=8, frameon=False, ncols=len(shown), loc="outside lower center"
+    )
     return fig
+
+
+def _draw_work(axis, panel, names):
+    lowest = 0.5 * float(np.finfo(float).eps)
+    axis.set(xscale="log", yscale="log", xlabel=panel.label, ylabel="relative error", title=panel.title)
+    for name, (work, errors, trusted, order) in panel.curves.items():
+        there = np.isfinite(work) & np.isfinite(errors)
+        if not there.any():
+            continue
+        i = names.index(name)
+        work, errors, trusted = work[there], np.maximum(errors[there], lowest), trusted[there]
+        axis.plot(work, errors, marker=MARKERS[i % len(MARKERS)], markersize=4, label=name, **style(i))
+        hollow = {"marker": MARKERS[i % len(MARKERS)], "color": COLOURS[i % len(COLOURS)], "markerfacecolor": "white"}
+        axis.plot(work[~trusted], errors[~trusted], linestyle="", markersize=4, zorder=3, **hollow)
+        if np.isfinite(order):
+            # Where curves are farthest apart: at their tight ends.
+            k = np.argmin(errors)
+            axis.annotate(
+                f"{order:.1f}", (work[k], errors[k]), (4, 1), textcoords="offset points", fontsize=8,
+                color=COLOURS[i % len(COLOURS)], va="bottom",
+            )  # fmt: skip
+    if panel.floor > 0:
+        bottom, top = axis.get_ylim()
+        bottom = min(bottom, 0.1 * panel.floor)
+        axis.axhspan(bottom, panel.floor, color="0.9", zorder=0)
+        axis.text(0.02, panel.floor, "the reference cannot tell", transform=axis.get_yaxis_transform(), fontsize=7,
+                  color="0.4", va="top")  # fmt: skip
+        axis.set_ylim(bottom, top)
+    _ticks_of_decades(axis.xaxis)
+    _ticks_of_decades(axis.yaxis)
+
+
+def _ticks_of_decades(axis):
+    """Powers of ten, every second one where there are many; within two decades also twice and five times them."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, NullLocator
+
+    low, high = sorted(axis.get_view_interval())
+    decades = np.log10(high / low)
+    short = decades < 2.2
+    axis.set_major_locator(LogLocator(10, (1.0, 2.0, 5.0) if short else (1.0,), numticks=6))
+    axis.set_minor_locator(NullLocator() if short or decades > 4 else LogLocator(10, range(2, 10)))
+    axis.set_minor_formatter(NullFormatter())
+    if low > 1e-4 and high < 1e8:
+        axis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:,.0f}" if x >= 1000 else f"{x:g}"))
 
 
 def fits(panels: dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]]):

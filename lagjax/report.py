@@ -1,33 +1,31 @@
 """Error against run time, and what happens in the extremes: the tables that `python -m lagjax` prints.
 
-A scene offers `Run`s (motions with a known answer) and `Case`s (stiff and extreme inputs, tried once). Times are
-medians of whole calls of `integrate` after the first, of which a few tenths of a millisecond are the call's own; one
-compilation serves a method at all its tolerances. What a person waits for the first answer is a run time too, and
-stands apart: from the call to the result, tracing and compiling included.
+A scene offers `Run`s (motions with a known answer) and `Case`s (stiff and extreme inputs, tried once). Runs are
+compared by `lj.work_precision`: times are medians of compiled solves without the call's own. What a person
+waits for the first answer is a run time too, and stands apart: tracing and compiling.
 """
 
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-import diffrax
 import jax
 import numpy as np
 from jaxtyping import PyTree
 
-from lagjax.mechanics import coordinates
-from lagjax.mechanics.structure import is_free_of_velocities
+from lagjax.comparison import work_precision as comparison
+from lagjax.comparison.diagram import WorkPrecision, in_ms
+from lagjax.comparison.others import usual_others
+from lagjax.comparison.tables import table
 from lagjax.mechanics.system import System
 from lagjax.motion.crossings import Crossing
-from lagjax.motion.integrate import integrate
-from lagjax.motion.trajectory import Trajectory, ended_well, message
-from lagjax.numerics.nystrom import Nystrom12
-from lagjax.numerics.runge_kutta import Dopri8, Tsit5
+from lagjax.motion.trajectory import Trajectory
 
 # The tolerance at which a run must reach its `required` error, for the method named with it.
 JUDGED_AT = 1e-10
 JUDGED_METHOD = "Dopri8"
+# Seconds of a solve after which tighter tolerances of a method are not tried.
+PATIENCE = 0.3
 
 
 @dataclass(frozen=True)
@@ -38,6 +36,8 @@ class Run:
     - `required`: the largest error allowed at rtol = atol = 1e-10 with Dopri8.
     - `invariant`: a quantity that must not change, (T,) from a trajectory; the Jacobi integral if None.
     - `events`: by name, `Crossing`s that end the motion.
+    - `by_hand`: accelerations and multipliers derived by hand, of `(t, q, v, params)`, for other tools; None without.
+    - `drawn`: whether it is long enough for run times to say something.
     """
 
     name: str
@@ -51,6 +51,8 @@ class Run:
     required: float = 1e-9
     invariant: Callable[[Trajectory], np.ndarray] | None = None
     events: Mapping[str, Crossing] | None = None
+    by_hand: Callable | None = None
+    drawn: bool = True
 
 
 @dataclass(frozen=True)
@@ -89,7 +91,7 @@ class Scene:
 
 @dataclass(frozen=True)
 class Row:
-    """One line of a work-precision table; `compile_seconds` is from the call to the first answer of that method."""
+    """One line of a work-precision table; None where something is not known of another tool."""
 
     run: str
     measured: str
@@ -97,10 +99,11 @@ class Row:
     tolerance: float
     error: float
     residual: float | None
-    drift: float
-    steps: int
+    drift: float | None
+    steps: int | None
+    evaluations: int | None
     seconds: float
-    compile_seconds: float
+    compile_seconds: float | None
     result: str
     required: float | None = field(default=None)
 
@@ -109,33 +112,21 @@ class Row:
         return self.required is None or bool(self.error <= self.required)
 
 
-def work_precision(
-    run: Run,
-    methods: dict[str, diffrax.AbstractSolver] | None = None,
-    tolerances: Sequence[float] = (1e-4, 1e-6, 1e-8, 1e-10, 1e-12),
-    repeats: int = 5,
-) -> list[Row]:
-    """Integrate one run by several methods at several tolerances, timed and checked.
+def work_precision(run: Run, others: bool = True, **settings: Any) -> WorkPrecision:
+    """Compare methods on a run; `others` with what one would take instead. `settings` are `lj.work_precision`'s."""
+    instead = None
+    if others and run.by_hand is not None:
+        acceleration = lambda *state: run.by_hand(*state)[0]
+        instead = usual_others(acceleration, run.q0, run.v0, run.params, run.ts)
+    return comparison.work_precision(
+        run.system, run.q0, run.v0, run.params,
+        ts=run.ts, events=run.events, error=run.error, others=instead, patience=PATIENCE, **settings,
+    )  # fmt: skip
 
-    **Arguments:** `methods` by name (by default Tsit5, Dopri8 and, where it can be used, Nystrom12); `tolerances`, each
-    used as rtol and atol; `repeats`, of which the median time is kept.
 
-    **Returns:** one `Row` a method and tolerance, `seconds` for a call with results ready.
-    """
-    methods = _methods_for(run) if methods is None else methods
-    rows = []
-    for name, method in methods.items():
-        solve = _solver_of(run, method)
-        compile_seconds = None
-        for tolerance in tolerances:
-            started = time.perf_counter()
-            trajectory = jax.block_until_ready(solve(tolerance))
-            if compile_seconds is None:
-                compile_seconds = time.perf_counter() - started
-            seconds = np.median([_seconds(solve, tolerance) for _ in range(repeats)])
-            judged = name == JUDGED_METHOD and tolerance == JUDGED_AT
-            rows.append(_row(run, name, tolerance, trajectory, seconds, compile_seconds, judged))
-    return rows
+def rows_of(run: Run, found: WorkPrecision) -> list[Row]:
+    """The lines of the first table of a scene."""
+    return [_row(run, curve, point) for curve in found.curves.values() for point in curve.points]
 
 
 def relative_error(got: PyTree, exact: PyTree) -> float:
@@ -148,20 +139,9 @@ def relative_error(got: PyTree, exact: PyTree) -> float:
     return float(np.max(errors))
 
 
-def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A plain-text table: first column to the left, the others to the right."""
-    lines = [header, *rows]
-    widths = [max(len(line[i]) for line in lines) for i in range(len(header))]
-    shown = [
-        "  ".join(cell.ljust(w) if i == 0 else cell.rjust(w) for i, (cell, w) in enumerate(zip(line, widths)))
-        for line in lines
-    ]
-    return "\n".join([shown[0], "-" * len(shown[0]), *shown[1:]])
-
-
 def work_precision_table(rows: Sequence[Row]) -> str:
     """The first table of a scene."""
-    header = ("run", "method", "tol", "error", "residual", "drift", "steps", "time/ms", "first/s", "")
+    header = ("run", "method", "tol", "error", "residual", "drift", "steps", "evaluations", "time/ms", "compile/s", "")
     cells = [
         (
             row.run,
@@ -169,10 +149,11 @@ def work_precision_table(rows: Sequence[Row]) -> str:
             f"{row.tolerance:.0e}",
             f"{row.error:.1e}",
             "-" if row.residual is None else f"{row.residual:.0e}",
-            f"{row.drift:.0e}",
-            f"{row.steps}",
-            f"{1e3 * row.seconds:.2f}",
-            f"{row.compile_seconds:.1f}",
+            "-" if row.drift is None else f"{row.drift:.0e}",
+            "-" if row.steps is None else f"{row.steps}",
+            "-" if row.evaluations is None else f"{row.evaluations}",
+            in_ms(row.seconds),
+            "-" if row.compile_seconds is None else f"{row.compile_seconds:.1f}",
             _verdict(row),
         )
         for row in rows
@@ -184,8 +165,8 @@ def first_answer(rows: Sequence[Row]) -> str:
     """How long the scene's first answer took in this process, and its next: a line below the first table."""
     row = rows[0]
     return (
-        f"first answer: {row.compile_seconds:.1f} s from the call to the result of '{row.run}' by {row.method}, "
-        f"tracing and compiling included; the same again: {1e3 * row.seconds:.2f} ms"
+        f"first answer: {row.compile_seconds or 0.0:.1f} s of tracing and compiling for '{row.run}' by {row.method}; "
+        f"then {in_ms(row.seconds)} ms a solve"
     )
 
 
@@ -201,49 +182,22 @@ def case_table(cases: Sequence[Case]) -> str:
     return table(header[:-1] + (header[-1].ljust(width),), [row[:-1] + (row[-1].ljust(width),) for row in cells])
 
 
-def _methods_for(run) -> dict[str, diffrax.AbstractSolver]:
-    by_runge_kutta: dict[str, diffrax.AbstractSolver] = {"Tsit5": Tsit5(), "Dopri8": Dopri8()}
-    state = coordinates.state(run.ts[0], run.q0, run.v0, run.params)
-    return by_runge_kutta | ({"Nystrom12": Nystrom12()} if is_free_of_velocities(run.system, *state) else {})
-
-
-def _solver_of(run, method):
-    def solve(tolerance):
-        return integrate(
-            run.system,
-            run.q0,
-            run.v0,
-            run.params,
-            ts=run.ts,
-            rtol=tolerance,
-            atol=tolerance,
-            method=method,
-            events=run.events,
-            throw=False,
-        )
-
-    return solve
-
-
-def _seconds(solve, tolerance):
-    started = time.perf_counter()
-    jax.block_until_ready(solve(tolerance))
-    return time.perf_counter() - started
-
-
-def _row(run, name, tolerance, trajectory, seconds, compile_seconds, judged):
+def _row(run, curve, point):
+    trajectory, compiled = point.trajectory, np.isfinite(curve.compile_seconds)
+    judged = curve.method == JUDGED_METHOD and point.tolerance == JUDGED_AT
     return Row(
         run=run.name,
         measured=run.measured,
-        method=name,
-        tolerance=tolerance,
-        error=run.error(trajectory) if bool(ended_well(trajectory.result)) else float("inf"),
-        residual=float(trajectory.residual()) if run.system.constraints else None,
-        drift=_drift(run, trajectory),
-        steps=int(trajectory.stats["num_steps"]),
-        seconds=float(seconds),
-        compile_seconds=compile_seconds,
-        result=message(trajectory.result),
+        method=curve.method,
+        tolerance=point.tolerance,
+        error=point.error,
+        residual=float(trajectory.residual()) if trajectory is not None and run.system.constraints else None,
+        drift=None if trajectory is None else _drift(run, trajectory),
+        steps=point.steps,
+        evaluations=point.evaluations,
+        seconds=point.seconds,
+        compile_seconds=curve.compile_seconds if compiled else None,
+        result=point.result,
         required=run.required if judged else None,
     )
 
@@ -258,5 +212,5 @@ def _drift(run, trajectory):
 
 def _verdict(row):
     if row.required is None:
-        return ""
+        return "" if np.isfinite(row.error) else row.result
     return f"ok (<= {row.required:.0e})" if row.passed else f"MISSED (> {row.required:.0e})"

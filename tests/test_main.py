@@ -49,7 +49,7 @@ def test_tables_pictures_and_numbers(run, monkeypatch):
     for part in (
         "tol",
         "error",
-        "first/s",
+        "compile/s",
         "first answer: ",
         "Dopri8",
         "1e-10",

@@ -31,7 +31,7 @@ from lagjax import plot
 from lagjax.mechanics.system import System
 from lagjax.motion.integrate import integrate
 from lagjax.report import Case, Run, Scene, relative_error
-from lagjax.scenes import potentials
+from lagjax.scenes import by_hand, potentials
 
 PARAMS = {
     "plane": {"G": 1.0, "sigma": 0.75},
@@ -177,13 +177,24 @@ def runs():
 
 
 def _ellipse_run():
-    params, ts = PARAMS["elliptic cylinder"], np.linspace(0.0, 8.0, 9)
+    params, ts = PARAMS["elliptic cylinder"], np.linspace(0.0, 80.0, 9)
 
     def error(trajectory):
         return relative_error((trajectory.q, trajectory.v), exact_inside_ellipse(params, *INSIDE, ts))
 
     words = "q and v against two oscillations"
-    return Run("inside the ellipse", SYSTEMS["elliptic cylinder"], params, *INSIDE, ts, error, words)
+    acceleration = by_hand.attracted(by_hand.field_of_elliptic_cylinder)
+    return Run(
+        "inside the ellipse",
+        SYSTEMS["elliptic cylinder"],
+        params,
+        *INSIDE,
+        ts,
+        error,
+        words,
+        1e-8,
+        by_hand=acceleration,
+    )
 
 
 def _helix_run():
@@ -194,17 +205,18 @@ def _helix_run():
         return drift(charges_along("helix", trajectory)["h p_z + 2 pi L_z"])
 
     words = "change of h p_z + 2π L_z"
-    return Run("around the helix", SYSTEMS["helix"], PARAMS["helix"], q0, v0, ts, error, words)
+    return Run("around the helix", SYSTEMS["helix"], PARAMS["helix"], q0, v0, ts, error, words, drawn=False)
 
 
 def _two_balls_run():
     q0, v0, duration = ORBITS["dumbbell"]
-    params, ts = PARAMS["dumbbell"] | {"rod": 0.0}, np.linspace(0.0, duration, 9)
+    params, ts = PARAMS["dumbbell"] | {"rod": 0.0}, np.linspace(0.0, 10 * duration, 9)
 
     def error(trajectory):
         return drift(euler_integral(params, trajectory.q, trajectory.v))
 
-    return Run("two balls", SYSTEMS["dumbbell"], params, q0, v0, ts, error, "change of Euler's integral")
+    words, acceleration = "change of Euler's integral", by_hand.attracted(by_hand.field_of_dumbbell)
+    return Run("two balls", SYSTEMS["dumbbell"], params, q0, v0, ts, error, words, by_hand=acceleration)
 
 
 def charges_along(name, trajectory):

@@ -45,6 +45,7 @@ from lagjax.motion.crossings import Crossing
 from lagjax.motion.integrate import integrate
 from lagjax.motion.trajectory import RESULTS
 from lagjax.report import Case, Run, Scene, relative_error
+from lagjax.scenes import by_hand
 
 PARAMS = {"m": 1.25, "R": 1.0, "a": 0.25, "g": 9.8125, "beta": 1.0}
 TOP = np.pi / 2
@@ -218,7 +219,7 @@ def flight_in_polar(left: Flight, params):
 
 def runs():
     """Down to the departure; the flight after it; and a hoop held to the cylinder, about the bottom."""
-    return [_down(1.25), _in_the_air(), _about_the_bottom(BOTTOM + 1.0, periods=10)]
+    return [_down(1.25), _in_the_air(), _about_the_bottom(BOTTOM + 1.0, periods=20, outputs=8)]
 
 
 def _down(theta0):
@@ -233,7 +234,7 @@ def _down(theta0):
 
     q0, v0 = start(PARAMS, theta0)
     measured = "q, v, and the time and angle of the departure"
-    return Run("until it leaves", system, PARAMS, q0, v0, ts, error, measured, events=DEPARTURE)
+    return Run("until it leaves", system, PARAMS, q0, v0, ts, error, measured, events=DEPARTURE, drawn=False)
 
 
 def _in_the_air():
@@ -246,17 +247,18 @@ def _in_the_air():
         return relative_error((trajectory.q, trajectory.v), exact)
 
     q0, v0 = flight_in_polar(left, PARAMS)
-    return Run("in flight", in_flight, PARAMS, q0, v0, ts, error, "q and v against the parabola")
+    return Run("in flight", in_flight, PARAMS, q0, v0, ts, error, "q and v against the parabola", drawn=False)
 
 
-def _about_the_bottom(theta0, periods):
-    ts = np.linspace(0.0, periods * period(PARAMS, theta0), 8 * periods + 1)
+def _about_the_bottom(theta0, periods, outputs):
+    ts = np.linspace(0.0, periods * period(PARAMS, theta0), outputs)
 
     def error(trajectory):
         return relative_error((trajectory.q, trajectory.v), exact_motion(PARAMS, theta0, ts))
 
     q0, v0 = start(PARAMS, theta0)
-    return Run(f"{periods} swings", system, PARAMS, q0, v0, ts, error, "q and v against Jacobi's functions")
+    words = "q and v against Jacobi's functions"
+    return Run(f"{periods} swings", system, PARAMS, q0, v0, ts, error, words, 1e-7, by_hand=by_hand.rolling)
 
 
 @compiled
@@ -337,7 +339,7 @@ def _no_inertia():
 
 
 def _hundred_swings():
-    run = _about_the_bottom(BOTTOM + 1.0, periods=100)
+    run = _about_the_bottom(BOTTOM + 1.0, periods=100, outputs=801)
     swings = integrate(system, run.q0, run.v0, PARAMS, ts=run.ts, rtol=1e-10, atol=1e-10)
     off, drift = run.error(swings), float(swings.drift())
     happened = f"worst residual (the error here); q and v off by {off:.0e}, energy by {drift:.0e}"

@@ -39,10 +39,13 @@ from lagjax.mechanics.multipliers import accelerations
 from lagjax.mechanics.system import System
 from lagjax.motion.integrate import integrate
 from lagjax.report import Case, Run, Scene, relative_error
+from lagjax.scenes import by_hand
 
 PARAMS = {"R": 2.5}
 # The end points of the generic arc: ψ₁, θ₁, ψ₂, θ₂.
 ENDS = (0.875, 0.25, 1.75, 1.625)
+# How often the runs go around.
+TURNS = 20
 
 MISPRINTS = (
     "§1 calls ψ the azimuth and θ the polar angle: z = R cos ψ makes ψ the polar angle (colatitude), θ the azimuth.",
@@ -222,29 +225,32 @@ def second_variation(angle):
 
 
 def runs():
-    """The source's form on a generic arc, and the embedded form once around over both poles."""
+    """The source's form and the embedded one, the latter over both poles; twenty times around."""
     return [_generic(), _over_the_poles()]
 
 
 def _generic():
     circle = great_circle(*ENDS)
-    ts = np.linspace(ENDS[1], ENDS[3], 5)
+    ts = np.array([ENDS[1], ENDS[3], ENDS[1] + 2 * np.pi * TURNS])
     q0, v0 = map(float, exact_over_azimuth(circle.A, circle.B, ts[0]))
 
     def error(trajectory):
         return relative_error((trajectory.q, trajectory.v), exact_over_azimuth(circle.A, circle.B, ts))
 
-    return Run("over the azimuth", over_azimuth, PARAMS, q0, v0, ts, error, "ψ and ψ' against cot ψ")
+    words = "ψ and ψ' against cot ψ"
+    return Run("over the azimuth", over_azimuth, PARAMS, q0, v0, ts, error, words, 1e-8, by_hand=by_hand.geodesic)
 
 
 def _over_the_poles():
     q0, v0 = start_towards(PARAMS, 0.5, 0.0, 0.25, np.pi)
-    ts = np.linspace(0.0, 2 * np.pi * PARAMS["R"], 9)
+    # Eighths of a turn come by in turn.
+    ts = np.linspace(0.0, 2 * np.pi * TURNS * PARAMS["R"], 33)
 
     def error(trajectory):
         return relative_error((trajectory.q, trajectory.v), exact_embedded(q0, v0, ts))
 
-    return Run("embedded, over both poles", embedded, PARAMS, q0, v0, ts, error, "r and dr/ds against the circle")
+    words = "r and dr/ds against the circle"
+    return Run("embedded, over both poles", embedded, PARAMS, q0, v0, ts, error, words, 1e-7, by_hand=by_hand.on_sphere)
 
 
 @compiled

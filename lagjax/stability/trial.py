@@ -20,12 +20,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
+from lagjax.comparison.tables import table
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.compiled import compiled
 from lagjax.mechanics.system import System
 from lagjax.motion.integrate import integrate
 from lagjax.motion.trajectory import Trajectory
-from lagjax.report import relative_error, table
+from lagjax.report import relative_error
 
 PER_PERIOD = 100.0
 # With fewer than two digits left nothing has been computed, whatever was asked.

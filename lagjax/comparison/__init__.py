@@ -1,0 +1,1 @@
+"""Error against run time and against evaluations, of several methods on one motion."""

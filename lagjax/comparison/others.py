@@ -1,0 +1,94 @@
+"""What one would take in place of lagjax: bare diffrax and SciPy, with accelerations derived by hand.
+
+Each function takes `acceleration(t, q, v, params)` and a motion, and returns a function of a tolerance that solves it
+and gives the states at `ts` and the number of evaluations: an entry of `others` of `lj.work_precision`. SciPy gets the
+compiled acceleration, which it calls from Python.
+"""
+
+import warnings
+from collections.abc import Callable
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from scipy import integrate
+
+MOST_STEPS = 2**20
+
+
+def usual_others(acceleration: Callable, q0, v0, params, ts) -> dict[str, Callable]:
+    """All of them by name."""
+    motion = acceleration, q0, v0, params, np.asarray(ts)
+    return {
+        "diffrax, by hand": bare_diffrax(*motion),
+        "DOP853, by hand": dop853(*motion),
+        "LSODA, by hand": lsoda(*motion),
+    }
+
+
+def bare_diffrax(acceleration, q0, v0, params, ts):
+    """diffrax's Dopri8 and its loop, compiled once."""
+    start, params = jax.tree.map(lambda x: jnp.asarray(x, float), ((q0, v0), params))
+    method = diffrax.Dopri8()
+    stages = method.tableau.num_stages - method.tableau.fsal
+
+    @jax.jit
+    def solve(tolerance, start, params):
+        solution = diffrax.diffeqsolve(
+            diffrax.ODETerm(lambda t, y, params: (y[1], acceleration(t, *y, params))),
+            method,
+            ts[0],
+            ts[-1],
+            None,
+            start,
+            params,
+            saveat=diffrax.SaveAt(ts=ts),
+            stepsize_controller=diffrax.PIDController(rtol=tolerance, atol=tolerance),
+            max_steps=MOST_STEPS,
+            throw=False,
+        )
+        return *solution.ys, stages * solution.stats["num_steps"]
+
+    return lambda tolerance: solve(jnp.asarray(tolerance), start, params)
+
+
+def dop853(acceleration, q0, v0, params, ts):
+    """`scipy.integrate.solve_ivp` with DOP853."""
+    field, y0, as_states = _in_numbers(acceleration, q0, v0, params)
+
+    def solve(tolerance):
+        solution = integrate.solve_ivp(
+            field, (ts[0], ts[-1]), y0, method="DOP853", t_eval=ts, rtol=tolerance, atol=tolerance
+        )
+        return *as_states(solution.y.T if solution.success else np.full((len(ts), len(y0)), np.nan)), solution.nfev
+
+    return solve
+
+
+def lsoda(acceleration, q0, v0, params, ts):
+    """`scipy.integrate.odeint`, which is LSODA."""
+    field, y0, as_states = _in_numbers(acceleration, q0, v0, params)
+
+    def solve(tolerance):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", integrate.ODEintWarning)
+            options = {"tfirst": True, "rtol": tolerance, "atol": tolerance, "mxstep": MOST_STEPS}
+            y, told = integrate.odeint(field, y0, ts, full_output=True, **options)
+        well = told["message"] == "Integration successful."
+        return *as_states(y if well else np.full_like(y, np.nan)), int(told["nfe"][-1])
+
+    return solve
+
+
+def _in_numbers(acceleration, q0, v0, params):
+    """The vector field of one vector, that vector at the start, and rows of such as (q, v)."""
+    y0, unravel = ravel_pytree(jax.tree.map(lambda x: jnp.asarray(x, float), (q0, v0)))
+
+    @jax.jit
+    def rates(t, y):
+        q, v = unravel(y)
+        return ravel_pytree((v, acceleration(t, q, v, params)))[0]
+
+    return lambda t, y: np.asarray(rates(t, y)), np.asarray(y0), jax.jit(jax.vmap(unravel))

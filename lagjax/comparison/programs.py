@@ -1,0 +1,138 @@
+"""A solve by one method as a compiled program, and how long calls take.
+
+The program takes tolerance, times and start as arguments: one compilation serves a method at all tolerances. It is what
+`integrate` runs where it is called by itself, without the checks around it.
+"""
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lagjax.jax_internals.compiling import compiler_options
+from lagjax.jax_internals.tracing import REGULAR_FIRST
+from lagjax.mechanics.coordinates import State
+from lagjax.mechanics.memory import parted
+from lagjax.mechanics.system import System
+from lagjax.motion.backward import runs_backward
+from lagjax.motion.integrate import integrate
+from lagjax.motion.reported import reporting
+from lagjax.motion.trajectory import Trajectory
+
+# Seconds of measuring after which a call is not repeated.
+ENOUGH = 0.1
+# A call of less seconds is made once before it is timed: right after another program caches are cold.
+SHORT = 0.02
+# Of a call of an empty program: a difference of less cannot be told from zero.
+RESOLVED = 0.1
+
+
+class Motion(NamedTuple):
+    """What is integrated: `start` has the first time; `options` are those of `integrate`, events included."""
+
+    system: System
+    start: State
+    ts: np.ndarray
+    options: Mapping[str, Any]
+
+
+class Program:
+    """The trajectory of a motion by one method, of (tolerance, ts, q, v); as many times as were given.
+
+    `compile_seconds` are those of tracing and compiling. Equations are first taken for regular, as `integrate` does;
+    where that turns out wrong, the careful program is compiled too, and kept to.
+    """
+
+    def __init__(self, motion: Motion, method: Any):
+        self._motion, self._method = motion, method
+        self.compile_seconds = 0.0
+        self._compiled = self._compile(careful=False)
+
+    def __call__(self, tolerance, ts=None, q=None, v=None) -> Trajectory:
+        """Solve; by default from the start, with outputs at its own times."""
+        args = self._arguments(tolerance, ts, q, v)
+        found, settled = self._compiled(args)
+        if settled is not None and not bool(settled):
+            self._compiled = self._compile(careful=True)
+            found, _ = self._compiled(args)
+        return jax.block_until_ready(found)
+
+    def call(self, tolerance) -> Callable[[], Any]:
+        """The bare call, to be timed, and waited for."""
+        args = self._arguments(tolerance)
+        return lambda: self._compiled(args)
+
+    def call_seconds(self) -> float:
+        """The least time of a call of a program that takes and returns the same, and does nothing."""
+        args = self._arguments(1e-3)
+        nothing = lambda args: jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), self._returned)
+        idle = jax.jit(nothing).lower(args).compile()
+        return min(seconds_of(lambda: idle(args)) for _ in range(50))
+
+    def _arguments(self, tolerance, ts=None, q=None, v=None):
+        start = self._motion.start
+        ts = self._motion.ts if ts is None else ts
+        given = (np.asarray(tolerance, ts.dtype), ts, start.q if q is None else q, start.v if v is None else v)
+        return [jnp.asarray(x) for x in parted((*given, start.params))[1]]
+
+    def _compile(self, careful):
+        motion, given = self._motion, (np.asarray(0.0, self._motion.ts.dtype), self._motion.ts, *self._motion.start[1:])
+        static, _ = parted(given)
+
+        def solve(args):
+            tolerance, ts, q, v, params = static.together(args)
+            # Times that decrease have to be known.
+            ts = motion.ts if runs_backward(motion.ts) else ts
+            tolerances = {"rtol": tolerance, "atol": tolerance}
+            return integrate(
+                motion.system, q, v, params, ts=ts, method=self._method, throw=False, **tolerances, **motion.options
+            )
+
+        def program(args):
+            found, _, settled = reporting(solve)(args)
+            return found, settled
+
+        started = time.perf_counter()
+        with REGULAR_FIRST(not careful):
+            lowered = jax.jit(program, compiler_options=compiler_options()).lower(self._arguments(1e-3))
+        compiled = lowered.compile()
+        self.compile_seconds += time.perf_counter() - started
+        self._returned = lowered.out_info
+        return compiled
+
+
+def seconds_of(call: Callable[[], Any]) -> float:
+    """The time of one call, its result waited for."""
+    started = time.perf_counter()
+    jax.block_until_ready(call())
+    return time.perf_counter() - started
+
+
+class Times(NamedTuple):
+    """Seconds of a call: the median and the least."""
+
+    median: float
+    least: float
+
+
+def in_turn(calls: Sequence[Callable[[], Any]], first: Sequence[float], repeats: int) -> list[Times]:
+    """Times of calls made in turn, so that whatever else the machine does falls on all of them.
+
+    `first` are the seconds of a call before, of which those that take long are not called again.
+    """
+    turns: list[list[float]] = [[seconds] if seconds > ENOUGH else [] for seconds in first]
+    for _ in range(repeats):
+        for call, seconds in zip(calls, turns):
+            if sum(seconds) <= ENOUGH:
+                if not seconds or seconds[-1] < SHORT:
+                    jax.block_until_ready(call())
+                seconds.append(seconds_of(call))
+    return [Times(float(np.median(seconds)), min(seconds)) for seconds in turns]
+
+
+def less_the_call(seconds: float, call_seconds: float) -> float:
+    """What of a measured time the solve itself takes."""
+    return max(seconds - call_seconds, RESOLVED * call_seconds)

@@ -1,0 +1,282 @@
+"""Error against run time of several methods on a system of the user's: check, compile, solve, time, judge."""
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import diffrax
+import jax
+import numpy as np
+from jaxtyping import Array, ArrayLike, PyTree
+
+from lagjax.comparison import compared, references
+from lagjax.comparison.compared import Compared, States
+from lagjax.comparison.diagram import WorkPrecision
+from lagjax.comparison.methods import chosen, evaluations_a_step, ladder
+from lagjax.comparison.points import Curve, Point
+from lagjax.comparison.programs import Motion, Program, Times, in_turn, less_the_call
+from lagjax.comparison.references import Known, Reference
+from lagjax.jax_internals.tracing import is_eager
+from lagjax.mechanics import coordinates
+from lagjax.mechanics.system import System
+from lagjax.motion import problem
+from lagjax.motion.crossings import Crossing
+from lagjax.motion.integrate import integrate
+from lagjax.motion.trajectory import Trajectory, ended_well, message
+
+# What of `integrate` means the same for every method.
+OPTIONS = ("max_step", "jump_ts", "drift", "max_steps")
+# An error is known where it is so many times what the reference may itself be off by.
+KNOWN_BY = 2
+UNTIMED = Times(float("nan"), float("nan"))
+
+
+def work_precision(
+    system: System,
+    q0: PyTree[ArrayLike],
+    v0: PyTree[ArrayLike],
+    params: PyTree = None,
+    *,
+    ts: Array | np.ndarray | Sequence[float],
+    methods: Sequence[diffrax.AbstractSolver] | Mapping[str, diffrax.AbstractSolver] | None = None,
+    tolerances: Sequence[float] | None = None,
+    events: Mapping[str, Crossing] | None = None,
+    reference: Trajectory | tuple[PyTree, PyTree] | Callable | None = None,
+    error: Callable[[Any], float] | None = None,
+    others: Mapping[str, Callable] | None = None,
+    repeats: int = 7,
+    patience: float = 30.0,
+    **options: Any,
+) -> WorkPrecision:
+    """Compare methods on one motion: the error that each makes at each tolerance, and what it costs.
+
+    >>> import jax.numpy as jnp
+    >>> import lagjax as lj
+    >>> spring = lj.System(lambda t, q, v, params: 0.5 * v**2 - 0.5 * params["k"] * q**2)
+    >>> exact = lambda ts: (jnp.cos(2 * ts), -2 * jnp.sin(2 * ts))
+    >>> found = work_precision(spring, 1.0, 0.0, {"k": 4.0}, ts=[0.0, 20.0], methods=[lj.Tsit5()], reference=exact)
+    >>> print(found.best(error=1e-6)[0].name, found.best(error=1e-6)[0].error < 1e-6, found.reference.agrees)
+    Tsit5 True True
+
+    `print(found)` shows a table, `found.plot()` draws it, `found.best(error=1e-6)` says what to take.
+
+    **Main arguments:**
+
+    - `system`, `q0`, `v0`, `params`, `ts`: as `integrate` takes them. A motion that takes less than ten calls' time
+      says little of methods: make `ts` long.
+    - `methods`: solvers with an estimate of their error, lagjax's or diffrax's, in a sequence or by name in a dict. By
+      default the explicit ones that suit the system, the default of `integrate` first; for what is stiff add
+      `lj.Radau5()`.
+    - `tolerances`: each used as rtol and atol; by default decades from 1e-3 to 1e-12 in float64.
+    - `events`: as `integrate` takes them. With one that ends the motion, errors are those of its time and of the state
+      there; without, of the states at `ts`, and of the times of crossings.
+    - `reference`: the right answer: a `Trajectory` at `ts`, states `(q, v)` with a row for each time, or a function
+      of times that returns these. By default two methods of different kind at 1e-13: where they do not agree, the
+      answer says to which digits it can be trusted.
+
+    **Other arguments:**
+
+    - `error`: a function of a `Trajectory` (of `others`: of what has its `t`, `q`, `v`, `params`) that returns the
+      error as one number, in place of the comparison with a reference.
+    - `others`: by name, functions of a tolerance by which another tool solves the same problem, for comparison:
+      each returns `(q, v, evaluations)`, the states at `ts` and how often it evaluated the accelerations, or None.
+    - `repeats`: of each solve; the median is kept. One that takes long is repeated less.
+    - `patience`: seconds of a solve after which a method's tighter tolerances are not tried.
+    - `options`: `max_step`, `jump_ts`, `drift` and `max_steps` of `integrate`.
+
+    **Returns:** a `WorkPrecision`.
+
+    **Raises:**
+
+    - `TypeError`, `ValueError` for methods that no tolerance steers or that do not suit the system, tolerances below
+      round-off, a reference that does not fit; for all that `integrate` refuses.
+    - `RuntimeError` where no method came to the end of the motion.
+
+    Times are of the compiled solve; a call's own time and that of compiling stand apart. A point that failed stays in
+    the table with its reason.
+
+    Source: Hairer, Nørsett & Wanner, *Solving ODEs I*, §II.10 (work-precision diagrams); `tests/comparison` measures
+    that orders and marks are right.
+    """
+    motion = _motion(system, q0, v0, params, ts, events, options)
+    solvers = chosen(methods, system, motion.start)
+    tolerances = ladder(tolerances, motion.ts.dtype)
+    _check(reference, error, others, events)
+    programs = {name: Program(motion, solver) for name, solver in solvers.items()}
+    solved = []
+    for name, program in programs.items():
+        solved += _by_program(name, program, tolerances, patience)
+    if not any(solve.ended_well for solve in solved):
+        raise _all_failed(motion, solved, tolerances)
+    known = None
+    if error is None and reference is None:
+        known = references.of_our_own(motion, programs, solvers)
+    elif error is None:
+        known = references.given(reference, motion, next(iter(programs.values())))
+    for name, solve in (others or {}).items():
+        solved += _by_other(motion, name, solve, tolerances, patience)
+    judged = None if known is None else known.judged(_tightest(motion, solved))
+    call_seconds = next(iter(programs.values())).call_seconds()
+    points = _points(motion, solvers, solved, known, judged, error, call_seconds, repeats)
+    return WorkPrecision(
+        curves={
+            name: Curve(
+                name,
+                solvers.get(name),
+                programs[name].compile_seconds if name in programs else float("nan"),
+                tuple(point for point in points if point.method == name),
+            )
+            for name in (*solvers, *(others or {}))
+        },
+        reference=judged,
+        measured=compared.in_words(events, len(motion.ts)) if error is None else "as given by error=",
+        call_seconds=call_seconds,
+    )
+
+
+class Solve(NamedTuple):
+    """One solve: what it found (None where it was not tried), how often it evaluated, and the call to be timed."""
+
+    method: str
+    tolerance: float
+    found: Any
+    evaluations: int | None
+    reason: str
+    call: Callable
+    seconds: float
+
+    @property
+    def ended_well(self) -> bool:
+        if isinstance(self.found, Trajectory):
+            return bool(ended_well(self.found.result))
+        return self.found is not None and all(np.isfinite(x).all() for x in jax.tree.leaves(self.found[1:3]))
+
+
+def _motion(system, q0, v0, params, ts, events, options):
+    """The motion, with its start in arrays; raise where there is none."""
+    problem.check_system(system)
+    unknown = [name for name in options if name not in OPTIONS]
+    if unknown:
+        raise TypeError(
+            f"work_precision() has no argument {unknown[0]!r}.\n"
+            f"Fix: of integrate's arguments it takes {', '.join(OPTIONS)}; rtol and atol are its tolerances=."
+        )
+    if not is_eager() or coordinates.is_traced((q0, v0, params, ts)):
+        raise TypeError("work_precision measures times, and what is being traced has none.\nFix: call it outside jit.")
+    ts = np.asarray(ts)
+    start = coordinates.state(ts[0] if ts.ndim == 1 and ts.size else 0.0, q0, v0, params)
+    return Motion(system, start, problem.times(ts, start.t.dtype), {**options, "events": events})
+
+
+def _check(reference, error, others, events):
+    if reference is not None and error is not None:
+        raise ValueError("reference and error are two ways to say the same.\nFix: leave one of them out.")
+    if reference is not None and not isinstance(reference, (Trajectory, tuple, list)) and not callable(reference):
+        raise TypeError(
+            f"reference is {type(reference).__name__}, which is no answer to compare with.\n"
+            f"Fix: {references.FIX_OF_FORM}."
+        )
+    if others and events:
+        raise ValueError("others have no events to compare.\nFix: leave out events, or others.")
+
+
+def _by_program(name, program, tolerances, patience):
+    """The solves of a method, from loose to tight."""
+    solves, slow = [], ""
+    for tolerance in tolerances:
+        if slow:
+            solves.append(Solve(name, tolerance, None, None, slow, program.call(tolerance), 0.0))
+            continue
+        started = time.perf_counter()
+        found = program(tolerance)
+        seconds = time.perf_counter() - started
+        solves.append(Solve(name, tolerance, found, None, message(found.result), program.call(tolerance), seconds))
+        slow = _too_slow(seconds, patience)
+    return solves
+
+
+def _by_other(motion, name, solve, tolerances, patience):
+    """The solves of another tool; once before, for what it compiles."""
+    solves, slow = [], ""
+    solve(tolerances[0])
+    for tolerance in tolerances:
+        call = lambda tolerance=tolerance: solve(tolerance)
+        if slow:
+            solves.append(Solve(name, tolerance, None, None, slow, call, 0.0))
+            continue
+        started = time.perf_counter()
+        q, v, evaluations = jax.tree.map(np.asarray, call())
+        seconds = time.perf_counter() - started
+        found = States(motion.ts, q, v, motion.start.params)
+        evaluations = None if evaluations is None else int(evaluations)
+        done = Solve(name, tolerance, found, evaluations, "successful", call, seconds)
+        solves.append(done if done.ended_well else done._replace(reason="failed"))
+        slow = _too_slow(seconds, patience)
+    return solves
+
+
+def _too_slow(seconds, patience):
+    return "" if seconds <= patience else f"not tried: before, {seconds:.1f} s"
+
+
+def _all_failed(motion, solved, tolerances):
+    """What to raise where nothing came to its end: what `integrate` says of it, where it does."""
+    reasons = "; ".join(dict.fromkeys(f"{solve.method}: {solve.reason}" for solve in solved))
+    cause = ""
+    try:
+        integrate(
+            motion.system, *motion.start[1:], ts=motion.ts, rtol=tolerances[0], atol=tolerances[0], **motion.options
+        )
+    except (ValueError, RuntimeError) as error:
+        cause = f"\nThe default method at {tolerances[0]:.0e}: {error}"
+    return RuntimeError(f"no method came to the end of this motion at any tolerance. {reasons}{cause}")
+
+
+def _tightest(motion, solved) -> list[Compared]:
+    """The tightest solves of two methods that came to the end; of a single one, its tightest two."""
+    good = [solve for solve in solved if solve.ended_well and isinstance(solve.found, Trajectory)]
+    good.sort(key=lambda solve: solve.tolerance)
+    by_method = list({solve.method: solve for solve in reversed(good)}.values())
+    by_method.sort(key=lambda solve: solve.tolerance)
+    chosen = by_method if len(by_method) > 1 else good
+    return [compared.of(solve.found, motion.options["events"]) for solve in chosen[:2]]
+
+
+def _points(motion, solvers, solved, known: Known | None, judged: Reference | None, error, call_seconds, repeats):
+    """What each solve amounts to; those that came to their end are timed, in turn."""
+    good = [solve for solve in solved if solve.ended_well]
+    measured = in_turn([solve.call for solve in good], [solve.seconds for solve in good], repeats)
+    times = {(solve.method, solve.tolerance): seconds for solve, seconds in zip(good, measured)}
+    return [
+        _point(motion, solve, times, solvers, known, judged, error, call_seconds) for solve in solved
+    ]  # fmt: skip
+
+
+def _point(motion, solve, times, solvers, known, judged, error, call_seconds):
+    events, found, reason = motion.options["events"], solve.found, solve.reason
+    ours, off = isinstance(found, Trajectory), float("inf")
+    if solve.ended_well and known is None:
+        off = float(error(found))
+    elif solve.ended_well:
+        of_motion = compared.of(found, events)
+        off, reason = known.distance(of_motion), compared.other_events(of_motion, known.right) or reason
+    steps, evaluations = None, solve.evaluations
+    if ours:
+        steps, stages = int(found.stats["num_steps"]), evaluations_a_step(solvers[solve.method])
+        evaluations = None if stages is None else stages * steps
+    seconds = times.get((solve.method, solve.tolerance), UNTIMED)
+    # What another tool's call costs is its own.
+    own = call_seconds if solve.method in solvers else 0.0
+    median, least = (less_the_call(x, own) for x in seconds)
+    return Point(
+        method=solve.method,
+        tolerance=solve.tolerance,
+        error=off,
+        trusted=judged is None or off > KNOWN_BY * judged.error,
+        seconds=median,
+        least=least,
+        steps=steps,
+        evaluations=evaluations,
+        result=reason,
+        trajectory=found if ours else None,
+    )
