@@ -24,8 +24,8 @@ from lagjax.motion.trajectory import Trajectory
 # The tolerance at which a run must reach its `required` error, for the method named with it.
 JUDGED_AT = 1e-10
 JUDGED_METHOD = "Dopri8"
-# Seconds of a solve after which tighter tolerances of a method are not tried.
-PATIENCE = 0.3
+# Seconds of a solve by another tool after which its tighter tolerances are not tried.
+PATIENCE = 0.5
 
 
 @dataclass(frozen=True)
@@ -120,7 +120,7 @@ def work_precision(run: Run, others: bool = True, **settings: Any) -> WorkPrecis
         instead = usual_others(acceleration, run.q0, run.v0, run.params, run.ts)
     return comparison.work_precision(
         run.system, run.q0, run.v0, run.params,
-        ts=run.ts, events=run.events, error=run.error, others=instead, patience=PATIENCE, **settings,
+        ts=run.ts, events=run.events, error=run.error, others=instead, patience_with_others=PATIENCE, **settings,
     )  # fmt: skip
 
 

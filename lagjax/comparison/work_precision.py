@@ -44,8 +44,9 @@ def work_precision(
     reference: Trajectory | tuple[PyTree, PyTree] | Callable | None = None,
     error: Callable[[Any], float] | None = None,
     others: Mapping[str, Callable] | None = None,
-    repeats: int = 7,
+    repeats: int = 15,
     patience: float = 30.0,
+    patience_with_others: float = 30.0,
     **options: Any,
 ) -> WorkPrecision:
     """Compare methods on one motion: the error that each makes at each tolerance, and what it costs.
@@ -81,7 +82,7 @@ def work_precision(
     - `others`: by name, functions of a tolerance by which another tool solves the same problem, for comparison:
       each returns `(q, v, evaluations)`, the states at `ts` and how often it evaluated the accelerations, or None.
     - `repeats`: of each solve; the median is kept. One that takes long is repeated less.
-    - `patience`: seconds of a solve after which a method's tighter tolerances are not tried.
+    - `patience`, `patience_with_others`: seconds of a solve after which tighter tolerances are not tried.
     - `options`: `max_step`, `jump_ts`, `drift` and `max_steps` of `integrate`.
 
     **Returns:** a `WorkPrecision`.
@@ -114,7 +115,7 @@ def work_precision(
     elif error is None:
         known = references.given(reference, motion, next(iter(programs.values())))
     for name, solve in (others or {}).items():
-        solved += _by_other(motion, name, solve, tolerances, patience)
+        solved += _by_other(motion, name, solve, tolerances, patience_with_others)
     judged = None if known is None else known.judged(_tightest(motion, solved))
     call_seconds = next(iter(programs.values())).call_seconds()
     points = _points(motion, solvers, solved, known, judged, error, call_seconds, repeats)
