@@ -114,9 +114,9 @@ class Row:
 
 def work_precision(run: Run, others: bool = True, **settings: Any) -> WorkPrecision:
     """Compare methods on a run; `others` with what one would take instead. `settings` are `lj.work_precision`'s."""
-    instead = None
-    if others and run.by_hand is not None:
-        acceleration = lambda *state: run.by_hand(*state)[0]
+    instead, by_hand = None, run.by_hand
+    if others and by_hand is not None:
+        acceleration = lambda *state: by_hand(*state)[0]
         instead = usual_others(acceleration, run.q0, run.v0, run.params, run.ts)
     return comparison.work_precision(
         run.system, run.q0, run.v0, run.params,

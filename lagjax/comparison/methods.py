@@ -118,8 +118,10 @@ def evaluations_a_step(method: Any) -> int | None:
     """How often a step evaluates the accelerations, the last one being the first of the next; None of implicit ones."""
     if isinstance(method, Nystrom):
         return len(method.tableau.c) - 1
-    if isinstance(method, (ExplicitRungeKutta, diffrax.AbstractERK)):
-        return method.tableau.num_stages - bool(method.tableau.fsal)
+    tableau = getattr(method, "tableau", None)
+    explicit = isinstance(method, (ExplicitRungeKutta, diffrax.AbstractERK))
+    if explicit and isinstance(tableau, diffrax.ButcherTableau):
+        return tableau.num_stages - bool(tableau.fsal)
     return None
 
 

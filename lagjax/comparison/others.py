@@ -7,6 +7,7 @@ compiled acceleration, which it calls from Python.
 
 import warnings
 from collections.abc import Callable
+from typing import cast
 
 import diffrax
 import jax
@@ -49,7 +50,8 @@ def bare_diffrax(acceleration, q0, v0, params, ts):
             max_steps=MOST_STEPS,
             throw=False,
         )
-        return *solution.ys, stages * solution.stats["num_steps"]
+        q, v = cast(tuple, solution.ys)
+        return q, v, stages * solution.stats["num_steps"]
 
     return lambda tolerance: solve(jnp.asarray(tolerance), start, params)
 

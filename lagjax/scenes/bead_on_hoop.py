@@ -277,9 +277,8 @@ def runs():
 
     def driven_error(trajectory):
         psi, psi_rate = exact_motion(PARAMS, 1.0, driven_ts)
-        torque = balance(PARAMS, psi, psi_rate).torque
         got = (trajectory.q["psi"], trajectory.v["psi"], trajectory.multipliers["motor"])
-        return relative_error(got, (psi, psi_rate, torque))
+        return relative_error(got, (psi, psi_rate, balance(PARAMS, psi, psi_rate).torque))
 
     return [
         Run(
