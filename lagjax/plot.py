@@ -178,9 +178,8 @@ def work_precision(panels: Sequence[Drawn]):
         axis.set_visible(False)
     found = {label: line for axis in axes.flat for line, label in zip(*axis.get_legend_handles_labels())}
     shown = [name for name in names if name in found]
-    fig.legend(
-        [found[name] for name in shown], shown, fontsize=8, frameon=False, ncols=len(shown), loc="outside lower center"
-    )
+    handles, ncols = [found[name] for name in shown], min(len(shown), 3 * columns)
+    fig.legend(handles, shown, fontsize=8, frameon=False, ncols=ncols, loc="outside lower center")
     return fig
 
 
