@@ -171,7 +171,7 @@ def cost_of(motion):
 def line(verdict, of_cost):
     """A verdict as a row of the table."""
     true, estimate = verdict.true, verdict.estimate
-    end = len(true) // 2 - 1
+    at_end = lambda errors: float(max(errors[len(errors) // 2 - 1], errors[-1])) if errors.size else 0.0
     kind = verdict.motion.method or verdict.motion.options.get("stepsize_controller")
     more = {"cost": of_cost[0], "ms": of_cost[1], "programs": of_cost[2]} if of_cost else {}
     if verdict.events.size:
@@ -180,8 +180,8 @@ def line(verdict, of_cost):
     return row(
         f"{verdict.motion.name}, {verdict.tolerance:.0e}", share(within(verdict.ratios, 10)),
         method=type(kind).__name__ if kind else "default", pairs=len(true), within_100=hundred,
-        farthest=farthest(verdict.ratios), error=float(max(true[end], true[-1])),
-        estimate=float(max(estimate[end], estimate[-1])), warned=verdict.warned, reference=verdict.motion.source,
+        farthest=farthest(verdict.ratios), error=at_end(true), estimate=at_end(estimate),
+        warned=verdict.warned, reference=verdict.motion.source,
         known=verdict.known, **more,
     )  # fmt: skip
 

@@ -51,6 +51,7 @@ def integrated(field, start, ts, columns):
     t, scale, length = ts[0], np.abs(y), (ts[-1] - ts[0]) * LONG(1e-3)
     found = [y]
     for end in ts[1:]:
+        length = np.copysign(length, end - t)
         while t != end:
             if abs(length) < 1e-15 * abs(ts[-1] - ts[0]):
                 raise RuntimeError(f"the reference does not get beyond t = {float(t)}")

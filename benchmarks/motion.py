@@ -9,6 +9,8 @@ from long_double import Integrated, reference
 import lagjax as lj
 
 DIGITS = 1e-13
+# Of the span: how far an exact crossing may be from one that was found.
+NEAR = 0.02
 
 
 class Motion(NamedTuple):
@@ -54,15 +56,21 @@ def roots(motion, guard, times):
     order = np.argsort(times)
     before, now = np.asarray(times)[order], np.asarray(times)[order] + 1e-6
 
+    room = NEAR * abs(motion.ts[-1] - motion.ts[0])
+    earliest, latest = before - room, before + room
+
     def value(at):
         q, v = motion.exact(np.concatenate([motion.ts[:1], at]))
         return np.asarray(guard(at, *(_rest(part) for part in (q, v)), motion.params), float)
 
     of_before = value(before)
     for _ in range(5):
-        of_now = value(now)
-        slope = np.where(of_now == of_before, np.inf, (of_now - of_before) / np.where(now == before, 1, now - before))
-        before, of_before, now = now, of_now, now - of_now / slope
+        of_now, apart = value(now), now - before
+        # What is left of a difference that is next to nothing is round-off.
+        done = (abs(apart) < DIGITS * room) | (of_now == of_before)
+        slope = np.where(done, np.inf, (of_now - of_before) / np.where(done, 1, apart))
+        # A crossing that the exact motion does not have must not lead far away.
+        before, of_before, now = now, of_now, np.clip(now - of_now / slope, earliest, latest)
     return now[np.argsort(order)]
 
 
