@@ -55,6 +55,8 @@ def steps_to_repeat(asked: bool | None, controller, progress: bool) -> np.ndarra
 
 def with_errors(run: Callable, first: Trajectory, settings, ts) -> Trajectory:
     """A trajectory with its errors by `run(settings)`, where it is short enough; not while JAX is tracing."""
+    if not is_among(first.result, ENDED_WELL):
+        return _unknown(first, first.result)
     steps = int(first.stats["num_accepted_steps"])
     if steps > settings.repeated_up_to or not _can_be_closer(settings):
         return _unknown(first)
@@ -115,10 +117,10 @@ def _compared(xp, first, second, settings, ts) -> Trajectory:
     return replace(first, error=found, departure=excess)
 
 
-def _unknown(first) -> Trajectory:
+def _unknown(first, result=RESULTS.not_estimated) -> Trajectory:
     nothing = jax.tree.map(lambda x: np.full(x.shape, np.nan, x.dtype), (first.q, first.v, first.multipliers))
     times = {name: np.full(found.t.shape, np.nan, found.t.dtype) for name, found in first.events.items()}
-    return replace(first, error=Errors(*nothing, times, RESULTS.not_estimated, np.zeros((), int)))
+    return replace(first, error=Errors(*nothing, times, result, np.zeros((), int)))
 
 
 def _columns(xp, of):
