@@ -47,6 +47,7 @@ class Outcome:
     - `residual`: of the constraints, None without constraints.
     - `gradient`: relative error of the derivative of the motion, forward mode against the exact one; None where not
       tried.
+    - `estimated`: the error as the motion itself estimates it, by the same measure; None where that is not the one.
     - `said`: the first sentence of what the library warned of or raised.
     - `expected`: the verdict that the row should have, None where any honest one will do.
     """
@@ -59,6 +60,7 @@ class Outcome:
     allowed: float
     residual: float | None = None
     gradient: float | None = None
+    estimated: float | None = None
     raised: bool = False
     said: str = ""
     expected: str | None = None
@@ -142,9 +144,16 @@ class Trial:
         if self.exact is None:
             return self._outcome(effort=steps, residual=residual, said=said)
         error = relative_error(self.observed(trajectory), self.exact(*self._exactly()))
+        gradient, estimated = self._gradient_error(self.exact), self._estimated(trajectory)
         return self._outcome(
-            effort=steps, error=error, residual=residual, said=said, gradient=self._gradient_error(self.exact)
+            effort=steps, error=error, residual=residual, said=said, gradient=gradient, estimated=estimated
         )
+
+    def _estimated(self, trajectory):
+        if self.observed is not _states or trajectory.error is None:
+            return None
+        leaves = zip(jax.tree.leaves(_states(trajectory.error)), jax.tree.leaves(_states(trajectory)))
+        return max(float(np.max(error) / (np.max(np.abs(x)) or 1.0)) for error, x in leaves)
 
     def _options(self):
         return {"rtol": self.tolerance, "atol": self.tolerance, "method": self.method, **self.options}
@@ -198,7 +207,18 @@ def _first_sentence(message):
 
 def stability_table(outcomes: Sequence[Outcome]) -> str:
     """The report: one line an outcome, then the count of each verdict."""
-    header = ("", "method", "steps", "error", "allowed", "residual", "gradient", "verdict", "what the library said")
+    header = (
+        "",
+        "method",
+        "steps",
+        "error",
+        "estimated",
+        "allowed",
+        "residual",
+        "gradient",
+        "verdict",
+        "what the library said",
+    )
     cells = [_cells(outcome) for outcome in outcomes]
     # The last column is prose: keep it to the left.
     width = max(len(row[-1]) for row in [header, *cells])
@@ -208,7 +228,8 @@ def stability_table(outcomes: Sequence[Outcome]) -> str:
         [
             *(line.rstrip() for line in body.split("\n")),
             "",
-            "error and gradient: relative, against the exact motion and its exact derivative; "
+            "error and gradient: relative, against the exact motion and its exact derivative; estimated: the error as "
+            "the motion itself says it; "
             f"accurate: at most {PER_PERIOD:g} tolerances a period, more after thousands, times the motion's own "
             f"amplification, and {OF_DERIVATIVES:g} times that for the gradient",
             ", ".join(f"{count} {verdict}" for verdict, count in counts.items()),
@@ -224,6 +245,7 @@ def _cells(outcome):
         outcome.method,
         outcome.effort or "-",
         number(outcome.error),
+        number(outcome.estimated),
         f"{outcome.allowed:.0e}",
         number(outcome.residual),
         number(outcome.gradient),
