@@ -12,7 +12,7 @@ from lagjax.mechanics.system import System
 from lagjax.motion import problem
 from lagjax.motion.solve import ROUND_OFFS
 from lagjax.numerics.nystrom import Nystrom, Nystrom12
-from lagjax.numerics.runge_kutta import Dopri8, ExplicitRungeKutta, Tsit5
+from lagjax.numerics.runge_kutta import Dopri8, Tsit5
 
 # From so loose that high orders do not show to where round-off takes over.
 LADDERS = {
@@ -112,17 +112,6 @@ def ladder(tolerances: Any, dtype) -> tuple[float, ...]:
                 )
             )
     return tuple(float(value) for value in sorted(set(found), reverse=True))
-
-
-def evaluations_a_step(method: Any) -> int | None:
-    """How often a step evaluates the accelerations, the last one being the first of the next; None of implicit ones."""
-    if isinstance(method, Nystrom):
-        return len(method.tableau.c) - 1
-    tableau = getattr(method, "tableau", None)
-    explicit = isinstance(method, (ExplicitRungeKutta, diffrax.AbstractERK))
-    if explicit and isinstance(tableau, diffrax.ButcherTableau):
-        return tableau.num_stages - bool(tableau.fsal)
-    return None
 
 
 def as_code(method: Any) -> str:

@@ -12,7 +12,7 @@ from jaxtyping import Array, ArrayLike, PyTree
 from lagjax.comparison import compared, references
 from lagjax.comparison.compared import Compared, States
 from lagjax.comparison.diagram import WorkPrecision
-from lagjax.comparison.methods import chosen, evaluations_a_step, ladder
+from lagjax.comparison.methods import chosen, ladder
 from lagjax.comparison.points import Curve, Point
 from lagjax.comparison.programs import Motion, Program, Times, in_turn, less_the_call
 from lagjax.comparison.references import Known, Reference
@@ -23,6 +23,7 @@ from lagjax.motion import problem
 from lagjax.motion.crossings import Crossing
 from lagjax.motion.integrate import integrate
 from lagjax.motion.trajectory import Trajectory, ended_well, message
+from lagjax.numerics.evaluations import evaluations_a_step
 
 # What of `integrate` means the same for every method.
 OPTIONS = ("max_step", "jump_ts", "drift", "max_steps")

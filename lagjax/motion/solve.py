@@ -34,8 +34,9 @@ from lagjax.motion.global_error import ROUND_OFFS, with_errors, with_errors_insi
 from lagjax.motion.loop import Solution, solution_of
 from lagjax.motion.reported import report_settled
 from lagjax.motion.trajectory import RESULTS, How, Moment, Trajectory, ended_well, pack, worst_drift
+from lagjax.numerics.evaluations import evaluations_a_step
 from lagjax.numerics.nystrom import Nystrom, Nystrom12
-from lagjax.numerics.runge_kutta import Dopri8, ExplicitRungeKutta, evaluations, in_our_form
+from lagjax.numerics.runge_kutta import Dopri8, ExplicitRungeKutta, in_our_form
 
 # A start may be off the constraints by this many tolerances; it is then moved onto them.
 START_TOLERANCES = 100.0
@@ -203,7 +204,9 @@ def _how(method, asked, settings):
     name = type(method).__name__ + ("" if asked is None or asked is method else " (diffrax's, in lagjax's form)")
     terms = diffrax.ODETerm(lambda t, y, args: y)
     chosen = "fixed" if isinstance(settings.controller, diffrax.ConstantStepSize) else "controller"
-    return How(name, method.error_order(terms), evaluations(method), chosen if settings.controller else "tolerance")
+    return How(
+        name, method.error_order(terms), evaluations_a_step(method), chosen if settings.controller else "tolerance"
+    )
 
 
 def method_of(settings, system, *state):

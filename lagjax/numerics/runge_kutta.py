@@ -109,20 +109,6 @@ class Dopri8(ExplicitRungeKutta):
         return 8
 
 
-def evaluations(method: diffrax.AbstractSolver) -> int | None:
-    """How often a step of an explicit method asks for the vector field; None for other methods.
-
-    >>> evaluations(Dopri8()), evaluations(Tsit5())
-    (13, 6)
-    """
-    tableau = getattr(method, "tableau", None)
-    nodes = getattr(tableau, "c", None)
-    if nodes is None or isinstance(method, diffrax.AbstractImplicitSolver):
-        return None
-    # diffrax leaves out the first node, which is zero; the last stage may be the first of the next step.
-    return len(nodes) + (1 - tableau.fsal if isinstance(tableau, diffrax.ButcherTableau) else 0)
-
-
 def in_our_form(method: diffrax.AbstractSolver) -> ExplicitRungeKutta | None:
     """Ours of the same name as one of diffrax's methods, as it is shipped; None of any other, or of one with options.
 
