@@ -60,7 +60,7 @@ def with_errors(run: Callable, first: Trajectory, settings, ts) -> Trajectory:
     steps = int(first.stats["num_accepted_steps"])
     if steps > settings.repeated_up_to or not _can_be_closer(settings):
         return _unknown(first)
-    return _compared(np, first, run(_closer(np, settings, steps, ts)), settings, ts)
+    return _compared(np, first, run(_closer(np, settings, steps, np.asarray(first.end.t), ts)), settings, ts)
 
 
 def with_errors_inside(run: Callable, first: Trajectory, settings, ts) -> Trajectory:
@@ -68,7 +68,7 @@ def with_errors_inside(run: Callable, first: Trajectory, settings, ts) -> Trajec
     if not _can_be_closer(settings):
         return _unknown(first)
     known, settings, ts = stopped((first, settings, ts))
-    second = stopped(run(_closer(jnp, settings, known.stats["num_accepted_steps"], ts)))
+    second = stopped(run(_closer(jnp, settings, known.stats["num_accepted_steps"], known.end.t, ts)))
     found = _compared(jnp, known, second, settings, ts)
     return replace(first, error=found.error, departure=found.departure)
 
@@ -81,16 +81,16 @@ def _can_be_closer(settings):
     return settings.controller is None or _fixed(settings.controller) and settings.dt0 is not None
 
 
-def _closer(xp, settings, steps, ts):
-    """The settings of a second run, after a first one of so many steps."""
+def _closer(xp, settings, steps, end, ts):
+    """The settings of a second run, after a first one of so many steps to the time `end`."""
     if settings.controller is not None:
         return replace(settings, dt0=settings.dt0 / 2)
     # Below round-off the other way: the difference is then what the looser run is off, and more than this one.
     scale = xp.where(settings.rtol / TIGHTER >= ROUND_OFFS * np.finfo(ts.dtype).eps, 1 / TIGHTER, TIGHTER)
-    span, an_output = abs(ts[-1] - ts[0]), steps / (len(ts) - 1)
-    limited = steps * settings.max_step * LIMITED <= span
+    an_output = steps / xp.maximum(1, xp.sum(ts < end))
+    limited = steps * settings.max_step * LIMITED <= end - ts[0]
     longest = xp.where(limited, settings.max_step / 2, settings.max_step)
-    pieces = xp.where(an_output <= FEW, xp.ceil(an_output - BUT_FOR) + 1, MANY)
+    pieces = xp.where(an_output <= FEW, xp.maximum(1, xp.ceil(an_output - BUT_FOR)) + 1, MANY)
     values = settings.rtol * scale, settings.atol * scale, longest, xp.stack([xp.asarray(FIRST), 1 / pieces])
     rtol, atol, longest, shares = (x.astype(ts.dtype) for x in values)
     return replace(settings, rtol=rtol, atol=atol, max_step=longest, shares=shares)
