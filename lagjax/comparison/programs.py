@@ -23,7 +23,7 @@ from lagjax.motion.reported import reporting
 from lagjax.motion.trajectory import Trajectory
 
 # Seconds of measuring after which a call is not repeated; one that takes longer counts twice, unless it is very long.
-ENOUGH, VERY_LONG = 0.1, 1.0
+ENOUGH, VERY_LONG = 0.05, 0.2
 # A call of less seconds is made once before it is timed: right after another program caches are cold.
 SHORT = 0.02
 # Of a call of an empty program: a difference of less cannot be told from zero.
