@@ -25,7 +25,7 @@ from lagjax.motion.trajectory import Trajectory
 JUDGED_AT = 1e-10
 JUDGED_METHOD = "Dopri8"
 # Seconds of a solve by another tool after which its tighter tolerances are not tried.
-PATIENCE = 0.2
+PATIENCE = 0.4
 
 
 @dataclass(frozen=True)
