@@ -15,6 +15,8 @@ BY_OUTPUTS, NOT_BY_OUTPUTS = 1.2, 4.0
 # The number of steps grows with the tolerance as the order says; by a share of that where stability limits them, and by
 # more where a second run had its longest step halved.
 BY_STABILITY, BY_LONGEST = 0.35, 1.6
+# Steps of which the first, which find their length, are few.
+ENOUGH = 40
 # A tolerance from which round-off is not far.
 NEAR_ROUND_OFF = 1e3
 
@@ -67,20 +69,23 @@ def account_of(trajectory) -> Account | None:
 
 def of_error(trajectory) -> list[tuple[str, str]]:
     """The lines of a printed trajectory about its error."""
-    found = account_of(trajectory)
-    if found is None:
+    if trajectory.error is None:
         return []
+    times = {name: np.asarray(x)[~np.isnan(np.asarray(x))] for name, x in trajectory.error.events.items()}
+    of_times = [(f"error of '{name}'", f"up to {x.max():.0e} in its times") for name, x in times.items() if len(x)]
+    found = account_of(trajectory)
+    return of_times if found is None else [("error", _at_the_end(found) + _lost(trajectory, found)), *of_times]
+
+
+def _at_the_end(found):
+    """The coordinate and the velocity that have lost most."""
     n, last = len(found.names) // 2, found.error[-1]
     parts = []
-    for which, columns_of in (("q", slice(0, n)), ("v", slice(n, None))):
-        relative = last[columns_of] / np.where(found.size[columns_of] > 0, found.size[columns_of], 1.0)
+    for which, group in (("q", slice(0, n)), ("v", slice(n, None))):
+        relative = last[group] / np.where(found.size[group] > 0, found.size[group], 1.0)
         i = int(np.argmax(relative))
-        name = f" ({found.names[i]})" if n > 1 else ""
-        parts.append(f"{last[columns_of][i]:.0e} in {which}{name}")
-    rows = [("error", f"about {' and '.join(parts)} at the end{_lost(trajectory, found)}")]
-    times = {name: np.asarray(x)[~np.isnan(np.asarray(x))] for name, x in trajectory.error.events.items()}
-    rows += [(f"error of '{name}'", f"up to {x.max():.0e} in its times") for name, x in times.items() if len(x)]
-    return rows
+        parts.append(f"{last[group][i]:.0e} in {which}" + (f" ({found.names[i]})" if n > 1 else ""))
+    return f"about {' and '.join(parts)} at the end"
 
 
 def _lost(trajectory, found):
@@ -112,9 +117,10 @@ def _chosen_by(trajectory, accepted):
     if an_output <= BY_OUTPUTS:
         return "the outputs: fewer of them cost less"
     growth = how.order * np.log10(int(trajectory.error.steps) / accepted)
-    if an_output > NOT_BY_OUTPUTS and growth > BY_LONGEST:
+    tells = accepted > ENOUGH and an_output > NOT_BY_OUTPUTS
+    if tells and growth > BY_LONGEST:
         return "max_step"
-    if an_output > NOT_BY_OUTPUTS and growth < BY_STABILITY and how.evaluations is not None:
+    if tells and growth < BY_STABILITY and how.evaluations is not None:
         return "stability, not the tolerance: the system is stiff; method=lj.Radau5() takes longer steps"
     if len(found.names) == 2:
         return "the tolerance"

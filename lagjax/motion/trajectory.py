@@ -307,7 +307,8 @@ def _lines(traj):
 
 
 def _not_estimated(traj):
-    return [] if traj.error is None else [("error", message(traj.error.result))]
+    estimated = traj.error is None or is_among(traj.error.result, ENDED_WELL)
+    return [] if estimated else [("error", message(traj.error.result))]
 
 
 def _pair(tolerance):
