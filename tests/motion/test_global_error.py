@@ -121,22 +121,29 @@ def test_passing_a_singularity():
     assert traj.departure > 1 and "near a singularity" in warning_of(traj)
 
 
-def test_by_default_and_when_asked():
-    """Eager calls are estimated, traced ones when they ask; derivatives are those of the motion alone."""
-    run = lambda g, **asked: lj.integrate(swing, 1.0, 0.0, {"g": g}, ts=np.linspace(0.0, 20.0, 5), rtol=1e-6, **asked)
-    eager, refused = run(9.81), run(9.81, estimate_error=False)
+def swung(g, **asked):
+    """The swing for 20 seconds."""
+    return lj.integrate(swing, 1.0, 0.0, {"g": g}, ts=np.linspace(0.0, 20.0, 5), rtol=1e-6, **asked)
+
+
+def test_by_default():
+    """Where nothing is traced, if it is not refused; the motion is the same."""
+    eager, refused = swung(9.81), swung(9.81, estimate_error=False)
     assert refused.error is None and "  error  " not in repr(refused) and "  error  " in repr(eager)
     np.testing.assert_array_equal(refused.q, eager.q)
-    inside = jax.jit(lambda g: run(g, estimate_error=True))
-    close = lambda found: np.testing.assert_allclose(found, eager.error.q, rtol=0.3)
+    assert jax.eval_shape(swung, 9.81).error is None
+
+
+@pytest.mark.slow
+def test_when_asked():
+    """In a program and in lanes as outside; derivatives are those of the motion alone."""
+    inside = jax.jit(lambda g: swung(g, estimate_error=True))
+    close = lambda found: np.testing.assert_allclose(found, swung(9.81).error.q, rtol=0.3)
     close(inside(9.81).error.q)
-    assert jax.jit(run)(9.81).error is None
-    lanes = jax.vmap(inside)(jnp.array([9.81, 5.0]))
-    close(lanes.error.q[0])
-    slope = lambda asked: jax.grad(lambda g: run(g, estimate_error=asked).q[-1])(9.81)
+    close(jax.vmap(inside)(jnp.array([9.81, 5.0])).error.q[0])
+    slope = lambda asked: jax.grad(lambda g: swung(g, estimate_error=asked).q[-1])(9.81)
     assert slope(True) == slope(None)
-    of_estimate = jax.jacfwd(lambda g: run(g, estimate_error=True).error.q[-1])(9.81)
-    assert of_estimate == 0.0
+    assert jax.jacfwd(lambda g: swung(g, estimate_error=True).error.q[-1])(9.81) == 0.0
 
 
 def test_what_cannot_be_estimated():
