@@ -72,9 +72,14 @@ def of_error(trajectory) -> list[tuple[str, str]]:
     if trajectory.error is None:
         return []
     times = {name: np.asarray(x)[~np.isnan(np.asarray(x))] for name, x in trajectory.error.events.items()}
-    of_times = [(f"error of '{name}'", f"up to {x.max():.0e} in its times") for name, x in times.items() if len(x)]
+    of_times = [(f"error of '{name}'", _of_times(x)) for name, x in times.items() if len(x)]
     found = account_of(trajectory)
     return of_times if found is None else [("error", _at_the_end(found) + _lost(trajectory, found)), *of_times]
+
+
+def _of_times(errors):
+    lost = "a crossing that a more precise run does not find: does it only touch zero?"
+    return lost if np.isinf(errors).any() else f"up to {errors.max():.0e} in its times"
 
 
 def _at_the_end(found):
