@@ -102,8 +102,9 @@ class Equations(eqx.Module):
         a, multipliers = self.rates(t, q, v)
         lagrangian = self.system.lagrangian(t, q, v, self.params)
         finite = jnp.all(jnp.isfinite(coordinates.flatten((a, multipliers, lagrangian))[0]))
-        singular = ~is_regular(*_vectors(self.system, t, q, v, self.params))
-        return Verdict(a, multipliers, finite, singular, jnp.asarray(False))
+        state = _vectors(self.system, t, q, v, self.params)
+        regular, mass = is_regular(*state)
+        return Verdict(a, multipliers, finite, ~regular, jnp.asarray(False), state[-1](mass))
 
     def quickly(self, t, q, v):
         """The accelerations, and the multipliers in one vector, as they are written out."""
@@ -202,7 +203,7 @@ def _verdict(form, system, t, q, v, params) -> Verdict:
     state = _vectors(system, t, q, v, params)
     found = form.verdict(*state)
     by_name = constraints.split(system, found.multipliers, t, q, v, params)
-    return found._replace(a=state[-1](found.a), multipliers=by_name)
+    return found._replace(a=state[-1](found.a), multipliers=by_name, mass=state[-1](found.mass))
 
 
 def _believed(form, system, t, q, v, params):

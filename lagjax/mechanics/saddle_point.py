@@ -85,7 +85,7 @@ class Dense(NamedTuple):
         solution = jnp.concatenate([found.a, found.multipliers, jnp.ravel(found.lagrangian)])
         singular = dense.reciprocal_condition(found.matrix) <= SINGULAR_BELOW[np.dtype(found.matrix.dtype)]
         finite, against = jnp.all(jnp.isfinite(solution)), jnp.any(found.contradictory)
-        return Verdict(found.a, found.multipliers, finite, singular, against)
+        return Verdict(found.a, found.multipliers, finite, singular, against, _of_rows(found.linear.mass))
 
     def believed(self, *state):
         """The solution as vectors, NaN where constraints contradict each other."""
@@ -112,6 +112,12 @@ def saddle_point_matrix(mass, jacobian, independent):
     rows = _pick(jacobian, independent, n)
     filled = _pick(jnp.ones_like(jacobian[:, 0]), independent, n) if m > 1 else jnp.ones(m, mass.dtype)
     return jnp.block([[mass, rows.T], [rows, jnp.diag(1 - filled)]])
+
+
+def _comparable(mass, jacobian, independent):
+    """The saddle-point matrix of M and A in units in which the largest of either is one: what tells it is singular."""
+    in_its_size = lambda x: x / jnp.where(jnp.any(x != 0), jnp.max(jnp.abs(x), initial=0.0), 1.0)
+    return saddle_point_matrix(in_its_size(mass), in_its_size(jacobian), independent)
 
 
 def displacement_map(mass, jacobian, independent):
@@ -171,12 +177,20 @@ def combinations(jacobian: Float[Array, "m n"], independent: Bool[Array, " m"]) 
     return jnp.where(independent[:, None], unit, scaled)
 
 
-def is_regular(*state) -> Bool[Array, ""]:
-    """Whether the equations at one state are regular: no constraint depends on others, and nothing is undetermined."""
+def is_regular(*state) -> tuple[Bool[Array, ""], Float[Array, " n"]]:
+    """Whether the equations at one state are regular, and the largest of each row of M.
+
+    They are where no constraint depends on others, and nothing is undetermined.
+    """
     mass, jacobian = mass_and_forcing(*state).mass, _without_vanishing(*state).jacobian
     independent = independent_rows(jacobian)
-    matrix = saddle_point_matrix(mass, jacobian, independent)
-    return jnp.all(independent) & (dense.reciprocal_condition(matrix) > SINGULAR_BELOW[np.dtype(mass.dtype)])
+    matrix = _comparable(mass, jacobian, independent)
+    regular = jnp.all(independent) & (dense.reciprocal_condition(matrix) > SINGULAR_BELOW[np.dtype(mass.dtype)])
+    return regular, _of_rows(mass)
+
+
+def _of_rows(mass):
+    return jnp.max(jnp.abs(mass), axis=1)
 
 
 class Examined(NamedTuple):
@@ -214,7 +228,7 @@ def _examined(system, t, x, u, params, unflatten) -> Examined:
         rows=rows,
         independent=independent,
         lagrangian=jnp.asarray(system.lagrangian(t, unflatten(x), unflatten(u), params)),
-        matrix=saddle_point_matrix(linear.mass, rows.jacobian, independent),
+        matrix=_comparable(linear.mass, rows.jacobian, independent),
         contradictory=_contradictory(linear, rows, independent, a, multipliers, x, u),
     )
 

@@ -128,7 +128,8 @@ class Banded(NamedTuple):
             contradictory = jnp.any(~kept & (jnp.abs(push(a) + rate) > tolerance))
         finite = jnp.all(jnp.isfinite(jnp.concatenate([jnp.ravel(x) for x in known])))
         solved = jnp.all(jnp.isfinite(jnp.concatenate([a, multipliers])))
-        return Verdict(a, multipliers, finite, finite & (singular | ~solved), contradictory)
+        mass = _largest_inertia(plan, inertia, x)
+        return Verdict(a, multipliers, finite, finite & (singular | ~solved), contradictory, mass)
 
     def believed(self, *state):
         """The solution as vectors, NaN where it is not to be believed."""

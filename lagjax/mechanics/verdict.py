@@ -11,13 +11,17 @@ VANISHES_BELOW = {np.dtype("float64"): 1e-10, np.dtype("float32"): 1e-4}
 
 
 class Verdict(NamedTuple):
-    """A solution of the equations at one state, as vectors or by name, and whether it is to be believed."""
+    """A solution of the equations at one state, as vectors or by name, and whether it is to be believed.
+
+    `mass`: the largest of each row of M, in the places of the coordinates.
+    """
 
     a: PyTree[Array]
     multipliers: Any
     finite: Bool[Array, ""]
     singular: Bool[Array, ""]
     contradictory: Bool[Array, ""]
+    mass: PyTree[Array]
 
 
 def slightly_off(y):

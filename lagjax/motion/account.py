@@ -6,7 +6,8 @@ import jax
 import numpy as np
 
 from lagjax.mechanics import coordinates
-from lagjax.motion.accuracy import AMPLIFIED, DIGITS_LEFT, EXPECTED, TURN, allowed, angle_mask, columns, sizes_of
+from lagjax.motion.accuracy import AMPLIFIED, DIGITS_LEFT, EXPECTED, allowed, angle_mask, columns, of_a_step, sizes_of
+from lagjax.motion.tolerances import TURN
 
 # A velocity that grows to so many times its median has passed near a singularity.
 PEAK = 30.0
@@ -61,9 +62,8 @@ def account_of(trajectory) -> Account | None:
         int(trajectory.stats["num_accepted_steps"]),
     )
     size = sizes_of(np, seen, angle_mask(trajectory), span, steps, len(trajectory.t))
-    limit, size = allowed(np, size, span, tolerance).ravel(), size.ravel()
-    of_a_step = np.repeat(tolerance[1], len(names)) + np.repeat(tolerance[0], len(names)) * size
-    amplified = error / (of_a_step * np.maximum(1.0, steps * abs(t - t[0]) / span)[:, None])
+    limit, step, size = allowed(np, size, span, tolerance).ravel(), of_a_step(size, tolerance).ravel(), size.ravel()
+    amplified = error / (step * np.maximum(1.0, steps * abs(t - t[0]) / span)[:, None])
     return Account([*names, *(f"v of {name}" for name in names)], t, value, error, size, limit, amplified)
 
 

@@ -11,13 +11,12 @@ import numpy as np
 from jaxtyping import Array, Float, Int, PyTree
 
 from lagjax.mechanics.structure import angles
+from lagjax.motion.tolerances import TURN
 
 # An error is as expected up to so many tolerances, as long as this share of the number is not lost.
 EXPECTED, DIGITS_LEFT = 1e4, 5e-4
 # A coordinate that stays within so many tolerances of zero, and at this share of the others, has no digits to lose.
 NOTHING, SMALL = 100.0, 1e-6
-# Of an angle at most one turn counts as its size.
-TURN = 2 * np.pi
 # Steps to an output from which on outputs are far from each other, and those of a motion to and fro.
 SPARSE, TO_AND_FRO = 1.5, 10.0
 # Errors that a motion has made this many times what the steps' errors add up to are amplified.
@@ -58,10 +57,15 @@ def sizes_of(xp, seen, is_angle, span, steps, outputs):
     return xp.stack([xp.maximum(q, v * step), xp.maximum(v, between)])
 
 
+def of_a_step(size, tolerance):
+    """The tolerances of a step for coordinates and velocities of these sizes, (2, n); `atol` is (2,) or (2, n)."""
+    rtol, atol = tolerance
+    return (atol[:, None] if atol.ndim == 1 else atol) + rtol[:, None] * size
+
+
 def allowed(xp, size, span, tolerance):
     """What errors of coordinates and velocities may be, (2, n), by their sizes; `tolerance` is (rtol, atol)."""
-    rtol, atol = tolerance
-    tolerances = atol[:, None] + rtol[:, None] * size
+    tolerances = of_a_step(size, tolerance)
     largest = xp.max(size, axis=1, keepdims=True)
     others = xp.maximum(largest, largest[::-1] * xp.asarray([[span], [1 / span]]))
     nothing = (size <= NOTHING * tolerances) & (size <= SMALL * others)

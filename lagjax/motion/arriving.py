@@ -16,6 +16,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from lagjax.mechanics.equations import Equations
+from lagjax.motion.tolerances import Weighing
 
 # The first step as it is proposed, and no longest one. Infinite, the share of an empty pause would be no number.
 WHOLE_STEPS = 1.0, 1e30
@@ -30,7 +31,7 @@ class Arriving(diffrax.AbstractStepSizeController):
     longest step.
     """
 
-    controller: diffrax.PIDController
+    controller: diffrax.PIDController | Weighing
     ts: Float[Array, " T"]
     shares: Float[Array, " 2"]
 

@@ -60,7 +60,7 @@ def with_errors(run: Callable, first: Trajectory, settings, ts) -> Trajectory:
     steps = int(first.stats["num_accepted_steps"])
     if steps > settings.repeated_up_to or not _can_be_closer(settings):
         return _unknown(first)
-    return _compared(np, first, run(_closer(np, settings, steps, np.asarray(first.end.t), ts)), settings, ts)
+    return _compared(np, first, run(_closer(np, settings, steps, np.asarray(first.end.t), ts)), ts)
 
 
 def with_errors_inside(run: Callable, first: Trajectory, settings, ts) -> Trajectory:
@@ -69,7 +69,7 @@ def with_errors_inside(run: Callable, first: Trajectory, settings, ts) -> Trajec
         return _unknown(first)
     known, settings, ts = stopped((first, settings, ts))
     second = stopped(run(_closer(jnp, settings, known.stats["num_accepted_steps"], known.end.t, ts)))
-    found = _compared(jnp, known, second, settings, ts)
+    found = _compared(jnp, known, second, ts)
     return replace(first, error=found.error, departure=found.departure)
 
 
@@ -96,7 +96,7 @@ def _closer(xp, settings, steps, end, ts):
     return replace(settings, rtol=rtol, atol=atol, max_step=longest, shares=shares)
 
 
-def _compared(xp, first, second, settings, ts) -> Trajectory:
+def _compared(xp, first, second, ts) -> Trajectory:
     """The first trajectory with what the two differ by, and with what round-off adds at least."""
     steps = xp.asarray(second.stats["num_accepted_steps"])
     share = ROUND_OFF * np.finfo(ts.dtype).eps * xp.sqrt(1.0 + steps)
@@ -113,7 +113,7 @@ def _compared(xp, first, second, settings, ts) -> Trajectory:
     found = Errors(*_in_their_places(errors, first), times, second.result, steps)
     of_motion = lambda row: row[: 2 * sum(np.size(x) for x in jax.tree.leaves(first.end.q))].reshape(2, -1)
     worst = of_motion(np.fmax.reduce(errors) if xp is np else jnp.nanmax(errors, axis=0))
-    excess = departure(xp, worst, of_motion(sizes[-1]), first, ts, (settings.rtol, settings.atol))
+    excess = departure(xp, worst, of_motion(sizes[-1]), first, ts, tuple(map(xp.asarray, first.tolerance)))
     return replace(first, error=found, departure=excess)
 
 

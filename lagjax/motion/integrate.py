@@ -72,9 +72,12 @@ def integrate(
     - `params`: what the Lagrangian takes; gradients flow to its floating arrays.
     - `ts` (T,): output times, `[t]`, increasing or, to run backward, decreasing. Each is the end of a step of the
       method, not an interpolation. (Decreasing times have to be known while JAX is tracing: a NumPy array.)
-    - `rtol`, `atol`: tolerances of the local error of each coordinate and velocity; by default 1e-9 in float64, 1e-5
-      in float32. A pair is one for coordinates, `[q]`, and one for velocities, `[q]/[t]`. Of an angle (a coordinate
-      that is seen through sines and cosines alone) at most one turn counts as its size.
+    - `rtol`, `atol`: tolerances of the local error of each coordinate and velocity, `atol + rtol |y|`. `rtol` is 1e-9
+      by default in float64, 1e-5 in float32. Without `atol` each number is judged by its own size, whatever the units
+      (`lagjax/motion/tolerances.py`): at zero crossings by the end of the step, at rest by what it moves in a step, and
+      what dies out over three decades. Give `atol` where small numbers do not matter, such as the stretching of a stiff
+      spring. A pair is one for coordinates, `[q]`, and one for velocities, `[q]/[t]`. Of an angle (a coordinate that is
+      seen through sines and cosines alone) at most one turn counts as its size.
 
     **Other arguments:**
 
@@ -147,7 +150,8 @@ def integrate(
         event=left_to_diffrax(event),
         adjoint=adjoint,
         rtol=problem.tolerance(rtol, "rtol", dtype),
-        atol=problem.tolerance(atol, "atol", dtype),
+        atol=problem.tolerance(rtol if atol is None else atol, "rtol" if atol is None else "atol", dtype),
+        by_size=atol is None,
         dt0=problem.step_length(dt0, "dt0", dtype),
         max_step=problem.step_length(np.inf if max_step is None else max_step, "max_step", dtype),
         jump_ts=problem.jumps(jump_ts, dtype),

@@ -21,9 +21,11 @@ from lagjax.mechanics.structure import angles
 from lagjax.motion.arriving import Arriving, together
 from lagjax.motion.consistency import stopped
 from lagjax.motion.crossing_times import Located, at_known_times, first_end, locate
-from lagjax.motion.stepping import Field, OnManifold, Quick, QuickField, Tolerances, forward_differentiable
+from lagjax.motion.stepping import Field, OnManifold, Quick, QuickField, forward_differentiable
+from lagjax.motion.tolerances import Scales, Tolerances, Weighing, as_nothing
 from lagjax.motion.watching import Watching
 from lagjax.numerics.nystrom import Nystrom
+from lagjax.numerics.radau import Radau5
 from lagjax.numerics.runge_kutta import ExplicitRungeKutta
 from lagjax.numerics.simplified_newton import SimplifiedNewton, with_tolerances
 
@@ -47,9 +49,11 @@ class Solution(NamedTuple):
     located: Located | None
 
 
-def solution_of(equations: Equations, start: State, y0, refused, ts, guards, settings, adjoint) -> Solution:
-    """Step through a motion by diffrax; where `refused`, end within a few steps."""
-    problem = (equations, start, y0, refused)
+def solution_of(
+    equations: Equations, start: State, y0, refused, scales: Scales | None, ts, guards, settings, adjoint
+) -> Solution:
+    """Step through a motion by diffrax; where `refused`, end within a few steps. Without `scales` by `atol`."""
+    problem = (equations, start, y0, refused, scales)
     if guards is None or isinstance(adjoint, diffrax.ForwardMode):
         return _loop(*problem, settings, ts, adjoint, guards)
     # In reverse mode diffrax differentiates outputs alone: once the crossings' times are known, they are outputs.
@@ -72,7 +76,7 @@ def solution_of(equations: Equations, start: State, y0, refused, ts, guards, set
     )
 
 
-def _loop(equations, start, y0, refused, settings, ts, adjoint, guards=None, repeated=False):
+def _loop(equations, start, y0, refused, scales, settings, ts, adjoint, guards=None, repeated=False):
     feedback = BAUMGARTE_DECAYS / (ts[-1] - ts[0]) if settings.drift == "baumgarte" else None
     quick, written = None, equations.written
     if written is not None and feedback is None:
@@ -81,13 +85,13 @@ def _loop(equations, start, y0, refused, settings, ts, adjoint, guards=None, rep
         quick = Quick(stages, in_a_loop)
     # BacksolveAdjoint integrates a larger state backwards: it takes the bare method, and no end beside the outputs.
     bare = isinstance(adjoint, diffrax.BacksolveAdjoint)
-    settings = eqx.tree_at(lambda s: s.method, settings, _with_root_finder(settings))
-    controller = _controller(ts, settings, bare, repeated)
+    settings = eqx.tree_at(lambda s: s.method, settings, _with_root_finder(settings, scales))
+    controller = _controller(equations, start, ts, settings, scales, bare, repeated)
     terms = diffrax.ODETerm(Field(equations, feedback) if quick is None else QuickField(equations))
     if bare:
         solver, saveat = settings.method, diffrax.SaveAt(ts=ts)
     else:
-        solver = _solver(equations, quick, feedback, start, refused, settings, adjoint)
+        solver = _solver(equations, quick, feedback, refused, settings, adjoint)
         subs = diffrax.SubSaveAt(ts=ts), diffrax.SubSaveAt(t1=True)
         saveat = diffrax.SaveAt(subs=subs, controller_state=guards is not None)
     if guards is not None:
@@ -149,19 +153,20 @@ def _own_calls_of_the_host(equations, terms, start, guards, settings, controller
 
 def method_alone(settings, method):
     """A method as a motion is stepped with it, on equations that are not written out."""
-    return _in_a_loop(_with_root_finder(replace(settings, method=method)), diffrax.ForwardMode())
+    return _in_a_loop(_with_root_finder(replace(settings, method=method), None), diffrax.ForwardMode())
 
 
-def _with_root_finder(settings):
+def _with_root_finder(settings, scales):
     """An implicit method with diffrax's default root finder gets ours; all get the solve's tolerances."""
     method, tolerances = settings.method, (settings.rtol[0], settings.atol[0])
+    if scales is not None and isinstance(method, Radau5):
+        tolerances = settings.rtol[0], as_nothing(scales, settings.rtol)
     if isinstance(getattr(method, "root_finder", None), diffrax.VeryChord):
         return eqx.tree_at(lambda method: method.root_finder, method, SimplifiedNewton(*tolerances))
     return with_tolerances(method, *tolerances)
 
 
-def _solver(equations, quick, feedback, start, refused, settings, adjoint):
-    angle = tuple(jax.tree.leaves(angles(equations.system, *start)))
+def _solver(equations, quick, feedback, refused, settings, adjoint):
     return OnManifold(
         solver=_in_a_loop(settings.method, adjoint),
         equations=equations,
@@ -169,9 +174,7 @@ def _solver(equations, quick, feedback, start, refused, settings, adjoint):
         feedback=feedback,
         refused=refused,
         tolerances=Tolerances(settings.rtol, settings.atol),
-        angles=angle,
         controlled=settings.controller is None,
-        weigh=settings.controller is None and (settings.apart or any(angle)),
         project=settings.drift == "project",
         arriving=_arriving(settings),
         jump_ts=settings.jump_ts,
@@ -195,7 +198,7 @@ def _arriving(settings):
     return settings.controller is None and settings.event is None
 
 
-def _controller(ts, settings, bare, repeated):
+def _controller(equations, start, ts, settings, scales, bare, repeated):
     if settings.controller is not None:
         return settings.controller
     # A step that small no longer moves t: the solution is singular there, or was NaN from the start.
@@ -205,6 +208,9 @@ def _controller(ts, settings, bare, repeated):
         rtol=settings.rtol[0], atol=settings.atol[0], norm=optx.max_norm, dtmin=dtmin, dtmax=settings.max_step,
         force_dtmin=False,
     )  # fmt: skip
+    angle = tuple(jax.tree.leaves(angles(equations.system, *start)))
+    if not bare and (scales is not None or settings.apart or any(angle)):
+        controller = Weighing(controller, Tolerances(settings.rtol, settings.atol), scales, angle)
     arriving = _arriving(settings) and not bare
     if settings.jump_ts is None and not repeated:
         return Arriving(controller, ts, settings.shares) if arriving else controller

@@ -33,6 +33,7 @@ from lagjax.motion.crossing_times import all_known, by_name, end_of
 from lagjax.motion.global_error import ROUND_OFFS, with_errors, with_errors_inside
 from lagjax.motion.loop import Solution, solution_of
 from lagjax.motion.reported import report_settled
+from lagjax.motion.tolerances import Scales, of_states, rounding, scales_of
 from lagjax.motion.trajectory import RESULTS, How, Moment, Trajectory, ended_well, pack, worst_drift
 from lagjax.numerics.evaluations import evaluations_a_step
 from lagjax.numerics.nystrom import Nystrom, Nystrom12
@@ -85,6 +86,8 @@ class Settings:
     shares: Float[Array, " 2"]
     # The most steps of a motion that is integrated again, for its error.
     repeated_up_to: Int[Array, ""]
+    # Whether `atol` is one of a motion's own size, and the one above only for want of it.
+    by_size: bool = eqx.field(static=True)
     apart: bool = eqx.field(static=True)
     max_steps: int | None = eqx.field(static=True)
     drift: str = eqx.field(static=True)
@@ -196,8 +199,8 @@ def _trajectory(system, q0, v0, params, ts, guards, settings):
     else:
         fields = solved(x, fixed, settings.adjoint, True)
     arrays, described = pack(system, params, how)
-    tolerance, settled = (settings.rtol, settings.atol), fields.pop("settled")
-    return Trajectory(t=ts, **fields, tolerance=tolerance, arrays=arrays, static=described), settled
+    settled = fields.pop("settled")
+    return Trajectory(t=ts, **fields, arrays=arrays, static=described), settled
 
 
 def _how(method, asked, settings):
@@ -236,7 +239,10 @@ def _solve(system, q0, v0, params, ts, guards, settings, adjoint):
     equations = equations_of(system, ts[0], q0, v0, params, quickly=quickly, fallback=settings.careful)
     if guards is not None and equations.unflatten is not None:
         guards = guards.in_numbers(equations.unflatten)
-    start = _start(equations, equations.inside(q0), equations.inside(v0), ts, settings)
+    q, v = equations.inside(q0), equations.inside(v0)
+    if settings.by_size:
+        settings = replace(settings, atol=stopped(of_states(settings.rtol, q, v, _span(ts))))
+    start = _start(equations, q, v, ts, settings)
     solution = _stepped(equations, start, ts, guards, settings, adjoint)
     outputs = _outputs(equations, start, solution, ts, settings)
     fields = _result(equations, start, solution, outputs, guards, settings)
@@ -251,12 +257,16 @@ def _solve(system, q0, v0, params, ts, guards, settings, adjoint):
 
 
 class Start(NamedTuple):
-    """The first state, moved onto the constraints, and what speaks against it, by names of `RESULTS`."""
+    """The first state, moved onto the constraints, and what speaks against it, by names of `RESULTS`.
+
+    `scales`: of the motion, where tolerances are relative to its size.
+    """
 
     q: PyTree[Float[Array, "..."]]
     v: PyTree[Float[Array, "..."]]
     against: dict[str, Bool[Array, ""]]
     refused: Bool[Array, ""]
+    scales: Scales | None
 
 
 class Outputs(NamedTuple):
@@ -274,7 +284,11 @@ def _start(equations: Equations, q, v, ts, settings) -> Start:
         off_constraints = ~within(equations, t, q, v, *tolerances)
     if settings.drift == "project":
         q, v, holds = returned(equations, t, q, v, settings.rtol, settings.atol)
-    _, _, finite, singular, contradictory = stopped(equations.verdict(t, q, v))
+    a, _, finite, singular, contradictory, mass = stopped(equations.verdict(t, q, v))
+    scales = None
+    if settings.by_size:
+        root_mass, a = jax.tree.map(lambda x: jnp.nan_to_num(x, posinf=0.0), (jax.tree.map(jnp.sqrt, mass), a))
+        scales = scales_of(root_mass, *stopped((q, v)), a, _span(ts))
     too_small = settings.controller is None and settings.rtol[0] < ROUND_OFFS * jnp.finfo(ts.dtype).eps
     lengths = [settings.max_step, *([] if settings.dt0 is None else [settings.dt0])]
     against = {
@@ -285,7 +299,12 @@ def _start(equations: Equations, q, v, ts, settings) -> Start:
         "tolerance_too_small": jnp.asarray(too_small),
         "unordered": jnp.any(ts[1:] < ts[:-1]) | ~jnp.all(jnp.asarray([True, *(length > 0 for length in lengths)])),
     }
-    return Start(q, v, against, jnp.any(jnp.stack([*against.values()])))
+    return Start(q, v, against, jnp.any(jnp.stack([*against.values()])), scales)
+
+
+def _span(ts):
+    # Times that go to and fro are refused.
+    return jnp.maximum(jnp.abs(ts[-1] - ts[0]), jnp.finfo(ts.dtype).tiny)
 
 
 def _stepped(equations, start, ts, guards, settings, adjoint) -> Solution:
@@ -294,7 +313,7 @@ def _stepped(equations, start, ts, guards, settings, adjoint) -> Solution:
     if settings.dt0 is not None:
         # Where it is not positive the motion is refused; diffrax's own check would end the program.
         settings = replace(settings, dt0=jnp.where(settings.dt0 > 0, settings.dt0, 1.0))
-    solution = solution_of(equations, first, y0, start.refused, ts, guards, settings, adjoint)
+    solution = solution_of(equations, first, y0, start.refused, start.scales, ts, guards, settings, adjoint)
     if solution.located is None:
         return solution
     end = end_of(guards, solution.located, *solution.end)
@@ -337,11 +356,21 @@ def _result(equations, start, solution, outputs, guards, settings):
         "multipliers": masked.multipliers,
         "end": end,
         "stats": stats,
+        "tolerance": (settings.rtol, _absolute(stopped((motion.q, motion.v)), start.scales, motion.t, settings)),
         "departure": _departure(stopped(equations), *stopped((motion.t, motion.q, motion.v)), stats, settings),
         "result": result,
         "settled": ended_well(result) | _among(result, THE_SAME) if regular else jnp.asarray(True),
         "events": {} if located is None else by_name(guards, located, motion.t[-1:], ~start.refused),
     }
+
+
+def _absolute(states, scales, t, settings):
+    """The `atol` that was given; by a motion's own size what was as good as zero on it, (2, n)."""
+    if scales is None:
+        return settings.atol
+    q, v = jax.tree.map(lambda x: jnp.max(jnp.abs(x), axis=0), states)
+    of_q, of_v = rounding(scales.root_mass, q, v, _span(t))
+    return jnp.stack([coordinates.flatten(of_q)[0], coordinates.flatten(of_v)[0]])
 
 
 def _departure(equations, t, q, v, stats, settings):

@@ -14,7 +14,6 @@ import equinox as eqx
 import equinox.internal as eqxi
 import jax.numpy as jnp
 import jax.tree_util as jtu
-import numpy as np
 from jax import lax
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, PyTree
@@ -23,25 +22,17 @@ from lagjax.jax_internals.one_function import called
 from lagjax.mechanics.equations import Equations, all_finite
 from lagjax.motion.arriving import between_jumps
 from lagjax.motion.consistency import to_manifold
+from lagjax.motion.tolerances import Tolerances
 from lagjax.numerics.interpolation import Interpolation
 from lagjax.numerics.radau import Radau5
 
 # Without projection a state drifts off its constraints, and dependent ones then disagree by that much.
 DEPENDENT_BELOW_WHILE_DRIFTING = 1e-3
-# Of the size of an angle no more counts than this: relative to a thousand turns, a tolerance would mean nothing.
-TURN = 2 * np.pi
 # An output is a shorter step than the accepted one that it lies in: its error should be smaller, not this much larger.
 OUTPUT_TOLERANCES = 100.0
 # With this share of a state as its error, a fixed step is beyond the method's stability.
 LOST = 0.3
 NOT_FINITE = diffrax.RESULTS.nonfinite_input
-
-
-class Tolerances(NamedTuple):
-    """Tolerances of coordinates and of velocities, each (2,)."""
-
-    rtol: Float[Array, " 2"]
-    atol: Float[Array, " 2"]
 
 
 class Stages(NamedTuple):
@@ -85,10 +76,8 @@ class OnManifold(diffrax.AbstractWrappedSolver):
     """Wrap `solver`: project after each step (where `project`), and step for dense output.
 
     A step that cannot be returned to the constraints is rejected; with a fixed step the solve ends there. `controlled`
-    says that steps are chosen by the tolerances. `weigh` rescales the error for a controller that knows one tolerance:
-    coordinates and velocities are judged each by their own, and the `angles` among the leaves of q by at most a turn.
-    `arriving` says that outputs are wanted at the ends of steps only. `jump_ts` become ends of steps by the controller;
-    here each step stays on its side of them.
+    says that steps are chosen by the tolerances. `arriving` says that outputs are wanted at the ends of steps only.
+    `jump_ts` become ends of steps by the controller; here each step stays on its side of them.
 
     The equations belong to the solver, since diffrax hands an interpolation only times and states; with `quick` it
     steps on those that are written out. `feedback` is the rate of Baumgarte's. Where `refused`, and where a step is not
@@ -102,9 +91,7 @@ class OnManifold(diffrax.AbstractWrappedSolver):
     feedback: Float[Array, ""] | None
     refused: Bool[Array, ""]
     tolerances: Tolerances
-    angles: tuple[bool, ...] = eqx.field(static=True)
     controlled: bool = eqx.field(static=True)
-    weigh: bool = eqx.field(static=True)
     project: bool = eqx.field(static=True)
     arriving: bool = eqx.field(static=True)
     jump_ts: Float[Array, " J"] | None = None
@@ -198,8 +185,6 @@ class OnManifold(diffrax.AbstractWrappedSolver):
         y1, error, _, solver_state, result = quick.solver.step(terms, t0, t1, y0, None, solver_state, jumped)
         if self.project:
             y1 = self.equations.projected(t1, *y1)
-        if self.weigh:
-            error = self._weighed(y0, y1, error)
         if not self.equations.fallback:
             return y1, error, solver_state, result
         believed = all_finite((y1, error))
@@ -218,8 +203,6 @@ class OnManifold(diffrax.AbstractWrappedSolver):
         if solver_state is None:
             solver_state = self.solver.init(terms, t0, t1, y0, stages)
         y1, error, _, solver_state, result = self.solver.step(terms, t0, t1, y0, stages, solver_state, jumped)
-        if self.weigh and error is not None:
-            error = self._weighed(y0, y1, error)
         if self.project:
             projected = to_manifold(self.equations, t1, *y1, *self.tolerances)
             y1 = (projected.q, projected.v)
@@ -258,20 +241,6 @@ class OnManifold(diffrax.AbstractWrappedSolver):
         largest = lambda tree: jnp.max(jnp.abs(ravel_pytree(tree)[0]))
         of_parts = [largest(e) <= OUTPUT_TOLERANCES * atol + share * largest((a, b)) for a, b, e in zip(y0, y1, error)]
         return of_parts[0] & of_parts[1]
-
-    def _weighed(self, y0, y1, error):
-        (rtol_q, rtol_v), (atol_q, atol_v) = self.tolerances
-
-        def weighed(a, b, error, rtol, atol, angle):
-            size = jnp.maximum(jnp.abs(a), jnp.abs(b))
-            counted = jnp.minimum(size, TURN) if angle else size
-            own = atol + rtol * counted
-            return error * (atol_q + rtol_q * size) / jnp.where(own > 0, own, 1.0)
-
-        (q0, v0), (q1, v1), (dq, dv) = y0, y1, error
-        angles = jtu.tree_unflatten(jtu.tree_structure(q0), self.angles)
-        dq = jtu.tree_map(lambda a, b, e, angle: weighed(a, b, e, rtol_q, atol_q, angle), q0, q1, dq, angles)
-        return dq, jtu.tree_map(lambda a, b, e: weighed(a, b, e, rtol_v, atol_v, False), v0, v1, dv)
 
     def _stages(self, t, y):
         threshold = None if self.project else DEPENDENT_BELOW_WHILE_DRIFTING

@@ -28,6 +28,7 @@ from lagjax.mechanics import coordinates
 from lagjax.mechanics.coordinates import State
 from lagjax.mechanics.diagnosis import describe, explain_failure
 from lagjax.mechanics.equations import equations_of
+from lagjax.motion.accuracy import of_a_step
 from lagjax.motion.consistent_state import consistent_state
 from lagjax.motion.loop import method_alone
 from lagjax.motion.solve import method_of
@@ -179,11 +180,9 @@ def look(trajectory, settings) -> Steps:
 def _attempt(method, terms, t0, t1, y, params, tolerance):
     """One step, and its error in units of the tolerance."""
     after, error, _, _, result = method.step(terms, t0, t1, y, params, method.init(terms, t0, t1, y, params), True)
-    (rtol, _), (atol, _) = tolerance
-    scaled = jax.tree.map(
-        lambda a, b, e: jnp.max(jnp.abs(e) / (atol + rtol * jnp.maximum(jnp.abs(a), jnp.abs(b)))), y, after, error
-    )
-    largest = jnp.max(jnp.stack(jax.tree.leaves(scaled)))
+    rows = lambda tree: jnp.abs(coordinates.flatten(tree)[0]).reshape(2, -1)
+    own = of_a_step(jnp.maximum(rows(y), rows(after)), tolerance)
+    largest = jnp.max(rows(error) / jnp.where(own > 0, own, 1.0))
     return after, jnp.where((result == diffrax.RESULTS.successful) & jnp.isfinite(largest), largest, jnp.inf)
 
 

@@ -119,8 +119,8 @@ class Trajectory(eqx.Module):
       where nothing must stay.
     - `result`: a `RESULTS` item; `lj.RESULTS.successful`, `event_occurred`, or what went wrong.
     - `events`: by name, the `Crossings` of what was asked for.
-    - `params`, `system`: what was integrated. `tolerance`: (rtol, atol), each (2,):
-      for coordinates and for velocities.
+    - `params`, `system`: what was integrated. `tolerance`: (rtol, atol), each (2,): for coordinates and for velocities.
+      Where no atol was given it is (2, n), for each of them: what is as good as zero on this motion.
 
     Under `vmap` every array has the batch's axes in front.
     """
@@ -288,7 +288,7 @@ def in_words(code) -> str:
 
 def _lines(traj):
     rows = [
-        ("method", f"{traj.static.method}, rtol {_pair(traj.tolerance[0])}, atol {_pair(traj.tolerance[1])}"),
+        ("method", f"{traj.static.method}, rtol {_pair(traj.tolerance[0])}, atol {_absolute(traj.tolerance[1])}"),
         ("result", message(traj.result) + _ended(traj)),
         *account.of_cost(traj),
         *(account.of_error(traj) or _not_estimated(traj)),
@@ -314,6 +314,10 @@ def _not_estimated(traj):
 def _pair(tolerance):
     of_q, of_v = (f"{float(value):.3g}" for value in np.asarray(tolerance))
     return of_q if of_q == of_v else f"{of_q} (q), {of_v} (v)"
+
+
+def _absolute(atol):
+    return _pair(atol) if np.ndim(atol) == 1 else "by size"
 
 
 def _batch_lines(traj, lanes):

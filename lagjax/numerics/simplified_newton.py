@@ -27,7 +27,7 @@ import numpy as np
 import optimistix as optx
 from jax import lax
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Bool, Float, Int, PyTree
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
 from lagjax.numerics import dense
 
@@ -81,7 +81,7 @@ class SimplifiedNewton(optx.AbstractRootFinder):
 
     and with tolerances of its own where steps are constant: `SimplifiedNewton(rtol=1e-10, atol=1e-12)`.
 
-    **Fields:** `rtol`, `atol`: the tolerances of the step; `norm`: how a correction in units of the tolerance is
+    **Fields:** `rtol`, `atol`: the tolerances of the step (`atol` may be a vector); `norm`: how a correction in units of it is
     measured; `kappa`: which part of the tolerance the iteration may leave, by default `min(0.03, 0.3 rtol^(1/3))` as
     in RADAU5; `slow`: the rate above which the Jacobian is computed anew (infinite: never, as in RADAU5).
 
@@ -95,7 +95,7 @@ class SimplifiedNewton(optx.AbstractRootFinder):
     """
 
     rtol: float
-    atol: float
+    atol: ArrayLike
     norm: Callable[[PyTree], Array] = optx.max_norm
     kappa: float | None = None
     slow: float = eqx.field(static=True, default=0.3)
