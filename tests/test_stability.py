@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from lagjax import job, stability
+from lagjax.numerics.runge_kutta import Dopri8
 from lagjax.stability import oscillator
 from lagjax.stability.trial import ACCURATE, DEGRADED, REFUSED, SILENTLY_WRONG, Outcome, Trial
 
@@ -22,7 +23,7 @@ def fixed(step):
     params = {"omega": oscillator.OMEGA}
     return Trial(
         "test", f"{step}", oscillator.oscillator, 1.0, 0.0, params, ts, oscillator.exact, tolerance=1e-9,
-        options=options, periods=1000 * step / (2 * np.pi), expected=None,
+        method=Dopri8(), options=options, periods=1000 * step / (2 * np.pi), expected=None,
     )  # fmt: skip
 
 

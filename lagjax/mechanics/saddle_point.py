@@ -194,7 +194,10 @@ def _of_rows(mass):
 
 
 class Examined(NamedTuple):
-    """A solution of the equations beside what tells whether to believe it."""
+    """A solution of the equations beside what tells whether to believe it.
+
+    `matrix`: the saddle-point matrix, M and A each in units of its largest.
+    """
 
     a: PyTree[Array]
     multipliers: Any

@@ -29,6 +29,7 @@ from lagjax.motion.reported import patient, report
 from lagjax.motion.slips import warn_of_float32, warn_of_odd_dissipation
 from lagjax.motion.solve import START_TOLERANCES, Settings
 from lagjax.motion.stopped_early import stopped_early
+from lagjax.motion.tolerances import tolerances_at
 from lagjax.motion.trajectory import ENDED_WELL, RESULTS, Trajectory, is_among, message
 
 
@@ -179,7 +180,7 @@ def _raise_failure(trajectory, start, settings):
     if not is_among(result, ENDED_WELL):
         system, start = trajectory.system, coordinates.as_arrays(start, start.t.dtype)
         if is_among(result, [RESULTS.start_off_constraints]):
-            tolerances = (START_TOLERANCES * np.asarray(tol) for tol in trajectory.tolerance)
+            tolerances = (START_TOLERANCES * np.asarray(tol) for tol in tolerances_at(start, trajectory.t, settings))
             raise ValueError(problem.off_constraints(system, start, *tolerances))
         if is_among(result, problem.REFUSED):
             problem.check_finite(start)

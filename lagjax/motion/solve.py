@@ -33,7 +33,7 @@ from lagjax.motion.crossing_times import all_known, by_name, end_of
 from lagjax.motion.global_error import ROUND_OFFS, with_errors, with_errors_inside
 from lagjax.motion.loop import Solution, solution_of
 from lagjax.motion.reported import report_settled
-from lagjax.motion.tolerances import Scales, of_states, rounding, scales_of
+from lagjax.motion.tolerances import Scales, rounding, scales_of, span_of, tolerances_at
 from lagjax.motion.trajectory import RESULTS, How, Moment, Trajectory, ended_well, pack, worst_drift
 from lagjax.numerics.evaluations import evaluations_a_step
 from lagjax.numerics.nystrom import Nystrom, Nystrom12
@@ -240,8 +240,8 @@ def _solve(system, q0, v0, params, ts, guards, settings, adjoint):
     if guards is not None and equations.unflatten is not None:
         guards = guards.in_numbers(equations.unflatten)
     q, v = equations.inside(q0), equations.inside(v0)
-    if settings.by_size:
-        settings = replace(settings, atol=stopped(of_states(settings.rtol, q, v, _span(ts))))
+    _, atol = tolerances_at(State(ts[0], q, v, params), ts, settings)
+    settings = replace(settings, atol=atol)
     start = _start(equations, q, v, ts, settings)
     solution = _stepped(equations, start, ts, guards, settings, adjoint)
     outputs = _outputs(equations, start, solution, ts, settings)
@@ -288,7 +288,7 @@ def _start(equations: Equations, q, v, ts, settings) -> Start:
     scales = None
     if settings.by_size:
         root_mass, a = jax.tree.map(lambda x: jnp.nan_to_num(x, posinf=0.0), (jax.tree.map(jnp.sqrt, mass), a))
-        scales = scales_of(root_mass, *stopped((q, v)), a, _span(ts))
+        scales = scales_of(root_mass, *stopped((q, v)), a, span_of(ts))
     too_small = settings.controller is None and settings.rtol[0] < ROUND_OFFS * jnp.finfo(ts.dtype).eps
     lengths = [settings.max_step, *([] if settings.dt0 is None else [settings.dt0])]
     against = {
@@ -300,11 +300,6 @@ def _start(equations: Equations, q, v, ts, settings) -> Start:
         "unordered": jnp.any(ts[1:] < ts[:-1]) | ~jnp.all(jnp.asarray([True, *(length > 0 for length in lengths)])),
     }
     return Start(q, v, against, jnp.any(jnp.stack([*against.values()])), scales)
-
-
-def _span(ts):
-    # Times that go to and fro are refused.
-    return jnp.maximum(jnp.abs(ts[-1] - ts[0]), jnp.finfo(ts.dtype).tiny)
 
 
 def _stepped(equations, start, ts, guards, settings, adjoint) -> Solution:
@@ -369,7 +364,7 @@ def _absolute(states, scales, t, settings):
     if scales is None:
         return settings.atol
     q, v = jax.tree.map(lambda x: jnp.max(jnp.abs(x), axis=0), states)
-    of_q, of_v = rounding(scales.root_mass, q, v, _span(t))
+    of_q, of_v = rounding(scales.root_mass, q, v, span_of(t))
     return jnp.stack([coordinates.flatten(of_q)[0], coordinates.flatten(of_v)[0]])
 
 

@@ -43,6 +43,8 @@ SAFETY, SHORTEST, LONGEST = 0.9, 0.2, 10.0
 HALVED, HALVINGS = 12, 44
 # A change over 2^-44 of a rejected step counts as a jump from this share of the largest acceleration in it on.
 JUMP, KINK = 1e-4, 1e-2
+# Where it is this many times as large inside a step as at its ends, there is a pole.
+POLE = 1e3
 # The velocities of a motion that sticks agree to this share.
 HELD = 1e-6
 # A step times the largest eigenvalue, where that limits it; and eigenvalues so different that some are fast.
@@ -281,7 +283,7 @@ def _halved(path, steps, i, order):
     """Where the acceleration (order 0) or its derivative (1) breaks on a rejected step, if it does."""
     t, y, low, high = steps.t[i], steps.y[i], 0.0, float(steps.h[i])
     below, above = path.at(t, y, low, order), path.at(t, y, high, order)
-    size = max(np.max(np.abs(below)), np.max(np.abs(above)))
+    size = at_ends = max(np.max(np.abs(below)), np.max(np.abs(above)))
     for _ in range(HALVINGS):
         middle = 0.5 * (low + high)
         between = path.at(t, y, middle, order)
@@ -294,6 +296,9 @@ def _halved(path, steps, i, order):
             low, below = middle, between
     which = int(np.argmax(np.abs(above - below)))
     change = abs(above - below)[which]
+    # A pole is no jump: it has larger values the nearer one looks.
+    if size > POLE * at_ends:
+        return None
     if not change > (KINK if order else JUMP) * size:
         return None
     # With t, q or v alone on the other side of it.

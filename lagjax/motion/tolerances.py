@@ -3,12 +3,13 @@
 A tolerance in the user's units is nothing to a motion of nanometres and everything to one of light years. Where `atol`
 is left to the library, each coordinate and each velocity is therefore judged by its own size alone:
 
-    rtol max(|y|, a thousandth of the largest |y| so far),        and for velocities also a thousandth of |q| / h
+    rtol max(|y|, a thousandth of the largest |y| so far),        for velocities also of √(|a| |q|)
 
 It is taken at the larger end of the step, so that passing through zero costs nothing; what dies out is followed over
-three decades; h is the longest step so far, and what a velocity moves in it is as good as nothing. Below that comes
-only what rounding makes of the other coordinates: a motion in a plane leaves the third dimension at round-off, which no
-step can follow. They are compared by √M_ii q_i and √M_ii v_i, all of one unit whatever the coordinates are.
+three decades; √(|a| |q|) is the velocity that belongs to an extent and an acceleration, which is what there is at rest
+when a force sets in. Below that comes only what rounding makes of the other coordinates: a motion in a plane leaves the
+third dimension at round-off, which no step can follow. They are compared by √M_ii q_i and √M_ii v_i, all of one unit
+whatever the coordinates are. Where all is zero at the start, nothing tells a size but the user's units.
 """
 
 from typing import Any, NamedTuple
@@ -29,8 +30,10 @@ TURN = 2 * np.pi
 DIED_OUT = 1e-3
 # What rounding makes of one number in another, in units of the last digit.
 ROUNDED = 8.0
-# Where all is zero at the start there is no size: this part of the user's units is taken, and rounding is below it.
-OF_A_UNIT = 1e-6
+# This part of the extent of all others counts for a coordinate at rest at zero where a force sets in.
+OF_OTHERS = 1e-6
+# Of what a constant acceleration makes of a motion from nothing; the user's unit at most.
+FROM_NOTHING = 1e-6
 
 
 class Tolerances(NamedTuple):
@@ -41,11 +44,15 @@ class Tolerances(NamedTuple):
 
 
 class Scales(NamedTuple):
-    """How large a motion is as its start tells it, nowhere zero; and √M_ii, like q."""
+    """How large a motion is as its start tells it, nowhere zero; and √M_ii, like q.
+
+    `least`: the least of coordinates and of velocities, where the start tells nothing; else zero.
+    """
 
     q: PyTree[Array]
     v: PyTree[Array]
     root_mass: PyTree[Array]
+    least: tuple[PyTree[Array], PyTree[Array]]
 
 
 class Seen(NamedTuple):
@@ -56,21 +63,34 @@ class Seen(NamedTuple):
     longest: Float[Array, ""]
 
 
-def of_states(rtol, q, v, span) -> Float[Array, " 2"]:
-    """The `atol` of a whole state, (2,), by the start: for the constraints, which see coordinates together."""
-    of_q = _first_positive(_largest(q), _largest(v) * span, OF_A_UNIT)
-    return rtol * jnp.stack([of_q, jnp.maximum(_largest(v), of_q / span)])
+def tolerances_at(start, ts, settings) -> Tolerances:
+    """The tolerances of a whole state, for the constraints, which see coordinates together: as given, or by the start's
+    size."""
+    if not settings.by_size:
+        return Tolerances(settings.rtol, settings.atol)
+    span, of_q, of_v = span_of(ts), _largest(start.q), _largest(start.v)
+    of_q = _first_positive(of_q, of_v * span, 1.0)
+    return Tolerances(settings.rtol, stopped(settings.rtol * jnp.stack([of_q, jnp.maximum(of_v, of_q / span)])))
+
+
+def span_of(ts):
+    """The time that a motion takes; positive also where it is refused."""
+    return jnp.maximum(jnp.abs(ts[-1] - ts[0]), jnp.finfo(ts.dtype).tiny)
 
 
 def scales_of(root_mass, q, v, a, span) -> Scales:
     """The scales of a motion by its first state and the accelerations there; what is zero is as the others are."""
     of_q, of_v, of_a = (_reach(root_mass, y) for y in (q, v, a))
+    nothing = (of_q == 0) & (of_v == 0)
     # From rest by what the acceleration makes of the extent, from the origin by what it makes of the velocity.
     from_origin = of_v**2 / jnp.where(of_a > 0, of_a, jnp.inf)
     of_v = _first_positive(jnp.maximum(of_v, jnp.sqrt(of_a * of_q)), of_a * span, of_q / span)
     of_q = _first_positive(of_q, from_origin, of_v * span)
     own = lambda y, size: jtu.tree_map(lambda y, s: _first_positive(jnp.abs(y), _over(size, s), 1.0), y, root_mass)
-    return Scales(own(q, of_q), own(v, of_v), root_mass)
+    of_unit = jnp.where(of_a > 0, FROM_NOTHING, 1.0)
+    least = lambda y: jtu.tree_map(lambda y: jnp.where(nothing, jnp.minimum(of_unit * y, 1.0), 0.0), y)
+    q, v = own(q, of_q), own(v, of_v)
+    return Scales(q, v, root_mass, (least(q), least(v)))
 
 
 def rounding(root_mass, q, v, time) -> tuple[PyTree[Array], PyTree[Array]]:
@@ -133,15 +153,16 @@ class Weighing(diffrax.AbstractAdaptiveStepSizeController):
         controller = eqx.tree_at(lambda c: c.atol, self.controller, self.controller.rtol)
         t1, state = controller.init(terms, t0, t1, _divided(y0, units), dt0, args, of_units, error_order)
         size = stopped(jtu.tree_map(jnp.abs, y0))
-        least = jnp.where(_largest(size) > 0, 0.0, OF_A_UNIT / DIED_OUT)
-        return t1, (state, Seen(*jtu.tree_map(lambda y: jnp.maximum(y, least), size), jnp.zeros_like(t0)))
+        first = jtu.tree_map(lambda y, least: jnp.maximum(y, least / DIED_OUT), size, self.scales.least)
+        return t1, (state, Seen(*first, jnp.zeros_like(t0)))
 
     def adapt_step_size(self, t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state):
         """Whether to keep a step, and the next one."""
         state, seen = controller_state
         before, after, h = stopped((y0, y1_candidate, t1 - t0))
         size = jtu.tree_map(lambda a, b: jnp.maximum(jnp.abs(a), jnp.abs(b)), before, after)
-        own = self._given(size) if seen is None else self._by_size(size, seen, h)
+        rate = jtu.tree_map(lambda a, b: jnp.abs(b - a) / h, before[1], after[1])
+        own = self._given(size) if seen is None else self._by_size(size, rate, seen, h)
         rtol, atol = self.controller.rtol, self.controller.atol
         weighed = jtu.tree_map(
             lambda e, size, own: e * (atol + rtol * size) / jnp.where(own > 0, own, 1.0), y_error, size, own
@@ -160,15 +181,16 @@ class Weighing(diffrax.AbstractAdaptiveStepSizeController):
         own_q = jtu.tree_map(lambda size: atol_q + rtol_q * size, self._turned(of_q))
         return own_q, jtu.tree_map(lambda size: atol_v + rtol_v * size, of_v)
 
-    def _by_size(self, size, seen, h):
+    def _by_size(self, size, rate, seen, h):
         scales, (rtol_q, rtol_v) = self.scales, self.tolerances.rtol
         assert scales is not None
         largest_q, largest_v = jtu.tree_map(jnp.maximum, size, (seen.q, seen.v))
         largest_q, longest = self._turned(largest_q), jnp.maximum(h, seen.longest)
         of_q = jtu.tree_map(lambda y, most: jnp.maximum(y, DIED_OUT * most), self._turned(size[0]), largest_q)
-        of_v = jtu.tree_map(
-            lambda y, most, q: jnp.maximum(y, DIED_OUT * jnp.maximum(most, q / longest)), size[1], largest_v, of_q
-        )
+        extent = _reach(scales.root_mass, largest_q)
+        set_in = lambda a, q, s: jnp.sqrt(a * (q + OF_OTHERS * _over(extent, s)))
+        of_v = jtu.tree_map(lambda y, most: jnp.maximum(y, DIED_OUT * most), size[1], largest_v)
+        of_v = jtu.tree_map(jnp.maximum, of_v, jtu.tree_map(set_in, rate, of_q, scales.root_mass))
         others = rounding(scales.root_mass, largest_q, largest_v, longest)
         own_q = jtu.tree_map(lambda size, least: rtol_q * size + least, of_q, others[0])
         return own_q, jtu.tree_map(lambda size, least: rtol_v * size + least, of_v, others[1])

@@ -307,8 +307,9 @@ def _lines(traj):
 
 
 def _not_estimated(traj):
-    estimated = traj.error is None or is_among(traj.error.result, ENDED_WELL)
-    return [] if estimated else [("error", message(traj.error.result))]
+    if traj.error is None or is_among(traj.error.result, ENDED_WELL):
+        return []
+    return [("error", message(traj.error.result))]
 
 
 def _pair(tolerance):

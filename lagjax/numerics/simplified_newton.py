@@ -81,9 +81,10 @@ class SimplifiedNewton(optx.AbstractRootFinder):
 
     and with tolerances of its own where steps are constant: `SimplifiedNewton(rtol=1e-10, atol=1e-12)`.
 
-    **Fields:** `rtol`, `atol`: the tolerances of the step (`atol` may be a vector); `norm`: how a correction in units of it is
-    measured; `kappa`: which part of the tolerance the iteration may leave, by default `min(0.03, 0.3 rtol^(1/3))` as
-    in RADAU5; `slow`: the rate above which the Jacobian is computed anew (infinite: never, as in RADAU5).
+    **Fields:** `rtol`, `atol`: the tolerances of the step (`atol` may be a vector); `norm`: how a correction in units
+    of them is measured; `kappa`: which part of the tolerance the iteration may leave, by default
+    `min(0.03, 0.3 rtol^(1/3))` as in RADAU5; `slow`: the rate above which the Jacobian is computed anew (infinite:
+    never, as in RADAU5).
 
     **Options** of a single solve: `init_state`, a state of another solve, whose Jacobian is used first; `offset`, added
     to the unknown where its size sets the tolerance; `inverse_at`, from an unknown to the `Inverse` there.

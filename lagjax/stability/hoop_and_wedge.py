@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lagjax.numerics.nystrom import Nystrom12
+from lagjax.numerics.runge_kutta import Dopri8
 from lagjax.scenes import bead_on_hoop, sliding_wedge
 from lagjax.scenes.elliptic import jacobi_elliptic
 from lagjax.stability.trial import ACCURATE, FULL, QUICK, REDUCED, REFUSED, Trial, by_parameter
@@ -79,8 +79,8 @@ def bead():
 
 
 def by_both(rows):
-    """The same by the default where accelerations do not depend on velocities."""
-    return [*rows, *(replace(row, method=Nystrom12()) for row in rows)]
+    """By the default, which is `Nystrom12` for the bead, and by the default of systems with constraints."""
+    return [*rows, *(replace(row, method=Dopri8()) for row in rows)]
 
 
 def separatrix():

@@ -6,7 +6,8 @@ what is lost of the energy shifts the phase in all later periods; and a motion m
 
     allowed = PER_PERIOD · tolerance · periods · (1 + periods/1000) · amplification, and never above USELESS
 
-and ten times that for the derivative of the motion. Neither is chosen by what came out.
+and ten times that for the derivative of the motion. Neither is chosen by what came out. Where a derivative is known,
+the motion is also one of several lanes of a compiled program with derivatives, and has to be as right there.
 """
 
 import warnings
@@ -32,6 +33,8 @@ PER_PERIOD = 100.0
 # With fewer than two digits left nothing has been computed, whatever was asked.
 USELESS = 1e-2
 OF_DERIVATIVES = 10.0
+# How far along the derivative's direction the lanes start; the first is the row itself.
+LANES = 0.0, 1e-3
 ACCURATE, DEGRADED, REFUSED, SILENTLY_WRONG = "accurate", "degraded", "refused", "SILENTLY WRONG"
 VERDICTS = (ACCURATE, DEGRADED, REFUSED, SILENTLY_WRONG)
 # Which rows belong to which report: each also has those of the ones before it.
@@ -45,8 +48,8 @@ class Outcome:
     - `effort`: steps, accepted and rejected, or the largest stable step.
     - `error`: relative, against the exact answer; infinite where there is no answer. `allowed`: of it.
     - `residual`: of the constraints, None without constraints.
-    - `gradient`: relative error of the derivative of the motion, forward mode against the exact one; None where not
-      tried.
+    - `lanes`: the error of the same motion in lanes of a program; `gradient`: relative error of its derivative there,
+      forward mode against the exact one; None where not tried.
     - `estimated`: the error as the motion itself estimates it, by the same measure; None where that is not the one.
     - `said`: the first sentence of what the library warned of or raised.
     - `expected`: the verdict that the row should have, None where any honest one will do.
@@ -59,6 +62,7 @@ class Outcome:
     error: float
     allowed: float
     residual: float | None = None
+    lanes: float | None = None
     gradient: float | None = None
     estimated: float | None = None
     raised: bool = False
@@ -72,8 +76,9 @@ class Outcome:
             return REFUSED
         if self.said:
             return DEGRADED
-        right = self.error <= self.allowed and (self.gradient is None or self.gradient <= OF_DERIVATIVES * self.allowed)
-        return ACCURATE if right else SILENTLY_WRONG
+        errors = self.error, self.lanes or 0.0, (self.gradient or 0.0) / OF_DERIVATIVES
+        # NaN is not right.
+        return ACCURATE if all(error <= self.allowed for error in errors) else SILENTLY_WRONG
 
     @property
     def passed(self) -> bool:
@@ -100,7 +105,8 @@ class Trial:
     """A motion to integrate and its exact answer.
 
     - `exact(q0, v0, params, ts)`: what `observed(trajectory)` must be, differentiable; by default (q, v).
-    - `along`: (dq0, dv0, dparams), the direction of the derivative; None for no check of it.
+    - `method`: None for the default. `along`: (dq0, dv0, dparams), the direction of the derivative; None for no check
+      of it, nor in lanes.
     - `tolerance`: what is asked. `options` of `integrate` beside it, such as an atol by size.
     - `periods`, `amplification`: how long, and by how much the motion itself magnifies an error of its start.
     """
@@ -115,7 +121,7 @@ class Trial:
     exact: Callable[..., PyTree] | None = None
     along: tuple[PyTree, PyTree, PyTree] | None = None
     tolerance: float = 1e-10
-    method: diffrax.AbstractSolver = field(default_factory=diffrax.Dopri8)
+    method: diffrax.AbstractSolver | None = None
     options: Mapping[str, Any] = field(default_factory=dict)
     observed: Callable[[Trajectory], PyTree] = _states
     periods: float = 1.0
@@ -142,12 +148,13 @@ class Trial:
         said = "; ".join(_first_sentence(warning.message) for warning in heard)
         residual = float(trajectory.residual()) if self.system.constraints else None
         if self.exact is None:
-            return self._outcome(effort=steps, residual=residual, said=said)
+            return self._outcome(trajectory.static.how.method, effort=steps, residual=residual, said=said)
         error = relative_error(self.observed(trajectory), self.exact(*self._exactly()))
-        gradient, estimated = self._gradient_error(self.exact), self._estimated(trajectory)
+        lanes, gradient = self._errors_in_lanes(self.exact)
         return self._outcome(
-            effort=steps, error=error, residual=residual, said=said, gradient=gradient, estimated=estimated
-        )
+            trajectory.static.how.method, effort=steps, error=error, residual=residual, said=said, lanes=lanes,
+            gradient=gradient, estimated=self._estimated(trajectory),
+        )  # fmt: skip
 
     def _estimated(self, trajectory):
         if self.observed is not _states or trajectory.error is None:
@@ -158,9 +165,10 @@ class Trial:
     def _options(self):
         return {"rtol": self.tolerance, "atol": self.tolerance, "method": self.method, **self.options}
 
-    def _outcome(self, effort="", error=float("inf"), **what):
+    def _outcome(self, chosen="", effort="", error=float("inf"), **what):
+        asked = f"default {chosen}".strip() if self.method is None else type(self.method).__name__
         return Outcome(
-            family=self.family, name=self.name, method=type(self.method).__name__, effort=effort, error=error,
+            family=self.family, name=self.name, method=asked, effort=effort, error=error,
             allowed=self.allowed, expected=self.expected, **what,
         )  # fmt: skip
 
@@ -170,29 +178,34 @@ class Trial:
         ts = np.asarray(self.ts).astype(start.t.dtype)
         return jax.tree.map(lambda x: jnp.asarray(x, float), (start.q, start.v, start.params, ts))
 
-    def _gradient_error(self, exact):
+    def _errors_in_lanes(self, exact):
         if self.along is None:
-            return None
+            return None, None
         *exactly, ts = self._exactly()
         tangents = jax.tree.map(lambda x, dx: jnp.broadcast_to(jnp.asarray(dx, float), x.shape), exactly, [*self.along])
-        wanted = jax.jvp(lambda *x: exact(*x, ts), tuple(exactly), tuple(tangents))[1]
+        wanted = jax.jvp(lambda *x: exact(*x, ts), tuple(exactly), tuple(tangents))
         start = coordinates.state(self.ts[0], self.q0, self.v0, self.params)
         point, dtype = [start.q, start.v, start.params], start.t.dtype
         tangents = jax.tree.map(lambda x, dx: dx.astype(x.dtype), point, tangents)
         as_array = lambda x: np.asarray(x, dtype) if isinstance(x, (float, np.ndarray)) else x
         options = jax.tree.map(as_array, self._options())
-        got = _derivative(self.system, point, tangents, np.asarray(self.ts, dtype), options, self.observed)
-        return relative_error(_gathered(got), _gathered(wanted))
+        got = _in_lanes(self.system, point, tangents, np.asarray(self.ts, dtype), options, self.observed)
+        return relative_error(got[0], wanted[0]), relative_error(*map(_gathered, (got[1], wanted[1])))
 
 
 @compiled
-def _derivative(system, point, tangents, ts, options, observed):
-    """The directional derivative of what is observed, in forward mode."""
+def _in_lanes(system, point, tangents, ts, options, observed):
+    """What is observed and its directional derivative, in forward mode; the other lanes start a little further on."""
 
     def motion(q0, v0, params):
         return observed(integrate(system, q0, v0, params, ts=ts, throw=False, **options))
 
-    return jax.jvp(motion, tuple(point), tuple(tangents))[1]
+    def lane(along):
+        moved = jax.tree.map(lambda x, dx: x + along * dx, tuple(point), tuple(tangents))
+        return jax.jvp(motion, moved, tuple(tangents))
+
+    lanes = jax.vmap(lane)(jnp.asarray(LANES, ts.dtype))
+    return jax.tree.map(lambda x: x[0], lanes)
 
 
 def _gathered(tree):
@@ -215,6 +228,7 @@ def stability_table(outcomes: Sequence[Outcome]) -> str:
         "estimated",
         "allowed",
         "residual",
+        "in lanes",
         "gradient",
         "verdict",
         "what the library said",
@@ -228,8 +242,8 @@ def stability_table(outcomes: Sequence[Outcome]) -> str:
         [
             *(line.rstrip() for line in body.split("\n")),
             "",
-            "error and gradient: relative, against the exact motion and its exact derivative; estimated: the error as "
-            "the motion itself says it; "
+            "error and gradient: relative, against the exact motion and its exact derivative; in lanes: the error of "
+            "the same motion in a compiled batch with derivatives; estimated: the error as the motion itself says it; "
             f"accurate: at most {PER_PERIOD:g} tolerances a period, more after thousands, times the motion's own "
             f"amplification, and {OF_DERIVATIVES:g} times that for the gradient",
             ", ".join(f"{count} {verdict}" for verdict, count in counts.items()),
@@ -248,6 +262,7 @@ def _cells(outcome):
         number(outcome.estimated),
         f"{outcome.allowed:.0e}",
         number(outcome.residual),
+        number(outcome.lanes),
         number(outcome.gradient),
         verdict,
         _short(outcome.said),
