@@ -104,7 +104,7 @@ class Equations(eqx.Module):
         finite = jnp.all(jnp.isfinite(coordinates.flatten((a, multipliers, lagrangian))[0]))
         state = _vectors(self.system, t, q, v, self.params)
         regular, mass = is_regular(*state)
-        return Verdict(a, multipliers, finite, ~regular, jnp.asarray(False), state[-1](mass))
+        return Verdict(a, multipliers, finite, ~regular, jnp.asarray(False), mass)
 
     def quickly(self, t, q, v):
         """The accelerations, and the multipliers in one vector, as they are written out."""
@@ -203,7 +203,7 @@ def _verdict(form, system, t, q, v, params) -> Verdict:
     state = _vectors(system, t, q, v, params)
     found = form.verdict(*state)
     by_name = constraints.split(system, found.multipliers, t, q, v, params)
-    return found._replace(a=state[-1](found.a), multipliers=by_name, mass=state[-1](found.mass))
+    return found._replace(a=state[-1](found.a), multipliers=by_name)
 
 
 def _believed(form, system, t, q, v, params):

@@ -4,7 +4,7 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, PyTree
+from jaxtyping import Array, Bool, Float, PyTree
 
 # A constraint whose derivative is this much smaller than near by has none: it is written as a square.
 VANISHES_BELOW = {np.dtype("float64"): 1e-10, np.dtype("float32"): 1e-4}
@@ -13,7 +13,7 @@ VANISHES_BELOW = {np.dtype("float64"): 1e-10, np.dtype("float32"): 1e-4}
 class Verdict(NamedTuple):
     """A solution of the equations at one state, as vectors or by name, and whether it is to be believed.
 
-    `mass`: the largest of each row of M, in the places of the coordinates.
+    `mass`: the largest of each row of M.
     """
 
     a: PyTree[Array]
@@ -21,7 +21,7 @@ class Verdict(NamedTuple):
     finite: Bool[Array, ""]
     singular: Bool[Array, ""]
     contradictory: Bool[Array, ""]
-    mass: PyTree[Array]
+    mass: Float[Array, " n"]
 
 
 def slightly_off(y):

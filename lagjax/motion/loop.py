@@ -208,7 +208,8 @@ def _controller(equations, start, ts, settings, scales, bare, repeated):
         rtol=settings.rtol[0], atol=settings.atol[0], norm=optx.max_norm, dtmin=dtmin, dtmax=settings.max_step,
         force_dtmin=False,
     )  # fmt: skip
-    angle = tuple(jax.tree.leaves(angles(equations.system, *start)))
+    kinds = zip(jax.tree.leaves(angles(equations.system, *start)), jax.tree.leaves(start.q))
+    angle = tuple(bool(kind) for kind, x in kinds for _ in range(x.size))
     if not bare and (scales is not None or settings.apart or any(angle)):
         controller = Weighing(controller, Tolerances(settings.rtol, settings.atol), scales, angle)
     arriving = _arriving(settings) and not bare

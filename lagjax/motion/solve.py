@@ -33,7 +33,7 @@ from lagjax.motion.crossing_times import all_known, by_name, end_of
 from lagjax.motion.global_error import ROUND_OFFS, with_errors, with_errors_inside
 from lagjax.motion.loop import Solution, solution_of
 from lagjax.motion.reported import report_settled
-from lagjax.motion.tolerances import Scales, rounding, scales_of, span_of, tolerances_at
+from lagjax.motion.tolerances import Scales, rounding, scales_of, shared, span_of, tolerances_at
 from lagjax.motion.trajectory import RESULTS, How, Moment, Trajectory, ended_well, pack, worst_drift
 from lagjax.numerics.evaluations import evaluations_a_step
 from lagjax.numerics.nystrom import Nystrom, Nystrom12
@@ -285,10 +285,7 @@ def _start(equations: Equations, q, v, ts, settings) -> Start:
     if settings.drift == "project":
         q, v, holds = returned(equations, t, q, v, settings.rtol, settings.atol)
     a, _, finite, singular, contradictory, mass = stopped(equations.verdict(t, q, v))
-    scales = None
-    if settings.by_size:
-        root_mass, a = jax.tree.map(lambda x: jnp.nan_to_num(x, posinf=0.0), (jax.tree.map(jnp.sqrt, mass), a))
-        scales = scales_of(root_mass, *stopped((q, v)), a, span_of(ts))
+    scales = scales_of(mass, *stopped((q, v)), a, span_of(ts)) if settings.by_size else None
     too_small = settings.controller is None and settings.rtol[0] < ROUND_OFFS * jnp.finfo(ts.dtype).eps
     lengths = [settings.max_step, *([] if settings.dt0 is None else [settings.dt0])]
     against = {
@@ -351,7 +348,7 @@ def _result(equations, start, solution, outputs, guards, settings):
         "multipliers": masked.multipliers,
         "end": end,
         "stats": stats,
-        "tolerance": (settings.rtol, _absolute(stopped((motion.q, motion.v)), start.scales, motion.t, settings)),
+        "tolerance": (settings.rtol, _absolute(stopped((motion.q, motion.v)), start.scales, settings)),
         "departure": _departure(stopped(equations), *stopped((motion.t, motion.q, motion.v)), stats, settings),
         "result": result,
         "settled": ended_well(result) | _among(result, THE_SAME) if regular else jnp.asarray(True),
@@ -359,13 +356,12 @@ def _result(equations, start, solution, outputs, guards, settings):
     }
 
 
-def _absolute(states, scales, t, settings):
+def _absolute(states, scales, settings):
     """The `atol` that was given; by a motion's own size what was as good as zero on it, (2, n)."""
     if scales is None:
         return settings.atol
-    q, v = jax.tree.map(lambda x: jnp.max(jnp.abs(x), axis=0), states)
-    of_q, of_v = rounding(scales.root_mass, q, v, span_of(t))
-    return jnp.stack([coordinates.flatten(of_q)[0], coordinates.flatten(of_v)[0]])
+    sizes = [coordinates.flatten(jax.tree.map(lambda x: jnp.max(jnp.abs(x), axis=0), y))[0] for y in states]
+    return rounding(shared(scales, jnp.stack(sizes)))
 
 
 def _departure(equations, t, q, v, stats, settings):
