@@ -50,9 +50,9 @@ class Scales(NamedTuple):
     - `time`: in which they change. `first`: the sizes of the numbers; where all are zero what is taken for them.
     """
 
-    root_mass: Float[Array, " n"]
-    over_root_mass: Float[Array, " n"]
-    reach: Float[Array, " 2"]
+    root_mass: Float[Array, "1 n"]
+    over_root_mass: Float[Array, "1 n"]
+    reach: Float[Array, "2 1"]
     time: Float[Array, ""]
     first: Float[Array, "2 n"]
 
@@ -73,7 +73,10 @@ def span_of(ts):
 
 def scales_of(mass, q, v, a, span) -> Scales:
     """The scales of a motion, by its first state and the accelerations there, which need not be finite."""
-    root_mass, sizes = jnp.sqrt(jnp.nan_to_num(mass, posinf=0.0)), jnp.abs(jnp.nan_to_num(_rows(q, v, a), posinf=0.0))
+    root_mass, sizes = (
+        jnp.sqrt(jnp.nan_to_num(mass[None], posinf=0.0)),
+        jnp.abs(jnp.nan_to_num(_rows(q, v, a), posinf=0.0)),
+    )
     over_root_mass = jnp.where(root_mass > 0, 1 / jnp.where(root_mass > 0, root_mass, 1.0), 0.0)
     of_q, of_v, of_a = jnp.max(root_mass * sizes, axis=1)
     nothing = (of_q == 0) & (of_v == 0)
@@ -84,9 +87,9 @@ def scales_of(mass, q, v, a, span) -> Scales:
     time = jnp.minimum(span, jnp.min(jnp.where(known, larger / jnp.where(known, smaller, 1.0), span)))
     of_v = jnp.maximum(of_v, jnp.where(of_a > 0, of_a * time, of_q / span))
     of_q = jnp.maximum(of_q, of_v * time)
-    reach = jnp.stack([of_q, of_v])
-    moved = jnp.where(of_a > 0, np.array(FROM_NOTHING, reach.dtype) * reach, 1.0)
-    least = jnp.minimum(moved[:, None] * over_root_mass, 1.0) / DIED_OUT
+    reach = jnp.stack([of_q, of_v])[:, None]
+    moved = jnp.where(of_a > 0, np.array(FROM_NOTHING, reach.dtype)[:, None] * reach, 1.0)
+    least = jnp.minimum(moved * over_root_mass, 1.0) / DIED_OUT
     reach = jnp.where(reach > 0, reach, 1.0)
     return Scales(root_mass, over_root_mass, reach, time, jnp.where(nothing, least, sizes[:2]))
 
@@ -103,7 +106,7 @@ def rounding(others: Float[Array, "2 n"]) -> Float[Array, "2 n"]:
 
 def as_nothing(scales: Scales, rtol) -> Float[Array, " 2n"]:
     """The `atol` of each coordinate and each velocity by the start alone: for iterations inside a step."""
-    others = scales.reach[:, None] * scales.over_root_mass
+    others = scales.reach * scales.over_root_mass
     own = jnp.where(scales.first > 0, scales.first, others)
     return jnp.ravel(DIED_OUT * rtol[:, None] * own + rounding(others))
 
