@@ -1,0 +1,157 @@
+"""Tolerances by a motion's own size: the same motion in any units, and what has no size of its own."""
+
+import warnings
+
+import diffrax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import lagjax as lj
+from lagjax.motion.tolerances import Tolerances, Weighing, rounding, scales_of, shared
+
+# In units of length and of time that are powers of four: scaling by them is exact, square roots included.
+UNITS = {"nanometres": (2.0**-30, 1.0), "light years": (2.0**54, 1.0), "years": (1.0, 2.0**-24)}
+rod = lj.System(
+    lambda t, q, v, p: 0.5 * p["m"] * jnp.sum(v**2) - p["m"] * p["g"] * q[1],
+    constraints={"rod": lj.Holonomic(lambda t, q, p: jnp.sum(q**2) - p["l"] ** 2)},
+)
+# A length beside an angle: a mass on a spring that turns.
+turning = lj.System(
+    lambda t, q, v, p: (
+        0.5 * p["m"] * (v["r"] ** 2 + (q["r"] * v["psi"]) ** 2)
+        - 0.5 * p["k"] * (q["r"] - p["l"]) ** 2
+        + p["m"] * p["g"] * q["r"] * jnp.cos(q["psi"])
+    )
+)
+driven = lj.System(lambda t, q, v, p: 0.5 * v**2 - 0.5 * q**2 + p["push"] * q)
+
+
+def on_rod(length=1.0, time=1.0, **options):
+    """Swings of a pendulum in Cartesian coordinates, as numbers of these units are long."""
+    g, ts = length / time**2, np.linspace(0.0, 20.0, 9) * time
+    q0 = length * np.array([np.sin(1.25), -np.cos(1.25)])
+    return lj.integrate(rod, q0, np.zeros(2), {"m": 2.0, "l": length, "g": g}, ts=ts, **options)
+
+
+def on_spring(length=1.0, time=1.0, **options):
+    """The same for a length and an angle, of which only the length changes with the unit."""
+    params = {"m": 2.0, "l": length, "k": 32.0 / time**2, "g": length / time**2}
+    q0, v0 = {"r": 1.25 * length, "psi": 0.0}, {"r": 0.0, "psi": 1.5 / time}
+    return lj.integrate(turning, q0, v0, params, ts=np.linspace(0.0, 20.0, 9) * time, **options)
+
+
+@pytest.mark.filterwarnings("ignore::lagjax.AccuracyWarning")
+def test_any_units():
+    """The same digits and the same steps; twin: with an absolute tolerance a nanometre is nothing."""
+    usual = on_rod()
+    for name, (length, time) in UNITS.items():
+        other = on_rod(length, time)
+        assert int(other.stats["num_steps"]) == int(usual.stats["num_steps"]), name
+        np.testing.assert_allclose(other.q / length, usual.q, rtol=0, atol=1e-12)
+        np.testing.assert_allclose(other.v * time / length, usual.v, rtol=0, atol=1e-12)
+        np.testing.assert_allclose(np.max(other.error.q) / length, np.max(usual.error.q), rtol=1e-3)
+        assert float(other.departure) < 1e-3
+    lost = on_rod(2.0**-30, atol=1e-9)
+    assert np.max(np.abs(lost.q / 2.0**-30 - usual.q)) > 1e-3 and float(lost.departure) > 1
+
+
+@pytest.mark.slow
+def test_an_angle_beside_a_length():
+    """The unit of length is no unit of the angle's: each has its own."""
+    usual = on_spring()
+    for name, (length, time) in UNITS.items():
+        other = on_spring(length, time)
+        assert int(other.stats["num_steps"]) == int(usual.stats["num_steps"]), name
+        np.testing.assert_allclose(other.q["psi"], usual.q["psi"], rtol=0, atol=1e-12)
+        np.testing.assert_allclose(other.q["r"] / length, usual.q["r"], rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("start", [(1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)], ids=["extent", "speed", "push"])
+def test_small_motions(start):
+    """A nanometre from rest, from the origin, and from rest at the origin: nine digits of either by the closed form."""
+    (q0, v0, push), t = 1e-9 * np.array(start), np.linspace(0.0, 200.0, 11)
+    traj = lj.integrate(driven, q0, v0, {"push": push}, ts=t)
+    expected = push + (q0 - push) * np.cos(t) + v0 * np.sin(t)
+    np.testing.assert_allclose(traj.q, expected, rtol=0, atol=1e-9 * 1e-9)
+    np.testing.assert_allclose(traj.q, expected, rtol=0, atol=5 * float(np.max(traj.error.q)))
+
+
+def test_given_tolerances_stay():
+    """An atol is what it was, in the user's units; print says which of the two it is."""
+    given, own = on_rod(atol=1e-9), on_rod()
+    assert given.tolerance[1].shape == (2,) and own.tolerance[1].shape == (2, 2)
+    assert "atol 1e-09" in str(given) and "atol by size" in str(own)
+
+
+def weighed(size, error, seen=None, mass=(1.0, 1.0), rtol=1e-9):
+    """The weighed error of one step of length 1 from and to velocities and coordinates of this size, as (2, 2)."""
+    y = tuple(jnp.asarray(row) for row in size)
+    scales = scales_of(jnp.asarray(mass), *y, jnp.zeros(2), 1.0)
+    if seen is not None:
+        scales = scales._replace(first=jnp.asarray(seen))
+    weighing = Weighing(
+        diffrax.PIDController(rtol=rtol, atol=rtol),
+        Tolerances(jnp.full(2, rtol), jnp.full(2, rtol)),
+        scales,
+        (False, False),
+    )
+    error, _ = weighing._weighed(jnp.asarray(1.0), y, y, tuple(jnp.asarray(row) for row in error), scales.first)
+    own = rtol * (1 + np.abs(np.asarray(size)))
+    return np.asarray(error) / own
+
+
+def test_each_by_its_own_size():
+    """An error of rtol |y| counts as one, whatever |y| is; so does a thousandth of the largest that has been."""
+    size = np.array([[1e-12, 1e9], [3e-12, 2e9]])
+    np.testing.assert_allclose(weighed(size, 1e-9 * size, mass=(1e18, 1e-24)), 1.0, rtol=1e-2)
+    died_out = weighed(1e-6 * np.ones((2, 2)), 1e-12 * np.ones((2, 2)), seen=np.ones((2, 2)))
+    np.testing.assert_allclose(died_out, 1.0, rtol=1e-2)
+
+
+def test_what_others_round_off():
+    """A coordinate at round-off has the others' round-off as its tolerance, by their masses."""
+    size = np.array([[1e3, 1e-16], [1.0, 1e-19]])
+    assert np.all(weighed(size, np.array([[0.0, 1e-13], [0.0, 1e-16]])) < 1)
+    # The other one has a million times the mass: a thousandth of the motion is as much to it.
+    assert weighed(size, np.array([[0.0, 1e-13], [0.0, 0.0]]), mass=(1.0, 1e12))[0, 1] > 1
+
+
+def test_scales_have_units():
+    """Scaled by length, time and mass alike; twin: a coordinate of another unit alone changes nothing of the others."""
+    mass, q, v, a = jnp.asarray([4.0, 0.25]), jnp.asarray([3.0, 0.0]), jnp.asarray([0.0, 0.5]), jnp.asarray([1.0, 2.0])
+    usual = scales_of(mass, q, v, a, 10.0)
+    length, time = 2.0**-20, 2.0**12
+    other = scales_of(mass / length**2 * time**2, length * q, length / time * v, length / time**2 * a, 10.0 * time)
+    np.testing.assert_allclose(other.time, time * usual.time, rtol=1e-14)
+    rates = np.array([[length], [length / time]])
+    np.testing.assert_allclose(other.first, rates * np.asarray(usual.first), rtol=1e-14)
+    np.testing.assert_allclose(
+        rounding(shared(other, other.first)), rates * np.asarray(rounding(shared(usual, usual.first))), rtol=1e-14
+    )
+    unit = np.array([1.0, 2.0**20])
+    mixed = scales_of(mass / unit**2, unit * q, unit * v, unit * a, 10.0)
+    np.testing.assert_allclose(mixed.time, usual.time, rtol=1e-14)
+    np.testing.assert_allclose(shared(mixed, mixed.first)[:, 0], shared(usual, usual.first)[:, 0], rtol=1e-14)
+
+
+def test_regular_in_any_units():
+    """A mass of a gram on a rod of a light year is no singular one; twin: a coordinate without mass is."""
+    q0 = 2.0**54 * np.array([np.sin(1.25), -np.cos(1.25)])
+    a, _ = lj.accelerations(rod, 0.0, q0, np.zeros(2), {"m": 1e-3, "l": 2.0**54, "g": 1.0})
+    np.testing.assert_allclose(a @ q0 / 2.0**54, 0.0, atol=1e-14)
+    with pytest.raises(ValueError, match="singular"):
+        lj.accelerations(rod, 0.0, q0, np.zeros(2), {"m": 0.0, "l": 2.0**54, "g": 1.0})
+
+
+def test_at_rest_until_a_force_sets_in():
+    """Nothing tells how large a motion will be whose force is switched on later: it is found without a word of it."""
+    late = lj.System(
+        lambda t, q, v, p: 0.5 * v**2 - 0.5 * (q - p["rest"]) ** 2,
+        force=lambda t, q, v, p: jnp.where(t > 5.25, 10.0, 0.0),
+    )
+    for rest in (0.0, 1.0):
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            traj = lj.integrate(late, rest, 0.0, {"rest": rest}, ts=np.array([0.0, 6.0]), max_step=0.5)
+        np.testing.assert_allclose(traj.q[-1] - rest, 10 * (1 - np.cos(0.75)), rtol=1e-7)
