@@ -1,5 +1,6 @@
 """All rows of the stability report."""
 
+from lagjax.stability.amplifying import amplifying
 from lagjax.stability.constraints import redundant
 from lagjax.stability.geodesics import geodesics
 from lagjax.stability.hoop_and_wedge import bead, float32, separatrix, wedge
@@ -7,7 +8,7 @@ from lagjax.stability.long import long
 from lagjax.stability.stiff import stable_steps, stiff
 from lagjax.stability.trial import FULL
 
-FAMILIES = (wedge, bead, separatrix, long, stiff, stable_steps, geodesics, float32, redundant)
+FAMILIES = (wedge, bead, separatrix, long, stiff, stable_steps, geodesics, amplifying, float32, redundant)
 
 
 def trials(tier=FULL):
