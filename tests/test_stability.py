@@ -46,7 +46,7 @@ def test_each_verdict():
     assert unreachable.verdict == REFUSED and "below what float64 can reach" in unreachable.said
     # Twins: a reference that is wrong, and an error that nothing can meet.
     assert replace(fixed(0.25), exact=detuned).attempt().verdict == SILENTLY_WRONG
-    assert replace(accurate, allowed=1e-30).verdict == SILENTLY_WRONG
+    assert replace(accurate, allowed=1e-30, estimated=None).verdict == SILENTLY_WRONG
     assert [outcome.passed for outcome in (accurate, degraded, refused)] == [True] * 3
 
 
@@ -54,6 +54,10 @@ def test_verdict_of_numbers():
     """NaN is not accurate, a wrong derivative neither; a row that expects another verdict does not pass."""
     assert OUTCOME.verdict == ACCURATE
     assert replace(OUTCOME, error=float("nan")).verdict == SILENTLY_WRONG
+    # An error that its own estimate tells is not silent; twin: one that is a hundred times as large.
+    assert replace(OUTCOME, error=5e-8, estimated=1e-8).verdict == DEGRADED
+    assert replace(OUTCOME, error=1e-6, estimated=1e-8).verdict == SILENTLY_WRONG
+    assert replace(OUTCOME, lanes=1e-6).verdict == SILENTLY_WRONG
     assert replace(OUTCOME, gradient=1e-6).verdict == SILENTLY_WRONG
     assert replace(OUTCOME, gradient=float("nan")).verdict == SILENTLY_WRONG
     assert not replace(OUTCOME, expected=REFUSED).passed

@@ -31,7 +31,10 @@ def _whirl(q0, v0, params, ts):
 
 def stiff():
     """A mass whirled on a spring of stiffness k, up to 1e5 times faster than the motion; mechanisms; fixed steps."""
-    rows = [_spring(k, None, derived=k < 1e10) for k in (1e4, 1e6, 1e8, 1e10)]
+    # At the limit of its stability a step of order 12 makes more of a derivative than of the motion, which the step
+    # size holds back.
+    rows = [_spring(k, None, derived=k < 1e7) for k in (1e4, 1e6, 1e8, 1e10)]
+    rows += [_spring(k, Dopri8(), derived=True) for k in (1e4, 1e6, 1e8)]
     rows += [_spring(k, Radau5(), expected=None) for k in (1e4, 1e6, 1e8, 1e10)]
     return [*rows, *(_mechanism(m.MECHANISM) for m in (car_axis, governor)), *_fixed_steps()]
 

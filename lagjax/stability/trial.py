@@ -1,8 +1,9 @@
 """One row of the stability report: a motion that is hard, its exact answer, and what the library made of it.
 
-A row is *accurate* where its error is a small multiple of the tolerance, *degraded* where the library warned, and
-*refused* where it raised. What is none of the three was *silently wrong*. A tolerance bounds what is lost a period;
-what is lost of the energy shifts the phase in all later periods; and a motion may amplify it. Hence
+A row is *accurate* where its error is a small multiple of the tolerance, *degraded* where the library warned or its own
+estimate says as much, and *refused* where it raised. What is none of the three was *silently wrong*. A tolerance bounds
+what is lost a period; what is lost of the energy shifts the phase in all later periods; and a motion may amplify it.
+Hence
 
     allowed = PER_PERIOD · tolerance · periods · (1 + periods/1000) · amplification, and never above USELESS
 
@@ -33,6 +34,8 @@ PER_PERIOD = 100.0
 # With fewer than two digits left nothing has been computed, whatever was asked.
 USELESS = 1e-2
 OF_DERIVATIVES = 10.0
+# An error that is at most this many times its estimate has been told.
+TOLD = 10.0
 # How far along the derivative's direction the lanes start; the first is the row itself.
 LANES = 0.0, 1e-3
 ACCURATE, DEGRADED, REFUSED, SILENTLY_WRONG = "accurate", "degraded", "refused", "SILENTLY WRONG"
@@ -78,7 +81,10 @@ class Outcome:
             return DEGRADED
         errors = self.error, self.lanes or 0.0, (self.gradient or 0.0) / OF_DERIVATIVES
         # NaN is not right.
-        return ACCURATE if all(error <= self.allowed for error in errors) else SILENTLY_WRONG
+        if all(error <= self.allowed for error in errors):
+            return ACCURATE
+        told = TOLD * (self.estimated or 0.0)
+        return DEGRADED if all(error <= max(told, self.allowed) for error in errors) else SILENTLY_WRONG
 
     @property
     def passed(self) -> bool:
