@@ -1,0 +1,31 @@
+"""What other tools integrate beside ours: accelerations and multipliers by hand are those of the Lagrangians."""
+
+import jax
+import numpy as np
+import pytest
+
+import lagjax as lj
+from lagjax.scenes import SCENES
+
+RUNS = [(name, run) for name, scene in SCENES.items() for run in scene.runs() if run.by_hand is not None]
+
+
+def flat(tree):
+    """All numbers of a tree."""
+    return np.concatenate([np.ravel(x) for x in jax.tree.leaves(tree)])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "run"), RUNS, ids=[f"{name}, {run.name}" for name, run in RUNS])
+def test_by_hand(name, run):
+    """At the start and at a state on the way; twin: of a state and parameters off by a thousandth they differ."""
+    traj = lj.integrate(run.system, run.q0, run.v0, run.params, ts=np.array([0.0, 0.37]) + run.ts[0], rtol=1e-12)
+    of_motion = lambda y, i: jax.tree.map(lambda x: np.asarray(x)[i], y)
+    for i in (0, 1):
+        t, q, v = (of_motion(y, i) for y in (traj.t, traj.q, traj.v))
+        expected = lj.accelerations(run.system, t, q, v, run.params)
+        got = run.by_hand(t, q, v, run.params)
+        size = np.max(np.abs(flat(expected)))
+        np.testing.assert_allclose(flat(got), flat(expected), rtol=0, atol=1e-10 * size)
+        off = jax.tree.map(lambda x: 1.001 * np.asarray(x), (q, v, run.params))
+        assert np.max(np.abs(flat(run.by_hand(t, *off)) - flat(expected))) > 1e-6 * size
