@@ -107,7 +107,8 @@ def integrate(
     - `estimate_error`: whether to integrate a second time, more precisely, to say in `traj.error` how wrong the motion
       may be. By default where nothing is traced, steps are chosen by lagjax or fixed, and there are at most 20,000. It
       compiles nothing there and costs 1.2 to 2 times the solve; inside `jit`, `vmap`, a sweep and derivatives it is one
-      more solve in the program, through which no derivatives go.
+      more solve in the program, through which no derivatives go. What a method damps in both runs alike, as
+      `lj.Radau5(step_powers=(0, 1))` does fast oscillations, it cannot see.
     - `drift`: `"project"` (return to the constraints after every step; the default where there are any),
       `"baumgarte"` (feedback at 50 decays a time span), or `"none"`.
 
