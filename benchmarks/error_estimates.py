@@ -19,8 +19,8 @@ to 10,000 tolerances.
 Cost: the time of a call with the estimate over that without, minus one; medians of calls in turn, at the tightest
 tolerance. Programs: what is compiled by calls with the estimate after one without, where none of them warns.
 
-`rtol` is given alone, and with `--atol` an equal atol beside it. The twin, `--twin`, divides every estimate by 1,000, and what decides on a warning: it has to miss. Exit status 1
-where a target is missed.
+`rtol` is given alone, and with `--atol` an equal atol beside it. The twin, `--twin`, divides every estimate by 1,000,
+and what decides on a warning: it has to miss. Exit status 1 where a target is missed.
 
     python benchmarks/error_estimates.py [--json FILE] [--only TEXT] [--atol] [--twin]
 """
