@@ -29,6 +29,8 @@ TURN = 2 * np.pi
 DIED_OUT = 1e-3
 # What rounding makes of one number in another, in units of the last digit.
 ROUNDED = 8.0
+# What is lighter than this, by the root of the mass, is taken for no lighter: rounding also comes by constraints.
+LIGHT = 1e-6
 # This part of the extent of all others counts for a coordinate at rest at zero where a force sets in.
 OF_OTHERS = 1e-6
 # Of the coordinates and velocities that the first acceleration makes of a motion from nothing in all its time.
@@ -45,7 +47,7 @@ class Tolerances(NamedTuple):
 class Scales(NamedTuple):
     """What the start tells of a motion's size; rows are coordinates and velocities.
 
-    - `root_mass`: √M_ii, and one over it; zero where there is no mass.
+    - `root_mass`: √M_ii, and about one over it.
     - `reach`: the largest of the numbers by that, never zero.
     - `time`: in which they change. `first`: the sizes of the numbers; where all are zero what is taken for them.
     """
@@ -77,7 +79,8 @@ def scales_of(mass, q, v, a, span) -> Scales:
         jnp.sqrt(jnp.nan_to_num(mass[None], posinf=0.0)),
         jnp.abs(jnp.nan_to_num(_rows(q, v, a), posinf=0.0)),
     )
-    over_root_mass = jnp.where(root_mass > 0, 1 / jnp.where(root_mass > 0, root_mass, 1.0), 0.0)
+    heaviest = jnp.max(root_mass)
+    over_root_mass = 1 / jnp.maximum(root_mass, LIGHT * jnp.where(heaviest > 0, heaviest, 1.0))
     of_q, of_v, of_a = jnp.max(root_mass * sizes, axis=1)
     nothing = (of_q == 0) & (of_v == 0)
     # What is zero is made of the others: a velocity of extent and acceleration, else all of the time that there is.
@@ -181,6 +184,8 @@ class Weighing(diffrax.AbstractAdaptiveStepSizeController):
         others = shared(scales, largest)
         q, v = self._turned(jnp.maximum(size, DIED_OUT * largest))
         own = jnp.stack([q, jnp.maximum(v, jnp.sqrt(rate * (q + OF_OTHERS * others[0])))])
+        if any(self.angles):
+            others = jnp.maximum(others, np.stack([self.angles, np.zeros(len(self.angles))]).astype(others.dtype))
         return self.tolerances.rtol[:, None] * own + rounding(others)
 
     def _turned(self, sizes):

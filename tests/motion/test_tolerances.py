@@ -155,3 +155,16 @@ def test_at_rest_until_a_force_sets_in():
             warnings.simplefilter("error")
             traj = lj.integrate(late, rest, 0.0, {"rest": rest}, ts=np.array([0.0, 6.0]), max_step=0.5)
         np.testing.assert_allclose(traj.q[-1] - rest, 10 * (1 - np.cos(0.75)), rtol=1e-7)
+
+
+@pytest.mark.slow
+def test_at_round_off_without_mass():
+    """A coordinate that is zero but for rounding, and has no mass to compare it by, does not stop the motion."""
+    beside = lj.Holonomic(lambda t, q, p: q[2] - 3.0 * (q[0] ** 2 + q[1] ** 2 - 1.0))
+    massless = lj.System(
+        lambda t, q, v, p: 0.5 * (v[0] ** 2 + v[1] ** 2) - q[1],
+        constraints={"rod": lj.Holonomic(lambda t, q, p: q[0] ** 2 + q[1] ** 2 - 1.0), "beside": beside},
+    )
+    q0 = np.array([np.sin(1.25), -np.cos(1.25), 0.0])
+    traj = lj.integrate(massless, q0, np.zeros(3), ts=np.linspace(0.0, 20.0, 9))
+    np.testing.assert_allclose(traj.q[:, :2], on_rod().q, rtol=0, atol=1e-8)
