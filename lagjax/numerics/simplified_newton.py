@@ -116,7 +116,8 @@ class SimplifiedNewton(optx.AbstractRootFinder):
         correction = inverse(residual)
         new = jtu.tree_map(lambda y, d: y - d, y, correction)
         whole = jtu.tree_map(jnp.add, new, options["offset"]) if "offset" in options else new
-        units = jtu.tree_map(lambda d, y: d / (self.atol + self.rtol * jnp.abs(y)), correction, whole)
+        own = lambda y: jnp.broadcast_to(self.atol, y.shape) + self.rtol * jnp.abs(y)
+        units = jtu.tree_map(lambda d, y: d / own(y), correction, whole)
         size = self.norm(units).astype(state.size.dtype)
         first = state.count == 0
         now = Iteration(
