@@ -37,7 +37,7 @@ class Choices(tuple):
         ours = next((c for c in self if c.method is not None), None)
         if ours is None:
             return lines
-        at = f"rtol={ours.tolerance:.0e}, atol={ours.tolerance:.0e}"
+        at = f"rtol={ours.tolerance:.0e}"
         return f"{lines}\nlj.integrate(system, q0, v0, params, ts=ts, method={as_code(ours.method)}, {at})"
 
 

@@ -86,9 +86,8 @@ class Program:
             tolerance, ts, q, v, params = static.together(args)
             # Times that decrease have to be known.
             ts = motion.ts if runs_backward(motion.ts) else ts
-            tolerances = {"rtol": tolerance, "atol": tolerance}
             return integrate(
-                motion.system, q, v, params, ts=ts, method=self._method, throw=False, **tolerances, **motion.options
+                motion.system, q, v, params, ts=ts, method=self._method, throw=False, rtol=tolerance, **motion.options
             )
 
         def program(args):

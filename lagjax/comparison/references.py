@@ -120,7 +120,7 @@ def given(reference: Any, motion: Motion, program: Program) -> Known:
         if events:
             raise TypeError(
                 "with events the reference must be a lj.Trajectory, which has their times.\n"
-                "Fix: reference=lj.integrate(..., events=events, rtol=1e-13, atol=1e-13), or leave it out."
+                "Fix: reference=lj.integrate(..., events=events, rtol=1e-13), or leave it out."
             )
         how = "the function that was given" if callable(reference) else "the states that were given"
         states = reference(jnp.asarray(ts)) if callable(reference) else reference

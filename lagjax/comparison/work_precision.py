@@ -69,7 +69,7 @@ def work_precision(
     - `methods`: solvers with an estimate of their error, lagjax's or diffrax's, in a sequence or by name in a dict. By
       default the explicit ones that suit the system, the default of `integrate` first; for what is stiff add
       `lj.Radau5()`.
-    - `tolerances`: each used as rtol and atol; by default decades from 1e-3 to 1e-12 in float64.
+    - `tolerances`: each used as rtol, by other tools as atol, too; by default decades from 1e-3 to 1e-12 in float64.
     - `events`: as `integrate` takes them. With one that ends the motion, errors are those of its time and of the state
       there; without, of the states at `ts`, and of the times of crossings.
     - `reference`: the right answer: a `Trajectory` at `ts`, states `(q, v)` with a row for each time, or a function
@@ -161,7 +161,7 @@ def _motion(system, q0, v0, params, ts, events, options):
     if unknown:
         raise TypeError(
             f"work_precision() has no argument {unknown[0]!r}.\n"
-            f"Fix: of integrate's arguments it takes {', '.join(OPTIONS)}; rtol and atol are its tolerances=."
+            f"Fix: of integrate's arguments it takes {', '.join(OPTIONS)}; rtol is its tolerances=."
         )
     if not is_eager() or coordinates.is_traced((q0, v0, params, ts)):
         raise TypeError("work_precision measures times, and what is being traced has none.\nFix: call it outside jit.")
@@ -226,9 +226,7 @@ def _all_failed(motion, solved, tolerances):
     reasons = "; ".join(dict.fromkeys(f"{solve.method}: {solve.reason}" for solve in solved))
     cause = ""
     try:
-        integrate(
-            motion.system, *motion.start[1:], ts=motion.ts, rtol=tolerances[0], atol=tolerances[0], **motion.options
-        )
+        integrate(motion.system, *motion.start[1:], ts=motion.ts, rtol=tolerances[0], **motion.options)
     except (ValueError, RuntimeError) as error:
         cause = f"\nThe default method at {tolerances[0]:.0e}: {error}"
     return RuntimeError(f"no method came to the end of this motion at any tolerance. {reasons}{cause}")
