@@ -33,6 +33,7 @@ from lagjax.motion.consistent_state import consistent_state
 from lagjax.motion.loop import method_alone
 from lagjax.motion.solve import method_of
 from lagjax.motion.stepping import Field
+from lagjax.motion.tolerances import tolerances_at
 from lagjax.motion.trajectory import RESULTS
 
 # The steps that are looked at; the first of them only find their length.
@@ -43,8 +44,7 @@ SAFETY, SHORTEST, LONGEST = 0.9, 0.2, 10.0
 HALVED, HALVINGS = 12, 44
 # A change over 2^-44 of a rejected step counts as a jump from this share of the largest acceleration in it on.
 JUMP, KINK = 1e-4, 1e-2
-# Where it is this many times as large inside a step as at its ends, there is a pole.
-POLE = 1e3
+POLE = 1e3  # times as large inside a step as at its ends.
 # The velocities of a motion that sticks agree to this share.
 HELD = 1e-6
 # A step times the largest eigenvalue, where that limits it; and eigenvalues so different that some are fast.
@@ -53,6 +53,7 @@ LIMITED, FAST = 0.3, 30.0
 UNSTABLE = 1.5
 # Accelerations grew and steps shrank by these factors.
 GREW, SHRANK = 3.0, 0.3
+BLOWN_UP = 1e6  # times those at the start: there is no other cause.
 # More steps than this are no advice, and this many times as many only the last one.
 TOO_MANY, MANY_TIMES = 1e8, 10
 # What keeps steps short where nothing else does.
@@ -156,6 +157,9 @@ def look(trajectory, settings) -> Steps:
     method = method_alone(settings, method_of(settings, system, *state))
     terms = diffrax.ODETerm(Field(equations_of(system, *state)))
     order = float(method.error_order(terms))
+    # Near a singularity nothing is as large as it was at the start.
+    first = State(*jax.tree.map(lambda x: x[0], (trajectory.t, trajectory.q, trajectory.v)), params)
+    tolerance = tolerances_at(first, trajectory.t, settings)
     way, last = np.sign(float(trajectory.t[-1] - end.t)), float(trajectory.t[-1])
     t, y = float(end.t), (end.q, end.v)
     size = abs(t - float(trajectory.t[0])) / max(1, int(trajectory.stats["num_accepted_steps"]))
@@ -165,7 +169,7 @@ def look(trajectory, settings) -> Steps:
         # The end is reached exactly.
         size = min(size, abs(last - t), float(settings.max_step))
         times = jnp.asarray(t), jnp.asarray(t + way * size)
-        after, error = _attempt(method, terms, *times, y, params, trajectory.tolerance)
+        after, error = _attempt(method, terms, *times, y, params, tolerance)
         error = float(error)
         put_down.append((t, y, way * size, error < 1))
         if error < 1:
@@ -194,6 +198,9 @@ class _Path:
     def __init__(self, trajectory):
         self.system, self.params = trajectory.system, trajectory.params
         self.names = coordinates.names(trajectory.end.q)
+        t, *y = jax.tree.map(lambda x: x[0], (trajectory.t, trajectory.q, trajectory.v))
+        x, u = (np.max(np.abs(coordinates.flatten(part)[0])) for part in y)
+        self.usual = max(np.max(np.abs(self.at(t, y, 0.0))), u**2 / max(x, 1e-300))
 
     def at(self, t, y, s, order=0):
         """The acceleration (order 0) or its derivative by s (1), of t, q and v those at s, or s[0], s[1], s[2]."""
@@ -311,20 +318,20 @@ def _halved(path, steps, i, order):
 def _singularity(path, steps):
     """Steps that shrink where accelerations grow."""
     kept = steps.kept
-    if len(kept) < 6:
+    if not kept.size:
         return None
-    first, last, lengths = kept[0], kept[-1], np.abs(steps.h[kept])
-    at = lambda i: np.abs(path.at(steps.t[i], steps.y[i], 0.0))
-    if not (np.max(at(last)) > GREW * np.max(at(first)) and lengths[-1] < SHRANK * lengths[0]):
+    lengths, at = np.abs(steps.h[kept]), lambda i: np.abs(path.at(steps.t[i], steps.y[i], 0.0))
+    last, limit = at(kept[-1]), steps.t[kept[-1]]
+    shrinks = lengths[-1] < SHRANK * lengths[0] and np.mean(np.diff(lengths) < 0) > 0.8
+    if len(kept) >= 6 and np.max(last) > GREW * np.max(at(kept[0])) and shrinks:
+        # Steps in a geometric series end at its limit.
+        ratio = min(np.median(lengths[1:] / lengths[:-1]), 1 - 1e-9)
+        limit += np.sign(steps.h[kept[-1]]) * lengths[-1] / (1 - ratio)
+    elif not np.max(last) > BLOWN_UP * path.usual:
         return None
-    if not np.mean(np.diff(lengths) < 0) > 0.8:
-        return None
-    # Steps in a geometric series end at its limit.
-    ratio = min(np.median(lengths[1:] / lengths[:-1]), 1 - 1e-9)
-    limit = steps.t[last] + np.sign(steps.h[last]) * lengths[-1] / (1 - ratio)
     return (
         f"a singularity of the motion near t = {limit:.6g}: steps shrink and the acceleration of "
-        f"'{path.names[int(np.argmax(at(last)))]}' grows (a collision, a motion that runs away)",
+        f"'{path.names[int(np.argmax(last))]}' grows (a collision, a motion that runs away)",
         f"ts that end before {limit:.6g}, an event on the way there, or a softer potential",
     )
 
