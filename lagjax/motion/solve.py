@@ -285,7 +285,7 @@ def _start(equations: Equations, q, v, ts, settings) -> Start:
     if settings.drift == "project":
         q, v, holds = returned(equations, t, q, v, settings.rtol, settings.atol)
     a, _, finite, singular, contradictory, mass = stopped(equations.verdict(t, q, v))
-    scales = scales_of(mass, *stopped((q, v)), a, span_of(ts)) if settings.by_size else None
+    scales = scales_of(mass, *stopped((q, v)), a, stopped(span_of(ts))) if settings.by_size else None
     too_small = settings.controller is None and settings.rtol[0] < ROUND_OFFS * jnp.finfo(ts.dtype).eps
     lengths = [settings.max_step, *([] if settings.dt0 is None else [settings.dt0])]
     against = {

@@ -29,6 +29,8 @@ TURN = 2 * np.pi
 DIED_OUT = 1e-3
 # What rounding makes of one number in another, in units of the last digit.
 ROUNDED = 8.0
+# A first step that is too short costs one more, one that is too long several; it may also pass over an event.
+FIRST = 0.1
 # What is lighter than this, by the root of the mass, is taken for no lighter: rounding also comes by constraints.
 LIGHT = 1e-6
 # This part of the extent of all others counts for a coordinate at rest at zero where a force sets in.
@@ -149,7 +151,7 @@ class Weighing(diffrax.AbstractAdaptiveStepSizeController):
     def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
         """The first step."""
         if self.scales is not None and dt0 is None:
-            dt0 = self.scales.time * self.rtol ** (1.0 / float(error_order or 1.0))
+            dt0 = FIRST * stopped(self.scales.time * self.rtol ** (1.0 / float(error_order or 1.0)))
         t1, state = self.controller.init(terms, t0, t1, y0, dt0, args, func, error_order)
         return t1, (state, None if self.scales is None else self.scales.first)
 
