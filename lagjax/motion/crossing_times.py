@@ -59,7 +59,11 @@ def locate(watching: Watching, watched: Watched, params) -> Located:
 
 
 def at_known_times(guards: Guards, equations: Equations, resolution, located: Located, y) -> Located:
-    """The same from the states `y` (S, ...) at the times that were found, in place of their roots."""
+    """The same with the derivatives of the states `y` (S, ...) at the times that were found.
+
+    Their values are those of the roots: `y` comes by other steps, and is on the guards to the tolerance only.
+    """
+    y = jtu.tree_map(lambda root, y: root + (y - lax.stop_gradient(y)), located.y, y)
 
     def found(owner, known):
         t, y = _exact((guards, equations), lax.stop_gradient(known[0]), known[1], owner, resolution)

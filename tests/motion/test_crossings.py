@@ -311,26 +311,15 @@ def test_derivative_by_many_numbers():
     system = lj.System(lambda t, q, v, p: 0.5 * v**2 - 0.5 * jnp.sum(p) * q**2)
     events = {"level": lj.Crossing(lambda t, q, v, p: q - 0.5 * jnp.sum(p), terminal=False)}
 
-    def second(p):
-        ts = jnp.array([0.0, 3.0])
-        return lj.integrate(system, 0.0, 1.0, p, ts=ts, events=events, dt0=0.1).events["level"].t[1]
+    def second(p, dt0=None):
+        return lj.integrate(system, 0.0, 1.0, p, ts=[0.0, 3.0], events=events, dt0=dt0).events["level"].t[1]
 
     # At Σp = 1: t = (π - arcsin(w · w²/2)) / w with w² = Σp.
     by_sum = lambda s: (jnp.pi - jnp.arcsin(0.5 * s**1.5)) / jnp.sqrt(s)
     np.testing.assert_allclose(second(weights), by_sum(jnp.sum(weights)), rtol=1e-8)
-    np.testing.assert_allclose(jax.grad(second)(weights), np.full(40, jax.grad(by_sum)(1.0)), rtol=1e-6)
-
-
-@pytest.mark.slow
-@pytest.mark.xfail(reason="in reverse mode NaN after some sequences of steps; forward mode is right", strict=False)
-def test_derivative_by_many_numbers_after_other_steps():
-    """The same after a longer first step, which changes where later ones end."""
-    weights = jnp.linspace(0.5, 1.5, 40) / 40
-    system = lj.System(lambda t, q, v, p: 0.5 * v**2 - 0.5 * jnp.sum(p) * q**2)
-    events = {"level": lj.Crossing(lambda t, q, v, p: q - 0.5 * jnp.sum(p), terminal=False)}
-    second = lambda p: lj.integrate(system, 0.0, 1.0, p, ts=[0.0, 3.0], events=events, dt0=0.3).events["level"].t[1]
-    along = jax.jvp(second, (weights,), (jnp.ones(40),))[1]
-    np.testing.assert_allclose(jnp.sum(jax.grad(second)(weights)), along, rtol=1e-6)
+    # Its state there comes by other steps than its time, and is on the level to the tolerance.
+    for dt0 in (None, 0.05, 0.3):
+        np.testing.assert_allclose(jax.grad(second)(weights, dt0), np.full(40, jax.grad(by_sum)(1.0)), rtol=1e-6)
 
 
 @pytest.mark.slow
