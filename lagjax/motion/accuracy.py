@@ -19,6 +19,8 @@ EXPECTED, DIGITS_LEFT = 1e4, 5e-4
 NOTHING, SMALL = 100.0, 1e-6
 # Steps to an output from which on outputs are far from each other, and those of a motion to and fro.
 SPARSE, TO_AND_FRO = 1.5, 10.0
+# Velocities at outputs of less than this part of that are there by the choice of the outputs.
+TURNING = 1e-3
 # Errors that a motion has made this many times what the steps' errors add up to are amplified.
 AMPLIFIED = 100.0
 
@@ -49,12 +51,13 @@ def sizes_of(xp, seen, is_angle, span, steps, outputs):
     """How large coordinates and velocities are, (2, n), by the largest of them that were `seen` at outputs, (2, n).
 
     Outputs that are far from each other may all be where a velocity is zero, or a coordinate: it is then at least what
-    the other makes of it in a step, or in ten. `is_angle` (n,) or one truth for all.
+    the other makes of it in a step, or in ten: of a velocity, if it is next to nothing beside that at all outputs, as
+    steps of a stiff motion are much shorter. `is_angle` (n,) or one truth for all.
     """
     q, v = xp.where(is_angle, xp.minimum(seen[0], TURN), seen[0]), seen[1]
     step = xp.where(steps > SPARSE * outputs, span / (1.0 + steps), 0.0)
     between = xp.where(step > 0, q / xp.where(step > 0, TO_AND_FRO * step, 1.0), 0.0)
-    return xp.stack([xp.maximum(q, v * step), xp.maximum(v, between)])
+    return xp.stack([xp.maximum(q, v * step), xp.where(v > TURNING * between, v, between)])
 
 
 def of_a_step(size, tolerance):
