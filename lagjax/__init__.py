@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 # isort: split
 # A system: its Lagrangian and its constraints.
 from lagjax.mechanics.constraints import Holonomic, Nonholonomic
+from lagjax.mechanics.hybrid import Hybrid, Switch
 from lagjax.mechanics.system import System
 
 # isort: split
@@ -28,7 +29,9 @@ from lagjax.motion.explanation import Explanation, explain
 # isort: split
 # Motion.
 from lagjax.animation import Animation
+from lagjax.motion.contacts import releases, slips, sticks, touches
 from lagjax.motion.crossings import Crossing, Crossings, EventWarning
+from lagjax.motion.hybrid_trajectory import HybridTrajectory, Switches
 from lagjax.motion.integrate import integrate
 from lagjax.motion.trajectory import RESULTS, AccuracyWarning, Moment, Trajectory
 from lagjax.numerics.nystrom import Nystrom8, Nystrom12
@@ -72,6 +75,12 @@ __all__ = [
     "System",
     "Holonomic",
     "Nonholonomic",
+    "Hybrid",
+    "Switch",
+    "touches",
+    "releases",
+    "slips",
+    "sticks",
     "momentum",
     "mass_matrix",
     "accelerations",
@@ -91,6 +100,8 @@ __all__ = [
     "Nystrom12",
     "Radau5",
     "Trajectory",
+    "HybridTrajectory",
+    "Switches",
     "Moment",
     "Animation",
     "RESULTS",

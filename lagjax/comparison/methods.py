@@ -10,7 +10,7 @@ from lagjax.mechanics.coordinates import State
 from lagjax.mechanics.structure import is_free_of_velocities
 from lagjax.mechanics.system import System
 from lagjax.motion import problem
-from lagjax.motion.solve import ROUND_OFFS
+from lagjax.motion.global_error import ROUND_OFFS
 from lagjax.numerics.nystrom import Nystrom, Nystrom12
 from lagjax.numerics.runge_kutta import Dopri8, Tsit5
 

@@ -201,6 +201,12 @@ def reached(jaxpr: Jaxpr, inputs: Iterable) -> set:
     return found
 
 
+def depends(jaxpr: Jaxpr, inputs: Iterable) -> bool:
+    """Whether any result of a program depends on some of its variables."""
+    found = reached(jaxpr, inputs)
+    return any(not isinstance(x, Literal) and x in found for x in jaxpr.outvars)
+
+
 def needed(jaxpr: Jaxpr) -> list:
     """The equations that a program's results depend on."""
     wanted, kept = {x for x in jaxpr.outvars if not isinstance(x, Literal)}, []

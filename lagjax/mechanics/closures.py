@@ -13,7 +13,8 @@ import jax
 from jaxtyping import Array
 
 from lagjax.jax_internals.tracing import is_eager
-from lagjax.mechanics.constraints import Holonomic, Nonholonomic
+from lagjax.mechanics.arguments import takes_of
+from lagjax.mechanics.constraints import Holonomic, Nonholonomic, zero_multipliers
 from lagjax.mechanics.coordinates import State
 from lagjax.mechanics.system import System
 
@@ -23,6 +24,7 @@ class Lifted(eqx.Module):
 
     function: Callable
     values: list[Array]
+    takes: tuple[str, ...] | None = eqx.field(static=True, default=None)
 
     def __call__(self, *args):
         return self.function(*args, *self.values)
@@ -35,7 +37,7 @@ def lift(system: System, s: State) -> System:
     of_state, of_position = (s.t, s.q, s.v, s.params), (s.t, s.q, s.params)
     functions = {
         "lagrangian": lift_function(system.lagrangian, of_state),
-        "force": lift_function(system.force, of_state),
+        "force": _lifted_force(system, s),
         "dissipation": lift_function(system.dissipation, of_state),
     }
     constraints = {
@@ -57,6 +59,15 @@ def lift_function(function: Callable | None, args: tuple):
     if not values:
         return function
     return Lifted(lambda *args: converted(eqx.filter(args[: len(static)], eqx.is_array), *args[len(static) :]), values)
+
+
+def _lifted_force(system, s):
+    if system.force is None:
+        return None
+    takes = takes_of(system.force)
+    given = s._asdict() | {"multipliers": zero_multipliers(system, s)}
+    lifted = lift_function(system.force, tuple(given[name] for name in takes))
+    return Lifted(lifted.function, lifted.values, takes) if isinstance(lifted, Lifted) else lifted
 
 
 def _is_lifted(node):

@@ -45,7 +45,24 @@ def explain_failure(system, s: coordinates.State) -> str | None:
                 "Usual cause: a distance written with sqrt, which has no derivative at zero.\n"
                 "Fix: constrain the square of the distance."
             )
-    return explain_singular(np.asarray(found.matrix), system, s) or explain_contradiction(found, system, s)
+    return (
+        explain_singular(np.asarray(found.matrix), system, s)
+        or explain_contradiction(found, system, s)
+        or _explain_paradox(found, s)
+    )
+
+
+def _explain_paradox(found: Examined, s):
+    if found.unique:
+        return None
+    return (
+        f"friction leaves no acceleration, or two, {where(s)}: the force grows with the multipliers faster than these "
+        "can balance it (Painlevé's paradox).\n"
+        "Usual cause: a rod or a wedge that is pushed against what it slides on, with a large coefficient; or a "
+        "friction force with the wrong sign.\n"
+        "Fix: the sign first: it acts against the sliding velocity; else a smaller coefficient, or a contact that "
+        "gives way (a stiff spring in L)."
+    )
 
 
 def equation_names(system, s: coordinates.State) -> list[str]:

@@ -12,19 +12,22 @@ from collections.abc import Callable, Mapping
 from contextlib import contextmanager
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 
+from lagjax.jax_internals.programs import depends
 from lagjax.jax_internals.tracing import is_eager
-from lagjax.mechanics.constraints import Holonomic
+from lagjax.mechanics import coordinates
+from lagjax.mechanics.arguments import OF_POSITION, OF_STATE, takes_of
+from lagjax.mechanics.constraints import Holonomic, count, zero_multipliers
 from lagjax.mechanics.coordinates import State
 from lagjax.mechanics.memory import kinds, remembered, shape_of
 from lagjax.mechanics.outside import first_alike, up_to_date
+from lagjax.mechanics.reactions import force_at, reacts
 from lagjax.mechanics.system import System
-
-OF_STATE, OF_POSITION = ("t", "q", "v", "params"), ("t", "q", "params")
 
 
 def looked_at(system: System, s: State) -> System:
@@ -67,13 +70,17 @@ def check_functions(system, t, q, v, params):
     for role, function in (("L", system.lagrangian), ("dissipation", system.dissipation)):
         if function is not None:
             _check_energy(Call(role, function, OF_STATE), given)
-    if system.force is not None:
-        _check_force(Call("force", system.force, OF_STATE), given)
     for name, constraint in system.constraints.items():
         if isinstance(constraint, Holonomic):
             _check_constraint(Call("g", constraint.g, OF_POSITION, f" of constraint '{name}'"), given)
         else:
             _check_constraint(Call("phi", constraint.phi, OF_STATE, f" of constraint '{name}'"), given)
+    if system.force is not None:
+        # After the constraints, which say what multipliers there are.
+        given |= {"multipliers": zero_multipliers(system, State(t, q, v, params))}
+        _check_force(Call("force", system.force, takes_of(system.force)), given)
+        if reacts(system):
+            _check_linear(system, t, q, v, params)
 
 
 class Call(NamedTuple):
@@ -116,6 +123,26 @@ def _check_force(call, given):
             f"  q has shapes {expected}\n  the force has {jax.tree.map(jnp.shape, force)}\n"
             "Usual cause: a force for one of the coordinates alone.\n"
             "Fix: return the structure of q, with 0.0 where no force acts."
+        )
+
+
+def _check_linear(system, t, q, v, params):
+    """Raise where the force is not linear in the multipliers: its slope depends on them."""
+    arrays, static = eqx.partition((t, q, v, params), eqx.is_array_like)
+
+    def slope(multipliers, arrays):
+        state = eqx.combine(arrays, static)
+        force = lambda multipliers: coordinates.flatten(force_at(system, *state, multipliers))[0]
+        return jax.jacfwd(force)(multipliers)
+
+    zero = np.zeros(count(system, t, q, v, params), coordinates.flatten(q)[0].dtype)
+    program = jax.make_jaxpr(slope)(zero, arrays).jaxpr
+    if depends(program, program.invars[:1]):
+        raise ValueError(
+            "force(t, q, v, multipliers, params) must be linear in the multipliers, and its slope depends on them.\n"
+            "Usual cause: the size of a normal force, jnp.abs(multipliers[...]) or jnp.maximum(multipliers[...], 0).\n"
+            'Fix: the multiplier itself, -mu * multipliers["contact"]: a phase ends where it reaches zero '
+            '(lj.releases("contact")).'
         )
 
 

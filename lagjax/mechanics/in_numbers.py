@@ -17,6 +17,7 @@ from lagjax.jax_internals.one_function import calls_host, poisoned
 from lagjax.jax_internals.programs import length, needed, staged
 from lagjax.jax_internals.tracing import WATCHED
 from lagjax.mechanics import coordinates
+from lagjax.mechanics.arguments import takes_of
 from lagjax.mechanics.constraints import Holonomic, Nonholonomic
 from lagjax.mechanics.system import System
 from lagjax.numerics.scalars import written_out
@@ -33,9 +34,15 @@ class InNumbers(eqx.Module):
     unflatten: Callable = eqx.field(static=True)
     returns_coordinates: bool = eqx.field(static=True, default=False)
 
+    @property
+    def takes(self):
+        return takes_of(self.function)
+
     def __call__(self, t, *states_and_params):
         *states, params = states_and_params
-        result = self.function(t, *(self.unflatten(jnp.stack(state)) for state in states), params)
+        # Multipliers come by name.
+        together = lambda state: self.unflatten(jnp.stack(state)) if isinstance(state, tuple) else state
+        result = self.function(t, *map(together, states), params)
         return coordinates.numbers(result) if self.returns_coordinates else result
 
 

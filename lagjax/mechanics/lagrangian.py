@@ -17,16 +17,21 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
-from lagjax.mechanics import coordinates
+from lagjax.mechanics import constraints, coordinates
 from lagjax.mechanics.compiled import compiled
 from lagjax.mechanics.first_call import looked_at
+from lagjax.mechanics.reactions import force_at, response
 
 
 class Linear(NamedTuple):
-    """The equation `M a = F` at one state, in vector form."""
+    """The equation `M a = F` at one state, in vector form.
+
+    `response`: B of a force F + B λ that depends on multipliers; None where it does not.
+    """
 
     mass: Float[Array, "n n"]
     forcing: Float[Array, " n"]
+    response: Float[Array, "n m"] | None
 
 
 def mass_and_forcing(system, t, x, u, params, unflatten) -> Linear:
@@ -37,11 +42,11 @@ def mass_and_forcing(system, t, x, u, params, unflatten) -> Linear:
     else:
         # The columns of M by name of velocity; M is symmetric.
         mass = jax.vmap(inertia)(jnp.eye(x.size, dtype=x.dtype))
-    return Linear(mass.astype(x.dtype), forcing)
+    return Linear(mass.astype(x.dtype), forcing, response(system, t, x, u, params, unflatten))
 
 
 def forcing_and_inertia(system, t, x, u, params, unflatten):
-    """F at a state, and the product with M there as a function of an acceleration."""
+    """F at a state without what multipliers add to it, and the product with M as a function of an acceleration."""
 
     def lagrangian(t, x, u):
         return system.lagrangian(t, unflatten(x), unflatten(u), params)
@@ -149,5 +154,7 @@ def _jacobi_integral(system, t, q, v, params):
 
 
 def _force_vector(system, t, x, u, params, unflatten):
-    force = system.force(t, unflatten(x), unflatten(u), params)
+    q, v = unflatten(x), unflatten(u)
+    none = jnp.zeros(constraints.count(system, t, q, v, params), x.dtype)
+    force = force_at(system, t, q, v, params, none)
     return coordinates.flatten(force)[0].astype(x.dtype)

@@ -63,7 +63,8 @@ def accelerations(system, t, q, v, params) -> tuple[PyTree[Array], dict[str, Arr
     found = examined(system, *s)
     solution = found.a, found.multipliers
     finite = all(np.all(np.isfinite(x)) for x in jax.tree.leaves((solution, found.lagrangian)))
-    if not finite or np.any(np.asarray(found.contradictory)) or explain_singular(np.asarray(found.matrix), system, s):
+    well = finite and bool(found.unique) and not np.any(np.asarray(found.contradictory))
+    if not well or explain_singular(np.asarray(found.matrix), system, s):
         raise ValueError(explain_failure(system, s) or f"the accelerations are not finite {where(s)}.")
     return solution
 

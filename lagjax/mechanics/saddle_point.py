@@ -37,6 +37,7 @@ from jaxtyping import Array, Bool, Float, PyTree
 from lagjax.mechanics import constraints, coordinates
 from lagjax.mechanics.compiled import compiled
 from lagjax.mechanics.lagrangian import Linear, mass_and_forcing
+from lagjax.mechanics.reactions import Reactions, with_reactions
 from lagjax.mechanics.verdict import Verdict, acceleration_round_off, slightly_off, vanishing
 from lagjax.numerics import dense
 from lagjax.numerics.rank import DEPENDENT_BELOW, independent_rows, unit_rows
@@ -62,7 +63,7 @@ class Dense(NamedTuple):
         if baumgarte_rate is not None:
             gamma = gamma + constraints.baumgarte_feedback(system, t, x, u, params, unflatten, baumgarte_rate)
         independent = independent_rows(jacobian) if independent is None else independent
-        return saddle_point(linear.mass, jacobian, linear.forcing, gamma, independent)
+        return _solved(linear, jacobian, gamma, independent)[:2]
 
     def independent(self, system, t, x, u, params, unflatten, dependent_below=None) -> Bool[Array, " m"]:
         """Which constraint equations to solve with."""
@@ -85,12 +86,13 @@ class Dense(NamedTuple):
         solution = jnp.concatenate([found.a, found.multipliers, jnp.ravel(found.lagrangian)])
         singular = dense.reciprocal_condition(found.matrix) <= SINGULAR_BELOW[np.dtype(found.matrix.dtype)]
         finite, against = jnp.all(jnp.isfinite(solution)), jnp.any(found.contradictory)
+        singular = singular | ~found.unique
         return Verdict(found.a, found.multipliers, finite, singular, against, _of_rows(found.linear.mass))
 
     def believed(self, *state):
         """The solution as vectors, NaN where constraints contradict each other."""
         found = _examined(*state)
-        believed = ~jnp.any(found.contradictory)
+        believed = found.unique & ~jnp.any(found.contradictory)
         return tuple(jnp.where(believed, x, jnp.nan) for x in (found.a, found.multipliers))
 
     def __str__(self):
@@ -104,6 +106,12 @@ def saddle_point(mass, jacobian, forcing, gamma, independent):
     solution = dense.solve(saddle_point_matrix(mass, jacobian, independent), known)
     multipliers = _spread(-solution[n:], independent)
     return solution[:n], minimum_norm(jacobian, multipliers, independent)
+
+
+def _solved(linear: Linear, jacobian, gamma, independent) -> Reactions:
+    """The solution with what the force has of the multipliers."""
+    solve = lambda forcing, gamma: saddle_point(linear.mass, jacobian, forcing, gamma, independent)
+    return with_reactions(solve, linear.forcing, gamma, linear.response)
 
 
 def saddle_point_matrix(mass, jacobian, independent):
@@ -182,11 +190,13 @@ def is_regular(*state) -> tuple[Bool[Array, ""], Float[Array, " n"]]:
 
     They are where no constraint depends on others, and nothing is undetermined.
     """
-    mass, jacobian = mass_and_forcing(*state).mass, _without_vanishing(*state).jacobian
+    linear, rows = mass_and_forcing(*state), _without_vanishing(*state)
+    mass, jacobian = linear.mass, rows.jacobian
     independent = independent_rows(jacobian)
+    unique = linear.response is None or _solved(linear, jacobian, rows.gamma, independent).unique
     matrix = _comparable(mass, jacobian, independent)
     regular = jnp.all(independent) & (dense.reciprocal_condition(matrix) > SINGULAR_BELOW[np.dtype(mass.dtype)])
-    return regular, _of_rows(mass)
+    return regular & unique, _of_rows(mass)
 
 
 def _of_rows(mass):
@@ -196,7 +206,8 @@ def _of_rows(mass):
 class Examined(NamedTuple):
     """A solution of the equations beside what tells whether to believe it.
 
-    `matrix`: the saddle-point matrix, M and A each in units of its largest.
+    `matrix`: the saddle-point matrix, M and A each in units of its largest. `unique`: whether what the force has of
+    the multipliers leaves one solution.
     """
 
     a: PyTree[Array]
@@ -207,6 +218,7 @@ class Examined(NamedTuple):
     lagrangian: Float[Array, ""]
     matrix: Float[Array, "k k"]
     contradictory: Bool[Array, " m"]
+    unique: Bool[Array, ""]
 
 
 @compiled
@@ -223,7 +235,7 @@ def _examined(system, t, x, u, params, unflatten) -> Examined:
     linear = mass_and_forcing(system, t, x, u, params, unflatten)
     rows = _without_vanishing(system, t, x, u, params, unflatten)
     independent = independent_rows(rows.jacobian)
-    a, multipliers = saddle_point(linear.mass, rows.jacobian, linear.forcing, rows.gamma, independent)
+    a, multipliers, unique = _solved(linear, rows.jacobian, rows.gamma, independent)
     return Examined(
         a=a,
         multipliers=multipliers,
@@ -233,6 +245,7 @@ def _examined(system, t, x, u, params, unflatten) -> Examined:
         lagrangian=jnp.asarray(system.lagrangian(t, unflatten(x), unflatten(u), params)),
         matrix=_comparable(linear.mass, rows.jacobian, independent),
         contradictory=_contradictory(linear, rows, independent, a, multipliers, x, u),
+        unique=unique,
     )
 
 

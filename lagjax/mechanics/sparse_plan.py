@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Int
 
 from lagjax.mechanics import constraints, coordinates
+from lagjax.mechanics.reactions import reacts
 from lagjax.mechanics.sparsity import pattern
 from lagjax.numerics import banded, dense
 
@@ -50,7 +51,7 @@ class Plan:
 def plan(system, t, q, v, params) -> Plan | None:
     """How to solve a system sparsely; None where the dense solve is as good. Only shapes and dtypes count."""
     n = sum(np.size(x) for x in jax.tree.leaves(q))
-    if n + constraints.count(system, t, q, v, params) < UNKNOWNS_AT_LEAST:
+    if reacts(system) or n + constraints.count(system, t, q, v, params) < UNKNOWNS_AT_LEAST:
         return None
     leaves, structure = jtu.tree_flatten((system, t, q, v, params))
     leaves = tuple(jax.ShapeDtypeStruct(x.shape, x.dtype) if eqx.is_array(x) else x for x in leaves)

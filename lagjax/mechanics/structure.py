@@ -25,12 +25,14 @@ import numpy as np
 from jaxtyping import PyTree
 
 from lagjax.jax_internals.names import ADDITIVE, BILINEAR, LINEAR_IN_FIRST, PERIODIC
-from lagjax.jax_internals.programs import Literal, interpreted, reached
+from lagjax.jax_internals.programs import Literal, depends, interpreted
 from lagjax.mechanics import constraints, coordinates
 from lagjax.mechanics.constraints import Holonomic
 from lagjax.mechanics.constraints import evaluate as constraint_value
+from lagjax.mechanics.hybrid import phases_of
 from lagjax.mechanics.in_numbers import WRITTEN, Numbers, in_numbers
 from lagjax.mechanics.lagrangian import mass_and_forcing
+from lagjax.mechanics.reactions import force_with_ones
 from lagjax.numerics import banded
 from lagjax.numerics.scalars import TooLong
 
@@ -142,10 +144,9 @@ def _momentum_at_rest(system, t, q, v, params):
 def _depends_on(numbers, names):
     """The names on which any result depends: "t", coordinates, "velocities"."""
     jaxpr, n = numbers.program.jaxpr, len(names)
-    depends = lambda inputs: any(not isinstance(x, Literal) and x in reached(jaxpr, inputs) for x in jaxpr.outvars)
     t, *state = numbers.state_variables
-    found = [name for name, x in zip(["t", *names], [t, *state[:n]]) if depends([x])]
-    return tuple([*found, "velocities"] if depends(state[n:]) else found)
+    found = [name for name, x in zip(["t", *names], [t, *state[:n]]) if depends(jaxpr, [x])]
+    return tuple([*found, "velocities"] if depends(jaxpr, state[n:]) else found)
 
 
 def _of_constraint(constraint, args, names):
@@ -209,8 +210,10 @@ def _of_state(constraint):
 
 def _seen(system):
     """All functions that the motion depends on, of (t, q, v, params)."""
-    functions = [system.lagrangian, system.force, system.dissipation]
-    functions += [_of_state(c) if isinstance(c, Holonomic) else c.phi for c in system.constraints.values()]
+    functions = []
+    for phase in phases_of(system):
+        functions += [phase.lagrangian, None if phase.force is None else force_with_ones(phase), phase.dissipation]
+        functions += [_of_state(c) if isinstance(c, Holonomic) else c.phi for c in phase.constraints.values()]
     return [f for f in functions if f is not None]
 
 

@@ -24,7 +24,8 @@ class System(eqx.Module):
       `q` and `v` arrive in the structure of the initial state, `params` as it was given.
     - `constraints`: by name, `Holonomic(g)` or `Nonholonomic(phi)`. The name is the key of its multiplier.
     - `force`: `Q(t, q, v, params)` -> like `q`, the generalized force that L does not contain,
-      `[L]/[q]`. It does the work `Q·v` per unit of time.
+      `[L]/[q]`. It does the work `Q·v` per unit of time. A force on a contact, as Coulomb's friction, is
+      `Q(t, q, v, multipliers, params)`, linear in these: it enters the equations that give them.
     - `dissipation`: Rayleigh's function `R(t, q, v, params)` -> scalar; its force is `-∂R/∂v`, so
       `R = ½ c v²` gives `-c v`.
 

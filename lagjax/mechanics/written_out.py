@@ -26,6 +26,7 @@ from lagjax.jax_internals.plain import is_plain
 from lagjax.mechanics import constraints, coordinates
 from lagjax.mechanics.in_numbers import WRITTEN, Numbers
 from lagjax.mechanics.lagrangian import mass_and_forcing
+from lagjax.mechanics.reactions import with_reactions
 from lagjax.mechanics.structure import is_diagonal
 from lagjax.numerics import dense
 from lagjax.numerics.scalars import TooLong
@@ -84,8 +85,9 @@ def _equations(diagonal, system, t, q, v, params):
         return unflatten(linear.forcing / linear.mass[0]), jnp.zeros(0, x.dtype)
     rows = constraints.acceleration_rows(system, t, x, u, params, unflatten)
     solver = dense.Saddle(linear.mass, rows.jacobian, diagonal)
-    a, multipliers = solver.solve(linear.forcing, rows.gamma)
-    return unflatten(a if diagonal else jnp.where(solver.believed, a, jnp.nan)), multipliers
+    a, multipliers, unique = with_reactions(solver.solve, linear.forcing, rows.gamma, linear.response)
+    believed = solver.believed if linear.response is None else solver.believed & unique
+    return unflatten(a if diagonal else jnp.where(believed, a, jnp.nan)), multipliers
 
 
 def _projected(system, t, q, v, params):

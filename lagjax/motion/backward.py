@@ -25,6 +25,7 @@ import equinox as eqx
 import jax
 import numpy as np
 
+from lagjax.mechanics.arguments import takes_of
 from lagjax.mechanics.constraints import Holonomic, Nonholonomic
 from lagjax.mechanics.coordinates import is_traced
 from lagjax.mechanics.system import System
@@ -38,6 +39,10 @@ class Reflected(eqx.Module):
     function: Callable
     of_velocities: bool = eqx.field(static=True, default=True)
     odd: bool = eqx.field(static=True, default=False)
+
+    @property
+    def takes(self):
+        return takes_of(self.function)
 
     def __call__(self, t, q, *rest):
         if self.of_velocities:

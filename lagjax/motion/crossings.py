@@ -21,6 +21,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from lagjax.jax_internals.programs import length
 from lagjax.jax_internals.tracing import is_eager
+from lagjax.mechanics.arguments import OF_STATE, WITH_MULTIPLIERS, takes_of
 from lagjax.mechanics.closures import lift_function
 from lagjax.mechanics.constraints import zero_multipliers
 from lagjax.mechanics.coordinates import State
@@ -29,8 +30,6 @@ from lagjax.mechanics.memory import is_array, kinds, remembered, shape_of
 from lagjax.mechanics.outside import first_guard_alike, read_by
 from lagjax.mechanics.system import System
 
-OF_STATE = ("t", "q", "v", "params")
-WITH_MULTIPLIERS = ("t", "q", "v", "multipliers", "params")
 # The operations of a guard that is compiled once for all places where it is looked at.
 LONG = 100
 DIRECTIONS = {None: 0, 0: 0, 1: 1, -1: -1}
@@ -135,7 +134,10 @@ class Crossings(eqx.Module):
 
 
 class Kind(NamedTuple):
-    """What of a guard is not a function: see `Crossing`; `long` where it takes long to compile; what it has `read`."""
+    """What of a guard is not a function: see `Crossing`; `long` where it takes long to compile; what it has `read`.
+
+    `holds`: it is taken to be above zero at the start, also where it is not, and is then crossed there.
+    """
 
     name: str
     direction: int
@@ -144,6 +146,7 @@ class Kind(NamedTuple):
     takes_multipliers: bool
     long: bool
     read: Hashable
+    holds: bool
 
 
 class Guards(eqx.Module):
@@ -257,7 +260,7 @@ def left_to_diffrax(event: diffrax.Event | None) -> diffrax.Event | None:
     return diffrax.Event(asking) if asking else None
 
 
-def guards_of(crossings: Mapping[str, Crossing], system: System, start: State) -> Guards | None:
+def guards_of(crossings: Mapping[str, Crossing], system: System, start: State, holds: bool = False) -> Guards | None:
     """The guards of all crossings, called once on shapes; None where there are none. `start` is the first state."""
     if not crossings:
         return None
@@ -269,13 +272,13 @@ def guards_of(crossings: Mapping[str, Crossing], system: System, start: State) -
         given = dict(zip(OF_STATE, start)) | {"multipliers": multipliers}
         functions.append(lift_function(guard, tuple(given[name] for name in takes)))
         of_crossing = crossing.direction, crossing.terminal, crossing.most
-        of_guards.append(Kind(name, *of_crossing, takes is WITH_MULTIPLIERS, long, read))
+        of_guards.append(Kind(name, *of_crossing, takes is WITH_MULTIPLIERS, long, read, holds))
     return Guards(tuple(functions), tuple(of_guards))
 
 
 def _looked_at(name, guard, system, start):
     """What a guard takes, multipliers for it, and whether it takes long to compile; raise where it is none."""
-    takes, multipliers = _takes(guard), zero_multipliers(system, start)
+    takes, multipliers = takes_of(guard), zero_multipliers(system, start)
     given = dict(zip(OF_STATE, start)) | {"multipliers": multipliers}
     call = Call("guard", guard, takes, f" of event '{name}'")
     _check(call, given)
@@ -286,23 +289,6 @@ def _looked_at(name, guard, system, start):
 def _length(call, given):
     arrays, static = eqx.partition([given[name] for name in call.takes], is_array)
     return length(jax.make_jaxpr(lambda arrays: call.function(*eqx.combine(arrays, static)))(arrays).jaxpr)
-
-
-def _takes(guard):
-    try:
-        inspect.signature(guard).bind(*WITH_MULTIPLIERS)
-        with_multipliers = not _binds(guard, OF_STATE)
-    except (TypeError, ValueError):
-        with_multipliers = False
-    return WITH_MULTIPLIERS if with_multipliers else OF_STATE
-
-
-def _binds(function, arguments):
-    try:
-        inspect.signature(function).bind(*arguments)
-    except TypeError:
-        return False
-    return True
 
 
 def _check(call, given):

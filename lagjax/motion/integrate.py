@@ -16,25 +16,25 @@ from jaxtyping import Array, ArrayLike, PyTree
 from lagjax.jax_internals.tracing import WATCHED, is_eager
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.closures import lift
-from lagjax.mechanics.diagnosis import explain_failure
 from lagjax.mechanics.first_call import looked_at, with_known_kinds
+from lagjax.mechanics.hybrid import Hybrid, phases_of
 from lagjax.mechanics.system import System
 from lagjax.motion import problem
 from lagjax.motion.arriving import WHOLE_STEPS
 from lagjax.motion.backward import in_either_direction, runs_backward
 from lagjax.motion.crossings import Crossing, crossings_of, guards_of, left_to_diffrax, warn_of_events
+from lagjax.motion.failure import raise_failure
 from lagjax.motion.global_error import steps_to_repeat
 from lagjax.motion.no_lanes import raise_at_run_time
 from lagjax.motion.reported import patient, report
 from lagjax.motion.slips import warn_of_float32, warn_of_odd_dissipation
-from lagjax.motion.solve import START_TOLERANCES, Settings
-from lagjax.motion.stopped_early import stopped_early
-from lagjax.motion.tolerances import tolerances_at
-from lagjax.motion.trajectory import ENDED_WELL, RESULTS, Trajectory, is_among, message
+from lagjax.motion.solve import Settings
+from lagjax.motion.switching import each_phase, phases_in, refuse_beside_switches, starting
+from lagjax.motion.trajectory import ENDED_WELL, Trajectory, is_among
 
 
 def integrate(
-    system: System,
+    system: System | Hybrid,
     q0: PyTree[ArrayLike],
     v0: PyTree[ArrayLike],
     params: PyTree = None,
@@ -55,6 +55,7 @@ def integrate(
     progress: bool = False,
     drift: str | None = None,
     estimate_error: bool | None = None,
+    start: str | None = None,
 ) -> Trajectory:
     """Integrate Lagrange's equations from (q0, v0) at `ts[0]`, with outputs at `ts`.
 
@@ -67,7 +68,7 @@ def integrate(
 
     **Main arguments:**
 
-    - `system`: the `System`.
+    - `system`: the `System`; or a `Hybrid`, a motion in phases.
     - `q0`, `v0`: initial coordinates and velocities, any pytree of float arrays, alike; `[q]`, `[q]/[t]`. A start
       that is off the constraints by no more than about the tolerance is moved onto them.
     - `params`: what the Lagrangian takes; gradients flow to its floating arrays.
@@ -109,10 +110,11 @@ def integrate(
       compiles nothing there and costs 1.2 to 2 times the solve; inside `jit`, `vmap`, a sweep and derivatives it is one
       more solve in the program, through which no derivatives go. What a method damps in both runs alike, as
       `lj.Radau5(step_powers=(0, 1))` does fast oscillations, it cannot see.
+    - `start`: the name of the phase of a `Hybrid` in which the motion starts; by default its first one.
     - `drift`: `"project"` (return to the constraints after every step; the default where there are any),
       `"baumgarte"` (feedback at 50 decays a time span), or `"none"`.
 
-    **Returns:** a `Trajectory`.
+    **Returns:** a `Trajectory`; of a `Hybrid` a `HybridTrajectory`, with the phases and switches.
 
     **Raises:**
 
@@ -135,15 +137,20 @@ def integrate(
     problem.check_controller(stepsize_controller, max_step, jump_ts)
     ts = coordinates.numpy_of(ts).asarray(ts)
     t0 = ts[0] if ts.ndim == 1 and ts.size else 0.0
-    start = coordinates.prepared(t0, q0, v0, params)
-    dtype = start.t.dtype
-    system = looked_at(system, start)
+    state = coordinates.prepared(t0, q0, v0, params)
+    dtype = state.t.dtype
+    system = each_phase(starting(system, start), lambda phase: looked_at(phase, state))
     if is_eager():
-        start = with_known_kinds(system, start)
+        state = with_known_kinds(phases_of(system)[0], state)
     warn_of_float32(dtype, q0, v0)
-    warn_of_odd_dissipation(system.dissipation, start)
-    guards = guards_of(crossings_of(events, event), system, start)
-    system = lift(system, start)
+    for phase in phases_of(system):
+        warn_of_odd_dissipation(phase.dissipation, state)
+    if isinstance(system, Hybrid):
+        refuse_beside_switches(system, state, events=events, event=event, jump_ts=jump_ts)
+        guards = phases_in(system, state)
+    else:
+        guards = guards_of(crossings_of(events, event), system, state)
+    system = each_phase(system, lambda phase: lift(phase, state))
     drift = problem.check_drift(drift, system)
     problem.check_adjoint(adjoint, drift, jump_ts)
     settings = Settings(
@@ -165,28 +172,21 @@ def integrate(
         repeated_up_to=steps_to_repeat(estimate_error, stepsize_controller, progress),
     )
     ts, backward = problem.times(ts, dtype), runs_backward(ts)
-    trajectory = in_either_direction(system, start.q, start.v, start.params, ts, guards, settings, backward)
+    trajectory = in_either_direction(system, state.q, state.v, state.params, ts, guards, settings, backward)
     trajectory = report(trajectory)
     if throw:
-        trajectory = _raise_failure(trajectory, start._replace(t=ts[0]), settings)
+        trajectory = _raise_or_warn(trajectory, state._replace(t=ts[0]), settings)
     return trajectory
 
 
-def _raise_failure(trajectory, start, settings):
+def _raise_or_warn(trajectory, start, settings):
     """Raise or warn in the user's words; while tracing, at run time with the result's own message."""
     if coordinates.is_traced(trajectory):
         # Who watches is told by the report.
         return trajectory if WATCHED.value else raise_at_run_time(trajectory)
     result = trajectory.result
     if not is_among(result, ENDED_WELL):
-        system, start = trajectory.system, coordinates.as_arrays(start, start.t.dtype)
-        if is_among(result, [RESULTS.start_off_constraints]):
-            tolerances = (START_TOLERANCES * np.asarray(tol) for tol in tolerances_at(start, trajectory.t, settings))
-            raise ValueError(problem.off_constraints(system, start, *tolerances))
-        if is_among(result, problem.REFUSED):
-            problem.check_finite(start)
-            raise ValueError(explain_failure(system, start) or message(result))
-        raise RuntimeError(stopped_early(trajectory, settings))
+        raise_failure(trajectory, start, settings)
     problem.warn_of_inaccuracy(trajectory)
     warn_of_events(trajectory.events)
     return trajectory

@@ -10,6 +10,7 @@ import numpy as np
 
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.coordinates import State
+from lagjax.mechanics.hybrid import Hybrid, phases_of
 from lagjax.mechanics.system import System
 from lagjax.motion.account import account_of, warning_of
 from lagjax.motion.consistency import departures
@@ -26,7 +27,7 @@ REFUSED = (RESULTS.start_not_finite, RESULTS.start_singular, RESULTS.contradicto
 
 def check_system(system: Any):
     """Raise where `system` is not a `System`."""
-    if not isinstance(system, System):
+    if not isinstance(system, System | Hybrid):
         raise TypeError(
             f"the first argument must be a lj.System, not {type(system).__name__}.\n"
             "Fix: system = lj.System(lagrangian)."
@@ -70,13 +71,14 @@ def check_adjoint(adjoint: Any, drift: str, jump_ts: Any):
         )
 
 
-def check_drift(drift: Any, system: System) -> str:
+def check_drift(drift: Any, system: System | Hybrid) -> str:
     """The drift control to use; raise where it is unknown."""
+    constrained = any(phase.constraints for phase in phases_of(system))
     if drift is None:
-        return "project" if system.constraints else "none"
+        return "project" if constrained else "none"
     if drift not in ("project", "baumgarte", "none"):
         raise ValueError(f'drift must be "project", "baumgarte" or "none", not {drift!r}.')
-    return drift if system.constraints else "none"
+    return drift if constrained else "none"
 
 
 def check_controller(controller: Any, max_step: Any, jump_ts: Any):

@@ -18,7 +18,7 @@ from lagjax.jax_internals.one_function import poisoned
 from lagjax.jax_internals.primitives import primitive
 from lagjax.jax_internals.programs import applied, bodies, equations, interpreted, stands_for
 from lagjax.jax_internals.tracing import REGULAR_FIRST, WATCHED
-from lagjax.motion.consistency import stopped, worst_residual
+from lagjax.motion.consistency import stopped
 from lagjax.motion.trajectory import RESULTS, Trajectory
 
 # In a program for many lanes that wait for each other, the steps after which a motion is given up, to be run alone.
@@ -48,10 +48,7 @@ def report(trajectory: Trajectory) -> Trajectory:
 
     def of(trajectory):
         t = stopped(trajectory)
-        residual = jnp.zeros_like(t.departure)
-        if t.system.constraints:
-            residual = worst_residual(t.system, t.t, t.q, t.v, t.params)
-        return Report(t.result._value, t.stats["num_steps"], t.departure, residual)
+        return Report(t.result._value, t.stats["num_steps"], t.departure, t.residual())
 
     return reported(trajectory, of)
 

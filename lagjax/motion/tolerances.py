@@ -61,11 +61,15 @@ class Scales(NamedTuple):
     first: Float[Array, "2 n"]
 
 
-def tolerances_at(start, ts, settings) -> Tolerances:
-    """The tolerances of a whole state, for constraints, which see coordinates together: as given, or by the start."""
+def tolerances_at(start, ts, settings, seen=None) -> Tolerances:
+    """The tolerances of a whole state, for constraints, which see coordinates together: as given, or by the start.
+
+    `seen` (2, n): how large coordinates and velocities have been before it.
+    """
     if not settings.by_size:
         return Tolerances(settings.rtol, settings.atol)
-    span, (of_q, of_v) = span_of(ts), jnp.max(jnp.abs(_rows(start.q, start.v)), axis=1)
+    sizes = jnp.abs(_rows(start.q, start.v))
+    span, (of_q, of_v) = span_of(ts), jnp.max(sizes if seen is None else jnp.maximum(sizes, seen), axis=1)
     of_q = jnp.where(of_q > 0, of_q, jnp.where(of_v > 0, of_v * span, 1.0))
     return Tolerances(settings.rtol, stopped(settings.rtol * jnp.stack([of_q, jnp.maximum(of_v, of_q / span)])))
 

@@ -20,6 +20,7 @@ from lagjax.motion import account, frames
 from lagjax.motion.accuracy import Errors
 from lagjax.motion.consistency import worst_residual
 from lagjax.motion.crossings import Crossings
+from lagjax.motion.curves import columns, curves, finite
 
 
 # For checkers equinox's enumerations are Python's, of which none can have more items than its parent.
@@ -35,6 +36,9 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
         "A step could not be solved, could not be returned to the constraints, or lost the state in its error."
     )
     tolerance_too_small = "The tolerance is below the round-off of the state's dtype."
+    too_many_switches = "There were more switches than most_switches."
+    guard_not_seen = "A guard is below zero, and was not seen to cross it: its phase began on it, and hardly left it."
+    guard_below_zero = "A guard of the first phase is below zero at the start."
     unordered = (
         "The times do not increase throughout, or dt0 or max_step is not positive. (Times that decrease are taken "
         "where they are known while JAX is tracing: a NumPy array.)"
@@ -72,7 +76,7 @@ class How(NamedTuple):
     """How a motion was stepped through.
 
     `order`: of the error that chooses steps; `evaluations`: of the equations in a step, None for an implicit method;
-    `steps`: chosen by the "tolerance", "fixed", or by the user's "controller".
+    `steps`: chosen by the "tolerance" (in several "legs" of a motion), "fixed", or by the user's "controller".
     """
 
     method: str
@@ -151,6 +155,10 @@ class Trajectory(eqx.Module):
         static = jax.tree.unflatten(self.static.structure, self.static.parts)
         return eqx.combine(self.arrays, static)
 
+    def rows(self) -> dict:
+        """What there is of each output, by the names of the fields."""
+        return {"t": self.t, "q": self.q, "v": self.v, "multipliers": self.multipliers}
+
     def jacobi_integral(self) -> Float[Array, " T"]:
         """The Jacobi integral `v·p - L` at every output, (T,), `[L]`. Not for batched trajectories."""
         return jacobi_and_scale(self.system, self.t, self.q, self.v, self.params)[0]
@@ -171,10 +179,10 @@ class Trajectory(eqx.Module):
         **Raises:** `ImportError` without matplotlib; `ValueError` for a batched trajectory.
         """
         self._check_alone("plot()")
-        panels = {"q": _curves(self.q), "v": _curves(self.v)}
+        panels = {"q": curves(self.q), "v": curves(self.v)}
         if self.multipliers:
             panels["multipliers"] = {
-                name + suffix: curve for name, values in self.multipliers.items() for suffix, curve in _columns(values)
+                name + suffix: curve for name, values in self.multipliers.items() for suffix, curve in columns(values)
             }
         return plot.time_series(np.asarray(self.t), panels)
 
@@ -191,8 +199,8 @@ class Trajectory(eqx.Module):
         first = jax.tree.map(lambda x: x[0], (lanes[0].t, lanes[0].q, lanes[0].v))
         of_leaves = angles(lanes[0].system, *first, lanes[0].params)
         is_angle = coordinates.flatten(jax.tree.map(lambda yes, x: np.full(x.shape, yes), of_leaves, first[1]))[0]
-        curves = [(_curves(lane.q), _curves(lane.v)) for lane in lanes]
-        drawn = {name: [_finite(q[name], v[name]) for q, v in curves] for name in curves[0][0]}
+        pairs = [(curves(lane.q), curves(lane.v)) for lane in lanes]
+        drawn = {name: [finite(q[name], v[name]) for q, v in pairs] for name in pairs[0][0]}
         return plot.phase_portrait({name: (drawn[name], bool(yes)) for name, yes in zip(drawn, is_angle)})
 
     def animate(
@@ -224,6 +232,17 @@ class Trajectory(eqx.Module):
         self._check_alone("animate(positions)")
         ended_by_event = bool(self.result == RESULTS.event_occurred)
         return frames.film(self, positions, seconds, rate, trail, ended_by_event)
+
+    def _of_system(self):
+        """What a line each says of the system and its events."""
+        found = []
+        if self.system.constraints:
+            found.append(("worst constraint residual", f"{float(self.residual()):.1e} (relative)"))
+        first = jax.tree.map(lambda x: np.asarray(x)[0], (self.t, self.q, self.v))
+        changed_by = next(what_changes_jacobi_integral(self.system, *first, self.params), None)
+        as_it_may = "" if changed_by is None else f"; need not be conserved: {changed_by}"
+        found.append(("change of the Jacobi integral", f"{float(self.drift()):.1e} (relative){as_it_may}"))
+        return found + [(f"event '{name}'", crossings.in_words()) for name, crossings in self.events.items()]
 
     def _check_alone(self, call):
         if self.t.ndim != 1:
@@ -293,13 +312,7 @@ def _lines(traj):
         *account.of_cost(traj),
         *(account.of_error(traj) or _not_estimated(traj)),
     ]
-    if traj.system.constraints:
-        rows.append(("worst constraint residual", f"{float(traj.residual()):.1e} (relative)"))
-    first = jax.tree.map(lambda x: np.asarray(x)[0], (traj.t, traj.q, traj.v))
-    changed_by = next(what_changes_jacobi_integral(traj.system, *first, traj.params), None)
-    as_it_may = "" if changed_by is None else f"; need not be conserved: {changed_by}"
-    rows.append(("change of the Jacobi integral", f"{float(traj.drift()):.1e} (relative){as_it_may}"))
-    rows += [(f"event '{name}'", found.in_words()) for name, found in traj.events.items()]
+    rows += traj._of_system()
     if float(traj.departure) > 1:
         rows.append(("WARNING", f"the error is {float(traj.departure):.2g} times what the tolerance lets expect"))
     rows += _shape_rows(traj)
@@ -358,30 +371,6 @@ def _shape_rows(traj):
 def _aligned(rows):
     width = max(len(label) for label, _ in rows)
     return [f"  {label:<{width}}  {value}" for label, value in rows]
-
-
-def _curves(tree):
-    """One curve a coordinate, by the user's names."""
-    first = jax.tree.map(lambda x: np.asarray(x[0]), tree)
-    columns = np.stack([np.ravel(x) for x in _rows(tree)])
-    return dict(zip(coordinates.names(first), columns.T))
-
-
-def _finite(*curves):
-    there = np.isfinite(curves).all(axis=0)
-    return tuple(x[there] for x in curves)
-
-
-def _rows(tree):
-    leaves = [np.asarray(x).reshape(len(x), -1) for x in jax.tree.leaves(tree)]
-    return np.concatenate(leaves, axis=1)
-
-
-def _columns(values):
-    values = np.asarray(values)
-    if values.ndim == 1:
-        return [("", values)]
-    return [(f"[{i}]", column) for i, column in enumerate(values.T)]
 
 
 @compiled

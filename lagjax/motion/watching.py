@@ -38,7 +38,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from lagjax.motion.consistency import stopped
-from lagjax.motion.crossings import Guards
+from lagjax.motion.crossings import Guards, Kind
 from lagjax.motion.pieces import (
     INNER,
     Enclosed,
@@ -197,7 +197,8 @@ class Watching(diffrax.AbstractStepSizeController):
             right = _where(looks, self._unseen(s.at, y, a), s.right)
             values, times, inner = self._seen(s.left, right, args, with_noise=True)
             right = right._replace(values=_where(looks, values, right.values))
-            signs = (jnp.where(begins, self._first_sign(x), f.sign) for f, x in zip(s.followed, right.values))
+            begun = zip(s.followed, right.values, self.guards.kinds)
+            signs = (jnp.where(begins, self._first_sign(x, k), f.sign) for f, x, k in begun)
             s = s._replace(
                 left=_where(begins, right, s.left), right=right, end=_where(ends, right, s.end), looks=s.looks + 1,
                 followed=tuple(f._replace(sign=sign) for f, sign in zip(s.followed, signs)),
@@ -265,9 +266,11 @@ class Watching(diffrax.AbstractStepSizeController):
             found.append(pieces_of(begin, by_both[:count], off, end, h, touches))
         return found
 
-    def _first_sign(self, value: Value):
+    def _first_sign(self, value: Value, kind: Kind):
         """The sign at the start of the motion: none where that is on the guard."""
         on_guard = jnp.abs(value.g) <= ON_GUARD * (value.noise + jnp.abs(value.rate) * self.resolution)
+        if kind.holds:
+            return jnp.where(on_guard & (value.rate > 0), 0.0, 1.0)
         return jnp.where(on_guard | ~jnp.isfinite(value.g), 0.0, jnp.sign(value.g))
 
     def _at_extremum(self, s: Search, looks):

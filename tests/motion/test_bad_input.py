@@ -200,7 +200,7 @@ def test_adjoint_that_leaves_the_constraints():
 @pytest.mark.slow
 def test_max_steps():
     """Where it stopped, after how many steps, how many are missing, and what to do."""
-    with refusal(RuntimeError, "stopped at t = 0", "max_steps = 4", r"needs \d more", r"max_steps=\d+, or a looser rtol"):
+    with refusal(RuntimeError, "stopped at t = 0", "max_steps = 4", r"needs \d more", r"max_steps=\d+, or"):
         lj.integrate(pendulum, 1.0, 0.0, PARAMS, ts=TS, max_steps=4)
 
 

@@ -1,0 +1,28 @@
+"""What a function of the user's takes: the state, or the state and the multipliers."""
+
+import inspect
+from collections.abc import Callable
+
+OF_STATE, OF_POSITION = ("t", "q", "v", "params"), ("t", "q", "params")
+WITH_MULTIPLIERS = ("t", "q", "v", "multipliers", "params")
+
+
+def takes_of(function: Callable) -> tuple[str, ...]:
+    """What a function takes: of the state, and the multipliers where it has room for them."""
+    known = getattr(function, "takes", None)
+    if known is not None:
+        return known
+    try:
+        inspect.signature(function).bind(*WITH_MULTIPLIERS)
+        with_multipliers = not _binds(function, OF_STATE)
+    except (TypeError, ValueError):
+        with_multipliers = False
+    return WITH_MULTIPLIERS if with_multipliers else OF_STATE
+
+
+def _binds(function, arguments):
+    try:
+        inspect.signature(function).bind(*arguments)
+    except TypeError:
+        return False
+    return True

@@ -1,0 +1,169 @@
+"""A motion in phases: a trajectory that knows the phase of each output, and its switches."""
+
+from functools import partial
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jax.core import Tracer
+from jaxtyping import Array, Bool, Float, Int, PyTree
+
+from lagjax import plot
+from lagjax.mechanics.compiled import compiled
+from lagjax.mechanics.hybrid import Hybrid
+from lagjax.mechanics.system import System
+from lagjax.motion.consistency import worst_residual
+from lagjax.motion.crossings import Crossings
+from lagjax.motion.trajectory import Trajectory, jacobi_and_scale
+
+# Of an output that was not reached, and of the room for switches that did not come.
+NO_PHASE = -1
+
+
+class Switches(eqx.Module):
+    """The switches of a motion, in the order of time; it prints itself.
+
+    - `t` (S,): their times, `[t]`; NaN beyond the last one. S is `most_switches` of the `lj.Hybrid`.
+    - `way` (S,): which of the hybrid's switches each is, and `to` (S,): the number of the next phase; -1 beyond the
+      last one. `names`: those of all phases, and `ways` the names of those that each of the hybrid's switches leaves.
+    - `q`, `v`: the states before them, each leaf with a leading axis S; `q_after`, `v_after`: those after them.
+    - `impulse`: the jump of the momentum, like v, `[L] [t]/[q]`; zero where nothing jumps.
+    - `count`: how many there were.
+    - `uncertain`: whether some may be missing: a guard touched zero within round-off, or changed too fast to be
+      followed.
+
+    Under `vmap` every array has the batch's axes in front.
+    """
+
+    t: Float[Array, " S"]
+    way: Int[Array, " S"]
+    to: Int[Array, " S"]
+    q: PyTree[Float[Array, "S ..."]]
+    v: PyTree[Float[Array, "S ..."]]
+    q_after: PyTree[Float[Array, "S ..."]]
+    v_after: PyTree[Float[Array, "S ..."]]
+    impulse: PyTree[Float[Array, "S ..."]]
+    count: Int[Array, ""]
+    uncertain: Bool[Array, ""]
+    names: tuple[str, ...] = eqx.field(static=True)
+    ways: tuple[str, ...] = eqx.field(static=True)
+
+    def as_crossings(self) -> Crossings:
+        """The same as crossings of one guard, with the states before them."""
+        return Crossings(self.t, self.q, self.v, {}, self.count, self.uncertain)
+
+    def __len__(self):
+        return int(self.count)
+
+    def __repr__(self):
+        if isinstance(self.t, Tracer) or not isinstance(self.t, jax.Array | np.ndarray):
+            return "Switches, being traced"
+        if np.ndim(self.count):
+            low, high = int(np.min(self.count)), int(np.max(self.count))
+            return f"Switches of {np.size(self.count)} lanes, {low} to {high} each"
+        return "\n".join(["Switches: " + self.in_words(), *self._rows()])
+
+    def in_words(self) -> str:
+        """How many."""
+        return f"{int(self.count)}" + ("; some may be missing" if bool(self.uncertain) else "")
+
+    def _rows(self):
+        times, ways, to = map(np.asarray, (self.t, self.way, self.to))
+        return [f"  t = {times[k]:<12.9g} {self.ways[ways[k]]} -> {self.names[to[k]]}" for k in range(int(self.count))]
+
+
+class HybridTrajectory(Trajectory):
+    """A motion in phases, as `lj.integrate` returns it for a `lj.Hybrid`: a `Trajectory` with more.
+
+    - `phase` (T,): the number of the phase at each output, in the order of `system.names`; -1 where none was reached.
+      An output at the very time of a switch has the state and the phase before it.
+    - `switches`: the `Switches`.
+    - `multipliers`: of all phases by constraint name; NaN where the phase has no such constraint.
+    - `end`: the last instant; where the motion ended on a switch, the state after it.
+    - `jacobi_integral()`, `residual()`: of each output's own phase. `drift()` is NaN: over all phases, in which forces
+      and impacts do work, there is nothing that must stay.
+    """
+
+    phase: Int[Array, " T"] = eqx.field(kw_only=True)
+    switches: Switches = eqx.field(kw_only=True)
+
+    @property
+    def system(self) -> Hybrid:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return self._problem()[0]
+
+    def named_phases(self) -> np.ndarray:
+        """The name of the phase at each output; an empty one where none was reached. Not while JAX is tracing."""
+        return np.array([*self.system.names, ""])[np.asarray(self.phase)]
+
+    def last_phase(self) -> int:
+        """The number of the phase in which the motion ended, or failed. Not while JAX is tracing."""
+        count = len(self.switches)
+        return int(self.switches.to[count - 1] if count else self.system.first)
+
+    def jacobi_integral(self) -> Float[Array, " T"]:
+        """The Jacobi integral of the phase at every output, (T,), `[L]`. Not for batched trajectories."""
+        return _of_phases(_integral, self)
+
+    def drift(self) -> Float[Array, ""]:
+        """Not known."""
+        return jnp.full_like(self.departure, jnp.nan)
+
+    def residual(self) -> Float[Array, ""]:
+        """The worst constraint residual over all outputs, each in its own phase, relative."""
+        worst = [_residual_in(system, i, self) for i, system in enumerate(self.system.systems) if system.constraints]
+        return jnp.max(jnp.stack([*worst, jnp.zeros_like(self.departure)]))
+
+    def plot(self):
+        """Plot coordinates, velocities and multipliers against time, with the switches; returns a matplotlib `Figure`.
+
+        **Raises:** `ImportError` without matplotlib; `ValueError` for a batched trajectory.
+        """
+        fig = super().plot()
+        for axis in fig.axes:
+            for t in np.asarray(self.switches.t)[: len(self.switches)]:
+                axis.axvline(t, color=plot.COLOURS[-1], linewidth=0.6, linestyle=":", zorder=0)
+        return fig
+
+    def rows(self) -> dict:
+        return super().rows() | {"phase": self.phase}
+
+    def _of_system(self):
+        lines = [("worst constraint residual", f"{float(self.residual()):.1e} (relative)")]
+        names, counts = np.unique(self.named_phases(), return_counts=True)
+        outputs = ", ".join(f"{count} in {name}" for name, count in zip(names, counts) if name)
+        found = [row.strip() for row in self.switches._rows()]
+        shown = found[:6] + (["..."] if len(found) > 6 else [])
+        return [
+            *(lines if any(system.constraints for system in self.system.systems) else []),
+            ("phases", f"outputs: {outputs}"),
+            ("switches", self.switches.in_words()),
+            *(("", row) for row in shown),
+        ]
+
+
+def _integral(system, t, q, v, params):
+    return jacobi_and_scale(system, t, q, v, params)[0]
+
+
+def _of_phases(function, trajectory):
+    """`function(system, t, q, v, params)` of all outputs, each by the system of its own phase."""
+    found = jnp.full_like(trajectory.t, jnp.nan)
+    for i, system in enumerate(trajectory.system.systems):
+        values = function(system, trajectory.t, trajectory.q, trajectory.v, trajectory.params)
+        found = jnp.where(trajectory.phase == i, values, found)
+    return found
+
+
+def _residual_in(system: System, i, trajectory):
+    return _worst(system, i, trajectory.phase, trajectory.t, trajectory.q, trajectory.v, trajectory.params)
+
+
+@compiled
+def _worst(system, i, phase, t, q, v, params):
+    mine = phase == i
+    # Other outputs are taken where the phase was first: they say nothing of it.
+    at = jnp.where(mine, jnp.arange(phase.size), jnp.argmax(mine))
+    t, q, v = jax.tree.map(partial(jnp.take, indices=at, axis=0), (t, q, v))
+    return lax.cond(jnp.any(mine), lambda: worst_residual(system, t, q, v, params), lambda: jnp.zeros_like(t[0]))

@@ -1,0 +1,258 @@
+"""A motion in phases: one solve after another, each from a switch to the next.
+
+A leg is a motion of its phase's system that ends where one of the phase's guards crosses zero from above, with the
+outputs that lie in it. Which leg comes next is known at run time, so that all phases are in one loop; in a batch each
+phase is solved for all lanes that are in it, and lanes that are not stand still. What is differentiated are the legs:
+the time and the state at a crossing carry their derivatives (`crossing_times.py`) into the start of the next one, which
+is the saltation matrix.
+
+A guard is taken to be above zero where its phase begins. One that is at zero there and goes down, however slowly, or
+is below zero, is crossed at once, in a leg of no length: two guards at one time, friction that does not hold where
+sliding stops.
+
+Source: Hiskens & Pai, IEEE Trans. Circuits Syst. I 47 (2000) 204 (trajectory sensitivities through switches).
+"""
+
+from dataclasses import replace
+from functools import partial, reduce
+from typing import Any, NamedTuple
+
+import diffrax
+import equinox as eqx
+import equinox.internal as eqxi
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int, PyTree
+
+from lagjax.mechanics import constraints, coordinates
+from lagjax.mechanics.hybrid import Hybrid
+from lagjax.motion.consistency import stopped
+from lagjax.motion.crossings import Guards
+from lagjax.motion.hybrid_trajectory import NO_PHASE, Switches
+from lagjax.motion.loop import resolution
+from lagjax.motion.one_solve import solved
+from lagjax.motion.trajectory import RESULTS, Moment, ended_well
+from lagjax.motion.watching import uneven
+
+# What a guard may be below zero where a motion starts, in tolerances of what it is made of.
+NOT_BELOW = 1e2
+# Times so near to each other, in units of what can be told apart, are one.
+AT_ONCE = 4
+
+
+class Phase(NamedTuple):
+    """What ends one phase: its guards, in the order of the switches, and what each of them does to the state.
+
+    `switches` (k,): their numbers in the hybrid; `targets` (k, 2): the next phase, and
+    that of rest; `resets`: `reset(t, q, v, multipliers, params)` -> (q, v), and whether
+    the motion comes to rest there.
+    """
+
+    guards: Guards | None
+    switches: tuple[int, ...]
+    targets: np.ndarray
+    resets: tuple
+
+
+class Rows(NamedTuple):
+    """The outputs of all legs so far; NaN, and no phase, where there is none yet."""
+
+    q: PyTree[Float[Array, "T ..."]]
+    v: PyTree[Float[Array, "T ..."]]
+    multipliers: dict[str, Array]
+    phase: Int[Array, " T"]
+
+
+class Way(NamedTuple):
+    """How far the legs have come: the state from which the next one starts, and what is known of all before.
+
+    `going`: whether there is a next one. `seen`: how large coordinates and velocities have been, (2, n); `least`: the
+    sizes below which numbers were nothing.
+    """
+
+    t: Float[Array, ""]
+    q: PyTree[Float[Array, "..."]]
+    v: PyTree[Float[Array, "..."]]
+    phase: Int[Array, ""]
+    going: Bool[Array, ""]
+    rows: Rows
+    switches: Switches
+    end: Moment
+    stats: dict[str, Array]
+    seen: Array
+    least: Array
+    departure: Float[Array, ""]
+    settled: Bool[Array, ""]
+    result: Any
+
+
+def solved_in_legs(hybrid: Hybrid, q0, v0, params, ts, phases, settings, adjoint):
+    """The fields of the trajectory, as `one_solve.solved` has them, with the phase of each output and the switches."""
+    first = _first_leg(hybrid, q0, v0, params, ts, settings)
+
+    def onward(way: Way) -> Way:
+        for i in range(len(hybrid.systems)):
+            mine = way.going & (way.phase == i)
+            leg = lambda way, i=i, mine=mine: _leg(hybrid, i, mine, way, params, ts, phases[i], settings, adjoint)
+            way = lax.cond(eqxi.unvmap_any(mine), leg, lambda way: way, way)
+        return way
+
+    if isinstance(adjoint, diffrax.ForwardMode):
+        way = lax.while_loop(lambda way: way.going, onward, first)
+    else:
+        # Each turn takes every lane one leg further, at least.
+        step = lambda way, _: (lax.cond(eqxi.unvmap_any(way.going), onward, lambda way: way, way), None)
+        way, _ = lax.scan(step, first, None, length=hybrid.most_switches + 1)
+    rows = way.rows
+    return {
+        "q": rows.q,
+        "v": rows.v,
+        "multipliers": rows.multipliers,
+        "end": way.end,
+        "stats": way.stats,
+        "tolerance": (settings.rtol, way.least),
+        "departure": way.departure,
+        "result": way.result,
+        "settled": way.settled,
+        "events": {"switches": way.switches.as_crossings()} if hybrid.switches else {},
+        "phase": rows.phase,
+        "switches": way.switches,
+    }
+
+
+def _first_leg(hybrid, q0, v0, params, ts, settings):
+    dtype, many, room = ts.dtype, ts.shape[0], hybrid.most_switches
+    nan = lambda shape: jnp.full(shape, jnp.nan, dtype)
+    of_rows = lambda tree, n: jax.tree.map(lambda x: nan((n, *x.shape)), tree)
+    shapes = reduce(lambda all, of: all | of, (constraints.shapes(s, ts[0], q0, v0, params) for s in hybrid.systems))
+    n = coordinates.flatten(q0)[0].size
+    rows = Rows(
+        of_rows(q0, many), of_rows(v0, many), {name: nan((many, *shape)) for name, shape in shapes.items()},
+        jnp.full(many, NO_PHASE, jnp.int32),
+    )  # fmt: skip
+    record = lambda tree: of_rows(tree, room)
+    none = jnp.full(room, NO_PHASE, jnp.int32)
+    switches = Switches(
+        t=nan(room), way=none, to=none, q=record(q0), v=record(v0), q_after=record(q0), v_after=record(v0),
+        impulse=record(v0), count=jnp.asarray(0), uncertain=jnp.asarray(False), names=hybrid.names,
+        ways=tuple(s.phase for s in hybrid.switches),
+    )  # fmt: skip
+    start = Moment(ts[0], q0, v0, {name: nan(shape) for name, shape in shapes.items()})
+    zero, least = jnp.asarray(0), jnp.zeros((2, n), dtype) if settings.by_size else settings.atol
+    stats = {name: zero for name in ("num_steps", "num_accepted_steps", "num_rejected_steps")}
+    return Way(
+        t=ts[0], q=q0, v=v0, phase=jnp.asarray(hybrid.first, jnp.int32), going=jnp.asarray(True), rows=rows,
+        switches=switches, end=start, stats=stats, seen=_sizes(q0, v0), least=least, departure=jnp.zeros((), dtype),
+        settled=jnp.asarray(True), result=RESULTS.successful,
+    )  # fmt: skip
+
+
+def _leg(hybrid, i, mine, way: Way, params, ts, phase: Phase, settings, adjoint) -> Way:
+    """The way with one more leg, in the phase i, of those lanes that are in it."""
+    system, at_start = hybrid.systems[i], way.switches.count == 0
+    # Who is elsewhere stands still.
+    times = jnp.where(mine & (ts > way.t), ts, way.t)
+    settings = settings if system.constraints else replace(settings, drift="none")
+    found = solved(system, way.q, way.v, params, times, phase.guards, settings, adjoint, way.seen)
+    result, end, switched, onward = found["result"], found["end"], jnp.asarray(False), jnp.asarray(False)
+    after, target, switches = After(way.q, way.v, jnp.asarray(False)), way.phase, way.switches
+    if phase.guards is not None:
+        switched = mine & (result == RESULTS.event_occurred)
+        at_once = switched & (end.t - way.t <= AT_ONCE * resolution(ts))
+        refused = at_once & at_start & _is_below(end, params, phase.guards, settings.rtol)
+        full = way.switches.count >= hybrid.most_switches
+        onward = switched & ~refused & ~full
+        # What happens at once happens where the leg begins, and its time moves as that does.
+        t, q, v = _where(at_once, (way.t, way.q, way.v), (end.t, end.q, end.v))
+        end = Moment(t, q, v, end.multipliers)
+        crossings = [found["events"][kind.name] for kind in phase.guards.kinds]
+        when = jnp.stack([jnp.where(jnp.isfinite(x.t[0]), x.t[0], jnp.inf) for x in crossings])
+        first = jnp.argmax(when <= jnp.min(when) + AT_ONCE * resolution(ts))
+        after, target, switches = _switched(system, first, end, params, phase, way, onward)
+        uncertain = mine & jnp.any(jnp.stack([x.uncertain for x in crossings]))
+        switches = eqx.tree_at(lambda s: s.uncertain, switches, switches.uncertain | uncertain)
+        failed = RESULTS.where(refused, RESULTS.guard_below_zero, RESULTS.too_many_switches)
+        unseen = ended_well(result) & ~switched & _is_below(end, params, phase.guards, settings.rtol)
+        result = RESULTS.where(unseen, RESULTS.guard_not_seen, RESULTS.where(switched, failed, result))
+        result = RESULTS.where(onward, RESULTS.successful, result)
+    known = ((times > way.t) & (times <= end.t) | at_start & (ts <= way.t)) & _reached(found["q"])
+    none = lambda name, x: end.multipliers.get(name, jnp.full_like(x, jnp.nan))
+    end = end._replace(multipliers={name: none(name, x) for name, x in way.end.multipliers.items()})
+    least = way.least if not settings.by_size else jnp.maximum(way.least, stopped(found["tolerance"][1]))
+    further = Way(
+        t=jnp.where(onward, end.t, way.t), q=_where(onward, after.q, way.q), v=_where(onward, after.v, way.v),
+        phase=jnp.where(onward, target, way.phase), going=onward & (end.t < ts[-1]),
+        rows=_filled(way.rows, mine & known, found, i), switches=switches,
+        end=_where(onward, end._replace(q=after.q, v=after.v), end),
+        stats={name: n + found["stats"][name] for name, n in way.stats.items()},
+        seen=jnp.maximum(way.seen, _sizes(end.q, end.v)), least=least,
+        departure=jnp.maximum(way.departure, found["departure"]), settled=way.settled & found["settled"], result=result,
+    )  # fmt: skip
+    return _where(mine, further, way)
+
+
+def _is_below(end: Moment, params, guards: Guards, rtol):
+    """Whether a guard is below zero, by more than errors make it."""
+    state = stopped(tuple(end))
+    value = lambda *state: jnp.stack(guards(*state, stopped(params)))
+    g, off = jax.jvp(value, state, uneven(state))
+    return jnp.any(g < -NOT_BELOW * rtol[0] * jnp.abs(off))
+
+
+def _reached(q):
+    return jnp.isfinite(jax.vmap(lambda q: jnp.sum(coordinates.flatten(q)[0]))(q))
+
+
+def _filled(rows: Rows, known, found, i) -> Rows:
+    """The outputs with those of a leg in the phase i where they are `known`."""
+    put = lambda all, new: jax.tree.map(lambda x, y: jnp.where(_like(known, x), y.astype(x.dtype), x), all, new)
+    multipliers = {name: put(x, found["multipliers"].get(name, x)) for name, x in rows.multipliers.items()}
+    return Rows(put(rows.q, found["q"]), put(rows.v, found["v"]), multipliers, jnp.where(known, i, rows.phase))
+
+
+class After(NamedTuple):
+    """The state after a switch."""
+
+    q: PyTree
+    v: PyTree
+    rests: Bool[Array, ""]
+
+
+def _switched(system, first, end: Moment, params, phase: Phase, way: Way, onward):
+    """The state after the switch that comes first of a phase's, and the record with it."""
+    states = [After(*reset(end.t, end.q, end.v, end.multipliers, params)) for reset in phase.resets]
+    after = jax.tree.map(lambda *x: _one_of(first, x), *states)
+    momentum = partial(jax.grad(system.lagrangian, argnums=2), end.t)
+    impulse = jax.tree.map(jnp.subtract, momentum(after.q, after.v, params), momentum(end.q, end.v, params))
+    s, way_out = way.switches, jnp.asarray(phase.switches, jnp.int32)[first]
+    place = onward & (jnp.arange(s.t.shape[0]) == s.count)
+    put = lambda all, new: jax.tree.map(lambda x, y: jnp.where(_like(place, x), y[None].astype(x.dtype), x), all, new)
+    to = jnp.asarray(phase.targets)[first, after.rests.astype(int)]
+    record = Switches(
+        t=put(s.t, end.t), way=put(s.way, way_out), to=put(s.to, to), q=put(s.q, end.q), v=put(s.v, end.v),
+        q_after=put(s.q_after, after.q), v_after=put(s.v_after, after.v), impulse=put(s.impulse, impulse),
+        count=s.count + onward, uncertain=s.uncertain, names=s.names, ways=s.ways,
+    )  # fmt: skip
+    return after, to, record
+
+
+def _sizes(q, v):
+    return jnp.abs(jnp.stack([stopped(coordinates.flatten(y)[0]) for y in (q, v)]))
+
+
+def _one_of(first, values):
+    found = values[0]
+    for i, x in enumerate(values[1:], 1):
+        found = jnp.where(first == i, x, found)
+    return found
+
+
+def _where(condition, a, b):
+    pick = lambda x, y: jnp.where(condition, x, y).astype(jnp.result_type(y)) if eqx.is_array(y) else y
+    return jax.tree.map(pick, a, b)
+
+
+def _like(mask, x):
+    return mask.reshape(mask.shape + (1,) * (x.ndim - 1))

@@ -1,0 +1,207 @@
+"""One motion from its start to its end, event or failure: start, diffrax's loop, outputs, result.
+
+Nothing here looks at values: a start that cannot be integrated is refused inside the program, which then ends
+within a few rejected steps, and the lane keeps the reason in its result.
+"""
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, PyTree
+
+from lagjax.mechanics import coordinates
+from lagjax.mechanics.coordinates import State
+from lagjax.mechanics.equations import Equations, equations_of
+from lagjax.mechanics.structure import conserves_jacobi_integral
+from lagjax.motion.arriving import apart_from_jumps
+from lagjax.motion.consistency import returned, stopped, within, worst_residual
+from lagjax.motion.crossing_times import all_known, by_name, end_of
+from lagjax.motion.global_error import ROUND_OFFS
+from lagjax.motion.loop import Solution, solution_of
+from lagjax.motion.tolerances import Scales, rounding, scales_of, shared, span_of, tolerances_at
+from lagjax.motion.trajectory import RESULTS, Moment, ended_well, worst_drift
+from lagjax.numerics.nystrom import Nystrom
+from lagjax.numerics.runge_kutta import ExplicitRungeKutta
+
+# A start may be off the constraints by this many tolerances; it is then moved onto them.
+START_TOLERANCES = 100.0
+# A motion of a hundred periods changes the Jacobi integral by ten to a hundred tolerances.
+DRIFT_TOLERANCES = 1e3
+# The same change times the number of steps is about twenty times the phase that it shifts, in radians: a hundredth.
+PHASE_STEPS = 0.2
+# With fixed steps no tolerance says how much is expected.
+FIXED_STEPS_ALLOW = 1e-5
+# What the careful way would say, too.
+THE_SAME = RESULTS.max_steps_reached, RESULTS.start_off_constraints, RESULTS.tolerance_too_small, RESULTS.unordered
+# What diffrax reports, in the words of a motion.
+TRANSLATED = {
+    "nonfinite_input": "not_finite",
+    "nonlinear_divergence": "unsolved_step",
+    "nonlinear_max_steps_reached": "unsolved_step",
+}
+
+
+def solved(system, q0, v0, params, ts, guards, settings, adjoint, seen=None):
+    """The fields of the trajectory of one system, by name, and whether it is settled.
+
+    `seen` (2, n): how large coordinates and velocities have been before, where this is not the first leg of a motion.
+    """
+    ours = isinstance(settings.method, (ExplicitRungeKutta, Nystrom))
+    # A condition that asks diffrax evaluates the vector field at the state that it gets, the user's.
+    quickly = ours and settings.event is None
+    equations = equations_of(system, ts[0], q0, v0, params, quickly=quickly, fallback=settings.careful)
+    if guards is not None and equations.unflatten is not None:
+        guards = guards.in_numbers(equations.unflatten)
+    q, v = equations.inside(q0), equations.inside(v0)
+    _, atol = tolerances_at(State(ts[0], q, v, params), ts, settings, seen)
+    settings = replace(settings, atol=atol)
+    start = _start(equations, q, v, ts, settings, seen)
+    solution = _stepped(equations, start, ts, guards, settings, adjoint)
+    outputs = _outputs(equations, start, solution, ts, settings)
+    fields = _result(equations, start, solution, outputs, guards, settings)
+    rows = jax.vmap(equations.outside)
+    end, events = fields["end"], fields["events"]
+    return fields | {
+        "q": rows(fields["q"]),
+        "v": rows(fields["v"]),
+        "end": end._replace(q=equations.outside(end.q), v=equations.outside(end.v)),
+        "events": {name: found.with_states(rows(found.q), rows(found.v)) for name, found in events.items()},
+    }
+
+
+class Start(NamedTuple):
+    """The first state, moved onto the constraints, and what speaks against it, by names of `RESULTS`.
+
+    `scales`: of the motion, where tolerances are relative to its size.
+    """
+
+    q: PyTree[Float[Array, "..."]]
+    v: PyTree[Float[Array, "..."]]
+    against: dict[str, Bool[Array, ""]]
+    refused: Bool[Array, ""]
+    scales: Scales | None
+
+
+class Outputs(NamedTuple):
+    """The motion at the outputs and, last, at its end, where nothing is NaN; and which outputs were reached."""
+
+    motion: Moment
+    reached: Bool[Array, " T"]
+
+
+def _start(equations: Equations, q, v, ts, settings, seen) -> Start:
+    """What speaks against a start comes in rising order: the last of what holds is the result."""
+    t, off_constraints, holds = ts[0], jnp.asarray(False), jnp.asarray(True)
+    if equations.system.constraints:
+        tolerances = START_TOLERANCES * settings.rtol, START_TOLERANCES * settings.atol
+        off_constraints = ~within(equations, t, q, v, *tolerances)
+    if settings.drift == "project":
+        q, v, holds = returned(equations, t, q, v, settings.rtol, settings.atol)
+    a, _, finite, singular, contradictory, mass = stopped(equations.verdict(t, q, v))
+    scales = scales_of(mass, *stopped((q, v)), a, stopped(span_of(ts))) if settings.by_size else None
+    if scales is not None and seen is not None:
+        scales = scales._replace(first=jnp.maximum(scales.first, seen))
+    too_small = settings.controller is None and settings.rtol[0] < ROUND_OFFS * jnp.finfo(ts.dtype).eps
+    lengths = [settings.max_step, *([] if settings.dt0 is None else [settings.dt0])]
+    against = {
+        "start_singular": singular,
+        "start_not_finite": ~finite,
+        "contradictory": contradictory,
+        "start_off_constraints": off_constraints | (finite & ~singular & ~holds),
+        "tolerance_too_small": jnp.asarray(too_small),
+        "unordered": jnp.any(ts[1:] < ts[:-1]) | ~jnp.all(jnp.asarray([True, *(length > 0 for length in lengths)])),
+    }
+    return Start(q, v, against, jnp.any(jnp.stack([*against.values()])), scales)
+
+
+def _stepped(equations, start, ts, guards, settings, adjoint) -> Solution:
+    y0 = jax.tree.map(lambda x: jnp.where(start.refused, 0.0, x), (start.q, start.v))
+    first = State(ts[0], start.q, start.v, equations.params)
+    if settings.dt0 is not None:
+        # Where it is not positive the motion is refused; diffrax's own check would end the program.
+        settings = replace(settings, dt0=jnp.where(settings.dt0 > 0, settings.dt0, 1.0))
+    solution = solution_of(equations, first, y0, start.refused, start.scales, ts, guards, settings, adjoint)
+    if solution.located is None:
+        return solution
+    end = end_of(guards, solution.located, *solution.end)
+    # The step in which the motion ended went on to its own end.
+    return solution._replace(end=end, reached=jnp.where(ts <= end[0], solution.reached, jnp.inf))
+
+
+def _outputs(equations, start, solution, ts, settings) -> Outputs:
+    # What was not reached is evaluated at the start and masked afterwards: NaN times zero would poison gradients.
+    reached = jnp.isfinite(solution.reached) & ~start.refused
+    states = jax.tree.map(lambda x, x0: jnp.where(_like(reached, x), x, x0[None]), solution.outputs, (start.q, start.v))
+    if settings.jump_ts is not None:
+        states = apart_from_jumps(equations, ts, settings.jump_ts, *states)
+    # One compiled evaluation for the outputs and the end together.
+    t, (q, v) = jax.tree.map(lambda x, last: jnp.concatenate([x, last]), (ts, states), solution.end)
+    return Outputs(Moment(t, q, v, jax.vmap(equations.multipliers)(t, q, v)), reached)
+
+
+def _result(equations, start, solution, outputs, guards, settings):
+    """The fields of the trajectory: NaN where it did not come, and why."""
+    (motion, reached), located = outputs, solution.located
+    result = RESULTS.promote(solution.result)
+    for reported, ours in TRANSLATED.items():
+        result = RESULTS.where(result == getattr(RESULTS, reported), getattr(RESULTS, ours), result)
+    # An output is a step of its own, and can fail where the steps of the solve did not.
+    known = jnp.all(jnp.isfinite(coordinates.flatten(jax.tree.map(lambda x: x[:-1], (motion.q, motion.v)))[0]))
+    regular = equations.are_taken_for_regular
+    if regular:
+        known = known & jnp.all(jnp.isfinite(coordinates.flatten(motion.multipliers)[0]))
+        known = known if located is None else known & all_known(located)
+    result = RESULTS.where(ended_well(result) & ~known, RESULTS.unsolved_step, result)
+    for name, holds in start.against.items():
+        result = RESULTS.where(holds, getattr(RESULTS, name), result)
+    stats = {name: jnp.asarray(count) for name, count in solution.stats.items() if name != "max_steps"}
+    masked = jax.tree.map(lambda x: jnp.where(_like(reached, x), x[:-1], jnp.nan), motion)
+    end = jax.tree.map(lambda x: jnp.where(start.refused, jnp.nan, x[-1]), motion)._replace(t=motion.t[-1])
+    return {
+        "q": masked.q,
+        "v": masked.v,
+        "multipliers": masked.multipliers,
+        "end": end,
+        "stats": stats,
+        "tolerance": (settings.rtol, _absolute(stopped((motion.q, motion.v)), start.scales, settings)),
+        "departure": _departure(stopped(equations), *stopped((motion.t, motion.q, motion.v)), stats, settings),
+        "result": result,
+        "settled": ended_well(result) | _among(result, THE_SAME) if regular else jnp.asarray(True),
+        "events": {} if located is None else by_name(guards, located, motion.t[-1:], ~start.refused),
+    }
+
+
+def _absolute(states, scales, settings):
+    """The `atol` that was given; by a motion's own size what was as good as zero on it, (2, n)."""
+    if scales is None:
+        return settings.atol
+    sizes = [coordinates.flatten(jax.tree.map(lambda x: jnp.max(jnp.abs(x), axis=0), y))[0] for y in states]
+    return rounding(shared(scales, jnp.stack(sizes)))
+
+
+def _departure(equations, t, q, v, stats, settings):
+    """How far what must stay constant has changed at the outputs, in units of what the tolerance lets expect.
+
+    An error of the Jacobi integral that grows steadily shifts the phase by about its size a radian, so that over very
+    many steps less of it is allowed. With steps that the tolerance does not choose it counts for itself.
+    """
+    system, params, drift, residual = equations.system, equations.params, jnp.zeros_like(t[0]), jnp.zeros_like(t[0])
+    if conserves_jacobi_integral(system, t[0], *jax.tree.map(lambda x: x[0], (q, v)), params):
+        drift = worst_drift(system, t, q, v, params)
+    if system.constraints and settings.drift != "project":
+        residual = worst_residual(system, t, q, v, params)
+    if settings.controller is not None:
+        return jnp.maximum(drift, residual) / FIXED_STEPS_ALLOW
+    rtol = jnp.maximum(settings.rtol[0], jnp.finfo(t.dtype).eps)
+    phase = drift * stats["num_accepted_steps"] / PHASE_STEPS
+    return jnp.maximum(jnp.maximum(drift, residual) / (DRIFT_TOLERANCES * rtol), phase)
+
+
+def _among(result, others):
+    return jnp.any(jnp.stack([result == other for other in others]))
+
+
+def _like(mask, x):
+    return mask.reshape(mask.shape + (1,) * (x.ndim - 1))

@@ -1,0 +1,190 @@
+"""What a hybrid system brings to a solve: its phases, their guards, and what switches do to the state."""
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+from jaxtyping import Array
+
+from lagjax.mechanics import constraints, coordinates
+from lagjax.mechanics.arguments import OF_STATE, takes_of
+from lagjax.mechanics.closures import lift_function
+from lagjax.mechanics.constraints import zero_multipliers
+from lagjax.mechanics.coordinates import State
+from lagjax.mechanics.equations import equations_of
+from lagjax.mechanics.first_call import Call, check_arguments, in_words
+from lagjax.mechanics.hybrid import Hybrid, Switch, replace_fields
+from lagjax.mechanics.memory import shape_of
+from lagjax.mechanics.outside import first_guard_alike
+from lagjax.mechanics.system import System
+from lagjax.motion.crossings import Crossing, guards_of
+from lagjax.motion.legs import Phase
+
+
+class Reset(eqx.Module):
+    """What a switch does to the state: (t, q, v, multipliers, params) -> (q, v), and whether the motion rests there.
+
+    `function` gives velocities, or the whole state; without one the state stays. With `settle`, which does so where the
+    motion comes to rest, the guard `when` opens by less than `slower_than` after it.
+    """
+
+    function: Callable | None
+    takes: tuple[str, ...] = eqx.field(static=True)
+    settle: Callable | None = None
+    when: Callable | None = None
+    slower_than: Array | np.ndarray | None = None
+
+    def __call__(self, t, q, v, multipliers, params):
+        q, v = self._reset(t, q, v, multipliers, params)
+        if self.settle is None:
+            return q, v, jnp.asarray(False)
+        assert self.when is not None
+        value = lambda t, q, when=self.when: when(t, q, v, params)
+        _, opening = jax.jvp(value, (t, q), (jnp.ones_like(t), v))
+        rests = opening <= self.slower_than
+        at_rest = self.settle(t, q, v, params)
+        return q, jtu.tree_map(lambda x, y: jnp.where(rests, x, y), at_rest, v), rests
+
+    def _reset(self, t, q, v, multipliers, params):
+        if self.function is None:
+            return q, v
+        given = {"t": t, "q": q, "v": v, "multipliers": multipliers, "params": params}
+        found = self.function(*(given[name] for name in self.takes))
+        found = (q, found) if _alike(found, v) else found
+        return jtu.tree_map(lambda new, old: new + 0 * old, found, (q, v))
+
+
+def each_phase(system: System | Hybrid, function: Callable[[System], System]) -> Any:
+    """The system, or that of each phase, as `function` gives it."""
+    if isinstance(system, Hybrid):
+        return replace_fields(system, systems=tuple(map(function, system.systems)))
+    return function(system)
+
+
+def check_phases(hybrid: Hybrid, start: State):
+    """Raise where constraints of one name have different shapes in two phases."""
+    seen: dict[str, tuple[tuple, str]] = {}
+    for name, system in zip(hybrid.names, hybrid.systems):
+        for constraint, shape in constraints.shapes(system, *start).items():
+            other, phase = seen.setdefault(constraint, (shape, name))
+            if other != shape:
+                raise ValueError(
+                    f"constraint '{constraint}' has shape {other} in phase '{phase}', and {shape} in '{name}'.\n"
+                    "Fix: another name for one of them."
+                )
+
+
+def refuse_beside_switches(hybrid: Hybrid, start: State, **given):
+    """Raise where an argument has no meaning for a motion in phases."""
+    check_phases(hybrid, start)
+    for name, value in given.items():
+        if value:
+            raise ValueError(
+                f"{name} is not for a motion in phases.\n"
+                "Fix: a switch from a phase to itself, which resets nothing, records where something happens: "
+                'lj.Switch("flying", to="flying", when=lambda t, q, v, params: v["y"]).'
+            )
+
+
+def phases_in(hybrid: Hybrid, start: State) -> tuple[Phase, ...]:
+    """What ends each phase, called once on shapes; `start` is the first state of the motion."""
+    return tuple(_phase(hybrid, i, start) for i in range(len(hybrid.systems)))
+
+
+def _phase(hybrid, i, start):
+    numbers, system = hybrid.leaving(i), hybrid.systems[i]
+    listed = [hybrid.switches[k] for k in numbers]
+    names = {f"{switch.in_words()}, number {k}": switch for k, switch in zip(numbers, listed)}
+    crossings = {name: Crossing(switch.when, direction=-1) for name, switch in names.items()}
+    guards = guards_of(crossings, system, start, holds=True)
+    resets = tuple(_reset(switch, hybrid, system, start) for switch in listed)
+    return Phase(guards, tuple(numbers), hybrid.targets[numbers], resets)
+
+
+def _reset(switch: Switch, hybrid, system, start) -> Reset:
+    reset = _reset_alone(switch, hybrid, system, start)
+    if switch.rest is None:
+        return reset
+    if takes_of(switch.when) is not OF_STATE:
+        raise ValueError(
+            f"the switch {switch.in_words()} has rest=, and its guard takes multipliers: how fast it opens is not "
+            "seen by velocities.\nFix: rest= with lj.touches(gap) alone."
+        )
+    settle = Plastic().between(system, hybrid.systems[hybrid.names.index(switch.rest)])
+    return Reset(reset.function, reset.takes, settle, switch.when, switch.slower_than)
+
+
+def _reset_alone(switch: Switch, hybrid, system, start) -> Reset:
+    function = switch.reset
+    if function is None:
+        return Reset(None, OF_STATE)
+    if isinstance(function, OfPhases):
+        function = function.between(system, hybrid.systems[hybrid.names.index(switch.to)])
+    else:
+        function, _ = first_guard_alike(function)
+    takes = takes_of(function)
+    given: Mapping[str, Any] = start._asdict() | {"multipliers": zero_multipliers(system, start)}
+    call = Call("reset", function, takes, f" of the switch {switch.in_words()}")
+    check_arguments(call, "the arguments of a guard without the parameters")
+    with in_words(call, given):
+        found = shape_of(function, *(given[name] for name in takes))
+    if not (_alike(found, start.v) or _alike(found, (start.q, start.v))):
+        raise ValueError(
+            f"{call} must return velocities like v, or a pair (q, v).\n"
+            f"  v has shapes {jax.tree.map(jnp.shape, start.v)}\n"
+            f"  it returned {jax.tree.map(jnp.shape, found)}\n"
+            "Usual cause: the velocity that jumps alone.\n"
+            'Fix: return v | {"y": -v["y"]}.'
+        )
+    return Reset(lift_function(function, tuple(given[name] for name in takes)), takes)
+
+
+class OfPhases(eqx.Module):
+    """A reset that needs to know the systems before and after a switch."""
+
+    def between(self, before: System, after: System) -> Callable:
+        """`reset(t, q, v, params)` for a switch between these."""
+        raise NotImplementedError
+
+
+class Plastic(OfPhases):
+    """The nearest velocities in the metric of M that the constraints of the next phase allow."""
+
+    def between(self, before: System, after: System) -> Callable:
+        """The velocities after it."""
+        return Nearest(after)
+
+
+class Nearest(eqx.Module):
+    """Velocities moved onto the constraints of a system: `reset(t, q, v, params)`."""
+
+    system: System
+    takes: tuple[str, ...] = eqx.field(static=True, default=OF_STATE)
+
+    def __call__(self, t, q, v, params):
+        if not self.system.constraints:
+            return v
+        x, unflatten = coordinates.flatten(q)
+        u, _ = coordinates.flatten(v)
+        off = constraints.velocity_residual(self.system, t, x, u, params, unflatten)
+        displacement = equations_of(self.system, t, q, v, params).displacement(t, q, v)
+        return unflatten(u - displacement(np.ones(off.size, bool), off))
+
+
+def _alike(found, wanted):
+    same = jtu.tree_structure(found) == jtu.tree_structure(wanted)
+    shapes = lambda tree: [jnp.shape(x) for x in jtu.tree_leaves(tree)]
+    return same and shapes(found) == shapes(wanted)
+
+
+def starting(system, start: str | None):
+    """The system, where it is a hybrid one in the phase from which motions start."""
+    if isinstance(system, Hybrid):
+        return system.starting(start)
+    if start is not None:
+        raise ValueError("start= names the first phase of a lj.Hybrid, and this is one lj.System.\nFix: leave it out.")
+    return system

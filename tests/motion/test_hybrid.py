@@ -1,0 +1,307 @@
+"""Motions in phases: times of switches, states and derivatives across them, impacts, friction, and what is refused."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import lagjax as lj
+
+G = 9.81
+FALL = np.sqrt(2 / G)
+
+
+def falling(t, q, v, params):
+    """A ball in its height."""
+    return 0.5 * v**2 - params["g"] * q
+
+
+height = lambda t, q, params: q
+ball = lj.System(falling)
+lying = lj.System(falling, {"floor": lj.Holonomic(lambda t, q, params: q)})
+bounce = lj.Switch("flying", to="flying", when=lambda t, q, v, p: q, reset=lambda t, q, v, p: -p["e"] * v)
+bouncing = lj.Hybrid({"flying": ball}, [bounce], most_switches=4)
+PARAMS = {"g": G, "e": 0.5}
+
+
+def in_phases(*args, **options) -> lj.HybridTrajectory:
+    """`lj.integrate` of a hybrid system."""
+    traj = lj.integrate(*args, **options)
+    assert isinstance(traj, lj.HybridTrajectory)
+    return traj
+
+
+def bounced(h=1.0, e=0.5, g=G, **options):
+    """Two bounces, with an output exactly at the first."""
+    ts = np.array([0.0, 0.25, FALL, 0.75, 1.0])
+    return in_phases(bouncing, h, 0.0, {"g": g, "e": e}, ts=ts, **options)
+
+
+def heights(t, h=1.0, e=0.5):
+    """Of the ball in closed form, for its first two flights after the fall."""
+    first, speed = np.sqrt(2 * h / G), np.sqrt(2 * h * G)
+    second = first + 2 * e * first
+    flight = lambda s, v: v * s - 0.5 * G * s**2
+    return np.where(
+        t <= first,
+        h - 0.5 * G * t**2,
+        np.where(t <= second, flight(t - first, e * speed), flight(t - second, e**2 * speed)),
+    )
+
+
+@pytest.mark.slow
+def test_a_ball_that_bounces():
+    """Times, states before and after, impulses; outputs on a switch have the state before it; derivatives both ways."""
+    traj = bounced()
+    np.testing.assert_allclose(traj.switches.t[:2], [FALL, 2 * FALL], rtol=1e-14)
+    np.testing.assert_allclose(traj.q, heights(np.asarray(traj.t)), rtol=0, atol=1e-13)
+    np.testing.assert_allclose(traj.v[2], -np.sqrt(2 * G), rtol=1e-13)
+    np.testing.assert_allclose(traj.switches.v_after[:2] / traj.switches.v[:2], -0.5, rtol=1e-14)
+    np.testing.assert_allclose(traj.switches.impulse[0], 1.5 * np.sqrt(2 * G), rtol=1e-13)
+    assert len(traj.switches) == 2 and np.isnan(traj.switches.t[2:]).all() and set(traj.named_phases()) == {"flying"}
+    of_times_and_end = lambda h, e: (lambda traj: jnp.append(traj.switches.t[:2], traj.q[-1]))(bounced(h, e))
+    by_h, by_e = jax.jacrev(of_times_and_end, argnums=(0, 1))(1.0, 0.5)
+    np.testing.assert_allclose(by_h[:2], [0.225761820493, 2 * 0.225761820493], rtol=1e-11)
+    np.testing.assert_allclose(by_e[:2], [0.0, 0.903047281972], rtol=1e-11, atol=1e-14)
+    step = 1e-6
+    np.testing.assert_allclose(by_h[2], (heights(1.0, 1 + step) - heights(1.0, 1 - step)) / (2 * step), rtol=1e-8)
+    np.testing.assert_allclose(
+        by_e[2], (heights(1.0, 1, 0.5 + step) - heights(1.0, 1, 0.5 - step)) / (2 * step), rtol=1e-8
+    )
+
+
+@pytest.mark.slow
+def test_lanes_are_single_runs():
+    """Members of a batch that switch at different times and different numbers of times."""
+    hs = np.array([0.4, 1.0, 3.0, 6.0])
+    together = jax.vmap(lambda h: bounced(h, estimate_error=False, throw=False))(hs)
+    alone = [bounced(h, estimate_error=False, throw=False) for h in hs]
+    assert [len(traj.switches) for traj in alone] == [4, 2, 1, 0]
+    assert np.isnan(together.q[0, -1]) and int(together.result._value[0]) == int(lj.RESULTS.too_many_switches._value)
+    for i, traj in enumerate(alone):
+        np.testing.assert_allclose(together.q[i], traj.q, rtol=1e-12, atol=1e-13)
+        np.testing.assert_allclose(together.switches.t[i], traj.switches.t, rtol=1e-13)
+
+
+def test_said_by_name():
+    """Too many switches, those that come to rest, a guard with the other sign, and what is no hybrid."""
+    with pytest.raises(RuntimeError, match="(?s)most_switches = 4.*each takes 0.5 of the time.*about t = 1.35457"):
+        lj.integrate(bouncing, 1.0, 0.0, PARAMS, ts=np.array([0.0, 0.25, 0.5, 0.75, 3.0]))
+    with pytest.raises(ValueError, match="guard of phase 'flying' is below zero at the start.*is -1"):
+        lj.integrate(bouncing, -1.0, 0.0, PARAMS, ts=np.array([0.0, 0.25, 0.5, 0.75, 3.0]))
+    with pytest.raises(ValueError, match="names a phase 'rolling', and there is none"):
+        lj.Hybrid({"flying": ball}, [lj.Switch("flying", to="rolling", when=lambda t, q, v, p: q)])
+    with pytest.raises(ValueError, match="start='rolling' is no phase"):
+        lj.integrate(bouncing, 1.0, 0.0, PARAMS, ts=np.array([0.0, 1.0]), start="rolling")
+    with pytest.raises(ValueError, match="start= names the first phase"):
+        lj.integrate(ball, 1.0, 0.0, PARAMS, ts=np.array([0.0, 1.0]), start="flying")
+    with pytest.raises(ValueError, match="events is not for a motion in phases"):
+        lj.integrate(
+            bouncing, 1.0, 0.0, PARAMS, ts=np.array([0.0, 1.0]), events={"a": lj.Crossing(lambda t, q, v, p: v)}
+        )
+    with pytest.raises(TypeError, match="phase 'a' is function"):
+        lj.Hybrid({"a": falling})
+    odd = lj.Switch("flying", to="flying", when=lambda t, q, v, p: q, reset=lambda t, q, v, p: (v, v, v))
+    with pytest.raises(ValueError, match=r"reset\(t, q, v, params\).* must return velocities like v"):
+        lj.integrate(lj.Hybrid({"flying": ball}, [odd]), 1.0, 0.0, PARAMS, ts=np.array([0.0, 1.0]))
+
+
+@pytest.mark.slow
+def test_it_comes_to_rest():
+    """Infinitely many bounces end in the phase that stays; the time is that of the closed form, √(2h/g)(1+e)/(1-e)."""
+    fall = lj.Switch("flying", to="flying", when=lj.touches(height, restitution=0.5), rest="lying", slower_than=1e-8)
+    both = lj.Hybrid({"flying": ball, "lying": lying}, [fall], most_switches=60)
+    traj = in_phases(both, 1.0, 0.0, {"g": G}, ts=np.linspace(0.0, 3.0, 7))
+    assert len(traj.switches) == 29 and traj.named_phases()[-1] == "lying"
+    np.testing.assert_allclose(traj.switches.t[28], 3 * FALL, rtol=1e-8)
+    np.testing.assert_allclose(traj.q[4:], 0.0, atol=1e-14)
+    np.testing.assert_allclose(traj.multipliers["floor"][4:], G, rtol=1e-12)
+    assert np.isnan(traj.multipliers["floor"][0])
+    # Without the phase that stays no phase lasts, and so it is called.
+    dead = lj.Hybrid({"flying": ball}, [lj.Switch("flying", to="flying", when=lj.touches(height, restitution=0.0))])
+    with pytest.raises(RuntimeError, match="no phase lasts"):
+        lj.integrate(dead, 1.0, 0.0, {"g": G}, ts=np.array([0.0, 1.0]))
+
+
+@pytest.mark.slow
+def test_between_walls():
+    """Without gravity dz_end/dz₀ = -1 after one elastic bounce, 1 after two; a thousand members by the closed form."""
+    free = lj.System(lambda t, q, v, p: 0.5 * v**2)
+    left, right = (lj.touches(gap, restitution=1.0) for gap in (height, lambda t, q, p: p["width"] - q))
+    walls = lj.Hybrid({"free": free}, [lj.Switch("free", to="free", when=wall) for wall in (left, right)])
+    end = lambda z, v: lj.integrate(walls, z, v, {"width": 1.0}, ts=np.array([0.0, 1.0]), estimate_error=False).q[-1]
+    # Lanes of derivatives, of members that bounce once and twice.
+    slopes = jax.vmap(jax.jacfwd(end))(np.array([0.3, 0.3]), np.array([1.0, 2.0]))
+    np.testing.assert_allclose(slopes, [-1.0, 1.0], rtol=1e-12)
+    z, v = np.linspace(0.1, 0.9, 1000), np.linspace(1.0, 9.0, 1000)
+    found = jax.jit(jax.vmap(end))(z, v)
+    np.testing.assert_allclose(found, np.abs((z + v + 1) % 2 - 1), rtol=0, atol=1e-12)
+
+
+SPHERE = {"m": 2.0, "R": 0.25, "g": G, "mu": 0.25}
+
+
+def sphere(t, q, v, p):
+    """A solid sphere in the plane."""
+    spin = 0.2 * p["m"] * p["R"] ** 2 * v["phi"] ** 2
+    return 0.5 * p["m"] * (v["x"] ** 2 + v["y"] ** 2) + spin - p["m"] * p["g"] * q["y"]
+
+
+def sliding(t, q, v, p):
+    """The velocity of the contact."""
+    return v["x"] - p["R"] * v["phi"]
+
+
+def coulomb(t, q, v, multipliers, p):
+    """Friction against a contact that slides forward."""
+    friction = -p["mu"] * multipliers["ground"]
+    return {"x": friction, "y": 0.0, "phi": -p["R"] * friction}
+
+
+ground = lj.Holonomic(lambda t, q, p: q["y"] - p["R"])
+slides = lj.System(sphere, {"ground": ground}, force=coulomb)
+rolls = lj.System(sphere, {"ground": ground, "grip": lj.Nonholonomic(sliding)})
+grip = lj.slips("grip", on="ground", coefficient=lambda p: p["mu"])
+thrown = lj.Hybrid(
+    {"slides": slides, "rolls": rolls},
+    [lj.Switch("slides", to="rolls", when=lj.sticks(sliding)), lj.Switch("rolls", to="slides", when=grip)],
+)
+
+
+def throw(mu, hybrid=thrown, **options):
+    """A sphere thrown without spin."""
+    q0, v0 = {"x": 0.0, "y": 0.25, "phi": 0.0}, {"x": 3.0, "y": 0.0, "phi": 0.0}
+    return in_phases(hybrid, q0, v0, SPHERE | {"mu": mu}, ts=np.linspace(0.0, 1.0, 5), **options)
+
+
+@pytest.mark.slow
+def test_a_sphere_thrown_sliding():
+    """It rolls from t = 2 v₀/(7 μ g) on with 5 v₀/7; the other phase's multiplier is absent."""
+    when = 6.0 / (7 * G)
+    for rtol in (1e-6, 1e-9, 1e-11):
+        traj = throw(0.25, rtol=rtol)
+        np.testing.assert_allclose(traj.switches.t[0], when / 0.25, rtol=10 * rtol)
+        np.testing.assert_allclose(traj.v["x"][-1], 15 / 7, rtol=10 * rtol)
+    np.testing.assert_allclose(traj.multipliers["ground"], 2.0 * G, rtol=1e-10)
+    assert np.isnan(traj.multipliers["grip"][0]) and abs(traj.multipliers["grip"][-1]) < 1e-9
+    # Twin: friction that drives the sliding never lets it end.
+    pushing = lambda t, q, v, multipliers, p: jax.tree.map(jnp.negative, coulomb(t, q, v, multipliers, p))
+    driven = lj.System(sphere, {"ground": ground}, force=pushing)
+    hybrid = lj.Hybrid({"slides": driven, "rolls": rolls}, thrown.switches)
+    traj = throw(0.25, hybrid=hybrid)
+    assert len(traj.switches) == 0
+
+
+def test_forces_of_multipliers():
+    """Friction enters the equations: a block on an incline, written out, in arrays, and with the careful way."""
+    incline = lj.Holonomic(lambda t, q, p: q["y"] - jnp.tan(p["angle"]) * q["x"])
+
+    def drag(t, q, v, multipliers, p):
+        # λ of y - x tan(angle) is the normal force times cos(angle); the block slides down, to smaller x.
+        normal = multipliers["incline"] / jnp.cos(p["angle"])
+        return {"x": p["mu"] * normal * jnp.cos(p["angle"]), "y": p["mu"] * normal * jnp.sin(p["angle"])}
+
+    kinetic = lambda t, q, v, p: 0.5 * p["m"] * (v["x"] ** 2 + v["y"] ** 2) - p["m"] * p["g"] * q["y"]
+    block = lj.System(kinetic, {"incline": incline}, force=drag)
+    params = {"m": 2.0, "g": G, "mu": 0.25, "angle": 0.7}
+    zero = {"x": 0.0, "y": 0.0}
+    along = G * (np.sin(0.7) - 0.25 * np.cos(0.7))
+    a, multipliers = lj.accelerations(block, 0.0, zero, zero, params)
+    np.testing.assert_allclose([a["x"], a["y"]], [-along * np.cos(0.7), -along * np.sin(0.7)], rtol=1e-14)
+    np.testing.assert_allclose(multipliers["incline"], 2.0 * G * np.cos(0.7) ** 2, rtol=1e-14)
+    traj = lj.integrate(block, zero, zero, params, ts=np.array([0.0, 0.5, 1.0]))
+    np.testing.assert_allclose(traj.q["x"][-1], -0.5 * along * np.cos(0.7), rtol=1e-9)
+    of_mu = jax.jacfwd(lambda mu: lj.accelerations(block, 0.0, zero, zero, params | {"mu": mu})[0]["x"])(0.25)
+    np.testing.assert_allclose(of_mu, G * np.cos(0.7) ** 2, rtol=1e-13)
+    absolute = lj.System(kinetic, {"incline": incline}, force=lambda t, q, v, multipliers, p: {
+        "x": jnp.abs(multipliers["incline"]), "y": 0.0})  # fmt: skip
+    with pytest.raises(ValueError, match="must be linear in the multipliers"):
+        lj.accelerations(absolute, 0.0, zero, zero, params)
+
+
+def test_a_paradox_is_named():
+    """A rod that is pushed into the ground by its own friction (Painlevé): one motion, or none."""
+    tip = lj.Holonomic(lambda t, q, p: q["y"] - p["l"] * jnp.sin(q["angle"]))
+
+    def friction(t, q, v, multipliers, p):
+        force = p["mu"] * multipliers["tip"]
+        return {"x": force, "y": 0.0, "angle": force * p["l"] * jnp.sin(q["angle"])}
+
+    rod = lj.System(
+        lambda t, q, v, p: 0.5 * (v["x"] ** 2 + v["y"] ** 2 + v["angle"] ** 2 / 3) - p["g"] * q["y"],
+        {"tip": tip},
+        force=friction,
+    )
+    angle = np.arctan(2.0)
+    q, v = {"x": 0.0, "y": np.sin(angle), "angle": angle}, {"x": -1.0, "y": 0.0, "angle": 0.0}
+    # 1 + 3 cos² - 3 μ sin cos of the angle is zero at μ = 4/3, its least value.
+    _, multipliers = lj.accelerations(rod, 0.0, q, v, {"l": 1.0, "g": G, "mu": 1.3})
+    np.testing.assert_allclose(multipliers["tip"], G / (1.6 - 1.2 * 1.3), rtol=1e-12)
+    with pytest.raises(ValueError, match="Painlevé"):
+        lj.accelerations(rod, 0.0, q, v, {"l": 1.0, "g": G, "mu": 1.4})
+
+
+@pytest.mark.slow
+def test_two_balls_collide():
+    """The impulse is that of the metric of M."""
+    balls = lj.System(lambda t, q, v, p: 0.5 * jnp.sum(p["m"] * v**2))
+    apart = lj.touches(lambda t, q, p: q[1] - q[0], restitution=lambda speed: 0.5 + 0.0 * speed)
+    hybrid = lj.Hybrid({"apart": balls}, [lj.Switch("apart", to="apart", when=apart)])
+    m, v0 = np.array([1.0, 3.0]), np.array([2.0, -1.0])
+
+    def ends(v0):
+        ts = np.array([0.0, 1.0])
+        return lj.integrate(hybrid, np.array([0.0, 1.0]), v0, {"m": m}, ts=ts, estimate_error=False).q[-1]
+
+    when, mean, closing = 1.0 / 3.0, m @ v0 / 4.0, 3.0
+    after = mean + 0.5 * closing * np.array([-m[1], m[0]]) / 4.0
+    np.testing.assert_allclose(ends(v0), v0[0] * when + after * (1.0 - when), rtol=1e-12)
+
+
+@pytest.mark.slow
+def test_stick_and_slip():
+    """A block on a belt, held by a spring: it sticks, slips and sticks again; the period against its quadrature."""
+    params = {"k": 4.0, "belt": 0.5, "mu_s": 0.4, "mu_k": 0.2, "g": G}
+    oscillator = lambda t, q, v, p: 0.5 * (v["x"] ** 2 + v["y"] ** 2) - 0.5 * p["k"] * q["x"] ** 2 - p["g"] * q["y"]
+    table = lj.Holonomic(lambda t, q, p: q["y"])
+    lags = lambda t, q, v, p: p["belt"] - v["x"]
+    drag = lambda t, q, v, multipliers, p: {"x": p["mu_k"] * multipliers["table"], "y": 0.0}
+    slipping = lj.System(oscillator, {"table": table}, force=drag)
+    sticking = lj.System(oscillator, {"table": table, "belt": lj.Nonholonomic(lambda t, q, v, p: v["x"] - p["belt"])})
+    hold = partial(lj.slips, "belt", on="table", coefficient=lambda p: p["mu_s"])
+    both = lj.Hybrid(
+        {"sticks": sticking, "slips": slipping},
+        [lj.Switch("sticks", to="slips", when=hold()), lj.Switch("slips", to="sticks", when=lj.sticks(lags))],
+    )
+    traj = in_phases(both, {"x": 0.0, "y": 0.0}, {"x": 0.5, "y": 0.0}, params, ts=np.linspace(0.0, 12.0, 61))
+    t = np.asarray(traj.switches.t)[: len(traj.switches)]
+    # It slips about x = μ_k g/k from x = μ_s g/k at the belt's speed, until it has that again; then it rides back.
+    w, off = 2.0, (0.4 - 0.2) * G / 4.0
+    slip, ride = 2 * (np.pi - np.arctan(w * off / 0.5)) / w, 2 * off / 0.5
+    np.testing.assert_allclose(np.diff(t)[0], slip, rtol=1e-9)
+    np.testing.assert_allclose(t[3:] - t[1:-2], slip + ride, rtol=1e-9)
+
+
+@pytest.mark.slow
+def test_a_body_that_rests_is_not_taken_to_fly():
+    """It would fall through what it rests on: nothing moves away from the guard, and that is said."""
+    touching = lj.Hybrid({"flying": ball}, [lj.Switch("flying", to="flying", when=lj.touches(height, restitution=0.0))])
+    ts = np.array([0.0, 1.0])
+    with pytest.raises(RuntimeError, match="no phase lasts"):
+        lj.integrate(touching, 0.0, 0.0, {"g": G}, ts=ts)
+    with pytest.raises(RuntimeError, match="not seen to cross it"):
+        lj.integrate(touching, 0.0, 1e-18, {"g": G}, ts=ts)
+
+
+@pytest.mark.slow
+def test_two_guards_at_once():
+    """A ball that falls into a corner: two walls at one time, one after the other."""
+    free = lj.System(lambda t, q, v, p: 0.5 * jnp.sum(v**2))
+    walls = [lj.touches(lambda t, q, p, i=i: q[i], restitution=1.0) for i in (0, 1)]
+    corner = lj.Hybrid({"free": free}, [lj.Switch("free", to="free", when=wall) for wall in walls])
+    traj = in_phases(corner, np.ones(2), -np.ones(2), ts=np.array([0.0, 3.0]))
+    np.testing.assert_allclose(traj.q[-1], 2.0, rtol=1e-13)
+    np.testing.assert_allclose(traj.switches.t[:2], 1.0, rtol=1e-14)
+    assert len(traj.switches) == 2
