@@ -24,6 +24,7 @@ from lagjax.mechanics import coordinates
 from lagjax.mechanics.arguments import OF_POSITION, OF_STATE, takes_of
 from lagjax.mechanics.constraints import Holonomic, count, zero_multipliers
 from lagjax.mechanics.coordinates import State
+from lagjax.mechanics.hybrid import Hybrid
 from lagjax.mechanics.memory import kinds, remembered, shape_of
 from lagjax.mechanics.outside import first_alike, up_to_date
 from lagjax.mechanics.reactions import force_at, reacts
@@ -32,6 +33,12 @@ from lagjax.mechanics.system import System
 
 def looked_at(system: System, s: State) -> System:
     """The system as its functions are now, which `check_functions` found to be in order; the first one of its kind."""
+    if isinstance(system, Hybrid):
+        raise TypeError(
+            "this is of one system, and a lj.Hybrid has one for each of its phases.\n"
+            f"Fix: hybrid.systems[{len(system.names) - 1}] for '{system.names[-1]}'; print(hybrid) shows how "
+            "the phases follow each other."
+        )
     now = up_to_date(system)
     remembered(system, (check_functions, now.read, kinds(s)), lambda: check_functions(now, *s))
     return first_alike(system, now) if is_eager() else now

@@ -76,8 +76,8 @@ def touches(gap: Callable, restitution: Callable | ArrayLike | None = None) -> T
     >>> ball = lj.System(lambda t, q, v, params: 0.5 * v**2 - 10.0 * q)
     >>> bounce = lj.Switch("flying", to="flying", when=touches(lambda t, q, params: q, restitution=0.5))
     >>> traj = lj.integrate(lj.Hybrid({"flying": ball}, [bounce]), 5.0, 0.0, ts=jnp.array([0.0, 1.5]))
-    >>> print(traj.q[-1].round(9), traj.switches.v_after[0].round(9), traj.switches.impulse[0].round(9))
-    1.25 5.0 15.0
+    >>> print(f"{traj.q[-1]:.6f} {traj.switches.v_after[0]:.6f} {traj.switches.impulse[0]:.6f}")
+    1.250000 5.000000 15.000000
 
     **Arguments:**
 

@@ -146,7 +146,7 @@ def integrate(
     for phase in phases_of(system):
         warn_of_odd_dissipation(phase.dissipation, state)
     if isinstance(system, Hybrid):
-        refuse_beside_switches(system, state, events=events, event=event, jump_ts=jump_ts)
+        refuse_beside_switches(system, state, ts, adjoint, events=events, event=event, jump_ts=jump_ts)
         guards = phases_in(system, state)
     else:
         guards = guards_of(crossings_of(events, event), system, state)

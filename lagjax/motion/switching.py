@@ -3,6 +3,7 @@
 from collections.abc import Callable, Mapping
 from typing import Any
 
+import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -21,6 +22,7 @@ from lagjax.mechanics.hybrid import Hybrid, Switch, replace_fields
 from lagjax.mechanics.memory import shape_of
 from lagjax.mechanics.outside import first_guard_alike
 from lagjax.mechanics.system import System
+from lagjax.motion.backward import runs_backward
 from lagjax.motion.crossings import Crossing, guards_of
 from lagjax.motion.legs import Phase
 
@@ -78,15 +80,22 @@ def check_phases(hybrid: Hybrid, start: State):
                 )
 
 
-def refuse_beside_switches(hybrid: Hybrid, start: State, **given):
+def refuse_beside_switches(hybrid: Hybrid, start: State, ts, adjoint, **given):
     """Raise where an argument has no meaning for a motion in phases."""
     check_phases(hybrid, start)
+    if runs_backward(ts):
+        raise ValueError(
+            "a motion in phases runs forward: what an impact has lost is not known.\nFix: times that increase."
+        )
+    if isinstance(adjoint, diffrax.BacksolveAdjoint):
+        raise ValueError(
+            "BacksolveAdjoint does not go back through switches.\nFix: leave adjoint out (both modes work)."
+        )
     for name, value in given.items():
-        if value:
+        if value is not None and not (isinstance(value, Mapping) and not value):
             raise ValueError(
-                f"{name} is not for a motion in phases.\n"
-                "Fix: a switch from a phase to itself, which resets nothing, records where something happens: "
-                'lj.Switch("flying", to="flying", when=lambda t, q, v, params: v["y"]).'
+                f"{name} is not for a motion in phases yet.\n"
+                "Fix: leave it out, or integrate the phase alone, hybrid.systems[0]."
             )
 
 

@@ -19,7 +19,7 @@ def dense_equations(system, q, v, params):
     x, unflatten = coordinates.flatten(q)
     u, _ = coordinates.flatten(v)
     linear = mass_and_forcing(system, t, x, u, params, unflatten)
-    return (*linear, *constraints.acceleration_rows(system, t, x, u, params, unflatten))
+    return (linear.mass, linear.forcing, *constraints.acceleration_rows(system, t, x, u, params, unflatten))
 
 
 def dense_solution(system, q, v, params):
