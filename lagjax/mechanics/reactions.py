@@ -39,12 +39,12 @@ class Reactions(NamedTuple):
 
 def reacts(system) -> bool:
     """Whether the force of a system depends on multipliers."""
-    return system.force is not None and takes_of(system.force) is WITH_MULTIPLIERS and bool(system.constraints)
+    return system.force is not None and takes_of(system.force) == WITH_MULTIPLIERS and bool(system.constraints)
 
 
 def force_at(system, t, q, v, params, multipliers):
     """The generalized force that L does not contain, like q; `multipliers` stacked."""
-    if takes_of(system.force) is not WITH_MULTIPLIERS:
+    if takes_of(system.force) != WITH_MULTIPLIERS:
         return system.force(t, q, v, params)
     return system.force(t, q, v, constraints.split(system, multipliers, t, q, v, params), params)
 

@@ -272,7 +272,7 @@ def guards_of(crossings: Mapping[str, Crossing], system: System, start: State, h
         given = dict(zip(OF_STATE, start)) | {"multipliers": multipliers}
         functions.append(lift_function(guard, tuple(given[name] for name in takes)))
         of_crossing = crossing.direction, crossing.terminal, crossing.most
-        of_guards.append(Kind(name, *of_crossing, takes is WITH_MULTIPLIERS, long, read, holds))
+        of_guards.append(Kind(name, *of_crossing, takes == WITH_MULTIPLIERS, long, read, holds))
     return Guards(tuple(functions), tuple(of_guards))
 
 
@@ -283,7 +283,7 @@ def _looked_at(name, guard, system, start):
     call = Call("guard", guard, takes, f" of event '{name}'")
     _check(call, given)
     # The equations give the multipliers.
-    return takes, multipliers, takes is WITH_MULTIPLIERS or _length(call, given) > LONG
+    return takes, multipliers, takes == WITH_MULTIPLIERS or _length(call, given) > LONG
 
 
 def _length(call, given):

@@ -118,7 +118,7 @@ def _reset(switch: Switch, hybrid, system, start) -> Reset:
     reset = _reset_alone(switch, hybrid, system, start)
     if switch.rest is None:
         return reset
-    if takes_of(switch.when) is not OF_STATE:
+    if takes_of(switch.when) != OF_STATE:
         raise ValueError(
             f"the switch {switch.in_words()} has rest=, and its guard takes multipliers: how fast it opens is not "
             "seen by velocities.\nFix: rest= with lj.touches(gap) alone."
