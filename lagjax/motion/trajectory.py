@@ -36,9 +36,6 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
         "A step could not be solved, could not be returned to the constraints, or lost the state in its error."
     )
     tolerance_too_small = "The tolerance is below the round-off of the state's dtype."
-    too_many_switches = "There were more switches than most_switches."
-    guard_not_seen = "A guard is below zero, and was not seen to cross it: its phase began on it, and hardly left it."
-    guard_below_zero = "A guard of the first phase is below zero at the start."
     unordered = (
         "The times do not increase throughout, or dt0 or max_step is not positive. (Times that decrease are taken "
         "where they are known while JAX is tracing: a NumPy array.)"
@@ -52,6 +49,9 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
         "shorten the steps of its controller is not known."
     )
     misfit = "The residuals of a fit are no errors of measurement: they contradict sigma, or follow a curve."
+    too_many_switches = "There were more switches than most_switches."
+    guard_not_seen = "A guard is below zero, and was not seen to cross it: its phase began on it, and hardly left it."
+    guard_below_zero = "A guard of the first phase is below zero at the start."
 
 
 # Diffrax has no words for a success, and equinox no other place for them.
