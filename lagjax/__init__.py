@@ -33,6 +33,9 @@ from lagjax.motion.contacts import releases, slips, sticks, touches
 from lagjax.motion.crossings import Crossing, Crossings, EventWarning
 from lagjax.motion.hybrid_trajectory import HybridTrajectory, Switches
 from lagjax.motion.integrate import integrate
+from lagjax.motion.ledger import EnergyLedger, energy_ledger
+from lagjax.motion.phase_graph import HybridExplanation
+from lagjax.motion.sections import PoincareSection, periods, poincare, turning_points
 from lagjax.motion.trajectory import RESULTS, AccuracyWarning, Moment, Trajectory
 from lagjax.numerics.nystrom import Nystrom8, Nystrom12
 from lagjax.numerics.radau import Radau5
@@ -90,10 +93,15 @@ __all__ = [
     "consistent_state",
     "explain",
     "Explanation",
+    "HybridExplanation",
     "integrate",
     "Crossing",
     "Crossings",
     "EventWarning",
+    "poincare",
+    "PoincareSection",
+    "periods",
+    "turning_points",
     "Dopri8",
     "Tsit5",
     "Nystrom8",
@@ -103,6 +111,8 @@ __all__ = [
     "HybridTrajectory",
     "Switches",
     "Moment",
+    "energy_ledger",
+    "EnergyLedger",
     "Animation",
     "RESULTS",
     "AccuracyWarning",

@@ -122,6 +122,31 @@ def phase_portrait(panels: dict[str, tuple[list[tuple[np.ndarray, np.ndarray]], 
     return fig
 
 
+def section(panels: dict[tuple[str, str], tuple[list[tuple[np.ndarray, np.ndarray]], bool]], note: str):
+    """Draw points, one panel a pair of names, one colour a motion.
+
+    **Arguments:** `panels` by the names to the right and upward: [(x (C,), y (C,)) of each motion], and whether x is an
+    angle. `note`: what stands above, for instance that these are not all; may be empty.
+
+    **Returns:** a matplotlib `Figure`.
+    """
+    columns = min(3, len(panels))
+    fig, axes = figure(-(-len(panels) // columns), columns, size=(4.2, 3.4))
+    for axis, ((to_the_right, upward), (motions, is_angle)) in zip(axes.flat, panels.items()):
+        # Small enough for curves of many points to be told from areas.
+        size = np.clip(80 / np.sqrt(1 + sum(len(x) for x, _ in motions)), 1.2, 5.0)
+        for i, (x, y) in enumerate(motions):
+            axis.plot(x, y, "o", markersize=size, markeredgewidth=0, color=COLOURS[i % len(COLOURS)])
+        if is_angle:
+            _ticks_in_pi(axis)
+        axis.set(xlabel=to_the_right, ylabel=upward)
+    for axis in axes.flat[len(panels) :]:
+        axis.set_visible(False)
+    if note:
+        fig.suptitle(note, fontsize=9)
+    return fig
+
+
 def _cut_at_half_turns(q, v):
     """An angle brought between -π and π, the curve cut (by NaN) where it leaves on one side and enters on the other."""
     turn = np.floor((q + np.pi) / (2 * np.pi))
@@ -284,4 +309,55 @@ def maps(axes: dict[str, np.ndarray], panels: dict[str, np.ndarray]):
         fig.colorbar(shown[0], ax=list(row), label=name)
     for axis in grid[-1]:
         axis.set_xlabel(across)
+    return fig
+
+
+def stacked(t, parts: dict[str, np.ndarray], total: np.ndarray, label: str):
+    """Draw parts against time, stacked, what is above zero upward and what is below downward; and their total.
+
+    **Arguments:** `t` (T,); `parts` by name, (T,); `total` (T,), drawn as a line with its `label`.
+
+    **Returns:** a matplotlib `Figure`.
+    """
+    fig, axes = figure(size=(6.4, 3.2))
+    axis, up, down = axes[0, 0], np.zeros(len(t)), np.zeros(len(t))
+    for i, (name, values) in enumerate(parts.items()):
+        colour = COLOURS[i % (len(COLOURS) - 1)]
+        higher, lower = up + np.maximum(values, 0), down + np.minimum(values, 0)
+        axis.fill_between(t, up, higher, color=colour, alpha=0.5, linewidth=0, label=name)
+        axis.fill_between(t, down, lower, color=colour, alpha=0.5, linewidth=0)
+        up, down = higher, lower
+    axis.plot(t, total, color=COLOURS[-1], linewidth=1.4, label=label)
+    axis.axhline(0.0, color=COLOURS[-1], linewidth=0.6)
+    axis.set(xlabel="t", ylabel="work")
+    axis.legend(fontsize=8, frameon=False, loc="center left", bbox_to_anchor=(1.0, 0.5))
+    return fig
+
+
+def graph(names: Sequence[str], arrows: Sequence[tuple[str, str, str]]):
+    """Draw names on a circle, and arrows between them, with their labels.
+
+    **Arguments:** `names`; `arrows`: (from, to, label) each; one from a name to itself is a loop.
+
+    **Returns:** a matplotlib `Figure`.
+    """
+    fig, axes = figure(size=(5.2, 3.8))
+    axis, n = axes[0, 0], len(names)
+    turn = np.pi / 2 - 2 * np.pi * np.arange(n) / n
+    places = dict(zip(names, np.stack([np.cos(turn), 0.8 * np.sin(turn)], axis=1) if n > 1 else np.zeros((1, 2))))
+    for i, (start, end, label) in enumerate(arrows):
+        a, b = places[start], places[end]
+        middle, curve, short = (a + b) / 2 + 0.125 * np.array([(b - a)[1], (a - b)[0]]), "arc3,rad=0.25", 22
+        if start == end:
+            out = a / np.hypot(*a) if np.any(a) else np.array([0.0, 1.0])
+            side = 0.22 * np.array([out[1], -out[0]])
+            a, b, middle, curve, short = a - side, a + side, a + 0.37 * out, "arc3,rad=-1.4", 10
+        arrow = {"arrowstyle": "-|>", "connectionstyle": curve, "shrinkA": short, "shrinkB": short}
+        axis.annotate("", b, a, arrowprops=arrow | {"color": COLOURS[i % len(COLOURS)]})
+        axis.annotate(label, middle, ha="center", va="center", fontsize=8, bbox=ON_MARKS)
+    for name, (x, y) in places.items():
+        box = {"boxstyle": "round,pad=0.5", "facecolor": "white", "edgecolor": COLOURS[-1]}
+        axis.text(x, y, name, ha="center", va="center", bbox=box)
+    axis.set(xlim=(-1.4, 1.4), ylim=(-1.3, 1.3))
+    axis.set_axis_off()
     return fig

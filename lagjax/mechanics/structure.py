@@ -193,14 +193,15 @@ def what_changes_jacobi_integral(system, t, q, v, params) -> Iterator[str]:
     for name, c in system.constraints.items():
         if not isinstance(c, Holonomic):
             yield f"constraint '{name}' is one of velocities"
-    if _sees_time(system.lagrangian, t, q, v, params):
+    if sees_time(system.lagrangian, t, q, v, params):
         yield "L depends on t"
     for name, c in system.constraints.items():
-        if isinstance(c, Holonomic) and _sees_time(_of_state(c), t, q, v, params):
+        if isinstance(c, Holonomic) and sees_time(_of_state(c), t, q, v, params):
             yield f"constraint '{name}' depends on t"
 
 
-def _sees_time(function, *state):
+def sees_time(function, *state) -> bool:
+    """Whether a function of (t, q, v, params) depends on t."""
     return _dependence(function, state, lambda args: args[0]) != Depends.NOT
 
 

@@ -72,7 +72,8 @@ def in_either_direction(system, q0, v0, params, ts, guards, settings, backward: 
     reflected = trajectory_of(
         reflect_system(system), q0, _negative(v0), params, -ts, guards, _reflect_settings(settings)
     )
-    arrays, static = pack(system, params, reflected.static.how)
+    asked = reflected.asked._replace(stepsize_controller=settings.controller, jump_ts=settings.jump_ts)
+    arrays, static = pack(system, params, asked, reflected.static.how)
     events = {name: replace(found, t=-found.t, v=_negative(found.v)) for name, found in reflected.events.items()}
     v, end = _negative(reflected.v), reflect_moment(reflected.end)
     return replace(reflected, t=ts, v=v, end=end, events=events, arrays=arrays, static=static)

@@ -11,11 +11,13 @@ from lagjax.mechanics.constraints import Holonomic
 from lagjax.mechanics.diagnosis import dependencies, describe, equation_names, explain_failure, listed
 from lagjax.mechanics.equations import equations_of
 from lagjax.mechanics.first_call import looked_at
+from lagjax.mechanics.hybrid import Hybrid
 from lagjax.mechanics.saddle_point import examined
 from lagjax.mechanics.structure import Structure, is_free_of_velocities, structure
 from lagjax.mechanics.system import System
 from lagjax.motion.consistency import departures, to_manifold, within
 from lagjax.motion.consistent_state import consistent_state
+from lagjax.motion.phase_graph import HybridExplanation, explained
 from lagjax.numerics.rank import independent_rows
 
 # A state is taken for one on the constraints that was rounded, and moved there, where it is this near.
@@ -49,7 +51,7 @@ class Explanation:
         return "\n".join(["System", *(f"  {label:<{width}}  {text}" for label, text in self.rows)])
 
 
-def explain(system: System, q, v, params=None, *, t=0.0) -> Explanation:
+def explain(system: System | Hybrid, q, v, params=None, *, t=0.0) -> Explanation | HybridExplanation:
     """Say what a system amounts to at a state: freedoms, dependent constraints, mass matrix, problems.
 
     >>> import lagjax as lj
@@ -72,13 +74,19 @@ def explain(system: System, q, v, params=None, *, t=0.0) -> Explanation:
     **Arguments:** `q` and `v` alike, `params` as the system takes it, `t` scalar. A state off the constraints is moved
     onto them first, and told where it was not near: dependent constraints agree only there.
 
-    **Returns:** an `Explanation`.
+    **Returns:** an `Explanation`; of a `Hybrid` a `HybridExplanation`: its phases, each explained, and its graph.
 
     **Raises:** `TypeError`, `ValueError` for a state of the wrong shape or dtype, or an L that is not scalar.
 
     Source: García de Jalón & Bayo, *Kinematic and Dynamic Simulation of Multibody Systems*, §3.2 (rank and freedoms).
     """
     s = coordinates.state(t, q, v, params)
+    if isinstance(system, Hybrid):
+        return explained(system, {name: _explain(phase, s) for name, phase in zip(system.names, system.systems)}, s)
+    return _explain(system, s)
+
+
+def _explain(system: System, s: coordinates.State) -> Explanation:
     system = looked_at(system, s)
     place = _on_the_constraints(system, s) if system.constraints else _Place(s)
     s = place.state

@@ -60,7 +60,7 @@ def _raise_in_phase(trajectory, start, settings) -> NoReturn:
         at = lambda tree: jax.tree.map(lambda x: np.asarray(x)[count - 1], tree)
         entered = State(*at((switches.t, switches.q_after, switches.v_after)), trajectory.params)
     there = f"in phase '{hybrid.names[phase]}', entered at t = {float(entered.t):.9g}: "
-    arrays, static = pack(hybrid.systems[phase], trajectory.params, trajectory.static.how)
+    arrays, static = pack(hybrid.systems[phase], trajectory.params, trajectory.asked, trajectory.static.how)
     fields = {
         name: getattr(trajectory, name) for name in ("q", "v", "end", "stats", "departure", "result", "tolerance")
     }

@@ -28,7 +28,7 @@ from lagjax.motion.hybrid_trajectory import HybridTrajectory
 from lagjax.motion.legs import solved_in_legs
 from lagjax.motion.one_solve import solved
 from lagjax.motion.reported import report_settled
-from lagjax.motion.trajectory import How, Trajectory, pack
+from lagjax.motion.trajectory import Asked, How, Trajectory, pack
 from lagjax.numerics.evaluations import evaluations_a_step
 from lagjax.numerics.nystrom import Nystrom, Nystrom12
 from lagjax.numerics.runge_kutta import Dopri8, in_our_form
@@ -155,8 +155,9 @@ def _trajectory_of(*problem):
 
 def _trajectory(system, q0, v0, params, ts, guards, settings):
     """The trajectory, and whether it is settled: what was taken for regular failed for no other reason than that."""
-    asked, method = settings.method, method_of(settings, system, ts[0], q0, v0, params)
-    how = _how(method, asked, settings, isinstance(system, Hybrid))
+    s, method = settings, method_of(settings, system, ts[0], q0, v0, params)
+    asked = Asked(s.method, s.controller, s.dt0, s.max_step, s.jump_ts, s.drift)
+    how = _how(method, s.method, settings, isinstance(system, Hybrid))
     settings = eqx.tree_at(lambda s: s.method, settings, method, is_leaf=lambda x: x is None)
     # Derivatives flow to the floating arrays of these; the settings are constants.
     x, rest = eqx.partition((system, q0, v0, params, ts, guards, settings.jump_ts), eqx.is_inexact_array)
@@ -176,7 +177,7 @@ def _trajectory(system, q0, v0, params, ts, guards, settings):
         fields = solve_in_both_modes(of_arrays, x, fixed)
     else:
         fields = of_arrays(x, fixed, settings.adjoint, True)
-    arrays, described = pack(system, params, how)
+    arrays, described = pack(system, params, asked, how)
     settled = fields.pop("settled")
     of = HybridTrajectory if isinstance(system, Hybrid) else Trajectory
     return of(t=ts, **fields, arrays=arrays, static=described), settled

@@ -85,6 +85,17 @@ class How(NamedTuple):
     steps: str
 
 
+class Asked(NamedTuple):
+    """What `integrate` was asked for beside the motion and its tolerances, each as it takes it."""
+
+    method: diffrax.AbstractSolver | None
+    stepsize_controller: diffrax.AbstractStepSizeController | None
+    dt0: Array | None
+    max_step: Array | None
+    jump_ts: Array | None
+    drift: str
+
+
 class Static(NamedTuple):
     """What of a trajectory is not an array: it must be hashable, so that JAX can carry it along."""
 
@@ -150,6 +161,10 @@ class Trajectory(eqx.Module):
     @property
     def params(self) -> PyTree:
         return self._problem()[1]
+
+    @property
+    def asked(self) -> Asked:
+        return self._problem()[2]
 
     def _problem(self):
         static = jax.tree.unflatten(self.static.structure, self.static.parts)
@@ -277,9 +292,9 @@ def worst_drift(system, t, q, v, params):
     return jnp.nanmax(jnp.abs(h - h[0])) / jnp.where(largest > 0, largest, 1.0)
 
 
-def pack(system, params, how: How) -> tuple[PyTree, Static]:
-    """Split (system, params) into arrays and hashable rest."""
-    arrays, static = eqx.partition((system, params), eqx.is_array)
+def pack(system, params, asked: Asked, how: How) -> tuple[PyTree, Static]:
+    """Split (system, params, asked) into arrays and hashable rest."""
+    arrays, static = eqx.partition((system, params, asked), eqx.is_array)
     return arrays, _static(static, how)
 
 

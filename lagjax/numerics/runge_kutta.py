@@ -48,7 +48,7 @@ class ExplicitRungeKutta(diffrax.AbstractAdaptiveSolver):
         increments, rate = [terms.prod(first, control)], first
         for weights, c in zip(tableau.a_lower, tableau.c):
             # Rounded differently, the last stage would not be at the time of the next step's first.
-            t = t1 if c == 1 else t0 + c * (t1 - t0)
+            t = t1 if c == 1 else t0 + float(c) * (t1 - t0)
             rate = terms.vf(t, weighted_sum(y0, weights, increments), args)
             increments.append(terms.prod(rate, control))
         y1 = weighted_sum(y0, tableau.b_sol, increments)

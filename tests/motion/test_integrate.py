@@ -204,6 +204,17 @@ def test_event_time_gradient():
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("method", [None, lj.Tsit5(), lj.Dopri8()], ids=["by default", "Tsit5", "Dopri8"])
+def test_float32_with_explicit_time(method):
+    """Stages at times of their own stay in float32, also where JAX has float64."""
+    driven = lj.System(lambda t, q, v, params: 0.5 * v**2 + params * q * jnp.sin(3 * t))
+    ts = np.array([0.0, 1.0, 2.0], np.float32)
+    traj = lj.integrate(driven, np.float32(0.0), np.float32(0.0), np.float32(2.0), ts=ts, method=method)
+    assert traj.q.dtype == jnp.float32
+    np.testing.assert_allclose(traj.q, 2 * (ts / 3 - np.sin(3 * ts) / 9), atol=1e-4)
+
+
+@pytest.mark.slow
 def test_float32_says_what_it_is():
     """float32 runs in float32 at its own default tolerance, keeps the constraint to its round-off and says so."""
     single = lambda tree: jax.tree.map(np.float32, tree)

@@ -1,0 +1,283 @@
+"""The works of the forces of one motion: powers at its instants, and their integrals between them.
+
+The motion is run once more, by the same method with the same tolerances, with outputs at the nodes of a quadrature,
+which is refined until it is better than the motion.
+
+Source: Piessens et al., *QUADPACK* (1983), §2.2.
+"""
+
+import warnings
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PyTree
+
+from lagjax.mechanics import constraints, coordinates
+from lagjax.mechanics.compiled import compiled
+from lagjax.mechanics.hybrid import phases_of
+from lagjax.mechanics.reactions import force_at
+from lagjax.mechanics.structure import sees_time
+from lagjax.motion.hybrid_trajectory import HybridTrajectory
+from lagjax.motion.integrate import integrate
+from lagjax.motion.trajectory import ENDED_WELL, Trajectory, is_among, message
+from lagjax.numerics import quadrature
+
+FORCE, DISSIPATION, TIME = "force", "dissipation", "explicit time"
+# How often the intervals that are not good enough are halved, and up to how many of them.
+HALVINGS, MOST_INTERVALS = 12, 10_000
+# The outer nodes of an interval are two thousandths of it from its ends.
+APART = 2e3
+
+
+class Work(NamedTuple):
+    """What one source gives to a motion, at every output.
+
+    `power`, like v: by coordinate, `[L]/[t]`; `work`, like v: its integral from the first output on, `[L]`. Of explicit
+    time, which belongs to no coordinate, they are (T,). `total` (T,): the work of all coordinates.
+    """
+
+    power: PyTree[Float[Array, "T ..."]]
+    work: PyTree[Float[Array, "T ..."]]
+    total: Float[Array, " T"]
+
+
+class Motion:
+    """One motion that is known, in NumPy's arrays: its instants, the phase of each, and the instants of its switches.
+
+    `t`, `q`, `v`, `multipliers`, `phase`: outputs, and the end where it lies `beyond` them. `systems`: those whose
+    forces are accounted for, a phase each; `forward`: 1, or -1 where time decreases. `sources`: by name how many
+    numbers its power has. `switch_times` (S,), and `entered` (S + 1,): the phases in their order.
+    """
+
+    def __init__(self, trajectory: Trajectory, accounted):
+        self.trajectory, self.systems, self.params = trajectory, phases_of(accounted), trajectory.params
+        hybrid = isinstance(trajectory, HybridTrajectory)
+        rows, end = jax.tree.map(np.asarray, (trajectory.rows(), trajectory.end))
+        states = [x.reshape(len(x), -1) for x in jax.tree.leaves((rows["q"], rows["v"]))]
+        reached = np.all(np.isfinite(np.concatenate(states, axis=1)), axis=1)
+        if not reached[:1].all():
+            raise ValueError(
+                f"the motion did not get beyond its start: {message(trajectory.result)}\nFix: see traj.result."
+            )
+        count = int(np.argmin(reached)) if not reached.all() else len(reached)
+        rows = jax.tree.map(lambda x: x[:count], rows)
+        self.forward = -1.0 if trajectory.t[-1] < trajectory.t[0] else 1.0
+        self.beyond = bool(self.forward * (end.t - rows["t"][-1]) > 0)
+        if self.beyond:
+            last = {"t": end.t, "q": end.q, "v": end.v, "multipliers": end.multipliers}
+            if hybrid:
+                last["phase"] = np.int32(trajectory.last_phase())
+            rows = jax.tree.map(lambda x, y: np.concatenate([x, y[None].astype(x.dtype)]), rows, last)
+        self.t, self.q, self.v, self.multipliers = (rows[name] for name in ("t", "q", "v", "multipliers"))
+        self.phase = rows.get("phase", np.zeros(len(self.t), int))
+        self.switches, self.switch_times, self.entered = None, np.zeros(0), np.zeros(1, int)
+        if isinstance(trajectory, HybridTrajectory):
+            self.switches, count = trajectory.switches, len(trajectory.switches)
+            self.switch_times, to = np.asarray(self.switches.t)[:count], np.asarray(self.switches.to)[:count]
+            self.entered = np.array([int(trajectory.system.first), *to])
+        self.sources: dict[str, int] = {}
+        for system in self.systems:
+            self.sources |= _sources(system, self._at(0), self.params)
+
+    def _at(self, row):
+        return jax.tree.map(lambda x: x[row], (self.t, self.q, self.v))
+
+    def energies(self) -> "Energies":
+        """At each instant, by the system of its own phase."""
+        return self._energies(self.phase, self.t, self.q, self.v)
+
+    def _energies(self, phase, *state):
+        found = Energies(*(np.full(len(phase), np.nan, self.t.dtype) for _ in Energies._fields))
+        for i in np.unique(phase):
+            values = _energies(self.systems[i], *state, self.params)
+            found = Energies(*(np.where(phase == i, new, old) for new, old in zip(values, found)))
+        return found
+
+    def works(self, allowed) -> tuple[dict[str, Work], float]:
+        """The work of each source, and what the errors of their integrals add up to: what is allowed, or more."""
+        powers = self._powers(self.phase, self.t, self.q, self.v, self.multipliers)
+        works, error = self._integrated(allowed) if len(self.t) > 1 and self.sources else (powers, 0.0)
+        return {name: self._work(name, powers[name], works[name]) for name in self.sources}, error
+
+    def _powers(self, phase, t, q, v, multipliers):
+        """By source, (rows, n)."""
+        powers = {name: np.zeros((len(t), size), self.t.dtype) for name, size in self.sources.items()}
+        for i in np.unique(phase):
+            system = self.systems[i]
+            # Other phases have other multipliers.
+            of_phase = {name: multipliers[name] for name in system.constraints}
+            for name, power in _powers(system, t, q, v, of_phase, self.params).items():
+                powers[name] = np.where((phase == i)[:, None], power, powers[name])
+        return powers
+
+    def _integrated(self, allowed):
+        """The works until each instant, (T, n) by source, and what their errors add up to."""
+        knots = self._knots()
+        apart = np.abs(np.diff(knots)) > self._shortest()
+        a, b = self._cut(knots[:-1][apart], knots[1:][apart])
+        done, span, names = [], abs(float(self.t[-1] - self.t[0])), list(self.sources)
+        for halving in range(HALVINGS + 1):
+            powers = self._again(a, b)
+            rows = np.concatenate([powers[name] for name in names], axis=1)
+            sums, errors, noise = quadrature.integrals(rows.reshape(len(a), len(quadrature.NODES), -1), a, b)
+            good = errors <= np.maximum(allowed * np.abs(b - a) / span, noise)
+            good |= np.abs(b - a) < 2 * self._shortest()
+            if halving == HALVINGS or 2 * np.sum(~good) > MOST_INTERVALS:
+                good[:] = True
+            done.append((b[good], sums[good], errors[good]))
+            if good.all():
+                break
+            middle = 0.5 * (a + b)[~good]
+            a, b = np.concatenate([a[~good], middle]), np.concatenate([middle, b[~good]])
+        ends, sums, errors = (np.concatenate(x) for x in zip(*done))
+        order = np.argsort(self.forward * ends)
+        until = np.concatenate([np.zeros((1, sums.shape[1])), np.cumsum(sums[order], axis=0)])
+        place = np.searchsorted(self.forward * ends[order], self.forward * self.t, side="right")
+        columns = np.cumsum([0, *self.sources.values()])
+        works = {name: until[place, low:high] for name, low, high in zip(names, columns, columns[1:])}
+        return works, float(np.sum(errors))
+
+    def _knots(self):
+        """The instants, and the times between them at which forces may jump."""
+        jumps = self.trajectory.asked.jump_ts
+        jumps = [] if jumps is None else np.asarray(jumps)
+        low, high = sorted((self.t[0], self.t[-1]))
+        more = [t for t in (*self.switch_times, *jumps) if low < t < high]
+        return self.forward * np.unique(self.forward * np.concatenate([self.t, np.asarray(more, self.t.dtype)]))
+
+    def _shortest(self):
+        """Of an interval whose nodes can be told apart."""
+        return APART * np.finfo(self.t.dtype).eps * np.max(np.abs(self.t))
+
+    def _cut(self, a, b):
+        """Intervals, cut where there are fewer of them than the motion had steps."""
+        steps = int(self.trajectory.stats["num_accepted_steps"])
+        span = np.sum(np.abs(b - a))
+        pieces = np.maximum(1, np.ceil(steps * np.abs(b - a) / span)).astype(int)
+        cuts = [np.linspace(x, y, n + 1) for x, y, n in zip(a, b, pieces)]
+        return np.concatenate([c[:-1] for c in cuts]), np.concatenate([c[1:] for c in cuts])
+
+    def _again(self, a, b):
+        """The powers at the nodes of intervals, on the motion as it is run again."""
+        t = quadrature.nodes(a, b).ravel()
+        order = np.argsort(self.forward * t, kind="stable")
+        ts = np.concatenate([self.t[:1], t[order], self.t[-1:]])
+        traj, first = self.trajectory, self._at(0)[1:]
+        rtol, atol = (np.asarray(x) for x in traj.tolerance)
+        settings = traj.asked._asdict() | {"rtol": tuple(rtol), "atol": None if atol.ndim == 2 else tuple(atol)}
+        if traj.asked.stepsize_controller is not None:
+            del settings["max_step"], settings["jump_ts"]
+        if isinstance(traj, HybridTrajectory):
+            settings["start"] = traj.system.names[self.entered[0]]
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            again = integrate(traj.system, *first, self.params, ts=ts, throw=False, estimate_error=False, **settings)
+        if not is_among(again.result, ENDED_WELL):
+            raise ValueError(
+                f"the motion could not be run again for its works: {message(again.result)}\n"
+                "Usual cause: a motion at the edge of what its tolerance allows.\nFix: a tighter or looser rtol."
+            )
+        back = np.empty_like(order)
+        back[order] = np.arange(len(order))
+        rows = {name: value for name, value in again.rows().items() if name != "phase"}
+        rows = jax.tree.map(lambda x: np.asarray(x)[1:-1][back], rows)
+        phase = self._phase_of(np.repeat(0.5 * (a + b), len(quadrature.NODES)))
+        return self._powers(phase, rows["t"], rows["q"], rows["v"], rows["multipliers"])
+
+    def _phase_of(self, t):
+        """The phase at times that are none of a switch."""
+        return self.entered[np.searchsorted(self.switch_times, t, side="right")]
+
+    def switches_until(self, row: int) -> int:
+        """How many switches were before an instant: an output at one is before it, an end behind it."""
+        side = "right" if self.beyond and row == len(self.t) - 1 else "left"
+        return int(np.searchsorted(self.switch_times, self.t[row], side=side))
+
+    def jumps(self) -> np.ndarray:
+        """By how much the Jacobi integral jumps at each switch."""
+        if self.switches is None or not len(self.switch_times):
+            return np.zeros(0, self.t.dtype)
+        s = self.switches
+        before, after = jax.tree.map(lambda x: np.asarray(x)[: len(s)], ((s.q, s.v), (s.q_after, s.v_after)))
+        h_before = self._energies(self.entered[:-1], self.switch_times, *before).h
+        return self._energies(self.entered[1:], self.switch_times, *after).h - h_before
+
+    def ways(self) -> tuple[str, ...]:
+        """From which phase to which each switch leads."""
+        names = () if self.switches is None else [self.switches.names[i] for i in self.entered]
+        return tuple(f"{x} -> {y}" for x, y in zip(names, names[1:]))
+
+    def _work(self, name, power, work):
+        total = np.sum(work, axis=1)
+        if name == TIME:
+            return Work(power[:, 0], total, total)
+        unflatten = jax.vmap(coordinates.flatten(self._at(0)[2])[1])
+        return Work(*(jax.tree.map(np.asarray, unflatten(x)) for x in (power, work)), total)
+
+
+class Energies(NamedTuple):
+    """The Jacobi integral, T₂, V = -L at v = 0, and the size of the terms of h, (rows,)."""
+
+    h: np.ndarray
+    kinetic: np.ndarray
+    potential: np.ndarray
+    size: np.ndarray
+
+
+@compiled
+def _energies(system, t, q, v, params):
+    """The `Energies` at each of a batch of states."""
+
+    def at(t, q, v):
+        lagrangian = lambda v: system.lagrangian(t, q, v, params)
+        value, p = jax.value_and_grad(lagrangian)(v)
+        rest, p_at_rest = jax.value_and_grad(lagrangian)(jax.tree.map(jnp.zeros_like, v))
+        dot = lambda x, y: coordinates.flatten(x)[0] @ coordinates.flatten(y)[0]
+        power = dot(v, p)
+        return power - value, 0.5 * dot(v, jax.tree.map(jnp.subtract, p, p_at_rest)), -rest, abs(power) + abs(value)
+
+    return jax.vmap(at)(t, q, v)
+
+
+def _sources(system, state, params) -> dict[str, int]:
+    """What does work in a system, and how many numbers its power has."""
+    n = coordinates.flatten(state[1])[0].size
+    found = {FORCE: n} if system.force is not None else {}
+    found |= {DISSIPATION: n} if system.dissipation is not None else {}
+    found |= {TIME: 1} if sees_time(system.lagrangian, *state, params) else {}
+    return found | {constraint_in_words(name): n for name in system.constraints}
+
+
+@compiled
+def _powers(system, t, q, v, multipliers, params):
+    """The power of each source at each of a batch of states, (rows, n)."""
+    sources = _sources(system, jax.tree.map(lambda x: x[0], (t, q, v)), params)
+
+    def at(t, q, v, multipliers):
+        x, unflatten = coordinates.flatten(q)
+        u, _ = coordinates.flatten(v)
+        powers = {}
+        if system.force is not None:
+            stacked = [jnp.atleast_1d(multipliers[name]).ravel() for name in system.constraints]
+            force = force_at(system, t, q, v, params, jnp.concatenate([jnp.zeros(0, x.dtype), *stacked]))
+            powers[FORCE] = coordinates.flatten(force)[0] * u
+        if system.dissipation is not None:
+            slope = jax.grad(lambda u: system.dissipation(t, q, unflatten(u), params))(u)
+            powers[DISSIPATION] = -slope * u
+        if TIME in sources:
+            powers[TIME] = -jax.grad(lambda t: system.lagrangian(t, q, v, params))(t)[None]
+        for name, constraint in system.constraints.items():
+            alone = eqx.tree_at(lambda s: s.constraints, system, {name: constraint})
+            rows = constraints.jacobian(alone, t, x, u, params, unflatten)
+            powers[constraint_in_words(name)] = (rows.T @ jnp.atleast_1d(multipliers[name])) * u
+        return powers
+
+    return jax.vmap(at)(t, q, v, multipliers)
+
+
+def constraint_in_words(name: str) -> str:
+    """How a constraint is called among the sources."""
+    return f"constraint '{name}'"

@@ -1,0 +1,221 @@
+"""The energy ledger: works in closed form, the balance of every scene, and what must break it."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import lagjax as lj
+from lagjax.mechanics.reactions import reacts
+from lagjax.numerics import quadrature
+from lagjax.scenes import SCENES, bead_on_hoop, sliding_wedge, slipping_hoop
+
+RTOL = 1e-9
+
+
+def falling(t, q, v, params):
+    """Of unit mass, with g = 10."""
+    return 0.5 * v**2 - 10.0 * q
+
+
+def drag(t, q, v, params):
+    """-v."""
+    return 0.5 * v**2
+
+
+DRAGGED = lj.System(falling, dissipation=drag)
+
+
+def flipped(system):
+    """The same system with forces and dissipation of the other sign, and constraints that push the other way."""
+    constraints = {
+        name: lj.Holonomic(lambda t, q, p, g=c.g: -g(t, q, p))
+        if isinstance(c, lj.Holonomic)
+        else lj.Nonholonomic(lambda t, q, v, p, phi=c.phi: -phi(t, q, v, p))
+        for name, c in system.constraints.items()
+    }
+    force, dissipation = system.force, system.dissipation
+    if reacts(system):
+        force = lambda t, q, v, multipliers, params, f=force: jax.tree.map(
+            jnp.negative, f(t, q, v, multipliers, params)
+        )
+    elif force is not None:
+        force = lambda t, q, v, params, f=force: jax.tree.map(jnp.negative, f(t, q, v, params))
+    if dissipation is not None:
+        dissipation = lambda t, q, v, params, r=dissipation: -r(t, q, v, params)
+    return lj.System(system.lagrangian, constraints, force, dissipation)
+
+
+def test_quadrature_is_exact_to_its_degree():
+    """Polynomials up to degree 22; twin: degree 24 is not. What the coarse rule misses is in the estimate."""
+    a, b = np.array([-0.5, 1.0]), np.array([1.0, 0.25])
+    powers = np.arange(25)
+    found = quadrature.integrals(quadrature.nodes(a, b)[:, :, None] ** powers, a, b)
+    exact = (b[:, None] ** (powers + 1) - a[:, None] ** (powers + 1)) / (powers + 1)
+    error = np.abs(found.values - exact)
+    assert error[:, :23].max() < 1e-15 and error[:, 24].max() > 1e-15
+    kink = quadrature.integrals(np.abs(quadrature.nodes(a, b))[:, :, None], a, b)
+    assert 1.0 > kink.errors[0] > abs(kink.values[0, 0] - 0.625) > 1e-6
+
+
+def test_drag_takes_what_the_closed_form_says():
+    """v = -10 (1 - e^-t), whose square is the power; twin: a wrong sign. The end by an event is the last row."""
+    exact = lambda t: -100 * (t - 2 * (1 - np.exp(-t)) + 0.5 * (1 - np.exp(-2 * t)))
+    floor = lj.Crossing(lambda t, q, v, params: q + 3.0, terminal=True)
+    traj = lj.integrate(DRAGGED, 5.0, 0.0, ts=np.array([0.0, 0.5, 0.6, 9.0]), events={"floor": floor})
+    ledger = lj.energy_ledger(traj)
+    work = ledger.works["dissipation"]
+    assert len(ledger.t) == 4 and ledger.t[-1] == traj.end.t
+    np.testing.assert_allclose(work.total, exact(ledger.t), atol=1e-9)
+    np.testing.assert_allclose(work.power[:3], -(np.asarray(traj.v)[:3] ** 2), rtol=1e-12)
+    assert ledger.kinetic is not None and ledger.potential is not None
+    np.testing.assert_allclose(ledger.potential[-1], -30.0, rtol=1e-9)
+    np.testing.assert_allclose(ledger.kinetic + ledger.potential, ledger.jacobi_integral, rtol=1e-13)
+    assert ledger.closes and ledger.relative_closure < 10 * RTOL and ledger.quadrature < RTOL
+    wrong = lj.energy_ledger(traj, flipped(DRAGGED))
+    assert wrong.relative_closure > 1e4 * max(ledger.relative_closure, RTOL)
+    assert "DOES NOT CLOSE" in repr(wrong) and "the dissipation gave" in repr(wrong)
+    assert "NOT CLOSE" not in repr(ledger) and "gave" not in repr(ledger)
+    axis = ledger.plot().axes[0]
+    assert [text.get_text() for text in axis.get_legend().get_texts()] == ["dissipation", "change of h"]
+
+
+def test_the_wedge_takes_what_the_mass_gives():
+    """The normal force does -W on the mass and +W on the wedge, W = ½ M Ẋ²; twin: pushing the other way, +W and -W."""
+    traj = lj.integrate(
+        sliding_wedge.system, sliding_wedge.Q0, sliding_wedge.V0, sliding_wedge.PARAMS, ts=np.linspace(0.0, 1.0, 6)
+    )
+    ledger = lj.energy_ledger(traj)
+    work = ledger.constraints["incline"]
+    W = 0.5 * sliding_wedge.PARAMS["M"] * np.asarray(traj.v["X"]) ** 2
+    np.testing.assert_allclose(work.work["X"], W, atol=1e-9 * W[-1])
+    np.testing.assert_allclose(work.work["x"] + work.work["y"], -W, atol=1e-9 * W[-1])
+    np.testing.assert_allclose(work.total, 0.0, atol=1e-12)
+    wrong = lj.energy_ledger(traj, flipped(sliding_wedge.system))
+    np.testing.assert_allclose(wrong.constraints["incline"].work["X"], -W, atol=1e-9 * W[-1])
+    assert "by X" in repr(ledger) and "constraint 'incline'          0" in repr(ledger)
+
+
+def test_the_motor_pays_for_the_hoop():
+    """The motor's work is ω ΔL_z, so that E - ω L_z stays: the Jacobi integral of the bead alone."""
+    params = bead_on_hoop.PARAMS
+    traj = lj.integrate(
+        bead_on_hoop.driven_system, *bead_on_hoop.driven_start(params, 1.0), params, ts=np.linspace(0.0, 1.0, 6)
+    )
+    ledger = lj.energy_ledger(traj)
+    spin = params["m"] * (params["a"] * np.sin(traj.q["psi"])) ** 2 * params["omega"]
+    paid = params["omega"] * (spin - spin[0])
+    assert np.ptp(paid) > 0.1
+    np.testing.assert_allclose(ledger.constraints["motor"].total, paid, atol=1e-8 * np.ptp(paid))
+    np.testing.assert_allclose(ledger.constraints["motor"].work["psi"], 0.0, atol=1e-12)
+    assert ledger.closes and not lj.energy_ledger(traj, flipped(bead_on_hoop.driven_system)).closes
+
+
+def test_time_and_velocities_that_are_prescribed():
+    """A charge in a field that grows, x = t³/6: -∂L/∂t does -∫ x dt; a belt that speeds up drags a box along."""
+    growing = lj.System(lambda t, q, v, params: 0.5 * v**2 + t * q)
+    ledger = lj.energy_ledger(lj.integrate(growing, 0.0, 0.0, ts=np.array([0.0, 1.0, 2.0])))
+    t = ledger.t
+    np.testing.assert_allclose(ledger.works["explicit time"].total, -(t**4) / 24, atol=1e-9)
+    np.testing.assert_allclose(ledger.jacobi_integral, t**4 / 8 - t**4 / 6, atol=1e-9)
+    assert ledger.closes and list(ledger.works) == ["explicit time"]
+    belt = lj.Nonholonomic(lambda t, q, v, params: v - t)
+    box = lj.System(lambda t, q, v, params: 0.5 * v**2, constraints={"belt": belt})
+    ledger = lj.energy_ledger(lj.integrate(box, 0.0, 0.0, ts=np.array([0.0, 1.0, 3.0])))
+    np.testing.assert_allclose(ledger.constraints["belt"].total, ledger.t**2 / 2, atol=1e-9)
+    assert ledger.closes
+
+
+@pytest.mark.slow
+def test_backward():
+    """Works backward have the other sign; an interval between outputs may be as long as it likes."""
+    there = lj.integrate(DRAGGED, 5.0, 0.0, ts=np.array([0.0, 20.0]))
+    back = lj.integrate(DRAGGED, there.q[-1], there.v[-1], ts=np.array([20.0, 17.0]))
+    ledgers = [lj.energy_ledger(traj) for traj in (there, back)]
+    np.testing.assert_allclose(ledgers[1].works["dissipation"].total[-1], 300.0, rtol=1e-6)
+    assert ledgers[0].closes and ledgers[1].closes and "gave" not in repr(ledgers[1])
+
+
+@pytest.mark.slow
+def test_impacts():
+    """A ball loses 1 - e² of what it has at each impact, and drag the rest; an output may be at one."""
+    ball = DRAGGED
+    floor = lj.Switch("flying", to="flying", when=lj.touches(lambda t, q, params: q, 0.5))
+    hybrid = lj.Hybrid({"flying": ball}, [floor], most_switches=4)
+    first = lj.integrate(hybrid, 1.0, 0.0, ts=np.array([0.0, 1.0]))
+    assert isinstance(first, lj.HybridTrajectory) and len(first.switches) == 2
+    at_impact = lj.integrate(hybrid, 1.0, 0.0, ts=np.array([0.0, float(first.switches.t[0]), 1.0]))
+    for traj in (first, at_impact):
+        assert isinstance(traj, lj.HybridTrajectory)
+        ledger = lj.energy_ledger(traj)
+        speeds = np.asarray(traj.switches.v)[:2]
+        np.testing.assert_allclose(ledger.impacts, -0.5 * (1 - 0.25) * speeds**2, rtol=1e-9)
+        assert ledger.closes and ledger.switches == ("flying -> flying",) * 2
+        assert not lj.energy_ledger(traj, lj.Hybrid({"flying": flipped(ball)}, [floor], most_switches=4)).closes
+    # Whether the output is before the impact or behind it is in its velocity.
+    assert (ledger.impact_total[1] == 0) == (at_impact.v[1] < 0) and "2 switches" in repr(ledger)
+
+
+@pytest.mark.slow
+def test_the_slipping_hoop():
+    """Rolls, slips, flies and lands: friction is the force of one of its phases, and its sign is seen."""
+    params = slipping_hoop.PARAMS | {"mu": 0.25}
+    traj = slipping_hoop.roll_and_slip(params, np.linspace(0.0, 2.0, 9), estimate_error=False)
+    ledger, rtol = lj.energy_ledger(traj), float(traj.tolerance[0][0])
+    assert ledger.relative_closure < 100 * rtol and ledger.works["force"].total[-1] < -1e-3
+    wrong = lj.Hybrid(
+        {name: flipped(system) for name, system in zip(traj.system.names, traj.system.systems)}, traj.system.switches
+    )
+    assert lj.energy_ledger(traj, wrong).relative_closure > 1e4 * max(ledger.relative_closure, rtol)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scene", SCENES)
+def test_every_scene_closes(scene):
+    """To a hundred tolerances, on every run of the main job; with half the momentum or without time, it does not."""
+    for run in SCENES[scene].runs():
+        traj = lj.integrate(run.system, run.q0, run.v0, run.params, ts=run.ts, events=run.events, estimate_error=False)
+        ledger = lj.energy_ledger(traj)
+        assert ledger.relative_closure < 100 * RTOL, run.name
+        if any(np.ptp(work.total) > 1e-3 * ledger.scale for _, work in ledger.sources()):
+            wrong = lj.energy_ledger(traj, flipped(run.system))
+            assert wrong.relative_closure > 1e4 * max(ledger.relative_closure, RTOL), run.name
+
+
+@pytest.mark.slow
+def test_tolerances():
+    """It closes to a hundred tolerances at loose ones, too, and in float32."""
+    system = lj.System(lambda t, q, v, params: 0.5 * v**2 + jnp.cos(q) * (1 + 0.2 * jnp.sin(3 * t)), dissipation=drag)
+    for rtol in (1e-4, 1e-7, 1e-11):
+        ledger = lj.energy_ledger(lj.integrate(system, 2.0, 1.0, ts=np.array([0.0, 7.0, 20.0]), rtol=rtol))
+        assert ledger.closes and ledger.allowed == pytest.approx(100 * rtol)
+    start = np.float32(2.0), np.float32(1.0)
+    ledger = lj.energy_ledger(lj.integrate(system, *start, ts=np.array([0.0, 7.0, 20.0], np.float32), rtol=1e-4))
+    assert ledger.closes and ledger.t.dtype == np.float32
+
+
+@pytest.mark.slow
+def test_settings_are_those_of_the_motion():
+    """A stiff decay by Radau5, with forces that jump: the motion is run again as it was."""
+    push = lambda t, q, v, params: jnp.where(t < 1.0, 2.0, 0.0)
+    system = lj.System(lambda t, q, v, params: 0.5 * v**2, force=push, dissipation=lambda t, q, v, params: 500 * v**2)
+    ts = np.array([0.0, 0.7, 3.0])
+    traj = lj.integrate(system, 0.0, 0.0, ts=ts, method=lj.Radau5(), jump_ts=[1.0], rtol=1e-7, estimate_error=False)
+    ledger = lj.energy_ledger(traj)
+    assert ledger.closes and int(traj.stats["num_steps"]) < 300
+    # v tends to 2/1000 within a thousandth of the time that the push of 2 lasts.
+    np.testing.assert_allclose(ledger.works["force"].total[-1], 2 * 2e-3 * (1 - 1e-3), rtol=1e-5)
+    assert traj.asked.method is not None and lj.integrate(system, 0.0, 0.0, ts=ts).asked.method is None
+
+
+def test_bad_input():
+    """What is no single motion that was computed is refused, with what to do."""
+    of = lambda q0: lj.integrate(DRAGGED, q0, 0.0, ts=np.array([0.0, 1.0]))
+    with pytest.raises(TypeError, match="made of a motion that was computed, not of float"):
+        lj.energy_ledger(3.0)
+    with pytest.raises(TypeError, match="one that JAX is tracing"):
+        jax.jit(lambda q0: lj.energy_ledger(of(q0)).closure)(1.0)
+    with pytest.raises(ValueError, match="account for one lane"):
+        lj.energy_ledger(jax.vmap(of)(np.array([1.0, 2.0])))
+    with pytest.raises(TypeError, match="another one by a lj.System"):
+        lj.energy_ledger(of(1.0), lj.Hybrid({"falling": DRAGGED}))

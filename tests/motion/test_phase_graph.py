@@ -1,0 +1,62 @@
+"""What `explain` says of a motion in phases: each phase, the guards at the state, and the graph."""
+
+import pytest
+
+import lagjax as lj
+
+
+def lagrangian(t, q, v, params):
+    """A stone above a table, of unit mass."""
+    return 0.5 * (v["x"] ** 2 + v["y"] ** 2) - 10.0 * q["y"]
+
+
+TABLE = lj.Holonomic(lambda t, q, params: q["y"])
+PHASES = {
+    "flying": lj.System(lagrangian),
+    "sliding": lj.System(lagrangian, constraints={"table": TABLE}),
+    "lost": lj.System(lagrangian),
+}
+
+
+def edge(t, q, v, params):
+    """How far the table goes on."""
+    return 3.0 - q["x"]
+
+
+@pytest.fixture(scope="module")
+def explanation():
+    """Of a stone on the table that slides with 2."""
+    touches = lj.touches(lambda t, q, params: q["y"], 0.5)
+    switches = [
+        lj.Switch("flying", to="flying", when=touches, rest="sliding"),
+        lj.Switch("sliding", to="flying", when=edge),
+        lj.Switch("sliding", to="flying", when=lj.releases("table")),
+    ]
+    return lj.explain(lj.Hybrid(PHASES, switches), {"x": 1.0, "y": 0.0}, {"x": 2.0, "y": 0.0})
+
+
+def test_phases_and_guards(explanation):
+    """Freedoms of each phase, values of the guards with its own multipliers, and phases without a way in or out."""
+    assert [found.degrees_of_freedom for found in explanation.phases.values()] == [2, 1, 2]
+    assert [(phase, to) for phase, to, _, _ in explanation.switches] == [
+        ("flying", ("flying", "sliding")), ("sliding", ("flying",)), ("sliding", ("flying",)),
+    ]  # fmt: skip
+    assert [value for *_, value in explanation.switches] == [0.0, 2.0, 10.0]
+    assert explanation.unreachable == explanation.final == ("lost",)
+    words = repr(explanation)
+    assert "-> flying, when edge reaches zero, now 2" in words
+    assert "no switch leads here; no switch leaves it" in words and "held by 'table'" in words
+
+
+def test_elsewhere_guards_have_no_value():
+    """Where the state is none of a phase, its guards are not evaluated."""
+    hybrid = lj.Hybrid(PHASES, [lj.Switch("sliding", to="flying", when=lj.releases("table"))])
+    found = lj.explain(hybrid, {"x": 1.0, "y": 5.0}, {"x": 2.0, "y": 0.0})
+    assert isinstance(found, lj.HybridExplanation) and found.switches[0][3] is None and "now" not in repr(found)
+
+
+def test_picture(explanation):
+    """A name each phase, an arrow each way out."""
+    axis = explanation.plot().axes[0]
+    words = [text.get_text() for text in axis.texts]
+    assert [word for word in words if word] == ["touches", "touches", "edge", "releases", *PHASES]
