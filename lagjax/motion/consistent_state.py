@@ -28,7 +28,7 @@ from lagjax.mechanics.diagnosis import describe, listed
 from lagjax.mechanics.equations import equations_of
 from lagjax.mechanics.first_call import looked_at
 from lagjax.mechanics.lagrangian import mass_and_forcing
-from lagjax.mechanics.saddle_point import displacement_map, saddle_point_matrix
+from lagjax.mechanics.saddle_point import displacement_map
 from lagjax.motion.consistency import departures, stopped, within
 from lagjax.numerics import dense
 from lagjax.numerics.rank import DEPENDENT_BELOW, independent_rows
@@ -170,7 +170,10 @@ def _nearest(residual: Callable, problem, y0, metric, free):
         curvature = jax.jacfwd(lambda y: multipliers @ rows_at(fixed, y))(y)
         curvature = jnp.where(free[:, None] & free[None, :], curvature, 0.0)
         rows = rows_at(fixed, y)
-        return saddle_point_matrix(fixed_metric + curvature, rows, solved_with(rows))
+        independent = solved_with(rows)
+        # In full, also of more equations than coordinates: the multipliers of all of them are unknowns.
+        rows = jnp.where(independent[:, None], rows, 0.0)
+        return jnp.block([[fixed_metric + curvature, rows.T], [rows, jnp.diag(jnp.where(independent, 0.0, 1.0))]])
 
     def equations(problem, metric, target, y, multipliers):
         force = metric @ (y - target) + multipliers @ rows_at(problem, y)

@@ -38,6 +38,8 @@ from lagjax.motion.watching import uneven
 
 # What a guard may be below zero where a motion starts, in tolerances of what it is made of.
 NOT_BELOW = 1e2
+# What a leg gives at its outputs.
+ROWS = "q", "v", "multipliers"
 # Times so near to each other, in units of what can be told apart, are one.
 AT_ONCE = 4
 
@@ -152,8 +154,11 @@ def _first_leg(hybrid, q0, v0, params, ts, settings):
 def _leg(hybrid, i, mine, way: Way, params, ts, phase: Phase, settings, adjoint) -> Way:
     """The way with one more leg, in the phase i, of those lanes that are in it."""
     system, at_start = hybrid.systems[i], way.switches.count == 0
-    # Who is elsewhere stands still.
-    times = jnp.where(mine & (ts > way.t), ts, way.t)
+    # Outputs that are past would cost a step each: those ahead come first, filled up by the last. Who is elsewhere
+    # stands still.
+    place, past = jnp.arange(ts.shape[0]), jnp.sum(ts <= way.t)
+    ahead = jnp.where(place == 0, way.t, ts[jnp.minimum(place + past - 1, ts.shape[0] - 1)])
+    times = jnp.where(mine, ahead, way.t)
     settings = settings if system.constraints else replace(settings, drift="none")
     found = solved(system, way.q, way.v, params, times, phase.guards, settings, adjoint, way.seen)
     result, end, switched, onward = found["result"], found["end"], jnp.asarray(False), jnp.asarray(False)
@@ -177,14 +182,15 @@ def _leg(hybrid, i, mine, way: Way, params, ts, phase: Phase, settings, adjoint)
         unseen = ended_well(result) & ~switched & _is_below(end, params, phase.guards, settings.rtol)
         result = RESULTS.where(unseen, RESULTS.guard_not_seen, RESULTS.where(switched, failed, result))
         result = RESULTS.where(onward, RESULTS.successful, result)
-    known = ((times > way.t) & (times <= end.t) | at_start & (ts <= way.t)) & _reached(found["q"])
+    rows = jax.tree.map(lambda x: x[jnp.maximum(place - past + 1, 0)], {name: found[name] for name in ROWS})
+    known = ((ts > way.t) & (ts <= end.t) | at_start & (ts <= way.t)) & _reached(rows["q"])
     none = lambda name, x: end.multipliers.get(name, jnp.full_like(x, jnp.nan))
     end = end._replace(multipliers={name: none(name, x) for name, x in way.end.multipliers.items()})
     least = way.least if not settings.by_size else jnp.maximum(way.least, stopped(found["tolerance"][1]))
     further = Way(
         t=jnp.where(onward, end.t, way.t), q=_where(onward, after.q, way.q), v=_where(onward, after.v, way.v),
         phase=jnp.where(onward, target, way.phase), going=onward & (end.t < ts[-1]),
-        rows=_filled(way.rows, mine & known, found, i), switches=switches,
+        rows=_filled(way.rows, mine & known, rows, i), switches=switches,
         end=_where(onward, end._replace(q=after.q, v=after.v), end),
         stats={name: n + found["stats"][name] for name, n in way.stats.items()},
         seen=jnp.maximum(way.seen, _sizes(end.q, end.v)), least=least,

@@ -140,6 +140,16 @@ def test_redundant_constraints_are_no_obstacle():
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("factors", [(1,), (1, 2)], ids=["once", "twice"])
+def test_one_coordinate(factors):
+    """More equations than coordinates: the place and the velocity of what holds it."""
+    holds = lambda factor: lj.Holonomic(lambda t, q, params: factor * (q - jnp.sin(t)))
+    held = lj.System(lambda t, q, v, params: 0.5 * v**2, {str(factor): holds(factor) for factor in factors})
+    q, v = lj.consistent_state(held, 0.5, 2.0, 0.3, None)
+    np.testing.assert_allclose([q, v], [np.sin(0.5), np.cos(0.5)], rtol=1e-12)
+
+
+@pytest.mark.slow
 def test_a_held_coordinate_that_a_constraint_fixes():
     """Where the value held is the one that is asked for, the constraint is one dependent equation more."""
     particle = lambda t, q, v, params: 0.5 * (v["x"] ** 2 + v["y"] ** 2 + v["z"] ** 2)
