@@ -106,6 +106,16 @@ def _newton(residual: Callable, problem: PyTree, y, displacement, slope):
     return y - displacement(residual(problem, y))
 
 
+def velocity_change(system, t, q, v, params, change):
+    """The least change of the velocities, in the metric of M, that changes the residuals of all constraints by so much.
+
+    `change` (m,): of `constraints.velocity_residual`. Returns what is like v, to be added to it.
+    """
+    _, unflatten = coordinates.flatten(v)
+    displacement = equations_of(system, t, q, v, params).displacement(t, q, v)
+    return unflatten(displacement(np.ones(change.size, bool), change))
+
+
 def stopped(tree):
     """`tree` without derivatives."""
     return jax.tree.map(lambda leaf: lax.stop_gradient(leaf) if eqx.is_array(leaf) else leaf, tree)

@@ -9,7 +9,6 @@ Source: Glocker, *Set-Valued Force Laws*, §6 (impacts in the metric of M), §5.
 Brogliato, *Nonsmooth Mechanics*, §4.2.
 """
 
-import math
 from collections.abc import Callable
 
 import equinox as eqx
@@ -18,15 +17,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import ArrayLike
 
-from lagjax.mechanics import constraints, coordinates
 from lagjax.mechanics.arguments import OF_STATE, WITH_MULTIPLIERS
-from lagjax.mechanics.constraints import Holonomic
-from lagjax.mechanics.equations import equations_of
-from lagjax.mechanics.system import System
+from lagjax.motion.impacts import Impact, Opening
 from lagjax.motion.switching import OfPhases, Plastic
-
-# The name of a gap among the constraints of a phase.
-GAP = "lagjax gap"
 
 
 class Touches(eqx.Module):
@@ -39,36 +32,12 @@ class Touches(eqx.Module):
         return self.gap(t, q, params)
 
 
-class Impact(OfPhases):
-    """An impact with a restitution: what it makes of the velocities; see `touches`."""
-
-    gap: Callable
-    restitution: Callable | ArrayLike
-
-    def between(self, before: System, after: System) -> Callable:
-        """The velocities after it: what holds in the phase before holds on, and only the gap's velocity jumps."""
-        held = before.constraints | {GAP: Holonomic(self.gap)}
-        return _Rebound(self, System(before.lagrangian, held, before.force, before.dissipation))
-
-
-class _Rebound(eqx.Module):
-    impact: Impact
-    held: System
-    takes: tuple[str, ...] = eqx.field(static=True, default=OF_STATE)
-
-    def __call__(self, t, q, v, params):
-        gap, e = self.impact.gap, self.impact.restitution
-        _, opening = jax.jvp(lambda t, q: gap(t, q, params), (t, q), (jnp.ones_like(t), v))
-        e = e(-opening) if callable(e) else e
-        shapes = constraints.shapes(self.held, t, q, v, params)
-        jumps = [np.full(math.prod(shape), name == GAP) for name, shape in shapes.items()]
-        off = jnp.where(np.concatenate(jumps), (1 + e) * opening, 0.0)
-        u, unflatten = coordinates.flatten(v)
-        displacement = equations_of(self.held, t, q, v, params).displacement(t, q, v)
-        return unflatten(u - displacement(np.ones(off.size, bool), off))
-
-
-def touches(gap: Callable, restitution: Callable | ArrayLike | None = None) -> Touches:
+def touches(
+    gap: Callable,
+    restitution: Callable | ArrayLike | None = None,
+    friction: Callable | ArrayLike | None = None,
+    sliding: Callable | None = None,
+) -> Touches:
     """A guard for `lj.Switch`: a gap closes; and the impact that goes with it.
 
     >>> import jax.numpy as jnp
@@ -79,29 +48,70 @@ def touches(gap: Callable, restitution: Callable | ArrayLike | None = None) -> T
     >>> print(f"{traj.q[-1]:.6f} {traj.switches.v_after[0]:.6f} {traj.switches.impulse[0]:.6f}")
     1.250000 5.000000 15.000000
 
+    With friction, a block that falls with (x, y) velocities (4, -10) loses 0.2 (1 + 0.5) 10 of its 4:
+
+    >>> block = lj.System(lambda t, q, v, params: 0.5 * jnp.sum(v**2) - 10.0 * q[1])
+    >>> rough = touches(lambda t, q, params: q[1], 0.5, friction=0.2, sliding=lambda t, q, v, params: v[0])
+    >>> hybrid = lj.Hybrid({"flying": block}, [lj.Switch("flying", to="flying", when=rough)])
+    >>> traj = lj.integrate(hybrid, jnp.array([0.0, 5.0]), jnp.array([4.0, 0.0]), ts=jnp.array([0.0, 1.5]))
+    >>> print(traj.switches.v_after[0].round(6), traj.switches.impulse[0].round(6))
+    [1. 5.] [-3. 15.]
+
     **Arguments:**
 
-    - `gap`: `gap(t, q, params)`, above zero as long as nothing touches, of any unit.
+    - `gap`: `gap(t, q, params)`, above zero as long as nothing touches, of any unit; a distance where there is
+      friction, `[sliding] [t]`.
     - `restitution`: the speed at which the gap opens after the impact over that at which it closed: a number, or a
       function of the closing speed. The impulse acts along the gap's gradient, and so the velocities change by the
       least in the metric of M that the constraints of the phase allow. None: the velocities become the nearest, in that
       metric, that the constraints of the *next* phase allow (a perfectly plastic impact, which sticks where they do).
+    - `friction`: the coefficient of friction in the impact, a number or a function of `params`; without one it is
+      smooth. The contact sticks, or slides with the impulse of friction on the cone; see `impacts.py`. What the next
+      phase is depends on that, and the phases say it: go to the one that slides, whose own guard, `lj.sticks`, ends it
+      at once where nothing slides in its direction.
+    - `sliding`: `sliding(t, q, v, params)`, the velocity at which the contact slides, linear in v.
 
-    **Raises:** `TypeError` for a gap that is no function.
+    **Raises:** `TypeError` for a gap, or a sliding velocity, that is no function; `ValueError` for friction without a
+    sliding velocity or without a restitution, and for a sliding velocity that is not one number, or not linear in v.
+
+    Source: Glocker, *Set-Valued Force Laws*, §6; for friction Pfeiffer & Glocker, *Multibody Dynamics with Unilateral
+    Contacts*, §8, with Newton's law in place of Poisson's and no tangential restitution.
     """
     if not callable(gap):
         raise TypeError(
             f"a gap must be a function of (t, q, params), not {type(gap).__name__}.\n"
             'Fix: lj.touches(lambda t, q, params: q["y"]).'
         )
-    return Touches(gap, Plastic() if restitution is None else Impact(gap, _number(restitution)))
+    if friction is None and sliding is None:
+        return Touches(gap, Plastic() if restitution is None else Impact(gap, _number(restitution)))
+    if friction is None or sliding is None:
+        given, missing = ("friction", "sliding") if sliding is None else ("sliding", "friction")
+        raise ValueError(
+            f"{given} is given and {missing} is not: friction in an impact needs a coefficient and a velocity.\n"
+            'Fix: lj.touches(gap, 0.5, friction=0.3, sliding=lambda t, q, v, params: v["x"]).'
+        )
+    if not callable(sliding):
+        raise TypeError(
+            f"sliding must be a function of (t, q, v, params), not {type(sliding).__name__}.\n"
+            'Fix: sliding=lambda t, q, v, params: v["x"].'
+        )
+    if restitution is None:
+        raise ValueError(
+            "friction in an impact needs a restitution: without one the impact makes the velocities what the next "
+            "phase allows, whatever friction could do.\nFix: lj.touches(gap, restitution=0.0, friction=...)."
+        )
+    return Touches(gap, Impact(gap, _number(restitution), _number(friction), sliding))
 
 
 class Releases(eqx.Module):
-    """The multiplier of a contact, as a guard."""
+    """The multiplier of a contact, as a guard; `reset` opens the contact by a round-off."""
 
     contact: str = eqx.field(static=True)
     takes: tuple[str, ...] = eqx.field(static=True, default=WITH_MULTIPLIERS)
+
+    @property
+    def reset(self):
+        return Opening(self.contact)
 
     def __call__(self, t, q, v, multipliers, params):
         return _multiplier(multipliers, self.contact)
@@ -112,10 +122,13 @@ def releases(contact: str) -> Releases:
 
     >>> import lagjax as lj
     >>> lj.Switch("on the ground", to="flying", when=releases("ground"))
-    Switch('on the ground' -> 'flying')
+    Switch('on the ground' -> 'flying', with a reset)
 
     **Arguments:** `contact`: the name of a constraint of one equation, written so that its multiplier is above zero as
     long as it pushes: as a gap, λ > 0 pushes along +∂g/∂q.
+
+    The reset opens the contact at a speed of some round-offs: it parts from zero with no speed and no acceleration, and
+    a guard of the next phase, `lj.touches` of the same gap, would have it closed for ever.
     """
     return Releases(contact)
 

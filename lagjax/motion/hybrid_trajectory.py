@@ -20,6 +20,8 @@ from lagjax.motion.trajectory import Trajectory, jacobi_and_scale
 
 # Of an output that was not reached, and of the room for switches that did not come.
 NO_PHASE = -1
+# The name under which switches are among the events of a motion.
+SWITCHES = "switches"
 
 
 class Switches(eqx.Module):
@@ -140,6 +142,7 @@ class HybridTrajectory(Trajectory):
             ("phases", f"outputs: {outputs}"),
             ("switches", self.switches.in_words()),
             *(("", row) for row in shown),
+            *((f"event '{name}'", found.in_words()) for name, found in self.events.items() if name != SWITCHES),
         ]
 
 

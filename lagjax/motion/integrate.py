@@ -97,7 +97,8 @@ def integrate(
     - `jump_ts` (J,): times at which a force jumps or has a kink, in any order, `[t]`. They become ends of steps, which
       stay on their side of them; derivatives by these times are right.
     - `events`: by name, a `lj.Crossing` each: where a function of the state crosses zero, recorded in `traj.events` or
-      ending the motion. Crossings are found also inside steps, several in one, and located to round-off.
+      ending the motion. Crossings are found also inside steps, several in one, and located to round-off. What jumps
+      over zero at a switch of a `Hybrid`, as a velocity does in an impact, does not cross it.
     - `event`: a `diffrax.Event` that ends the motion; its condition takes `(t, (q, v), params, **kwargs)`. It is found
       as `events` are, under the name "event".
     - `adjoint`: any diffrax adjoint. Without one, forward and reverse mode both work.
@@ -146,8 +147,8 @@ def integrate(
     for phase in phases_of(system):
         warn_of_odd_dissipation(phase.dissipation, state)
     if isinstance(system, Hybrid):
-        refuse_beside_switches(system, state, ts, adjoint, events=events, event=event, jump_ts=jump_ts)
-        guards = phases_in(system, state)
+        refuse_beside_switches(system, state, ts, adjoint, event)
+        guards = phases_in(system, state, crossings_of(events, event))
     else:
         guards = guards_of(crossings_of(events, event), system, state)
     system = each_phase(system, lambda phase: lift(phase, state))

@@ -29,11 +29,12 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 from lagjax.mechanics import constraints, coordinates
 from lagjax.mechanics.hybrid import Hybrid
 from lagjax.motion.consistency import stopped
-from lagjax.motion.crossings import Guards
-from lagjax.motion.hybrid_trajectory import NO_PHASE, Switches
+from lagjax.motion.crossings import Crossings, Guards
+from lagjax.motion.hybrid_trajectory import NO_PHASE, SWITCHES, Switches
 from lagjax.motion.loop import resolution
 from lagjax.motion.one_solve import solved
-from lagjax.motion.trajectory import RESULTS, Moment, ended_well
+from lagjax.motion.recorded import nothing, with_those_of
+from lagjax.motion.trajectory import RESULTS, Moment
 from lagjax.motion.watching import uneven
 
 # What a guard may be below zero where a motion starts, in tolerances of what it is made of.
@@ -49,13 +50,14 @@ class Phase(NamedTuple):
 
     `switches` (k,): their numbers in the hybrid; `targets` (k, 2): the next phase, and
     that of rest; `resets`: `reset(t, q, v, multipliers, params)` -> (q, v), and whether
-    the motion comes to rest there.
+    the motion comes to rest there; `events`: the names of the guards after those of switches, which are recorded.
     """
 
     guards: Guards | None
     switches: tuple[int, ...]
     targets: np.ndarray
     resets: tuple
+    events: tuple[str, ...]
 
 
 class Rows(NamedTuple):
@@ -70,8 +72,8 @@ class Rows(NamedTuple):
 class Way(NamedTuple):
     """How far the legs have come: the state from which the next one starts, and what is known of all before.
 
-    `going`: whether there is a next one. `seen`: how large coordinates and velocities have been, (2, n); `least`: the
-    sizes below which numbers were nothing.
+    `going`: whether there is a next one. `events`: what was recorded. `seen`: how large coordinates and velocities have
+    been, (2, n); `least`: the sizes below which numbers were nothing.
     """
 
     t: Float[Array, ""]
@@ -81,6 +83,7 @@ class Way(NamedTuple):
     going: Bool[Array, ""]
     rows: Rows
     switches: Switches
+    events: dict[str, Crossings]
     end: Moment
     stats: dict[str, Array]
     seen: Array
@@ -92,7 +95,7 @@ class Way(NamedTuple):
 
 def solved_in_legs(hybrid: Hybrid, q0, v0, params, ts, phases, settings, adjoint):
     """The fields of the trajectory, as `one_solve.solved` has them, with the phase of each output and the switches."""
-    first = _first_leg(hybrid, q0, v0, params, ts, settings)
+    first = _first_leg(hybrid, q0, v0, params, ts, phases[0], settings)
 
     def onward(way: Way) -> Way:
         for i in range(len(hybrid.systems)):
@@ -118,13 +121,13 @@ def solved_in_legs(hybrid: Hybrid, q0, v0, params, ts, phases, settings, adjoint
         "departure": way.departure,
         "result": way.result,
         "settled": way.settled,
-        "events": {"switches": way.switches.as_crossings()} if hybrid.switches else {},
+        "events": way.events | ({SWITCHES: way.switches.as_crossings()} if hybrid.switches else {}),
         "phase": rows.phase,
         "switches": way.switches,
     }
 
 
-def _first_leg(hybrid, q0, v0, params, ts, settings):
+def _first_leg(hybrid, q0, v0, params, ts, phase, settings):
     dtype, many, room = ts.dtype, ts.shape[0], hybrid.most_switches
     nan = lambda shape: jnp.full(shape, jnp.nan, dtype)
     of_rows = lambda tree, n: jax.tree.map(lambda x: nan((n, *x.shape)), tree)
@@ -146,8 +149,9 @@ def _first_leg(hybrid, q0, v0, params, ts, settings):
     stats = {name: zero for name in ("num_steps", "num_accepted_steps", "num_rejected_steps")}
     return Way(
         t=ts[0], q=q0, v=v0, phase=jnp.asarray(hybrid.first, jnp.int32), going=jnp.asarray(True), rows=rows,
-        switches=switches, end=start, stats=stats, seen=_sizes(q0, v0), least=least, departure=jnp.zeros((), dtype),
-        settled=jnp.asarray(True), result=RESULTS.successful,
+        switches=switches, events=nothing(phase.guards, phase.events, q0, v0, start.multipliers), end=start,
+        stats=stats, seen=_sizes(q0, v0), least=least, departure=jnp.zeros((), dtype), settled=jnp.asarray(True),
+        result=RESULTS.successful,
     )  # fmt: skip
 
 
@@ -163,23 +167,29 @@ def _leg(hybrid, i, mine, way: Way, params, ts, phase: Phase, settings, adjoint)
     found = solved(system, way.q, way.v, params, times, phase.guards, settings, adjoint, way.seen)
     result, end, switched, onward = found["result"], found["end"], jnp.asarray(False), jnp.asarray(False)
     after, target, switches = After(way.q, way.v, jnp.asarray(False)), way.phase, way.switches
-    if phase.guards is not None:
-        switched = mine & (result == RESULTS.event_occurred)
-        at_once = switched & (end.t - way.t <= AT_ONCE * resolution(ts))
-        refused = at_once & at_start & _is_below(end, params, phase.guards, settings.rtol)
+    if phase.guards is not None and phase.switches:
+        count, at_one_time = len(phase.switches), AT_ONCE * resolution(ts)
+        crossings = [found["events"][kind.name] for kind in phase.guards.kinds]
+        when = jnp.stack([jnp.where(jnp.isfinite(x.t[0]), x.t[0], jnp.inf) for x in crossings])
+        # An event that ends the motion at the time of a switch comes first.
+        ending = jnp.where(phase.guards.terminal, when, jnp.inf)[count:]
+        when = when[:count]
+        by_event = jnp.any(ending <= jnp.min(when) + at_one_time)
+        switched = mine & (result == RESULTS.event_occurred) & ~by_event
+        at_once = switched & (end.t - way.t <= at_one_time)
+        is_below = _is_below(end, params, phase.guards, count, settings.rtol)
+        refused = at_once & at_start & is_below
         full = way.switches.count >= hybrid.most_switches
         onward = switched & ~refused & ~full
         # What happens at once happens where the leg begins, and its time moves as that does.
         t, q, v = _where(at_once, (way.t, way.q, way.v), (end.t, end.q, end.v))
         end = Moment(t, q, v, end.multipliers)
-        crossings = [found["events"][kind.name] for kind in phase.guards.kinds]
-        when = jnp.stack([jnp.where(jnp.isfinite(x.t[0]), x.t[0], jnp.inf) for x in crossings])
-        first = jnp.argmax(when <= jnp.min(when) + AT_ONCE * resolution(ts))
+        first = jnp.argmax(when <= jnp.min(when) + at_one_time)
         after, target, switches = _switched(system, first, end, params, phase, way, onward)
-        uncertain = mine & jnp.any(jnp.stack([x.uncertain for x in crossings]))
+        uncertain = mine & jnp.any(jnp.stack([x.uncertain for x in crossings[:count]]))
         switches = eqx.tree_at(lambda s: s.uncertain, switches, switches.uncertain | uncertain)
         failed = RESULTS.where(refused, RESULTS.guard_below_zero, RESULTS.too_many_switches)
-        unseen = ended_well(result) & ~switched & _is_below(end, params, phase.guards, settings.rtol)
+        unseen = (result == RESULTS.successful) & is_below
         result = RESULTS.where(unseen, RESULTS.guard_not_seen, RESULTS.where(switched, failed, result))
         result = RESULTS.where(onward, RESULTS.successful, result)
     rows = jax.tree.map(lambda x: x[jnp.maximum(place - past + 1, 0)], {name: found[name] for name in ROWS})
@@ -191,6 +201,7 @@ def _leg(hybrid, i, mine, way: Way, params, ts, phase: Phase, settings, adjoint)
         t=jnp.where(onward, end.t, way.t), q=_where(onward, after.q, way.q), v=_where(onward, after.v, way.v),
         phase=jnp.where(onward, target, way.phase), going=onward & (end.t < ts[-1]),
         rows=_filled(way.rows, mine & known, rows, i), switches=switches,
+        events=with_those_of(found["events"], way.events),
         end=_where(onward, end._replace(q=after.q, v=after.v), end),
         stats={name: n + found["stats"][name] for name, n in way.stats.items()},
         seen=jnp.maximum(way.seen, _sizes(end.q, end.v)), least=least,
@@ -199,10 +210,10 @@ def _leg(hybrid, i, mine, way: Way, params, ts, phase: Phase, settings, adjoint)
     return _where(mine, further, way)
 
 
-def _is_below(end: Moment, params, guards: Guards, rtol):
-    """Whether a guard is below zero, by more than errors make it."""
+def _is_below(end: Moment, params, guards: Guards, count: int, rtol):
+    """Whether one of the first guards is below zero, by more than errors make it."""
     state = stopped(tuple(end))
-    value = lambda *state: jnp.stack(guards(*state, stopped(params)))
+    value = lambda *state: jnp.stack(guards(*state, stopped(params))[:count])
     g, off = jax.jvp(value, state, uneven(state))
     return jnp.any(g < -NOT_BELOW * rtol[0] * jnp.abs(off))
 

@@ -156,7 +156,7 @@ class PoincareSection(eqx.Module):
 
 
 def poincare(
-    system: System,
+    system: System | Hybrid,
     q0: PyTree[ArrayLike],
     v0: PyTree[ArrayLike],
     params: PyTree = None,
@@ -199,11 +199,6 @@ def poincare(
     Source: Hénon & Heiles, *Astron. J.* 69 (1964) 73, §4; Hénon, *Physica D* 5 (1982) 412 (points that are exactly on
     the surface).
     """
-    if isinstance(system, Hybrid):
-        raise TypeError(
-            "a Poincaré section is of one system, and a lj.Hybrid has one for each of its phases.\n"
-            "Fix: the switches are recorded by lj.integrate, traj.switches; or one phase alone, hybrid.systems[0]."
-        )
     others = crossings_of(events, None)
     if SECTION in others:
         raise ValueError(

@@ -16,14 +16,15 @@ from lagjax.mechanics.arguments import OF_STATE, takes_of
 from lagjax.mechanics.closures import lift_function
 from lagjax.mechanics.constraints import zero_multipliers
 from lagjax.mechanics.coordinates import State
-from lagjax.mechanics.equations import equations_of
 from lagjax.mechanics.first_call import Call, check_arguments, in_words
 from lagjax.mechanics.hybrid import Hybrid, Switch, replace_fields
 from lagjax.mechanics.memory import shape_of
 from lagjax.mechanics.outside import first_guard_alike
 from lagjax.mechanics.system import System
 from lagjax.motion.backward import runs_backward
-from lagjax.motion.crossings import Crossing, guards_of
+from lagjax.motion.consistency import velocity_change
+from lagjax.motion.crossings import Crossing, Guards, guards_of, left_to_diffrax
+from lagjax.motion.hybrid_trajectory import SWITCHES
 from lagjax.motion.legs import Phase
 
 
@@ -80,7 +81,7 @@ def check_phases(hybrid: Hybrid, start: State):
                 )
 
 
-def refuse_beside_switches(hybrid: Hybrid, start: State, ts, adjoint, **given):
+def refuse_beside_switches(hybrid: Hybrid, start: State, ts, adjoint, event):
     """Raise where an argument has no meaning for a motion in phases."""
     check_phases(hybrid, start)
     if runs_backward(ts):
@@ -91,27 +92,38 @@ def refuse_beside_switches(hybrid: Hybrid, start: State, ts, adjoint, **given):
         raise ValueError(
             "BacksolveAdjoint does not go back through switches.\nFix: leave adjoint out (both modes work)."
         )
-    for name, value in given.items():
-        if value is not None and not (isinstance(value, Mapping) and not value):
+    if left_to_diffrax(event) is not None:
+        raise ValueError(
+            "an event that asks diffrax, as diffrax.steady_state_event does, is not for a motion in phases.\n"
+            "Fix: events= with a lj.Crossing."
+        )
+
+
+def phases_in(hybrid: Hybrid, start: State, events: Mapping[str, Crossing]) -> tuple[Phase, ...]:
+    """What ends each phase, called once on shapes, and what is recorded in all; `start`: the motion's first state."""
+    for name, crossing in events.items():
+        if takes_of(crossing.guard) != OF_STATE:
             raise ValueError(
-                f"{name} is not for a motion in phases yet.\n"
-                "Fix: leave it out, or integrate the phase alone, hybrid.systems[0]."
+                f"event '{name}' takes multipliers, which are others in each phase.\n"
+                "Fix: lj.Switch(..., when=lj.releases(name)) for a contact that lets go; traj.multipliers at outputs."
             )
+    if SWITCHES in events:
+        raise ValueError(
+            f"an event of events= is named '{SWITCHES}': so are the switches in traj.events.\nFix: another name."
+        )
+    return tuple(_phase(hybrid, i, start, events) for i in range(len(hybrid.systems)))
 
 
-def phases_in(hybrid: Hybrid, start: State) -> tuple[Phase, ...]:
-    """What ends each phase, called once on shapes; `start` is the first state of the motion."""
-    return tuple(_phase(hybrid, i, start) for i in range(len(hybrid.systems)))
-
-
-def _phase(hybrid, i, start):
+def _phase(hybrid, i, start, events):
     numbers, system = hybrid.leaving(i), hybrid.systems[i]
     listed = [hybrid.switches[k] for k in numbers]
     names = {f"{switch.in_words()}, number {k}": switch for k, switch in zip(numbers, listed)}
     crossings = {name: Crossing(switch.when, direction=-1) for name, switch in names.items()}
-    guards = guards_of(crossings, system, start, holds=True)
+    both = [guards_of(crossings, system, start, holds=True), guards_of(events, system, start)]
+    given = [guards for guards in both if guards is not None]
+    guards = Guards(*(sum((getattr(g, name) for g in given), ()) for name in ("functions", "kinds"))) if given else None
     resets = tuple(_reset(switch, hybrid, system, start) for switch in listed)
-    return Phase(guards, tuple(numbers), hybrid.targets[numbers], resets)
+    return Phase(guards, tuple(numbers), hybrid.targets[numbers], resets, tuple(events))
 
 
 def _reset(switch: Switch, hybrid, system, start) -> Reset:
@@ -180,8 +192,7 @@ class Nearest(eqx.Module):
         x, unflatten = coordinates.flatten(q)
         u, _ = coordinates.flatten(v)
         off = constraints.velocity_residual(self.system, t, x, u, params, unflatten)
-        displacement = equations_of(self.system, t, q, v, params).displacement(t, q, v)
-        return unflatten(u - displacement(np.ones(off.size, bool), off))
+        return jtu.tree_map(jnp.add, v, velocity_change(self.system, t, q, v, params, -off))
 
 
 def _alike(found, wanted):

@@ -54,6 +54,8 @@ class Motion:
 
     def __init__(self, trajectory: Trajectory, accounted):
         self.trajectory, self.systems, self.params = trajectory, phases_of(accounted), trajectory.params
+        # The number of outputs with which the motion is run again.
+        self.room = 0
         hybrid = isinstance(trajectory, HybridTrajectory)
         rows, end = jax.tree.map(np.asarray, (trajectory.rows(), trajectory.end))
         states = [x.reshape(len(x), -1) for x in jax.tree.leaves((rows["q"], rows["v"]))]
@@ -163,8 +165,7 @@ class Motion:
     def _again(self, a, b):
         """The powers at the nodes of intervals, on the motion as it is run again."""
         t = quadrature.nodes(a, b).ravel()
-        order = np.argsort(self.forward * t, kind="stable")
-        ts = np.concatenate([self.t[:1], t[order], self.t[-1:]])
+        ts = self._with_others(t)
         traj, first = self.trajectory, self._at(0)[1:]
         rtol, atol = (np.asarray(x) for x in traj.tolerance)
         settings = traj.asked._asdict() | {"rtol": tuple(rtol), "atol": None if atol.ndim == 2 else tuple(atol)}
@@ -180,12 +181,16 @@ class Motion:
                 f"the motion could not be run again for its works: {message(again.result)}\n"
                 "Usual cause: a motion at the edge of what its tolerance allows.\nFix: a tighter or looser rtol."
             )
-        back = np.empty_like(order)
-        back[order] = np.arange(len(order))
-        rows = {name: value for name, value in again.rows().items() if name != "phase"}
-        rows = jax.tree.map(lambda x: np.asarray(x)[1:-1][back], rows)
+        rows, place = again.rows(), np.searchsorted(self.forward * ts, self.forward * t)
+        rows = jax.tree.map(lambda x: np.asarray(x)[place], {name: rows[name] for name in ("q", "v", "multipliers")})
         phase = self._phase_of(np.repeat(0.5 * (a + b), len(quadrature.NODES)))
-        return self._powers(phase, rows["t"], rows["q"], rows["v"], rows["multipliers"])
+        return self._powers(phase, t, **rows)
+
+    def _with_others(self, t):
+        """These times in their order, the first and the last instant, and as many between as make one program do."""
+        self.room = max(self.room, 2 ** (len(t) + 1).bit_length())
+        others = np.linspace(self.t[0], self.t[-1], self.room - len(t), dtype=self.t.dtype)
+        return self.forward * np.unique(self.forward * np.concatenate([t, others]))
 
     def _phase_of(self, t):
         """The phase at times that are none of a switch."""

@@ -97,10 +97,6 @@ def test_said_by_name():
         lj.integrate(bouncing, 1.0, 0.0, PARAMS, ts=np.array([0.0, 1.0]), start="rolling")
     with pytest.raises(ValueError, match="start= names the first phase"):
         lj.integrate(ball, 1.0, 0.0, PARAMS, ts=np.array([0.0, 1.0]), start="flying")
-    with pytest.raises(ValueError, match="events is not for a motion in phases"):
-        lj.integrate(
-            bouncing, 1.0, 0.0, PARAMS, ts=np.array([0.0, 1.0]), events={"a": lj.Crossing(lambda t, q, v, p: v)}
-        )
     with pytest.raises(ValueError, match="runs forward"):
         lj.integrate(bouncing, 1.0, 0.0, PARAMS, ts=np.array([1.0, 0.0]))
     with pytest.raises(ValueError, match="leads back to its phase and resets nothing"):

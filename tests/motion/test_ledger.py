@@ -8,7 +8,8 @@ import pytest
 import lagjax as lj
 from lagjax.mechanics.reactions import reacts
 from lagjax.numerics import quadrature
-from lagjax.scenes import SCENES, bead_on_hoop, sliding_wedge, slipping_hoop
+from lagjax.scenes import SCENES, bead_on_hoop, sliding_wedge
+from tests.motion.test_hybrid import SPHERE, rolls, slides, throw
 
 RTOL = 1e-9
 
@@ -157,16 +158,14 @@ def test_impacts():
 
 
 @pytest.mark.slow
-def test_the_slipping_hoop():
-    """Rolls, slips, flies and lands: friction is the force of one of its phases, and its sign is seen."""
-    params = slipping_hoop.PARAMS | {"mu": 0.25}
-    traj = slipping_hoop.roll_and_slip(params, np.linspace(0.0, 2.0, 9), estimate_error=False)
-    ledger, rtol = lj.energy_ledger(traj), float(traj.tolerance[0][0])
-    assert ledger.relative_closure < 100 * rtol and ledger.works["force"].total[-1] < -1e-3
-    wrong = lj.Hybrid(
-        {name: flipped(system) for name, system in zip(traj.system.names, traj.system.systems)}, traj.system.switches
-    )
-    assert lj.energy_ledger(traj, wrong).relative_closure > 1e4 * max(ledger.relative_closure, rtol)
+def test_friction_on_a_multiplier():
+    """A sphere that slides, and rolls from then on: two sevenths of its energy go; twin: friction of the other sign."""
+    traj = throw(0.25, estimate_error=False)
+    ledger = lj.energy_ledger(traj)
+    assert len(traj.switches) == 1 and ledger.relative_closure < 100 * RTOL
+    np.testing.assert_allclose(ledger.works["force"].total[-1], -2 / 7 * 0.5 * SPHERE["m"] * 3.0**2, rtol=1e-9)
+    wrong = lj.Hybrid({"slides": flipped(slides), "rolls": rolls}, traj.system.switches)
+    assert lj.energy_ledger(traj, wrong).relative_closure > 1e4 * max(ledger.relative_closure, RTOL)
 
 
 @pytest.mark.slow

@@ -315,7 +315,3 @@ def test_refused_elsewhere():
         lj.periods(by_hand(jnp.ones(1)))
     with pytest.raises(ValueError, match="no event 'top'; recorded: 'section', 'turn'"):
         lj.PoincareSection(section.trajectory, "top")
-    ball = lj.System(lambda t, q, v, p: 0.5 * v**2 - 10.0 * q)
-    bounces = lj.Hybrid({"up": ball}, [lj.Switch("up", to="up", when=lj.touches(lambda t, q, p: q, restitution=0.5))])
-    with pytest.raises(TypeError, match="of one system"):
-        lj.poincare(bounces, 1.0, 0.0, section=bottom, ts=[0.0, 1.0])
