@@ -95,8 +95,14 @@ fig
 
 # %% [markdown]
 # The wedge recedes, so that the angle between the normal force and the particle's velocity is more than 90°: the
-# wedge takes 2.285 J from the particle in 0.75 s.
-#
+# wedge takes 2.285 J from the particle in 0.75 s. The energy ledger integrates the power of every force, by coordinate,
+# and has the same books. It never asks the energy, so that what does not add up would show in its last line.
+
+# %%
+ledger = lj.energy_ledger(traj)
+ledger
+
+# %% [markdown]
 # ## Who gets the energy?
 #
 # When the particle has fallen by $y$, energy $m g y$ has been set free. How much of it has the wedge? A sweep over
@@ -201,6 +207,9 @@ for name in power:
     assert abs(0.5 * ts[-1] * power[name][-1] - gain[name][-1]) < 1e-9
     assert abs(0.5 * ts[-1] * printed[name][-1] - gain[name][-1]) > 4.5, "the printed one"
 assert abs(gain["wedge"][-1] - 2.285) < 5e-4
+booked = ledger.constraints["incline"].work
+assert np.max(np.abs(booked["X"] - gain_of_wedge)) < 1e-9 and ledger.closes
+assert np.max(np.abs(booked["x"] + booked["y"] - gain_of_particle)) < 1e-9
 assert swept.ok.all() and np.max(np.abs(swept.values["of the energy"] - closed)) < 1e-9
 assert np.max(np.abs(swept.values["as work"] - closed)) < 1e-9
 assert np.max(np.abs(swept.values["force"] - cosine / (1 + ratios * sine**2))) < 1e-9

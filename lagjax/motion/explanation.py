@@ -1,7 +1,7 @@
 """`explain`: what a system amounts to at one state, in words and numbers."""
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, overload
 
 import jax.numpy as jnp
 import numpy as np
@@ -51,7 +51,15 @@ class Explanation:
         return "\n".join(["System", *(f"  {label:<{width}}  {text}" for label, text in self.rows)])
 
 
-def explain(system: System | Hybrid, q, v, params=None, *, t=0.0) -> Explanation | HybridExplanation:
+@overload
+def explain(system: System, q, v, params=None, *, t=0.0) -> Explanation: ...
+
+
+@overload
+def explain(system: Hybrid, q, v, params=None, *, t=0.0) -> HybridExplanation: ...
+
+
+def explain(system, q, v, params=None, *, t=0.0):
     """Say what a system amounts to at a state: freedoms, dependent constraints, mass matrix, problems.
 
     >>> import lagjax as lj

@@ -1,13 +1,10 @@
-"""The woodpecker toy: its cycle and the derivatives of its period against an independent computation."""
-
-from typing import cast
+"""The woodpecker toy: its cycle against an independent computation (`benchmarks/woodpecker.py`: its derivatives)."""
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lagjax.scenes.woodpecker import PARAMS, TURN, Lap, beak, lap, motion
+from lagjax.scenes.woodpecker import PARAMS, TURN, beak, lap, motion
 from tests.scenes import woodpecker_by_events as by_events
 
 TS = np.linspace(0.0, 0.18, 19)
@@ -15,7 +12,7 @@ NAMES = ("y", "sleeve", "bird")
 
 
 def test_the_independent_cycle():
-    """The other computation: the bird turns where it did, the modes of the cycle, and no energy for its edges to gain.
+    """The other computation: where the bird turns, the period, and what happens in it.
 
     Twin: without friction in the impacts the bird turns elsewhere.
     """
@@ -47,28 +44,3 @@ def test_the_cycle():
     assert np.all(np.asarray(jax.vmap(lambda t, q: beak(t, q, PARAMS))(traj.t, traj.q)) > 0)
     stiffer = by_events.changes(PARAMS | {"c": 1.001 * PARAMS["c"]}, TURN)
     assert abs(stiffer[-1].t - expected[-1].t) > 1e-5
-
-
-def of_parameters(given, **options):
-    """The period and what the bird gains, of (turn, mu, c)."""
-    turn, mu, c = given
-    found: Lap = lap(motion(PARAMS | {"mu": mu, "c": c}, TS[:: len(TS) - 1], turn, estimate_error=False, **options))
-    return jnp.stack([found.period, found.gained])
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("mode", ["forward", "reverse"])
-def test_the_period_by_its_parameters(mode):
-    """The derivative of the period of the cycle, by friction and by stiffness, against differences. Twin: at one turn.
-
-    The cycle moves with them: dT/dp = T_p - T_a r_p / r_a, with a the angle of the turn and r what the bird gains.
-    """
-    given = jnp.array([TURN, PARAMS["mu"], PARAMS["c"]])
-    slopes = jax.jit((jax.jacfwd if mode == "forward" else jax.jacrev)(of_parameters))(given)
-    (of_turn, *direct), (gain_of_turn, *gains) = np.asarray(slopes)
-    found = np.array(direct) - of_turn * np.array(gains) / gain_of_turn
-    for k, name in enumerate(("mu", "c")):
-        step = 1e-4 * cast(float, PARAMS[name])
-        above, below = (by_events.cycle(PARAMS | {name: PARAMS[name] + s * step}, TURN)[1] for s in (1, -1))
-        np.testing.assert_allclose(found[k], (above - below) / (2 * step), rtol=1e-5)
-        assert abs(direct[k] / found[k] - 1) > 1e-2
