@@ -52,11 +52,13 @@ class Explanation:
 
 
 @overload
-def explain(system: System, q, v, params=None, *, t=0.0) -> Explanation: ...
+def explain(system: System, q, v, params=None, *, t=0.0) -> Explanation:
+    """Of one system."""
 
 
 @overload
-def explain(system: Hybrid, q, v, params=None, *, t=0.0) -> HybridExplanation: ...
+def explain(system: Hybrid, q, v, params=None, *, t=0.0) -> HybridExplanation:
+    """Of a motion in phases."""
 
 
 def explain(system, q, v, params=None, *, t=0.0):

@@ -138,7 +138,7 @@ def energy_ledger(trajectory: Trajectory, system: System | Hybrid | None = None)
     >>> traj = lj.integrate(drop, 5.0, 0.0, ts=jnp.array([0.0, 1.0]))
     >>> ledger = energy_ledger(traj)
     >>> print(f"{ledger.works['dissipation'].total[-1]:.9f}")
-    -16.809124103
+    -16.809124072
 
     **Arguments:**
 
