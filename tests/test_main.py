@@ -92,13 +92,14 @@ def test_unknown_scene(run, capsys):
 def test_side_by_side_prints_the_same_in_order(tmp_path, capsys, monkeypatch):
     """Two scenes in processes of their own: what is printed and kept is that of one after the other, but for times."""
     monkeypatch.setattr(job, "_machine", lambda: "here")
+    names = ["bead_on_hoop", "sliding_wedge"]
 
     def done(jobs):
         folder = tmp_path / jobs
-        status = job.main(["bead_on_hoop", "stability", "--quick", "-o", str(folder), "-j", jobs])
-        report, rows = (json.loads((folder / f"{name}.json").read_text()) for name in ("report", "stability"))
-        errors = [(row["run"], row["method"], row["error"]) for row in report["scenes"]["bead_on_hoop"]["runs"]]
+        status = job.main([*names, "--quick", "-o", str(folder), "-j", jobs])
+        report = json.loads((folder / "report.json").read_text())
+        rows = [row for name in names for row in report["scenes"][name]["runs"]]
         titles = [line for line in capsys.readouterr().out.splitlines() if line and set(line) == {"="}]
-        return status, errors, [(row["name"], row["verdict"]) for row in rows["rows"]], titles
+        return status, [(row["run"], row["method"], row["error"]) for row in rows], titles
 
     assert done("2") == done("1")

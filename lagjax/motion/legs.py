@@ -48,9 +48,9 @@ AT_ONCE = 4
 class Phase(NamedTuple):
     """What ends one phase: its guards, in the order of the switches, and what each of them does to the state.
 
-    `switches` (k,): their numbers in the hybrid; `targets` (k, 2): the next phase, and
-    that of rest; `resets`: `reset(t, q, v, multipliers, params)` -> (q, v), and whether
-    the motion comes to rest there; `events`: the names of the guards after those of switches, which are recorded.
+    `switches` (k,): their numbers in the hybrid; `targets` (k, 2): the next phase, and that of rest; `resets`:
+    `reset(t, q, v, multipliers, params)` -> (q, v), and whether the motion comes to rest there; `events`: the names of
+    the guards after those of switches, which are recorded.
     """
 
     guards: Guards | None
