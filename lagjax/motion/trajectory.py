@@ -134,9 +134,9 @@ class Trajectory(eqx.Module):
       where nothing must stay.
     - `result`: a `RESULTS` item; `lj.RESULTS.successful`, `event_occurred`, or what went wrong.
     - `events`: by name, the `Crossings` of what was asked for.
-    - `params`, `system`: what was integrated; `asked`: by which method, with which steps. `tolerance`: (rtol, atol), each
-      (2,): for coordinates and for velocities. Where no atol was given it is (2, n), for each of them: what is as good
-      as zero on this motion.
+    - `params`, `system`: what was integrated; `asked`: by which method, with which steps. `tolerance`: (rtol, atol),
+      each (2,): for coordinates and for velocities. Where no atol was given it is (2, n), for each of them: what is as
+      good as zero on this motion.
 
     Under `vmap` every array has the batch's axes in front.
     """
