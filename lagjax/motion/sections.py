@@ -191,8 +191,8 @@ def poincare(
 
     **Raises:**
 
-    - `TypeError` for a section that is no function, and for a motion in phases; `ValueError` for a section that ends
-      the motion; and what `lj.integrate` raises.
+    - `TypeError` for a section that is no function; `ValueError` for a section that ends the motion, and in a motion in
+      phases for one that takes multipliers; and what `lj.integrate` raises.
     - Warns (`lj.EventWarning`) where crossings may be missing, and where there were more than are kept. In lanes and
       under `jit` look at `uncertain` and `count`, which are printed and drawn too.
 

@@ -56,7 +56,6 @@ class Motion:
         self.trajectory, self.systems, self.params = trajectory, phases_of(accounted), trajectory.params
         # The number of outputs with which the motion is run again.
         self.room = 0
-        hybrid = isinstance(trajectory, HybridTrajectory)
         rows, end = jax.tree.map(np.asarray, (trajectory.rows(), trajectory.end))
         states = [x.reshape(len(x), -1) for x in jax.tree.leaves((rows["q"], rows["v"]))]
         reached = np.all(np.isfinite(np.concatenate(states, axis=1)), axis=1)
@@ -70,7 +69,7 @@ class Motion:
         self.beyond = bool(self.forward * (end.t - rows["t"][-1]) > 0)
         if self.beyond:
             last = {"t": end.t, "q": end.q, "v": end.v, "multipliers": end.multipliers}
-            if hybrid:
+            if isinstance(trajectory, HybridTrajectory):
                 last["phase"] = np.int32(trajectory.last_phase())
             rows = jax.tree.map(lambda x, y: np.concatenate([x, y[None].astype(x.dtype)]), rows, last)
         self.t, self.q, self.v, self.multipliers = (rows[name] for name in ("t", "q", "v", "multipliers"))
@@ -259,7 +258,7 @@ def _sources(system, state, params) -> dict[str, int]:
 @compiled
 def _powers(system, t, q, v, multipliers, params):
     """The power of each source at each of a batch of states, (rows, n)."""
-    sources = _sources(system, jax.tree.map(lambda x: x[0], (t, q, v)), params)
+    timed = sees_time(system.lagrangian, *jax.tree.map(lambda x: x[0], (t, q, v)), params)
 
     def at(t, q, v, multipliers):
         x, unflatten = coordinates.flatten(q)
@@ -272,7 +271,7 @@ def _powers(system, t, q, v, multipliers, params):
         if system.dissipation is not None:
             slope = jax.grad(lambda u: system.dissipation(t, q, unflatten(u), params))(u)
             powers[DISSIPATION] = -slope * u
-        if TIME in sources:
+        if timed:
             powers[TIME] = -jax.grad(lambda t: system.lagrangian(t, q, v, params))(t)[None]
         for name, constraint in system.constraints.items():
             alone = eqx.tree_at(lambda s: s.constraints, system, {name: constraint})
