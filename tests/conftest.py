@@ -1,14 +1,18 @@
 """Strict numerics for all tests: float64, no silent rank promotion, warnings are errors.
 
-What is checked where; `.ci/run` does all three:
+What is checked where; `.ci/run` does the first three:
 
     python -m lagjax    the scenes: error against exact motions by method and tolerance, stiff and extreme cases,
                         pictures; the reduced stability report. Judged by the exit status, which `test_main.py` and
                         `test_stability.py` show to be 1 where anything is missed.
     pytest              every module on programs that compile in seconds; messages; examples in docstrings; the house.
-    pytest -m slow      what compiles for long, or in processes of its own: derivatives in both modes, orders, events,
+    pytest -m "slow and not exhaustive"
+                        what compiles for long, or in processes of its own: derivatives in both modes, orders, events,
                         degenerate and large systems, every mechanism to its end, fits and their uncertainties, random
                         systems; the code of README and docs, the notebooks, the types.
+    pytest -m exhaustive
+                        before a release, by hand, for an hour and more: further sizes, seeds, methods and modes of
+                        what a test above shows once.
 """
 
 import gc

@@ -88,7 +88,7 @@ def test_unknown_scene(run, capsys):
     assert "no scene named tinny; there are: tiny, and stability" in capsys.readouterr().err
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_side_by_side_prints_the_same_in_order(tmp_path, capsys, monkeypatch):
     """Two scenes in processes of their own: what is printed and kept is that of one after the other, but for times."""
     monkeypatch.setattr(job, "_machine", lambda: "here")

@@ -24,6 +24,7 @@ from lagjax.numerics.chained import Unknowns
 from lagjax.scenes import rolling_hoop
 from tests.counting import compiles
 from tests.fitting.cases import CASES, HUNG, PENDULUM, hung, pendulum, swing
+from tests.tiers import exhaustive_but
 
 TS = np.linspace(0.0, 5.0, 100)
 GUESS = PENDULUM | {"l": 1.4, "c": 0.1}
@@ -141,7 +142,7 @@ def test_a_measured_force_shows_the_mass():
     assert lj.identifiability(hung, record(q=traj.q, multipliers=traj.multipliers), HUNG, free=free).rank == 3
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_start_on_constraints_is_as_uncertain_as_they_are():
     """Held at its side a bob is a rod's length away, to the error of that length; as much in the angle, exactly."""
     case = CASES["pendulum on a rod"]
@@ -192,7 +193,7 @@ springs = lj.System(lambda t, q, v, p: 0.5 * jnp.sum(p.m * v**2) - 0.5 * jnp.sum
 SPRINGS = Springs(jnp.array([1.0, 2.0]), {"k": jnp.array([3.0, 5.0])})
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_elements_of_any_pytree():
     """One entry of an array is found, the others stay; bounds by element; a run with parameters of its own."""
     ts = np.linspace(0.0, 4.0, 60)
@@ -224,7 +225,7 @@ def test_what_the_residuals_tell():
     lj.fit(spring, lj.Record(TS, q=noisy(np.asarray(clean), 0.25)), {"k": 3.0})
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_observation_velocity_and_end():
     """Positions through an observation function, velocities, a time of departure: each finds what it shows."""
     measured = lambda t, q, v, params: {"x": params["l"] * jnp.sin(q), "y": -params["l"] * jnp.cos(q)}
@@ -249,7 +250,7 @@ def test_observation_velocity_and_end():
     np.testing.assert_allclose(found.sd, 1e-3 * 2 * rolling_hoop.PARAMS["g"] / float(left.end.t), rtol=1e-6)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_long_record_wants_a_growing_horizon():
     """27 periods at once end in a wrong minimum; a growing part of them, joined windows, and many starts do not."""
     ts = np.linspace(0.0, 60.0, 1500)
@@ -353,7 +354,9 @@ def problem(case, measured, **options):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["pendulum", "pendulum on a rod", "rolling hoop"])
+@pytest.mark.parametrize(
+    "name", exhaustive_but(("pendulum", "pendulum on a rod"), ("pendulum", "pendulum on a rod", "rolling hoop"))
+)
 def test_slopes_three_ways(name):
     """Slopes of all residuals, measured multipliers among them: forward, reverse, and by differences.
 
@@ -393,7 +396,7 @@ def test_inside_a_program(swinging):
     assert np.ptp(np.asarray(together)[:, 1]) > 1e-5
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_other_optimisers(swinging):
     """Another least-squares solver, and minimisers with derivatives in reverse, end in the same place."""
     data = noisy(swinging[0])
@@ -499,7 +502,7 @@ def test_unknowns_of_a_start_keep_to_the_constraints():
         assert abs(q["x"] * v["x"] + q["y"] * v["y"]) < 1e-12
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_log_likelihood_of_several_runs(swinging):
     """Two records: the likelihood of both, at their best the sum of squares."""
     records = [lj.Record(TS, q=noisy(swinging[0], seed=i), q0=1.0, v0=0.0, sigma=0.01) for i in (1, 2)]

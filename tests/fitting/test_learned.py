@@ -90,7 +90,7 @@ def test_a_learned_friction():
         assert float(lj.fit(viscous, measured, {"c": 0.5}).rms()["q"]) > 10 * noise
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_slopes_of_a_network_in_reverse():
     """The gradient of the cost by 193 weights: pulled back in one pass, and pushed forward along each."""
     net = eqx.nn.MLP("scalar", "scalar", 12, 2, jnp.tanh, key=jax.random.key(0))

@@ -69,7 +69,7 @@ def test_what_contradicts_sigma_is_no_success(clean):
     assert bool(lj.fit(driven, lj.Record(TS, q=larger(1.2), sigma=SIGMA), GUESS).converged)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("known", [True, False])
 def test_in_a_sweep(clean, known):
     """50 repeats from guesses up to 30 % off, and as many of something else: the status tells them apart."""
@@ -127,7 +127,7 @@ def test_quantiles_and_inverses():
         np.testing.assert_allclose(_undampened(dampened(r, loss), loss), r, rtol=1e-6)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_start_read_off_traced_measurements(clean):
     """In a program the start is read off as it is outside."""
     fit = lambda data: lj.fit(driven, lj.Record(TS, q=data, sigma=SIGMA), TRUE).values

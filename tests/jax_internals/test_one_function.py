@@ -189,7 +189,7 @@ def test_products_of_many_multiplications(size):
     check_products([size])
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_products_of_every_size():
     """Of 2 to 300, as matrix times vector; and of their square roots, as matrix times matrix."""
     check_products(range(2, 301))

@@ -41,7 +41,7 @@ def test_told_where_something_is_compiled(process):
 
 
 @pytest.mark.skipif(not memory_maps.MAPS.exists(), reason="only Linux tells")
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_the_remedy_helps():
     """Each system takes maps; after `jax.clear_caches()` there are as many as before the first."""
     code = """

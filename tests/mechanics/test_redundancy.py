@@ -102,7 +102,7 @@ def test_report_names_dependent_constraints_and_counts_freedoms():
     assert lj.explain(rod_pendulum, *STATE[1:]).dependent == ()
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_report_of_a_rounded_state():
     """The door has one degree of freedom and seven dependent equations, also at a state typed with six digits.
 
@@ -116,7 +116,7 @@ def test_report_of_a_rounded_state():
     assert lj.explain(door, rounded, DOOR_STATE[2], DOOR_STATE[3]).degrees_of_freedom == 1
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_report_of_a_state_with_other_velocities():
     """Off its constraints by the velocity: that is said first, and the nearest state on them judged: no contradiction.
 

@@ -66,7 +66,9 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("name", [pytest.param(x, marks=[pytest.mark.slow] * (x in ("net", "bars"))) for x in CASES])
+@pytest.mark.parametrize(
+    "name", [pytest.param(x, marks=[pytest.mark.exhaustive] * (x in ("net", "bars"))) for x in CASES]
+)
 def test_same_as_dense(name):
     """Accelerations and multipliers of chain, loop, net and jointed bars are those of the dense equations."""
     case = CASES[name]()
@@ -87,7 +89,7 @@ def doubled(count):
     return lj.System(particles, system.constraints | extra), q, v, params
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_redundant_constraints_have_the_shortest_multipliers():
     """With rows that depend on others the accelerations are the same, and the multipliers those of least squares."""
     case = doubled(10)
@@ -99,7 +101,7 @@ def test_redundant_constraints_have_the_shortest_multipliers():
     assert largest(found[0] - alone) <= 1e-11 * largest(alone)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_contradictory_constraints_are_named():
     """The same links asked for at another rate contradict: an error, and NaN while tracing."""
     system, q, v, params = chain(10)
@@ -118,7 +120,7 @@ def test_undetermined_is_refused():
         lj.accelerations(system, 0.0, q, v, params)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_undetermined_is_refused_at_the_start_of_a_motion():
     """The same, by the verdict inside the compiled program."""
     system, q, v, params = with_masses(np.append(np.ones(11), 0.0))
@@ -217,7 +219,7 @@ def test_without_constraints():
         lj.accelerations(free, 0.0, q, v, params | {"m": params["m"].at[3].set(0.0)})
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_explain_says_so():
     """The row names band and size; a small system has none."""
     assert "banded, half bandwidth 1, 9 equations" in repr(lj.explain(*chain(9)))
@@ -237,7 +239,7 @@ def test_a_motion_stays_on_its_links():
     assert sparse.residual() < 1e-14 and sparse.drift() < 1e-9
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_gradient_of_a_motion():
     """Of the end of a chain by gravity: forward, reverse, and a difference of two motions."""
     system, q, v, params = chain(8)

@@ -18,7 +18,7 @@ def disturbed(params, roll, steer, roll_rate, steer_rate):
     return q | {"roll": roll, "steer": steer}, v | {"steer": steer_rate, "yaw": yaw_rate}
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_it_runs_straight_and_obeys_the_published_linear_equations():
     """M a = -u C₁ rates - (g K₀ + u² K₂) angles, for each of four disturbances; with another trail it does not."""
     respond = jax.jit(lambda q, v, params: lj.accelerations(bicycle.system, 0.0, q, v, params))

@@ -11,6 +11,7 @@ import lagjax as lj
 from lagjax.mechanisms import MECHANISMS, andrews, car_axis, driven_crank, fekete, n_four_bar
 from tests.mechanisms import published
 from tests.mechanisms.test_equations import stacked
+from tests.tiers import exhaustive_but
 
 pytestmark = pytest.mark.slow
 
@@ -110,6 +111,7 @@ def test_andrews_multipliers_at_the_start():
     assert np.max(np.abs(np.asarray(traj.multipliers["loops"][0]) + andrews.SOURCE_MULTIPLIERS[0])) <= 1e-10
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("rtol", TOLERANCES)
 def test_ladder_before_it_lies_down(rtol):
     """The chain of four-bars ends where the elliptic functions do, before the first singular position."""
@@ -120,7 +122,7 @@ def test_ladder_before_it_lies_down(rtol):
     assert np.all(errors <= WITHIN), errors
 
 
-@pytest.mark.parametrize("rtol", [*TOLERANCES, 1e-12])
+@pytest.mark.parametrize("rtol", exhaustive_but((1e-8,), (*TOLERANCES, 1e-12)))
 def test_singular_position_is_passed_or_reported(rtol):
     """Through the first singular position the end is right, or the integration says that it failed."""
     mechanism = n_four_bar.MECHANISM
@@ -132,6 +134,7 @@ def test_singular_position_is_passed_or_reported(rtol):
     assert right or not bool(traj.result == lj.RESULTS.successful)
 
 
+@pytest.mark.exhaustive
 def test_motor_of_the_driven_crank():
     """At all times the motion is the closed form's, and the drive's multiplier is the motor's torque."""
     mechanism = driven_crank.MECHANISM
@@ -143,6 +146,7 @@ def test_motor_of_the_driven_crank():
     np.testing.assert_allclose(traj.multipliers["motor"], torque, atol=1e-13 * np.max(np.abs(torque)))
 
 
+@pytest.mark.exhaustive
 def test_fekete_multipliers():
     """At rest every multiplier is -(N - 1)/4, whatever the arrangement."""
     np.testing.assert_allclose(run(fekete.MECHANISM, 1e-10).multipliers["sphere"][-1], -19 / 4, rtol=1e-12)

@@ -109,7 +109,11 @@ def test_each_part_is_reflected():
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "options",
-    ({"drift": "baumgarte"}, {"method": lj.Radau5()}, {"dt0": 0.01, "max_step": 0.1}),
+    [
+        {"dt0": 0.01, "max_step": 0.1},
+        pytest.param({"drift": "baumgarte"}, marks=pytest.mark.exhaustive),
+        pytest.param({"method": lj.Radau5()}, marks=pytest.mark.exhaustive),
+    ],
     ids=str,
 )
 def test_there_and_back(options):
@@ -145,7 +149,7 @@ def test_events_backward():
     np.testing.assert_allclose(run(moving).t, 1.4, atol=1e-12)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_derivatives_and_lanes_backward():
     """Forward, reverse and second derivatives, `jit` and `vmap`: q = q2 cos(k (t - 2)) + v2/k sin(k (t - 2))."""
     spring = lj.System(lambda t, q, v, params: 0.5 * v**2 - 0.5 * (params["k"] * q) ** 2)

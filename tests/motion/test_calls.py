@@ -131,7 +131,7 @@ print(used[5] - used[2])
 """
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_programs_of_many_systems_are_dropped():
     """Memory maps stay as they are; the twin, which keeps all, takes more for each."""
     grown = lambda kept: float(subprocess.check_output([sys.executable, "-c", MANY, kept], text=True))

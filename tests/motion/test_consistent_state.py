@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import lagjax as lj
+from tests.tiers import exhaustive_but
 
 rng = np.random.default_rng(5)
 MASSES = np.array([2.0, 0.5])
@@ -61,7 +62,7 @@ def test_nearest_in_the_metric_of_the_masses():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("mode", [jax.jacfwd, jax.jacrev])
+@pytest.mark.parametrize("mode", exhaustive_but((jax.jacrev,), (jax.jacfwd, jax.jacrev)))
 def test_derivatives_by_everything(mode):
     """Its derivatives by time, state and parameters are those of the one-angle solution, also from far off."""
     ours = lambda t, q, v, params: flat(lj.consistent_state(on_ellipse, t, q, v, params))
@@ -130,7 +131,7 @@ def test_unreachable_is_an_error_with_the_residual_by_name():
         lj.consistent_state(lj.System(lagrangian, walls), 0.0, *state, PARAMS)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_redundant_constraints_are_no_obstacle():
     """An ellipse given twice leads to the same point."""
     again = lj.Holonomic(lambda t, q, params: 2.0 * ellipse(t, q, params))
@@ -149,7 +150,7 @@ def test_one_coordinate(factors):
     np.testing.assert_allclose([q, v], [np.sin(0.5), np.cos(0.5)], rtol=1e-12)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_held_coordinate_that_a_constraint_fixes():
     """Where the value held is the one that is asked for, the constraint is one dependent equation more."""
     particle = lambda t, q, v, params: 0.5 * (v["x"] ** 2 + v["y"] ** 2 + v["z"] ** 2)

@@ -57,7 +57,7 @@ def test_massless_crank():
     assert np.max(np.abs(x - 0.5 * np.cos(slower * CRANK_TS) - np.sin(slower * CRANK_TS) / slower)) > 0.5
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_massless_crank_reaches_its_dead_centre():
     """Faster, the slider reaches l, where nothing determines θ: the motion ends there, with time and place."""
     speed = 2.5
@@ -164,7 +164,7 @@ def on_shell(params, start, tol=TIGHT):
     )
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_charge_on_its_mass_shell():
     """Indefinite M under a nonlinear velocity constraint: cyclotron, crossed fields, a force that the shell alters."""
     start = four_velocity(0.75, -1.25)
@@ -190,7 +190,7 @@ def test_charge_on_its_mass_shell():
     assert np.max(np.abs(u[0, 1] + scalar["f"] / scalar["m"] * PROPER_TIMES - u[:, 1])) > 0.1
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_cyclotron_without_its_mass_shell():
     """The indefinite M alone: radius γ m v / (e B), rate e B / (γ m) in the laboratory's time; η(u, u) stays."""
     start = four_velocity(0.75, -1.25)
@@ -245,7 +245,7 @@ def gyrating(params, t):
     return jnp.stack([params["ux"] * s + params["uy"] * c, params["uy"] * s - params["ux"] * c])
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_relativistic_charge():
     """Hyperbolic motion from γ = 1.5 to 4.5, and the circle in B, with their derivatives by every parameter."""
     t = jnp.asarray(12.0)
@@ -334,7 +334,7 @@ def distance_to_great_circle(traj, miss):
     return np.max(np.abs(path - great_circle(miss, np.asarray(traj.t))))
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_through_the_pole_or_not_at_all():
     """A path that runs into the pole comes out on its great circle, to the tolerance, or ends there: never else."""
     outcomes = []

@@ -87,7 +87,7 @@ def test_a_motion_that_failed_plays_as_far_as_it_came():
         lj.integrate(kepler, 0.0, 0.0, ts=DENSE, throw=False).animate(bob)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_batch_is_animated_lane_by_lane():
     """A batch says how to take a lane of it, and the lane plays."""
     batch = jax.vmap(lambda q0: lj.integrate(pendulum, q0, 0.0, PARAMS, ts=DENSE))(np.array([0.5, 1.0]))

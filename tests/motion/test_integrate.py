@@ -75,7 +75,7 @@ def test_gradients_in_both_modes():
         np.testing.assert_allclose(reverse[name], forward[name], rtol=1e-9, atol=1e-10)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_second_derivative_forward():
     """Forward over forward agrees with a central difference of first derivatives."""
     final = lambda k: lj.integrate(
@@ -89,7 +89,12 @@ def test_second_derivative_forward():
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "adjoint", [diffrax.ForwardMode(), diffrax.RecursiveCheckpointAdjoint(), diffrax.BacksolveAdjoint()]
+    "adjoint",
+    [
+        diffrax.ForwardMode(),
+        diffrax.RecursiveCheckpointAdjoint(),
+        pytest.param(diffrax.BacksolveAdjoint(), marks=pytest.mark.exhaustive),
+    ],
 )
 def test_diffrax_adjoints_are_accepted(adjoint):
     """Each adjoint gives cos(2t)'s derivative by the stiffness of an oscillator."""
@@ -117,7 +122,7 @@ def test_lanes_agree_with_single_runs_and_keep_their_own_failure():
     assert "3 successful" in repr(batch) and "not finite" in repr(batch)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_gradient_of_a_batch():
     """The gradient of a sum over lanes is the sum of the lanes' gradients, with shared and with batched inputs."""
     system = lj.System(lambda t, q, v, params: 0.5 * v**2 - 0.5 * params["k"] * q**2)
@@ -134,8 +139,8 @@ def test_gradient_of_a_batch():
 @pytest.mark.parametrize(
     "transform",
     [
-        pytest.param(jax.jacfwd, marks=pytest.mark.slow),
-        pytest.param(jax.grad, marks=pytest.mark.slow),
+        pytest.param(jax.jacfwd, marks=pytest.mark.exhaustive),
+        pytest.param(jax.grad, marks=pytest.mark.exhaustive),
         lambda f: jax.jit(jax.grad(f)),
     ],
 )
@@ -165,7 +170,7 @@ def test_event_is_located_by_the_method():
     assert bool(traj.result == lj.RESULTS.event_occurred)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_lanes_with_and_without_an_event():
     """A batch may mix lanes that reach the event, that do not, and that fail; a true-or-false condition works too."""
     event = diffrax.Event({"bottom": lambda t, y, p, **kwargs: y[0], "late": lambda t, y, p, **kwargs: t > 1.5})
@@ -204,7 +209,9 @@ def test_event_time_gradient():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("method", [None, lj.Tsit5(), lj.Dopri8()], ids=["by default", "Tsit5", "Dopri8"])
+@pytest.mark.parametrize(
+    "method", [None, lj.Dopri8(), pytest.param(lj.Tsit5(), marks=pytest.mark.exhaustive)], ids=["default", "8", "5"]
+)
 def test_float32_with_explicit_time(method):
     """Stages at times of their own stay in float32, also where JAX has float64."""
     driven = lj.System(lambda t, q, v, params: 0.5 * v**2 + params * q * jnp.sin(3 * t))

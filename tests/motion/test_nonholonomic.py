@@ -676,7 +676,7 @@ def test_returning_to_the_plane_rolls():
     assert np.max(np.abs(np.asarray(sliding))) > 1e-5
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_gradient_of_rolling_in_reverse():
     """d(place + friction)/d(m, R, I, g, start) of the disk on an incline, reverse mode, is the closed form's."""
     weights = np.array([0.75, -1.25, 0.5, 1.5])
@@ -698,7 +698,7 @@ def test_gradient_of_rolling_in_reverse():
             np.testing.assert_allclose(found[name], value, atol=1e-10, err_msg=name)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_gradients_of_cruising_in_reverse():
     """Reverse mode through a nonlinear velocity constraint: the closed form's derivatives of place, velocity and μ."""
     ts = np.array([0.0, 1.25])

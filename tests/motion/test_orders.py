@@ -21,6 +21,7 @@ from jax.flatten_util import ravel_pytree
 import lagjax as lj
 from lagjax.numerics.simplified_newton import SimplifiedNewton
 from tests.systems import DOUBLE_PARAMS, DOUBLE_SWING, double_pendulum, double_rods, rods_from_angles
+from tests.tiers import exhaustive_but
 
 CLAIM = 0.35
 OUTPUTS = np.concatenate([[0.0], np.linspace(0.3, 8.0, 28) + 0.013 * np.sin(7 * np.arange(28.0))])
@@ -108,22 +109,26 @@ class ShippedDopri8(diffrax.Dopri8):
     """Diffrax's own: as it is shipped it would run in our form."""
 
 
+SLOW = [(lj.Radau5(root_finder=SimplifiedNewton(rtol=1e-12, atol=1e-12)), 5, (28, 40, 56))]
 # One of each kind that diffrax has: the rest differ in their numbers alone.
-SLOW = [
+OTHERS = [
     (ShippedDopri8(), 8, (18, 22, 28)),
     (diffrax.Kvaerno5(root_finder=NEWTON), 5, (28, 40, 56)),
-    (lj.Radau5(root_finder=SimplifiedNewton(rtol=1e-12, atol=1e-12)), 5, (28, 40, 56)),
     (diffrax.Euler(), 1, (800, 1600, 3200)),
     (diffrax.LeapfrogMidpoint(), 2, (200, 400, 800)),
     (diffrax.ReversibleHeun(), 2, (200, 400, 800)),
     (diffrax.HalfSolver(diffrax.Heun()), 2, (100, 200, 400)),
 ]
-slow = lambda cases: [pytest.param(*case, marks=pytest.mark.slow) for case in cases]
+marked = lambda cases, *marks: [pytest.param(*case, marks=marks) for case in cases]
 name_of = lambda value: type(value).__name__ if isinstance(value, diffrax.AbstractSolver) else None
 
 
 @pytest.mark.parametrize("form", ["free", pytest.param("constrained", marks=pytest.mark.slow)])
-@pytest.mark.parametrize(("method", "order", "steps"), FAST + slow(SLOW), ids=name_of)
+@pytest.mark.parametrize(
+    ("method", "order", "steps"),
+    FAST + marked(SLOW, pytest.mark.slow) + marked(OTHERS, pytest.mark.exhaustive),
+    ids=name_of,
+)
 def test_order(exact, form, method, order, steps):
     """Each method has its order in positions, velocities and multipliers, free and projected, between its steps."""
     measured = orders(exact[form], steps, lambda n: computed(form, run(form, method, 1 / n)))
@@ -138,7 +143,7 @@ def with_lower_weights(method):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("form", ["free", "constrained"])
+@pytest.mark.parametrize("form", exhaustive_but(("free",), ("free", "constrained")))
 @pytest.mark.parametrize(("method", "order", "steps"), FAST[:2], ids=name_of)
 def test_a_lower_order_would_be_seen(exact, form, method, order, steps):
     """Failing twin: with the embedded weights no quantity passes."""
@@ -147,7 +152,7 @@ def test_a_lower_order_would_be_seen(exact, form, method, order, steps):
     assert not any(within(order, measured)), measured
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_cubic_outputs_would_be_seen(exact):
     """Failing twin: the same steps with cubic outputs between them (as diffrax's Kvaerno5 has) show order four."""
     every_second = {name: value[1::2] for name, value in exact["constrained"].items()}
@@ -175,7 +180,7 @@ def cubic(y, slope, s, h):
     return jax.tree.map(one, y, slope)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_gradients_through_a_thousand_constrained_steps():
     """d(final state, multipliers)/d(parameters, start): finite, forward is reverse to 1e-8, a difference to 1e-6."""
 

@@ -63,7 +63,7 @@ two_rods = lj.System(
 )
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_derivatives_in_lanes():
     """Reverse derivatives of end and force, in lanes, are the forward ones of the pendulum in its angle."""
     lanes = {"g": jnp.array([9.8, 5.0]), "l": jnp.array([1.25, 2.0]), "v": jnp.array([2.5, -1.0])}

@@ -9,6 +9,7 @@ import pytest
 
 import lagjax as lj
 from lagjax.motion import both_modes
+from tests.tiers import exhaustive_but
 
 TS = np.array([0.0, 0.9])
 spring = lj.System(lambda t, q, v, params: 0.5 * v**2 - 0.5 * (params * q) ** 2)
@@ -40,7 +41,7 @@ def of_thirty_by_hand(p):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("inner", (jax.jacfwd, jax.jacrev))
+@pytest.mark.parametrize("inner", exhaustive_but((jax.jacrev,), (jax.jacfwd, jax.jacrev)))
 @pytest.mark.parametrize("outer", (jax.jacfwd, jax.jacrev))
 def test_modes_in_any_order(inner, outer):
     """The Hessian of a motion whose formula is known, with the modes nested in all four ways."""
@@ -56,7 +57,7 @@ def test_gradients_of_gradients():
     np.testing.assert_allclose(jax.jit(jax.vmap(second(end)))(k), jax.vmap(second(exact))(k), atol=1e-8)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_hessian_times_a_vector_by_many_numbers():
     """`jvp(grad)` by 30 numbers, whose gradient goes through the checkpoints, is that of the formula."""
     along = jax.tree.map(np.cos, MANY)

@@ -9,6 +9,8 @@ import sys
 
 import pytest
 
+from tests.tiers import exhaustive_but
+
 START = """
 import jax, jax.numpy as jnp, numpy as np, equinox as eqx, lagjax as lj
 jax.config.update("jax_enable_x64", True)
@@ -38,7 +40,7 @@ def survives(script):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("how", TRANSFORMED)
+@pytest.mark.parametrize("how", exhaustive_but(("closed over", "lanes"), TRANSFORMED))
 def test_any_number_of_outputs(how):
     """2 times (one output after the start) to 100,000; XLA ended the process above 10 kB that it knew."""
     sizes = (2, 3, 1000, 1024, 1025, 1251, 5000, 100_000) if how == "closed over" else (2, 1251, 100_000)
@@ -48,7 +50,7 @@ def test_any_number_of_outputs(how):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("width", [16, 32, 63, 64, 65, 128])
+@pytest.mark.parametrize("width", exhaustive_but((64,), (16, 32, 63, 64, 65, 128)))
 def test_networks_of_any_width(width):
     """One in `params`, one closed over, in value and derivative, against the network left out of all rewriting."""
     survives(f"""
@@ -68,7 +70,7 @@ agrees(slope, (step(1 + 1e-4) - step(1 - 1e-4)) / 2e-4, 1e-6)
 """)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_mass_matrices_and_tables_of_any_size():
     """Coordinates around 16, whose matrix products have 4,096 multiplications, and tables around 10 kB."""
     survives("""

@@ -69,7 +69,7 @@ def test_integrate_tells_and_goes_on():
     assert jax.eval_shape(traced, 0.5, 0.5).shape == (2,)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_single_precision_is_told_once():
     """Without x64: by the first start that is none of NumPy's float32; with it never."""
     code = """

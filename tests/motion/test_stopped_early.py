@@ -120,7 +120,7 @@ def test_steps_that_collapse_at_a_singularity():
         lj.integrate(kepler, 1.0, 0.0, ts=np.array([0.0, 2.0]), method=lj.Dopri8())
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_the_advice_for_a_stiff_spring_helps():
     """With `step_powers=(0, 1)` it moves as on a rod to 1e-5, in a fifth of the steps of `Radau5()`."""
     start, ts = ({"x": 1.0, "y": 0.0}, {"x": 0.0, "y": 0.0}), np.array([0.0, 10.0])

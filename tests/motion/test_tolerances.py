@@ -157,7 +157,7 @@ def test_at_rest_until_a_force_sets_in():
         np.testing.assert_allclose(traj.q[-1] - rest, 10 * (1 - np.cos(0.75)), rtol=1e-7)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_at_round_off_without_mass():
     """A coordinate that is zero but for rounding, and has no mass to compare it by, does not stop the motion."""
     beside = lj.Holonomic(lambda t, q, p: q[2] - 3.0 * (q[0] ** 2 + q[1] ** 2 - 1.0))

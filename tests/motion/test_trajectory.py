@@ -83,7 +83,7 @@ def test_plot_has_a_panel_for_each_kind(traj):
     assert [axis.get_ylabel() for axis in free.plot().axes] == ["q", "v"]
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_batch_is_plotted_lane_by_lane():
     """A batch refuses to plot itself and says how to take a lane."""
     batch = jax.vmap(lambda q0: lj.integrate(pendulum, q0, 0.0, PARAMS, ts=TS))(np.array([0.5, 1.0]))

@@ -79,7 +79,7 @@ def test_weights_are_quadratures(tableau):
     np.testing.assert_allclose([sum(row) for row in tableau.a], c[1:] ** 2 / 2, rtol=1e-12)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_stages_in_a_loop_are_the_same():
     """Step by step."""
     fixed = diffrax.ConstantStepSize()
@@ -131,7 +131,7 @@ def test_refused_where_velocities_count():
             lj.integrate(system, 1.0, 0.0, {"g": 1.0}, ts=jnp.array([0.0, 0.1]), method=lj.Nystrom8())
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_many_coordinates_and_derivatives():
     """A lattice of forty masses, in arrays and stages in a loop: against Dopri8, with its derivatives in both modes."""
     springs = lambda q, params: jnp.sum(0.5 * jnp.diff(q) ** 2 + params["β"] / 4 * jnp.diff(q) ** 4)

@@ -213,7 +213,7 @@ def test_forward_derivative():
     np.testing.assert_allclose(forward(jnp.array([3.0, 1.5])), gradient_of_decay(3.0, 1.5), rtol=1e-7)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_reverse_derivative():
     """So is the gradient through the checkpointed solve, and lane by lane."""
     reverse = jax.jit(jax.vmap(jax.grad(lambda p: end_of_decay(p, diffrax.RecursiveCheckpointAdjoint()))))
@@ -221,7 +221,7 @@ def test_reverse_derivative():
     np.testing.assert_allclose(reverse(points), [gradient_of_decay(*p) for p in points], rtol=1e-7)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_derivatives_of_a_motion():
     """A stiff oscillator through `lagjax.integrate`: dq/dk of cos(sqrt(k) t) in both modes."""
     system = lj.System(lambda t, q, v, params: 0.5 * v**2 - 0.5 * params * q**2)

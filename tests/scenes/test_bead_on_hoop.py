@@ -159,7 +159,7 @@ def test_exact_motion_obeys_equation_13():
         assert np.max(np.abs(second + params["g"] / params["a"] * jnp.sin(angle))) > 0.1
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_measured_periods():
     """Periods measured by an event on ψ̇ at tolerance 1e-10 are those of the elliptic integrals to 1e-9, but for one."""
     params = _stacked([params for params, _ in PERIODS.values()])

@@ -278,7 +278,7 @@ def test_screw_symmetry_of_the_potential():
         assert abs(potential(scene.vector(*moved, z + h * angle), params) - start) > 1e-2
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_bounce_through_the_plane():
     """The fall onto the kink takes a quarter of the period 4 w/(2πGσ), and ends with the speed w."""
     for speed in (2.0, 0.5):

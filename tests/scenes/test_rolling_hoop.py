@@ -126,7 +126,7 @@ def test_motion_and_departure_when_integrated():
     assert float(got.residual()) <= 1e-12
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_departures_of_other_starts():
     """Near the top, on the left, pushed either way, other inertia: angles and times to 1e-9, none on the top."""
     starts = {

@@ -16,6 +16,7 @@ from lagjax.motion import reported
 from lagjax.sweeps import lanes, remembered
 from lagjax.sweeps.axes import axes_of
 from tests.plain import not_plain
+from tests.tiers import exhaustive_but
 
 # The mass matrix [[k, 1], [1, k]] is definite for k > 1; for k < 1 it needs pivots.
 saddle = lj.System(
@@ -123,7 +124,7 @@ HIDDEN = {
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("what", HIDDEN)
+@pytest.mark.parametrize("what", exhaustive_but(("a map",), HIDDEN))
 def test_motions_that_nobody_is_told_of(what, compiled, monkeypatch):
     """In a loop or a branch nothing is taken for regular. Twin: it would go unnoticed."""
     run = lambda point: HIDDEN[what](point["k"])
@@ -135,7 +136,9 @@ def test_motions_that_nobody_is_told_of(what, compiled, monkeypatch):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("derivative", [jax.grad, jax.jacfwd, lambda f: jax.vmap(jax.grad(f))])
+@pytest.mark.parametrize(
+    "derivative", exhaustive_but((jax.grad,), (jax.grad, jax.jacfwd, lambda f: jax.vmap(jax.grad(f))))
+)
 def test_derivatives(derivative, compiled):
     """In both modes, and in lanes inside: those of the exact motion. Twin: the first program alone has NaN."""
     motion = lambda k: saddle_motion(k).q[-1, 0]
@@ -151,7 +154,7 @@ def test_derivatives(derivative, compiled):
     np.testing.assert_array_equal(np.isnan(regular_alone(run)[0]), BOTH["k"] < 1)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_many_chunks_and_workers(compiled):
     """One careful program for all of them; after a chunk that is mostly irregular the other is not called again."""
     many = {"k": np.tile(BOTH["k"][:2], 40)}
@@ -173,7 +176,7 @@ def test_many_chunks_and_workers(compiled):
     assert calls["regular"] == 1
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_in_turn_and_resweep(compiled):
     """One lane after the other, and run again."""
     swept = quiet(first_coordinate, layout="in turn")
@@ -204,7 +207,7 @@ doubled = lj.System(
 )
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_constraint_written_twice(monkeypatch):
     """Dependent constraints, and starts that are none: values and statuses are those without all this."""
 
