@@ -19,6 +19,7 @@ from lagjax.fitting.records import Record
 from lagjax.fitting.result import Fit, FitWarning
 from lagjax.fitting.search import Course, listening, look, search
 from lagjax.mechanics import coordinates
+from lagjax.mechanics.hybrid import Hybrid
 from lagjax.mechanics.system import System
 from lagjax.meter import meter, waiting
 from lagjax.motion.integrate import integrate
@@ -43,7 +44,7 @@ STAGE_DONE, DONE, OF_RTOL, ROUND_OFFS = 1e-4, 1e-9, 10.0, 100.0
 
 
 def fit(
-    system: System,
+    system: System | Hybrid,
     records: Record | Sequence[Record],
     params: PyTree,
     *,
@@ -77,6 +78,7 @@ def fit(
 
     **Main arguments:**
 
+    - `system`: also a `Hybrid`, whose records start in one phase (`start=`, the first by default); without windows.
     - `records`: one `Record` or several, each with its own initial state. Angles as they run on, not wrapped to a turn.
     - `params`: what the Lagrangian takes, with guesses of what is to be found; all records share it.
     - `free`: the names of what is found, `"g"`, `["m[1]", "arm.length"]`, or of a part, such as a network,
@@ -153,7 +155,7 @@ def fit(
 
 
 def identifiability(
-    system: System,
+    system: System | Hybrid,
     records: Record | Sequence[Record],
     params: PyTree,
     *,

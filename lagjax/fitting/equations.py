@@ -71,6 +71,8 @@ class Problem:
     """
 
     system: Any
+    # What holds at the starts: of a motion in phases the first of them.
+    first: Any
     found: Found
     overrides: dict[str, Array]
     windows: Windows
@@ -115,7 +117,7 @@ class Problem:
     def state(self, x, s, w):
         """(q, v) from which the motion of window w starts."""
         of_window, t = jax.tree.map(lambda a: a[w], self.starts), jnp.asarray(self.windows.ts)[w, 0]
-        return of_window.state(s, self.system, t, self.params(x, w), self.unflatten)
+        return of_window.state(s, self.first, t, self.params(x, w), self.unflatten)
 
     def motion(self, x, s, w, stage: Stage, adjoint=None):
         """The motion of window w, and the state it starts from."""

@@ -11,6 +11,7 @@ from lagjax.fitting.equations import Problem
 from lagjax.fitting.records import channel_name
 from lagjax.mechanics import constraints
 from lagjax.mechanics.diagnosis import listed
+from lagjax.mechanics.hybrid import phases_of
 
 
 def check_predicted(problem: Problem):
@@ -20,8 +21,9 @@ def check_predicted(problem: Problem):
     t, params = jax.ShapeDtypeStruct((), problem.windows.ts.dtype), problem.found.params
 
     def one_time(t, q, v, params):
-        shapes = constraints.shapes(problem.system, t, q, v, params)
-        said = {"q": q, "v": v, "multipliers": {name: jnp.zeros(shape) for name, shape in shapes.items()}}
+        shapes = [constraints.shapes(phase, t, q, v, params) for phase in phases_of(problem.system)]
+        multipliers = {name: jnp.zeros(shape) for phase in shapes for name, shape in phase.items()}
+        said = {"q": q, "v": v, "multipliers": multipliers}
         if problem.observe is not None:
             said["observed"] = problem.observe(t, q, v, params)
         return said | {"end": {"t": t, **said}}

@@ -15,8 +15,10 @@ from lagjax.fitting.result import FitWarning
 from lagjax.fitting.starts import starts
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.diagnosis import listed
+from lagjax.mechanics.hybrid import Hybrid, first_phase
 from lagjax.mechanics.outside import up_to_date
 from lagjax.motion.problem import check_system
+from lagjax.motion.switching import each_phase, starting
 
 # What `integrate` takes and a fit sets itself.
 OURS = {"ts", "throw", "adjoint"}
@@ -25,7 +27,8 @@ OURS = {"ts", "throw", "adjoint"}
 def problem_of(system, records, params, free, observe, bounds, priors, loss, window, options) -> Problem:
     """Check everything and make arrays of it."""
     check_system(system)
-    system = up_to_date(system)
+    system = _starting(system, window, options)
+    first = first_phase(system)
     records = [records] if isinstance(records, Record) else list(records)
     if not records or not all(isinstance(record, Record) for record in records):
         raise TypeError("records must be a lj.Record or a list of them.\nFix: lj.Record(t, q=measured).")
@@ -41,19 +44,30 @@ def problem_of(system, records, params, free, observe, bounds, priors, loss, win
     windows = cut(records, window, dtype)
     overrides = _overrides(records, windows, found)
     params_of = lambda r: replace(found.params, {name: values[r] for name, values in overrides.items()})
-    starting, unflatten = starts(system, records, windows, params_of, options)
+    guessed, unflatten = starts(first, records, windows, params_of, options)
     measured = {kind: _gathered(windows, [record.measured[kind] for record in records], kind)
                 for kind in records[0].measured}  # fmt: skip
     _check_anything_measured(measured)
     sigma, spreads, ratio = _sigmas(records, windows, measured, absolute)
     per_window = {name: values[windows.record] for name, values in overrides.items()}
-    xp = coordinates.numpy_of((starting.q.guess, starting.v.guess))
-    unit = xp.std(xp.concatenate([starting.q.guess, starting.v.guess], axis=1), axis=0)
+    xp = coordinates.numpy_of((guessed.q.guess, guessed.v.guess))
+    unit = xp.std(xp.concatenate([guessed.q.guess, guessed.v.guess], axis=1), axis=0)
     _warn_of_wrapped(records)
     return Problem(
-        system, found, per_window, windows, starting, measured, sigma, spreads, ratio,
+        system, first, found, per_window, windows, guessed, measured, sigma, spreads, ratio,
         xp.where(unit > 0, unit, 1.0), unflatten, observe, options, loss, absolute,
     )  # fmt: skip
+
+
+def _starting(system, window, options):
+    """The system as it is now, of a motion in phases in the phase that `start=` names; taken out of the options."""
+    system = starting(each_phase(system, up_to_date), options.pop("start", None))
+    if isinstance(system, Hybrid) and window is not None:
+        raise ValueError(
+            "window= cuts records into windows of their own, and of a lj.Hybrid nobody knows in which phase each would "
+            "start.\nFix: leave window out; or a lj.Record for each part, with start= the phase of all of them."
+        )
+    return system
 
 
 def _absolute(records, loss, priors):

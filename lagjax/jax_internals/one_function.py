@@ -47,7 +47,8 @@ TOGETHER = 256
 # The multiplications of a product of matrices above which the library is worth more than one function.
 PRODUCT = 4096
 AT_ANY_SIZE = ELEMENTWISE | MOVING | OF_EQUINOX | {
-    "bessel_i0e", "bessel_i1e", "dynamic_update_slice", "reduce_precision", "sincos", "tile", "xla_metadata_value",
+    "bessel_i0e", "bessel_i1e", "bitcast_convert_type", "dynamic_update_slice", "reduce_precision", "sincos", "tile",
+    "xla_metadata_value",
 }  # fmt: skip
 SMALL = REDUCING | ACCUMULATING - {"cumlogsumexp"} | {"argmax", "argmin"}
 WITH_BODIES = CALLS | CALLS_WITH_RULES | CONTROL_FLOW | {"one_function"}

@@ -168,13 +168,15 @@ class Hybrid(eqx.Module):
         self.first = np.zeros((), np.int32)
 
     def starting(self, start: str | None) -> "Hybrid":
-        """The same, for motions that start in the phase of this name; None for the first one."""
-        if start is not None and start not in self.names:
+        """The same, for motions that start in the phase of this name; with None in the one that is known already."""
+        if start is None:
+            return self
+        if start not in self.names:
             raise ValueError(
                 f"start={start!r} is no phase.\nThe phases are {', '.join(map(repr, self.names))}, of which the first "
                 "is the start by default."
             )
-        return replace_fields(self, first=np.asarray(0 if start is None else self.names.index(start), np.int32))
+        return replace_fields(self, first=np.asarray(self.names.index(start), np.int32))
 
     def leaving(self, phase: int) -> list[int]:
         """The numbers of the switches that end a phase."""
@@ -208,6 +210,11 @@ def replace_fields(hybrid: Hybrid, **fields) -> Hybrid:
     for name in ("systems", "switches", "first", "names", "most_switches"):
         object.__setattr__(same, name, fields.get(name, getattr(hybrid, name)))
     return same
+
+
+def first_phase(system: System | Hybrid) -> System:
+    """The system of the phase in which motions start, or the system itself. Not while JAX is tracing."""
+    return system.systems[int(system.first)] if isinstance(system, Hybrid) else system
 
 
 def phases_of(system: System | Hybrid) -> tuple[System, ...]:

@@ -37,6 +37,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from lagjax.jax_internals.one_function import called
 from lagjax.motion.consistency import stopped
 from lagjax.motion.crossings import Guards, Kind
 from lagjax.motion.pieces import (
@@ -153,7 +154,7 @@ class Watching(diffrax.AbstractStepSizeController):
         # What is not finite is in doubt.
         a, _ = self.motion.rates(t1, y1, believe=True)
         values, _, inner = self._seen(watched.end, self._unseen(t1, y1, a), args)
-        of_guards = self._judged(watched.end, Node(t1, y1, a, values), inner)
+        of_guards = _apart(self._judged, watched.end, Node(t1, y1, a, values), inner)
         signs = [(f.sign, p.sign) for f, p in zip(watched.followed, of_guards)]
         noticed = _any([_any(p.doubt + changes(*x)) for p, x in zip(of_guards, signs)])
         followed = tuple(f._replace(sign=last_known(*x)) for f, x in zip(watched.followed, signs))
@@ -195,7 +196,7 @@ class Watching(diffrax.AbstractStepSizeController):
             y = _where(begins, y0, _where(ends, y1, y))
             a = lax.cond(eqxi.unvmap_any(looks), lambda: self.motion.rates(s.at, y)[0], lambda: s.right.a)
             right = _where(looks, self._unseen(s.at, y, a), s.right)
-            values, times, inner = self._seen(s.left, right, args, with_noise=True)
+            values, times, inner = _apart(self._seen, s.left, right, args, with_noise=True)
             right = right._replace(values=_where(looks, values, right.values))
             begun = zip(s.followed, right.values, self.guards.kinds)
             signs = (jnp.where(begins, self._first_sign(x, k), f.sign) for f, x, k in begun)
@@ -203,8 +204,9 @@ class Watching(diffrax.AbstractStepSizeController):
                 left=_where(begins, right, s.left), right=right, end=_where(ends, right, s.end), looks=s.looks + 1,
                 followed=tuple(f._replace(sign=sign) for f, sign in zip(s.followed, signs)),
             )  # fmt: skip
-            again, s = self._at_extremum(s, looks)
-            judged = self._judge(s, ~(again | begins | s.done), times, self._judged(s.left, s.right, inner))
+            again, s = _apart(self._at_extremum, s, looks)
+            of_guards = _apart(self._judged, s.left, s.right, inner)
+            judged = self._judge(s, ~(again | begins | s.done), times, of_guards)
             onward = s._replace(
                 look=jnp.asarray(True),
                 where=jnp.where(begins, AT_END, INSIDE),
@@ -357,6 +359,16 @@ class Watching(diffrax.AbstractStepSizeController):
                 count = count + (wanted & ((count < kind.most) | (new.guess <= end)))
             counts.append(count)
         return counts, enclosed
+
+
+def _apart(function, *args, **options):
+    """`function(*args)` as a call: what its results share XLA would compute anew for each of those who need them."""
+    return called(_jitted(function, args, options))
+
+
+@eqx.filter_jit
+def _jitted(function, args, options):
+    return function(*args, **options)
 
 
 def _any(conditions):
