@@ -128,7 +128,8 @@ def _parse(arguments):
         parser.error(f"no scene named {', '.join(unknown)}; there are: {', '.join(SCENES)}, and {STABILITY}")
     asked = stability.FULL if options.scenes else stability.REDUCED
     options.tier = stability.QUICK if options.quick else asked
-    options.scenes = options.scenes or [*SCENES, STABILITY]
+    short = [name for name, scene in SCENES.items() if not (options.quick and scene.long)]
+    options.scenes = options.scenes or [*short, STABILITY]
     return options
 
 
@@ -198,7 +199,7 @@ def _described(scene, rows, cases):
     ]
     return "\n".join([
         f"{scene.title}\n{'=' * len(scene.title)}\n{scene.source}\n",
-        report.work_precision_table(rows), report.first_answer(rows), *of_errors, "",
+        *((report.work_precision_table(rows), report.first_answer(rows), *of_errors, "") if rows else ()),
         report.case_table(cases), "",
         "Where the source is wrong:", *(f"- {line}" for line in scene.misprints),
     ])  # fmt: skip

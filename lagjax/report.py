@@ -87,6 +87,8 @@ class Scene:
     runs: Callable[[], Sequence[Run]]
     cases: Callable[[], Sequence[Case]]
     picture: Callable[[], Any]
+    # Left out of `--quick`: what compiles for longer than all of that.
+    long: bool = False
 
 
 @dataclass(frozen=True)

@@ -281,6 +281,61 @@ right.legend(fontsize=9, frameon=False)
 fig
 
 # %% [markdown]
+# ## Rolls, slips, flies: one motion
+#
+# That took an equation derived by hand. The multipliers can do it alone: each phase is a system with its own
+# constraints, friction is a force that depends on a multiplier, and switches end a phase where a guard goes through
+# zero.
+
+
+# %%
+def sliding_friction(t, q, v, multipliers, params):
+    pulled = params["c"] * multipliers["contact"]  # forward, against a contact that slides downhill
+    return {"r": 0.0, "theta": length * pulled, "phi": params["a"] * pulled}
+
+
+slippery = lj.Hybrid(
+    {
+        "rolls": hoop,
+        "slips": lj.System(lagrangian, constraints={"contact": held}, force=sliding_friction),
+        "flies": free,
+    },
+    [
+        lj.Switch("rolls", to="slips", when=lj.slips("rolling", on="contact", coefficient=lambda p: p["c"], side=1)),
+        lj.Switch("slips", to="flies", when=lj.releases("contact")),
+    ],
+    most_switches=2,
+)
+until = jnp.linspace(0.0, 2.2, 89)
+
+
+def whole(c):
+    return lj.integrate(slippery, *at(first, rate_from_the_top(first)), params | {"c": c}, ts=until, rtol=1e-10)
+
+
+in_phases = whole(0.25)
+print(in_phases)
+found = np.array([whole(c).switches.q["theta"] for c in friction])
+
+# %%
+fig, axes = plot.figure(1, 2, size=(4.6, 3.5))
+ax, right = axes[0]
+for i, name in enumerate(slippery.names):
+    mine = np.asarray(in_phases.phase) == i
+    ax.plot(until[mine], np.degrees(in_phases.v["phi"][mine]) / 360, label=f"{name}: spin", **plot.style(i))
+on_it = np.asarray(in_phases.phase) < 2
+rolling_spin = -length / params["a"] * in_phases.v["theta"][on_it]
+ax.plot(until[on_it], np.degrees(rolling_spin) / 360, ":", color="black", linewidth=1.2, label="rolling would take")
+ax.set(xlabel="t / s", ylabel="turns a second", title="c = 1/4: it turns too slowly to roll")
+ax.legend(fontsize=9, frameon=False)
+for i, (name, exact_angle) in enumerate((("slips", slips), ("leaves", leaves_at))):
+    right.semilogx(friction, np.degrees(exact_angle), label=f"{name}, as above", **plot.style(1 - i))
+    right.semilogx(friction, np.degrees(found[:, i]), "o", color="black", markersize=4)
+right.set(xlabel="coefficient of friction c", ylabel=r"$\theta$ / degrees", title="Marks: the motion in phases")
+right.legend(fontsize=9, frameon=False)
+fig
+
+# %% [markdown]
 # With $c = 1/4$ the hoop slips at 65.70° and leaves at 36.63°; with $c = 1$ at 43.05° and 32.43°. "This is the angle
 # at which the hoop falls from the cylinder, $\theta = 30°$", says the solution. For every finite coefficient that
 # fails: the hoop leaves between 30° and 41.81°, because the normal force goes to zero; and it slips before, because
@@ -300,6 +355,7 @@ assert np.max(np.abs(np.sin(released["theta"]) - np.cos(tilts) / 2)) < 1e-9
 assert np.max(np.abs(flown.q["r"] - length - gap)) < 1e-9
 assert abs((flown.q["r"][1] - length) / (cubic * 1e-9) - 1) < 2e-3
 assert np.max(np.abs(u - np.sin(leaves_at))) < 1e-9
+assert np.max(np.abs(found - np.stack([slips, leaves_at], axis=1))) < 1e-8
 assert np.allclose(np.cos(slips), 2 * friction * (2 * np.sin(slips) - 1), rtol=1e-12)
 for c, slip, leave in ((0.25, 65.70, 36.63), (1.0, 43.05, 32.43)):
     i = np.argmin(np.abs(friction - c))

@@ -65,6 +65,13 @@ def test_tables_pictures_and_numbers(run, monkeypatch):
     assert all(row["seconds"] > 0 and row["steps"] > 0 for row in rows)
 
 
+def test_what_compiles_for_long_is_not_quick(run):
+    """A scene that is marked so is left out of `--quick`, but where it is named."""
+    long = replace(SCENE, long=True, runs=tuple)
+    assert "went well" not in run(long, "--quick")[1] and "went well" in run(long, "tiny", "--quick")[1]
+    assert "went well" in run(replace(long, long=False), "--quick")[1]
+
+
 @pytest.mark.parametrize(
     ("scene", "named"),
     [

@@ -11,6 +11,7 @@ from lagjax.scenes import (
     mass_distributions,
     rolling_hoop,
     sliding_wedge,
+    slipping_hoop,
     sphere_geodesic,
 )
 
@@ -19,6 +20,7 @@ SCENES = {
     for module in (
         sphere_geodesic,
         rolling_hoop,
+        slipping_hoop,
         bead_on_hoop,
         mass_distributions,
         sliding_wedge,
@@ -33,5 +35,6 @@ __all__ = [
     "mass_distributions",
     "rolling_hoop",
     "sliding_wedge",
+    "slipping_hoop",
     "sphere_geodesic",
 ]

@@ -20,12 +20,14 @@ import jax.numpy as jnp
 import numpy as np
 from scipy import optimize
 
+from lagjax import plot
 from lagjax.mechanics.constraints import Holonomic
 from lagjax.mechanics.hybrid import Hybrid, Switch
 from lagjax.mechanics.system import System
 from lagjax.motion.contacts import releases, slips, sticks, touches
 from lagjax.motion.hybrid_trajectory import HybridTrajectory
 from lagjax.motion.integrate import integrate
+from lagjax.report import Case, Scene, relative_error
 from lagjax.scenes import rolling_hoop
 from lagjax.scenes.rolling_hoop import contact, in_flight, lagrangian, rolling
 
@@ -61,9 +63,12 @@ hybrid = Hybrid(
 
 def roll_and_slip(params, ts, **options) -> HybridTrajectory:
     """The motion from rest at the top, taken up at `FIRST` with the speed that it has there."""
-    l, beta = params["R"] + params["a"], params["beta"]
-    rate = -jnp.sqrt(2 * params["g"] * (1 - jnp.sin(FIRST)) / ((1 + beta) * l))
-    traj = integrate(hybrid, *rolling_hoop.start(params, FIRST, rate), params, ts=ts, **options)
+    rate = rolling_hoop.exact_rate(params, FIRST, rolling_hoop.TOP)
+    return _in_phases(*rolling_hoop.start(params, FIRST, rate), params, ts=ts, **options)
+
+
+def _in_phases(*motion, **options) -> HybridTrajectory:
+    traj = integrate(hybrid, *motion, **options)
     assert isinstance(traj, HybridTrajectory)
     return traj
 
@@ -103,3 +108,84 @@ def exact(params) -> Friction:
 def _root(function, low, high) -> float:
     """The root between two angles."""
     return float(np.asarray(optimize.brentq(function, low, high, xtol=1e-15)))
+
+
+def seen(params) -> Friction:
+    """The same as `exact`, integrated at rtol 1e-11."""
+    switches = roll_and_slip(params, np.array([0.0, 3.0]), rtol=1e-11, estimate_error=False).switches
+    (slip, left, down), rate = switches.q["theta"][:3], switches.v["theta"][1]
+    spin, l = switches.v["phi"][1], params["R"] + params["a"]
+    return Friction(*map(float, (slip, left, -l * rate, spin, switches.q["r"][2] * np.cos(down))))
+
+
+def cases():
+    """Friction from little to much; a disk, a sphere, a shell; none at all; and too little to begin to roll."""
+    many = {f"mu = {mu:g}": {"mu": mu} for mu in (0.0625, 0.25, 1.0, 4.0, 16.0)}
+    many |= {f"a {name}, mu = 0.25": {"beta": rolling_hoop.SHAPES[name]} for name in ("disk", "sphere", "shell")}
+    rows = []
+    for name, changed in many.items():
+        params = PARAMS | changed
+        found, expected = seen(params), exact(params)
+        angles = " and ".join(f"{word} at {np.degrees(x):.4f} deg" for word, x in zip(("slips", "leaves"), found[:2]))
+        rows.append(Case(name, f"{angles}, lands at x = {found.lands:.6f}", relative_error(found, expected), 1e-9))
+    return [*rows, _without_friction(), _too_little_to_roll()]
+
+
+def _without_friction():
+    """It slides from the top on, does not turn, and leaves where its height has fallen by a third."""
+    params = PARAMS | {"mu": 0.0}
+    rate = rolling_hoop.exact_rate(params | {"beta": 0.0}, FIRST, rolling_hoop.TOP)
+    q, v = rolling_hoop.start(params, FIRST, rate)
+    settings = {"ts": np.array([0.0, 3.0]), "rtol": 1e-11, "estimate_error": False}
+    switches = _in_phases(q, v | {"phi": 0.0 * rate}, params, start="slips", **settings).switches
+    sine, spin = np.sin(switches.q["theta"][0]), abs(float(switches.v["phi"][0]))
+    happened = f"leaves at {np.degrees(np.arcsin(sine)):.4f} deg, and has not turned"
+    return Case("mu = 0, sliding from the start", happened, max(relative_error(sine, 2 / 3), spin), 1e-9)
+
+
+def _too_little_to_roll():
+    name = "mu = 2^-10, rolling at the start"
+    try:
+        seen(PARAMS | {"mu": 2.0**-10})
+    except (RuntimeError, ValueError) as error:
+        return Case(name, "refused: " + str(error).split("\n")[0], 0.0, 0.0)
+    return Case(name, "NOT REFUSED", np.inf, 0.0)
+
+
+def picture():
+    """Where it slips and leaves, over the coefficient of friction; and how near to rolling it still is."""
+    fig, axes = plot.figure(1, 2, size=(4.9, 3.8))
+    lines, marks = np.geomspace(0.05, 20.0, 121), 2.0 ** np.arange(-4.0, 4.1, 0.5)
+    curves, points = (
+        Friction(*map(np.array, zip(*(function(PARAMS | {"mu": mu}) for mu in many))))
+        for function, many in ((exact, lines), (seen, marks))
+    )
+    left, right = axes[0]
+    for i, name in enumerate(("slips", "leaves")):
+        left.semilogx(lines, np.degrees(getattr(curves, name)), label=f"{name}, closed form", **plot.style(i))
+        left.semilogx(marks, np.degrees(getattr(points, name)), "o", color="black", markersize=4)
+    for level, x, y, words in ((30.0, 0.06, 28.0, "friction without bound: 30°"), (41.81, 3.0, 42.6, "none: 41.81°")):
+        left.axhline(level, color="0.5", linewidth=0.8)
+        left.text(x, y, words, fontsize=9)
+    left.set(xlabel="coefficient of friction μ", ylabel="θ / degrees", title="It slips, and then leaves", ylim=(26, 88))
+    left.legend(fontsize=8, frameon=False)
+    a = PARAMS["a"]
+    right.semilogx(lines, a * curves.spin / curves.speed, label="closed form", **plot.style(0))
+    right.semilogx(marks, a * points.spin / points.speed, "o", color="black", markersize=4, label="integrated")
+    right.set(
+        xlabel="coefficient of friction μ", ylabel="a φ' / speed", title="How it turns when it leaves: 1 is rolling"
+    )
+    right.legend(fontsize=8, frameon=False)
+    return fig
+
+
+SCENE = Scene(
+    name="slipping_hoop",
+    title="The same hoop with friction: it rolls, slips, flies and lands",
+    source="source document §2, with Coulomb's friction in place of rolling at any price",
+    misprints=rolling_hoop.MISPRINTS[1:2],
+    runs=tuple,
+    cases=cases,
+    picture=picture,
+    long=True,
+)

@@ -39,7 +39,9 @@ string = lj.Hybrid(
 def thrown(speed, until=1.2):
     """From the bottom, to the right."""
     start = jnp.array([0.0, -L]), jnp.array([speed, 0.0])
-    return lj.integrate(string, *start, ts=jnp.array([0.0, until]), rtol=1e-11, estimate_error=False)
+    traj = lj.integrate(string, *start, ts=jnp.array([0.0, until]), rtol=1e-11, estimate_error=False)
+    assert isinstance(traj, lj.HybridTrajectory)
+    return traj
 
 
 @pytest.mark.slow
