@@ -1,6 +1,6 @@
 """What a hybrid system brings to a solve: its phases, their guards, and what switches do to the state."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Hashable, Mapping
 from typing import Any
 
 import diffrax
@@ -19,7 +19,7 @@ from lagjax.mechanics.coordinates import State
 from lagjax.mechanics.first_call import Call, check_arguments, in_words
 from lagjax.mechanics.hybrid import Hybrid, Switch, replace_fields
 from lagjax.mechanics.memory import shape_of
-from lagjax.mechanics.outside import first_guard_alike
+from lagjax.mechanics.outside import first_guard_alike, read_by
 from lagjax.mechanics.system import System
 from lagjax.motion.backward import runs_backward
 from lagjax.motion.consistency import velocity_change
@@ -32,7 +32,8 @@ class Reset(eqx.Module):
     """What a switch does to the state: (t, q, v, multipliers, params) -> (q, v), and whether the motion rests there.
 
     `function` gives velocities, or the whole state; without one the state stays. With `settle`, which does so where the
-    motion comes to rest, the guard `when` opens by less than `slower_than` after it.
+    motion comes to rest, the guard `when` opens by less than `slower_than` after it. `read`: what the function reads
+    from outside, which a compiled program holds.
     """
 
     function: Callable | None
@@ -40,6 +41,7 @@ class Reset(eqx.Module):
     settle: Callable | None = None
     when: Callable | None = None
     slower_than: Array | np.ndarray | None = None
+    read: Hashable = eqx.field(static=True, default=())
 
     def __call__(self, t, q, v, multipliers, params):
         q, v = self._reset(t, q, v, multipliers, params)
@@ -136,7 +138,7 @@ def _reset(switch: Switch, hybrid, system, start) -> Reset:
             "seen by velocities.\nFix: rest= with lj.touches(gap) alone."
         )
     settle = Plastic().between(system, hybrid.systems[hybrid.names.index(switch.rest)])
-    return Reset(reset.function, reset.takes, settle, switch.when, switch.slower_than)
+    return Reset(reset.function, reset.takes, settle, switch.when, switch.slower_than, reset.read)
 
 
 def _reset_alone(switch: Switch, hybrid, system, start) -> Reset:
@@ -144,9 +146,10 @@ def _reset_alone(switch: Switch, hybrid, system, start) -> Reset:
     if function is None:
         return Reset(None, OF_STATE)
     if isinstance(function, OfPhases):
+        read = read_by(function)
         function = function.between(system, hybrid.systems[hybrid.names.index(switch.to)])
     else:
-        function, _ = first_guard_alike(function)
+        function, read = first_guard_alike(function)
     takes = takes_of(function)
     given: Mapping[str, Any] = start._asdict() | {"multipliers": zero_multipliers(system, start)}
     call = Call("reset", function, takes, f" of the switch {switch.in_words()}")
@@ -161,7 +164,7 @@ def _reset_alone(switch: Switch, hybrid, system, start) -> Reset:
             "Usual cause: the velocity that jumps alone.\n"
             'Fix: return v | {"y": -v["y"]}.'
         )
-    return Reset(lift_function(function, tuple(given[name] for name in takes)), takes)
+    return Reset(lift_function(function, tuple(given[name] for name in takes)), takes, read=read)
 
 
 class OfPhases(eqx.Module):

@@ -72,6 +72,28 @@ def test_a_ball_that_bounces():
     )
 
 
+RESTITUTION, LEVEL = 0.5, 0.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("ready_made", [True, False])
+def test_what_functions_read_may_change(monkeypatch, ready_made):
+    """A reset, a restitution and a gap that read globals, as cells of a notebook do: each call has their values."""
+    gap = lambda t, q, params: q - LEVEL
+    if ready_made:
+        switch = lj.Switch("flying", to="flying", when=lj.touches(gap, lambda speed: RESTITUTION + 0 * speed))
+    else:
+        guard = lambda t, q, v, params: gap(t, q, params)
+        switch = lj.Switch("flying", to="flying", when=guard, reset=lambda t, q, v, params: -RESTITUTION * v)
+    system, ts = lj.Hybrid({"flying": ball}, [switch], most_switches=4), np.array([0.0, 1.0])
+    ends = lambda: float(in_phases(system, 1.0, 0.0, {"g": G}, ts=ts, estimate_error=False).q[-1])
+    np.testing.assert_allclose(ends(), heights(1.0), rtol=1e-8)
+    monkeypatch.setitem(globals(), "RESTITUTION", 0.75)
+    np.testing.assert_allclose(ends(), heights(1.0, e=0.75), rtol=1e-8)
+    monkeypatch.setitem(globals(), "LEVEL", 0.125)
+    np.testing.assert_allclose(ends(), 0.125 + heights(1.0, 0.875, 0.75), rtol=1e-8)
+
+
 @pytest.mark.slow
 def test_lanes_are_single_runs():
     """Members of a batch that switch at different times and different numbers of times."""
