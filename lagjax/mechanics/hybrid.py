@@ -8,7 +8,7 @@ Source: Brogliato, *Nonsmooth Mechanics*, §1.3; Acary & Brogliato, *Numerical M
 §2.8 (event-driven schemes).
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 
 import equinox as eqx
 import jax
@@ -126,6 +126,8 @@ class Hybrid(eqx.Module):
     first: Int[Array, ""] | np.ndarray
     names: tuple[str, ...] = eqx.field(static=True)
     most_switches: int = eqx.field(static=True)
+    # What the switches' functions read from outside, which a compiled program holds.
+    read: Hashable = eqx.field(static=True)
 
     def __init__(
         self,
@@ -165,7 +167,7 @@ class Hybrid(eqx.Module):
                     )
         self.systems, self.names = tuple(phases.values()), tuple(phases)
         self.switches, self.most_switches = tuple(listed), most_switches
-        self.first = np.zeros((), np.int32)
+        self.first, self.read = np.zeros((), np.int32), ()
 
     def starting(self, start: str | None) -> "Hybrid":
         """The same, for motions that start in the phase of this name; with None in the one that is known already."""
@@ -207,7 +209,7 @@ def _count(n, word, plural):
 def replace_fields(hybrid: Hybrid, **fields) -> Hybrid:
     """A hybrid with other values of some of its fields, which are not checked again."""
     same = object.__new__(Hybrid)
-    for name in ("systems", "switches", "first", "names", "most_switches"):
+    for name in ("systems", "switches", "first", "names", "most_switches", "read"):
         object.__setattr__(same, name, fields.get(name, getattr(hybrid, name)))
     return same
 

@@ -1,6 +1,6 @@
 """What a hybrid system brings to a solve: its phases, their guards, and what switches do to the state."""
 
-from collections.abc import Callable, Hashable, Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import diffrax
@@ -32,8 +32,7 @@ class Reset(eqx.Module):
     """What a switch does to the state: (t, q, v, multipliers, params) -> (q, v), and whether the motion rests there.
 
     `function` gives velocities, or the whole state; without one the state stays. With `settle`, which does so where the
-    motion comes to rest, the guard `when` opens by less than `slower_than` after it. `read`: what the function reads
-    from outside, which a compiled program holds.
+    motion comes to rest, the guard `when` opens by less than `slower_than` after it.
     """
 
     function: Callable | None
@@ -41,7 +40,6 @@ class Reset(eqx.Module):
     settle: Callable | None = None
     when: Callable | None = None
     slower_than: Array | np.ndarray | None = None
-    read: Hashable = eqx.field(static=True, default=())
 
     def __call__(self, t, q, v, multipliers, params):
         q, v = self._reset(t, q, v, multipliers, params)
@@ -138,7 +136,7 @@ def _reset(switch: Switch, hybrid, system, start) -> Reset:
             "seen by velocities.\nFix: rest= with lj.touches(gap) alone."
         )
     settle = Plastic().between(system, hybrid.systems[hybrid.names.index(switch.rest)])
-    return Reset(reset.function, reset.takes, settle, switch.when, switch.slower_than, reset.read)
+    return Reset(reset.function, reset.takes, settle, switch.when, switch.slower_than)
 
 
 def _reset_alone(switch: Switch, hybrid, system, start) -> Reset:
@@ -146,10 +144,9 @@ def _reset_alone(switch: Switch, hybrid, system, start) -> Reset:
     if function is None:
         return Reset(None, OF_STATE)
     if isinstance(function, OfPhases):
-        read = read_by(function)
         function = function.between(system, hybrid.systems[hybrid.names.index(switch.to)])
     else:
-        function, read = first_guard_alike(function)
+        function, _ = first_guard_alike(function)
     takes = takes_of(function)
     given: Mapping[str, Any] = start._asdict() | {"multipliers": zero_multipliers(system, start)}
     call = Call("reset", function, takes, f" of the switch {switch.in_words()}")
@@ -164,7 +161,7 @@ def _reset_alone(switch: Switch, hybrid, system, start) -> Reset:
             "Usual cause: the velocity that jumps alone.\n"
             'Fix: return v | {"y": -v["y"]}.'
         )
-    return Reset(lift_function(function, tuple(given[name] for name in takes)), takes, read=read)
+    return Reset(lift_function(function, tuple(given[name] for name in takes)), takes)
 
 
 class OfPhases(eqx.Module):
@@ -205,9 +202,10 @@ def _alike(found, wanted):
 
 
 def starting(system, start: str | None):
-    """The system, where it is a hybrid one in the phase from which motions start."""
+    """The system, where it is a hybrid one in the phase from which motions start, with what its switches read now."""
     if isinstance(system, Hybrid):
-        return system.starting(start)
+        read = tuple(read_by(function) for switch in system.switches for function in (switch.when, switch.reset))
+        return replace_fields(system.starting(start), read=read)
     if start is not None:
         raise ValueError("start= names the first phase of a lj.Hybrid, and this is one lj.System.\nFix: leave it out.")
     return system
