@@ -71,9 +71,10 @@ def first_alike(system: System, now: System) -> System:
 
 
 def first_guard_alike(guard: Callable) -> tuple[Callable, Hashable]:
-    """The first function that means the same as `guard`, and what it reads."""
+    """The first function, or module that can be called, that means the same as `guard`, and what it reads."""
     read = read_by(guard)
-    meaning = remembered(guard, (first_guard_alike, read), lambda: _meaning_of_all((guard,), ()))
+    look = lambda: meaning_of(guard) if isinstance(guard, types.FunctionType | eqx.Module) else None
+    meaning = remembered(guard, (first_guard_alike, read), look)
     return _first_of(_guards, meaning, (guard, read), lambda first: read_by(first[0]) == first[1])
 
 

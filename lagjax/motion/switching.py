@@ -11,6 +11,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array
 
+from lagjax.jax_internals.tracing import is_eager
 from lagjax.mechanics import constraints, coordinates
 from lagjax.mechanics.arguments import OF_STATE, takes_of
 from lagjax.mechanics.closures import lift_function
@@ -145,8 +146,6 @@ def _reset_alone(switch: Switch, hybrid, system, start) -> Reset:
         return Reset(None, OF_STATE)
     if isinstance(function, OfPhases):
         function = function.between(system, hybrid.systems[hybrid.names.index(switch.to)])
-    else:
-        function, _ = first_guard_alike(function)
     takes = takes_of(function)
     given: Mapping[str, Any] = start._asdict() | {"multipliers": zero_multipliers(system, start)}
     call = Call("reset", function, takes, f" of the switch {switch.in_words()}")
@@ -201,11 +200,23 @@ def _alike(found, wanted):
     return same and shapes(found) == shapes(wanted)
 
 
+def _looked_at(switch: Switch):
+    """The switch with the first functions that mean the same as its own, and what they read."""
+    functions = switch.when, switch.reset
+    if not is_eager():
+        return switch, tuple(map(read_by, functions))
+    found, read = zip(*((None, ()) if function is None else first_guard_alike(function) for function in functions))
+    if any(one is not other for one, other in zip(found, functions)):
+        own = lambda x: any(x is function for function in functions)
+        switch = eqx.tree_at(lambda s: (s.when, s.reset), switch, found, is_leaf=own)
+    return switch, read
+
+
 def starting(system, start: str | None):
     """The system, where it is a hybrid one in the phase from which motions start, with what its switches read now."""
     if isinstance(system, Hybrid):
-        read = tuple(read_by(function) for switch in system.switches for function in (switch.when, switch.reset))
-        return replace_fields(system.starting(start), read=read)
+        switches, read = zip(*map(_looked_at, system.switches)) if system.switches else ((), ())
+        return replace_fields(system.starting(start), switches=switches, read=read)
     if start is not None:
         raise ValueError("start= names the first phase of a lj.Hybrid, and this is one lj.System.\nFix: leave it out.")
     return system

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import lagjax as lj
+from tests.counting import compiles
 
 G = 9.81
 FALL = np.sqrt(2 / G)
@@ -92,6 +93,26 @@ def test_what_functions_read_may_change(monkeypatch, ready_made):
     np.testing.assert_allclose(ends(), heights(1.0, e=0.75), rtol=1e-8)
     monkeypatch.setitem(globals(), "LEVEL", 0.125)
     np.testing.assert_allclose(ends(), 0.125 + heights(1.0, 0.875, 0.75), rtol=1e-8)
+
+
+def made_again(e):
+    """All functions anew, as a cell of a notebook makes them that is run again."""
+    system = lj.System(lambda t, q, v, params: 0.5 * v**2 - params["g"] * q)
+    flying = lj.Switch("flying", to="flying", when=lj.touches(lambda t, q, params: q, lambda speed: e + 0 * speed))
+    return lj.Hybrid({"flying": system}, [flying], most_switches=4)
+
+
+@pytest.mark.slow
+def test_made_again_it_compiles_nothing():
+    """The same functions made anew mean the same program; twin: those with another number in them do not."""
+    end = lambda e: float(in_phases(made_again(e), 1.0, 0.0, {"g": G}, ts=np.array([0.0, 1.0])).q[-1])
+    np.testing.assert_allclose(end(0.5), heights(1.0), rtol=1e-8)
+    with compiles() as found:
+        np.testing.assert_allclose(end(0.5), heights(1.0), rtol=1e-8)
+    assert not found
+    with compiles() as found:
+        np.testing.assert_allclose(end(0.75), heights(1.0, e=0.75), rtol=1e-8)
+    assert found
 
 
 @pytest.mark.slow
