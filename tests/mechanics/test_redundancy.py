@@ -168,7 +168,7 @@ def test_derivatives_of_shared_multipliers(mode):
         np.testing.assert_allclose(got[name], expected[name], atol=1e-11)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_contradictory_accelerations_are_named():
     """One coordinate driven by two motions that agree in position and velocity only: no acceleration satisfies both."""
     drive = lambda rate: lj.Holonomic(lambda t, q, params: q["x"] - 0.5 * rate * t**2)

@@ -226,7 +226,7 @@ def test_explain_says_so():
     assert "banded" not in repr(lj.explain(*chain(4)))
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_motion_stays_on_its_links():
     """A short motion of 16 links, against the dense path of the same motion, and its energy."""
     system, q, v, params = chain(16)

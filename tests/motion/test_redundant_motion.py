@@ -87,7 +87,7 @@ def outcome_of_one(x):
     return x["l"] * jnp.cos(angle), -inward / (2 * x["l"])
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_redundancy_that_ends_is_reported():
     """Two rods of equal length agree; once one of them grows, no motion satisfies both, and that is said."""
     grows = lj.Holonomic(lambda t, q, params: rod(t, q, params) - jnp.where(t > 0.5, (t - 0.5) ** 3, 0.0))

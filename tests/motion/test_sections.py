@@ -155,7 +155,7 @@ def test_radial_periods():
     assert np.all(abs(period(1.25, 0.75, 1.25) / [float(kepler(1.25, 1.25)), np.pi / np.sqrt(0.75)] - 1) > 0.05)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_derivatives_of_keplers_period():
     """By the speed at right angles and by μ, forward and reverse."""
     period = lambda x: lj.periods(radial(jnp.ones(()), x[0], x[1], 0.0, 30.0)["nearest"])[1]

@@ -244,7 +244,7 @@ def departure_time_by_mpmath(beta):
         return (mpmath.ellipk(k**2) - mpmath.ellipf(mpmath.asin(mpmath.cos(end / 2) / k), k**2)) / w
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_gradients_of_the_departure_time():
     """∂t_d/∂(m, R, a, g, β) of the event to 1e-6: forward and in reverse against the exact one, and by differences."""
     ts = np.array([0.0, 2.0])
