@@ -1,7 +1,7 @@
-"""When exactly a guard is zero, and what the state is then: the root on the flow, with its derivatives.
+"""When exactly a guard is zero, and what the state is then, with their derivatives.
 
-`locate` finds the time, between two that enclose it, at which the state that the method steps to is on the guard. Times
-are not differentiated there, states are. `_exact` gives both what follows from g(t, y(t)) = 0,
+A crossing is the end of a step (`watching.py`): its time is not differentiated there, the state at that time is.
+`_exact` gives both what follows from g(t, y(t)) = 0,
 
     dt = -dg / (dg/dt),    dy = ∂y + (dy/dt) dt.
 
@@ -20,13 +20,10 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from lagjax.mechanics.equations import Equations
-from lagjax.motion.consistency import stopped
 from lagjax.motion.crossings import Crossings, Guards
 from lagjax.motion.pieces import Watched
 from lagjax.motion.watching import Watching, uneven
 
-# Steps to find a root: by Newton's formula four; by halves fifty.
-LOOKS = 100
 # A guard that is this much farther from zero where it changes its sign than time can resolve jumps there.
 JUMPS = 64
 
@@ -44,16 +41,15 @@ class Located(NamedTuple):
     uncertain: Bool[Array, " m"]
 
 
-def locate(watching: Watching, watched: Watched, params) -> Located:
-    """The roots of what was enclosed."""
-    motion, guards = watching.motion, watching.guards
+def locate(watching: Watching, watched: Watched) -> Located:
+    """The crossings that were kept, with what follows from staying on the guards."""
+    equations, guards = watching.motion.equations, watching.guards
 
-    def found(owner, kept):
-        t, y = _root(watching, owner, kept, params)
-        t, y = _exact((guards, motion.equations), lax.stop_gradient(t), y, owner, watching.resolution)
-        return t, y, motion.equations.multipliers(t, *y)
+    def found(owner, row):
+        t, y = _exact((guards, equations), *row, owner, watching.resolution)
+        return t, y, equations.multipliers(t, *y)
 
-    t, y, multipliers = _each(found, guards, jnp.isfinite(watched.kept.enclosed.before), watched.kept)
+    t, y, multipliers = _each(found, guards, jnp.isfinite(watched.t), (watched.t, watched.y))
     counts, uncertain = (jnp.stack([getattr(f, name) for f in watched.followed]) for name in ("count", "uncertain"))
     return Located(t, y, multipliers, counts, uncertain)
 
@@ -85,51 +81,6 @@ def _each(function, guards, there, rows):
         return jtu.tree_map(lambda x, y: jnp.where(there, x, y), found, nothing)
 
     return lax.map(one, (owners, there, rows))
-
-
-class _Bracket(NamedTuple):
-    """The search for a root between two times: where it was asked last and what it moved by, and the slope there."""
-
-    t: Float[Array, ""]
-    y: PyTree
-    low: Float[Array, ""]
-    high: Float[Array, ""]
-    g: Float[Array, ""]
-    slope: Float[Array, ""]
-    moved: Float[Array, ""]
-    looks: Int[Array, ""]
-    done: Bool[Array, ""]
-
-
-def _root(watching, owner, kept, args):
-    """The root on the flow, and the state there: by secants, and by halves where these do not get on."""
-    fixed, resolution = stopped(watching), watching.resolution
-    t0, y0, enclosed = kept
-
-    def look(s: _Bracket) -> _Bracket:
-        y = watching.motion.flow(t0, y0, s.t)
-        g = jnp.stack(fixed.value(s.t, *stopped((y, args))))[owner]
-        crossed = g * enclosed.sign >= 0
-        low, high = jnp.where(crossed, s.low, s.t), jnp.where(crossed, s.t, s.high)
-        secant = (g - s.g) / jnp.where(s.moved != 0, s.moved, 1.0)
-        slope = jnp.where((s.looks > 0) & (s.moved != 0) & (secant != 0), secant, s.slope)
-        step = -g / jnp.where(slope != 0, slope, jnp.nan)
-        narrow = high - low <= resolution
-        # A secant that halves its steps, and stays inside.
-        nearer = (s.t + step > low) & (s.t + step < high) & ((s.looks == 0) | (jnp.abs(step) <= 0.5 * jnp.abs(s.moved)))
-        # What jumps is zero nowhere: the first time after it counts.
-        following = jnp.where(narrow, high, jnp.where(nearer, s.t + step, low + 0.5 * (high - low)))
-        done = (jnp.abs(step) <= resolution) | (narrow & crossed) | (s.looks >= LOOKS)
-        t = jnp.where(done, s.t, following)
-        return _Bracket(t, y, low, high, g, slope, t - s.t, s.looks + 1, done)
-
-    zero = jnp.zeros_like(enclosed.guess)
-    start = _Bracket(
-        enclosed.guess, y0, enclosed.before, enclosed.after, zero, enclosed.slope, zero, jnp.asarray(0),
-        jnp.asarray(False),
-    )  # fmt: skip
-    found = lax.while_loop(lambda s: ~s.done, look, start)
-    return found.t, found.y
 
 
 def first_end(guards: Guards, t):

@@ -95,7 +95,7 @@ def _loop(equations, start, y0, refused, scales, settings, ts, adjoint, guards=N
         subs = diffrax.SubSaveAt(ts=ts), diffrax.SubSaveAt(t1=True)
         saveat = diffrax.SaveAt(subs=subs, controller_state=guards is not None)
     if guards is not None:
-        controller = Watching(controller, guards, solver, resolution(ts))
+        controller = Watching(controller, guards, solver, resolution(ts), ts[-1])
     arguments = (
         terms, solver, ts[0], ts[-1], settings.dt0, y0, start.params, saveat, controller, _by_position(settings.event),
     )  # fmt: skip
@@ -121,7 +121,7 @@ def _diffeqsolve(terms, solver, t0, t1, dt0, y0, args, saveat, controller, event
         event=event, max_steps=max_steps, throw=False, progress_meter=_progress_meter(progress),
     )  # fmt: skip
     watching = isinstance(controller, Watching)
-    located = locate(controller, cast(tuple, solution.controller_state)[1], args) if watching else None
+    located = locate(controller, cast(tuple, solution.controller_state)[1]) if watching else None
     return solution.ts, solution.ys, solution.stats, solution.result, located
 
 

@@ -41,24 +41,6 @@ class Node(NamedTuple):
     values: tuple[Value, ...]
 
 
-class Enclosed(NamedTuple):
-    """Two times around a crossing, NaN where there is none; the sign after it; a cubic's root, and its slope there."""
-
-    before: Float[Array, " S"]
-    after: Float[Array, " S"]
-    sign: Float[Array, " S"]
-    guess: Float[Array, " S"]
-    slope: Float[Array, " S"]
-
-
-class Kept(NamedTuple):
-    """Room for crossings, S in all: the start of the step in which one is, and where in there."""
-
-    t0: Float[Array, " S"]
-    y0: PyTree[Float[Array, "S ..."]]
-    enclosed: Enclosed
-
-
 class Followed(NamedTuple):
     """What is known of one guard so far: its sign, 0 if not known yet; its crossings; whether some may be missing."""
 
@@ -67,13 +49,55 @@ class Followed(NamedTuple):
     uncertain: Bool[Array, ""]
 
 
+class Root(NamedTuple):
+    """A crossing of a `guard` (-1: none) between two times, with the sign after it; where it may be; and, where a root
+    of another guard was found first that is not the first one, the time of that."""
+
+    guard: Int[Array, ""]
+    low: Float[Array, ""]
+    high: Float[Array, ""]
+    after: Float[Array, ""]
+    guess: Float[Array, ""]
+    before: Float[Array, ""]
+
+
+class Part(NamedTuple):
+    """The step under way, of which parts are taken where it is `parted`: its end, and what the wrapped controller said
+    comes then: the end of the next one, and whether there is a jump between the two.
+
+    `looks`: how often it was looked into. The guard `asked` (-1: none) is believed to have an extremum where the part
+    ends, with this `curvature`, for the `tries`th time; of a root that is sought `tries` are counted too, and how far
+    the last one `moved`. The guards that are known to turn at the time `turns_at`.
+    """
+
+    parted: Bool[Array, ""]
+    until: Float[Array, ""]
+    following: Float[Array, ""]
+    jumps: Bool[Array, ""]
+    looks: Int[Array, ""]
+    asked: Int[Array, ""]
+    curvature: Float[Array, ""]
+    tries: Int[Array, ""]
+    turns: tuple[Bool[Array, ""], ...]
+    turns_at: Float[Array, ""]
+    root: Root
+    moved: Float[Array, ""]
+
+
 class Watched(NamedTuple):
-    """What is known up to the end of the last step; nothing yet where not `begun`."""
+    """What is known up to the end of the last part of a step; nothing yet where not `begun`.
+
+    The acceleration and the guards there; each guard so far; the crossings, S in all: times, NaN where there is none
+    yet, and states; and the step under way.
+    """
 
     begun: Bool[Array, ""]
-    end: Node
+    a: PyTree
+    values: tuple[Value, ...]
     followed: tuple[Followed, ...]
-    kept: Kept
+    t: Float[Array, " S"]
+    y: PyTree[Float[Array, "S ..."]]
+    part: Part
 
 
 class Pieces(NamedTuple):
@@ -157,17 +181,32 @@ def between(left: Node, right: Node, h):
     return fine, coarse
 
 
+def first_root(kinds, times, of_guards, signs, crosses) -> Root:
+    """The first of the crossings that are wanted, of all guards; `crosses`: at which nodes each has another sign."""
+    infinite = jnp.full_like(times[0], jnp.inf)
+    first = Root(jnp.asarray(-1), times[0], times[-1], jnp.zeros_like(times[0]), infinite, infinite)
+    for i, (kind, p, sign, crossed) in enumerate(zip(kinds, of_guards, signs, crosses)):
+        since = times[0], p.g[0], p.rate[0]
+        for t, g, rate, after, changed in zip(times[1:], p.g[1:], p.rate[1:], sign, crossed):
+            wanted = changed & (True if kind.direction == 0 else kind.direction == after)
+            found = Root(jnp.asarray(i), since[0], t, after, root_of_cubic(since, (t, g, rate)), infinite)
+            sooner = wanted & (found.guess < first.guess)
+            first = jtu.tree_map(lambda x, y: jnp.where(sooner, x, y), found, first)
+            # From a node whose sign is known.
+            since = tuple(jnp.where(after != 0, x, y) for x, y in zip((t, g, rate), since))
+    return first
+
+
 def root_of_cubic(begin, end):
-    """Where the cubic through two (t, g, dg/dt) is zero, and its slope there."""
+    """Where the cubic through two (t, g, dg/dt) is zero."""
     (t0, g0, rate0), (t1, g1, rate1) = begin, end
     h = t1 - t0
     c1, c2, c3 = h * rate0, 3 * (g1 - g0) - h * (2 * rate0 + rate1), 2 * (g0 - g1) + h * (rate0 + rate1)
-    slope_at = lambda x: c1 + x * (2 * c2 + x * 3 * c3)
     x = jnp.clip(g0 / jnp.where(g0 != g1, g0 - g1, 1.0), 0.0, 1.0)
     for _ in range(3):
-        slope = slope_at(x)
+        slope = c1 + x * (2 * c2 + x * 3 * c3)
         x = jnp.clip(x - (g0 + x * (c1 + x * (c2 + x * c3))) / jnp.where(slope != 0, slope, 1.0), 0.0, 1.0)
-    return t0 + x * h, slope_at(x) / jnp.where(h > 0, h, 1.0)
+    return t0 + x * h
 
 
 def changes(sign, signs):

@@ -1,4 +1,4 @@
-"""Crossings inside steps: the sign of each guard is followed along the flow.
+"""Crossings inside steps: the sign of each guard is followed along the flow, and each crossing is the end of a step.
 
 A step of a method of high order is a good part of a period long, and a guard may cross zero in it and come back. So
 after each accepted step the guards are followed between its ends, where q, v and a are known, along the quintic that
@@ -11,13 +11,15 @@ between two nodes is one of three:
     monotone   the rates and the polygon have one direction: the signs at its ends tell whether it crosses
     in doubt   anything else: an extremum near zero, or an interpolant that is too crude
 
-Where a piece is in doubt the motion itself is asked, by a step of the method from the step's start to a time in there:
-at the extremum, or halfway. The interval up to that time is looked at first, and then the rest. So a step without
-doubts costs one acceleration and a few guards; an extremum near zero costs two or three steps, however near it is; what
-jumps is narrowed down by halves.
+A step without doubts and crossings is taken as it is. Any other is taken in parts, each a step of the method from where
+the part before it ended: where a piece is in doubt, up to there (the extremum, or halfway); where a guard crosses, up to
+the root, which Newton's formula on the flow finds in two or three steps. So there is no other way to ask the motion than
+to step, whatever the loop that steps: one copy of the equations in a program, and in a batch nobody waits for a lane
+that looks closer. The wrapped controller is not asked about parts. It gets the step as a whole, and what it answered is
+kept until the last part is taken.
 
-Nothing here is differentiated. Of a crossing the step's start and two times that enclose it are kept, and
-`crossing_times.py` finds it on the flow once the loop is over.
+Of a crossing the time, without derivatives, and the state at that time, with them, are kept: `crossing_times.py` makes
+both what follows from staying on the guard.
 
 All is written guard by guard and node by node, on single numbers: on a CPU arrays of four are slower than four numbers.
 
@@ -35,26 +37,27 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from lagjax.jax_internals.one_function import called
+from lagjax.mechanics.equations import all_finite
 from lagjax.motion.consistency import stopped
 from lagjax.motion.crossings import Guards, Kind
 from lagjax.motion.pieces import (
     INNER,
-    Enclosed,
     Followed,
-    Kept,
     Node,
+    Part,
     Pieces,
+    Root,
     Value,
     Watched,
     between,
     changes,
+    first_root,
     last_known,
     next_look,
     pieces_of,
-    root_of_cubic,
 )
 from lagjax.motion.stepping import OnManifold
 
@@ -62,6 +65,8 @@ from lagjax.motion.stepping import OnManifold
 SAFETY = 2.0
 # How often to look inside one step: an extremum takes three, a jump fifty.
 LOOKS = 200
+# Steps to find a root: by Newton's formula three; by halves fifty.
+ROOT_LOOKS = 100
 # An extremum is where it is believed to be if what is left changes its height by less than this part.
 NEAR_EXTREMUM, EXTREMUM_LOOKS = 0.1, 8
 # What rounding leaves of a guard, in units of the change that its arguments' last digit makes; and of a start on it.
@@ -70,161 +75,253 @@ ROUNDED, ON_GUARD = 8, 64
 TOUCHES = 10.0
 # An interval of so many resolutions of time is not parted again.
 NARROW = 16
-# Where to look: at the step's start, at its end, or inside by a step of the method.
-AT_START, AT_END, INSIDE = 0, 1, 2
+# Roots so near to each other, in resolutions of time, are at one time.
+AT_ONCE = 4
+# diffrax takes no step that ends within a hundred round-offs of the end of the motion, but the one to the end itself.
+NEAR_THE_LAST = 32
 
 
-class Search(NamedTuple):
-    """The search in one step: all before `left` is settled, and the interval up to `right` is looked at.
+class Move(NamedTuple):
+    """What is made of a step: whether it `takes` the part, where the next one ends, and what is known then.
 
-    The next look is `at` a time, of the kind `where`, if `look`. There the guard `asked` (-1: none) is believed to have
-    an extremum, with this `curvature`, for the `tries`th time.
+    `crossed`: the guards that cross at the end of this part. `turns_left`: those found to turn at its start.
     """
+
+    takes: Bool[Array, ""]
+    at: Float[Array, ""]
+    part: Part
+    followed: tuple[Followed, ...]
+    crossed: tuple[Bool[Array, ""], ...]
+    turns_left: tuple[Bool[Array, ""], ...]
+
+
+class Seen(NamedTuple):
+    """The guards between the last part's end and this one's: see `Pieces`; signs and changes that are believed."""
 
     left: Node
     right: Node
-    end: Node
-    look: Bool[Array, ""]
-    where: Int[Array, ""]
-    at: Float[Array, ""]
-    asked: Int[Array, ""]
-    curvature: Float[Array, ""]
-    tries: Int[Array, ""]
-    looks: Int[Array, ""]
-    done: Bool[Array, ""]
-    followed: tuple[Followed, ...]
-    enclosed: Enclosed
+    times: list
+    of_guards: list[Pieces]
+    in_doubt: list
+    signs: list
+    crosses: list
 
 
 class Watching(diffrax.AbstractStepSizeController):
     """Wrap `controller`: follow the guards through each step that it accepts, and end the solve at a terminal one.
 
     What was found is the controller's state, a pair of the wrapped one's and a `Watched`. `resolution`: how near two
-    times can be told apart.
+    times can be told apart; `last`: the end of the motion.
     """
 
     controller: diffrax.AbstractStepSizeController
     guards: Guards
     motion: OnManifold
     resolution: Float[Array, ""]
+    last: Float[Array, ""]
 
     def wrap(self, direction):
         """The same for time in this direction, which is always forward."""
-        return Watching(self.controller.wrap(direction), self.guards, self.motion, self.resolution)
+        return Watching(self.controller.wrap(direction), self.guards, self.motion, self.resolution, self.last)
 
     def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
         """The first step."""
         t1, inner = self.controller.init(terms, t0, t1, y0, dt0, args, func, error_order)
-        (t, (q, v)), places = stopped((t0, y0)), self.guards.owners.size
-        zero, no, nothing = jnp.zeros_like(t), jnp.asarray(False), jnp.full(places, jnp.nan, t.dtype)
-        node = self._unseen(t, (q, v), jtu.tree_map(jnp.zeros_like, v))
+        t, (_, v) = stopped((t0, y0))
+        places, count = self.guards.owners.size, len(self.guards.kinds)
+        no, none = jnp.asarray(False), jnp.asarray(-1)
+        part = Part(no, t, t, no, jnp.asarray(0), none, t, jnp.asarray(0), (no,) * count, t, Root(none, t, t, t, t, t), t)
+        followed = (Followed(jnp.zeros_like(t), jnp.asarray(0), no),) * count
         rows = jtu.tree_map(lambda x: jnp.broadcast_to(x, (places, *x.shape)), y0)
-        kept = Kept(nothing, rows, Enclosed(*[nothing] * len(Enclosed._fields)))
-        followed = (Followed(zero, jnp.asarray(0), no),) * len(self.guards.kinds)
-        return t1, (inner, Watched(no, node, followed, kept))
+        a, values = jtu.tree_map(jnp.zeros_like, v), self._unseen(t).values
+        return t1, (inner, Watched(no, a, values, followed, jnp.full(places, jnp.nan, t.dtype), rows, part))
 
     def adapt_step_size(self, t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state):
-        """Whether to keep a step, and the next one."""
+        """Whether to keep a step, or a part of one, and the next."""
         inner, watched = controller_state
-        keep, next_t0, next_t1, jumped, inner, result = self.controller.adapt_step_size(
+        parted, resolution = watched.part.parted, self.resolution
+        keep, next_t0, next_t1, jumped, asked, result = self.controller.adapt_step_size(
             t0, t1, y0, y1_candidate, args, y_error, error_order, inner
         )
+        # A part that fails, though the whole step did not, is halved: the controller has had its say.
+        lost = parted & ~all_finite(y_error)
         # With fixed steps it is Python's True.
-        keep = jnp.asarray(keep)
-        follow = lambda: self._follow(keep, t0, t1, y0, y1_candidate, args, watched)
-        watched = lax.cond(eqxi.unvmap_any(keep), follow, lambda: watched)
-        counts = [f.count for f, kind in zip(watched.followed, self.guards.kinds) if kind.terminal]
-        ended = keep & (sum(counts) > 0) & (result == diffrax.RESULTS.successful)
-        result = diffrax.RESULTS.where(ended, diffrax.RESULTS.event_occurred, result)
-        return keep, next_t0, next_t1, jumped, (inner, watched), result
+        keep = jnp.where(parted, ~lost, keep)
+        whole = t1, next_t1, jnp.asarray(jumped)
+        until, following, jumps = _where(parted, (watched.part.until, watched.part.following, watched.part.jumps), whole)
+        state = t0, t1, y0, y1_candidate, args, watched, until
+        unchanged = jnp.asarray(False), t1, jnp.asarray(False), watched
+        takes, at, ended, watched = lax.cond(
+            eqxi.unvmap_any(keep), lambda: self._follow(keep, *state), lambda: unchanged
+        )
+        done = takes & (t1 >= until)
+        ours = keep | lost
+        # The end of the whole step moves with the outputs.
+        at = jnp.where(done, following, jnp.where(lost, t0 + 0.5 * (t1 - t0), jnp.where(at >= until, until, at)))
+        part = watched.part._replace(parted=ours & ~done, until=until, following=following, jumps=jumps)
+        result = diffrax.RESULTS.where(parted, diffrax.RESULTS.successful, result)
+        result = diffrax.RESULTS.where(lost & (t1 - t0 <= resolution), diffrax.RESULTS.dt_min_reached, result)
+        ended = ended & (result == diffrax.RESULTS.successful)
+        return (
+            takes,
+            jnp.where(ours, jnp.where(takes, t1, t0), next_t0),
+            jnp.where(ours, at, next_t1),
+            # Known while tracing, it spares diffrax what it does after a jump.
+            jumped if jumped is False else done & jumps,
+            (_where(parted, inner, asked), watched._replace(part=part)),
+            diffrax.RESULTS.where(ended, diffrax.RESULTS.event_occurred, result),
+        )
 
     # Jitted, so that it is traced once: diffrax traces the body of its loop three times.
     @eqx.filter_jit
-    def _follow(self, keep, t0, t1, y0, y1, args, watched: Watched) -> Watched:
-        fixed, step = stopped(self), stopped((keep, t0, t1, y0, y1, args, watched))
-        if self.guards.long:
-            return self._with_starts(fixed._search(*step), keep, t0, y0, watched)
-        quiet, end, followed = fixed._at_a_glance(*step)
-        after = watched._replace(end=end, followed=followed)
-        search = lambda: self._with_starts(fixed._search(*step), keep, t0, y0, watched)
-        return lax.cond(eqxi.unvmap_all(quiet | ~keep), lambda: after, search)
+    def _follow(self, keep, t0, t1, y0, y1, args, watched: Watched, until):
+        """Whether a part is taken, where the next one ends, whether the motion ends with it, and what is known then."""
+        fixed, part = stopped(self), watched.part
+        known = stopped((t0, t1, y0, y1, args, watched._replace(y=None), until))
+        move, a, values = fixed._move(*known)
+        takes, ended = keep & move.takes, jnp.asarray(False)
+        counts = [f.count for f in watched.followed]
+        crossed = [takes & c for c in move.crossed]
+        owners, ranks, new = self.guards.owners, self.guards.ranks, jnp.zeros(self.guards.owners.size, bool)
+        for i, (kind, count, c) in enumerate(zip(self.guards.kinds, counts, crossed)):
+            new = new | ((owners == i) & (ranks == count) & c)
+            ended = ended | (c & kind.terminal)
 
-    def _at_a_glance(self, keep, t0, t1, y0, y1, args, watched: Watched):
-        """Whether a step is seen at once to have no crossing; and then its end, and what is known of the guards."""
-        # What is not finite is in doubt.
-        a, _ = self.motion.rates(t1, y1, believe=True)
-        values, _, inner = self._seen(watched.end, self._unseen(t1, y1, a), args)
-        of_guards = _apart(self._judged, watched.end, Node(t1, y1, a, values), inner)
-        signs = [(f.sign, p.sign) for f, p in zip(watched.followed, of_guards)]
-        noticed = _any([_any(p.doubt + changes(*x)) for p, x in zip(of_guards, signs)])
-        followed = tuple(f._replace(sign=last_known(*x)) for f, x in zip(watched.followed, signs))
-        now = _where(keep, (Node(t1, y1, a, values), followed), (watched.end, watched.followed))
-        return watched.begun & ~noticed, *now
+        def with_new():
+            put = lambda x, all: jnp.where(new.reshape(-1, *[1] * x.ndim), x[None], all)
+            return jtu.tree_map(put, (lax.stop_gradient(t1), y1), (watched.t, watched.y))
 
-    def _with_starts(self, found: Search, keep, t0, y0, watched: Watched) -> Watched:
-        """What a search found, with the start of the step that it was in."""
-        new = self._places([f.count for f in watched.followed], [f.count for f in found.followed])
+        t, y = lax.cond(eqxi.unvmap_any(jnp.any(new)), with_new, lambda: (watched.t, watched.y))
+        followed = tuple(f._replace(count=f.count + c) for f, c in zip(move.followed, crossed))
+        begins = keep & ~watched.begun
+        at_left = (v._replace(turns=v.turns | turns) for v, turns in zip(watched.values, move.turns_left))
+        a, values = _where(takes | begins, (a, values), (watched.a, tuple(at_left)))
+        later = Watched(watched.begun | keep, a, values, followed, t, y, move.part)
+        small = lambda w: w._replace(t=None, y=None)
+        later = _where(keep, small(later), small(watched._replace(part=part)))._replace(t=t, y=y)
+        return takes, move.at, ended, later
 
-        def with_start():
-            at_start = lambda x, all: jnp.where(new.reshape(-1, *[1] * x.ndim), x[None], all)
-            return jtu.tree_map(at_start, (t0, y0), (watched.kept.t0, watched.kept.y0))
+    def _move(self, t0, t1, y0, y1, args, watched: Watched, until):
+        """What is made of a step from t0 to t1; and the acceleration and the guards at its end."""
+        part, begins, kinds = watched.part, ~watched.begun, self.guards.kinds
+        # The first step is asked for its start, and taken again.
+        t, y = _where(begins, (t0, y0), (t1, y1))
+        a, _ = self.motion.rates(t, y)
+        left = Node(t0, y0, watched.a, watched.values)
+        right = self._unseen(t)._replace(y=y, a=a)
+        turns = [x & (t == part.turns_at) for x in part.turns]
+        right = right._replace(values=tuple(v._replace(turns=x) for v, x in zip(right.values, turns)))
+        values, times, inner = _apart(self._seen, left, right, args)
+        right = right._replace(values=values)
+        of_guards = _apart(self._judged, left, right, inner)
+        doubts = [_any(p.doubt) for p in of_guards]
+        # Where doubts remain, only the signs at the ends are believed.
+        signs = [[jnp.where(x, 0.0, sign) for sign in p.sign[:-1]] + p.sign[-1:] for p, x in zip(of_guards, doubts)]
+        crosses = [changes(f.sign, sign) for f, sign in zip(watched.followed, signs)]
+        seen = Seen(left, right, times, of_guards, doubts, signs, crosses)
+        no = (jnp.asarray(False),) * len(kinds)
+        first = tuple(f._replace(sign=self._first_sign(x, k)) for f, x, k in zip(watched.followed, values, kinds))
+        begun = Move(no[0], until, part, first, no, no)
+        move = _where(
+            part.root.guard >= 0, self._toward_root(seen, watched, until), self._looked(seen, watched, until)
+        )
+        return _where(begins, begun, move), a, values
 
-        fresh = eqxi.unvmap_any(jnp.any(new))
-        starts = lax.cond(fresh, with_start, lambda: (watched.kept.t0, watched.kept.y0))
-        return Watched(watched.begun | keep, found.end, found.followed, Kept(*starts, found.enclosed))
+    def _looked(self, seen: Seen, watched: Watched, until) -> Move:
+        """Settle what is between two nodes, or say where to look next; where a guard crosses, go to the root."""
+        (left, right, times, of_guards, in_doubt, signs, crosses), part = seen, watched.part
+        kinds, no = self.guards.kinds, (jnp.asarray(False),) * len(self.guards.kinds)
+        again, at_extremum, asked, turns, followed = _apart(self._at_extremum, right, left, part, watched.followed, until)
+        right = right._replace(values=tuple(v._replace(turns=v.turns | x) for v, x in zip(right.values, turns)))
+        given_up = part.looks >= LOOKS
+        # By halves down to the resolution of time: a jump, whose place is then known.
+        settled = ~again & (~_any(in_doubt) | (right.t - left.t <= NARROW * self.resolution) | given_up)
+        root = first_root(kinds, times, of_guards, signs, crosses)
+        crosses_now = settled & (root.guard >= 0)
+        takes = settled & (root.guard < 0)
+        following = next_look(left, right, times, of_guards, self.resolution)
+        looking = ~again & ~settled
+        # A start beyond the guard is as near to it as a root can be.
+        sign = _chosen(root.guard, [v.g for v in left.values]) * root.after
+        begin = jnp.where((sign >= 0) & (root.low <= left.t), left.t + self.resolution, root.guess)
+        at = jnp.where(again, at_extremum, jnp.where(following.look, following.at, right.t))
+        at = jnp.where(takes, until, jnp.where(crosses_now, self._inside(root, begin), at))
+        at_end = takes & (right.t >= until)
+        none = jnp.asarray(-1)
+        later = part._replace(
+            looks=jnp.where(at_end, 0, part.looks + 1),
+            asked=jnp.where(again, asked, jnp.where(looking & following.look, following.asked, none)),
+            curvature=jnp.where(again, part.curvature, following.curvature),
+            tries=jnp.where(again, part.tries + 1, 0),
+            turns=tuple(looking & ~following.look & x for x in following.turns_right),
+            turns_at=right.t,
+            root=_where(crosses_now, root, root._replace(guard=none)),
+            moved=jnp.full_like(at, jnp.inf),
+        )
+        followed = tuple(
+            Followed(jnp.where(takes, last_known(f.sign, s), f.sign), f.count, f.uncertain | (settled & x & given_up))
+            for f, s, x in zip(followed, signs, in_doubt)
+        )
+        return Move(takes, at, later, followed, no, tuple(looking & x for x in following.turns_left))
 
-    def _places(self, counts, later):
-        """Which of all places are those of crossings from `counts` to `later`, by guard."""
-        of_guards = zip(self.guards.kinds, counts, later)
-        ranks = ((np.arange(kind.most), a, b) for kind, a, b in of_guards)
-        return jnp.concatenate([(rank >= a) & (rank < b) for rank, a, b in ranks])
+    def _toward_root(self, seen: Seen, watched: Watched, until) -> Move:
+        """One step of Newton's formula, or of halves where that does not get on; the part is taken at the root."""
+        (left, right, times, of_guards, _, signs, crosses), part = seen, watched.part
+        root, t, kinds = part.root, right.t, self.guards.kinds
+        no = (jnp.asarray(False),) * len(kinds)
+        g, rate = (_chosen(root.guard, [getattr(v, name) for v in right.values]) for name in ("g", "rate"))
+        crossed = g * root.after >= 0
+        low, high = jnp.where(crossed, root.low, jnp.maximum(root.low, t)), jnp.where(crossed, t, root.high)
+        step = -g / jnp.where(rate != 0, rate, jnp.nan)
+        narrow = high - low <= self.resolution
+        size = jnp.abs(step)
+        found = (size <= self.resolution) | (narrow & crossed) | (part.tries >= ROOT_LOOKS)
+        found = found | (crossed & (t >= self.last) & (size <= NEAR_THE_LAST * self.resolution))
+        # What jumps is zero nowhere: the first time after it counts.
+        nearer = (t + step > low) & (t + step < high) & (size <= 0.5 * jnp.abs(part.moved))
+        at = jnp.where(narrow, high, jnp.where(nearer, t + step, low + 0.5 * (high - low)))
+        # Another guard may be crossed on the way: the one that was sought is not the first.
+        others = [[c & (root.guard != i) for c in mine] for i, mine in enumerate(crosses)]
+        earlier = first_root(kinds, times, of_guards, signs, others)
+        at_one_time = AT_ONCE * self.resolution
+        # Of two that jump at one time neither is the first, whatever an interpolant says.
+        sooner = found & (earlier.guard >= 0) & (earlier.guess < t - at_one_time) & (t < root.before - at_one_time)
+        found = found & ~sooner
+        # diffrax halves what it is asked for next to the end of the motion: no root before there, go on from there.
+        takes = found | (~sooner & ~crossed & (t <= root.low))
+        followed, crossing = [], []
+        for i, (kind, f, v) in enumerate(zip(kinds, watched.followed, right.values)):
+            known = jnp.where(jnp.abs(v.g) > v.noise, jnp.sign(v.g), 0.0)
+            wanted = (f.sign != 0) & (True if kind.direction == 0 else kind.direction == -f.sign)
+            close = jnp.abs(v.g) <= jnp.maximum(v.noise, at_one_time * jnp.abs(v.rate))
+            together = wanted & ((close & (v.rate * f.sign < 0)) | (known == -f.sign))
+            mine = found & ((root.guard == i) | together)
+            sign = jnp.where(mine, -f.sign, jnp.where(found & (known != 0), known, f.sign))
+            followed.append(f._replace(sign=jnp.where(found & (root.guard == i), root.after, sign)))
+            crossing.append(mine)
+        none = jnp.asarray(-1)
+        onward = _where(sooner, earlier._replace(before=t), root._replace(low=low, high=high))
+        at = jnp.where(found, until, jnp.where(sooner, self._inside(earlier, earlier.guess), at))
+        later = part._replace(
+            looks=jnp.where(found & (t >= until), 0, part.looks),
+            asked=none,
+            tries=jnp.where(found | sooner, 0, part.tries + 1),
+            turns=no,
+            root=onward._replace(guard=jnp.where(found, none, onward.guard)),
+            moved=jnp.where(found | sooner, jnp.inf, at - t),
+        )
+        return Move(takes, at, later, tuple(followed), tuple(crossing), no)
 
-    def _search(self, keep, t0, t1, y0, y1, args, watched) -> Search:
-        start = watched.end
-        search = Search(
-            left=start, right=start, end=start, look=keep, where=jnp.where(watched.begun, AT_END, AT_START),
-            at=jnp.where(watched.begun, t1, t0), asked=jnp.asarray(-1), curvature=jnp.ones_like(t1),
-            tries=jnp.asarray(0), looks=jnp.asarray(0), done=~keep, followed=watched.followed,
-            enclosed=watched.kept.enclosed,
-        )  # fmt: skip
-
-        def look(s: Search) -> Search:
-            looks = s.look & ~s.done
-            begins, ends, inside = (looks & (s.where == kind) for kind in (AT_START, AT_END, INSIDE))
-            flow = lambda: self.motion.flow(t0, y0, s.at)
-            y = lax.cond(eqxi.unvmap_any(inside), flow, lambda: y1)
-            y = _where(begins, y0, _where(ends, y1, y))
-            a = lax.cond(eqxi.unvmap_any(looks), lambda: self.motion.rates(s.at, y)[0], lambda: s.right.a)
-            right = _where(looks, self._unseen(s.at, y, a), s.right)
-            values, times, inner = _apart(self._seen, s.left, right, args, with_noise=True)
-            right = right._replace(values=_where(looks, values, right.values))
-            begun = zip(s.followed, right.values, self.guards.kinds)
-            signs = (jnp.where(begins, self._first_sign(x, k), f.sign) for f, x, k in begun)
-            s = s._replace(
-                left=_where(begins, right, s.left), right=right, end=_where(ends, right, s.end), looks=s.looks + 1,
-                followed=tuple(f._replace(sign=sign) for f, sign in zip(s.followed, signs)),
-            )  # fmt: skip
-            again, s = _apart(self._at_extremum, s, looks)
-            of_guards = _apart(self._judged, s.left, s.right, inner)
-            judged = self._judge(s, ~(again | begins | s.done), times, of_guards)
-            onward = s._replace(
-                look=jnp.asarray(True),
-                where=jnp.where(begins, AT_END, INSIDE),
-                at=jnp.where(begins, t1, s.at),
-                enclosed=judged.enclosed,
-            )
-            # What is enclosed has been chosen already, and is long.
-            few = lambda s: s._replace(enclosed=None)
-            return _where(again | begins, few(onward), few(judged))._replace(enclosed=judged.enclosed)
-
-        return lax.while_loop(lambda s: ~s.done, look, search)
+    def _inside(self, root: Root, at):
+        """A time between the two that enclose a root."""
+        return jnp.clip(at, jnp.minimum(root.low + self.resolution, root.high), root.high)
 
     def value(self, t, y, args):
         """Each guard at one state."""
         multipliers = self.motion.rates(t, y)[1] if self.guards.take_multipliers else {}
         return self.guards(t, *y, multipliers, args)
 
-    def _seen(self, left: Node, right: Node, args, with_noise=False):
+    def _seen(self, left: Node, right: Node, args):
         """The guards at `right`; the ends of the pieces between the two nodes; and each guard at the inner ones, by the
         quintic and by the cubics."""
         h = right.t - left.t
@@ -232,11 +329,9 @@ class Watching(diffrax.AbstractStepSizeController):
         one, (fine, coarse) = jnp.ones_like(h), between(left, right, h)
         states = [(right.t, right.y, right.a), *((t, *state) for t, state in zip(times[1:-1] * 2, fine + coarse))]
         places, along = [(t, y) for t, y, _ in states], [(one, (y[1], a)) for _, y, a in states]
-        if with_noise:
-            # Along the state itself, to see what its last digit makes of the guards.
-            places, along = [*places, places[0]], [*along, (right.t, uneven(right.y))]
-        (g, rate), *found = self._along(places, along, args)
-        digits = found.pop()[1] if with_noise else [jnp.zeros_like(h)] * len(g)
+        # Along the state itself, to see what its last digit makes of the guards.
+        places, along = [*places, places[0]], [*along, (right.t, uneven(right.y))]
+        (g, rate), *found, (_, digits) = self._along(places, along, args)
         eps = ROUNDED * jnp.finfo(h.dtype).eps
         values = tuple(
             Value(x, dx, eps * (jnp.abs(d) + jnp.abs(x)), turning.turns)
@@ -253,10 +348,10 @@ class Watching(diffrax.AbstractStepSizeController):
         found = jax.vmap(push)(*together)
         return [jtu.tree_map(lambda x: x[i], found) for i in range(len(places))]
 
-    def _unseen(self, t, y, a) -> Node:
-        """A node whose guards are not known yet."""
+    def _unseen(self, t) -> Node:
+        """A node at which nothing is known yet."""
         zero = jnp.zeros_like(t)
-        return Node(t, y, a, (Value(zero, zero, zero, jnp.asarray(False)),) * len(self.guards.kinds))
+        return Node(t, None, None, (Value(zero, zero, zero, jnp.asarray(False)),) * len(self.guards.kinds))
 
     def _judged(self, left: Node, right: Node, inner) -> list[Pieces]:
         """Each guard between two nodes, from what it is at the inner ones by the quintic and by the cubics."""
@@ -275,100 +370,30 @@ class Watching(diffrax.AbstractStepSizeController):
             return jnp.where(on_guard & (value.rate > 0), 0.0, 1.0)
         return jnp.where(on_guard | ~jnp.isfinite(value.g), 0.0, jnp.sign(value.g))
 
-    def _at_extremum(self, s: Search, looks):
-        """Whether an extremum is to be looked for again, nearer; else, if it was, that it is known."""
-        here = s.right
-        g, rate, noise = (_chosen(s.asked, [getattr(v, name) for v in here.values]) for name in ("g", "rate", "noise"))
-        asked = looks & (s.asked >= 0)
-        shift = -rate / s.curvature
+    def _at_extremum(self, here: Node, left: Node, part: Part, followed, until):
+        """Whether an extremum is to be looked for again, where, and of which guard; else, if it was, that it is known."""
+        g, rate, noise = (
+            _chosen(part.asked, [getattr(v, name) for v in here.values]) for name in ("g", "rate", "noise")
+        )
+        asked = part.asked >= 0
+        shift = -rate / part.curvature
         there = (0.5 * jnp.abs(rate * shift) <= NEAR_EXTREMUM * jnp.abs(g)) | (jnp.abs(shift) <= self.resolution)
-        again = asked & ~there & (s.tries < EXTREMUM_LOOKS) & (s.looks < LOOKS)
-        mine = [asked & there & (s.asked == i) for i in range(len(here.values))]
+        again = asked & ~there & (part.tries < EXTREMUM_LOOKS) & (part.looks < LOOKS)
+        mine = [asked & there & (part.asked == i) for i in range(len(here.values))]
         eps = ROUNDED * jnp.finfo(g.dtype).eps
         touches = jnp.abs(g) <= noise * jnp.maximum(TOUCHES * self.motion.tolerances.rtol[0] / eps, 1.0)
-        return again, s._replace(
-            at=jnp.where(again, jnp.clip(here.t + shift, s.left.t, s.end.t), s.at),
-            tries=jnp.where(again, s.tries + 1, 0),
-            asked=jnp.where(again, s.asked, -1),
-            right=here._replace(values=tuple(v._replace(turns=v.turns | m) for v, m in zip(here.values, mine))),
-            followed=tuple(f._replace(uncertain=f.uncertain | (m & touches)) for f, m in zip(s.followed, mine)),
-        )
-
-    def _judge(self, s: Search, here, times, of_guards) -> Search:
-        """Settle what is between `left` and `right`, or say where to look next; where `here`."""
-        in_doubt = [_any(p.doubt) for p in of_guards]
-        given_up = s.looks >= LOOKS
-        # By halves down to the resolution of time: a jump, whose place is then known.
-        settled = here & (~_any(in_doubt) | (s.right.t - s.left.t <= NARROW * self.resolution) | given_up)
-        # Where doubts remain, only the signs at the ends are believed.
-        signs = [
-            [jnp.where(doubt, 0.0, sign) for sign in p.sign[:-1]] + p.sign[-1:] for p, doubt in zip(of_guards, in_doubt)
-        ]
-        crosses = [changes(f.sign, sign) for f, sign in zip(s.followed, signs)]
-        any_crosses = settled & _any([_any(x) for x in crosses])
-        keep = lambda: self._keep(s, times, of_guards, signs, crosses, any_crosses)
-        nothing = lambda: ([f.count for f in s.followed], s.enclosed)
-        counts, enclosed = lax.cond(eqxi.unvmap_any(any_crosses), keep, nothing)
-        ended = _any([n > f.count for n, f, kind in zip(counts, s.followed, self.guards.kinds) if kind.terminal])
-        at_end = ended | (s.right.t >= s.end.t)
-        onward = settled & ~at_end
-        following = next_look(s.left, s.right, times, of_guards, self.resolution)
-        flat = lambda node, turns: node._replace(
-            values=tuple(v._replace(turns=v.turns | (~settled & x)) for v, x in zip(node.values, turns))
-        )
-        return s._replace(
-            left=_where(onward, s.right, flat(s.left, following.turns_left)),
-            right=_where(onward, s.end, flat(s.right, following.turns_right)),
-            look=~settled & following.look,
-            where=jnp.asarray(INSIDE),
-            at=following.at,
-            asked=jnp.where(settled, -1, following.asked),
-            curvature=following.curvature,
-            tries=jnp.asarray(0),
-            done=s.done | (settled & at_end),
-            followed=tuple(
-                Followed(_where(settled, last_known(f.sign, sign), f.sign), n, f.uncertain | (here & doubt & given_up))
-                for f, sign, n, doubt in zip(s.followed, signs, counts, in_doubt)
-            ),
-            enclosed=enclosed,
-        )
-
-    def _keep(self, s: Search, times, of_guards, signs, crosses, settled):
-        """Keep the crossings between the nodes, of each guard as many as there is room for."""
-        counts, enclosed, first, found = [], s.enclosed, 0, []
-        for kind, p, sign, crossed in zip(self.guards.kinds, of_guards, signs, crosses):
-            since, mine = (times[0], p.g[0], p.rate[0]), []
-            for t, g, rate, after, changed in zip(times[1:], p.g[1:], p.rate[1:], sign, crossed):
-                wanted = settled & changed & (True if kind.direction == 0 else kind.direction == after)
-                mine.append((wanted, Enclosed(since[0], t, after, *root_of_cubic(since, (t, g, rate)))))
-                since = _where(after != 0, (t, g, rate), since)
-            found.append(mine)
-        # Those for which there is no room are counted up to the end of the motion. The others are known better later.
-        end = jnp.asarray(jnp.inf, times[0].dtype)
-        for kind, mine in zip(self.guards.kinds, found):
-            for wanted, new in mine if kind.terminal else ():
-                end = jnp.where(wanted, jnp.minimum(end, new.guess), end)
-        for f, kind, mine in zip(s.followed, self.guards.kinds, found):
-            count, place = f.count, first + np.arange(kind.most)
-            first += kind.most
-            there = np.zeros(self.guards.owners.size, bool)
-            there[place] = True
-            for wanted, new in mine:
-                here = there & (self.guards.ranks == count) & wanted
-                enclosed = jtu.tree_map(lambda all, x: jnp.where(here, x, all), enclosed, new)
-                count = count + (wanted & ((count < kind.most) | (new.guess <= end)))
-            counts.append(count)
-        return counts, enclosed
+        followed = tuple(f._replace(uncertain=f.uncertain | (m & touches)) for f, m in zip(followed, mine))
+        return again, jnp.clip(here.t + shift, left.t, until), part.asked, tuple(mine), followed
 
 
-def _apart(function, *args, **options):
+def _apart(function, *args):
     """`function(*args)` as a call: what its results share XLA would compute anew for each of those who need them."""
-    return called(_jitted(function, args, options))
+    return called(_jitted(function, args))
 
 
 @eqx.filter_jit
-def _jitted(function, args, options):
-    return function(*args, **options)
+def _jitted(function, args):
+    return function(*args)
 
 
 def _any(conditions):
