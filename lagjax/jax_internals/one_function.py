@@ -100,6 +100,21 @@ def called(results):
     return jtu.tree_unflatten(jtu.tree_structure(results), [marked(first, STAYS_A_CALL), *others])
 
 
+def apart(function: Callable, *args):
+    """`function(*args)` as a call of its own: what XLA fuses it computes anew for each of those who need it.
+
+    >>> import jax.numpy as jnp
+    >>> print(apart(jnp.sin, jnp.asarray(0.0)))
+    0.0
+    """
+    return called(_jitted(function, args))
+
+
+@eqx.filter_jit
+def _jitted(function, args):
+    return function(*args)
+
+
 def fits(jaxpr: Jaxpr) -> bool:
     """Whether XLA can compile a program, `without_library` if it can be, as one function."""
     return all(_equation_fits(equation) for equation in jaxpr.eqns)

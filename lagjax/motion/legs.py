@@ -26,6 +26,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
+from lagjax.jax_internals.one_function import apart
 from lagjax.mechanics import constraints, coordinates
 from lagjax.mechanics.hybrid import Hybrid
 from lagjax.motion.consistency import stopped
@@ -157,43 +158,26 @@ def _first_leg(hybrid, q0, v0, params, ts, phase, settings):
 
 def _leg(hybrid, i, mine, way: Way, params, ts, phase: Phase, settings, adjoint) -> Way:
     """The way with one more leg, in the phase i, of those lanes that are in it."""
-    system, at_start = hybrid.systems[i], way.switches.count == 0
+    system = hybrid.systems[i]
     # Outputs that are past would cost a step each: those ahead come first, filled up by the last. Who is elsewhere
     # stands still.
     place, past = jnp.arange(ts.shape[0]), jnp.sum(ts <= way.t)
     ahead = jnp.where(place == 0, way.t, ts[jnp.minimum(place + past - 1, ts.shape[0] - 1)])
     times = jnp.where(mine, ahead, way.t)
     settings = settings if system.constraints else replace(settings, drift="none")
-    found = solved(system, way.q, way.v, params, times, phase.guards, settings, adjoint, way.seen)
-    result, end, switched, onward = found["result"], found["end"], jnp.asarray(False), jnp.asarray(False)
+    found = apart(solved, system, way.q, way.v, params, times, phase.guards, settings, adjoint, way.seen)
+    result, end, onward = found["result"], found["end"], jnp.asarray(False)
     after, target, switches = After(way.q, way.v, jnp.asarray(False)), way.phase, way.switches
     if phase.guards is not None and phase.switches:
-        count, at_one_time = len(phase.switches), AT_ONCE * resolution(ts)
         crossings = [found["events"][kind.name] for kind in phase.guards.kinds]
         when = jnp.stack([jnp.where(jnp.isfinite(x.t[0]), x.t[0], jnp.inf) for x in crossings])
-        # An event that ends the motion at the time of a switch comes first.
-        ending = jnp.where(phase.guards.terminal, when, jnp.inf)[count:]
-        when = when[:count]
-        by_event = jnp.any(ending <= jnp.min(when) + at_one_time)
-        switched = mine & (result == RESULTS.event_occurred) & ~by_event
-        at_once = switched & (end.t - way.t <= at_one_time)
-        is_below = _is_below(end, params, phase.guards, count, settings.rtol)
-        refused = at_once & at_start & is_below
-        full = way.switches.count >= hybrid.most_switches
-        onward = switched & ~refused & ~full
-        # What happens at once happens where the leg begins, and its time moves as that does.
-        t, q, v = _where(at_once, (way.t, way.q, way.v), (end.t, end.q, end.v))
-        end = Moment(t, q, v, end.multipliers)
-        first = jnp.argmax(when <= jnp.min(when) + at_one_time)
-        after, target, switches = _switched(system, first, end, params, phase, way, onward)
-        uncertain = mine & jnp.any(jnp.stack([x.uncertain for x in crossings[:count]]))
+        uncertain = mine & jnp.any(jnp.stack([x.uncertain for x in crossings[: len(phase.switches)]]))
+        ending = apart(_ending, phase, result, end, when, mine, way, params, resolution(ts), settings.rtol)
+        result, end, onward = ending.result, ending.end, ending.onward
+        after, target, switches = apart(_switched, system, ending, params, phase, way)
         switches = eqx.tree_at(lambda s: s.uncertain, switches, switches.uncertain | uncertain)
-        failed = RESULTS.where(refused, RESULTS.guard_below_zero, RESULTS.too_many_switches)
-        unseen = (result == RESULTS.successful) & is_below
-        result = RESULTS.where(unseen, RESULTS.guard_not_seen, RESULTS.where(switched, failed, result))
-        result = RESULTS.where(onward, RESULTS.successful, result)
     rows = jax.tree.map(lambda x: x[jnp.maximum(place - past + 1, 0)], {name: found[name] for name in ROWS})
-    known = ((ts > way.t) & (ts <= end.t) | at_start & (ts <= way.t)) & _reached(rows["q"])
+    known = ((ts > way.t) & (ts <= end.t) | (way.switches.count == 0) & (ts <= way.t)) & _reached(rows["q"])
     none = lambda name, x: end.multipliers.get(name, jnp.full_like(x, jnp.nan))
     end = end._replace(multipliers={name: none(name, x) for name, x in way.end.multipliers.items()})
     least = way.least if not settings.by_size else jnp.maximum(way.least, stopped(found["tolerance"][1]))
@@ -208,6 +192,39 @@ def _leg(hybrid, i, mine, way: Way, params, ts, phase: Phase, settings, adjoint)
         departure=jnp.maximum(way.departure, found["departure"]), settled=way.settled & found["settled"], result=result,
     )  # fmt: skip
     return _where(mine, further, way)
+
+
+class Ending(NamedTuple):
+    """How a leg ends: whether another one follows, and by which of the phase's switches; where; and the result."""
+
+    onward: Bool[Array, ""]
+    first: Int[Array, ""]
+    end: Moment
+    result: Any
+
+
+def _ending(phase: Phase, result, end: Moment, when, mine, way: Way, params, resolution, rtol) -> Ending:
+    """What ends a leg; `when`: the times at which its guards cross, infinite of those that do not."""
+    assert phase.guards is not None
+    count, at_one_time, at_start = len(phase.switches), AT_ONCE * resolution, way.switches.count == 0
+    # An event that ends the motion at the time of a switch comes first.
+    ending = jnp.where(phase.guards.terminal, when, jnp.inf)[count:]
+    when = when[:count]
+    by_event = jnp.any(ending <= jnp.min(when) + at_one_time)
+    switched = mine & (result == RESULTS.event_occurred) & ~by_event
+    at_once = switched & (end.t - way.t <= at_one_time)
+    # What happens at once happens where the leg begins, and its time moves as that does.
+    t, q, v = _where(at_once, (way.t, way.q, way.v), (end.t, end.q, end.v))
+    end = Moment(t, q, v, end.multipliers)
+    is_below = _is_below(end, params, phase.guards, count, rtol)
+    refused, full = at_once & at_start & is_below, way.switches.count >= way.switches.t.shape[0]
+    onward = switched & ~refused & ~full
+    failed = RESULTS.where(refused, RESULTS.guard_below_zero, RESULTS.too_many_switches)
+    unseen = (result == RESULTS.successful) & is_below
+    result = RESULTS.where(unseen, RESULTS.guard_not_seen, RESULTS.where(switched, failed, result))
+    result = RESULTS.where(onward, RESULTS.successful, result)
+    first = jnp.argmax(when <= jnp.min(when) + at_one_time)
+    return Ending(onward, first, end, result)
 
 
 def _is_below(end: Moment, params, guards: Guards, count: int, rtol):
@@ -237,8 +254,9 @@ class After(NamedTuple):
     rests: Bool[Array, ""]
 
 
-def _switched(system, first, end: Moment, params, phase: Phase, way: Way, onward):
+def _switched(system, ending: Ending, params, phase: Phase, way: Way):
     """The state after the switch that comes first of a phase's, and the record with it."""
+    onward, first, end, _ = ending
     states = [After(*reset(end.t, end.q, end.v, end.multipliers, params)) for reset in phase.resets]
     after = jax.tree.map(lambda *x: _one_of(first, x), *states)
     momentum = partial(jax.grad(system.lagrangian, argnums=2), end.t)

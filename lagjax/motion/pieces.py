@@ -184,17 +184,20 @@ def between(left: Node, right: Node, h):
 def first_root(kinds, times, of_guards, signs, crosses) -> Root:
     """The first of the crossings that are wanted, of all guards; `crosses`: at which nodes each has another sign."""
     infinite = jnp.full_like(times[0], jnp.inf)
-    first = Root(jnp.asarray(-1), times[0], times[-1], jnp.zeros_like(times[0]), infinite, infinite)
+    start = times[0], of_guards[0].g[0], of_guards[0].rate[0]
+    guard, at, begin, end, after = jnp.asarray(-1), infinite, start, start, jnp.zeros_like(infinite)
     for i, (kind, p, sign, crossed) in enumerate(zip(kinds, of_guards, signs, crosses)):
         since = times[0], p.g[0], p.rate[0]
-        for t, g, rate, after, changed in zip(times[1:], p.g[1:], p.rate[1:], sign, crossed):
-            wanted = changed & (True if kind.direction == 0 else kind.direction == after)
-            found = Root(jnp.asarray(i), since[0], t, after, root_of_cubic(since, (t, g, rate)), infinite)
-            sooner = wanted & (found.guess < first.guess)
-            first = jtu.tree_map(lambda x, y: jnp.where(sooner, x, y), found, first)
+        for node, new, changed in zip(zip(times[1:], p.g[1:], p.rate[1:]), sign, crossed):
+            wanted = changed & (True if kind.direction == 0 else kind.direction == new)
+            (t0, g0, _), (t1, g1, _) = since, node
+            secant = t0 + (t1 - t0) * jnp.clip(g0 / jnp.where(g0 != g1, g0 - g1, 1.0), 0.0, 1.0)
+            sooner = wanted & (secant < at)
+            found, before = (jnp.asarray(i), secant, since, node, new), (guard, at, begin, end, after)
+            guard, at, begin, end, after = jtu.tree_map(lambda x, y: jnp.where(sooner, x, y), found, before)
             # From a node whose sign is known.
-            since = tuple(jnp.where(after != 0, x, y) for x, y in zip((t, g, rate), since))
-    return first
+            since = tuple(jnp.where(new != 0, x, y) for x, y in zip(node, since))
+    return Root(guard, begin[0], end[0], after, root_of_cubic(begin, end), infinite)
 
 
 def root_of_cubic(begin, end):

@@ -27,6 +27,7 @@ Source: Farouki & Rajan, Comput. Aided Geom. Des. 4 (1987) 191 (hulls); Hairer &
 output by Hermite's formula); Shampine & Thompson, Appl. Math. Comput. 39 (2000) 43s (crossings inside a step).
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import diffrax
@@ -39,7 +40,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from lagjax.jax_internals.one_function import called
+from lagjax.jax_internals.one_function import apart
 from lagjax.mechanics.equations import all_finite
 from lagjax.motion.consistency import stopped
 from lagjax.motion.crossings import Guards, Kind
@@ -66,7 +67,7 @@ SAFETY = 2.0
 # How often to look inside one step: an extremum takes three, a jump fifty.
 LOOKS = 200
 # Steps to find a root: by Newton's formula three; by halves fifty.
-ROOT_LOOKS = 100
+ROOT_LOOKS, FEW_LOOKS = 100, 5
 # An extremum is where it is believed to be if what is left changes its height by less than this part.
 NEAR_EXTREMUM, EXTREMUM_LOOKS = 0.1, 8
 # What rounding leaves of a guard, in units of the change that its arguments' last digit makes; and of a start on it.
@@ -96,7 +97,8 @@ class Move(NamedTuple):
 
 
 class Seen(NamedTuple):
-    """The guards between the last part's end and this one's: see `Pieces`; signs and changes that are believed."""
+    """The guards between the last part's end and this one's: see `Pieces`; the signs that are believed, and the first
+    root that is wanted."""
 
     left: Node
     right: Node
@@ -104,7 +106,7 @@ class Seen(NamedTuple):
     of_guards: list[Pieces]
     in_doubt: list
     signs: list
-    crosses: list
+    root: Root
 
 
 class Watching(diffrax.AbstractStepSizeController):
@@ -211,86 +213,69 @@ class Watching(diffrax.AbstractStepSizeController):
         right = self._unseen(t)._replace(y=y, a=a)
         turns = [x & (t == part.turns_at) for x in part.turns]
         right = right._replace(values=tuple(v._replace(turns=x) for v, x in zip(right.values, turns)))
-        values, times, inner = _apart(self._seen, left, right, args)
+        values, times, inner = apart(self._seen, left, right, args)
         right = right._replace(values=values)
-        of_guards = _apart(self._judged, left, right, inner)
+        of_guards = apart(self._judged, left, right, inner)
         doubts = [_any(p.doubt) for p in of_guards]
         # Where doubts remain, only the signs at the ends are believed.
         signs = [[jnp.where(x, 0.0, sign) for sign in p.sign[:-1]] + p.sign[-1:] for p, x in zip(of_guards, doubts)]
         crosses = [changes(f.sign, sign) for f, sign in zip(watched.followed, signs)]
-        seen = Seen(left, right, times, of_guards, doubts, signs, crosses)
+        # Where a root is sought, those of other guards on the way there.
+        others = [[c & (part.root.guard != i) for c in mine] for i, mine in enumerate(crosses)]
+        root = apart(partial(first_root, kinds), times, of_guards, signs, others)
+        seen = Seen(left, right, times, of_guards, doubts, signs, root)
         no = (jnp.asarray(False),) * len(kinds)
         first = tuple(f._replace(sign=self._first_sign(x, k)) for f, x, k in zip(watched.followed, values, kinds))
         begun = Move(no[0], until, part, first, no, no)
-        move = _where(
-            part.root.guard >= 0, self._toward_root(seen, watched, until), self._looked(seen, watched, until)
-        )
+        ways = (apart(way, seen, watched, until) for way in (self._toward_root, self._looked))
+        move = _where(part.root.guard >= 0, *ways)
         return _where(begins, begun, move), a, values
 
     def _looked(self, seen: Seen, watched: Watched, until) -> Move:
         """Settle what is between two nodes, or say where to look next; where a guard crosses, go to the root."""
-        (left, right, times, of_guards, in_doubt, signs, crosses), part = seen, watched.part
-        kinds, no = self.guards.kinds, (jnp.asarray(False),) * len(self.guards.kinds)
-        again, at_extremum, asked, turns, followed = _apart(self._at_extremum, right, left, part, watched.followed, until)
+        part, left, right, no = watched.part, seen.left, seen.right, (jnp.asarray(False),) * len(self.guards.kinds)
+        again, at_extremum, turns, followed = apart(self._at_extremum, right, left, part, watched.followed, until)
         right = right._replace(values=tuple(v._replace(turns=v.turns | x) for v, x in zip(right.values, turns)))
         given_up = part.looks >= LOOKS
         # By halves down to the resolution of time: a jump, whose place is then known.
-        settled = ~again & (~_any(in_doubt) | (right.t - left.t <= NARROW * self.resolution) | given_up)
-        root = first_root(kinds, times, of_guards, signs, crosses)
-        crosses_now = settled & (root.guard >= 0)
-        takes = settled & (root.guard < 0)
-        following = next_look(left, right, times, of_guards, self.resolution)
+        narrow = right.t - left.t <= NARROW * self.resolution
+        root, following = seen.root, apart(next_look, left, right, seen.times, seen.of_guards, self.resolution)
+        settled, takes, crosses = apart(self._settled, seen.in_doubt, again, narrow | given_up, root)
         looking = ~again & ~settled
         # A start beyond the guard is as near to it as a root can be.
         sign = _chosen(root.guard, [v.g for v in left.values]) * root.after
         begin = jnp.where((sign >= 0) & (root.low <= left.t), left.t + self.resolution, root.guess)
         at = jnp.where(again, at_extremum, jnp.where(following.look, following.at, right.t))
-        at = jnp.where(takes, until, jnp.where(crosses_now, self._inside(root, begin), at))
-        at_end = takes & (right.t >= until)
+        at = jnp.where(takes, until, jnp.where(crosses, self._inside(root, begin), at))
         none = jnp.asarray(-1)
         later = part._replace(
-            looks=jnp.where(at_end, 0, part.looks + 1),
-            asked=jnp.where(again, asked, jnp.where(looking & following.look, following.asked, none)),
+            looks=jnp.where(takes & (right.t >= until), 0, part.looks + 1),
+            asked=jnp.where(again, part.asked, jnp.where(looking & following.look, following.asked, none)),
             curvature=jnp.where(again, part.curvature, following.curvature),
             tries=jnp.where(again, part.tries + 1, 0),
             turns=tuple(looking & ~following.look & x for x in following.turns_right),
             turns_at=right.t,
-            root=_where(crosses_now, root, root._replace(guard=none)),
+            root=root._replace(guard=jnp.where(crosses, root.guard, none)),
             moved=jnp.full_like(at, jnp.inf),
         )
         followed = tuple(
             Followed(jnp.where(takes, last_known(f.sign, s), f.sign), f.count, f.uncertain | (settled & x & given_up))
-            for f, s, x in zip(followed, signs, in_doubt)
+            for f, s, x in zip(followed, seen.signs, seen.in_doubt)
         )
         return Move(takes, at, later, followed, no, tuple(looking & x for x in following.turns_left))
 
+    def _settled(self, in_doubt, again, anyway, root: Root):
+        """Whether no doubt is left, and then, whether nothing is crossed, or something is."""
+        settled = ~again & (~_any(in_doubt) | anyway)
+        return settled, settled & (root.guard < 0), settled & (root.guard >= 0)
+
     def _toward_root(self, seen: Seen, watched: Watched, until) -> Move:
         """One step of Newton's formula, or of halves where that does not get on; the part is taken at the root."""
-        (left, right, times, of_guards, _, signs, crosses), part = seen, watched.part
-        root, t, kinds = part.root, right.t, self.guards.kinds
-        no = (jnp.asarray(False),) * len(kinds)
-        g, rate = (_chosen(root.guard, [getattr(v, name) for v in right.values]) for name in ("g", "rate"))
-        crossed = g * root.after >= 0
-        low, high = jnp.where(crossed, root.low, jnp.maximum(root.low, t)), jnp.where(crossed, t, root.high)
-        step = -g / jnp.where(rate != 0, rate, jnp.nan)
-        narrow = high - low <= self.resolution
-        size = jnp.abs(step)
-        found = (size <= self.resolution) | (narrow & crossed) | (part.tries >= ROOT_LOOKS)
-        found = found | (crossed & (t >= self.last) & (size <= NEAR_THE_LAST * self.resolution))
-        # What jumps is zero nowhere: the first time after it counts.
-        nearer = (t + step > low) & (t + step < high) & (size <= 0.5 * jnp.abs(part.moved))
-        at = jnp.where(narrow, high, jnp.where(nearer, t + step, low + 0.5 * (high - low)))
-        # Another guard may be crossed on the way: the one that was sought is not the first.
-        others = [[c & (root.guard != i) for c in mine] for i, mine in enumerate(crosses)]
-        earlier = first_root(kinds, times, of_guards, signs, others)
-        at_one_time = AT_ONCE * self.resolution
-        # Of two that jump at one time neither is the first, whatever an interpolant says.
-        sooner = found & (earlier.guard >= 0) & (earlier.guess < t - at_one_time) & (t < root.before - at_one_time)
-        found = found & ~sooner
-        # diffrax halves what it is asked for next to the end of the motion: no root before there, go on from there.
-        takes = found | (~sooner & ~crossed & (t <= root.low))
-        followed, crossing = [], []
-        for i, (kind, f, v) in enumerate(zip(kinds, watched.followed, right.values)):
+        part, t, none = watched.part, seen.right.t, jnp.asarray(-1)
+        no = (jnp.asarray(False),) * len(self.guards.kinds)
+        found, sooner, takes, onward, at = apart(self._nearer, seen, part)
+        root, at_one_time, followed, crossing = part.root, AT_ONCE * self.resolution, [], []
+        for i, (kind, f, v) in enumerate(zip(self.guards.kinds, watched.followed, seen.right.values)):
             known = jnp.where(jnp.abs(v.g) > v.noise, jnp.sign(v.g), 0.0)
             wanted = (f.sign != 0) & (True if kind.direction == 0 else kind.direction == -f.sign)
             close = jnp.abs(v.g) <= jnp.maximum(v.noise, at_one_time * jnp.abs(v.rate))
@@ -299,9 +284,6 @@ class Watching(diffrax.AbstractStepSizeController):
             sign = jnp.where(mine, -f.sign, jnp.where(found & (known != 0), known, f.sign))
             followed.append(f._replace(sign=jnp.where(found & (root.guard == i), root.after, sign)))
             crossing.append(mine)
-        none = jnp.asarray(-1)
-        onward = _where(sooner, earlier._replace(before=t), root._replace(low=low, high=high))
-        at = jnp.where(found, until, jnp.where(sooner, self._inside(earlier, earlier.guess), at))
         later = part._replace(
             looks=jnp.where(found & (t >= until), 0, part.looks),
             asked=none,
@@ -310,7 +292,34 @@ class Watching(diffrax.AbstractStepSizeController):
             root=onward._replace(guard=jnp.where(found, none, onward.guard)),
             moved=jnp.where(found | sooner, jnp.inf, at - t),
         )
-        return Move(takes, at, later, tuple(followed), tuple(crossing), no)
+        return Move(takes, jnp.where(found, until, at), later, tuple(followed), tuple(crossing), no)
+
+    def _nearer(self, seen: Seen, part: Part):
+        """Whether the root is found, whether another one is `sooner`, and whether the part is taken; the root that is
+        sought then, and where."""
+        root, t = part.root, seen.right.t
+        g, rate = (_chosen(root.guard, [getattr(v, name) for v in seen.right.values]) for name in ("g", "rate"))
+        crossed = g * root.after >= 0
+        low, high = jnp.where(crossed, root.low, jnp.maximum(root.low, t)), jnp.where(crossed, t, root.high)
+        step = -g / jnp.where(rate != 0, rate, jnp.nan)
+        narrow, size = high - low <= self.resolution, jnp.abs(step)
+        # To the last digit, where rounding lets it.
+        small = size <= jnp.where(part.tries < FEW_LOOKS, 0.25, 1.0) * self.resolution
+        found = small | (narrow & crossed) | (part.tries >= ROOT_LOOKS)
+        found = found | (crossed & (t >= self.last) & (size <= NEAR_THE_LAST * self.resolution))
+        # What jumps is zero nowhere: the first time after it counts.
+        nearer = (t + step > low) & (t + step < high) & (size <= 0.5 * jnp.abs(part.moved))
+        at = jnp.where(narrow, high, jnp.where(nearer, t + step, low + 0.5 * (high - low)))
+        # Another guard may be crossed on the way: the one that was sought is not the first. Of two that jump at one
+        # time neither is, whatever an interpolant says.
+        earlier = seen.root
+        before, limit = (x - AT_ONCE * self.resolution for x in (t, root.before))
+        sooner = found & (earlier.guard >= 0) & (earlier.guess < before) & (t < limit)
+        found = found & ~sooner
+        # diffrax halves what it is asked for next to the end of the motion: no root before there, go on from there.
+        takes = found | (~sooner & ~crossed & (t <= root.low))
+        onward = _where(sooner, earlier._replace(before=t), root._replace(low=low, high=high))
+        return found, sooner, takes, onward, jnp.where(sooner, self._inside(earlier, earlier.guess), at)
 
     def _inside(self, root: Root, at):
         """A time between the two that enclose a root."""
@@ -365,10 +374,14 @@ class Watching(diffrax.AbstractStepSizeController):
 
     def _first_sign(self, value: Value, kind: Kind):
         """The sign at the start of the motion: none where that is on the guard."""
-        on_guard = jnp.abs(value.g) <= ON_GUARD * (value.noise + jnp.abs(value.rate) * self.resolution)
+        on_guard = self._is_on(value)
         if kind.holds:
             return jnp.where(on_guard & (value.rate > 0), 0.0, 1.0)
         return jnp.where(on_guard | ~jnp.isfinite(value.g), 0.0, jnp.sign(value.g))
+
+    def _is_on(self, value: Value):
+        """Whether a state is on a guard, but for round-off."""
+        return jnp.abs(value.g) <= ON_GUARD * (value.noise + jnp.abs(value.rate) * self.resolution)
 
     def _at_extremum(self, here: Node, left: Node, part: Part, followed, until):
         """Whether an extremum is to be looked for again, where, and of which guard; else, if it was, that it is known."""
@@ -382,18 +395,12 @@ class Watching(diffrax.AbstractStepSizeController):
         mine = [asked & there & (part.asked == i) for i in range(len(here.values))]
         eps = ROUNDED * jnp.finfo(g.dtype).eps
         touches = jnp.abs(g) <= noise * jnp.maximum(TOUCHES * self.motion.tolerances.rtol[0] / eps, 1.0)
-        followed = tuple(f._replace(uncertain=f.uncertain | (m & touches)) for f, m in zip(followed, mine))
-        return again, jnp.clip(here.t + shift, left.t, until), part.asked, tuple(mine), followed
-
-
-def _apart(function, *args):
-    """`function(*args)` as a call: what its results share XLA would compute anew for each of those who need them."""
-    return called(_jitted(function, args))
-
-
-@eqx.filter_jit
-def _jitted(function, args):
-    return function(*args)
+        # Next to a start on the guard it is that start.
+        apart_from_left = _chosen(part.asked, [~self._is_on(v) for v in left.values])
+        followed = tuple(
+            f._replace(uncertain=f.uncertain | (m & touches & apart_from_left)) for f, m in zip(followed, mine)
+        )
+        return again, jnp.clip(here.t + shift, left.t, until), tuple(mine), followed
 
 
 def _any(conditions):
