@@ -1,6 +1,6 @@
 """What a hybrid system brings to a solve: its phases, their guards, and what switches do to the state."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Hashable, Mapping
 from typing import Any
 
 import diffrax
@@ -33,11 +33,13 @@ class Reset(eqx.Module):
     """What a switch does to the state: (t, q, v, multipliers, params) -> (q, v), and whether the motion rests there.
 
     `function` gives velocities, or the whole state; without one the state stays. With `settle`, which does so where the
-    motion comes to rest, the guard `when` opens by less than `slower_than` after it.
+    motion comes to rest, the guard `when` opens by less than `slower_than` after it. What the function has `read` from
+    outside tells it from one of the same code.
     """
 
     function: Callable | None
     takes: tuple[str, ...] = eqx.field(static=True)
+    read: Hashable = eqx.field(static=True, default=())
     settle: Callable | None = None
     when: Callable | None = None
     slower_than: Array | np.ndarray | None = None
@@ -123,12 +125,13 @@ def _phase(hybrid, i, start, events):
     both = [guards_of(crossings, system, start, holds=True), guards_of(events, system, start)]
     given = [guards for guards in both if guards is not None]
     guards = Guards(*(sum((getattr(g, name) for g in given), ()) for name in ("functions", "kinds"))) if given else None
-    resets = tuple(_reset(switch, hybrid, system, start) for switch in listed)
+    read = hybrid.read or ((),) * len(hybrid.switches)
+    resets = tuple(_reset(hybrid.switches[k], read[k], hybrid, system, start) for k in numbers)
     return Phase(guards, tuple(numbers), hybrid.targets[numbers], resets, tuple(events))
 
 
-def _reset(switch: Switch, hybrid, system, start) -> Reset:
-    reset = _reset_alone(switch, hybrid, system, start)
+def _reset(switch: Switch, read: Hashable, hybrid, system, start) -> Reset:
+    reset = _reset_alone(switch, read, hybrid, system, start)
     if switch.rest is None:
         return reset
     if takes_of(switch.when) != OF_STATE:
@@ -137,13 +140,13 @@ def _reset(switch: Switch, hybrid, system, start) -> Reset:
             "seen by velocities.\nFix: rest= with lj.touches(gap) alone."
         )
     settle = Plastic().between(system, hybrid.systems[hybrid.names.index(switch.rest)])
-    return Reset(reset.function, reset.takes, settle, switch.when, switch.slower_than)
+    return Reset(reset.function, reset.takes, read, settle, switch.when, switch.slower_than)
 
 
-def _reset_alone(switch: Switch, hybrid, system, start) -> Reset:
+def _reset_alone(switch: Switch, read: Hashable, hybrid, system, start) -> Reset:
     function = switch.reset
     if function is None:
-        return Reset(None, OF_STATE)
+        return Reset(None, OF_STATE, read)
     if isinstance(function, OfPhases):
         function = function.between(system, hybrid.systems[hybrid.names.index(switch.to)])
     takes = takes_of(function)
@@ -160,7 +163,7 @@ def _reset_alone(switch: Switch, hybrid, system, start) -> Reset:
             "Usual cause: the velocity that jumps alone.\n"
             'Fix: return v | {"y": -v["y"]}.'
         )
-    return Reset(lift_function(function, tuple(given[name] for name in takes)), takes)
+    return Reset(lift_function(function, tuple(given[name] for name in takes)), takes, read)
 
 
 class OfPhases(eqx.Module):

@@ -180,7 +180,7 @@ class Watching(diffrax.AbstractStepSizeController):
         """Whether a part is taken, where the next one ends, whether the motion ends with it, and what is known then."""
         fixed, part = stopped(self), watched.part
         known = stopped((t0, t1, y0, y1, args, watched._replace(y=None), until))
-        move, a, values = fixed._move(*known)
+        move, a, values = fixed._move(keep, *known)
         takes, ended = keep & move.takes, jnp.asarray(False)
         counts = [f.count for f in watched.followed]
         crossed = [takes & c for c in move.crossed]
@@ -203,7 +203,7 @@ class Watching(diffrax.AbstractStepSizeController):
         later = _where(keep, small(later), small(watched._replace(part=part)))._replace(t=t, y=y)
         return takes, move.at, ended, later
 
-    def _move(self, t0, t1, y0, y1, args, watched: Watched, until):
+    def _move(self, keep, t0, t1, y0, y1, args, watched: Watched, until):
         """What is made of a step from t0 to t1; and the acceleration and the guards at its end."""
         part, begins, kinds = watched.part, ~watched.begun, self.guards.kinds
         # The first step is asked for its start, and taken again.
@@ -220,16 +220,25 @@ class Watching(diffrax.AbstractStepSizeController):
         # Where doubts remain, only the signs at the ends are believed.
         signs = [[jnp.where(x, 0.0, sign) for sign in p.sign[:-1]] + p.sign[-1:] for p, x in zip(of_guards, doubts)]
         crosses = [changes(f.sign, sign) for f, sign in zip(watched.followed, signs)]
-        # Where a root is sought, those of other guards on the way there.
-        others = [[c & (part.root.guard != i) for c in mine] for i, mine in enumerate(crosses)]
-        root = apart(partial(first_root, kinds), times, of_guards, signs, others)
-        seen = Seen(left, right, times, of_guards, doubts, signs, root)
-        no = (jnp.asarray(False),) * len(kinds)
-        first = tuple(f._replace(sign=self._first_sign(x, k)) for f, x, k in zip(watched.followed, values, kinds))
-        begun = Move(no[0], until, part, first, no, no)
-        ways = (apart(way, seen, watched, until) for way in (self._toward_root, self._looked))
-        move = _where(part.root.guard >= 0, *ways)
-        return _where(begins, begun, move), a, values
+        # Nothing else to be seen: most steps of most motions.
+        calm = watched.begun & (part.root.guard < 0) & (part.asked < 0) & ~_any(doubts + [_any(c) for c in crosses])
+        nothing, at_end = (jnp.asarray(False),) * len(kinds), t1 >= until
+        followed = tuple(f._replace(sign=last_known(f.sign, sign)) for f, sign in zip(watched.followed, signs))
+        onward = Move(
+            jnp.asarray(True), until, part._replace(looks=jnp.where(at_end, 0, part.looks + 1)), followed, nothing, nothing
+        )
+
+        def closer():
+            # Where a root is sought, those of other guards on the way there.
+            others = [[c & (part.root.guard != i) for c in mine] for i, mine in enumerate(crosses)]
+            root = apart(partial(first_root, kinds), times, of_guards, signs, others)
+            seen = Seen(left, right, times, of_guards, doubts, signs, root)
+            first = tuple(f._replace(sign=self._first_sign(x, k)) for f, x, k in zip(watched.followed, values, kinds))
+            ways = (apart(way, seen, watched, until) for way in (self._toward_root, self._looked))
+            move = _where(part.root.guard >= 0, *ways)
+            return _where(begins, Move(nothing[0], until, part, first, nothing, nothing), move)
+
+        return lax.cond(eqxi.unvmap_all(calm | ~keep), lambda: onward, closer), a, values
 
     def _looked(self, seen: Seen, watched: Watched, until) -> Move:
         """Settle what is between two nodes, or say where to look next; where a guard crosses, go to the root."""
