@@ -85,7 +85,8 @@ NEAR_THE_LAST = 32
 class Move(NamedTuple):
     """What is made of a step: whether it `takes` the part, where the next one ends, and what is known then.
 
-    `crossed`: the guards that cross at the end of this part. `turns_left`: those found to turn at its start.
+    `crossed`: the guards that cross at the end of this part. `turns`: those known to turn there; `turns_left`: those
+    found to turn at its start.
     """
 
     takes: Bool[Array, ""]
@@ -93,6 +94,7 @@ class Move(NamedTuple):
     part: Part
     followed: tuple[Followed, ...]
     crossed: tuple[Bool[Array, ""], ...]
+    turns: tuple[Bool[Array, ""], ...]
     turns_left: tuple[Bool[Array, ""], ...]
 
 
@@ -196,8 +198,9 @@ class Watching(diffrax.AbstractStepSizeController):
         t, y = lax.cond(eqxi.unvmap_any(jnp.any(new)), with_new, lambda: (watched.t, watched.y))
         followed = tuple(f._replace(count=f.count + c) for f, c in zip(move.followed, crossed))
         begins = keep & ~watched.begun
-        at_left = (v._replace(turns=v.turns | turns) for v, turns in zip(watched.values, move.turns_left))
-        a, values = _where(takes | begins, (a, values), (watched.a, tuple(at_left)))
+        known = lambda values, turns: tuple(v._replace(turns=v.turns | x) for v, x in zip(values, turns))
+        here, at_left = known(values, move.turns), known(watched.values, move.turns_left)
+        a, values = _where(takes | begins, (a, here), (watched.a, at_left))
         later = Watched(watched.begun | keep, a, values, followed, t, y, move.part)
         small = lambda w: w._replace(t=None, y=None)
         later = _where(keep, small(later), small(watched._replace(part=part)))._replace(t=t, y=y)
@@ -225,8 +228,9 @@ class Watching(diffrax.AbstractStepSizeController):
         nothing, at_end = (jnp.asarray(False),) * len(kinds), t1 >= until
         followed = tuple(f._replace(sign=last_known(f.sign, sign)) for f, sign in zip(watched.followed, signs))
         onward = Move(
-            jnp.asarray(True), until, part._replace(looks=jnp.where(at_end, 0, part.looks + 1)), followed, nothing, nothing
-        )
+            jnp.asarray(True), until, part._replace(looks=jnp.where(at_end, 0, part.looks + 1)), followed,
+            nothing, nothing, nothing,
+        )  # fmt: skip
 
         def closer():
             # Where a root is sought, those of other guards on the way there.
@@ -236,7 +240,7 @@ class Watching(diffrax.AbstractStepSizeController):
             first = tuple(f._replace(sign=self._first_sign(x, k)) for f, x, k in zip(watched.followed, values, kinds))
             ways = (apart(way, seen, watched, until) for way in (self._toward_root, self._looked))
             move = _where(part.root.guard >= 0, *ways)
-            return _where(begins, Move(nothing[0], until, part, first, nothing, nothing), move)
+            return _where(begins, Move(nothing[0], until, part, first, nothing, nothing, nothing), move)
 
         return lax.cond(eqxi.unvmap_all(calm | ~keep), lambda: onward, closer), a, values
 
@@ -265,13 +269,13 @@ class Watching(diffrax.AbstractStepSizeController):
             turns=tuple(looking & ~following.look & x for x in following.turns_right),
             turns_at=right.t,
             root=root._replace(guard=jnp.where(crosses, root.guard, none)),
-            moved=jnp.full_like(at, jnp.inf),
+            moved=jnp.where(again, at - right.t, jnp.inf),
         )
         followed = tuple(
             Followed(jnp.where(takes, last_known(f.sign, s), f.sign), f.count, f.uncertain | (settled & x & given_up))
             for f, s, x in zip(followed, seen.signs, seen.in_doubt)
         )
-        return Move(takes, at, later, followed, no, tuple(looking & x for x in following.turns_left))
+        return Move(takes, at, later, followed, no, turns, tuple(looking & x for x in following.turns_left))
 
     def _settled(self, in_doubt, again, anyway, root: Root):
         """Whether no doubt is left, and then, whether nothing is crossed, or something is."""
@@ -301,7 +305,7 @@ class Watching(diffrax.AbstractStepSizeController):
             root=onward._replace(guard=jnp.where(found, none, onward.guard)),
             moved=jnp.where(found | sooner, jnp.inf, at - t),
         )
-        return Move(takes, jnp.where(found, until, at), later, tuple(followed), tuple(crossing), no)
+        return Move(takes, jnp.where(found, until, at), later, tuple(followed), tuple(crossing), no, no)
 
     def _nearer(self, seen: Seen, part: Part):
         """Whether the root is found, whether another one is `sooner`, and whether the part is taken; the root that is
@@ -400,7 +404,10 @@ class Watching(diffrax.AbstractStepSizeController):
         asked = part.asked >= 0
         shift = -rate / part.curvature
         there = (0.5 * jnp.abs(rate * shift) <= NEAR_EXTREMUM * jnp.abs(g)) | (jnp.abs(shift) <= self.resolution)
-        again = asked & ~there & (part.tries < EXTREMUM_LOOKS) & (part.looks < LOOKS)
+        at = here.t + shift
+        # Else what led here was too crude: what is before it is looked at with what is known now.
+        nearer = (at > left.t) & (at < until) & (jnp.abs(shift) <= 0.5 * jnp.abs(part.moved))
+        again = asked & ~there & nearer & (part.tries < EXTREMUM_LOOKS) & (part.looks < LOOKS)
         mine = [asked & there & (part.asked == i) for i in range(len(here.values))]
         eps = ROUNDED * jnp.finfo(g.dtype).eps
         touches = jnp.abs(g) <= noise * jnp.maximum(TOUCHES * self.motion.tolerances.rtol[0] / eps, 1.0)
@@ -409,7 +416,7 @@ class Watching(diffrax.AbstractStepSizeController):
         followed = tuple(
             f._replace(uncertain=f.uncertain | (m & touches & apart_from_left)) for f, m in zip(followed, mine)
         )
-        return again, jnp.clip(here.t + shift, left.t, until), tuple(mine), followed
+        return again, at, tuple(mine), followed
 
 
 def _any(conditions):
