@@ -37,7 +37,7 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import minimize_scalar
 
 import lagjax as lj
-from lagjax.motion import watching
+from lagjax.motion import sight
 from lagjax.scenes import bead_on_hoop
 
 jax.config.update("jax_enable_x64", True)
@@ -413,7 +413,7 @@ def of_family(name, family, count, seed, lanes=False):
     return pairs, rtols, [judge(*x) for x in zip(pairs, rtols, outcomes)]
 
 
-def at_ends_of_steps(begin, inner, off, end, h, touches, pieces=watching.pieces_of):
+def at_ends_of_steps(begin, inner, off, end, h, touches, pieces=sight.pieces_of):
     """The twin's pieces: nothing is known or in doubt between the ends of a step."""
     found = pieces(begin, inner, off, end, h, touches)
     between = len(found.sign) - 1
@@ -441,11 +441,11 @@ def rows(wanted):
     for name in TWINS:
         what = f"twin, ends of steps only: {name}: share missed"
         if wanted(what):
-            watching.pieces_of, pieces = at_ends_of_steps, watching.pieces_of
+            sight.pieces_of, pieces = at_ends_of_steps, sight.pieces_of
             try:
                 *_, verdicts = of_family(name, FAMILIES[name], each, OPTIONS["seed"])
             finally:
-                watching.pieces_of = pieces
+                sight.pieces_of = pieces
             found = totals(verdicts)
             yield row(what, found["missed"] / found["there"], 0.02, "more", **found)
     yield from costs(wanted)

@@ -22,7 +22,8 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 from lagjax.mechanics.equations import Equations
 from lagjax.motion.crossings import Crossings, Guards
 from lagjax.motion.pieces import Watched
-from lagjax.motion.watching import Watching, uneven
+from lagjax.motion.sight import uneven
+from lagjax.motion.watching import Watching
 
 # A guard that is this much farther from zero where it changes its sign than time can resolve jumps there.
 JUMPS = 64
@@ -43,10 +44,11 @@ class Located(NamedTuple):
 
 def locate(watching: Watching, watched: Watched) -> Located:
     """The crossings that were kept, with what follows from staying on the guards."""
-    equations, guards = watching.motion.equations, watching.guards
+    sight = watching.sight
+    equations, guards = sight.motion.equations, sight.guards
 
     def found(owner, row):
-        t, y = _exact((guards, equations), *row, owner, watching.resolution)
+        t, y = _exact((guards, equations), *row, owner, sight.resolution)
         return t, y, equations.multipliers(t, *y)
 
     t, y, multipliers = _each(found, guards, jnp.isfinite(watched.t), (watched.t, watched.y))

@@ -7,7 +7,7 @@ import numpy as np
 
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.coordinates import State
-from lagjax.mechanics.diagnosis import explain_failure
+from lagjax.mechanics.diagnosis import describe, explain_failure
 from lagjax.mechanics.multipliers import accelerations
 from lagjax.motion import problem
 from lagjax.motion.hybrid_trajectory import HybridTrajectory
@@ -54,6 +54,8 @@ def _raise_in_phase(trajectory, start, settings) -> NoReturn:
             "that rests on what it is taken to fly above.\n"
             "Fix: a phase for that, with the constraint that holds it: lj.Switch(..., rest=name), or start=name."
         )
+    if is_among(result, [RESULTS.reset_not_finite]):
+        raise RuntimeError(_no_state_after(trajectory))
     count, phase = len(switches), trajectory.last_phase()
     entered = start
     if count:
@@ -95,6 +97,27 @@ def _too_many(trajectory):
         )
     return said + (
         f"Usual cause: a long motion.\nFix: lj.Hybrid(..., most_switches={10 * count}), or ts that end before."
+    )
+
+
+def _no_state_after(trajectory):
+    hybrid, switches = trajectory.system, trajectory.switches
+    last = len(switches) - 1
+    switch = hybrid.switches[int(switches.way[last])]
+    before = f"q = {describe(jax.tree.map(lambda x: x[last], switches.q))}"
+    said = (
+        f"the switch {switch.in_words()} at t = {float(switches.t[last]):.9g} gives a state that is not finite, from "
+        f"{before}.\n"
+    )
+    if getattr(switch.reset, "friction", None) is not None:
+        return said + (
+            "Usual cause: a contact that jams. The gap and the constraints settle how it slides, whatever friction "
+            "does, and friction exceeds what pushes the contact together: there is no impulse that does both.\n"
+            "Fix: less friction, or a plastic impact onto a phase in which the contact holds: lj.touches(gap)."
+        )
+    return said + (
+        "Usual cause: a reset that divides by what is zero there, or takes a root of it; constraints of the next phase "
+        "that cannot be met.\nFix: look at reset(t, q, v, params) at that state, traj.switches with throw=False."
     )
 
 

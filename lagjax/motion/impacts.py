@@ -90,15 +90,12 @@ class _Rebound(eqx.Module):
         return _moved(after, self._slowed(t, q, v, params, jump, by_gap, along, alone), along)
 
     def _unit(self, contact, t, q, v, params):
-        """The least change of the velocities that changes the last residual by one and no other; whether there is one.
-
-        All others are those of the contact, and of the constraints that hold.
-        """
+        """The least change of the velocities that changes the residual that is last in `contact` by one and no other;
+        whether there is one. All others are those of the contact, and of the constraints that hold."""
         before = self.before
         system = System(before.lagrangian, before.constraints | contact, before.force, before.dissipation)
         x, unflatten = coordinates.flatten(q)
-        change = np.zeros(constraints.count(system, t, q, v, params), x.dtype)
-        change[-1] = 1.0
+        change = _of(list(contact)[-1], constraints.shapes(system, t, q, v, params)).astype(x.dtype)
         found = velocity_change(system, t, q, v, params, jnp.asarray(change))
         rows = constraints.jacobian(system, t, x, coordinates.flatten(v)[0], params, unflatten)
         d = coordinates.flatten(found)[0]
@@ -142,13 +139,17 @@ class _Opened(eqx.Module):
         x, unflatten = coordinates.flatten(q)
         u, _ = coordinates.flatten(v)
         sizes = jnp.abs(constraints.jacobian(self.before, t, x, u, params, unflatten)) @ jnp.abs(u)
-        shapes = constraints.shapes(self.before, t, q, v, params)
-        mine = np.concatenate([np.full(math.prod(shape), name == self.contact) for name, shape in shapes.items()])
+        mine = _of(self.contact, constraints.shapes(self.before, t, q, v, params))
         opening = constraints.velocity_residual(self.before, t, x, u, params, unflatten)
         # Of a body at rest, too, the speed is above zero.
         least = OPENS * jnp.finfo(x.dtype).eps * sizes + jnp.sqrt(jnp.finfo(x.dtype).tiny)
         change = stopped(jnp.where(mine, jnp.maximum(least - opening, 0.0), 0.0))
         return _moved(v, 1.0, velocity_change(self.before, t, q, v, params, change))
+
+
+def _of(name, shapes):
+    """Which equations of all constraints, which have these shapes, are those of this name."""
+    return np.concatenate([np.full(math.prod(shape), other == name) for other, shape in shapes.items()])
 
 
 def _moved(v, size, along):

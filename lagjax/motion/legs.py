@@ -28,6 +28,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from lagjax.jax_internals.one_function import apart
 from lagjax.mechanics import constraints, coordinates
+from lagjax.mechanics.equations import all_finite
 from lagjax.mechanics.hybrid import Hybrid
 from lagjax.motion.consistency import stopped
 from lagjax.motion.crossings import Crossings, Guards
@@ -35,8 +36,8 @@ from lagjax.motion.hybrid_trajectory import NO_PHASE, SWITCHES, Switches
 from lagjax.motion.loop import resolution
 from lagjax.motion.one_solve import solved
 from lagjax.motion.recorded import nothing, with_those_of
+from lagjax.motion.sight import uneven
 from lagjax.motion.trajectory import RESULTS, Moment
-from lagjax.motion.watching import uneven
 
 # What a guard may be below zero where a motion starts, in tolerances of what it is made of.
 NOT_BELOW = 1e2
@@ -176,6 +177,8 @@ def _leg(hybrid, i, mine, way: Way, params, ts, phase: Phase, settings, adjoint)
         result, end, onward = ending.result, ending.end, ending.onward
         after, target, switches = apart(_switched, system, ending, params, phase, way)
         switches = eqx.tree_at(lambda s: s.uncertain, switches, switches.uncertain | uncertain)
+        broken = onward & ~all_finite((after.q, after.v))
+        result, onward = RESULTS.where(broken, RESULTS.reset_not_finite, result), onward & ~broken
     rows = jax.tree.map(lambda x: x[jnp.maximum(place - past + 1, 0)], {name: found[name] for name in ROWS})
     known = ((ts > way.t) & (ts <= end.t) | (way.switches.count == 0) & (ts <= way.t)) & _reached(rows["q"])
     none = lambda name, x: end.multipliers.get(name, jnp.full_like(x, jnp.nan))

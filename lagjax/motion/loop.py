@@ -21,6 +21,7 @@ from lagjax.mechanics.structure import angles
 from lagjax.motion.arriving import Arriving, together
 from lagjax.motion.consistency import stopped
 from lagjax.motion.crossing_times import Located, at_known_times, first_end, locate
+from lagjax.motion.sight import Sight
 from lagjax.motion.stepping import Field, OnManifold, Quick, QuickField, forward_differentiable
 from lagjax.motion.tolerances import Scales, Tolerances, Weighing, as_nothing
 from lagjax.motion.watching import Watching
@@ -95,7 +96,7 @@ def _loop(equations, start, y0, refused, scales, settings, ts, adjoint, guards=N
         subs = diffrax.SubSaveAt(ts=ts), diffrax.SubSaveAt(t1=True)
         saveat = diffrax.SaveAt(subs=subs, controller_state=guards is not None)
     if guards is not None:
-        controller = Watching(controller, guards, solver, resolution(ts), ts[-1])
+        controller = Watching(controller, Sight(guards, solver, resolution(ts)), ts[-1])
     arguments = (
         terms, solver, ts[0], ts[-1], settings.dt0, y0, start.params, saveat, controller, _by_position(settings.event),
     )  # fmt: skip

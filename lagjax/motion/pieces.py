@@ -66,8 +66,8 @@ class Part(NamedTuple):
     comes then: the end of the next one, and whether there is a jump between the two.
 
     `looks`: how often it was looked into. The guard `asked` (-1: none) is believed to have an extremum where the part
-    ends, with this `curvature`, for the `tries`th time; they are counted for a root that is sought, too, and how far the
-    last one `moved`. The guards that are known to turn at the time `turns_at`.
+    ends, with this `curvature`. `tries`: for it, or for the `root` that is sought; and how far the last one `moved`.
+    `turns`: the guards that are known to turn at the time `turns_at`.
     """
 
     parted: Bool[Array, ""]

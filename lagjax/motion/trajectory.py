@@ -52,6 +52,7 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
     too_many_switches = "There were more switches than most_switches."
     guard_not_seen = "A guard is below zero, and was not seen to cross it: its phase began on it, and hardly left it."
     guard_below_zero = "A guard of the first phase is below zero at the start."
+    reset_not_finite = "The state after a switch is NaN or infinite."
 
 
 # Diffrax has no words for a success, and equinox no other place for them.

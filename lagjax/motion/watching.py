@@ -12,9 +12,9 @@ between two nodes is one of three:
     in doubt   anything else: an extremum near zero, or an interpolant that is too crude
 
 A step without doubts and crossings is taken as it is. Any other is taken in parts, each a step of the method from where
-the part before it ended: where a piece is in doubt, up to there (the extremum, or halfway); where a guard crosses, up to
-the root, which Newton's formula on the flow finds in two or three steps. So there is no other way to ask the motion than
-to step, whatever the loop that steps: one copy of the equations in a program, and in a batch nobody waits for a lane
+the part before it ended: where a piece is in doubt, up to there (the extremum, or halfway); where a guard crosses, up
+to the root, which Newton's formula on the flow finds in two or three steps. So the motion is asked in one way only, by
+steps of the loop that steps anyway: a program has one copy of the equations, and in a batch nobody waits for a lane
 that looks closer. The wrapped controller is not asked about parts. It gets the step as a whole, and what it answered is
 kept until the last part is taken.
 
@@ -33,47 +33,35 @@ from typing import NamedTuple
 import diffrax
 import equinox as eqx
 import equinox.internal as eqxi
-import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from lagjax.jax_internals.one_function import apart
 from lagjax.mechanics.equations import all_finite
 from lagjax.motion.consistency import stopped
-from lagjax.motion.crossings import Guards, Kind
+from lagjax.motion.crossings import Kind
 from lagjax.motion.pieces import (
-    INNER,
     Followed,
     Node,
     Part,
     Pieces,
     Root,
-    Value,
     Watched,
-    between,
     changes,
     first_root,
     last_known,
     next_look,
-    pieces_of,
 )
-from lagjax.motion.stepping import OnManifold
+from lagjax.motion.sight import Sight
 
-# The distance of the two interpolants, times this, is taken for the error.
-SAFETY = 2.0
 # How often to look inside one step: an extremum takes three, a jump fifty.
 LOOKS = 200
 # Steps to find a root: by Newton's formula three; by halves fifty.
 ROOT_LOOKS, FEW_LOOKS = 100, 5
 # An extremum is where it is believed to be if what is left changes its height by less than this part.
 NEAR_EXTREMUM, EXTREMUM_LOOKS = 0.1, 8
-# What rounding leaves of a guard, in units of the change that its arguments' last digit makes; and of a start on it.
-ROUNDED, ON_GUARD = 8, 64
-# An extremum within so many tolerances of zero may be on either side of it.
-TOUCHES = 10.0
 # An interval of so many resolutions of time is not parted again.
 NARROW = 16
 # Roots so near to each other, in resolutions of time, are at one time.
@@ -114,30 +102,40 @@ class Seen(NamedTuple):
 class Watching(diffrax.AbstractStepSizeController):
     """Wrap `controller`: follow the guards through each step that it accepts, and end the solve at a terminal one.
 
-    What was found is the controller's state, a pair of the wrapped one's and a `Watched`. `resolution`: how near two
-    times can be told apart; `last`: the end of the motion.
+    What was found is the controller's state: that of the wrapped one, and a `Watched`. `last`: the motion's end.
     """
 
     controller: diffrax.AbstractStepSizeController
-    guards: Guards
-    motion: OnManifold
-    resolution: Float[Array, ""]
+    sight: Sight
     last: Float[Array, ""]
+
+    @property
+    def kinds(self) -> tuple[Kind, ...]:
+        """Of the guards."""
+        return self.sight.guards.kinds
+
+    @property
+    def resolution(self) -> Float[Array, ""]:
+        """How near to each other two times can be told apart."""
+        return self.sight.resolution
 
     def wrap(self, direction):
         """The same for time in this direction, which is always forward."""
-        return Watching(self.controller.wrap(direction), self.guards, self.motion, self.resolution, self.last)
+        return Watching(self.controller.wrap(direction), self.sight, self.last)
 
     def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
         """The first step."""
         t1, inner = self.controller.init(terms, t0, t1, y0, dt0, args, func, error_order)
         t, (_, v) = stopped((t0, y0))
-        places, count = self.guards.owners.size, len(self.guards.kinds)
-        no, none = jnp.asarray(False), jnp.asarray(-1)
-        part = Part(no, t, t, no, jnp.asarray(0), none, t, jnp.asarray(0), (no,) * count, t, Root(none, t, t, t, t, t), t)
-        followed = (Followed(jnp.zeros_like(t), jnp.asarray(0), no),) * count
+        places, count = self.sight.guards.owners.size, len(self.kinds)
+        no, zero, none = jnp.asarray(False), jnp.asarray(0), jnp.asarray(-1)
+        part = Part(
+            parted=no, until=t, following=t, jumps=no, looks=zero, asked=none, curvature=t, tries=zero,
+            turns=(no,) * count, turns_at=t, root=Root(none, t, t, t, t, t), moved=t,
+        )  # fmt: skip
+        followed = (Followed(jnp.zeros_like(t), zero, no),) * count
         rows = jtu.tree_map(lambda x: jnp.broadcast_to(x, (places, *x.shape)), y0)
-        a, values = jtu.tree_map(jnp.zeros_like, v), self._unseen(t).values
+        a, values = jtu.tree_map(jnp.zeros_like, v), self.sight.unseen(t).values
         return t1, (inner, Watched(no, a, values, followed, jnp.full(places, jnp.nan, t.dtype), rows, part))
 
     def adapt_step_size(self, t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state):
@@ -151,8 +149,8 @@ class Watching(diffrax.AbstractStepSizeController):
         lost = parted & ~all_finite(y_error)
         # With fixed steps it is Python's True.
         keep = jnp.where(parted, ~lost, keep)
-        whole = t1, next_t1, jnp.asarray(jumped)
-        until, following, jumps = _where(parted, (watched.part.until, watched.part.following, watched.part.jumps), whole)
+        before = watched.part.until, watched.part.following, watched.part.jumps
+        until, following, jumps = _where(parted, before, (t1, next_t1, jnp.asarray(jumped)))
         state = t0, t1, y0, y1_candidate, args, watched, until
         unchanged = jnp.asarray(False), t1, jnp.asarray(False), watched
         takes, at, ended, watched = lax.cond(
@@ -186,8 +184,9 @@ class Watching(diffrax.AbstractStepSizeController):
         takes, ended = keep & move.takes, jnp.asarray(False)
         counts = [f.count for f in watched.followed]
         crossed = [takes & c for c in move.crossed]
-        owners, ranks, new = self.guards.owners, self.guards.ranks, jnp.zeros(self.guards.owners.size, bool)
-        for i, (kind, count, c) in enumerate(zip(self.guards.kinds, counts, crossed)):
+        owners, ranks = self.sight.guards.owners, self.sight.guards.ranks
+        new = jnp.zeros(owners.size, bool)
+        for i, (kind, count, c) in enumerate(zip(self.kinds, counts, crossed)):
             new = new | ((owners == i) & (ranks == count) & c)
             ended = ended | (c & kind.terminal)
 
@@ -208,17 +207,17 @@ class Watching(diffrax.AbstractStepSizeController):
 
     def _move(self, keep, t0, t1, y0, y1, args, watched: Watched, until):
         """What is made of a step from t0 to t1; and the acceleration and the guards at its end."""
-        part, begins, kinds = watched.part, ~watched.begun, self.guards.kinds
+        part, begins, kinds = watched.part, ~watched.begun, self.kinds
         # The first step is asked for its start, and taken again.
         t, y = _where(begins, (t0, y0), (t1, y1))
-        a, _ = self.motion.rates(t, y)
+        a, _ = self.sight.motion.rates(t, y)
         left = Node(t0, y0, watched.a, watched.values)
-        right = self._unseen(t)._replace(y=y, a=a)
+        right = self.sight.unseen(t)._replace(y=y, a=a)
         turns = [x & (t == part.turns_at) for x in part.turns]
         right = right._replace(values=tuple(v._replace(turns=x) for v, x in zip(right.values, turns)))
-        values, times, inner = apart(self._seen, left, right, args)
+        values, times, inner = apart(self.sight.seen, left, right, args)
         right = right._replace(values=values)
-        of_guards = apart(self._judged, left, right, inner)
+        of_guards = apart(self.sight.judged, left, right, inner)
         doubts = [_any(p.doubt) for p in of_guards]
         # Where doubts remain, only the signs at the ends are believed.
         signs = [[jnp.where(x, 0.0, sign) for sign in p.sign[:-1]] + p.sign[-1:] for p, x in zip(of_guards, doubts)]
@@ -237,7 +236,8 @@ class Watching(diffrax.AbstractStepSizeController):
             others = [[c & (part.root.guard != i) for c in mine] for i, mine in enumerate(crosses)]
             root = apart(partial(first_root, kinds), times, of_guards, signs, others)
             seen = Seen(left, right, times, of_guards, doubts, signs, root)
-            first = tuple(f._replace(sign=self._first_sign(x, k)) for f, x, k in zip(watched.followed, values, kinds))
+            of_guards_now = zip(watched.followed, values, kinds)
+            first = tuple(f._replace(sign=self.sight.first_sign(value, kind)) for f, value, kind in of_guards_now)
             ways = (apart(way, seen, watched, until) for way in (self._toward_root, self._looked))
             move = _where(part.root.guard >= 0, *ways)
             return _where(begins, Move(nothing[0], until, part, first, nothing, nothing, nothing), move)
@@ -246,7 +246,7 @@ class Watching(diffrax.AbstractStepSizeController):
 
     def _looked(self, seen: Seen, watched: Watched, until) -> Move:
         """Settle what is between two nodes, or say where to look next; where a guard crosses, go to the root."""
-        part, left, right, no = watched.part, seen.left, seen.right, (jnp.asarray(False),) * len(self.guards.kinds)
+        part, left, right, no = watched.part, seen.left, seen.right, (jnp.asarray(False),) * len(self.kinds)
         again, at_extremum, turns, followed = apart(self._at_extremum, right, left, part, watched.followed, until)
         right = right._replace(values=tuple(v._replace(turns=v.turns | x) for v, x in zip(right.values, turns)))
         given_up = part.looks >= LOOKS
@@ -285,10 +285,10 @@ class Watching(diffrax.AbstractStepSizeController):
     def _toward_root(self, seen: Seen, watched: Watched, until) -> Move:
         """One step of Newton's formula, or of halves where that does not get on; the part is taken at the root."""
         part, t, none = watched.part, seen.right.t, jnp.asarray(-1)
-        no = (jnp.asarray(False),) * len(self.guards.kinds)
+        no = (jnp.asarray(False),) * len(self.kinds)
         found, sooner, takes, onward, at = apart(self._nearer, seen, part)
         root, at_one_time, followed, crossing = part.root, AT_ONCE * self.resolution, [], []
-        for i, (kind, f, v) in enumerate(zip(self.guards.kinds, watched.followed, seen.right.values)):
+        for i, (kind, f, v) in enumerate(zip(self.kinds, watched.followed, seen.right.values)):
             known = jnp.where(jnp.abs(v.g) > v.noise, jnp.sign(v.g), 0.0)
             wanted = (f.sign != 0) & (True if kind.direction == 0 else kind.direction == -f.sign)
             close = jnp.abs(v.g) <= jnp.maximum(v.noise, at_one_time * jnp.abs(v.rate))
@@ -338,69 +338,9 @@ class Watching(diffrax.AbstractStepSizeController):
         """A time between the two that enclose a root."""
         return jnp.clip(at, jnp.minimum(root.low + self.resolution, root.high), root.high)
 
-    def value(self, t, y, args):
-        """Each guard at one state."""
-        multipliers = self.motion.rates(t, y)[1] if self.guards.take_multipliers else {}
-        return self.guards(t, *y, multipliers, args)
-
-    def _seen(self, left: Node, right: Node, args):
-        """The guards at `right`; the ends of the pieces between the two nodes; and each guard at the inner ones, by the
-        quintic and by the cubics."""
-        h = right.t - left.t
-        times = [left.t, *(left.t + share * h for share in INNER), right.t]
-        one, (fine, coarse) = jnp.ones_like(h), between(left, right, h)
-        states = [(right.t, right.y, right.a), *((t, *state) for t, state in zip(times[1:-1] * 2, fine + coarse))]
-        places, along = [(t, y) for t, y, _ in states], [(one, (y[1], a)) for _, y, a in states]
-        # Along the state itself, to see what its last digit makes of the guards.
-        places, along = [*places, places[0]], [*along, (right.t, uneven(right.y))]
-        (g, rate), *found, (_, digits) = self._along(places, along, args)
-        eps = ROUNDED * jnp.finfo(h.dtype).eps
-        values = tuple(
-            Value(x, dx, eps * (jnp.abs(d) + jnp.abs(x)), turning.turns)
-            for x, dx, d, turning in zip(g, rate, digits, right.values)
-        )
-        return values, times, [[(x[i], dx[i]) for x, dx in found] for i in range(len(values))]
-
-    def _along(self, places, directions, args):
-        """The guards at places (t, y), and their derivatives along a direction each: pairs of tuples."""
-        push = lambda place, direction: jax.jvp(lambda t, y: self.value(t, y, args), place, direction)
-        if not self.guards.long:
-            return [push(*x) for x in zip(places, directions)]
-        together = jtu.tree_map(lambda *x: jnp.stack(x), *zip(places, directions))
-        found = jax.vmap(push)(*together)
-        return [jtu.tree_map(lambda x: x[i], found) for i in range(len(places))]
-
-    def _unseen(self, t) -> Node:
-        """A node at which nothing is known yet."""
-        zero = jnp.zeros_like(t)
-        return Node(t, None, None, (Value(zero, zero, zero, jnp.asarray(False)),) * len(self.guards.kinds))
-
-    def _judged(self, left: Node, right: Node, inner) -> list[Pieces]:
-        """Each guard between two nodes, from what it is at the inner ones by the quintic and by the cubics."""
-        found, h, count = [], right.t - left.t, len(INNER)
-        for begin, end, by_both in zip(left.values, right.values, inner):
-            pairs = zip(by_both[:count], by_both[count:])
-            off = [tuple(SAFETY * jnp.abs(x - z) for x, z in zip(*pair)) for pair in pairs]
-            touches = TOUCHES * self.motion.tolerances.rtol[0] * h * jnp.maximum(jnp.abs(begin.rate), jnp.abs(end.rate))
-            found.append(pieces_of(begin, by_both[:count], off, end, h, touches))
-        return found
-
-    def _first_sign(self, value: Value, kind: Kind):
-        """The sign at the start of the motion: none where that is on the guard."""
-        on_guard = self._is_on(value)
-        if kind.holds:
-            return jnp.where(on_guard & (value.rate > 0), 0.0, 1.0)
-        return jnp.where(on_guard | ~jnp.isfinite(value.g), 0.0, jnp.sign(value.g))
-
-    def _is_on(self, value: Value):
-        """Whether a state is on a guard, but for round-off."""
-        return jnp.abs(value.g) <= ON_GUARD * (value.noise + jnp.abs(value.rate) * self.resolution)
-
     def _at_extremum(self, here: Node, left: Node, part: Part, followed, until):
-        """Whether an extremum is to be looked for again, where, and of which guard; else, if it was, that it is known."""
-        g, rate, noise = (
-            _chosen(part.asked, [getattr(v, name) for v in here.values]) for name in ("g", "rate", "noise")
-        )
+        """Whether an extremum is to be looked for again, and where; else which guard turns here, if one does."""
+        g, rate = (_chosen(part.asked, [getattr(v, name) for v in here.values]) for name in ("g", "rate"))
         asked = part.asked >= 0
         shift = -rate / part.curvature
         there = (0.5 * jnp.abs(rate * shift) <= NEAR_EXTREMUM * jnp.abs(g)) | (jnp.abs(shift) <= self.resolution)
@@ -408,15 +348,12 @@ class Watching(diffrax.AbstractStepSizeController):
         # Else what led here was too crude: what is before it is looked at with what is known now.
         nearer = (at > left.t) & (at < until) & (jnp.abs(shift) <= 0.5 * jnp.abs(part.moved))
         again = asked & ~there & nearer & (part.tries < EXTREMUM_LOOKS) & (part.looks < LOOKS)
-        mine = [asked & there & (part.asked == i) for i in range(len(here.values))]
-        eps = ROUNDED * jnp.finfo(g.dtype).eps
-        touches = jnp.abs(g) <= noise * jnp.maximum(TOUCHES * self.motion.tolerances.rtol[0] / eps, 1.0)
-        # Next to a start on the guard it is that start.
-        apart_from_left = _chosen(part.asked, [~self._is_on(v) for v in left.values])
-        followed = tuple(
-            f._replace(uncertain=f.uncertain | (m & touches & apart_from_left)) for f, m in zip(followed, mine)
-        )
-        return again, at, tuple(mine), followed
+        mine, doubtful = [asked & there & (part.asked == i) for i in range(len(here.values))], []
+        for f, turns, before, value in zip(followed, mine, left.values, here.values):
+            # Next to a start on the guard it is that start.
+            touches = turns & self.sight.touches(value) & ~self.sight.is_on(before)
+            doubtful.append(f._replace(uncertain=f.uncertain | touches))
+        return again, at, tuple(mine), tuple(doubtful)
 
 
 def _any(conditions):
@@ -431,16 +368,6 @@ def _chosen(i, values):
     for k, x in enumerate(values[1:], 1):
         found = jnp.where(i == k, x, found)
     return found
-
-
-def uneven(y):
-    """The state, each number times another factor near one: sums of their parts should not cancel."""
-    leaves, structure = jtu.tree_flatten(y)
-    scaled = []
-    for i, x in enumerate(leaves):
-        factor = 0.5 + np.mod(0.618 * (np.arange(x.size) + 1) + 0.377 * i, 1.0)
-        scaled.append(x * factor.reshape(x.shape).astype(x.dtype))
-    return jtu.tree_unflatten(structure, scaled)
 
 
 def _where(condition, a, b):

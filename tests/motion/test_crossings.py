@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import lagjax as lj
-from lagjax.motion import watching
+from lagjax.motion import sight
 from tests.systems import PARAMS, pendulum, rod_pendulum
 from tests.tiers import exhaustive_but
 
@@ -184,7 +184,7 @@ def test_refused_crossings():
 # Slow: a program each.
 
 
-def at_ends_of_steps(begin, inner, off, end, h, touches, pieces=watching.pieces_of):
+def at_ends_of_steps(begin, inner, off, end, h, touches, pieces=sight.pieces_of):
     """The twin: nothing is known or in doubt between the ends of steps."""
     found = pieces(begin, inner, off, end, h, touches)
     no = jnp.asarray(False)
@@ -198,7 +198,7 @@ def test_twin_ends_of_steps(monkeypatch):
         oscillator, 0.0, 1.0, ts=[0.0, 6.0], events={"level": lj.Crossing(guard, terminal=False)}
     )
     assert len(times(run(lambda t, q, v, p: q - 0.99))) == 2
-    monkeypatch.setattr(watching, "pieces_of", at_ends_of_steps)
+    monkeypatch.setattr(sight, "pieces_of", at_ends_of_steps)
     # Another guard: the program of the first would serve an equal one.
     assert len(times(run(lambda t, q, v, p: q - 0.991))) == 0
 

@@ -170,6 +170,34 @@ def test_sliding_that_is_settled():
     assert np.isnan(impact(rising, point)(0.0, 0.0, -1.0, {"mu": 0.6}))
 
 
+def on_wire(name):
+    """A bead that slides down a wire, x = 2 y, to a floor with friction."""
+    falls = lj.System(
+        lambda t, q, v, p: 0.5 * jnp.sum(v**2) - 9.81 * q[1], {name: lj.Holonomic(lambda t, q, p: q[0] - 2.0 * q[1])}
+    )
+    floor = lj.touches(lambda t, q, p: q[1], 0.5, coefficient, lambda t, q, v, p: v[0])
+    return lj.Hybrid({"falls": falls}, [lj.Switch("falls", to="falls", when=floor)])
+
+
+@pytest.mark.parametrize("name", ["a wire", "wire"])
+def test_what_holds_goes_by_any_name(name):
+    """It stays on the wire and loses half its speed, whether the constraint's name comes before the gap's or after."""
+    switch, (system,) = on_wire(name).switches[0], on_wire(name).systems
+    found = impact(switch.when, system)(0.0, jnp.zeros(2), jnp.array([-8.0, -4.0]), {"mu": 0.1})
+    np.testing.assert_allclose(found, [4.0, 2.0], rtol=1e-13)
+
+
+@pytest.mark.slow
+def test_a_contact_that_jams_is_said():
+    """By name, and with what it came from; the motion is kept up to there."""
+    start, ts = (jnp.array([2.0, 1.0]), jnp.zeros(2), {"mu": 5.0}), np.array([0.0, 1.0, 1.2])
+    with pytest.raises(RuntimeError, match="(?s)'falls' -> 'falls'.* at t = 1.00963755 .*not finite.*jams.*Fix: less"):
+        lj.integrate(on_wire("wire"), *start, ts=ts)
+    traj = lj.integrate(on_wire("wire"), *start, ts=ts, throw=False)
+    assert bool(traj.result == lj.RESULTS.reset_not_finite)
+    assert np.isfinite(traj.q[:, 0]).tolist() == [True, True, False]
+
+
 def test_said_by_name():
     """What is no friction."""
     with pytest.raises(ValueError, match="friction is given and sliding is not"):

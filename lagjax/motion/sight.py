@@ -1,0 +1,103 @@
+"""What guards are between two times at which the motion is known, and at one.
+
+See `watching.py` for how it is used, and `pieces.py` for what is made of it.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+from jaxtyping import Array, Float
+
+from lagjax.motion.crossings import Guards, Kind
+from lagjax.motion.pieces import INNER, Node, Pieces, Value, between, pieces_of
+from lagjax.motion.stepping import OnManifold
+
+# The distance of the two interpolants, times this, is taken for the error.
+SAFETY = 2.0
+# What rounding leaves of a guard, in units of the change that its arguments' last digit makes; and of a start on it.
+ROUNDED, ON_GUARD = 8, 64
+# An extremum within so many tolerances of zero may be on either side of it.
+TOUCHES = 10.0
+
+
+class Sight(eqx.Module):
+    """The guards along a motion; `resolution`: how near to each other two times can be told apart."""
+
+    guards: Guards
+    motion: OnManifold
+    resolution: Float[Array, ""]
+
+    def value(self, t, y, args):
+        """Each guard at one state."""
+        multipliers = self.motion.rates(t, y)[1] if self.guards.take_multipliers else {}
+        return self.guards(t, *y, multipliers, args)
+
+    def seen(self, left: Node, right: Node, args):
+        """The guards at `right`; the ends of the pieces between the two nodes; and each guard at the inner ones, by the
+        quintic and by the cubics."""
+        h = right.t - left.t
+        times = [left.t, *(left.t + share * h for share in INNER), right.t]
+        one, (fine, coarse) = jnp.ones_like(h), between(left, right, h)
+        states = [(right.t, right.y, right.a), *((t, *state) for t, state in zip(times[1:-1] * 2, fine + coarse))]
+        places, along = [(t, y) for t, y, _ in states], [(one, (y[1], a)) for _, y, a in states]
+        # Along the state itself, to see what its last digit makes of the guards.
+        places, along = [*places, places[0]], [*along, (right.t, uneven(right.y))]
+        (g, rate), *found, (_, digits) = self._along(places, along, args)
+        eps = ROUNDED * jnp.finfo(h.dtype).eps
+        values = tuple(
+            Value(x, dx, eps * (jnp.abs(d) + jnp.abs(x)), turning.turns)
+            for x, dx, d, turning in zip(g, rate, digits, right.values)
+        )
+        return values, times, [[(x[i], dx[i]) for x, dx in found] for i in range(len(values))]
+
+    def _along(self, places, directions, args):
+        """The guards at places (t, y), and their derivatives along a direction each: pairs of tuples."""
+        push = lambda place, direction: jax.jvp(lambda t, y: self.value(t, y, args), place, direction)
+        if not self.guards.long:
+            return [push(*x) for x in zip(places, directions)]
+        together = jtu.tree_map(lambda *x: jnp.stack(x), *zip(places, directions))
+        found = jax.vmap(push)(*together)
+        return [jtu.tree_map(lambda x: x[i], found) for i in range(len(places))]
+
+    def unseen(self, t) -> Node:
+        """A node at which nothing is known yet."""
+        zero = jnp.zeros_like(t)
+        return Node(t, None, None, (Value(zero, zero, zero, jnp.asarray(False)),) * len(self.guards.kinds))
+
+    def judged(self, left: Node, right: Node, inner) -> list[Pieces]:
+        """Each guard between two nodes, from what it is at the inner ones by the quintic and by the cubics."""
+        found, h, count = [], right.t - left.t, len(INNER)
+        for begin, end, by_both in zip(left.values, right.values, inner):
+            pairs = zip(by_both[:count], by_both[count:])
+            off = [tuple(SAFETY * jnp.abs(x - z) for x, z in zip(*pair)) for pair in pairs]
+            touches = TOUCHES * self.motion.tolerances.rtol[0] * h * jnp.maximum(jnp.abs(begin.rate), jnp.abs(end.rate))
+            found.append(pieces_of(begin, by_both[:count], off, end, h, touches))
+        return found
+
+    def first_sign(self, value: Value, kind: Kind):
+        """The sign at the start of the motion: none where that is on the guard."""
+        on_guard = self.is_on(value)
+        if kind.holds:
+            return jnp.where(on_guard & (value.rate > 0), 0.0, 1.0)
+        return jnp.where(on_guard | ~jnp.isfinite(value.g), 0.0, jnp.sign(value.g))
+
+    def is_on(self, value: Value):
+        """Whether a state is on a guard, but for round-off."""
+        return jnp.abs(value.g) <= ON_GUARD * (value.noise + jnp.abs(value.rate) * self.resolution)
+
+    def touches(self, value: Value):
+        """Whether an extremum there may be on either side of zero."""
+        eps = ROUNDED * jnp.finfo(value.g.dtype).eps
+        return jnp.abs(value.g) <= value.noise * jnp.maximum(TOUCHES * self.motion.tolerances.rtol[0] / eps, 1.0)
+
+
+def uneven(y):
+    """The state, each number times another factor near one: sums of their parts should not cancel."""
+    leaves, structure = jtu.tree_flatten(y)
+    scaled = []
+    for i, x in enumerate(leaves):
+        factor = 0.5 + np.mod(0.618 * (np.arange(x.size) + 1) + 0.377 * i, 1.0)
+        scaled.append(x * factor.reshape(x.shape).astype(x.dtype))
+    return jtu.tree_unflatten(structure, scaled)
