@@ -15,6 +15,8 @@ SHARES = (0.0, 0.45, 1.0)
 PIECES, INNER = len(SHARES) - 1, SHARES[1:-1]
 # What a cubic over the whole interval leaves out of a guard, times this, is what those over its pieces may leave out.
 BENT = 0.5
+# A start on a guard is flat if its rate alone makes less than this part of what the guard is at the next node.
+FLAT = 1e-3
 # The polynomials that weigh (q0, h v0, h² a0, h² a1, h v1, q1), and of a cubic (x0, h dx0, h dx1, x1).
 QUINTIC = np.array([
     [1, 0, 0, -10, 15, -6], [0, 1, 0, -6, 8, -3], [0, 0, 0.5, -1.5, 1.5, -0.5],
@@ -137,7 +139,12 @@ def pieces_of(begin: Value, inner, off, end: Value, h, touches) -> Pieces:
         clear = (lowest > largest) | (highest < -largest)
         direction.append(jnp.sign(way[i] + way[i + 1]))
         same = known[i] & known[i + 1] & (direction[i] != 0) & (way[i] * way[i + 1] >= 0)
-        monotone.append(same & ((three - two) * direction[i] >= bent))
+        rises = (three - two) * direction[i] >= bent
+        if i == 0:
+            # From the guard itself without speed, as t³ does, no polygon rises.
+            flat = (jnp.abs(one) <= begin.noise) & (third * jnp.abs(rate[0]) <= FLAT * jnp.abs(four))
+            rises = rises | (flat & (sign[1] == direction[0]))
+        monotone.append(same & rises)
         doubt.append(~(clear | monotone[i]))
     for i in range(1, PIECES):
         # Where one run ends and another begins, the sign must be known; not inside a run.
