@@ -10,6 +10,7 @@ from collections.abc import Callable
 
 import equinox as eqx
 import jax
+from jax.core import Tracer
 from jaxtyping import Array
 
 from lagjax.jax_internals.tracing import is_eager
@@ -55,10 +56,20 @@ def lift_function(function: Callable | None, args: tuple):
     if function is None or is_eager() or (isinstance(function, types.FunctionType) and function.__closure__ is None):
         return function
     arrays, static = eqx.partition(args, eqx.is_array)
-    converted, values = jax.closure_convert(lambda arrays: function(*eqx.combine(arrays, static)), arrays)
-    if not values:
+    of_arrays = lambda arrays: function(*eqx.combine(arrays, static))
+    # JAX's `closure_convert` lifts what may be differentiated, and leaves what is batched.
+    program, shapes = jax.make_jaxpr(of_arrays, return_shape=True)(arrays)
+    traced = [isinstance(value, Tracer) for value in program.consts]
+    if not any(traced):
         return function
-    return Lifted(lambda *args: converted(eqx.filter(args[: len(static)], eqx.is_array), *args[len(static) :]), values)
+
+    def lifted(*args):
+        arrays, values = eqx.filter(args[: len(static)], eqx.is_array), iter(args[len(static) :])
+        every = [next(values) if t else value for value, t in zip(program.consts, traced)]
+        found = jax.core.eval_jaxpr(program.jaxpr, every, *jax.tree.leaves(arrays))
+        return jax.tree.unflatten(jax.tree.structure(shapes), found)
+
+    return Lifted(lifted, [value for value, t in zip(program.consts, traced) if t])
 
 
 def _lifted_force(system, s):

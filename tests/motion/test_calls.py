@@ -158,3 +158,17 @@ def test_where_nothing_is_traced():
             transform(look)(jnp.ones(2) if transform is jax.vmap else 1.0)
     look(1.0)
     assert seen[0] and seen[-1] and not any(seen[1:-1])
+
+
+def test_lanes_of_what_functions_close_over():
+    """Numbers that L and a guard close over, batched without `jit`: each lane has its own. Twin: its neighbour's."""
+
+    def falls(g, level):
+        stone = lj.System(lambda t, q, v, p: 0.5 * v**2 - g * q)
+        events = {"level": lj.Crossing(lambda t, q, v, p: q - level)}
+        return lj.integrate(stone, 2.0, 0.0, ts=np.array([0.0, 9.0]), events=events, throw=False).end.t
+
+    g, level = jnp.array([1.0, 4.0, 16.0]), jnp.array([1.0, 0.5, -1.0])
+    found, expected = jax.vmap(falls)(g, level), np.sqrt(2 * (2.0 - level) / g)
+    np.testing.assert_allclose(found, expected, rtol=1e-12)
+    assert np.all(np.abs(found - np.roll(expected, 1)) > 0.1)
