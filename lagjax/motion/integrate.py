@@ -97,12 +97,13 @@ def integrate(
     - `jump_ts` (J,): times at which a force jumps or has a kink, in any order, `[t]`. They become ends of steps, which
       stay on their side of them; derivatives by these times are right.
     - `events`: by name, a `lj.Crossing` each: where a function of the state crosses zero, recorded in `traj.events` or
-      ending the motion. Crossings are found also inside steps, several in one, and located to round-off. What jumps
-      over zero at a switch of a `Hybrid`, as a velocity does in an impact, does not cross it.
+      ending the motion. Crossings are found also inside steps, several in one, and located to round-off: such a step
+      is taken in parts, which end there, and its controller is asked once. What jumps over zero at a switch of a
+      `Hybrid`, as a velocity does in an impact, does not cross it.
     - `event`: a `diffrax.Event` that ends the motion; its condition takes `(t, (q, v), params, **kwargs)`. It is found
       as `events` are, under the name "event".
     - `adjoint`: any diffrax adjoint. Without one, forward and reverse mode both work.
-    - `max_steps`: the largest number of steps, accepted and rejected.
+    - `max_steps`: the largest number of steps, accepted and rejected, those that look for events among them.
     - `throw`: raise where the integration fails. With `throw=False` the trajectory carries the reason in
       `result` and NaN from there on.
     - `progress`: show a progress meter.
