@@ -31,6 +31,7 @@ from jax.core import ShapedArray
 from jaxtyping import PyTree
 
 from lagjax.jax_internals.primitives import ad, primitive
+from lagjax.motion.replay import Replay
 
 # Up to this many derivatives of one number, pushing all of them forward is cheaper than one pull back through the
 # checkpoints, to run and to compile.
@@ -191,7 +192,7 @@ def _pull(x, fixed, wanted, cotangents, *, outputs, **params):
     def of_wanted(*chosen):
         chosen = iter(chosen)
         every = [next(chosen) if w else a for a, w in zip(x, wanted)]
-        return outputs(diffrax.RecursiveCheckpointAdjoint(), *every, *fixed)
+        return outputs(Replay(), *every, *fixed)
 
     return jax.vjp(of_wanted, *[a for a, w in zip(x, wanted) if w])[1](cotangents)
 

@@ -210,6 +210,10 @@ class OnManifold(diffrax.AbstractWrappedSolver):
             result = diffrax.RESULTS.where(projected.holds, result, diffrax.RESULTS.nonlinear_divergence)
         return y1, error, solver_state, result
 
+    def again(self, t0, t1, y0):
+        """The end of an accepted step, by what is known where it starts."""
+        return self.step(None, t0, t1, y0, None, None, True)[0]
+
     def flow(self, t0, y0, t):
         """The state at t, by one step from t0."""
         begin, end = (t0, t) if self.jump_ts is None else between_jumps(t0, t, self.jump_ts, True)[:2]
