@@ -112,7 +112,10 @@ def _loop(equations, start, y0, refused, scales, settings, ts, adjoint, guards=N
     own = lambda: _own_calls_of_the_host(equations, terms, start, guards, settings, controller)
     if isinstance(adjoint, Replay):
         assert isinstance(controller, Arriving)
-        problem = Problem(terms, solver, controller, ts, ts[0], ts[-1], settings.dt0, y0, start.params)
+        first, after = (jnp.searchsorted(ts, ts, side=side) for side in ("left", "right"))
+        problem = Problem(
+            terms, solver, controller, ts, first, after, ts[0], ts[-1], settings.dt0, y0, start.params
+        )  # fmt: skip
         return _replayed(replayed(problem, settings.max_steps, checked=not own()), ts)
     # Reverse mode has to look inside.
     if isinstance(adjoint, diffrax.ForwardMode):

@@ -32,12 +32,17 @@ CLIPPED = 100
 
 
 class Problem(NamedTuple):
-    """What a motion is stepped through with; the outputs `ts` increase, and begin and end with `t0` and `t1`."""
+    """What a motion is stepped through with; the outputs `ts` increase, and begin and end with `t0` and `t1`.
+
+    Of each output: `first`, the first of those at its time, and `after`, the first of those at a later one.
+    """
 
     terms: PyTree[diffrax.AbstractTerm]
     solver: OnManifold
     controller: Arriving
     ts: Float[Array, " T"]
+    first: Int[Array, " T"]
+    after: Int[Array, " T"]
     t0: Float[Array, ""]
     t1: Float[Array, ""]
     dt0: Float[Array, ""] | None
@@ -107,7 +112,7 @@ def recorded(problem: Problem, max_steps: int | None) -> Recorded:
     outputs = jax.tree.map(lambda x: jnp.broadcast_to(x, (p.ts.size, *x.shape)), p.y0)
     place = _first(p)
     places = jax.tree.map(lambda x: jnp.broadcast_to(x, (PLACES, *jnp.shape(x))), place)
-    start = _Run(place, _no_rows(p), zero, zero, _well(), outputs, following(p.ts)[0])
+    start = _Run(place, _no_rows(p), zero, zero, _well(), outputs, p.after[0])
     on = lambda run: _is_on(p, run, max_steps)
 
     def onward(state):
@@ -124,12 +129,11 @@ def recorded(problem: Problem, max_steps: int | None) -> Recorded:
     state = start, places, jnp.asarray(1)
     run, places, stride = lax.while_loop(lambda state: eqxi.unvmap_any(on(state[0])), onward, state)
     result = diffrax.RESULTS.where(on(run._replace(steps=zero)), diffrax.RESULTS.max_steps_reached, run.result)
-    first = preceding(p.ts)
     # diffrax looks for outputs at the end of each accepted step; without time to go there is none.
-    reached = (first < run.saved) & ((run.accepted > 0) | (p.t0 == p.t1))
+    reached = (p.first < run.saved) & ((run.accepted > 0) | (p.t0 == p.t1))
     stats = {"num_steps": run.steps, "num_accepted_steps": run.accepted, "num_rejected_steps": run.steps - run.accepted}
     record = Record(run.accepted, run.rows, places, stride, run.saved)
-    outputs = jax.tree.map(lambda x: x[first], run.outputs)
+    outputs = jax.tree.map(lambda x: x[p.first], run.outputs)
     return Recorded(reached, outputs, run.place.t, run.place.y, stats, result, record)
 
 
@@ -139,16 +143,6 @@ def recorded_again(problem: Problem, record: Record, number) -> Rows:
     place, begun = jax.tree.map(lambda x: x[slot], record.places), slot * record.stride * ROWS
     run = _Run(place, record.rows, begun, begun, _well(), None, None)
     return _until(problem, run, jnp.minimum((number + 1) * ROWS, record.count), None).rows
-
-
-def following(ts):
-    """For each of the increasing times the place of the next larger one."""
-    return jnp.searchsorted(ts, ts, side="right", method="compare_all")
-
-
-def preceding(ts):
-    """For each of the increasing times the first place at which it stands."""
-    return jnp.searchsorted(ts, ts, method="compare_all")
 
 
 def _well():
@@ -185,7 +179,7 @@ def _until(p: Problem, run: _Run, limit, max_steps) -> _Run:
 
     In a batch whole arrays would be selected in each turn for lanes that are done: here only the numbers that change.
     """
-    on, after = lambda run: _is_on(p, run, max_steps) & (run.accepted < limit), following(p.ts)
+    on = lambda run: _is_on(p, run, max_steps) & (run.accepted < limit)
 
     def turn(run: _Run) -> _Run:
         here, place, row = on(run), run.place, run.accepted % ROWS
@@ -197,7 +191,7 @@ def _until(p: Problem, run: _Run, limit, max_steps) -> _Run:
             i = jnp.minimum(saved, p.ts.size - 1)
             hit = here & keep & (saved < p.ts.size) & (place.t1 >= p.ts[i])
             outputs = jax.tree.map(lambda all, x: _put(all, i, x, hit), outputs, further.y)
-            saved = jnp.where(hit, after[i], saved)
+            saved = jnp.where(hit, p.after[i], saved)
         place, result = _where(here, (further, result), (place, run.result))
         return _Run(place, rows, run.steps + here, run.accepted + (here & keep), result, outputs, saved)
 

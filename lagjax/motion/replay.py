@@ -30,7 +30,7 @@ from jaxtyping import Array, Int, PyTree
 
 from lagjax.jax_internals.one_function import one_function
 from lagjax.jax_internals.primitives import ad, primitive
-from lagjax.motion.recording import ROWS, Problem, Recorded, Rows, preceding, recorded, recorded_again
+from lagjax.motion.recording import ROWS, Problem, Recorded, Rows, recorded, recorded_again
 
 
 @dataclass(frozen=True)
@@ -181,10 +181,10 @@ def _moved_transpose(cotangents, *operands, motion, lanes, moved):
     asked = given.outputs, given.t, given.y
     asked = jax.tree.map(ad.instantiate_zeros, asked, is_leaf=_is_zero)
     # Of outputs at one time the first has the cotangents of all.
-    ts = _ts_of(leaves, motion, lanes)
-    together = lambda ts, ct: jnp.zeros_like(ct).at[preceding(ts)].add(ct)
+    _, first = _outputs_of(leaves, motion, lanes)
+    together = lambda first, ct: jnp.zeros_like(ct).at[first].add(ct)
     together = together if lanes is None else jax.vmap(together)
-    asked = jax.tree.map(lambda ct: together(ts, ct), asked[0]), *asked[1:]
+    asked = jax.tree.map(lambda ct: together(first, ct), asked[0]), *asked[1:]
     swept = partial(swept_back, motion=motion, moved=moved, lanes=lanes)
     if lanes is None:
         found = one_function(swept, leaves, motion.recorded(values), asked, checked=motion.checked, in_blocks=True)
@@ -215,8 +215,7 @@ def swept_back(leaves, found: Recorded, asked, *, motion: Motion, moved, lanes: 
     batched = [False] * len(leaves) if alone else lanes.batched
     each = lambda function: function if alone else jax.vmap(function)
     with_leaves = lambda function, more: function if alone else lanes.each(function, more)
-    ts = _ts_of(leaves, motion, lanes)
-    first = each(preceding)(ts)
+    ts, first = _outputs_of(leaves, motion, lanes)
     at = each(lambda tree, i: jax.tree.map(lambda x: x[i], tree))
 
     # A lane without steps stands in for the longest: its own state may be none, and NaN times zero is NaN.
@@ -296,9 +295,9 @@ def swept_back(leaves, found: Recorded, asked, *, motion: Motion, moved, lanes: 
     return total
 
 
-def _ts_of(leaves, motion, lanes):
-    """The outputs' times, of one lane or of all."""
-    of = lambda *leaves: motion.problem(leaves).ts
+def _outputs_of(leaves, motion, lanes):
+    """The times of the outputs, and the first at each of them, of one lane or of all."""
+    of = lambda *leaves: (motion.problem(leaves).ts, motion.problem(leaves).first)
     return of(*leaves) if lanes is None else lanes.each(of)(*leaves)
 
 
