@@ -250,21 +250,22 @@ def _tangent_batched(operands, axes, *, outputs, shapes, size, many):
         dy = _tangent_p.bind(*x, *fixed, *dx, **{**params, "many": True})
         dy = [d.reshape(lanes, -1, *d.shape[1:]) for d in dy] if many else dy
         return dy, [0] * len(dy)
-    # Lanes: the same solve at many points, one direction each; a tangent has the shape of its primal.
-    dx = widen(dx, batched_dx)
+    # Lanes: the same solve at many points, one direction each; a tangent has the shape of its primal. What is shared by
+    # all, a network, is not repeated: products with it are of matrices then, and so are those that make its gradient.
+    apart = [many or a or b for a, b in zip(batched_x, batched_dx)]
+    x, dx = (widen(y, [b or not a for b, a in zip(have, apart)]) for y, have in ((x, batched_x), (dx, batched_dx)))
+    along = lambda dx: _lanes(x, fixed, dx, apart, batched_fixed, lanes, params)
     if many:
         # One direction after the other of each lane.
-        along = lambda dx: _lanes(x, fixed, dx, batched_x, batched_fixed, lanes, params)
         dy = lax.map(along, [jnp.moveaxis(d, 1, 0) for d in dx])
         dy = [jnp.moveaxis(d, 0, 1) for d in dy]
     else:
-        dy = _lanes(x, fixed, dx, batched_x, batched_fixed, lanes, params)
+        dy = along(dx)
     return dy, [0] * len(dy)
 
 
-def _lanes(x, fixed, dx, batched_x, batched_fixed, lanes, params):
-    x = [a if here else jnp.broadcast_to(a, (lanes, *a.shape)) for a, here in zip(x, batched_x)]
-    in_axes = [0] * len(x) + [0 if here else None for here in batched_fixed]
+def _lanes(x, fixed, dx, apart, batched_fixed, lanes, params):
+    in_axes = [0 if here else None for here in (*apart, *batched_fixed)]
     outputs, shapes = params["outputs"], params["shapes"]
 
     def lane_outputs(adjoint, *operands):
