@@ -30,6 +30,7 @@ from jaxtyping import Array, Int, PyTree
 
 from lagjax.jax_internals.one_function import one_function
 from lagjax.jax_internals.primitives import ad, primitive
+from lagjax.motion.stepping import OnManifold
 from lagjax.motion.recording import ROWS, Problem, Recorded, Rows, recorded, recorded_again
 
 
@@ -70,6 +71,12 @@ class Motion:
         """The record with these arrays."""
         structure, others = self.found[0]
         return eqx.combine(jtu.tree_unflatten(structure, arrays), others)
+
+    @property
+    def careful(self) -> bool:
+        """Whether some steps may have been taken the careful way, and not as they are written out."""
+        solver = self.static.solver
+        return solver.quick is not None and solver.equations.fallback
 
     @property
     def where(self) -> Problem:
@@ -231,16 +238,20 @@ def swept_back(leaves, found: Recorded, asked, *, motion: Motion, moved, lanes: 
 
     def pulled(t0, t1, y, ct):
         """The cotangents of the arrays, of both times and of the state at the start of a step."""
+        start = ([steps[i] for i in moved], t0, t1, y) if of_times else ([steps[i] for i in moved], y)
 
-        def ends(chosen, t0, t1, y):
-            step = lambda *x: motion.problem(x[:-3]).solver.again(*x[-3:])
-            return with_leaves(lambda *x: step(*x), 3)(*_with(steps, moved, chosen), t0, t1, y)
+        def ends(by, chosen, *start):
+            times_and_state = start if of_times else (t0, t1, *start)
+            step = lambda *x: by(motion.problem(x[:-3]).solver, *x[-3:])
+            return with_leaves(step, 3)(*_with(steps, moved, chosen), *times_and_state)
 
-        chosen = [steps[i] for i in moved]
-        if of_times:
-            return jax.vjp(ends, chosen, t0, t1, y)[1](ct)
-        of_arrays, of_y = jax.vjp(lambda chosen, y: ends(chosen, t0, t1, y), chosen, y)[1](ct)
-        return of_arrays, None, None, of_y
+        _, pull, believed = jax.vjp(partial(ends, OnManifold.again), *start, has_aux=True)
+        carefully = partial(ends, OnManifold.again_carefully)
+        if motion.careful:
+            # Not a choice between two ends: what is not to be believed has no derivative, and zero times that is NaN.
+            pull = partial(lax.cond, eqxi.unvmap_all(believed), pull, lambda ct: jax.vjp(carefully, *start)[1](ct))
+        of_arrays, *of_start = pull(ct)
+        return of_arrays, *([None, None] if not of_times else []), *of_start
 
     def at_time(t, ct):
         """The cotangent of a time as that of the end of a step that it is."""
