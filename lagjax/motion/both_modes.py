@@ -3,17 +3,18 @@
 diffrax offers one derivative a solve: `ForwardMode` or `RecursiveCheckpointAdjoint`. Which one is wanted is
 known only when JAX pushes tangents through (`jacfwd`, Levenberg-Marquardt) or transposes them (`grad`).
 The derivative of y = solve(x) is therefore bound as a linear map dx -> dy of its own: a primitive that is
-evaluated by forward mode and transposed by the checkpointed reverse mode; where few derivatives are asked for,
-by forward mode too, along each of them. Undifferentiated, there is no trace of it in the compiled program.
-Differentiated, the plain solve runs beside the derivative's own; naming an `adjoint` saves that one solve.
+evaluated by forward mode and transposed by a replay of the steps (`pulled.py`); where few derivatives are asked for,
+by forward mode too, along each of them. Undifferentiated, there is no trace of it in the compiled program. With many
+numbers to differentiate by, the solve that gives the values records its steps, and the replay is of these.
 
-Second derivatives are those of this map, which is bilinear in dx and in the direction dz in which x moves:
+Second derivatives by few numbers are those of this map, which is bilinear in dx and in the direction dz in which x
+moves:
 
     d(J dx) = H[dx, dz] + J d(dx)
 
 It is evaluated forward over forward, and bound as a linear map of (dz, d(dx)) in its turn: transposed, it is pushed
-along every axis of them. So `jacfwd(jacfwd)`, `jvp(grad)`, `grad(grad)` and the other orders all work, for as many
-pushes as there are numbers to differentiate by (squared, for `grad(grad)`); more than `PUSH_AT_MOST` are refused.
+along every axis of them. Those by many numbers are in `pulled.py`. So `jacfwd(jacfwd)`, `jvp(grad)`, `grad(grad)`,
+`jacrev(jacrev)` and the other orders all work; third derivatives by many numbers are refused.
 """
 
 from collections.abc import Callable
@@ -31,51 +32,83 @@ from jax.core import ShapedArray
 from jaxtyping import PyTree
 
 from lagjax.jax_internals.primitives import ad, primitive
+from lagjax.motion.pulled import Push, pull, turned
 from lagjax.motion.replay import Replay
 
 # Up to this many derivatives of one number, pushing all of them forward is cheaper than one pull back through the
 # checkpoints, to run and to compile.
 PUSH_UP_TO = 24
-# Second derivatives in reverse push along every axis, in one batch: beyond this it would not fit into memory.
-PUSH_AT_MOST = 2**14
 
 
-def solve_in_both_modes(solve: Callable, x: PyTree, fixed: PyTree) -> PyTree:
+def solve_in_both_modes(solve: Callable, x: PyTree, fixed: PyTree, recorded: bool = True) -> PyTree:
     """`solve(x, fixed, adjoint, differentiated)` for a diffrax adjoint, differentiable in both modes in `x`.
 
-    All leaves of `x` are floating arrays, all leaves of `fixed` and of the result are arrays, and `solve`
-    closes over no traced value. `differentiated` says whether this solve is for a derivative.
+    It returns its result and, where the adjoint is a `Replay`, a record of the motion for another one; else None. All
+    leaves of `x` are floating arrays, all leaves of `fixed` and of the result are arrays, and `solve` closes over no
+    traced value. `differentiated` says whether this solve is for a derivative; `recorded`, whether there is a record.
     """
-    return _solve((x, fixed), solve=solve)
+    return _solve((x, fixed), solve=solve, recorded=recorded)
 
 
 @eqx.filter_custom_jvp
-def _solve(inputs, *, solve):
-    return solve(*inputs, diffrax.ForwardMode(), False)
+def _solve(inputs, *, solve, recorded):
+    return solve(*inputs, diffrax.ForwardMode(), False)[0]
+
+
+@eqx.filter_custom_jvp
+def _recorded(inputs, *, solve):
+    """The same with the record."""
+    return solve(*inputs, Replay(), True)
 
 
 @_solve.def_jvp
-def _solve_jvp(primals, tangents, *, solve):
+def _solve_jvp(primals, tangents, *, solve, recorded):
     ((x, fixed),), ((dx, _),) = primals, tangents
     # By itself, so that a second derivative finds this rule again.
-    y = _solve((x, fixed), solve=solve)
-    leaves, structure = jtu.tree_flatten((x, fixed))
+    if not recorded or _are_few(jtu.tree_leaves(x)[i] for i in _moved(x, dx)):
+        y, record = _solve((x, fixed), solve=solve, recorded=recorded), None
+    else:
+        y, record = _recorded((x, fixed), solve=solve)
+    return y, _derivative(x, fixed, dx, y, record, solve)
+
+
+@_recorded.def_jvp
+def _recorded_jvp(primals, tangents, *, solve):
+    ((x, fixed),), ((dx, _),) = primals, tangents
+    y, record = _recorded((x, fixed), solve=solve)
+    return (y, record), (_derivative(x, fixed, dx, y, record, solve), jtu.tree_map(lambda _: None, record))
+
+
+def _moved(x, dx):
+    """Which leaves have a tangent, and at least one."""
+    along = jtu.tree_structure(x).flatten_up_to(dx)
+    return [i for i, d in enumerate(along) if d is not None] or [0]
+
+
+def _are_few(leaves):
+    return sum(a.size for a in leaves) <= PUSH_UP_TO
+
+
+def _derivative(x, fixed, dx, y, record, solve):
+    """The derivative of y, as a linear map of dx."""
+    leaves, structure = jtu.tree_flatten((x, fixed, record))
     along = jtu.tree_structure(x).flatten_up_to(dx)
     # What is not moved is a constant: a tangent of zeros would go through every step.
-    moved = [i for i, d in enumerate(along) if d is not None] or [0]
+    moved = _moved(x, dx)
     dx = [eqxi.materialise_zeros(leaves[i], along[i]) for i in moved]
     order = moved + [i for i in range(len(leaves)) if i not in moved]
 
     def float_outputs(adjoint, *operands):
-        x, fixed = jtu.tree_unflatten(structure, [operands[order.index(i)] for i in range(len(order))])
-        return jtu.tree_leaves(eqx.filter(solve(x, fixed, adjoint, True), eqx.is_inexact_array))
+        x, fixed, record = jtu.tree_unflatten(structure, [operands[order.index(i)] for i in range(len(order))])
+        adjoint = Replay(record) if isinstance(adjoint, Replay) else adjoint
+        return jtu.tree_leaves(eqx.filter(solve(x, fixed, adjoint, True)[0], eqx.is_inexact_array))
 
     floats, rest = eqx.partition(y, eqx.is_inexact_array)
     shapes = tuple((leaf.shape, leaf.dtype) for leaf in jtu.tree_leaves(floats))
     params = dict(outputs=float_outputs, shapes=shapes, size=len(moved), many=False)
     dy = _tangent_p.bind(*(leaves[i] for i in order), *dx, **params)
     dy = jtu.tree_unflatten(jtu.tree_structure(floats), dy)
-    return y, eqx.combine(dy, jtu.tree_map(lambda _: None, rest))
+    return eqx.combine(dy, jtu.tree_map(lambda _: None, rest))
 
 
 # The operands of the primitive are the leaves of x, of `fixed`, and of dx; `size` is the count of the
@@ -100,7 +133,26 @@ def _tangent_shapes(*operands, shapes, size, many, **params):
 
 
 def _tangent_jvp(primals, tangents, **params):
-    return _linear(partial(_tangent, **params), primals, tangents, _tangent_p.bind(*primals, **params))
+    x, fixed, dx = _split(primals, params["size"])
+    values = _tangent_p.bind(*primals, **params)
+    if _are_few(x):
+        return _linear(partial(_tangent, **params), primals, tangents, values)
+    push = partial(turned, Push(len(x), params["outputs"]), shapes=params["shapes"])
+    if not params["many"]:
+        return values, push(primals, tangents)
+    # The directions are lanes.
+    count, here = len(primals) - len(dx), lambda t: not isinstance(t, ad.Zero)
+    axes = [None] * count + [0] * len(dx)
+    moving = [t for t in tangents if here(t)]
+
+    def along(primals, moving):
+        moving = iter(moving)
+        each = [
+            next(moving) if here(t) else ad.Zero(jax.typeof(x).to_tangent_aval()) for x, t in zip(primals, tangents)
+        ]
+        return [ad.instantiate_zeros(d) for d in push(primals, each)]
+
+    return values, jax.vmap(along, (axes, [axis for axis, t in zip(axes, tangents) if here(t)]))(list(primals), moving)
 
 
 def _linear(function, points, tangents, values):
@@ -138,9 +190,6 @@ def _pushed_transpose(cotangents, *operands, along, size):
     points, directions = operands[:-size], operands[-size:]
     wanted = [ad.is_undefined_primal(direction) for direction in directions]
     like = [direction.aval if w else direction for direction, w in zip(directions, wanted)]
-    count = sum(a.size for a, w in zip(like, wanted) if w)
-    # Those of a gradient have their own axis of directions, one for each number.
-    _check_count(count, count**2 if count > PUSH_UP_TO else count)
     push = lambda *axes: jax.vmap(lambda *axes: along(*points, *axes))(*axes)
     slopes = _along_axes(like, wanted, push, [ad.instantiate_zeros(ct) for ct in cotangents])
     found = iter(slopes)
@@ -175,56 +224,19 @@ def _along_axes(like, wanted, push, cotangents):
     return [slopes[i : i + n].reshape(a.shape).astype(a.dtype) for i, n, a, w in zip(starts, sizes, like, wanted) if w]
 
 
-def _tangent_transpose(cotangents, *operands, size, many, **params):
+def _tangent_transpose(cotangents, *operands, outputs, shapes, size, many):
     x, fixed, dx = _split(operands, size)
-    cotangents = [ad.instantiate_zeros(ct) for ct in cotangents]
-    wanted = [ad.is_undefined_primal(tangent) for tangent in dx]
-    if sum(a.size for a, w in zip(x, wanted) if w) <= PUSH_UP_TO:
-        along = lambda cotangents: _pull_by_pushing(x, fixed, wanted, cotangents, size=size, **params)
+    wanted = tuple(ad.is_undefined_primal(tangent) for tangent in dx)
+    if _are_few(a for a, w in zip(x, wanted) if w):
+        params = dict(outputs=outputs, shapes=shapes, size=size)
+        cotangents = [ad.instantiate_zeros(ct) for ct in cotangents]
+        along = lambda cotangents: _pull_by_pushing(x, fixed, wanted, cotangents, **params)
     else:
-        params = tuple({"size": size, **params}.items())
-        along = lambda cotangents: _pull_once(x, fixed, cotangents, wanted=tuple(wanted), params=params)
+        asked = tuple(not isinstance(ct, ad.Zero) for ct in cotangents)
+        cotangents = tuple(ct for ct, a in zip(cotangents, asked) if a)
+        along = lambda cotangents: pull(x, fixed, cotangents, which=(wanted, asked), outputs=outputs)
     found = iter(jax.vmap(along)(cotangents) if many else along(cotangents))
     return [None] * (len(operands) - size) + [next(found) if w else None for w in wanted]
-
-
-def _pull(x, fixed, wanted, cotangents, *, outputs, **params):
-    def of_wanted(*chosen):
-        chosen = iter(chosen)
-        every = [next(chosen) if w else a for a, w in zip(x, wanted)]
-        return outputs(Replay(), *every, *fixed)
-
-    return jax.vjp(of_wanted, *[a for a, w in zip(x, wanted) if w])[1](cotangents)
-
-
-def _check_count(count, pushes):
-    """Raise where a second derivative by `count` numbers takes too many pushes."""
-    if pushes > PUSH_AT_MOST:
-        raise NotImplementedError(
-            f"a derivative of a gradient by {count} numbers: it takes {pushes} solves side by side, and no more than "
-            f"{PUSH_AT_MOST} are begun.\n"
-            "Usual cause: a Hessian, or its product with a vector, of a loss with a large network in L.\n"
-            "Fix: jax.jvp(lambda p: jax.jvp(loss, (p,), (u,))[1], (p,), (w,)) for u·H·w along given directions, or "
-            "(jax.grad(loss)(p + h * u) - jax.grad(loss)(p - h * u)) / (2 * h) for H·u."
-        )
-
-
-@eqx.filter_custom_jvp
-def _pull_once(x, fixed, cotangents, *, wanted, params):
-    return _pull(x, fixed, wanted, cotangents, **dict(params))
-
-
-@_pull_once.def_jvp
-def _pull_once_jvp(primals, tangents, *, wanted, params):
-    # The checkpoints can be pulled back through, and not pushed: the derivative is that of the same by pushing.
-    x, fixed, cotangents = primals
-    count = sum(a.size for a, w in zip(x, wanted) if w)
-    _check_count(count, count)
-    by_pushing = lambda x, cotangents: _pull_by_pushing(x, fixed, wanted, cotangents, **dict(params))
-    values = _pull(x, fixed, wanted, cotangents, **dict(params))
-    filled = lambda given, along: type(given)(eqxi.materialise_zeros(a, d) for a, d in zip(given, along))
-    along = filled(x, tangents[0]), filled(cotangents, tangents[2])
-    return values, type(values)(jax.jvp(by_pushing, (x, cotangents), along)[1])
 
 
 def _pull_by_pushing(x, fixed, wanted, cotangents, **params):

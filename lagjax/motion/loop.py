@@ -40,7 +40,7 @@ BAUMGARTE_DECAYS = 50.0
 class Solution(NamedTuple):
     """What the loop came to: times that it reached (infinite elsewhere), states there, its last time and state, (1,).
 
-    `located`: where guards are zero; None without guards.
+    `located`: where guards are zero; None without guards. `record`: of the steps, where they can be replayed.
     """
 
     reached: Float[Array, " T"]
@@ -49,6 +49,7 @@ class Solution(NamedTuple):
     stats: dict[str, Array]
     result: diffrax.RESULTS
     located: Located | None
+    record: Recorded | None = None
 
 
 def solution_of(
@@ -116,7 +117,7 @@ def _loop(equations, start, y0, refused, scales, settings, ts, adjoint, guards=N
         problem = Problem(
             terms, solver, controller, ts, first, after, ts[0], ts[-1], settings.dt0, y0, start.params
         )  # fmt: skip
-        return _replayed(replayed(problem, settings.max_steps, checked=not own()), ts)
+        return _replayed(replayed(problem, settings.max_steps, not own(), adjoint.record), ts)
     # Reverse mode has to look inside.
     if isinstance(adjoint, diffrax.ForwardMode):
         reached, outputs, *rest = one_function(solve, *arguments, checked=not own(), in_blocks=True)
@@ -133,7 +134,7 @@ def _loop(equations, start, y0, refused, scales, settings, ts, adjoint, guards=N
 
 def _replayed(found: Recorded, ts) -> Solution:
     end = found.t[None], jax.tree.map(lambda x: x[None], found.y)
-    return Solution(jnp.where(found.reached, ts, jnp.inf), found.outputs, end, found.stats, found.result, None)
+    return Solution(jnp.where(found.reached, ts, jnp.inf), found.outputs, end, found.stats, found.result, None, found)
 
 
 def _diffeqsolve(terms, solver, t0, t1, dt0, y0, args, saveat, controller, event, *, max_steps, adjoint, progress):

@@ -30,13 +30,18 @@ from jaxtyping import Array, Int, PyTree
 
 from lagjax.jax_internals.one_function import one_function
 from lagjax.jax_internals.primitives import ad, primitive
-from lagjax.motion.stepping import OnManifold
 from lagjax.motion.recording import ROWS, Problem, Recorded, Rows, recorded, recorded_again
+from lagjax.motion.stepping import OnManifold
 
 
 @dataclass(frozen=True)
 class Replay:
-    """In place of one of diffrax's adjoints: differentiate the motion by a replay of its steps, where that can be."""
+    """In place of one of diffrax's adjoints: differentiate the motion by a replay of its steps, where that can be.
+
+    `record`: what an earlier call at the same point found; it is then not stepped through again.
+    """
+
+    record: Recorded | None = None
 
 
 class Lanes(NamedTuple):
@@ -73,6 +78,11 @@ class Motion:
         return eqx.combine(jtu.tree_unflatten(structure, arrays), others)
 
     @property
+    def size(self) -> int:
+        """How many arrays there are."""
+        return max(self.places) + 1
+
+    @property
     def careful(self) -> bool:
         """Whether some steps may have been taken the careful way, and not as they are written out."""
         solver = self.static.solver
@@ -84,8 +94,8 @@ class Motion:
         return jtu.tree_unflatten(self.structure, self.places)
 
 
-def replayed(problem: Problem, max_steps: int | None, checked: bool) -> Recorded:
-    """The motion, which is replayed where it is differentiated in reverse."""
+def replayed(problem: Problem, max_steps: int | None, checked: bool, known: Recorded | None = None) -> Recorded:
+    """The motion, which is replayed where it is differentiated in reverse; its values, where they are `known`."""
     arrays, static = eqx.partition(problem, eqx.is_array)
     given, structure = jtu.tree_flatten(arrays)
     # What is passed twice, as by a solver and by the controller that asks it, is one operand.
@@ -101,7 +111,12 @@ def replayed(problem: Problem, max_steps: int | None, checked: bool) -> Recorded
     # Jitted, so that it is traced once.
     places = tuple(number[id(x)] for x in given)
     motion = Motion(structure, places, static, max_steps, checked, jax.jit(results), [])
-    return motion.recorded(_run_p.bind(*leaves, motion=motion, lanes=None))
+    if known is None:
+        return motion.recorded(_run_p.bind(*leaves, motion=motion, lanes=None))
+    values, rest = eqx.partition(known, eqx.is_array)
+    values, structure = jtu.tree_flatten(values)
+    motion.found.append((structure, rest))
+    return motion.recorded(_known_p.bind(*leaves, *values, motion=motion, lanes=None))
 
 
 # The operands of the first primitive are the arrays of the problem, its results those of the record. Those of its
@@ -118,13 +133,45 @@ def _run_shapes(*leaves, motion, lanes):
     return [ShapedArray(x.shape, x.dtype) for x in found]
 
 
+def _known(*operands, motion, lanes):
+    return list(operands[motion.size :])
+
+
+def _known_jvp(primals, tangents, *, motion, lanes):
+    # The values are those at the arrays that are given, so that what these move by says it all.
+    values, leaves = _known_p.bind(*primals, motion=motion, lanes=lanes), primals[: motion.size]
+    return values, _derivative(leaves, values, tangents[: motion.size], motion, lanes)
+
+
+def _known_batched(operands, axes, *, motion, lanes):
+    count = next(x.shape[axis] for x, axis in zip(operands, axes) if axis is not None)
+    front = [x if axis is None else jnp.moveaxis(x, axis, 0) for x, axis in zip(operands, axes)]
+    batched = [axis is not None for axis in axes]
+    leaves, values = front[: motion.size], front[motion.size :]
+    values = [x if b else jnp.broadcast_to(x, (count, *x.shape)) for x, b in zip(values, batched[motion.size :])]
+    if lanes is None:
+        both, back = Lanes(count, tuple(batched[: motion.size])), lambda x: x
+    else:
+        leaves, both = _lanes_of_lanes(leaves, batched, lanes, count)
+        values = [x.reshape(count * lanes.count, *x.shape[2:]) for x in values]
+        back = lambda x: x.reshape(count, lanes.count, *x.shape[1:])
+    found = [back(x) for x in _known_p.bind(*leaves, *values, motion=motion, lanes=both)]
+    return found, [0] * len(found)
+
+
 def _run_jvp(primals, tangents, *, motion, lanes):
     values = _run_p.bind(*primals, motion=motion, lanes=lanes)
+    return values, _derivative(primals, values, tangents, motion, lanes)
+
+
+def _derivative(leaves, values, tangents, motion, lanes):
     moved = tuple(i for i, t in enumerate(tangents) if not isinstance(t, ad.Zero))
-    moving = [tangents[i] for i in moved]
-    derivative = iter(_moved_p.bind(*primals, *values, *moving, motion=motion, lanes=lanes, moved=moved))
     zero = lambda x: ad.Zero(jax.typeof(x).to_tangent_aval())
-    return values, [next(derivative) if _is_float(x) else zero(x) for x in values]
+    if not moved:
+        return [zero(x) for x in values]
+    moving = [tangents[i] for i in moved]
+    found = iter(_moved_p.bind(*leaves, *values, *moving, motion=motion, lanes=lanes, moved=moved))
+    return [next(found) if _is_float(x) else zero(x) for x in values]
 
 
 def _run_batched(operands, axes, *, motion, lanes):
@@ -134,22 +181,26 @@ def _run_batched(operands, axes, *, motion, lanes):
     if lanes is None:
         found = _run_p.bind(*front, motion=motion, lanes=Lanes(count, batched))
         return found, [0] * len(found)
-    # Lanes of lanes are lanes.
+    flat, both = _lanes_of_lanes(front, batched, lanes, count)
+    found = _run_p.bind(*flat, motion=motion, lanes=both)
+    return [x.reshape(count, lanes.count, *x.shape[1:]) for x in found], [0] * len(found)
+
+
+def _lanes_of_lanes(leaves, batched, lanes, count):
+    """Lanes of lanes are lanes."""
     flat = []
-    for x, b, inner in zip(front, batched, lanes.batched):
+    for x, b, inner in zip(leaves, batched, lanes.batched):
         if b or inner:
             x = x if b else jnp.broadcast_to(x, (count, *x.shape))
             x = x if inner else jnp.broadcast_to(x[:, None], (count, lanes.count, *x.shape[1:]))
             x = x.reshape(count * lanes.count, *x.shape[2:])
         flat.append(x)
-    both = Lanes(count * lanes.count, tuple(b or inner for b, inner in zip(batched, lanes.batched)))
-    found = _run_p.bind(*flat, motion=motion, lanes=both)
-    return [x.reshape(count, lanes.count, *x.shape[1:]) for x in found], [0] * len(found)
+    return flat, Lanes(count * lanes.count, tuple(b or inner for b, inner in zip(batched, lanes.batched)))
 
 
 def _operands(operands, motion, moved):
     """The arrays of the problem, those of the record, and the tangents."""
-    size = max(motion.places) + 1
+    size = motion.size
     return operands[:size], operands[size : len(operands) - len(moved)], operands[len(operands) - len(moved) :]
 
 
@@ -165,6 +216,12 @@ def _moved(*operands, motion, lanes, moved):
 
 def _moved_shapes(*operands, motion, lanes, moved):
     return [ShapedArray(x.shape, x.dtype) for x in _operands(operands, motion, moved)[1] if _is_float(x)]
+
+
+def _moved_jvp(primals, tangents, **params):
+    # Only forward: the derivative of what is pushed.
+    tangents = [ad.instantiate_zeros(t) for t in tangents]
+    return jax.jvp(partial(_moved, **params), primals, tuple(tangents))
 
 
 def _moved_batched(operands, axes, **params):
@@ -336,7 +393,11 @@ def _with(leaves, moved, chosen):
 
 
 _run_p = primitive("lagjax_recorded", _run, _run_shapes, several=True, jvp=_run_jvp, batched=_run_batched)
+_known_p = primitive(
+    "lagjax_recorded_before", _known, lambda *operands, motion, lanes: list(operands[motion.size :]),
+    several=True, jvp=_known_jvp, batched=_known_batched,
+)  # fmt: skip
 _moved_p = primitive(
     "lagjax_recorded_tangent", _moved, _moved_shapes,
-    several=True, transpose=_moved_transpose, batched=_moved_batched,
+    several=True, jvp=_moved_jvp, transpose=_moved_transpose, batched=_moved_batched,
 )  # fmt: skip
