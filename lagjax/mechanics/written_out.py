@@ -17,6 +17,7 @@ Source: Golub & Van Loan, *Matrix Computations*, §4.1.2 (L D Lᵀ), §4.2.7 (wi
 from functools import partial
 from typing import NamedTuple
 
+import equinox as eqx
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from jax import lax
@@ -61,7 +62,8 @@ class WrittenOut(NamedTuple):
 
 def is_small(system, t, q, v, params) -> bool:
     """Whether the equations of a system are to be written out."""
-    if is_plain() or any(jnp.ndim(x) > 1 and jnp.size(x) >= MATRIX for x in jtu.tree_leaves((system, params))):
+    arrays = [x for x in jtu.tree_leaves((system, params)) if eqx.is_array(x)]
+    if is_plain() or any(x.ndim > 1 and x.size >= MATRIX for x in arrays):
         return False
     size = sum(leaf.size for leaf in jtu.tree_leaves(q))
     count = constraints.count(system, t, q, v, params)

@@ -18,6 +18,7 @@ along every axis of them. Those by many numbers are in `pulled.py`. So `jacfwd(j
 """
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial, reduce
 
 import diffrax
@@ -32,6 +33,7 @@ from jax.core import ShapedArray
 from jaxtyping import PyTree
 
 from lagjax.jax_internals.primitives import ad, primitive
+from lagjax.motion.consistency import stopped
 from lagjax.motion.pulled import Push, pull, turned
 from lagjax.motion.replay import Replay
 
@@ -47,71 +49,98 @@ def solve_in_both_modes(solve: Callable, x: PyTree, fixed: PyTree, recorded: boo
     leaves of `x` are floating arrays, all leaves of `fixed` and of the result are arrays, and `solve` closes over no
     traced value. `differentiated` says whether this solve is for a derivative; `recorded`, whether there is a record.
     """
-    return _solve((x, fixed), solve=solve, recorded=recorded)
+    leaves, structure = jtu.tree_flatten((x, fixed))
+    shapes = {}
+
+    def by(adjoint, differentiated, *leaves):
+        found = solve(*jtu.tree_unflatten(structure, leaves), adjoint, differentiated)
+        shapes["y"], shapes[type(adjoint)] = map(jtu.tree_structure, found)
+        return tuple(jtu.tree_leaves(part) for part in found)
+
+    def outputs(adjoint, *operands):
+        leaves, record = operands[: structure.num_leaves], operands[structure.num_leaves :]
+        if isinstance(adjoint, Replay):
+            adjoint = Replay(jtu.tree_unflatten(shapes[Replay], record) if record else None)
+        return [y for y in by(adjoint, True, *leaves)[0] if _is_float(y)]
+
+    # Jitted, so that they are traced once.
+    values, with_record = jax.jit(partial(by, diffrax.ForwardMode(), False)), jax.jit(partial(by, Replay(), True))
+    of = _Solve(values, with_record if recorded else None, outputs, len(jtu.tree_leaves(x)))
+    found = _solve_p.bind(*leaves, of=of)
+    return jtu.tree_unflatten(shapes["y"], found)
 
 
-@eqx.filter_custom_jvp
-def _solve(inputs, *, solve, recorded):
-    return solve(*inputs, diffrax.ForwardMode(), False)[0]
+@dataclass(frozen=True, eq=False)
+class _Solve:
+    """A solve as functions of arrays, of which the first `size` can be differentiated.
+
+    `values(*leaves)` and `recorded(*leaves)` give the arrays of the result and those of the record, if there is one;
+    `outputs(adjoint, *leaves, *record)` the floating ones of the result, for a derivative.
+    """
+
+    values: Callable
+    recorded: Callable | None
+    outputs: Callable
+    size: int
+
+    def in_lanes(self, axes, count):
+        """The same for lanes, with the results in front."""
+        lanes = lambda function: jax.vmap(function, axes, axis_size=count)
+
+        def outputs(adjoint, *operands):
+            more = [0] * (len(operands) - len(axes))
+            return jax.vmap(partial(self.outputs, adjoint), [*axes, *more], axis_size=count)(*operands)
+
+        return _Solve(lanes(self.values), self.recorded and lanes(self.recorded), outputs, self.size)
 
 
-@eqx.filter_custom_jvp
-def _recorded(inputs, *, solve):
-    """The same with the record."""
-    return solve(*inputs, Replay(), True)
+def _solved(*leaves, of):
+    return of.values(*leaves)[0]
 
 
-@_solve.def_jvp
-def _solve_jvp(primals, tangents, *, solve, recorded):
-    ((x, fixed),), ((dx, _),) = primals, tangents
-    # By itself, so that a second derivative finds this rule again.
-    if not recorded or _are_few(jtu.tree_leaves(x)[i] for i in _moved(x, dx)):
-        y, record = _solve((x, fixed), solve=solve, recorded=recorded), None
+def _solved_shapes(*leaves, of):
+    like = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in leaves]
+    return [ShapedArray(y.shape, y.dtype) for y in jax.eval_shape(of.values, *like)[0]]
+
+
+def _solved_jvp(primals, tangents, *, of):
+    # What is not moved is a constant: a tangent of zeros would go through every step.
+    moved = [i for i in range(of.size) if not isinstance(tangents[i], ad.Zero)]
+    zero = lambda y: ad.Zero(jax.typeof(y).to_tangent_aval())
+    if of.recorded is None or not moved or _are_few(primals[i] for i in moved):
+        # By itself, so that a second derivative finds this rule again.
+        values, record = _solve_p.bind(*primals, of=of), []
     else:
-        y, record = _recorded((x, fixed), solve=solve)
-    return y, _derivative(x, fixed, dx, y, record, solve)
+        values, record = of.recorded(*primals)
+    if not moved:
+        return values, [zero(y) for y in values]
+    # The record says where the motion is replayed, and is no function of that.
+    leaves = [*primals, *stopped(record)]
+    order = moved + [i for i in range(len(leaves)) if i not in moved]
+    place = [order.index(i) for i in range(len(leaves))]
+    outputs = lambda adjoint, *operands: of.outputs(adjoint, *(operands[i] for i in place))
+    shapes = tuple((y.shape, y.dtype) for y in values if _is_float(y))
+    params = dict(outputs=outputs, shapes=shapes, size=len(moved), many=False)
+    dy = iter(_tangent_p.bind(*(leaves[i] for i in order), *(tangents[i] for i in moved), **params))
+    return values, [next(dy) if _is_float(y) else zero(y) for y in values]
 
 
-@_recorded.def_jvp
-def _recorded_jvp(primals, tangents, *, solve):
-    ((x, fixed),), ((dx, _),) = primals, tangents
-    y, record = _recorded((x, fixed), solve=solve)
-    return (y, record), (_derivative(x, fixed, dx, y, record, solve), jtu.tree_map(lambda _: None, record))
-
-
-def _moved(x, dx):
-    """Which leaves have a tangent, and at least one."""
-    along = jtu.tree_structure(x).flatten_up_to(dx)
-    return [i for i, d in enumerate(along) if d is not None] or [0]
+def _solved_batched(operands, axes, *, of):
+    count = next(x.shape[axis] for x, axis in zip(operands, axes) if axis is not None)
+    front = [x if axis is None else jnp.moveaxis(x, axis, 0) for x, axis in zip(operands, axes)]
+    found = _solve_p.bind(*front, of=of.in_lanes([None if axis is None else 0 for axis in axes], count))
+    return found, [0] * len(found)
 
 
 def _are_few(leaves):
     return sum(a.size for a in leaves) <= PUSH_UP_TO
 
 
-def _derivative(x, fixed, dx, y, record, solve):
-    """The derivative of y, as a linear map of dx."""
-    leaves, structure = jtu.tree_flatten((x, fixed, record))
-    along = jtu.tree_structure(x).flatten_up_to(dx)
-    # What is not moved is a constant: a tangent of zeros would go through every step.
-    moved = _moved(x, dx)
-    dx = [eqxi.materialise_zeros(leaves[i], along[i]) for i in moved]
-    order = moved + [i for i in range(len(leaves)) if i not in moved]
-
-    def float_outputs(adjoint, *operands):
-        x, fixed, record = jtu.tree_unflatten(structure, [operands[order.index(i)] for i in range(len(order))])
-        adjoint = Replay(record) if isinstance(adjoint, Replay) else adjoint
-        return jtu.tree_leaves(eqx.filter(solve(x, fixed, adjoint, True)[0], eqx.is_inexact_array))
-
-    floats, rest = eqx.partition(y, eqx.is_inexact_array)
-    shapes = tuple((leaf.shape, leaf.dtype) for leaf in jtu.tree_leaves(floats))
-    params = dict(outputs=float_outputs, shapes=shapes, size=len(moved), many=False)
-    dy = _tangent_p.bind(*(leaves[i] for i in order), *dx, **params)
-    dy = jtu.tree_unflatten(jtu.tree_structure(floats), dy)
-    return eqx.combine(dy, jtu.tree_map(lambda _: None, rest))
+def _is_float(x):
+    return jnp.issubdtype(x.dtype, jnp.inexact)
 
 
-# The operands of the primitive are the leaves of x, of `fixed`, and of dx; `size` is the count of the
+# The operands of the derivative are the leaves of x, of what is fixed, and of dx; `size` is the count of the
 # first and the last. `outputs(adjoint, *x, *fixed)` gives the floating leaves of the result; their `shapes`
 # are those of their tangents, and known without tracing. With `many`, each dx has a leading axis of directions,
 # and so has each result.
@@ -287,6 +316,9 @@ def _lanes(x, fixed, dx, apart, batched_fixed, lanes, params):
     return _tangent_p.bind(*x, *fixed, *dx, **{**params, "outputs": lane_outputs, "shapes": shapes, "many": False})
 
 
+_solve_p = primitive(
+    "lagjax_trajectory", _solved, _solved_shapes, several=True, jvp=_solved_jvp, batched=_solved_batched
+)
 _tangent_p = primitive(
     "lagjax_trajectory_tangent", _tangent, _tangent_shapes,
     several=True, jvp=_tangent_jvp, transpose=_tangent_transpose, batched=_tangent_batched,
