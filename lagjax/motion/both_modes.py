@@ -65,7 +65,8 @@ def solve_in_both_modes(solve: Callable, x: PyTree, fixed: PyTree, recorded: boo
 
     # Jitted, so that they are traced once.
     values, with_record = jax.jit(partial(by, diffrax.ForwardMode(), False)), jax.jit(partial(by, Replay(), True))
-    of = _Solve(values, with_record if recorded else None, outputs, len(jtu.tree_leaves(x)))
+    no_steps = lambda *record: jtu.tree_unflatten(shapes[Replay], record).record.count == 0
+    of = _Solve(values, with_record if recorded else None, outputs, no_steps, len(jtu.tree_leaves(x)))
     found = _solve_p.bind(*leaves, of=of)
     return jtu.tree_unflatten(shapes["y"], found)
 
@@ -75,13 +76,27 @@ class _Solve:
     """A solve as functions of arrays, of which the first `size` can be differentiated.
 
     `values(*leaves)` and `recorded(*leaves)` give the arrays of the result and those of the record, if there is one;
-    `outputs(adjoint, *leaves, *record)` the floating ones of the result, for a derivative.
+    `outputs(adjoint, *leaves, *record)` the floating ones of the result, for a derivative; `no_steps(*record)` says
+    whether the motion was refused. `axes`: in lanes, of each array.
     """
 
     values: Callable
     recorded: Callable | None
     outputs: Callable
+    no_steps: Callable
     size: int
+    axes: tuple | None = None
+
+    def without_refused(self, leaves, record):
+        """The same arrays, where there is no motion without derivatives: those there may be infinite."""
+        if not record:
+            return leaves
+        none = self.no_steps(*record)
+        none = none if self.axes is None else jnp.all(none.reshape(none.shape[0], -1), axis=1)
+        still = lambda x: jnp.where(none.reshape(none.shape + (1,) * (x.ndim - none.ndim)), lax.stop_gradient(x), x)
+        # What lanes share stays one.
+        mine = [i < self.size and (self.axes is None or self.axes[i] == 0) for i in range(len(leaves))]
+        return [still(x) if m else x for x, m in zip(leaves, mine)]
 
     def in_lanes(self, axes, count):
         """The same for lanes, with the results in front."""
@@ -91,7 +106,8 @@ class _Solve:
             more = [0] * (len(operands) - len(axes))
             return jax.vmap(partial(self.outputs, adjoint), [*axes, *more], axis_size=count)(*operands)
 
-        return _Solve(lanes(self.values), self.recorded and lanes(self.recorded), outputs, self.size)
+        recorded = self.recorded and lanes(self.recorded)
+        return _Solve(lanes(self.values), recorded, outputs, self.no_steps, self.size, tuple(axes))
 
 
 def _solved(*leaves, of):
@@ -118,7 +134,12 @@ def _solved_jvp(primals, tangents, *, of):
     leaves = [*primals, *stopped(record)]
     order = moved + [i for i in range(len(leaves)) if i not in moved]
     place = [order.index(i) for i in range(len(leaves))]
-    outputs = lambda adjoint, *operands: of.outputs(adjoint, *(operands[i] for i in place))
+
+    def outputs(adjoint, *operands):
+        operands = [operands[i] for i in place]
+        leaves, record = operands[: len(primals)], operands[len(primals) :]
+        return of.outputs(adjoint, *of.without_refused(leaves, record), *record)
+
     shapes = tuple((y.shape, y.dtype) for y in values if _is_float(y))
     params = dict(outputs=outputs, shapes=shapes, size=len(moved), many=False)
     dy = iter(_tangent_p.bind(*(leaves[i] for i in order), *(tangents[i] for i in moved), **params))

@@ -30,7 +30,7 @@ from jaxtyping import Array, Int, PyTree
 
 from lagjax.jax_internals.one_function import one_function
 from lagjax.jax_internals.primitives import ad, primitive
-from lagjax.motion.recording import ROWS, Problem, Recorded, Rows, recorded, recorded_again
+from lagjax.motion.recording import Problem, Recorded, Rows, recorded, recorded_again
 from lagjax.motion.stepping import OnManifold
 
 
@@ -275,6 +275,7 @@ class Sweep(NamedTuple):
 def swept_back(leaves, found: Recorded, asked, *, motion: Motion, moved, lanes: Lanes | None):
     """The cotangents of the arrays that are `moved`, from those of the outputs, of the last time and the last state."""
     (of_outputs, of_t, of_y), record, where = asked, found.record, motion.where
+    many = record.rows.t0.shape[-1]
     alone = lanes is None
     batched = [False] * len(leaves) if alone else lanes.batched
     each = lambda function: function if alone else jax.vmap(function)
@@ -321,8 +322,8 @@ def swept_back(leaves, found: Recorded, asked, *, motion: Motion, moved, lanes: 
         )
 
     def turn(s: Sweep) -> Sweep:
-        here = (s.k >= s.number * ROWS) & (s.k >= 0)
-        t0, t1, y0 = at(s.rows, jnp.maximum(s.k, 0) % ROWS)
+        here = (s.k >= s.number * many) & (s.k >= 0)
+        t0, t1, y0 = at(s.rows, jnp.maximum(s.k, 0) % many)
         output = jnp.maximum(s.output, 0)
         time = at(ts, output)
         hit = here & (s.output >= 0) & (time > t0) & (time <= t1)
@@ -340,13 +341,13 @@ def swept_back(leaves, found: Recorded, asked, *, motion: Motion, moved, lanes: 
         return Sweep(s.k - here, s.number, s.rows, y, total, jnp.where(hit, at(first, output - 1), s.output))
 
     def piece(s: Sweep) -> Sweep:
-        number = jnp.where(s.k >= 0, s.k // ROWS, -1)
+        number = jnp.where(s.k >= 0, s.k // many, -1)
         again = lambda: rows_of(
             with_leaves(lambda *x: recorded_again(motion.problem(x[:-2]), *x[-2:]), 2)(*leaves, record, number)
         )
         # The last rows are in hand.
         rows = lax.cond(eqxi.unvmap_any(number < s.number), again, lambda: s.rows)
-        is_on = lambda s: eqxi.unvmap_any((s.k >= s.number * ROWS) & (s.k >= 0))
+        is_on = lambda s: eqxi.unvmap_any((s.k >= s.number * many) & (s.k >= 0))
         return lax.while_loop(is_on, turn, s._replace(number=number, rows=rows))
 
     total = [jnp.zeros_like(leaves[i]) for i in moved]
@@ -354,7 +355,7 @@ def swept_back(leaves, found: Recorded, asked, *, motion: Motion, moved, lanes: 
         total = add(total, where.controller.ts, at_time(found.t, of_t))
     k = record.count - 1
     last = at(first, record.saved - 1)
-    s = Sweep(k, jnp.where(k >= 0, k // ROWS, -1), rows_of(record.rows), of_y, total, last)
+    s = Sweep(k, jnp.where(k >= 0, k // many, -1), rows_of(record.rows), of_y, total, last)
     s = lax.while_loop(lambda s: eqxi.unvmap_any(s.k >= 0), piece, s)
     # Outputs at the start are the first state.
     y, total = jax.tree.map(lambda y, c: y + c, s.y, at(of_outputs, jnp.zeros_like(k))), s.moved
