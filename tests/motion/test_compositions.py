@@ -1,8 +1,8 @@
 """JAX's transformations around a motion, in combination: each gives what pushing tangents forward gives.
 
 Thirty-three numbers of a small network in L are more than are pushed forward where reverse mode asks for it, so that
-these are the derivatives that learned Lagrangians have. Each combination is reduced to one number along fixed directions
-u and w: a slope g·u, or a curvature u·H·w, which two pushes give.
+these are the derivatives that learned Lagrangians have. Each combination is reduced to one number along directions
+u and w, which stay the same: a slope g·u, or a curvature u·H·w, which two pushes give.
 """
 
 import jax
