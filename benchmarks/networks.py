@@ -2,9 +2,9 @@
 
 A particle in the plane, a double pendulum in its angles, and a particle on a rod, whose potential has a network of two
 hidden layers in it. diffrax integrates by its Dopri8 as shipped, its gradient is that of its default adjoint, and its
-accelerations are written by hand as a user of it would, from the same L by `jax.grad` and `jax.jvp`. Tolerances are the
-loosest of a list at which a gradient is within `ERROR` of that at `EXACT`: each is compared with its own limit, and both
-limits are the same to that. `gradient_cost.py` makes rows of this.
+accelerations are written by hand as a user of it would, from the same L by `jax.grad` and `jax.jvp`. A tolerance is the
+loosest of a list at which a gradient is within `ERROR` of that at `EXACT`: each is compared with its own limit; these
+are the same to that. `gradient_cost.py` makes rows of this.
 
     python benchmarks/networks.py "987 numbers, a particle, 100 outputs" lagjax
 """

@@ -10,28 +10,23 @@ constraint equations chosen at its start; what the method keeps from step to ste
 steps that it rejected and the search for events are not there. Where steps end is constant, as it is in a solve that is
 pushed forward; but outputs and jumps are ends of steps, and the cotangents of these times are theirs.
 
-`recording.py` keeps the steps. Both loops, there and back, are one primitive and its linear derivative with a rule for
-lanes: in a batch the cotangents of what all lanes share are added up inside a product of matrices, not lane by lane.
+`recording.py` keeps the steps, `way_back.py` goes over them. Both loops, there and back, are one primitive and its
+linear derivative, with rules for lanes.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import NamedTuple
 
 import equinox as eqx
-import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jax import lax
 from jax.core import ShapedArray
-from jaxtyping import Array, Int, PyTree
 
 from lagjax.jax_internals.one_function import one_function
 from lagjax.jax_internals.primitives import ad, primitive
-from lagjax.motion.recording import Problem, Recorded, Rows, recorded, recorded_again
-from lagjax.motion.stepping import OnManifold
+from lagjax.motion.recording import Problem, Recorded, recorded
+from lagjax.motion.way_back import Lanes, Motion, filled, swept_back, together
 
 
 @dataclass(frozen=True)
@@ -42,56 +37,6 @@ class Replay:
     """
 
     record: Recorded | None = None
-
-
-class Lanes(NamedTuple):
-    """Of a batch: how many lanes there are, and which operands have one row for each."""
-
-    count: int
-    batched: tuple[bool, ...]
-
-    def each(self, function, more=0):
-        """`function` of the operands, and of `more` that all are batched, for all lanes."""
-        return jax.vmap(function, [0 if b else None for b in self.batched] + [0] * more, axis_size=self.count)
-
-
-@dataclass(frozen=True, eq=False)
-class Motion:
-    """A motion as a function of its arrays, each of them once; all else is kept here."""
-
-    structure: jtu.PyTreeDef
-    places: tuple[int, ...]
-    static: PyTree
-    max_steps: int | None
-    checked: bool
-    results: Callable
-    # The structure of the record, once it has been traced.
-    found: list
-
-    def problem(self, leaves) -> Problem:
-        """The problem with these arrays."""
-        return eqx.combine(jtu.tree_unflatten(self.structure, [leaves[i] for i in self.places]), self.static)
-
-    def recorded(self, arrays) -> Recorded:
-        """The record with these arrays."""
-        structure, others = self.found[0]
-        return eqx.combine(jtu.tree_unflatten(structure, arrays), others)
-
-    @property
-    def size(self) -> int:
-        """How many arrays there are."""
-        return max(self.places) + 1
-
-    @property
-    def careful(self) -> bool:
-        """Whether some steps may have been taken the careful way, and not as they are written out."""
-        solver = self.static.solver
-        return solver.quick is not None and solver.equations.fallback
-
-    @property
-    def where(self) -> Problem:
-        """The problem, in place of each array its number."""
-        return jtu.tree_unflatten(self.structure, self.places)
 
 
 def replayed(problem: Problem, max_steps: int | None, checked: bool, known: Recorded | None = None) -> Recorded:
@@ -208,7 +153,7 @@ def _moved(*operands, motion, lanes, moved):
     leaves, _, moving = _operands(operands, motion, moved)
 
     def of_moved(*chosen):
-        found = _run(*_with(leaves, moved, chosen), motion=motion, lanes=lanes)
+        found = _run(*filled(leaves, moved, chosen), motion=motion, lanes=lanes)
         return [x for x in found if _is_float(x)]
 
     return jax.jvp(of_moved, tuple(leaves[i] for i in moved), tuple(moving))[1]
@@ -244,11 +189,7 @@ def _moved_transpose(cotangents, *operands, motion, lanes, moved):
         )
     asked = given.outputs, given.t, given.y
     asked = jax.tree.map(ad.instantiate_zeros, asked, is_leaf=_is_zero)
-    # Of outputs at one time the first has the cotangents of all.
-    _, first = _outputs_of(leaves, motion, lanes)
-    together = lambda first, ct: jnp.zeros_like(ct).at[first].add(ct)
-    together = together if lanes is None else jax.vmap(together)
-    asked = jax.tree.map(lambda ct: together(first, ct), asked[0]), *asked[1:]
+    asked = together(leaves, motion, lanes, asked[0]), *asked[1:]
     swept = partial(swept_back, motion=motion, moved=moved, lanes=lanes)
     if lanes is None:
         found = one_function(swept, leaves, motion.recorded(values), asked, checked=motion.checked, in_blocks=True)
@@ -257,140 +198,12 @@ def _moved_transpose(cotangents, *operands, motion, lanes, moved):
     return [None] * (len(leaves) + len(values)) + found
 
 
-class Sweep(NamedTuple):
-    """How far the way back has come: steps from `k` on are done, those of `number` are in the rows.
-
-    `y`: the cotangent of the state at the start of the last step that was done; `moved`: of the arrays so far;
-    `output`: the last output that is not passed yet.
-    """
-
-    k: Int[Array, ""]
-    number: Int[Array, ""]
-    rows: Rows
-    y: PyTree
-    moved: list
-    output: Int[Array, ""]
-
-
-def swept_back(leaves, found: Recorded, asked, *, motion: Motion, moved, lanes: Lanes | None):
-    """The cotangents of the arrays that are `moved`, from those of the outputs, of the last time and the last state."""
-    (of_outputs, of_t, of_y), record, where = asked, found.record, motion.where
-    many = record.rows.t0.shape[-1]
-    alone = lanes is None
-    batched = [False] * len(leaves) if alone else lanes.batched
-    each = lambda function: function if alone else jax.vmap(function)
-    with_leaves = lambda function, more: function if alone else lanes.each(function, more)
-    ts, first = _outputs_of(leaves, motion, lanes)
-    at = each(lambda tree, i: jax.tree.map(lambda x: x[i], tree))
-
-    # A lane without steps stands in for the longest: its own state may be none, and NaN times zero is NaN.
-    steps, rows_of = leaves, lambda rows: rows
-    if not alone:
-        idle, longest = record.count == 0, jnp.argmax(record.count)
-        instead = lambda x: jnp.where(_like(idle, x), x[longest][None], x)
-        steps = [instead(x) if b else x for x, b in zip(leaves, batched)]
-        rows_of = lambda rows: jax.tree.map(instead, rows)
-
-    of_times = sorted({where.t0, where.controller.ts} & set(moved))
-    add = lambda total, i, x: total if i not in moved else _added(total, moved.index(i), x, alone or batched[i])
-
-    def pulled(t0, t1, y, ct):
-        """The cotangents of the arrays, of both times and of the state at the start of a step."""
-        start = ([steps[i] for i in moved], t0, t1, y) if of_times else ([steps[i] for i in moved], y)
-
-        def ends(by, chosen, *start):
-            times_and_state = start if of_times else (t0, t1, *start)
-            step = lambda *x: by(motion.problem(x[:-3]).solver, *x[-3:])
-            return with_leaves(step, 3)(*_with(steps, moved, chosen), *times_and_state)
-
-        _, pull, believed = jax.vjp(partial(ends, OnManifold.again), *start, has_aux=True)
-        carefully = partial(ends, OnManifold.again_carefully)
-        if motion.careful:
-            # Not a choice between two ends: what is not to be believed has no derivative, and zero times that is NaN.
-            pull = partial(lax.cond, eqxi.unvmap_all(believed), pull, lambda ct: jax.vjp(carefully, *start)[1](ct))
-        of_arrays, *of_start = pull(ct)
-        return of_arrays, *([None, None] if not of_times else []), *of_start
-
-    def at_time(t, ct):
-        """The cotangent of a time as that of the end of a step that it is."""
-        one = lambda ts, t, ct: jnp.where((jnp.arange(ts.size) == jnp.sum(ts < t)) & (ts == t), ct, 0.0)
-        knots = leaves[where.controller.ts]
-        return (
-            one(knots, t, ct)
-            if alone
-            else jax.vmap(one, (0 if batched[where.controller.ts] else None, 0, 0))(knots, t, ct)
-        )
-
-    def turn(s: Sweep) -> Sweep:
-        here = (s.k >= s.number * many) & (s.k >= 0)
-        t0, t1, y0 = at(s.rows, jnp.maximum(s.k, 0) % many)
-        output = jnp.maximum(s.output, 0)
-        time = at(ts, output)
-        hit = here & (s.output >= 0) & (time > t0) & (time <= t1)
-        ct = jax.tree.map(lambda y, c: y + jnp.where(_like(hit, c), c, 0.0), s.y, at(of_outputs, output))
-        on = jax.tree.map(lambda x: jnp.where(_like(here, x), x, 0.0), ct)
-        of_arrays, of_t0, of_t1, of_y = pulled(t0, t1, y0, on)
-        mine = lambda x, i: jnp.where(_like(here, x), x, 0.0) if not alone and batched[i] else x
-        total = [a + mine(b, i) for a, b, i in zip(s.moved, of_arrays, moved)]
-        if of_times:
-            start = s.k == 0
-            total = add(total, where.t0, jnp.where(here & start, of_t0, 0.0))
-            total = add(total, where.controller.ts, at_time(t1, jnp.where(here, of_t1, 0.0)))
-            total = add(total, where.controller.ts, at_time(t0, jnp.where(here & ~start, of_t0, 0.0)))
-        y = jax.tree.map(lambda x, ct: jnp.where(_like(here, x), x, ct), of_y, ct)
-        return Sweep(s.k - here, s.number, s.rows, y, total, jnp.where(hit, at(first, output - 1), s.output))
-
-    def piece(s: Sweep) -> Sweep:
-        number = jnp.where(s.k >= 0, s.k // many, -1)
-        again = lambda: rows_of(
-            with_leaves(lambda *x: recorded_again(motion.problem(x[:-2]), *x[-2:]), 2)(*leaves, record, number)
-        )
-        # The last rows are in hand.
-        rows = lax.cond(eqxi.unvmap_any(number < s.number), again, lambda: s.rows)
-        is_on = lambda s: eqxi.unvmap_any((s.k >= s.number * many) & (s.k >= 0))
-        return lax.while_loop(is_on, turn, s._replace(number=number, rows=rows))
-
-    total = [jnp.zeros_like(leaves[i]) for i in moved]
-    if of_times:
-        total = add(total, where.controller.ts, at_time(found.t, of_t))
-    k = record.count - 1
-    last = at(first, record.saved - 1)
-    s = Sweep(k, jnp.where(k >= 0, k // many, -1), rows_of(record.rows), of_y, total, last)
-    s = lax.while_loop(lambda s: eqxi.unvmap_any(s.k >= 0), piece, s)
-    # Outputs at the start are the first state.
-    y, total = jax.tree.map(lambda y, c: y + c, s.y, at(of_outputs, jnp.zeros_like(k))), s.moved
-    for i, x in zip(jtu.tree_leaves(where.y0), jtu.tree_leaves(y)):
-        total = add(total, i, x)
-    return total
-
-
-def _outputs_of(leaves, motion, lanes):
-    """The times of the outputs, and the first at each of them, of one lane or of all."""
-    of = lambda *leaves: (motion.problem(leaves).ts, motion.problem(leaves).first)
-    return of(*leaves) if lanes is None else lanes.each(of)(*leaves)
-
-
-def _added(total, place, x, as_it_is):
-    return [a + (x if as_it_is else jnp.sum(x, axis=0)) if i == place else a for i, a in enumerate(total)]
-
-
-def _like(mask, x):
-    return mask.reshape(mask.shape + (1,) * (jnp.ndim(x) - jnp.ndim(mask)))
-
-
 def _is_float(x):
     return jnp.issubdtype(x.dtype, jnp.inexact)
 
 
 def _is_zero(x):
     return isinstance(x, ad.Zero)
-
-
-def _with(leaves, moved, chosen):
-    filled = list(leaves)
-    for i, x in zip(moved, chosen):
-        filled[i] = x
-    return filled
 
 
 _run_p = primitive("lagjax_recorded", _run, _run_shapes, several=True, jvp=_run_jvp, batched=_run_batched)
