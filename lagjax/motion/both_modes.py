@@ -32,7 +32,7 @@ from jax import lax
 from jax.core import ShapedArray
 from jaxtyping import PyTree
 
-from lagjax.jax_internals.primitives import ad, primitive
+from lagjax.jax_internals.primitives import ad, jaxpr_as_fun, primitive
 from lagjax.motion.consistency import stopped
 from lagjax.motion.pulled import Push, pull, turned
 from lagjax.motion.replay import Replay
@@ -63,24 +63,24 @@ def solve_in_both_modes(solve: Callable, x: PyTree, fixed: PyTree, recorded: boo
             adjoint = Replay(jtu.tree_unflatten(shapes[Replay], record) if record else None)
         return [y for y in by(adjoint, True, *leaves)[0] if _is_float(y)]
 
-    # Jitted, so that they are traced once.
-    values, with_record = jax.jit(partial(by, diffrax.ForwardMode(), False)), jax.jit(partial(by, Replay(), True))
+    # What is not differentiated is a program that others may look into, as they do with a call.
+    program = jax.make_jaxpr(lambda *leaves: by(diffrax.ForwardMode(), False, *leaves)[0])(*leaves)
+    with_record = jax.jit(partial(by, Replay(), True))
     no_steps = lambda *record: jtu.tree_unflatten(shapes[Replay], record).record.count == 0
-    of = _Solve(values, with_record if recorded else None, outputs, no_steps, len(jtu.tree_leaves(x)))
-    found = _solve_p.bind(*leaves, of=of)
+    of = _Solve(with_record if recorded else None, outputs, no_steps, len(jtu.tree_leaves(x)))
+    found = _solve_p.bind(*leaves, program=program, of=of)
     return jtu.tree_unflatten(shapes["y"], found)
 
 
 @dataclass(frozen=True, eq=False)
 class _Solve:
-    """A solve as functions of arrays, of which the first `size` can be differentiated.
+    """How to differentiate a solve, a function of arrays, by the first `size` of them.
 
-    `values(*leaves)` and `recorded(*leaves)` give the arrays of the result and those of the record, if there is one;
-    `outputs(adjoint, *leaves, *record)` the floating ones of the result, for a derivative; `no_steps(*record)` says
-    whether the motion was refused. `axes`: in lanes, of each array.
+    `recorded(*leaves)` gives the arrays of the result and those of the record, if there is one; `outputs(adjoint,
+    *leaves, *record)` the floating ones of the result, for a derivative; `no_steps(*record)` says whether the motion
+    was refused. `axes`: in lanes, of each array.
     """
 
-    values: Callable
     recorded: Callable | None
     outputs: Callable
     no_steps: Callable
@@ -107,25 +107,24 @@ class _Solve:
             return jax.vmap(partial(self.outputs, adjoint), [*axes, *more], axis_size=count)(*operands)
 
         recorded = self.recorded and lanes(self.recorded)
-        return _Solve(lanes(self.values), recorded, outputs, self.no_steps, self.size, tuple(axes))
+        return _Solve(recorded, outputs, self.no_steps, self.size, tuple(axes))
 
 
-def _solved(*leaves, of):
-    return of.values(*leaves)[0]
+def _solved(*leaves, program, of):
+    return jaxpr_as_fun(program)(*leaves)
 
 
-def _solved_shapes(*leaves, of):
-    like = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in leaves]
-    return [ShapedArray(y.shape, y.dtype) for y in jax.eval_shape(of.values, *like)[0]]
+def _solved_shapes(*leaves, program, of):
+    return program.out_avals
 
 
-def _solved_jvp(primals, tangents, *, of):
+def _solved_jvp(primals, tangents, *, program, of):
     # What is not moved is a constant: a tangent of zeros would go through every step.
     moved = [i for i in range(of.size) if not isinstance(tangents[i], ad.Zero)]
     zero = lambda y: ad.Zero(jax.typeof(y).to_tangent_aval())
     if of.recorded is None or not moved or _are_few(primals[i] for i in moved):
         # By itself, so that a second derivative finds this rule again.
-        values, record = _solve_p.bind(*primals, of=of), []
+        values, record = _solve_p.bind(*primals, program=program, of=of), []
     else:
         values, record = of.recorded(*primals)
     if not moved:
@@ -146,10 +145,12 @@ def _solved_jvp(primals, tangents, *, of):
     return values, [next(dy) if _is_float(y) else zero(y) for y in values]
 
 
-def _solved_batched(operands, axes, *, of):
+def _solved_batched(operands, axes, *, program, of):
     count = next(x.shape[axis] for x, axis in zip(operands, axes) if axis is not None)
     front = [x if axis is None else jnp.moveaxis(x, axis, 0) for x, axis in zip(operands, axes)]
-    found = _solve_p.bind(*front, of=of.in_lanes([None if axis is None else 0 for axis in axes], count))
+    axes = [None if axis is None else 0 for axis in axes]
+    lanes = jax.make_jaxpr(jax.vmap(jaxpr_as_fun(program), axes, axis_size=count))(*front)
+    found = _solve_p.bind(*front, program=lanes, of=of.in_lanes(axes, count))
     return found, [0] * len(found)
 
 
