@@ -11,15 +11,24 @@ functions at the end. Four derivatives: by g, a, ω and the angle of release.
 first. diffrax's own gradients stand beside them, by `ForwardMode` and by its default adjoint. A mode's programs run
 in turn; ratios are medians over the turns.
 
+By networks in L (`networks.py`), of a thousand numbers and of twenty thousand: the first gradient and the next ones,
+beside our own solve and beside the gradient of diffrax, each in a process of its own. On one core:
+
+    taskset -c 0 python benchmarks/gradient_cost.py --only numbers
+
     python benchmarks/gradient_cost.py [--json FILE] [--only TEXT]
 """
+
+import time
+from pathlib import Path
 
 import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
 from against_peers import loosest
-from measure import in_turn, main, row
+from measure import CLOCK, in_new_process, in_turn, main, row
+from networks import PROBLEMS
 
 import lagjax as lj
 from lagjax.scenes import bead_on_hoop
@@ -117,6 +126,40 @@ def tolerance_of(solve):
 
 
 def rows(wanted):
+    """By four parameters, and by networks."""
+    yield from by_parameters(wanted)
+    for name, problem in PROBLEMS.items():
+        if wanted(name):
+            yield from by_network(name, problem)
+
+
+def by_network(name, problem):
+    """The gradient of a motion with a network in L: ours, beside our solve and diffrax's."""
+    clock = "process_time" if CLOCK["seconds"] is time.process_time else "perf_counter"
+    run = lambda who, method="": in_new_process(
+        f"import json, sys\nsys.path.insert(0, {str(Path(__file__).parent)!r})\nfrom networks import measured\n"
+        f"print(json.dumps(measured({name!r}, {who!r}, {method!r}, {clock!r})))"
+    )
+    ours = run("lagjax")
+    target = 4.0 if problem.kind == "rod" else 3.5 if problem.lanes else 3.0
+    shown = {"ms": 1e3 * ours["next"], "error": ours["error"], "rtol": ours["rtol"], "MB": ours["MB"]}
+    yield row(f"{name}: gradient / our solve", ours["next"] / ours["solve"], target, **shown)
+    if problem.kind == "rod":
+        yield row(f"{name}: first gradient, s", ours["first"])
+        return
+    theirs = run("diffrax")
+    theirs_shown = {"diffrax_ms": 1e3 * theirs["next"], "diffrax_error": theirs["error"], "diffrax_MB": theirs["MB"]}
+    yield row(f"{name}: first gradient / diffrax's", ours["first"] / theirs["first"], 1.0, s=ours["first"])
+    target = 0.5 if problem.outputs == 20 else 0.35
+    yield row(f"{name}: gradient / diffrax's", ours["next"] / theirs["next"], target, **shown, **theirs_shown)
+    if problem.outputs == 20:
+        # Each output is the end of a step: with so many of them a lower order is enough.
+        eight = run("lagjax", "Nystrom8")
+        shown = {"ms": 1e3 * eight["next"], "error": eight["error"]}
+        yield row(f"{name}: gradient by Nystrom8 / diffrax's", eight["next"] / theirs["next"], target, **shown)
+
+
+def by_parameters(wanted):
     """Each mode: the gradient beside a solve of ours and one of diffrax, and diffrax's own."""
     names = {mode: f"{mode} mode, {'4 parameters' if mode == 'forward' else f'{OUTPUTS} outputs'}" for mode in MODES}
     if not any(wanted(name) for name in names.values()):

@@ -2,10 +2,10 @@
 
 from collections.abc import Callable
 
-from jax.extend.core import Primitive
+from jax.extend.core import Primitive, jaxpr_as_fun
 from jax.interpreters import ad, batching, mlir
 
-__all__ = ["Primitive", "ad", "primitive"]
+__all__ = ["Primitive", "ad", "jaxpr_as_fun", "primitive"]
 
 
 def primitive(

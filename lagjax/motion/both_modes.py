@@ -3,20 +3,22 @@
 diffrax offers one derivative a solve: `ForwardMode` or `RecursiveCheckpointAdjoint`. Which one is wanted is
 known only when JAX pushes tangents through (`jacfwd`, Levenberg-Marquardt) or transposes them (`grad`).
 The derivative of y = solve(x) is therefore bound as a linear map dx -> dy of its own: a primitive that is
-evaluated by forward mode and transposed by the checkpointed reverse mode; where few derivatives are asked for,
-by forward mode too, along each of them. Undifferentiated, there is no trace of it in the compiled program.
-Differentiated, the plain solve runs beside the derivative's own; naming an `adjoint` saves that one solve.
+evaluated by forward mode and transposed by a replay of the steps (`pulled.py`); where few derivatives are asked for,
+by forward mode too, along each of them. Undifferentiated, there is no trace of it in the compiled program. With many
+numbers to differentiate by, the solve that gives the values records its steps, and the replay is of these.
 
-Second derivatives are those of this map, which is bilinear in dx and in the direction dz in which x moves:
+Second derivatives by few numbers are those of this map, which is bilinear in dx and in the direction dz in which x
+moves:
 
     d(J dx) = H[dx, dz] + J d(dx)
 
 It is evaluated forward over forward, and bound as a linear map of (dz, d(dx)) in its turn: transposed, it is pushed
-along every axis of them. So `jacfwd(jacfwd)`, `jvp(grad)`, `grad(grad)` and the other orders all work, for as many
-pushes as there are numbers to differentiate by (squared, for `grad(grad)`); more than `PUSH_AT_MOST` are refused.
+along every axis of them. Those by many numbers are in `pulled.py`. So `jacfwd(jacfwd)`, `jvp(grad)`, `grad(grad)`,
+`jacrev(jacrev)` and the other orders all work; third derivatives by many numbers are refused.
 """
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial, reduce
 
 import diffrax
@@ -30,54 +32,137 @@ from jax import lax
 from jax.core import ShapedArray
 from jaxtyping import PyTree
 
-from lagjax.jax_internals.primitives import ad, primitive
+from lagjax.jax_internals.primitives import ad, jaxpr_as_fun, primitive
+from lagjax.motion.consistency import stopped
+from lagjax.motion.pulled import Push, pull, turned
+from lagjax.motion.replay import Replay
 
 # Up to this many derivatives of one number, pushing all of them forward is cheaper than one pull back through the
 # checkpoints, to run and to compile.
 PUSH_UP_TO = 24
-# Second derivatives in reverse push along every axis, in one batch: beyond this it would not fit into memory.
-PUSH_AT_MOST = 2**14
 
 
-def solve_in_both_modes(solve: Callable, x: PyTree, fixed: PyTree) -> PyTree:
+def solve_in_both_modes(solve: Callable, x: PyTree, fixed: PyTree, recorded: bool = True) -> PyTree:
     """`solve(x, fixed, adjoint, differentiated)` for a diffrax adjoint, differentiable in both modes in `x`.
 
-    All leaves of `x` are floating arrays, all leaves of `fixed` and of the result are arrays, and `solve`
-    closes over no traced value. `differentiated` says whether this solve is for a derivative.
+    It returns its result and, where the adjoint is a `Replay`, a record of the motion for another one; else None. All
+    leaves of `x` are floating arrays, all leaves of `fixed` and of the result are arrays, and `solve` closes over no
+    traced value. `differentiated` says whether this solve is for a derivative; `recorded`, whether there is a record.
     """
-    return _solve((x, fixed), solve=solve)
-
-
-@eqx.filter_custom_jvp
-def _solve(inputs, *, solve):
-    return solve(*inputs, diffrax.ForwardMode(), False)
-
-
-@_solve.def_jvp
-def _solve_jvp(primals, tangents, *, solve):
-    ((x, fixed),), ((dx, _),) = primals, tangents
-    # By itself, so that a second derivative finds this rule again.
-    y = _solve((x, fixed), solve=solve)
     leaves, structure = jtu.tree_flatten((x, fixed))
-    along = jtu.tree_structure(x).flatten_up_to(dx)
+    shapes = {}
+
+    def by(adjoint, differentiated, *leaves):
+        found = solve(*jtu.tree_unflatten(structure, leaves), adjoint, differentiated)
+        shapes["y"], shapes[type(adjoint)] = map(jtu.tree_structure, found)
+        return tuple(jtu.tree_leaves(part) for part in found)
+
+    def outputs(adjoint, *operands):
+        leaves, record = operands[: structure.num_leaves], operands[structure.num_leaves :]
+        if isinstance(adjoint, Replay):
+            adjoint = Replay(jtu.tree_unflatten(shapes[Replay], record) if record else None)
+        return [y for y in by(adjoint, True, *leaves)[0] if _is_float(y)]
+
+    # What is not differentiated is a program that others may look into, as they do with a call.
+    program = jax.make_jaxpr(lambda *leaves: by(diffrax.ForwardMode(), False, *leaves)[0])(*leaves)
+    with_record = jax.jit(partial(by, Replay(), True))
+    no_steps = lambda *record: jtu.tree_unflatten(shapes[Replay], record).record.count == 0
+    of = _Solve(with_record if recorded else None, outputs, no_steps, len(jtu.tree_leaves(x)))
+    found = _solve_p.bind(*leaves, program=program, of=of)
+    return jtu.tree_unflatten(shapes["y"], found)
+
+
+@dataclass(frozen=True, eq=False)
+class _Solve:
+    """How to differentiate a solve, a function of arrays, by the first `size` of them.
+
+    `recorded(*leaves)` gives the arrays of the result and those of the record, if there is one; `outputs(adjoint,
+    *leaves, *record)` the floating ones of the result, for a derivative; `no_steps(*record)` says whether the motion
+    was refused. `axes`: in lanes, of each array.
+    """
+
+    recorded: Callable | None
+    outputs: Callable
+    no_steps: Callable
+    size: int
+    axes: tuple | None = None
+
+    def without_refused(self, leaves, record):
+        """The same arrays, where there is no motion without derivatives: those there may be infinite."""
+        if not record:
+            return leaves
+        none = self.no_steps(*record)
+        none = none if self.axes is None else jnp.all(none.reshape(none.shape[0], -1), axis=1)
+        still = lambda x: jnp.where(none.reshape(none.shape + (1,) * (x.ndim - none.ndim)), lax.stop_gradient(x), x)
+        # What lanes share stays one.
+        mine = [i < self.size and (self.axes is None or self.axes[i] == 0) for i in range(len(leaves))]
+        return [still(x) if m else x for x, m in zip(leaves, mine)]
+
+    def in_lanes(self, axes, count):
+        """The same for lanes, with the results in front."""
+        lanes = lambda function: jax.vmap(function, axes, axis_size=count)
+
+        def outputs(adjoint, *operands):
+            more = [0] * (len(operands) - len(axes))
+            return jax.vmap(partial(self.outputs, adjoint), [*axes, *more], axis_size=count)(*operands)
+
+        recorded = self.recorded and lanes(self.recorded)
+        return _Solve(recorded, outputs, self.no_steps, self.size, tuple(axes))
+
+
+def _solved(*leaves, program, of):
+    return jaxpr_as_fun(program)(*leaves)
+
+
+def _solved_shapes(*leaves, program, of):
+    return program.out_avals
+
+
+def _solved_jvp(primals, tangents, *, program, of):
     # What is not moved is a constant: a tangent of zeros would go through every step.
-    moved = [i for i, d in enumerate(along) if d is not None] or [0]
-    dx = [eqxi.materialise_zeros(leaves[i], along[i]) for i in moved]
+    moved = [i for i in range(of.size) if not isinstance(tangents[i], ad.Zero)]
+    zero = lambda y: ad.Zero(jax.typeof(y).to_tangent_aval())
+    if of.recorded is None or not moved or _are_few(primals[i] for i in moved):
+        # By itself, so that a second derivative finds this rule again.
+        values, record = _solve_p.bind(*primals, program=program, of=of), []
+    else:
+        values, record = of.recorded(*primals)
+    if not moved:
+        return values, [zero(y) for y in values]
+    # The record says where the motion is replayed, and is no function of that.
+    leaves = [*primals, *stopped(record)]
     order = moved + [i for i in range(len(leaves)) if i not in moved]
+    place = [order.index(i) for i in range(len(leaves))]
 
-    def float_outputs(adjoint, *operands):
-        x, fixed = jtu.tree_unflatten(structure, [operands[order.index(i)] for i in range(len(order))])
-        return jtu.tree_leaves(eqx.filter(solve(x, fixed, adjoint, True), eqx.is_inexact_array))
+    def outputs(adjoint, *operands):
+        operands = [operands[i] for i in place]
+        leaves, record = operands[: len(primals)], operands[len(primals) :]
+        return of.outputs(adjoint, *of.without_refused(leaves, record), *record)
 
-    floats, rest = eqx.partition(y, eqx.is_inexact_array)
-    shapes = tuple((leaf.shape, leaf.dtype) for leaf in jtu.tree_leaves(floats))
-    params = dict(outputs=float_outputs, shapes=shapes, size=len(moved), many=False)
-    dy = _tangent_p.bind(*(leaves[i] for i in order), *dx, **params)
-    dy = jtu.tree_unflatten(jtu.tree_structure(floats), dy)
-    return y, eqx.combine(dy, jtu.tree_map(lambda _: None, rest))
+    shapes = tuple((y.shape, y.dtype) for y in values if _is_float(y))
+    params = dict(outputs=outputs, shapes=shapes, size=len(moved), many=False)
+    dy = iter(_tangent_p.bind(*(leaves[i] for i in order), *(tangents[i] for i in moved), **params))
+    return values, [next(dy) if _is_float(y) else zero(y) for y in values]
 
 
-# The operands of the primitive are the leaves of x, of `fixed`, and of dx; `size` is the count of the
+def _solved_batched(operands, axes, *, program, of):
+    count = next(x.shape[axis] for x, axis in zip(operands, axes) if axis is not None)
+    front = [x if axis is None else jnp.moveaxis(x, axis, 0) for x, axis in zip(operands, axes)]
+    axes = [None if axis is None else 0 for axis in axes]
+    lanes = jax.make_jaxpr(jax.vmap(jaxpr_as_fun(program), axes, axis_size=count))(*front)
+    found = _solve_p.bind(*front, program=lanes, of=of.in_lanes(axes, count))
+    return found, [0] * len(found)
+
+
+def _are_few(leaves):
+    return sum(a.size for a in leaves) <= PUSH_UP_TO
+
+
+def _is_float(x):
+    return jnp.issubdtype(x.dtype, jnp.inexact)
+
+
+# The operands of the derivative are the leaves of x, of what is fixed, and of dx; `size` is the count of the
 # first and the last. `outputs(adjoint, *x, *fixed)` gives the floating leaves of the result; their `shapes`
 # are those of their tangents, and known without tracing. With `many`, each dx has a leading axis of directions,
 # and so has each result.
@@ -99,7 +184,26 @@ def _tangent_shapes(*operands, shapes, size, many, **params):
 
 
 def _tangent_jvp(primals, tangents, **params):
-    return _linear(partial(_tangent, **params), primals, tangents, _tangent_p.bind(*primals, **params))
+    x, fixed, dx = _split(primals, params["size"])
+    values = _tangent_p.bind(*primals, **params)
+    if _are_few(x):
+        return _linear(partial(_tangent, **params), primals, tangents, values)
+    push = partial(turned, Push(len(x), params["outputs"]), shapes=params["shapes"])
+    if not params["many"]:
+        return values, push(primals, tangents)
+    # The directions are lanes.
+    count, here = len(primals) - len(dx), lambda t: not isinstance(t, ad.Zero)
+    axes = [None] * count + [0] * len(dx)
+    moving = [t for t in tangents if here(t)]
+
+    def along(primals, moving):
+        moving = iter(moving)
+        each = [
+            next(moving) if here(t) else ad.Zero(jax.typeof(x).to_tangent_aval()) for x, t in zip(primals, tangents)
+        ]
+        return [ad.instantiate_zeros(d) for d in push(primals, each)]
+
+    return values, jax.vmap(along, (axes, [axis for axis, t in zip(axes, tangents) if here(t)]))(list(primals), moving)
 
 
 def _linear(function, points, tangents, values):
@@ -137,9 +241,6 @@ def _pushed_transpose(cotangents, *operands, along, size):
     points, directions = operands[:-size], operands[-size:]
     wanted = [ad.is_undefined_primal(direction) for direction in directions]
     like = [direction.aval if w else direction for direction, w in zip(directions, wanted)]
-    count = sum(a.size for a, w in zip(like, wanted) if w)
-    # Those of a gradient have their own axis of directions, one for each number.
-    _check_count(count, count**2 if count > PUSH_UP_TO else count)
     push = lambda *axes: jax.vmap(lambda *axes: along(*points, *axes))(*axes)
     slopes = _along_axes(like, wanted, push, [ad.instantiate_zeros(ct) for ct in cotangents])
     found = iter(slopes)
@@ -174,56 +275,19 @@ def _along_axes(like, wanted, push, cotangents):
     return [slopes[i : i + n].reshape(a.shape).astype(a.dtype) for i, n, a, w in zip(starts, sizes, like, wanted) if w]
 
 
-def _tangent_transpose(cotangents, *operands, size, many, **params):
+def _tangent_transpose(cotangents, *operands, outputs, shapes, size, many):
     x, fixed, dx = _split(operands, size)
-    cotangents = [ad.instantiate_zeros(ct) for ct in cotangents]
-    wanted = [ad.is_undefined_primal(tangent) for tangent in dx]
-    if sum(a.size for a, w in zip(x, wanted) if w) <= PUSH_UP_TO:
-        along = lambda cotangents: _pull_by_pushing(x, fixed, wanted, cotangents, size=size, **params)
+    wanted = tuple(ad.is_undefined_primal(tangent) for tangent in dx)
+    if _are_few(a for a, w in zip(x, wanted) if w):
+        params = dict(outputs=outputs, shapes=shapes, size=size)
+        cotangents = [ad.instantiate_zeros(ct) for ct in cotangents]
+        along = lambda cotangents: _pull_by_pushing(x, fixed, wanted, cotangents, **params)
     else:
-        params = tuple({"size": size, **params}.items())
-        along = lambda cotangents: _pull_once(x, fixed, cotangents, wanted=tuple(wanted), params=params)
+        asked = tuple(not isinstance(ct, ad.Zero) for ct in cotangents)
+        cotangents = tuple(ct for ct, a in zip(cotangents, asked) if a)
+        along = lambda cotangents: pull(x, fixed, cotangents, which=(wanted, asked), outputs=outputs)
     found = iter(jax.vmap(along)(cotangents) if many else along(cotangents))
     return [None] * (len(operands) - size) + [next(found) if w else None for w in wanted]
-
-
-def _pull(x, fixed, wanted, cotangents, *, outputs, **params):
-    def of_wanted(*chosen):
-        chosen = iter(chosen)
-        every = [next(chosen) if w else a for a, w in zip(x, wanted)]
-        return outputs(diffrax.RecursiveCheckpointAdjoint(), *every, *fixed)
-
-    return jax.vjp(of_wanted, *[a for a, w in zip(x, wanted) if w])[1](cotangents)
-
-
-def _check_count(count, pushes):
-    """Raise where a second derivative by `count` numbers takes too many pushes."""
-    if pushes > PUSH_AT_MOST:
-        raise NotImplementedError(
-            f"a derivative of a gradient by {count} numbers: it takes {pushes} solves side by side, and no more than "
-            f"{PUSH_AT_MOST} are begun.\n"
-            "Usual cause: a Hessian, or its product with a vector, of a loss with a large network in L.\n"
-            "Fix: jax.jvp(lambda p: jax.jvp(loss, (p,), (u,))[1], (p,), (w,)) for u·H·w along given directions, or "
-            "(jax.grad(loss)(p + h * u) - jax.grad(loss)(p - h * u)) / (2 * h) for H·u."
-        )
-
-
-@eqx.filter_custom_jvp
-def _pull_once(x, fixed, cotangents, *, wanted, params):
-    return _pull(x, fixed, wanted, cotangents, **dict(params))
-
-
-@_pull_once.def_jvp
-def _pull_once_jvp(primals, tangents, *, wanted, params):
-    # The checkpoints can be pulled back through, and not pushed: the derivative is that of the same by pushing.
-    x, fixed, cotangents = primals
-    count = sum(a.size for a, w in zip(x, wanted) if w)
-    _check_count(count, count)
-    by_pushing = lambda x, cotangents: _pull_by_pushing(x, fixed, wanted, cotangents, **dict(params))
-    values = _pull(x, fixed, wanted, cotangents, **dict(params))
-    filled = lambda given, along: type(given)(eqxi.materialise_zeros(a, d) for a, d in zip(given, along))
-    along = filled(x, tangents[0]), filled(cotangents, tangents[2])
-    return values, type(values)(jax.jvp(by_pushing, (x, cotangents), along)[1])
 
 
 def _pull_by_pushing(x, fixed, wanted, cotangents, **params):
@@ -249,21 +313,22 @@ def _tangent_batched(operands, axes, *, outputs, shapes, size, many):
         dy = _tangent_p.bind(*x, *fixed, *dx, **{**params, "many": True})
         dy = [d.reshape(lanes, -1, *d.shape[1:]) for d in dy] if many else dy
         return dy, [0] * len(dy)
-    # Lanes: the same solve at many points, one direction each; a tangent has the shape of its primal.
-    dx = widen(dx, batched_dx)
+    # Lanes: the same solve at many points, one direction each; a tangent has the shape of its primal. What is shared by
+    # all, a network, is not repeated: products with it are of matrices then, and so are those that make its gradient.
+    apart = [many or a or b for a, b in zip(batched_x, batched_dx)]
+    x, dx = (widen(y, [b or not a for b, a in zip(have, apart)]) for y, have in ((x, batched_x), (dx, batched_dx)))
+    along = lambda dx: _lanes(x, fixed, dx, apart, batched_fixed, lanes, params)
     if many:
         # One direction after the other of each lane.
-        along = lambda dx: _lanes(x, fixed, dx, batched_x, batched_fixed, lanes, params)
         dy = lax.map(along, [jnp.moveaxis(d, 1, 0) for d in dx])
         dy = [jnp.moveaxis(d, 0, 1) for d in dy]
     else:
-        dy = _lanes(x, fixed, dx, batched_x, batched_fixed, lanes, params)
+        dy = along(dx)
     return dy, [0] * len(dy)
 
 
-def _lanes(x, fixed, dx, batched_x, batched_fixed, lanes, params):
-    x = [a if here else jnp.broadcast_to(a, (lanes, *a.shape)) for a, here in zip(x, batched_x)]
-    in_axes = [0] * len(x) + [0 if here else None for here in batched_fixed]
+def _lanes(x, fixed, dx, apart, batched_fixed, lanes, params):
+    in_axes = [0 if here else None for here in (*apart, *batched_fixed)]
     outputs, shapes = params["outputs"], params["shapes"]
 
     def lane_outputs(adjoint, *operands):
@@ -273,6 +338,9 @@ def _lanes(x, fixed, dx, batched_x, batched_fixed, lanes, params):
     return _tangent_p.bind(*x, *fixed, *dx, **{**params, "outputs": lane_outputs, "shapes": shapes, "many": False})
 
 
+_solve_p = primitive(
+    "lagjax_trajectory", _solved, _solved_shapes, several=True, jvp=_solved_jvp, batched=_solved_batched
+)
 _tangent_p = primitive(
     "lagjax_trajectory_tangent", _tangent, _tangent_shapes,
     several=True, jvp=_tangent_jvp, transpose=_tangent_transpose, batched=_tangent_batched,

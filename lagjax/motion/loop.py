@@ -21,6 +21,8 @@ from lagjax.mechanics.structure import angles
 from lagjax.motion.arriving import Arriving, together
 from lagjax.motion.consistency import stopped
 from lagjax.motion.crossing_times import Located, at_known_times, first_end, locate
+from lagjax.motion.recording import Problem, Recorded
+from lagjax.motion.replay import Replay, replayed
 from lagjax.motion.sight import Sight
 from lagjax.motion.stepping import Field, OnManifold, Quick, QuickField, forward_differentiable
 from lagjax.motion.tolerances import Scales, Tolerances, Weighing, as_nothing
@@ -39,7 +41,7 @@ BAUMGARTE_DECAYS = 50.0
 class Solution(NamedTuple):
     """What the loop came to: times that it reached (infinite elsewhere), states there, its last time and state, (1,).
 
-    `located`: where guards are zero; None without guards.
+    `located`: where guards are zero; None without guards. `record`: of the steps, where they can be replayed.
     """
 
     reached: Float[Array, " T"]
@@ -48,6 +50,7 @@ class Solution(NamedTuple):
     stats: dict[str, Array]
     result: diffrax.RESULTS
     located: Located | None
+    record: Recorded | None = None
 
 
 def solution_of(
@@ -77,7 +80,14 @@ def solution_of(
     )
 
 
+def _followed(adjoint, settings):
+    """The adjoint; of a motion that is not stepped from output to output diffrax's own for a replay of its steps."""
+    can = _arriving(settings) and not settings.progress
+    return diffrax.RecursiveCheckpointAdjoint() if isinstance(adjoint, Replay) and not can else adjoint
+
+
 def _loop(equations, start, y0, refused, scales, settings, ts, adjoint, guards=None, repeated=False):
+    adjoint = _followed(adjoint, settings)
     feedback = BAUMGARTE_DECAYS / (ts[-1] - ts[0]) if settings.drift == "baumgarte" else None
     quick, written = None, equations.written
     if written is not None and feedback is None:
@@ -101,10 +111,17 @@ def _loop(equations, start, y0, refused, scales, settings, ts, adjoint, guards=N
         terms, solver, ts[0], ts[-1], settings.dt0, y0, start.params, saveat, controller, _by_position(settings.event),
     )  # fmt: skip
     solve = partial(_diffeqsolve, max_steps=settings.max_steps, adjoint=adjoint, progress=settings.progress)
+    own = lambda: _own_calls_of_the_host(equations, terms, start, guards, settings, controller)
+    if isinstance(adjoint, Replay):
+        assert isinstance(controller, Arriving)
+        first, after = (jnp.searchsorted(ts, ts, side=side) for side in ("left", "right"))
+        problem = Problem(
+            terms, solver, controller, ts, first, after, ts[0], ts[-1], settings.dt0, y0, start.params
+        )  # fmt: skip
+        return _replayed(replayed(problem, settings.max_steps, not own(), adjoint.record), ts)
     # Reverse mode has to look inside.
     if isinstance(adjoint, diffrax.ForwardMode):
-        own = _own_calls_of_the_host(equations, terms, start, guards, settings, controller)
-        reached, outputs, *rest = one_function(solve, *arguments, checked=not own, in_blocks=True)
+        reached, outputs, *rest = one_function(solve, *arguments, checked=not own(), in_blocks=True)
     else:
         reached, outputs, *rest = solve(*arguments)
     assert reached is not None and outputs is not None
@@ -114,6 +131,11 @@ def _loop(equations, start, y0, refused, scales, settings, ts, adjoint, guards=N
         (reached, end_t), (outputs, end_y) = reached, outputs
         end = end_t, end_y
     return Solution(reached, outputs, end, *rest)
+
+
+def _replayed(found: Recorded, ts) -> Solution:
+    end = found.t[None], jax.tree.map(lambda x: x[None], found.y)
+    return Solution(jnp.where(found.reached, ts, jnp.inf), found.outputs, end, found.stats, found.result, None, found)
 
 
 def _diffeqsolve(terms, solver, t0, t1, dt0, y0, args, saveat, controller, event, *, max_steps, adjoint, progress):
@@ -184,12 +206,12 @@ def _solver(equations, quick, feedback, refused, settings, adjoint):
 
 def _in_a_loop(method, adjoint):
     """The method with a loop over its stages, of the kind that the derivative needs."""
-    if isinstance(method, Nystrom):
+    if isinstance(method, Nystrom) or isinstance(method, ExplicitRungeKutta) and isinstance(adjoint, Replay):
         return type(method)(in_a_loop=True)
     # A subclass may have a tableau of its own, which diffrax's implementation does not know.
     ours = isinstance(method, ExplicitRungeKutta) and method.tableau is method.shipped.tableau
     method = method.shipped if ours else method
-    if isinstance(adjoint, diffrax.RecursiveCheckpointAdjoint | diffrax.DirectAdjoint):
+    if isinstance(adjoint, diffrax.RecursiveCheckpointAdjoint | diffrax.DirectAdjoint | Replay):
         return forward_differentiable(method)
     return eqx.tree_at(lambda s: s.scan_kind, method, "lax", is_leaf=lambda x: x is None) if ours else method
 

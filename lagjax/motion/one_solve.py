@@ -64,6 +64,7 @@ def solved(system, q0, v0, params, ts, guards, settings, adjoint, seen=None):
     rows = jax.vmap(equations.outside)
     end, events = fields["end"], fields["events"]
     return fields | {
+        "record": solution.record,
         "q": rows(fields["q"]),
         "v": rows(fields["v"]),
         "end": end._replace(q=equations.outside(end.q), v=equations.outside(end.v)),

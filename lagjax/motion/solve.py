@@ -171,12 +171,14 @@ def _trajectory(system, q0, v0, params, ts, guards, settings):
         unroll_up_to = 0 if differentiated else settings.unroll_up_to
         careful = settings.careful or differentiated and settings.adjoint is None
         settings = replace(settings, jump_ts=jump_ts, unroll_up_to=unroll_up_to, careful=careful)
-        return solve(*motion, settings, adjoint)
+        fields = solve(*motion, settings, adjoint)
+        return fields, fields.pop("record", None)
 
     if settings.adjoint is None:
-        fields = solve_in_both_modes(of_arrays, x, fixed)
+        # Each leg of a motion in phases is replayed by itself.
+        fields = solve_in_both_modes(of_arrays, x, fixed, recorded=not isinstance(system, Hybrid))
     else:
-        fields = of_arrays(x, fixed, settings.adjoint, True)
+        fields, _ = of_arrays(x, fixed, settings.adjoint, True)
     arrays, described = pack(system, params, asked, how)
     settled = fields.pop("settled")
     of = HybridTrajectory if isinstance(system, Hybrid) else Trajectory

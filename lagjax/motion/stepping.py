@@ -210,6 +210,22 @@ class OnManifold(diffrax.AbstractWrappedSolver):
             result = diffrax.RESULTS.where(projected.holds, result, diffrax.RESULTS.nonlinear_divergence)
         return y1, error, solver_state, result
 
+    def again(self, t0, t1, y0):
+        """The end of an accepted step by what is known at its start, and whether it was taken so, or carefully."""
+        if self.quick is None:
+            return self.again_carefully(t0, t1, y0), jnp.asarray(True)
+        if self.jump_ts is not None:
+            t0, t1, _ = between_jumps(t0, t1, self.jump_ts, True)
+        y1, error, *_ = self.quick.solver.step(self.quick_terms, t0, t1, y0, None, None, True)
+        y1 = self.equations.projected(t1, *y1) if self.project else y1
+        return y1, all_finite((y1, error))
+
+    def again_carefully(self, t0, t1, y0):
+        """The end of an accepted step the careful way."""
+        if self.jump_ts is not None:
+            t0, t1, _ = between_jumps(t0, t1, self.jump_ts, True)
+        return self._careful_step(t0, t1, y0, None, True)[0]
+
     def flow(self, t0, y0, t):
         """The state at t, by one step from t0."""
         begin, end = (t0, t) if self.jump_ts is None else between_jumps(t0, t, self.jump_ts, True)[:2]

@@ -80,9 +80,10 @@ class Nystrom(diffrax.AbstractAdaptiveSolver):
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         """One step, its error and all that the dense output needs."""
         tableau, h = self.tableau, terms.contr(t0, t1)
-        first = solver_state if made_jump is False else terms.vf(t0, y0, args)[1]
+        acceleration = lambda t, q: terms.vf(t, (q, y0[1]), args)[1]
+        first = solver_state if made_jump is False else None
         stages = _in_a_loop if self.in_a_loop else _one_by_one
-        last, combined = stages(tableau, lambda t, q: terms.vf(t, (q, y0[1]), args)[1], t0, t1, h, y0, first)
+        first, last, combined = stages(tableau, acceleration, t0, t1, h, y0, first)
         q1 = _position(y0, h, 1, combined(tableau.b_position))
         v1 = jtu.tree_map(lambda v, k: v + h * k, y0[1], combined(tableau.b_velocity))
         dq, dv = (
@@ -105,15 +106,15 @@ def _position(y0, h, c, combined):
 
 
 def _one_by_one(tableau, acceleration, t0, t1, h, y0, first):
-    """The last stage, and the sums of all of them by their weights; zero weights leave no trace."""
-    found = [first]
+    """The first and the last stage, and the sums of all of them by their weights; zero weights leave no trace."""
+    found = [acceleration(t0, y0[0]) if first is None else first]
 
     combined = lambda weights: weighted_sum(None, weights, found)
     for c, row in zip(tableau.c[1:], tableau.a):
         # Rounded differently, the last stage would not be at the time of the next step's first.
         t = t1 if c == 1 else t0 + c * (t1 - t0)
         found.append(acceleration(t, _position(y0, h, c, combined(row))))
-    return found[-1], combined
+    return found[0], found[-1], combined
 
 
 def _in_a_loop(tableau, acceleration, t0, t1, h, y0, first):
@@ -130,9 +131,12 @@ def _in_a_loop(tableau, acceleration, t0, t1, h, y0, first):
         q = _position(y0, h, nodes[i], jtu.tree_map(by(rows[i]), found))
         return jtu.tree_map(lambda ks, k: ks.at[i].set(k), found, acceleration(t, q))
 
-    start = jtu.tree_map(lambda k: jnp.zeros((count, *jnp.shape(k)), jnp.result_type(k)).at[0].set(k), first)
-    found = lax.fori_loop(1, count, stage, start)
-    return jtu.tree_map(lambda ks: ks[-1], found), lambda weights: jtu.tree_map(by(weights), found)
+    start = jtu.tree_map(lambda q: jnp.zeros((count, *jnp.shape(q)), jnp.result_type(q)), y0[0])
+    if first is not None:
+        start = jtu.tree_map(lambda ks, k: ks.at[0].set(k), start, first)
+    found = lax.fori_loop(0 if first is None else 1, count, stage, start)
+    first, last = (jtu.tree_map(lambda ks: ks[i], found) for i in (0, -1))
+    return first, last, lambda weights: jtu.tree_map(by(weights), found)
 
 
 class Quintic(Interpolation):

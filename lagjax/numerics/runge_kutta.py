@@ -17,6 +17,7 @@ import diffrax
 import equinox as eqx
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import numpy as np
 from equinox import AbstractClassVar
 from jax import lax
 
@@ -25,11 +26,14 @@ class ExplicitRungeKutta(diffrax.AbstractAdaptiveSolver):
     """An embedded explicit method for `diffrax.diffeqsolve`, with the tableau of its subclass.
 
     `shipped` is diffrax's implementation of it, for vector fields that are too large to be written out for each stage.
+    `in_a_loop` compiles the vector field once for all stages, too, in a loop that both modes differentiate.
     """
 
     tableau: AbstractClassVar[diffrax.ButcherTableau]
     shipped: AbstractClassVar[diffrax.AbstractERK]
     term_structure: ClassVar = diffrax.AbstractTerm
+
+    in_a_loop: bool = eqx.field(default=False, static=True)
 
     def func(self, terms, t0, y0, args):
         """The vector field."""
@@ -43,6 +47,8 @@ class ExplicitRungeKutta(diffrax.AbstractAdaptiveSolver):
         """One step, its error and all that the dense output needs."""
         tableau, control = self.tableau, terms.contr(t0, t1)
         first = solver_state
+        if self.in_a_loop:
+            return self._in_a_loop(terms, t0, t1, y0, args, first if made_jump is False else None)
         if first is None or made_jump is not False:
             first = terms.vf(t0, y0, args)
         increments, rate = [terms.prod(first, control)], first
@@ -55,6 +61,30 @@ class ExplicitRungeKutta(diffrax.AbstractAdaptiveSolver):
         error = weighted_sum(None, tableau.b_error, increments)
         stages = jtu.tree_map(lambda *k: jnp.stack(k), *increments)
         return y1, error, {"y0": y0, "y1": y1, "k": stages}, rate if tableau.fsal else None, diffrax.RESULTS.successful
+
+    def _in_a_loop(self, terms, t0, t1, y0, args, first):
+        """The same with the vector field compiled once; without a `first` stage it is one of the loop's."""
+        tableau, control, count = self.tableau, terms.contr(t0, t1), len(self.tableau.b_sol)
+        rows = np.zeros((count, count))
+        for i, row in enumerate(tableau.a_lower, start=1):
+            rows[i, :i] = row
+        nodes, rows = jnp.asarray(np.append(0.0, tableau.c), jnp.result_type(t0)), jnp.asarray(rows)
+        by = lambda weights, ks: jtu.tree_map(lambda k: jnp.tensordot(weights.astype(k.dtype), k, 1), ks)
+
+        def stage(i, ks):
+            t = jnp.where(nodes[i] == 1, t1, t0 + nodes[i] * (t1 - t0))
+            y = jtu.tree_map(jnp.add, y0, terms.prod(by(rows[i], ks), control))
+            return jtu.tree_map(lambda ks, k: ks.at[i].set(k), ks, terms.vf(t, y, args))
+
+        ks = jtu.tree_map(lambda y: jnp.zeros((count, *jnp.shape(y)), jnp.result_type(y)), y0)
+        if first is not None:
+            ks = jtu.tree_map(lambda ks, k: ks.at[0].set(k), ks, first)
+        ks = lax.fori_loop(0 if first is None else 1, count, stage, ks)
+        of = lambda weights: terms.prod(by(jnp.asarray(np.asarray(weights)), ks), control)
+        y1 = jtu.tree_map(jnp.add, y0, of(tableau.b_sol))
+        last = jtu.tree_map(lambda k: k[-1], ks) if tableau.fsal else None
+        dense = {"y0": y0, "y1": y1, "k": terms.prod(ks, control)}
+        return y1, of(tableau.b_error), dense, last, diffrax.RESULTS.successful
 
 
 def weighted_sum(start, weights, increments):

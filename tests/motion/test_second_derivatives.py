@@ -1,14 +1,11 @@
 """Second derivatives in every order of the modes, of few numbers and of many."""
 
-from functools import partial
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import lagjax as lj
-from lagjax.motion import both_modes
 from tests.tiers import exhaustive_but
 
 TS = np.array([0.0, 0.9])
@@ -59,18 +56,8 @@ def test_gradients_of_gradients():
 
 @pytest.mark.exhaustive
 def test_a_hessian_times_a_vector_by_many_numbers():
-    """`jvp(grad)` by 30 numbers, whose gradient goes through the checkpoints, is that of the formula."""
+    """`jvp(grad)` by 30 numbers, whose gradient is a replay of the steps, is that of the formula."""
     along = jax.tree.map(np.cos, MANY)
     product = lambda f: jax.jvp(jax.grad(f), (MANY,), (along,))[1]
     found, expected = product(of_thirty), product(of_thirty_by_hand)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-7), found, expected)
-
-
-@pytest.mark.slow
-def test_too_many_numbers_are_refused(monkeypatch):
-    """In words, with what does work; the gradient itself is not refused."""
-    monkeypatch.setattr(both_modes, "PUSH_AT_MOST", 29)
-    with pytest.raises(NotImplementedError, match="(?s)gradient by 30 numbers.*Usual cause: a Hessian.*Fix: jax.jvp"):
-        # Another system: what JAX has traced it does not ask about again.
-        of_another = partial(of_thirty, system=lj.System(lambda t, q, v, p: of_many.lagrangian(t, q, v, p)))
-        jax.jvp(jax.grad(of_another), (MANY,), (MANY,))

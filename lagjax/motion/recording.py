@@ -1,0 +1,225 @@
+"""A loop over steps that keeps a record of those it accepts, in a room of fixed size.
+
+Reverse mode asks for the accepted steps from the last to the first. How many there are is known when the motion is
+over, and arrays have a size before that. So the last `ROWS` steps are kept in full, each by its two times and the state
+that it starts from, and of every `ROWS`-th step all that the loop depends on (a `Place`), from which the loop can be
+run again to fill the rows with the steps before them. Of these places there is room for `PLACES`: when it is used up
+every other one is given up, and from then on they are kept half as often. The longest motions are so run again in
+pieces, some of them more than once (`ROWS * PLACES` steps: each once), and memory stays what it is.
+
+It is diffrax's loop of an adaptive solve whose outputs are ends of steps, with diffrax's solvers and controllers. That
+one keeps a record too (`SaveAt(steps=True)`), of as many rows as there may be steps: a million.
+"""
+
+from typing import Any, NamedTuple
+
+import diffrax
+import equinox as eqx
+import equinox.internal as eqxi
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int, PyTree
+
+from lagjax.motion.arriving import Arriving
+from lagjax.motion.stepping import OnManifold
+
+# A row of a pendulum takes 40 bytes: in a thousand lanes the rows take 20 MB.
+ROWS = 512
+PLACES = 64
+# diffrax ends a solve from here on, in units of the last digit of its last time.
+CLIPPED = 100
+
+
+class Problem(NamedTuple):
+    """What a motion is stepped through with; the outputs `ts` increase, and begin and end with `t0` and `t1`.
+
+    Of each output: `first`, the first of those at its time, and `after`, the first of those at a later one.
+    """
+
+    terms: PyTree[diffrax.AbstractTerm]
+    solver: OnManifold
+    controller: Arriving
+    ts: Float[Array, " T"]
+    first: Int[Array, " T"]
+    after: Int[Array, " T"]
+    t0: Float[Array, ""]
+    t1: Float[Array, ""]
+    dt0: Float[Array, ""] | None
+    y0: PyTree[Float[Array, "..."]]
+    args: PyTree
+
+
+class Place(NamedTuple):
+    """Where the loop stands: all that the step from t to t1 and those after it depend on."""
+
+    t: Float[Array, ""]
+    t1: Float[Array, ""]
+    y: PyTree[Float[Array, "..."]]
+    solver_state: PyTree
+    controller_state: PyTree
+
+
+class Rows(NamedTuple):
+    """The last accepted steps, the k-th in row k modulo `ROWS`: their times and the states that they start from."""
+
+    t0: Float[Array, " R"]
+    t1: Float[Array, " R"]
+    y0: PyTree[Float[Array, "R ..."]]
+
+
+class Record(NamedTuple):
+    """What reverse mode needs of a motion.
+
+    `count`: how many steps it has; `rows`: the last of them; `places`: where every (`ROWS * stride`)-th of them begins;
+    `saved`: the first output that was not reached.
+    """
+
+    count: Int[Array, ""]
+    rows: Rows
+    places: Place
+    stride: Int[Array, ""]
+    saved: Int[Array, ""]
+
+
+class Recorded(NamedTuple):
+    """What the loop came to, as diffrax says it, and the record."""
+
+    reached: Bool[Array, " T"]
+    outputs: PyTree[Float[Array, "T ..."]]
+    t: Float[Array, ""]
+    y: PyTree[Float[Array, "..."]]
+    stats: dict[str, Array]
+    result: Any
+    record: Record
+
+
+class _Run(NamedTuple):
+    """The state of the loop. `outputs` and `saved` are those of `Recorded`; None where it runs again."""
+
+    place: Place
+    rows: Rows
+    steps: Int[Array, ""]
+    accepted: Int[Array, ""]
+    result: Any
+    outputs: PyTree | None
+    saved: Int[Array, ""] | None
+
+
+def recorded(problem: Problem, max_steps: int | None) -> Recorded:
+    """Step through a motion, as `diffrax.diffeqsolve` does."""
+    p, zero = problem, jnp.asarray(0)
+    outputs = jax.tree.map(lambda x: jnp.broadcast_to(x, (p.ts.size, *x.shape)), p.y0)
+    place = _first(p)
+    places = jax.tree.map(lambda x: jnp.broadcast_to(x, (PLACES, *jnp.shape(x))), place)
+    start = _Run(place, _no_rows(p), zero, zero, _well(), outputs, p.after[0])
+    on = lambda run: _is_on(p, run, max_steps)
+
+    def onward(state):
+        run, places, stride = state
+        number = run.accepted // ROWS
+        full = on(run) & (number >= PLACES * stride)
+        places = lax.cond(eqxi.unvmap_any(full), lambda: _thinned(places, full), lambda: places)
+        stride = jnp.where(full, 2 * stride, stride)
+        here = on(run) & (number % stride == 0)
+        put = lambda all, x: _put(all, jnp.minimum(number // stride, PLACES - 1), x, here)
+        places = jax.tree.map(put, places, run.place)
+        return _until(p, run, (number + 1) * ROWS, max_steps), places, stride
+
+    state = start, places, jnp.asarray(1)
+    run, places, stride = lax.while_loop(lambda state: eqxi.unvmap_any(on(state[0])), onward, state)
+    result = diffrax.RESULTS.where(on(run._replace(steps=zero)), diffrax.RESULTS.max_steps_reached, run.result)
+    # diffrax looks for outputs at the end of each accepted step; without time to go there is none.
+    reached = (p.first < run.saved) & ((run.accepted > 0) | (p.t0 == p.t1))
+    stats = {"num_steps": run.steps, "num_accepted_steps": run.accepted, "num_rejected_steps": run.steps - run.accepted}
+    record = Record(run.accepted, run.rows, places, stride, run.saved)
+    outputs = jax.tree.map(lambda x: x[p.first], run.outputs)
+    return Recorded(reached, outputs, run.place.t, run.place.y, stats, result, record)
+
+
+def recorded_again(problem: Problem, record: Record, number) -> Rows:
+    """The rows of the steps from `number * ROWS` on, by running again from a place before them."""
+    slot = jnp.maximum(number, 0) // record.stride
+    place, begun = jax.tree.map(lambda x: x[slot], record.places), slot * record.stride * ROWS
+    run = _Run(place, record.rows, begun, begun, _well(), None, None)
+    return _until(problem, run, jnp.minimum((number + 1) * ROWS, record.count), None).rows
+
+
+def _well():
+    """That all went well so far, as a number that may change in a loop."""
+    return diffrax.RESULTS.where(jnp.asarray(True), diffrax.RESULTS.successful, diffrax.RESULTS.successful)
+
+
+def _first(p: Problem) -> Place:
+    controller, order = p.controller, p.solver.error_order(p.terms)
+    t1, state = controller.init(p.terms, p.t0, p.t1, p.y0, p.dt0, p.args, p.solver.func, order)
+    t1 = jnp.minimum(t1, p.t1)
+    place = Place(p.t0, t1, p.y0, p.solver.init(p.terms, p.t0, t1, p.y0, p.args), state)
+    return jax.tree.map(jnp.asarray, place)
+
+
+def _no_rows(p: Problem) -> Rows:
+    # Where there is no step a row is the start: finite, for who looks at it in vain.
+    rows = lambda x: jnp.broadcast_to(x, (ROWS, *x.shape))
+    return Rows(rows(p.t0), rows(p.t0), jax.tree.map(rows, p.y0))
+
+
+def _thinned(places, full):
+    half = lambda x: jnp.concatenate([x[::2], x[PLACES // 2 :]])
+    return jax.tree.map(lambda x: jnp.where(full, half(x), x), places)
+
+
+def _is_on(p: Problem, run: _Run, max_steps):
+    on = (run.place.t < p.t1) & diffrax.is_successful(run.result)
+    return on if max_steps is None else on & (run.steps < max_steps)
+
+
+def _until(p: Problem, run: _Run, limit, max_steps) -> _Run:
+    """The loop up to a number of accepted steps.
+
+    In a batch whole arrays would be selected in each turn for lanes that are done: here only the numbers that change.
+    """
+    on = lambda run: _is_on(p, run, max_steps) & (run.accepted < limit)
+
+    def turn(run: _Run) -> _Run:
+        here, place, row = on(run), run.place, run.accepted % ROWS
+        further, keep, result = _step(p, place)
+        # A step that is rejected is written over by the one after it.
+        rows = jax.tree.map(lambda all, x: _put(all, row, x, here), run.rows, Rows(place.t, place.t1, place.y))
+        outputs, saved = run.outputs, run.saved
+        if outputs is not None:
+            i = jnp.minimum(saved, p.ts.size - 1)
+            hit = here & keep & (saved < p.ts.size) & (place.t1 >= p.ts[i])
+            outputs = jax.tree.map(lambda all, x: _put(all, i, x, hit), outputs, further.y)
+            saved = jnp.where(hit, p.after[i], saved)
+        place, result = _where(here, (further, result), (place, run.result))
+        return _Run(place, rows, run.steps + here, run.accepted + (here & keep), result, outputs, saved)
+
+    return lax.while_loop(lambda run: eqxi.unvmap_any(on(run)), turn, run)
+
+
+def _step(p: Problem, place: Place):
+    """The place after one more attempt, whether it was accepted, and what went wrong."""
+    order, results = p.solver.error_order(p.terms), diffrax.RESULTS
+    y, error, _, solver_state, solved = p.solver.step(
+        p.terms, place.t, place.t1, place.y, p.args, place.solver_state, False
+    )
+    error = jax.tree.map(lambda x: jnp.where(jnp.isnan(x), jnp.inf, x), error)
+    keep, t, t1, _, controller_state, judged = p.controller.adapt_step_size(
+        place.t, place.t1, place.y, y, p.args, error, order, place.controller_state
+    )
+    t = jnp.minimum(t, p.t1)
+    nearly = p.t1 - CLIPPED * jnp.finfo(p.t1.dtype).eps * jnp.abs(p.t1)
+    t1 = jnp.where(t1 > nearly, jnp.where(keep, p.t1, t + 0.5 * (p.t1 - t)), t1)
+    y, solver_state = _where(keep, (y, solver_state), (place.y, place.solver_state))
+    solved = results.where(keep, solved, results.successful)
+    result = results.where(diffrax.is_okay(solved), judged, solved)
+    return Place(t, t1, y, solver_state, controller_state), keep, result
+
+
+def _put(all, i, x, here):
+    return all.at[i].set(jnp.where(here, x, all[i]))
+
+
+def _where(condition, a, b):
+    return jax.tree.map(lambda x, y: jnp.where(condition, x, y) if eqx.is_array(y) else y, a, b)

@@ -1,0 +1,217 @@
+"""Reverse mode by replay: the accepted steps from the last to the first, each pulled back by itself.
+
+A motion is a chain of steps, y_{i+1} = Phi(t_i, t_{i+1}, y_i, p). With the cotangents c_i of the states that are asked
+for, and l_N = c_N at its end,
+
+    (dp_i, l_i) = (∂Phi/∂(p, y))ᵀ l_{i+1},    l_i += c_i,    dp = Σ dp_i
+
+takes one step at a time, from where it was taken: the step as it was, with its return to the constraints and with the
+constraint equations chosen at its start; what the method keeps from step to step is computed anew. The controller, the
+steps that it rejected and the search for events are not there. Where steps end is constant, as it is in a solve that is
+pushed forward; but outputs and jumps are ends of steps, and the cotangents of these times are theirs.
+
+`recording.py` keeps the steps, `way_back.py` goes over them. Both loops, there and back, are one primitive and its
+linear derivative, with rules for lanes.
+"""
+
+from dataclasses import dataclass
+from functools import partial
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jax.core import ShapedArray
+
+from lagjax.jax_internals.one_function import one_function
+from lagjax.jax_internals.primitives import ad, primitive
+from lagjax.motion.recording import Problem, Recorded, recorded
+from lagjax.motion.way_back import Lanes, Motion, filled, swept_back, together
+
+
+@dataclass(frozen=True)
+class Replay:
+    """In place of one of diffrax's adjoints: differentiate the motion by a replay of its steps, where that can be.
+
+    `record`: what an earlier call at the same point found; it is then not stepped through again.
+    """
+
+    record: Recorded | None = None
+
+
+def replayed(problem: Problem, max_steps: int | None, checked: bool, known: Recorded | None = None) -> Recorded:
+    """The motion, which is replayed where it is differentiated in reverse; its values, where they are `known`."""
+    arrays, static = eqx.partition(problem, eqx.is_array)
+    given, structure = jtu.tree_flatten(arrays)
+    # What is passed twice, as by a solver and by the controller that asks it, is one operand.
+    leaves = list({id(x): x for x in given}.values())
+    number = {id(x): i for i, x in enumerate(leaves)}
+
+    def results(*leaves):
+        found = one_function(recorded, motion.problem(leaves), max_steps, checked=checked, in_blocks=True)
+        arrays, others = eqx.partition(found, eqx.is_array)
+        motion.found.append((jtu.tree_structure(arrays), others))
+        return jtu.tree_leaves(arrays)
+
+    # Jitted, so that it is traced once.
+    places = tuple(number[id(x)] for x in given)
+    motion = Motion(structure, places, static, max_steps, checked, jax.jit(results), [])
+    if known is None:
+        return motion.recorded(_run_p.bind(*leaves, motion=motion, lanes=None))
+    values, rest = eqx.partition(known, eqx.is_array)
+    values, structure = jtu.tree_flatten(values)
+    motion.found.append((structure, rest))
+    return motion.recorded(_known_p.bind(*leaves, *values, motion=motion, lanes=None))
+
+
+# The operands of the first primitive are the arrays of the problem, its results those of the record. Those of its
+# derivative are both, and tangents of the arrays that are `moved`; its results the tangents of the floating ones.
+
+
+def _run(*leaves, motion, lanes):
+    return motion.results(*leaves) if lanes is None else lanes.each(motion.results)(*leaves)
+
+
+def _run_shapes(*leaves, motion, lanes):
+    like = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in leaves]
+    found = jax.eval_shape(lambda *leaves: _run(*leaves, motion=motion, lanes=lanes), *like)
+    return [ShapedArray(x.shape, x.dtype) for x in found]
+
+
+def _known(*operands, motion, lanes):
+    return list(operands[motion.size :])
+
+
+def _known_jvp(primals, tangents, *, motion, lanes):
+    # The values are those at the arrays that are given, so that what these move by says it all.
+    values, leaves = _known_p.bind(*primals, motion=motion, lanes=lanes), primals[: motion.size]
+    return values, _derivative(leaves, values, tangents[: motion.size], motion, lanes)
+
+
+def _known_batched(operands, axes, *, motion, lanes):
+    count = next(x.shape[axis] for x, axis in zip(operands, axes) if axis is not None)
+    front = [x if axis is None else jnp.moveaxis(x, axis, 0) for x, axis in zip(operands, axes)]
+    batched = [axis is not None for axis in axes]
+    leaves, values = front[: motion.size], front[motion.size :]
+    values = [x if b else jnp.broadcast_to(x, (count, *x.shape)) for x, b in zip(values, batched[motion.size :])]
+    if lanes is None:
+        both, back = Lanes(count, tuple(batched[: motion.size])), lambda x: x
+    else:
+        leaves, both = _lanes_of_lanes(leaves, batched, lanes, count)
+        values = [x.reshape(count * lanes.count, *x.shape[2:]) for x in values]
+        back = lambda x: x.reshape(count, lanes.count, *x.shape[1:])
+    found = [back(x) for x in _known_p.bind(*leaves, *values, motion=motion, lanes=both)]
+    return found, [0] * len(found)
+
+
+def _run_jvp(primals, tangents, *, motion, lanes):
+    values = _run_p.bind(*primals, motion=motion, lanes=lanes)
+    return values, _derivative(primals, values, tangents, motion, lanes)
+
+
+def _derivative(leaves, values, tangents, motion, lanes):
+    moved = tuple(i for i, t in enumerate(tangents) if not isinstance(t, ad.Zero))
+    zero = lambda x: ad.Zero(jax.typeof(x).to_tangent_aval())
+    if not moved:
+        return [zero(x) for x in values]
+    moving = [tangents[i] for i in moved]
+    found = iter(_moved_p.bind(*leaves, *values, *moving, motion=motion, lanes=lanes, moved=moved))
+    return [next(found) if _is_float(x) else zero(x) for x in values]
+
+
+def _run_batched(operands, axes, *, motion, lanes):
+    front = [x if axis is None else jnp.moveaxis(x, axis, 0) for x, axis in zip(operands, axes)]
+    batched = tuple(axis is not None for axis in axes)
+    count = next(x.shape[0] for x, b in zip(front, batched) if b)
+    if lanes is None:
+        found = _run_p.bind(*front, motion=motion, lanes=Lanes(count, batched))
+        return found, [0] * len(found)
+    flat, both = _lanes_of_lanes(front, batched, lanes, count)
+    found = _run_p.bind(*flat, motion=motion, lanes=both)
+    return [x.reshape(count, lanes.count, *x.shape[1:]) for x in found], [0] * len(found)
+
+
+def _lanes_of_lanes(leaves, batched, lanes, count):
+    """Lanes of lanes are lanes."""
+    flat = []
+    for x, b, inner in zip(leaves, batched, lanes.batched):
+        if b or inner:
+            x = x if b else jnp.broadcast_to(x, (count, *x.shape))
+            x = x if inner else jnp.broadcast_to(x[:, None], (count, lanes.count, *x.shape[1:]))
+            x = x.reshape(count * lanes.count, *x.shape[2:])
+        flat.append(x)
+    return flat, Lanes(count * lanes.count, tuple(b or inner for b, inner in zip(batched, lanes.batched)))
+
+
+def _operands(operands, motion, moved):
+    """The arrays of the problem, those of the record, and the tangents."""
+    size = motion.size
+    return operands[:size], operands[size : len(operands) - len(moved)], operands[len(operands) - len(moved) :]
+
+
+def _moved(*operands, motion, lanes, moved):
+    leaves, _, moving = _operands(operands, motion, moved)
+
+    def of_moved(*chosen):
+        found = _run(*filled(leaves, moved, chosen), motion=motion, lanes=lanes)
+        return [x for x in found if _is_float(x)]
+
+    return jax.jvp(of_moved, tuple(leaves[i] for i in moved), tuple(moving))[1]
+
+
+def _moved_shapes(*operands, motion, lanes, moved):
+    return [ShapedArray(x.shape, x.dtype) for x in _operands(operands, motion, moved)[1] if _is_float(x)]
+
+
+def _moved_jvp(primals, tangents, **params):
+    # Only forward: the derivative of what is pushed.
+    tangents = [ad.instantiate_zeros(t) for t in tangents]
+    return jax.jvp(partial(_moved, **params), primals, tuple(tangents))
+
+
+def _moved_batched(operands, axes, **params):
+    # Many directions, pushed forward.
+    count = next(x.shape[axis] for x, axis in zip(operands, axes) if axis is not None)
+    found = jax.vmap(lambda *x: _moved(*x, **params), axes, axis_size=count)(*operands)
+    return found, [0] * len(found)
+
+
+def _moved_transpose(cotangents, *operands, motion, lanes, moved):
+    leaves, values, _ = _operands(operands, motion, moved)
+    given = iter(cotangents)
+    given = jtu.tree_unflatten(motion.found[0][0], [next(given) if _is_float(x) else None for x in values])
+    of_record = jtu.tree_leaves(given.record, is_leaf=_is_zero)
+    if any(eqx.is_array(ct) for ct in of_record):
+        raise NotImplementedError(
+            "a reverse derivative of the record of a motion's steps.\n"
+            "Usual cause: reverse mode over a derivative that was itself taken in reverse.\n"
+            "Fix: jax.jvp of it, along each direction that is wanted."
+        )
+    asked = given.outputs, given.t, given.y
+    asked = jax.tree.map(ad.instantiate_zeros, asked, is_leaf=_is_zero)
+    asked = together(leaves, motion, lanes, asked[0]), *asked[1:]
+    swept = partial(swept_back, motion=motion, moved=moved, lanes=lanes)
+    if lanes is None:
+        found = one_function(swept, leaves, motion.recorded(values), asked, checked=motion.checked, in_blocks=True)
+    else:
+        found = swept(leaves, motion.recorded(values), asked)
+    return [None] * (len(leaves) + len(values)) + found
+
+
+def _is_float(x):
+    return jnp.issubdtype(x.dtype, jnp.inexact)
+
+
+def _is_zero(x):
+    return isinstance(x, ad.Zero)
+
+
+_run_p = primitive("lagjax_recorded", _run, _run_shapes, several=True, jvp=_run_jvp, batched=_run_batched)
+_known_p = primitive(
+    "lagjax_recorded_before", _known, lambda *operands, motion, lanes: list(operands[motion.size :]),
+    several=True, jvp=_known_jvp, batched=_known_batched,
+)  # fmt: skip
+_moved_p = primitive(
+    "lagjax_recorded_tangent", _moved, _moved_shapes,
+    several=True, jvp=_moved_jvp, transpose=_moved_transpose, batched=_moved_batched,
+)  # fmt: skip

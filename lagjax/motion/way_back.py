@@ -1,0 +1,253 @@
+"""The way back over the recorded steps of a motion: what `replay.py` is about, as a loop.
+
+It goes through the steps in pieces of as many as there are rows, the last piece first, whose rows are in hand; those
+before it are run again, each from a place that was kept. In a batch a step of all lanes is pulled back at once, so that
+the cotangents of what they share are sums inside products of matrices. Lanes have different numbers of steps: each
+begins with its own last one, and stands still when it is through.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property, partial
+from typing import NamedTuple
+
+import equinox as eqx
+import equinox.internal as eqxi
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jax import lax
+from jaxtyping import Array, Int, PyTree
+
+from lagjax.motion.recording import Problem, Record, Recorded, Rows, recorded_again
+from lagjax.motion.stepping import OnManifold
+
+
+class Lanes(NamedTuple):
+    """Of a batch: how many lanes there are, and which operands have one row for each."""
+
+    count: int
+    batched: tuple[bool, ...]
+
+    def each(self, function, more=0):
+        """`function` of the operands, and of `more` that all are batched, for all lanes."""
+        return jax.vmap(function, [0 if b else None for b in self.batched] + [0] * more, axis_size=self.count)
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """A motion as a function of its arrays, each of them once; all else is kept here."""
+
+    structure: jtu.PyTreeDef
+    places: tuple[int, ...]
+    static: PyTree
+    max_steps: int | None
+    checked: bool
+    results: Callable
+    # The structure of the record, once it has been traced.
+    found: list
+
+    def problem(self, leaves) -> Problem:
+        """The problem with these arrays."""
+        return eqx.combine(jtu.tree_unflatten(self.structure, [leaves[i] for i in self.places]), self.static)
+
+    def recorded(self, arrays) -> Recorded:
+        """The record with these arrays."""
+        structure, others = self.found[0]
+        return eqx.combine(jtu.tree_unflatten(structure, arrays), others)
+
+    @property
+    def size(self) -> int:
+        """How many arrays there are."""
+        return max(self.places) + 1
+
+    @property
+    def careful(self) -> bool:
+        """Whether some steps may have been taken the careful way, and not as they are written out."""
+        solver = self.static.solver
+        return solver.quick is not None and solver.equations.fallback
+
+    @property
+    def where(self) -> Problem:
+        """The problem, in place of each array its number."""
+        return jtu.tree_unflatten(self.structure, self.places)
+
+
+class Sweep(NamedTuple):
+    """How far the way back has come: the step `k` is the next one, and rows are those of the piece `number`.
+
+    `y`: the cotangent of the state where the step k ends, without that of an output there; `moved`: those of the
+    arrays so far; `output`: the last output that is not passed yet.
+    """
+
+    k: Int[Array, ""]
+    number: Int[Array, ""]
+    rows: Rows
+    y: PyTree
+    moved: list
+    output: Int[Array, ""]
+
+
+def swept_back(leaves, found: Recorded, asked, *, motion: Motion, moved, lanes: Lanes | None):
+    """The cotangents of the arrays that are `moved`, from those of the outputs, of the last time and the last state.
+
+    Of outputs at one time the first has the cotangents of all: see `together`.
+    """
+    of_outputs, of_t, of_y = asked
+    way = _Way(leaves, motion, moved, lanes, found.record, of_outputs)
+    total = [jnp.zeros_like(leaves[i]) for i in moved]
+    if way.of_times:
+        total = way.added(total, way.where.controller.ts, way.at_time(found.t, of_t))
+    k = found.record.count - 1
+    output = way.at(way.first, found.record.saved - 1)
+    s = Sweep(k, jnp.where(k >= 0, k // way.many, -1), way.safe(found.record.rows), of_y, total, output)
+    s = lax.while_loop(lambda s: eqxi.unvmap_any(s.k >= 0), way.piece, s)
+    # Outputs at the start are the first state.
+    y, total = jax.tree.map(jnp.add, s.y, way.at(of_outputs, jnp.zeros_like(k))), s.moved
+    for i, ct in zip(jtu.tree_leaves(way.where.y0), jtu.tree_leaves(y)):
+        total = way.added(total, i, ct)
+    return total
+
+
+def together(leaves, motion: Motion, lanes: Lanes | None, of_outputs):
+    """The cotangents of outputs; of those at one time the first has the cotangents of all."""
+    _, first = _outputs(leaves, motion, lanes)
+    summed = lambda first, ct: jnp.zeros_like(ct).at[first].add(ct)
+    summed = summed if lanes is None else jax.vmap(summed)
+    return jax.tree.map(lambda ct: summed(first, ct), of_outputs)
+
+
+def filled(leaves, moved, chosen):
+    """The arrays, those that are moved being the chosen ones."""
+    every = list(leaves)
+    for i, x in zip(moved, chosen):
+        every[i] = x
+    return every
+
+
+@dataclass(frozen=True, eq=False)
+class _Way:
+    """What does not change on the way back, of one lane or of all."""
+
+    leaves: list
+    motion: Motion
+    moved: tuple[int, ...]
+    lanes: Lanes | None
+    record: Record
+    of_outputs: PyTree
+
+    @cached_property
+    def where(self) -> Problem:
+        return self.motion.where
+
+    @cached_property
+    def of_times(self) -> bool:
+        """Whether the cotangents of times are asked for."""
+        return bool({self.where.t0, self.where.controller.ts} & set(self.moved))
+
+    @property
+    def many(self) -> int:
+        """The number of rows."""
+        return self.record.rows.t0.shape[-1]
+
+    @property
+    def ts(self):
+        return _outputs(self.leaves, self.motion, self.lanes)[0]
+
+    @property
+    def first(self):
+        return _outputs(self.leaves, self.motion, self.lanes)[1]
+
+    def is_lane(self, i) -> bool:
+        """Whether the i-th array has a row for each lane."""
+        return self.lanes is not None and self.lanes.batched[i]
+
+    def at(self, tree, i):
+        """The i-th rows."""
+        of = lambda tree, i: jax.tree.map(lambda x: x[i], tree)
+        return of(tree, i) if self.lanes is None else jax.vmap(of)(tree, i)
+
+    def each(self, function: Callable, more: int) -> Callable:
+        """`function(problem, ...)` of the arrays and so many arguments."""
+        of = lambda *x: function(self.motion.problem(x[: len(x) - more]), *x[len(x) - more :])
+        return of if self.lanes is None else self.lanes.each(of, more)
+
+    def safe(self, tree):
+        """Rows for lanes; one without steps stands in for the longest: NaN, its own may be, times zero is NaN."""
+        if self.lanes is None:
+            return tree
+        idle, longest = self.record.count == 0, jnp.argmax(self.record.count)
+        return jax.tree.map(lambda x: jnp.where(_like(idle, x), x[longest][None], x), tree)
+
+    def added(self, total, i, ct):
+        """The cotangents of the arrays with one more, of the i-th, if it is asked for."""
+        if i not in self.moved:
+            return total
+        ct = jnp.sum(ct, axis=0) if self.lanes is not None and not self.is_lane(i) else ct
+        return [x + ct if j == i else x for j, x in zip(self.moved, total)]
+
+    def at_time(self, t, ct):
+        """The cotangent of a time as that of the end of a step that it is."""
+        of = lambda ts, t, ct: jnp.where((jnp.arange(ts.size) == jnp.sum(ts < t)) & (ts == t), ct, 0.0)
+        ends = self.where.controller.ts
+        of = of if self.lanes is None else jax.vmap(of, (0 if self.is_lane(ends) else None, 0, 0))
+        return of(self.leaves[ends], t, ct)
+
+    def pulled(self, t0, t1, y, ct):
+        """The cotangents of the arrays, of both times (None where not asked for) and of the state at a step's start."""
+        leaves = [self.safe(x) if self.is_lane(i) else x for i, x in enumerate(self.leaves)]
+        chosen = [leaves[i] for i in self.moved]
+        start = (chosen, t0, t1, y) if self.of_times else (chosen, y)
+
+        def end(by, chosen, *start):
+            start = start if self.of_times else (t0, t1, *start)
+            step = lambda problem, *start: by(problem.solver, *start)
+            return self.each(step, 3)(*filled(leaves, self.moved, chosen), *start)
+
+        _, pull, believed = jax.vjp(partial(end, OnManifold.again), *start, has_aux=True)
+        if self.motion.careful:
+            # Not a choice between two ends: what is not to be believed has no derivative, and zero times that is NaN.
+            carefully = lambda ct: jax.vjp(partial(end, OnManifold.again_carefully), *start)[1](ct)
+            pull = partial(lax.cond, eqxi.unvmap_all(believed), pull, carefully)
+        of_arrays, *of_start = pull(ct)
+        return (of_arrays, *of_start) if self.of_times else (of_arrays, None, None, *of_start)
+
+    def is_on(self, s: Sweep):
+        """Whether the next step is one of this piece."""
+        return (s.k >= s.number * self.many) & (s.k >= 0)
+
+    def turn(self, s: Sweep) -> Sweep:
+        """One step further back."""
+        here = self.is_on(s)
+        t0, t1, y0 = self.at(s.rows, jnp.maximum(s.k, 0) % self.many)
+        output = jnp.maximum(s.output, 0)
+        time = self.at(self.ts, output)
+        hit = here & (s.output >= 0) & (time > t0) & (time <= t1)
+        only = lambda condition, tree: jax.tree.map(lambda x: jnp.where(_like(condition, x), x, 0.0), tree)
+        ct = jax.tree.map(jnp.add, s.y, only(hit, self.at(self.of_outputs, output)))
+        of_arrays, of_t0, of_t1, of_y = self.pulled(t0, t1, y0, only(here, ct))
+        total = [x + (only(here, d) if self.is_lane(i) else d) for x, d, i in zip(s.moved, of_arrays, self.moved)]
+        if self.of_times:
+            first, ends = here & (s.k == 0), self.where.controller.ts
+            total = self.added(total, self.where.t0, only(first, of_t0))
+            total = self.added(total, ends, self.at_time(t1, only(here, of_t1)))
+            total = self.added(total, ends, self.at_time(t0, only(here & ~first, of_t0)))
+        y = jax.tree.map(lambda x, ct: jnp.where(_like(here, x), x, ct), of_y, ct)
+        return Sweep(s.k - here, s.number, s.rows, y, total, jnp.where(hit, self.at(self.first, output - 1), s.output))
+
+    def piece(self, s: Sweep) -> Sweep:
+        """One piece further back."""
+        number = jnp.where(s.k >= 0, s.k // self.many, -1)
+        again = lambda: self.safe(self.each(recorded_again, 2)(*self.leaves, self.record, number))
+        rows = lax.cond(eqxi.unvmap_any(number < s.number), again, lambda: s.rows)
+        return lax.while_loop(lambda s: eqxi.unvmap_any(self.is_on(s)), self.turn, s._replace(number=number, rows=rows))
+
+
+def _outputs(leaves, motion, lanes):
+    """The times of the outputs, and the first at each of them, of one lane or of all."""
+    of = lambda *leaves: (motion.problem(leaves).ts, motion.problem(leaves).first)
+    return of(*leaves) if lanes is None else lanes.each(of)(*leaves)
+
+
+def _like(mask, x):
+    return mask.reshape(mask.shape + (1,) * (jnp.ndim(x) - jnp.ndim(mask)))
