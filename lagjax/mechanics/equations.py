@@ -66,13 +66,13 @@ class Equations(eqx.Module):
         """The same back in the user's structure."""
         return y if self.unflatten is None else self.unflatten(jnp.stack(y))
 
-    def rates(self, t, q, v, believe=False) -> tuple[PyTree[Array], dict[str, Array]]:
-        """The accelerations, and the multipliers by name; with `believe` of the quick way alone, which may be NaN."""
+    def rates(self, t, q, v) -> tuple[PyTree[Array], dict[str, Array]]:
+        """The accelerations, and the multipliers by name."""
         if self.written is None:
             return self.accelerations(t, q, v)
         a, stacked = self.quickly(t, q, v)
         quickly = a, constraints.split(self.system, stacked, t, q, v, self.params)
-        if believe or not self.fallback:
+        if not self.fallback:
             return quickly
         # A branch also in a batch, where it is taken for all lanes or none.
         return lax.cond(eqxi.unvmap_all(all_finite(quickly)), lambda: quickly, lambda: self.accelerations(t, q, v))

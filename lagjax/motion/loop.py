@@ -24,7 +24,7 @@ from lagjax.motion.crossing_times import Located, at_known_times, first_end, loc
 from lagjax.motion.recording import Problem, Recorded
 from lagjax.motion.replay import Replay, replayed
 from lagjax.motion.sight import Sight
-from lagjax.motion.stepping import Field, OnManifold, Quick, QuickField, forward_differentiable
+from lagjax.motion.stepping import Field, OnManifold, QuickField, forward_differentiable
 from lagjax.motion.tolerances import Scales, Tolerances, Weighing, as_nothing
 from lagjax.motion.watching import Watching
 from lagjax.numerics.nystrom import Nystrom
@@ -91,9 +91,8 @@ def _loop(equations, start, y0, refused, scales, settings, ts, adjoint, guards=N
     feedback = BAUMGARTE_DECAYS / (ts[-1] - ts[0]) if settings.drift == "baumgarte" else None
     quick, written = None, equations.written
     if written is not None and feedback is None:
-        in_a_loop = _in_a_loop(settings.method, adjoint)
-        stages = settings.method if written.equations.length <= settings.unroll_up_to else in_a_loop
-        quick = Quick(stages, in_a_loop)
+        unrolled = written.equations.length <= settings.unroll_up_to
+        quick = settings.method if unrolled else _in_a_loop(settings.method, adjoint)
     # BacksolveAdjoint integrates a larger state backwards: it takes the bare method, and no end beside the outputs.
     bare = isinstance(adjoint, diffrax.BacksolveAdjoint)
     settings = eqx.tree_at(lambda s: s.method, settings, _with_root_finder(settings, scales))

@@ -61,17 +61,6 @@ class QuickField(eqx.Module):
         return y[1], self.equations.quickly(t, *y)[0]
 
 
-class Quick(NamedTuple):
-    """The methods of steps on equations that are written out.
-
-    `inside` is the same method with a loop over its stages, for steps to times inside another one, which are asked for
-    at two places.
-    """
-
-    solver: diffrax.AbstractSolver
-    inside: diffrax.AbstractSolver
-
-
 class OnManifold(diffrax.AbstractWrappedSolver):
     """Wrap `solver`: project after each step (where `project`), and step for dense output.
 
@@ -79,15 +68,15 @@ class OnManifold(diffrax.AbstractWrappedSolver):
     says that steps are chosen by the tolerances. `arriving` says that outputs are wanted at the ends of steps only.
     `jump_ts` become ends of steps by the controller; here each step stays on its side of them.
 
-    The equations belong to the solver, since diffrax hands an interpolation only times and states; with `quick` it
-    steps on those that are written out. `feedback` is the rate of Baumgarte's. Where `refused`, and where a step is not
-    finite, its error is infinite: an adaptive solve ends within a few steps at the smallest step size, one with fixed
-    steps at once.
+    The equations belong to the solver, since diffrax hands an interpolation only times and states; by `quick`, the same
+    method, it steps on those that are written out. `feedback` is the rate of Baumgarte's. Where `refused`, and where a
+    step is not finite, its error is infinite: an adaptive solve ends within a few steps at the smallest step size, one
+    with fixed steps at once.
     """
 
     solver: diffrax.AbstractSolver
     equations: Equations
-    quick: Quick | None
+    quick: diffrax.AbstractSolver | None
     feedback: Float[Array, ""] | None
     refused: Bool[Array, ""]
     tolerances: Tolerances
@@ -147,7 +136,7 @@ class OnManifold(diffrax.AbstractWrappedSolver):
 
     def init(self, terms, t0, t1, y0, args):
         if self.quick is not None:
-            return self.quick.solver.init(self.quick_terms, t0, t1, y0, args)
+            return self.quick.init(self.quick_terms, t0, t1, y0, args)
         return self.solver.init(self.terms, t0, t1, y0, self._stages(t0, y0))
 
     def func(self, terms, t0, y0, args):
@@ -182,7 +171,7 @@ class OnManifold(diffrax.AbstractWrappedSolver):
         quick, terms = self.quick, self.quick_terms
         assert quick is not None
         jumped = True if self.project else made_jump
-        y1, error, _, solver_state, result = quick.solver.step(terms, t0, t1, y0, None, solver_state, jumped)
+        y1, error, _, solver_state, result = quick.step(terms, t0, t1, y0, None, solver_state, jumped)
         if self.project:
             y1 = self.equations.projected(t1, *y1)
         if not self.equations.fallback:
@@ -191,7 +180,7 @@ class OnManifold(diffrax.AbstractWrappedSolver):
 
         def again():
             y1, error, _, result = self._careful_step(t0, t1, y0, None, True)
-            return y1, error, quick.solver.init(terms, t1, t1, y1, None), result
+            return y1, error, quick.init(terms, t1, t1, y1, None), result
 
         # A branch also in a batch, where it is taken for all lanes or none.
         return lax.cond(eqxi.unvmap_all(believed), lambda: (y1, error, solver_state, result), again)
@@ -216,7 +205,7 @@ class OnManifold(diffrax.AbstractWrappedSolver):
             return self.again_carefully(t0, t1, y0), jnp.asarray(True)
         if self.jump_ts is not None:
             t0, t1, _ = between_jumps(t0, t1, self.jump_ts, True)
-        y1, error, *_ = self.quick.solver.step(self.quick_terms, t0, t1, y0, None, None, True)
+        y1, error, *_ = self.quick.step(self.quick_terms, t0, t1, y0, None, None, True)
         y1 = self.equations.projected(t1, *y1) if self.project else y1
         return y1, all_finite((y1, error))
 
@@ -226,21 +215,9 @@ class OnManifold(diffrax.AbstractWrappedSolver):
             t0, t1, _ = between_jumps(t0, t1, self.jump_ts, True)
         return self._careful_step(t0, t1, y0, None, True)[0]
 
-    def flow(self, t0, y0, t):
-        """The state at t, by one step from t0."""
-        begin, end = (t0, t) if self.jump_ts is None else between_jumps(t0, t, self.jump_ts, True)[:2]
-        # Asked seldom: one kind of step compiles in a third of the time of both.
-        if self.quick is None or self.equations.fallback:
-            y = self._careful_step(begin, end, y0, None, True)[0]
-        else:
-            method, terms = self.quick.inside, self.quick_terms
-            y, *_ = method.step(terms, begin, end, y0, None, method.init(terms, begin, end, y0, None), True)
-            y = self.equations.projected(end, *y) if self.project else y
-        return jtu.tree_map(lambda y, y0: jnp.where(t > t0, y, y0), y, y0)
-
-    def rates(self, t, y, believe=False):
-        """The accelerations, and the multipliers by name; with `believe` of a quick result, which may be NaN."""
-        a, multipliers = self.equations.rates(t, *y, believe)
+    def rates(self, t, y):
+        """The accelerations, and the multipliers by name."""
+        a, multipliers = self.equations.rates(t, *y)
         if self.feedback is not None:
             a, _ = self.equations.accelerations(t, *y, self.feedback)
         return a, multipliers
