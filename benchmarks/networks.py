@@ -41,7 +41,7 @@ PROBLEMS = {
     "20,165 numbers, a particle, 100 outputs": Problem("particle", 140, 0, 100, 100.0),
     "20,308 numbers, a double pendulum, 100 outputs": Problem("double pendulum", 139, 0, 100, 100.0),
     "987 numbers, 64 particles, 100 outputs": Problem("particle", 29, 64, 100, 100.0),
-    "987 numbers, a rod with its multiplier, 100 outputs": Problem("rod", 29, 0, 100, 100.0),
+    "987 numbers, a rod with its multiplier, 100 outputs": Problem("rod", 29, 0, 100, 20.0),
 }
 
 

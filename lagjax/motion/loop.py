@@ -206,7 +206,7 @@ def _solver(equations, quick, feedback, refused, settings, adjoint):
 def _in_a_loop(method, adjoint):
     """The method with a loop over its stages, of the kind that the derivative needs."""
     if isinstance(method, Nystrom) or isinstance(method, ExplicitRungeKutta) and isinstance(adjoint, Replay):
-        return type(method)(in_a_loop=True)
+        return replace(method, in_a_loop=True)
     # A subclass may have a tableau of its own, which diffrax's implementation does not know.
     ours = isinstance(method, ExplicitRungeKutta) and method.tableau is method.shipped.tableau
     method = method.shipped if ours else method

@@ -10,7 +10,9 @@ so that w goes to H[c, w] again, forward along w, and to J w, a push. The deriva
 transposed likewise, to H[c, dx], the pull's derivative along dx, and Jᵀ c.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import diffrax
 import equinox as eqx
@@ -82,7 +84,7 @@ class Pull:
     size: int
     fixed: int
     which: tuple
-    outputs: object
+    outputs: Callable
 
     def _parted(self, points):
         return points[: self.size], points[self.size : self.size + self.fixed], points[self.size + self.fixed :]
@@ -115,7 +117,7 @@ class Push:
     """The derivative of a push, at points that are x, what is fixed, and as many directions."""
 
     size: int
-    outputs: object
+    outputs: Callable
 
     def _parted(self, points):
         return points[: self.size], points[self.size : -self.size], points[-self.size :]
@@ -144,7 +146,7 @@ class Push:
 class _OfLanes:
     """The same in a batch: of points and of directions, which have one row for each lane."""
 
-    one: object
+    one: Any
     points: tuple
     moving: tuple
     count: int

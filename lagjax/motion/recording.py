@@ -102,8 +102,8 @@ class _Run(NamedTuple):
     steps: Int[Array, ""]
     accepted: Int[Array, ""]
     result: Any
-    outputs: PyTree | None
-    saved: Int[Array, ""] | None
+    outputs: PyTree
+    saved: Any
 
 
 def recorded(problem: Problem, max_steps: int | None) -> Recorded:

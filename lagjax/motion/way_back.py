@@ -9,7 +9,7 @@ begins with its own last one, and stands still when it is through.
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import equinox.internal as eqxi
@@ -38,7 +38,7 @@ class Lanes(NamedTuple):
 class Motion:
     """A motion as a function of its arrays, each of them once; all else is kept here."""
 
-    structure: jtu.PyTreeDef
+    structure: Any
     places: tuple[int, ...]
     static: PyTree
     max_steps: int | None
@@ -137,7 +137,7 @@ class _Way:
     of_outputs: PyTree
 
     @cached_property
-    def where(self) -> Problem:
+    def where(self) -> Any:
         return self.motion.where
 
     @cached_property

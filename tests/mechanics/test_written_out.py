@@ -115,6 +115,9 @@ def test_the_compiled_program():
     assert "lapack" in text.lower()
     assert not is_small(many, *coordinates.state(0.0, np.ones(9), np.ones(9), PARAMS))
     assert is_small(seven, *coordinates.state(0.0, np.ones(7), np.ones(7), PARAMS))
+    # A network in L is for arrays; twin: as many numbers in a vector are not.
+    assert not is_small(seven, *coordinates.state(0.0, np.ones(7), np.ones(7), np.ones((8, 8))))
+    assert is_small(seven, *coordinates.state(0.0, np.ones(7), np.ones(7), np.ones(64)))
 
 
 @pytest.mark.slow

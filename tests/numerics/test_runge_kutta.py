@@ -28,6 +28,22 @@ def solve(method, controller, ts=None, dt0=None):
     )  # fmt: skip
 
 
+@pytest.mark.parametrize("kind", [Tsit5, Dopri8])
+@pytest.mark.parametrize("known", [False, True])
+def test_stages_in_a_loop(kind, known):
+    """The same step, and the same derivative in reverse, with the vector field compiled once; its first stage known."""
+    terms, y0 = diffrax.ODETerm(swing), {"angle": jnp.asarray(1.0), "rate": jnp.asarray(0.5)}
+
+    def step(method, y0):
+        first = swing(0.25, y0, None) if known else None
+        y1, error, _, last, _ = method.step(terms, 0.25, 0.75, y0, None, first, not known)
+        return y1, error, last
+
+    for find in (step, lambda method, y0: jax.grad(lambda y0: step(method, y0)[0]["angle"])(y0)):
+        found, expected = find(kind(in_a_loop=True), y0), find(kind(), y0)
+        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-13, atol=1e-15), found, expected)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(("ours", "shipped"), PAIRS, ids=name_of)
 def test_the_steps_of_diffrax(ours, shipped):
