@@ -93,7 +93,7 @@ ALL = {**SLOPES, **OF_LANES, **CURVATURES, **OF_LANES_TWICE}
 FAST = {("free", "grad"), ("free", "jvp of grad")}
 SLOW = {
     *(("free", name) for name in ("grad of grad", "hessian", "grad of vmap", "grad of scan", "grad of cond")),
-    *((motion, "jvp of grad") for motion in ("held", "stiff")),
+    ("stiff", "jvp of grad"),
 }
 
 

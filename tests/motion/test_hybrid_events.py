@@ -45,7 +45,7 @@ def test_recorded_through_all_phases():
     np.testing.assert_allclose(places, [1 / 4, 1 / 16], rtol=1e-9)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_ending_the_motion():
     """In the first fall at 0.2; at the apex after it; at the floor before the switch. Twin: without them it goes on."""
     at_height = lj.Crossing(lambda t, q, v, params: q - 0.2)

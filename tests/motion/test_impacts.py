@@ -235,7 +235,7 @@ def thrown_exactly(x, phi, mu):
     return np.array([x * fall + u * (UNTIL - fall), phi * fall + spin * (UNTIL - fall)])
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_thrown_on_a_floor():
     """Where it is after the impact, the impulse, and both derivatives, for members that slide and that stick."""
     members = np.array([[9.0, 1.0, 0.2], [1.0, 1.0, 0.2], [-9.0, 4.0, 0.1]])

@@ -92,7 +92,7 @@ def test_second_derivative_forward():
     "adjoint",
     [
         diffrax.ForwardMode(),
-        diffrax.RecursiveCheckpointAdjoint(),
+        pytest.param(diffrax.RecursiveCheckpointAdjoint(), marks=pytest.mark.exhaustive),
         pytest.param(diffrax.BacksolveAdjoint(), marks=pytest.mark.exhaustive),
     ],
 )
