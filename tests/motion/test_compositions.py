@@ -90,9 +90,12 @@ OF_LANES_TWICE = {
     ),
 }
 ALL = {**SLOPES, **OF_LANES, **CURVATURES, **OF_LANES_TWICE}
-FAST = {("free", "grad"), ("free", "jvp of grad")}
+FAST = {("free", "grad")}
 SLOW = {
-    *(("free", name) for name in ("grad of grad", "hessian", "grad of vmap", "grad of scan", "grad of cond")),
+    *(
+        ("free", name)
+        for name in ("jvp of grad", "grad of grad", "hessian", "grad of vmap", "grad of scan", "grad of cond")
+    ),
     ("stiff", "jvp of grad"),
 }
 
