@@ -10,7 +10,7 @@ from collections.abc import Callable
 
 import equinox as eqx
 import jax
-from jax.core import Tracer
+from jax.core import Tracer, eval_jaxpr
 from jaxtyping import Array
 
 from lagjax.jax_internals.tracing import is_eager
@@ -66,7 +66,7 @@ def lift_function(function: Callable | None, args: tuple):
     def lifted(*args):
         arrays, values = eqx.filter(args[: len(static)], eqx.is_array), iter(args[len(static) :])
         every = [next(values) if t else value for value, t in zip(program.consts, traced)]
-        found = jax.core.eval_jaxpr(program.jaxpr, every, *jax.tree.leaves(arrays))
+        found = eval_jaxpr(program.jaxpr, every, *jax.tree.leaves(arrays))
         return jax.tree.unflatten(jax.tree.structure(shapes), found)
 
     return Lifted(lifted, [value for value, t in zip(program.consts, traced) if t])
