@@ -37,8 +37,8 @@ from lagjax.motion.consistency import stopped
 from lagjax.motion.pulled import Push, pull, turned
 from lagjax.motion.replay import Replay
 
-# Up to this many derivatives of one number, pushing all of them forward is cheaper than one pull back through the
-# checkpoints, to run and to compile.
+# Up to this many derivatives of one number, pushing all of them forward is cheaper than one pull back through
+# checkpoints was, to run and to compile. Where a replay begins to be cheaper was not measured.
 PUSH_UP_TO = 24
 
 

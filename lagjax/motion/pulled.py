@@ -22,6 +22,7 @@ from jax.core import ShapedArray
 
 from lagjax.jax_internals.primitives import ad, primitive
 from lagjax.motion.replay import Replay
+from lagjax.motion.way_back import filled
 
 
 @eqx.filter_custom_jvp
@@ -59,22 +60,15 @@ def _bent(x, fixed, cotangents, which, outputs, at, direction):
     """The derivative of a pull as the x that are `at` these places move in a direction."""
 
     def of_moved(*chosen):
-        return _pulled(_with(x, at, chosen), fixed, cotangents, which, outputs)
+        return _pulled(filled(x, at, chosen), fixed, cotangents, which, outputs)
 
     return jax.jvp(of_moved, tuple(x[i] for i in at), tuple(direction))[1]
 
 
 def _pushed(x, fixed, outputs, at, direction):
     """The derivative of the outputs as the x that are `at` these places move in a direction."""
-    of_moved = lambda *chosen: outputs(diffrax.ForwardMode(), *_with(x, at, chosen), *fixed)
+    of_moved = lambda *chosen: outputs(diffrax.ForwardMode(), *filled(x, at, chosen), *fixed)
     return jax.jvp(of_moved, tuple(x[i] for i in at), tuple(direction))[1]
-
-
-def _with(values, at, chosen):
-    filled = list(values)
-    for i, x in zip(at, chosen):
-        filled[i] = x
-    return filled
 
 
 @dataclass(frozen=True)
@@ -93,7 +87,7 @@ class Pull:
         """Along directions of the points that are moved."""
 
         def of_moved(*chosen):
-            return _pulled(*self._parted(_with(points, moved, chosen)), self.which, self.outputs)
+            return _pulled(*self._parted(filled(points, moved, chosen)), self.which, self.outputs)
 
         return jax.jvp(of_moved, tuple(points[i] for i in moved), tuple(moving))[1]
 
@@ -126,7 +120,7 @@ class Push:
         """Along directions of the points that are moved."""
 
         def of_moved(*chosen):
-            x, fixed, dx = self._parted(_with(points, moved, chosen))
+            x, fixed, dx = self._parted(filled(points, moved, chosen))
             return _pushed(x, fixed, self.outputs, range(self.size), dx)
 
         return jax.jvp(of_moved, tuple(points[i] for i in moved), tuple(moving))[1]
