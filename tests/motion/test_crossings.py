@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import lagjax as lj
-from lagjax.motion import sight
+from lagjax.motion import pieces, sight
 from tests.systems import PARAMS, pendulum, rod_pendulum
 from tests.tiers import exhaustive_but
 
@@ -94,6 +94,21 @@ def test_a_start_on_the_guard_does_not_fire():
         swing(1.0, 0.0, 1.0, [0.0, 3.0, 7.0])
     # Twin: a start that is off by more is before the guard.
     assert len(times(swing(0.5 * (1 - 1e-9), np.sqrt(0.75), 0.5, [0.0, 3.0, 6.5]))) == 3
+
+
+def test_a_guard_that_is_left_without_speed(monkeypatch):
+    """From zero as t³: left in the steps of the motion itself. Twin: without that rule by halves from the start."""
+
+    def steps(guard):
+        events = {"cubic": lj.Crossing(guard, direction=-1, terminal=False)}
+        traj = lj.integrate(oscillator, 0.0, 1.0, ts=[0.0, 2.0], events=events, estimate_error=False)
+        assert int(traj.events["cubic"].count) == 0 and not bool(traj.events["cubic"].uncertain)
+        return int(traj.stats["num_steps"])
+
+    assert steps(lambda t, q, v, p: q**3) < 20
+    monkeypatch.setattr(pieces, "FLAT", -1.0)
+    # Another guard: the program of the first would serve an equal one.
+    assert steps(lambda t, q, v, p: 2.0 * q**3) > 40
 
 
 def test_a_section_by_going_on_where_it_ended():
