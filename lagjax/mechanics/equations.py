@@ -27,9 +27,10 @@ from lagjax.mechanics.in_numbers import in_numbers
 from lagjax.mechanics.saddle_point import Dense, is_regular
 from lagjax.mechanics.sparse_plan import plan
 from lagjax.mechanics.sparse_saddle_point import Banded
+from lagjax.mechanics.structure import is_diagonal
 from lagjax.mechanics.system import System
 from lagjax.mechanics.verdict import Verdict
-from lagjax.mechanics.written_out import WrittenOut, is_small, write_out
+from lagjax.mechanics.written_out import UP_TO, WrittenOut, has_networks, is_small, write_out
 
 
 class Equations(eqx.Module):
@@ -157,7 +158,11 @@ def equations_of(system, t, q, v, params, *, quickly=False, fallback=True) -> Eq
 def _form(system, t, q, v, params):
     unknowns = sum(jnp.size(x) for x in jtu.tree_leaves(q)) + constraints.count(system, t, q, v, params)
     sparse = plan(system, t, q, v, params)
-    return Dense(unknowns) if sparse is None else Banded(sparse)
+    if sparse is not None:
+        return Banded(sparse)
+    # Other small systems are written out, where zeros cost nothing.
+    asked = has_networks(system, params) and not system.constraints and unknowns <= UP_TO
+    return Dense(unknowns, asked and is_diagonal(system, t, q, v, params))
 
 
 def _written_for(*problem) -> WrittenOut | None:

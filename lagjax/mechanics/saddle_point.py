@@ -47,9 +47,13 @@ SINGULAR_BELOW = {np.dtype("float64"): 1e-13, np.dtype("float32"): 1e-6}
 
 
 class Dense(NamedTuple):
-    """The equations solved in one matrix, of so many rows. A state is given as (system, t, x, u, params, unflatten)."""
+    """The equations solved in one matrix, of so many rows. A state is given as (system, t, x, u, params, unflatten).
+
+    `diagonal`: there are no constraints, and the mass matrix is known to be diagonal.
+    """
 
     unknowns: int
+    diagonal: bool = False
 
     def accelerations(self, system, t, x, u, params, unflatten, baumgarte_rate=None, independent=None):
         """The accelerations and the stacked multipliers, as vectors; `independent` (m,): which equations to solve with.
@@ -58,7 +62,10 @@ class Dense(NamedTuple):
         """
         linear = mass_and_forcing(system, t, x, u, params, unflatten)
         if not system.constraints:
-            return dense.solve(linear.mass, linear.forcing), jnp.zeros(0, x.dtype)
+            alone = jnp.zeros(0, x.dtype)
+            if self.diagonal:
+                return linear.forcing / jnp.sum(linear.mass, axis=1), alone
+            return dense.solve(linear.mass, linear.forcing), alone
         jacobian, gamma = constraints.acceleration_rows(system, t, x, u, params, unflatten)
         if baumgarte_rate is not None:
             gamma = gamma + constraints.baumgarte_feedback(system, t, x, u, params, unflatten, baumgarte_rate)
@@ -96,7 +103,8 @@ class Dense(NamedTuple):
         return tuple(jnp.where(believed, x, jnp.nan) for x in (found.a, found.multipliers))
 
     def __str__(self):
-        return f"{self.unknowns} equations by {'elimination' if self.unknowns <= dense.ELIMINATE_UP_TO else 'LAPACK'}"
+        by = "division" if self.diagonal else "elimination" if self.unknowns <= dense.ELIMINATE_UP_TO else "LAPACK"
+        return f"{self.unknowns} equations by {by}"
 
 
 def saddle_point(mass, jacobian, forcing, gamma, independent):

@@ -60,10 +60,15 @@ class WrittenOut(NamedTuple):
         return of(self.equations), of(self.project)
 
 
+def has_networks(system, params) -> bool:
+    """Whether a system or its parameters have matrices as large as those of a network."""
+    arrays = [x for x in jtu.tree_leaves((system, params)) if eqx.is_array(x)]
+    return any(x.ndim > 1 and x.size >= MATRIX for x in arrays)
+
+
 def is_small(system, t, q, v, params) -> bool:
     """Whether the equations of a system are to be written out."""
-    arrays = [x for x in jtu.tree_leaves((system, params)) if eqx.is_array(x)]
-    if is_plain() or any(x.ndim > 1 and x.size >= MATRIX for x in arrays):
+    if is_plain() or has_networks(system, params):
         return False
     size = sum(leaf.size for leaf in jtu.tree_leaves(q))
     count = constraints.count(system, t, q, v, params)

@@ -84,12 +84,12 @@ def integrate(
     **Other arguments:**
 
     - `method`: any diffrax solver. By default `lj.Nystrom12()` where there are no constraints and accelerations do not
-      depend on velocities (`lj.explain` says so), else `lj.Dopri8()`: the fastest way to an error between 1e-4 and
-      1e-10 on nearly all scenes (`benchmarks/results/work_precision.json`). With these, with `lj.Nystrom8()` and
-      `lj.Tsit5()`, small systems run on equations that are written out number by number, and so they do with
-      `diffrax.Dopri8()` and `diffrax.Tsit5()`, which are taken for ours; diffrax's other methods take 2 to 10 times
-      longer. For stiff systems `lj.Radau5()` where something decays fast, and `lj.Radau5(step_powers=(0, 1))` where
-      springs are stiff and their oscillation does not matter.
+      depend on velocities (`lj.explain` says so), `lj.Nystrom8()` if L has a network in it, else `lj.Dopri8()`: the
+      fastest way to an error between 1e-4 and 1e-10 on nearly all scenes (`benchmarks/results/work_precision.json`).
+      With these and with `lj.Tsit5()` small systems run on equations that are written out number by number, and so
+      they do with `diffrax.Dopri8()` and `diffrax.Tsit5()`, which are taken for ours; diffrax's other methods take 2
+      to 10 times longer. For stiff systems `lj.Radau5()` where something decays fast, and
+      `lj.Radau5(step_powers=(0, 1))` where springs are stiff and their oscillation does not matter.
     - `stepsize_controller`: any diffrax controller, in place of `diffrax.PIDController(rtol, atol)`.
     - `dt0`: the length of the first step, `[t]`; needed with `diffrax.ConstantStepSize()`.
     - `max_step`: the longest step, `[t]`. Adaptive steps pass over what is narrower than they are, such as a short push

@@ -104,6 +104,7 @@ def swinging(**more):
 
 
 POLAR = lj.System(lambda t, q, v, params: 0.5 * (v["r"] ** 2 + (q["r"] * v["φ"]) ** 2) + params["g"] / q["r"])
+NETWORK = lj.System(lambda t, q, v, params: 0.5 * v**2 - jnp.sum(jnp.tanh(params["weights"] * q)))
 RELATIVISTIC = lj.System(lambda t, q, v, params: -jnp.sqrt(1 - v**2) - params["g"] * q**2)
 CASES = [
     (swinging(), 1.0, "Nystrom12"),
@@ -113,14 +114,16 @@ CASES = [
     (swinging(constraints={"still": lj.Holonomic(lambda t, q, params: q - 1.0)}), 1.0, "Dopri8"),
     (POLAR, {"r": 1.0, "φ": 0.0}, "Dopri8"),
     (RELATIVISTIC, 0.1, "Dopri8"),
+    (NETWORK, 0.1, "Nystrom8"),
 ]
 
 
 @pytest.mark.parametrize(("system", "q0", "expected"), CASES)
 def test_default(system, q0, expected):
-    """Taken where accelerations do not depend on velocities, and nowhere else."""
+    """Taken where accelerations do not depend on velocities, of lower order for a network, and nowhere else."""
     v0 = jax.tree.map(lambda x: 0.0, q0)
-    run = lambda q0, v0: lj.integrate(system, q0, v0, {"g": 1.0}, ts=jnp.array([0.0, 0.1]), throw=False)
+    params = {"g": 1.0} | ({"weights": np.ones((8, 8))} if system is NETWORK else {})
+    run = lambda q0, v0: lj.integrate(system, q0, v0, params, ts=jnp.array([0.0, 0.1]), throw=False)
     assert jax.eval_shape(run, q0, v0).static.method == expected
 
 
