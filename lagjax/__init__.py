@@ -35,6 +35,7 @@ from lagjax.motion.hybrid_trajectory import HybridTrajectory, Switches
 from lagjax.motion.integrate import integrate
 from lagjax.motion.ledger import EnergyLedger, energy_ledger
 from lagjax.motion.phase_graph import HybridExplanation
+from lagjax.motion.replay import Replay
 from lagjax.motion.sections import PoincareSection, periods, poincare, turning_points
 from lagjax.motion.trajectory import RESULTS, AccuracyWarning, Moment, Trajectory
 from lagjax.numerics.nystrom import Nystrom8, Nystrom12
@@ -107,6 +108,7 @@ __all__ = [
     "Nystrom8",
     "Nystrom12",
     "Radau5",
+    "Replay",
     "Trajectory",
     "HybridTrajectory",
     "Switches",

@@ -60,7 +60,7 @@ def solve_in_both_modes(solve: Callable, x: PyTree, fixed: PyTree, recorded: boo
     def outputs(adjoint, *operands):
         leaves, record = operands[: structure.num_leaves], operands[structure.num_leaves :]
         if isinstance(adjoint, Replay):
-            adjoint = Replay(jtu.tree_unflatten(shapes[Replay], record) if record else None)
+            adjoint = Replay(record=jtu.tree_unflatten(shapes[Replay], record) if record else None)
         return [y for y in by(adjoint, True, *leaves)[0] if _is_float(y)]
 
     # What is not differentiated is a program that others may look into, as they do with a call.

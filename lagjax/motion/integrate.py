@@ -26,6 +26,7 @@ from lagjax.motion.crossings import Crossing, crossings_of, guards_of, left_to_d
 from lagjax.motion.failure import raise_failure
 from lagjax.motion.global_error import steps_to_repeat
 from lagjax.motion.no_lanes import raise_at_run_time
+from lagjax.motion.replay import Replay
 from lagjax.motion.reported import patient, report
 from lagjax.motion.slips import warn_of_float32, warn_of_odd_dissipation
 from lagjax.motion.solve import Settings
@@ -49,7 +50,7 @@ def integrate(
     jump_ts: ArrayLike | Sequence[float] | None = None,
     events: Mapping[str, Crossing] | None = None,
     event: diffrax.Event | None = None,
-    adjoint: diffrax.AbstractAdjoint | None = None,
+    adjoint: diffrax.AbstractAdjoint | Replay | None = None,
     max_steps: int | None = 2**20,
     throw: bool = True,
     progress: bool = False,
@@ -102,7 +103,8 @@ def integrate(
       `Hybrid`, as a velocity does in an impact, does not cross it.
     - `event`: a `diffrax.Event` that ends the motion; its condition takes `(t, (q, v), params, **kwargs)`. It is found
       as `events` are, under the name "event".
-    - `adjoint`: any diffrax adjoint. Without one, forward and reverse mode both work.
+    - `adjoint`: any diffrax adjoint. Without one, forward and reverse mode both work; so they do with `lj.Replay`,
+      which says how much memory reverse mode may use.
     - `max_steps`: the largest number of steps, accepted and rejected, those that look for events among them.
     - `throw`: raise where the integration fails. With `throw=False` the trajectory carries the reason in
       `result` and NaN from there on.
@@ -153,13 +155,14 @@ def integrate(
     else:
         guards = guards_of(crossings_of(events, event), system, state)
     system = each_phase(system, lambda phase: lift(phase, state))
-    drift = problem.check_drift(drift, system)
-    problem.check_adjoint(adjoint, drift, jump_ts)
+    drift, left = problem.check_drift(drift, system), left_to_diffrax(event)
+    problem.check_adjoint(adjoint, drift, jump_ts, stepsize_controller is None and left is None and not progress)
     settings = Settings(
         method=method,
         controller=stepsize_controller,
-        event=left_to_diffrax(event),
-        adjoint=adjoint,
+        event=left,
+        adjoint=None if isinstance(adjoint, Replay) else adjoint,
+        memory=adjoint.memory if isinstance(adjoint, Replay) else None,
         rtol=problem.tolerance(rtol, "rtol", dtype),
         atol=problem.tolerance(rtol if atol is None else atol, "rtol" if atol is None else "atol", dtype),
         by_size=atol is None,

@@ -21,7 +21,7 @@ from lagjax.mechanics.structure import angles
 from lagjax.motion.arriving import Arriving, together
 from lagjax.motion.consistency import stopped
 from lagjax.motion.crossing_times import Located, at_known_times, first_end, locate
-from lagjax.motion.recording import Problem, Recorded
+from lagjax.motion.recording import Problem, Recorded, with_room
 from lagjax.motion.replay import Replay, replayed
 from lagjax.motion.sight import Sight
 from lagjax.motion.stepping import Field, OnManifold, QuickField, forward_differentiable
@@ -117,6 +117,7 @@ def _loop(equations, start, y0, refused, scales, settings, ts, adjoint, guards=N
         problem = Problem(
             terms, solver, controller, ts, first, after, ts[0], ts[-1], settings.dt0, y0, start.params
         )  # fmt: skip
+        problem = with_room(problem, settings.memory)
         return _replayed(replayed(problem, settings.max_steps, not own(), adjoint.record), ts)
     # Reverse mode has to look inside.
     if isinstance(adjoint, diffrax.ForwardMode):

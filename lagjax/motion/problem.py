@@ -15,6 +15,7 @@ from lagjax.mechanics.system import System
 from lagjax.motion.account import account_of, warning_of
 from lagjax.motion.consistency import departures
 from lagjax.motion.global_error import ROUND_OFFS
+from lagjax.motion.replay import Replay
 from lagjax.motion.trajectory import RESULTS, AccuracyWarning
 
 # Tolerances that each dtype reaches with room to spare.
@@ -57,8 +58,14 @@ def check_method(method: Any):
         )
 
 
-def check_adjoint(adjoint: Any, drift: str, jump_ts: Any):
-    """Raise where an adjoint cannot follow the motion."""
+def check_adjoint(adjoint: Any, drift: str, jump_ts: Any, recorded: bool):
+    """Raise where an adjoint cannot follow the motion; `recorded`: whether its steps can be, by lagjax."""
+    if isinstance(adjoint, Replay) and adjoint.memory is not None and not recorded:
+        raise ValueError(
+            "the memory of lj.Replay is for a record of steps, which is not kept with a stepsize_controller, a "
+            "condition for diffrax in event, or progress: diffrax's own checkpoints are reverse mode there.\n"
+            "Fix: leave these out; or adjoint=diffrax.RecursiveCheckpointAdjoint(checkpoints=100)."
+        )
     if isinstance(adjoint, diffrax.BacksolveAdjoint) and jump_ts is not None:
         raise ValueError(
             "BacksolveAdjoint goes back over the motion with steps of its own, which do not end at jump_ts.\n"

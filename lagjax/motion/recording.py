@@ -1,16 +1,17 @@
 """A loop over steps that keeps a record of those it accepts, in a room of fixed size.
 
 Reverse mode asks for the accepted steps from the last to the first. How many there are is known when the motion is
-over, and arrays have a size before that. So the last `ROWS` steps are kept in full, each by its two times and the state
-that it starts from, and of every `ROWS`-th step all that the loop depends on (a `Place`), from which the loop can be
-run again to fill the rows with the steps before them. Of these places there is room for `PLACES`: when it is used up
+over, and arrays have a size before that. So the last steps are kept in full, in so many rows, each by its two times and
+the state that it starts from; and of the first of every so many steps all that the loop depends on (a `Place`), from
+which the loop can be run again to fill the rows with the steps before the last. When the room for places is used up
 every other one is given up, and from then on they are kept half as often. The longest motions are so run again in
-pieces, some of them more than once (`ROWS * PLACES` steps: each once), and memory stays what it is.
+pieces, some of them more than once (up to as many steps as rows times places: each once), and memory stays what it is.
 
 It is diffrax's loop of an adaptive solve whose outputs are ends of steps, with diffrax's solvers and controllers. That
 one keeps a record too (`SaveAt(steps=True)`), of as many rows as there may be steps: a million.
 """
 
+import math
 from typing import Any, NamedTuple
 
 import diffrax
@@ -18,6 +19,7 @@ import equinox as eqx
 import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
@@ -27,8 +29,17 @@ from lagjax.motion.stepping import OnManifold
 # A row of a pendulum takes 40 bytes: in a thousand lanes the rows take 20 MB.
 ROWS = 512
 PLACES = 64
+# The least of both, which takes long for long motions.
+FEWEST_ROWS, FEWEST_PLACES = 16, 4
 # diffrax ends a solve from here on, in units of the last digit of its last time.
 CLIPPED = 100
+
+
+class Room(NamedTuple):
+    """How many rows and places there are."""
+
+    rows: int
+    places: int
 
 
 class Problem(NamedTuple):
@@ -48,6 +59,7 @@ class Problem(NamedTuple):
     dt0: Float[Array, ""] | None
     y0: PyTree[Float[Array, "..."]]
     args: PyTree
+    room: Room | None = None
 
 
 class Place(NamedTuple):
@@ -61,7 +73,7 @@ class Place(NamedTuple):
 
 
 class Rows(NamedTuple):
-    """The last accepted steps, the k-th in row k modulo `ROWS`: their times and the states that they start from."""
+    """The last accepted steps, the k-th in row k modulo their number: their times and the states they start from."""
 
     t0: Float[Array, " R"]
     t1: Float[Array, " R"]
@@ -106,25 +118,48 @@ class _Run(NamedTuple):
     saved: Any
 
 
+def with_room(problem: Problem, memory: float | None) -> Problem:
+    """The problem with room for a record of so many bytes, half of them for rows; None stands for the usual room."""
+    if memory is None:
+        return problem._replace(room=Room(ROWS, PLACES))
+    size = lambda tree: sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(tree))
+    place = jax.eval_shape(lambda: jax.tree.map(jnp.asarray, _first(problem)))
+    # On the way back a piece is run again, beside the one before it, and its ends corrected: XLA keeps four.
+    of_row, of_place = 4 * size((problem.t0, problem.t1, problem.y0)), size(place)
+    rows, places = int(memory / 2 / of_row), 2 * int(memory / 4 / of_place)
+    if rows < FEWEST_ROWS or places < FEWEST_PLACES:
+        least = 2 * max(FEWEST_ROWS * of_row, FEWEST_PLACES * of_place)
+        raise ValueError(
+            f"a record of this motion's steps in {memory:.3g} bytes has no room.\n"
+            "Usual cause: a budget in megabytes; it is in bytes, and for one motion, of which a batch has many.\n"
+            f"Fix: lj.Replay(memory={_rounded_up(least)}) or more."
+        )
+    return problem._replace(room=Room(rows, places))
+
+
+def _rounded_up(number):
+    return f"{math.ceil(number / 1000)}e3"
+
+
 def recorded(problem: Problem, max_steps: int | None) -> Recorded:
     """Step through a motion, as `diffrax.diffeqsolve` does."""
-    p, zero = problem, jnp.asarray(0)
+    p, zero, many = problem, jnp.asarray(0), problem.room.rows
     outputs = jax.tree.map(lambda x: jnp.broadcast_to(x, (p.ts.size, *x.shape)), p.y0)
     place = _first(p)
-    places = jax.tree.map(lambda x: jnp.broadcast_to(x, (PLACES, *jnp.shape(x))), place)
+    places = jax.tree.map(lambda x: jnp.broadcast_to(x, (p.room.places, *jnp.shape(x))), place)
     start = _Run(place, _no_rows(p), zero, zero, _well(), outputs, p.after[0])
     on = lambda run: _is_on(p, run, max_steps)
 
     def onward(state):
         run, places, stride = state
-        number = run.accepted // ROWS
-        full = on(run) & (number >= PLACES * stride)
+        number = run.accepted // many
+        full = on(run) & (number >= p.room.places * stride)
         places = lax.cond(eqxi.unvmap_any(full), lambda: _thinned(places, full), lambda: places)
         stride = jnp.where(full, 2 * stride, stride)
         here = on(run) & (number % stride == 0)
-        put = lambda all, x: _put(all, jnp.minimum(number // stride, PLACES - 1), x, here)
+        put = lambda all, x: _put(all, jnp.minimum(number // stride, p.room.places - 1), x, here)
         places = jax.tree.map(put, places, run.place)
-        return _until(p, run, (number + 1) * ROWS, max_steps), places, stride
+        return _until(p, run, (number + 1) * many, max_steps), places, stride
 
     state = start, places, jnp.asarray(1)
     run, places, stride = lax.while_loop(lambda state: eqxi.unvmap_any(on(state[0])), onward, state)
@@ -137,12 +172,27 @@ def recorded(problem: Problem, max_steps: int | None) -> Recorded:
     return Recorded(reached, outputs, run.place.t, run.place.y, stats, result, record)
 
 
-def recorded_again(problem: Problem, record: Record, number) -> Rows:
-    """The rows of the steps from `number * ROWS` on, by running again from a place before them."""
-    slot = jnp.maximum(number, 0) // record.stride
-    place, begun = jax.tree.map(lambda x: x[slot], record.places), slot * record.stride * ROWS
-    run = _Run(place, record.rows, begun, begun, _well(), None, None)
-    return _until(problem, run, jnp.minimum((number + 1) * ROWS, record.count), None).rows
+def recorded_again(problem: Problem, record: Record, number, end) -> Rows:
+    """The rows of the steps of the piece `number`, which ends at a time, by running again from a place before them.
+
+    Compiled another time the same operations round otherwise, and a step may be chosen longer by a part in 1e8. Pieces
+    must meet all the same: the last step goes to the end, and what is missing of their number are steps of no length.
+    """
+    slot, many = jnp.maximum(number, 0) // record.stride, problem.room.rows
+    place, begun = jax.tree.map(lambda x: x[slot], record.places), slot * record.stride * many
+    p = problem._replace(t1=jnp.minimum(end, problem.t1))
+    run = _Run(place._replace(t1=jnp.minimum(place.t1, p.t1)), record.rows, begun, begun, _well(), None, None)
+    count = jnp.minimum((number + 1) * many, record.count)
+    run = _until(p, run, count, None)
+    k = number * many + np.arange(many)
+    taken, place = k < run.accepted, run.place
+    t0, t1, y0 = run.rows
+    t1 = jnp.where(taken & (k < count - 1), t1, p.t1)
+    return Rows(jnp.where(taken, t0, p.t1), t1, jax.tree.map(lambda x, y: _chosen(taken, x, y), y0, place.y))
+
+
+def _chosen(mask, x, y):
+    return jnp.where(mask.reshape(mask.shape + (1,) * (x.ndim - mask.ndim)), x, y)
 
 
 def _well():
@@ -160,12 +210,12 @@ def _first(p: Problem) -> Place:
 
 def _no_rows(p: Problem) -> Rows:
     # Where there is no step a row is the start: finite, for who looks at it in vain.
-    rows = lambda x: jnp.broadcast_to(x, (ROWS, *x.shape))
+    rows = lambda x: jnp.broadcast_to(x, (p.room.rows, *x.shape))
     return Rows(rows(p.t0), rows(p.t0), jax.tree.map(rows, p.y0))
 
 
 def _thinned(places, full):
-    half = lambda x: jnp.concatenate([x[::2], x[PLACES // 2 :]])
+    half = lambda x: jnp.concatenate([x[::2], x[len(x) // 2 :]])
     return jax.tree.map(lambda x: jnp.where(full, half(x), x), places)
 
 
@@ -182,7 +232,7 @@ def _until(p: Problem, run: _Run, limit, max_steps) -> _Run:
     on = lambda run: _is_on(p, run, max_steps) & (run.accepted < limit)
 
     def turn(run: _Run) -> _Run:
-        here, place, row = on(run), run.place, run.accepted % ROWS
+        here, place, row = on(run), run.place, run.accepted % p.room.rows
         further, keep, result = _step(p, place)
         # A step that is rejected is written over by the one after it.
         rows = jax.tree.map(lambda all, x: _put(all, row, x, here), run.rows, Rows(place.t, place.t1, place.y))

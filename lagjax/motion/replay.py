@@ -31,12 +31,36 @@ from lagjax.motion.way_back import Lanes, Motion, filled, swept_back, together
 
 @dataclass(frozen=True)
 class Replay:
-    """In place of one of diffrax's adjoints: differentiate the motion by a replay of its steps, where that can be.
+    """Reverse mode by a replay of the motion's steps, within a budget of memory, for `lj.integrate(adjoint=...)`.
 
-    `record`: what an earlier call at the same point found; it is then not stepped through again.
+    >>> import jax
+    >>> import jax.numpy as jnp
+    >>> import lagjax as lj
+    >>> swing = lj.System(lambda t, q, v, p: 0.5 * v**2 + jnp.sum(p) * jnp.cos(q))
+    >>> ts, few = jnp.array([0.0, 1.0]), lj.Replay(memory=20e3)
+    >>> end = lambda p: lj.integrate(swing, 1e-3, 0.0, p, ts=ts, adjoint=few).q[-1]
+    >>> print(f"{1e3 * jax.grad(end)(jnp.full(30, 1 / 30))[0]:.3f}")
+    -0.421
+
+    - `memory`: for one motion's record, in bytes, all of which is taken; without it as much as 512 steps and 64 places
+      to go on from need. What does not fit is stepped through again on the way back: with room for r steps and p
+      places a motion of up to r steps not at all, one of up to r p steps once. A batch has a record for each motion,
+      and a program other memory beside: outputs, and what a step itself takes.
+
+    It is what `adjoint=None` does. `record` is for lagjax alone.
+
+    **Raises:** `ValueError` where a motion is integrated for which the memory is too small.
     """
 
+    memory: float | None = None
+    # What an earlier call at the same point found; the motion is then not stepped through again.
     record: Recorded | None = None
+
+    def __post_init__(self):
+        if self.memory is not None and not (isinstance(self.memory, int | float) and self.memory > 0):
+            raise ValueError(
+                f"memory must be a positive number of bytes, not {self.memory!r:.40}.\nFix: lj.Replay(memory=50e6)."
+            )
 
 
 def replayed(problem: Problem, max_steps: int | None, checked: bool, known: Recorded | None = None) -> Recorded:

@@ -69,6 +69,8 @@ class Settings:
     max_steps: int | None = eqx.field(static=True)
     drift: str = eqx.field(static=True)
     progress: bool = eqx.field(static=True)
+    # Of the record for reverse mode, in bytes; None for the usual one.
+    memory: float | None = eqx.field(static=True, default=None)
     # False where the equations are taken for regular, until that turns out to be wrong.
     careful: bool = eqx.field(static=True, default=True)
     # The operations of a right-hand side that is copied to each of a method's stages.

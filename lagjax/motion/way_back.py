@@ -240,8 +240,9 @@ class _Way:
 
     def turn(self, s: Sweep) -> Sweep:
         """One step further back."""
-        here = self.is_on(s)
+        on = self.is_on(s)
         t0, t1, y0 = self.at(s.rows, jnp.maximum(s.k, 0) % self.many)
+        here = on & (t1 > t0)
         output = jnp.maximum(s.output, 0)
         time = self.at(self.ts, output)
         hit = here & (s.output >= 0) & (time > t0) & (time <= t1)
@@ -255,13 +256,19 @@ class _Way:
             total = self.added(total, ends, self.at_time(t1, only(here, of_t1)))
             total = self.added(total, ends, self.at_time(t0, only(here & ~first, of_t0)))
         y = jax.tree.map(lambda x, ct: jnp.where(_like(here, x), x, ct), of_y, ct)
-        return Sweep(s.k - here, s.number, s.rows, y, total, jnp.where(hit, self.at(self.first, output - 1), s.output))
+        return Sweep(s.k - on, s.number, s.rows, y, total, jnp.where(hit, self.at(self.first, output - 1), s.output))
 
     def piece(self, s: Sweep) -> Sweep:
         """One piece further back."""
         number = jnp.where(s.k >= 0, s.k // self.many, -1)
-        again = lambda: self.safe(self.each(recorded_again, 2)(*self.leaves, self.record, number))
-        rows = lax.cond(eqxi.unvmap_any(number < s.number), again, lambda: s.rows)
+        # The piece before this one ends where this one begins.
+        end, further = self.at(s.rows.t0, jnp.zeros_like(number)), number < s.number
+
+        def again():
+            rows = self.safe(self.each(recorded_again, 3)(*self.leaves, self.record, number, end))
+            return jax.tree.map(lambda x, old: jnp.where(_like(further, x), x, old), rows, s.rows)
+
+        rows = lax.cond(eqxi.unvmap_any(further), again, lambda: s.rows)
         return lax.while_loop(lambda s: eqxi.unvmap_any(self.is_on(s)), self.turn, s._replace(number=number, rows=rows))
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import lagjax as lj
-from lagjax.motion import both_modes, recording, replay
+from lagjax.motion import both_modes, recording, replay, way_back
 from tests.tiers import exhaustive_but
 
 TS = np.linspace(0.0, 2.0, 9)
@@ -196,3 +196,45 @@ def test_two_switches():
     at = np.array([0.0, 0.25, 0.75, 1.0])
     function = lambda p: jnp.sum(lj.integrate(bouncing, p["h"], 0.0, p, ts=at, rtol=1e-10).q ** 2)
     modes_agree(function, {"g": 9.81, "e": 0.5, "h": 1.0})
+
+
+def long_swing():
+    """A pendulum of thirty numbers over two thousand of its times, and the derivative of its last angle by them."""
+    system = lj.System(lambda t, q, v, p: 0.5 * v**2 + jnp.sum(p) * jnp.cos(q))
+    end = lambda p, adjoint: lj.integrate(system, 1.0, 0.0, p, ts=np.array([0.0, 2e3]), adjoint=adjoint).q[-1]
+    return lambda adjoint: jax.jit(jax.grad(lambda p: end(p, adjoint)))
+
+
+@pytest.mark.slow
+def test_a_budget_of_memory(monkeypatch):
+    """A record is as large as was asked for, and pieces that are stepped through again meet, whatever is rounded."""
+    at, swing = jnp.full(30, 1 / 30), long_swing()
+    whole, pieces = (swing(lj.Replay(memory=memory)) for memory in (1e6, 1e5))
+    assert 0.8e6 < whole.lower(at).compile().memory_analysis().temp_size_in_bytes < 1.2e6
+    assert 0.8e5 < pieces.lower(at).compile().memory_analysis().temp_size_in_bytes < 1.2e5
+    np.testing.assert_allclose(pieces(at), whole(at), rtol=1e-6)
+    until = recording._until
+    # The steps that are taken again are longer from the first on.
+    longer = lambda p, run, *rest: until(
+        p, run._replace(place=run.place._replace(t1=run.place.t + 1.01 * (run.place.t1 - run.place.t))), *rest
+    )
+    again = recording.recorded_again
+
+    def otherwise(*args):
+        with monkeypatch.context() as patch:
+            patch.setattr(recording, "_until", longer)
+            return again(*args)
+
+    monkeypatch.setattr(way_back, "recorded_again", otherwise)
+    np.testing.assert_allclose(long_swing()(lj.Replay(memory=1e5))(at), whole(at), rtol=1e-5)
+
+
+def test_a_budget_that_is_none():
+    """In the user's words."""
+    with pytest.raises(ValueError, match=r"(?s)has no room.*Fix: lj.Replay\(memory=5e3\)"):
+        long_swing()(lj.Replay(memory=100.0))(jnp.ones(30))
+    with pytest.raises(ValueError, match="positive number of bytes"):
+        lj.Replay(memory=-1.0)
+    constant = dict(stepsize_controller=diffrax.ConstantStepSize(), dt0=0.01)
+    with pytest.raises(ValueError, match="which is not kept with a stepsize_controller"):
+        lj.integrate(pendulum(), 1.0, 0.0, PARAMS, ts=TS, adjoint=lj.Replay(memory=1e6), **constant)
