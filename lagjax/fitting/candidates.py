@@ -6,7 +6,7 @@ parameters and the start of a run. A number that changes by c·z then has the va
     var = cᵀ (AᵀA)⁻¹ c,        A = [A_now; H]        after measurements with the slopes H,
 
 so that H is judged before anything of it is measured. The start of another run is unknown, and H has columns for it
-that `A_now` has not. Where c has a part in what `A` takes to zero, the data do not determine the number: var is infinite.
+that `A_now` has not. Where c has a part in what `A` takes to zero, the number is not determined: var is infinite.
 
 Which times of a run carry its information is a c-optimal design: one time of a set after the other is exchanged for a
 better one, until none is better.
