@@ -93,9 +93,10 @@ class NextMeasurements(NamedTuple):
         return "\n".join(_lines(self))
 
 
-def judged(name, t, rows, known, direction, sigma, least, one_time=False) -> Candidate:
-    """A candidate with what it would do: of all its times, or of the best one."""
-    rows, known, direction = _scaled(rows, known, direction)
+def judged(name, t, rows, known, direction, values, sigma, least, one_time=False) -> Candidate:
+    """A candidate with what it would do: of all its times, or of the best one; `values` (n,) are where it is judged."""
+    units = units_of(np.concatenate([known, *rows]), values, least)
+    rows, known, direction = rows * units, known * units, direction * np.where(units > 0, units, 1.0)
     candidate = Candidate(name, t, t, np.inf, np.full(len(t), np.inf), sigma, rows, known, direction, least)
     alone = sd_after_each(direction, known, rows, least)
     if one_time:
@@ -107,7 +108,7 @@ def judged(name, t, rows, known, direction, sigma, least, one_time=False) -> Can
 
 def sd_of(direction, rows, least) -> float:
     """The standard deviation of a number from equations (r, n) with errors of size one; infinite where it has none."""
-    sizes, right, seen = _parted(rows, least)
+    sizes, right, seen = seen_directions(rows, least)
     along = right @ direction
     if np.sum(along[~seen] ** 2) > NO_PART * np.sum(direction**2):
         return np.inf
@@ -120,7 +121,7 @@ def sd_after_each(direction, known, rows, least):
     In coordinates z of what is known, with errors of size one, and u of what is not, a time adds `H z + G u`. Of its
     combinations those along the range of G say what u is, and only the others say more of z.
     """
-    sizes, right, seen = _parted(known, least)
+    sizes, right, seen = seen_directions(known, least)
     of_z, of_u = right[seen].T / sizes[seen], right[~seen].T
     by_z, by_u = rows @ of_z, rows @ of_u
     left, spread, across = np.linalg.svd(by_u, full_matrices=False)
@@ -138,7 +139,7 @@ def sd_after_each(direction, known, rows, least):
     return np.where(unseen > NO_PART * np.sum(direction**2), np.inf, np.sqrt(np.maximum(variance, 0.0)))
 
 
-def _parted(rows, least):
+def seen_directions(rows, least):
     """Singular values (n,), directions by row (n, n), and which of them are seen, of equations (r, n)."""
     _, sizes, right = np.linalg.svd(_triangle(rows), full_matrices=True)
     sizes = np.append(sizes, np.zeros(rows.shape[1] - len(sizes)))
@@ -160,11 +161,16 @@ def _triangle(rows):
     return rows if len(rows) <= rows.shape[1] else np.linalg.qr(rows, mode="r")
 
 
-def _scaled(rows, known, direction):
-    """In units in which each unknown has slopes of size one: their own units do not matter."""
-    sizes = np.sqrt(np.sum(rows**2, axis=(0, 1)) + np.sum(known**2, axis=0))
-    sizes = np.where(sizes > 0, sizes, 1.0)
-    return rows / sizes, known / sizes, direction / sizes
+def units_of(rows, values, least) -> Float[np.ndarray, " n"]:
+    """Units of the unknowns in which their slopes (r, n) have the size one; 0 of those that leave no trace.
+
+    A relative change of a value that shows less than round-off of the largest one does is none.
+    """
+    sizes = np.sqrt(np.sum(rows**2, axis=0))
+    seen = (sizes > 0) & (
+        (values == 0) | (sizes * np.abs(values) > least * np.max(sizes * np.abs(values), initial=0.0))
+    )
+    return np.where(seen, 1 / np.where(seen, sizes, 1.0), 0.0)
 
 
 def _exchanged(candidate: Candidate, count):

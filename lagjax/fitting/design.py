@@ -16,7 +16,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Float
 
-from lagjax.fitting.candidates import Candidate, NextMeasurements, judged, sd_of, without
+from lagjax.fitting.candidates import Candidate, NextMeasurements, judged, sd_of, units_of, without
 from lagjax.fitting.equations import WHOLE, Problem
 from lagjax.fitting.predicted import check_predicted
 from lagjax.fitting.records import PADDING, Record, Windows, channel_name, padded
@@ -74,11 +74,10 @@ def next_measurements(
     known = Known(np.concatenate([prior, *each]), each, prior)
     # As `seen_from` decides what the data determine.
     least = float(np.sqrt(np.finfo(problem.windows.ts.dtype).eps) / UNSEEN)
-    sizes = np.sqrt(np.sum(known.shared**2, axis=0))
-    sizes = np.where(sizes > 0, sizes, 1.0)
+    units = units_of(known.shared, np.asarray(problem.found.start), least)
     # Without sigmas the rows are in units of a common size: what they tell is a multiple of the error.
     error = 1.0 if problem.absolute else float(jax.tree.leaves(problem.sigma)[0].ravel()[0])
-    now = sd_of(direction / sizes, known.shared / sizes, least) / error
+    now = sd_of(direction * np.where(units > 0, units, 1.0), known.shared * units, least) / error
     if candidates is None:
         found = _further(problem, records, at, known, direction, least)
     else:
@@ -172,9 +171,10 @@ def _run(name, record, parts, known, direction, least):
         for at_time, block in zip(*_by_time(part, both)):
             rows[at_time].append(block)
     held = np.concatenate([known.shared, np.zeros((len(known.shared), n - p))], axis=1)
-    along = np.concatenate([direction, np.zeros(n - p)])
+    along, values = np.zeros((2, n))
+    along[:p], values[:p] = direction, parts[0].found.start
     stacked = np.stack([np.concatenate(blocks) for blocks in rows])
-    return judged(name, record.t, stacked, held, along, _errors(parts), least)
+    return judged(name, record.t, stacked, held, along, values, _errors(parts), least)
 
 
 def _by_time(part, both):
@@ -221,6 +221,8 @@ def _further(problem, records, at, known, direction, least) -> list[Candidate]:
     further, slopes = surveyed(longer, problem.start).linear.slopes, at.linear.slopes
     k = slopes.rows_by_own.shape[-1]
     along = np.concatenate([direction, np.zeros(k)])
+    # A start at zero is as good as any: of these no relative change is asked.
+    values = np.concatenate([problem.found.start, np.zeros(k)])
     best: dict[str, Candidate] = {}
     for w, r in enumerate(longer.windows.record):
         others = known.but(w)
@@ -234,7 +236,7 @@ def _further(problem, records, at, known, direction, least) -> list[Candidate]:
             if not np.isfinite(sigma):
                 continue
             label = f"{name} of record {r}" if len(records) > 1 else name
-            found = judged(label, ts, rows[:, i : i + 1], here, along, {name: sigma}, least, one_time=True)
+            found = judged(label, ts, rows[:, i : i + 1], here, along, values, {name: sigma}, least, one_time=True)
             # Of a record in windows the one that has the best time.
             if label not in best or found.sd < best[label].sd:
                 best[label] = found

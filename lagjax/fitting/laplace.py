@@ -26,8 +26,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from lagjax.fitting.candidates import NO_PART, seen_directions, units_of
 from lagjax.fitting.equations import WHOLE, Problem, of_window, over_windows
-from lagjax.fitting.search import NO_PART, UNSEEN
+from lagjax.fitting.search import UNSEEN
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.compiled import compiled
 from lagjax.numerics.chained import Unknowns
@@ -163,11 +164,11 @@ def laplace(problem: Problem, u: Unknowns, variance: float) -> Laplace:
     names = (*found.names, *labels[labels != ""])
     mean = np.concatenate([np.asarray(u.shared), (starts_at + np.asarray(u.own)).ravel()])[places]
     slopes, gradient, term = _together(problem, u, at, places)
-    lengths = np.sqrt(np.sum(slopes**2, axis=0))
-    lengths = np.where(lengths > 0, lengths, 1.0)
-    _, sizes, right = np.linalg.svd(slopes / lengths, full_matrices=True)
-    seen = np.append(sizes, np.zeros(len(names) - len(sizes))) > np.sqrt(np.finfo(mean.dtype).eps) / UNSEEN
-    whitened = right[seen].T / sizes[seen[: len(sizes)]] / lengths[:, None]
+    least = float(np.sqrt(np.finfo(mean.dtype).eps) / UNSEEN)
+    units = units_of(slopes, np.append(np.asarray(u.shared), np.zeros(len(names) - p)), least)
+    lengths = 1 / np.where(units > 0, units, 1.0)
+    sizes, right, seen = seen_directions(slopes * units, least)
+    whitened = right[seen].T / sizes[seen] / lengths[:, None]
     eigenvalues, turned = np.linalg.eigh(np.eye(int(seen.sum())) + whitened.T @ term @ whitened)
     along = whitened @ turned
     peak = eigenvalues > LEAST
