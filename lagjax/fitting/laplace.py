@@ -159,6 +159,13 @@ class Laplace:
 def laplace(problem: Problem, u: Unknowns, variance: float) -> Laplace:
     """Laplace's approximation at `u`, where an error in sigmas has a variance."""
     at, found, p = curved(problem, u), problem.found, len(u.shared)
+    if not all(np.all(np.isfinite(x)) for x in at):
+        astray = ", ".join(f"{name} = {x:.4g}" for name, x in zip(found.names, u.shared))
+        raise ValueError(
+            f"the second derivatives of the motion are not finite at the estimate, {astray}.\n"
+            "Usual cause: a number that the data do not see and that went astray, or a motion that fails.\n"
+            "Fix: fewer numbers in free=, priors={...}, or a fit that has converged."
+        )
     labels, starts_at = _labels(problem)
     places = np.append(np.arange(p), p + np.flatnonzero(labels != "")).astype(int)
     names = (*found.names, *labels[labels != ""])
