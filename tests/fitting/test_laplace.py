@@ -154,10 +154,10 @@ def test_no_peak(rough):
     assert found.laplace().off < 1e-3 and all("no peak" not in words for words in found.laplace().doubts)
 
     with pytest.warns(lj.FitWarning):
-        unseen = lj.fit(pendulum, lj.Record(T, q=np.cos(T), sigma=0.3), PENDULUM, free=["g", "l"], restarts=0)
+        unseen = lj.fit(pendulum, lj.Record(T, q=np.cos(T), sigma=0.3), PENDULUM, free=["c", "g", "l"], restarts=0)
     with pytest.warns(lj.FitWarning, match="the data do not see .*'g'.*'l'"):
         told = unseen.laplace()
-    assert np.isnan(told.sd[:2]).all() and np.isfinite(told.sd[2:]).all() and len(told.unseen) == 1
+    assert np.isnan(told.sd[:3]).all() and np.isfinite(told.sd[3:]).all() and len(told.unseen) == 1
     with pytest.raises(TypeError, match="outside of the program"):
         jax.jit(lambda x: lj.fit(fall, lj.Record(T, q=x), {"g": 9.0}, restarts=0).laplace().mean)(measured())
 
