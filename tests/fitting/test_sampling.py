@@ -13,7 +13,7 @@ from tests.fitting.test_laplace import SIGMA, T, exact, fall, measured, swing
 pytestmark = pytest.mark.slow
 DRAWS = 3000
 # A large swing from rest, seen at four times: its frequency and its amplitude make up for each other.
-TS, ROUGH, PRIOR = np.array([0.5, 1.0, 3.6, 3.8]), 0.3, (4.0, 1.5)
+TS, ROUGH, PRIOR = np.array([0.5, 1.0, 3.6, 3.8]), 0.2, (4.0, 1.5)
 
 
 def nuts(density, n, key):
@@ -81,7 +81,7 @@ def test_a_normal_posterior():
 
 def test_a_bent_posterior():
     """A large swing from rest, of unknown frequency and amplitude: as quadrature of Jacobi's functions has it."""
-    data = angle(TS, 4.0, 2.2) + ROUGH * np.random.default_rng(2).normal(size=4)
+    data = angle(TS, 4.0, 2.2) + ROUGH * np.random.default_rng(0).normal(size=4)
     # The run begins at its first time, at which nothing is measured.
     times, angles = np.append(0.0, TS), np.append(np.nan, data)
     record = lj.Record(times, q=angles, q0=2.0, v0=0.0, hold_v=True, sigma=ROUGH)
@@ -95,5 +95,4 @@ def test_a_bent_posterior():
     for x, exactly in zip(both(draws), known):
         assert np.max(np.abs(errors(x, *exactly))) < 4
     # Twin: Laplace's normal distribution is not this one: both are bent.
-    for x, exactly in zip(both(normal), known):
-        assert np.max(np.abs(errors(x, *exactly))) > 8
+    assert all(np.max(np.abs(errors(x, *exactly))) > 8 for x, exactly in zip(both(normal), known))
