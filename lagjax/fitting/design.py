@@ -103,6 +103,8 @@ def _direction(problem, shrink):
             what = "has no finite slope" if np.any(direction) else "does not depend on what is found"
             raise ValueError(f"shrink(params) {what} here, by {listed(list(names))}.\nFix: free=[...], other params.")
         return "shrink(params)" if name == "<lambda>" else name, direction
+    if not names:
+        raise ValueError(f"shrink names {shrink!r}, and no parameter is found.\nFix: free=[{shrink!r}].")
     if shrink not in names:
         raise ValueError(
             f"shrink names {shrink!r}, which is not among what is found: {listed(list(names))}.\n"
@@ -160,7 +162,7 @@ def _run(name, record, parts, known, direction, least):
     for part in parts:
         at = surveyed(part, part.start)
         if not at.linear.well[0]:
-            raise ValueError(f"the motion of candidate '{name}' fails: {_why(part)}\nFix: try it with lj.integrate.")
+            raise ValueError(f"the motion of candidate '{name}' fails: {_why(part)}")
         slopes.append(at.linear.slopes)
     p, k, times = len(direction), slopes[0].rows_by_own.shape[-1], len(record.t)
     n = p + k * len(parts)
@@ -212,7 +214,7 @@ def _why(part):
         integrate(part.system, q, v, params, ts=ts, **(options | {"throw": True}))
     except (ValueError, RuntimeError) as error:
         return str(error)
-    return "it stops early."
+    return "it stops early.\nFix: look at it with lj.integrate."
 
 
 def _further(problem, records, at, known, direction, least) -> list[Candidate]:

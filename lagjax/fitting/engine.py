@@ -209,6 +209,11 @@ def identifiability(
         raise ValueError('candidates= are judged by what they shrink.\nFix: shrink="g", the number to know better.')
     at = None if shrink is None else surveyed(problem, problem.start)
     seen = look(problem, problem.start, WHOLE) if at is None else at.seen
+    if coordinates.is_traced(seen):
+        raise TypeError(
+            "identifiability looks at numbers, and here it is traced.\n"
+            "Fix: call it in a Python loop, not in jit, vmap or lj.sweep: it is compiled once."
+        )
     _check_motion(problem, seen, problem.start)
     following = None
     if at is not None:

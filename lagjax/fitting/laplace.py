@@ -137,7 +137,7 @@ class Laplace:
     def sample(self, key: Array, count: int) -> dict[str, Array]:
         """So many draws, as `Fit.log_likelihood` takes unknowns, each with a leading axis."""
         self._check()
-        return self.unknowns(jax.random.normal(key, (count, len(self.names)), self.mean.dtype))
+        return self.unknowns(jax.random.normal(key, (count, len(self.names)), self._at["starts"].dtype))
 
     def _check(self):
         if not self.positive_definite:
@@ -171,7 +171,7 @@ def laplace(problem: Problem, u: Unknowns, variance: float) -> Laplace:
     names = (*found.names, *labels[labels != ""])
     mean = np.concatenate([np.asarray(u.shared), (starts_at + np.asarray(u.own)).ravel()])[places]
     slopes, gradient, term = _together(problem, u, at, places)
-    least = float(np.sqrt(np.finfo(mean.dtype).eps) / UNSEEN)
+    least = float(np.sqrt(np.finfo(problem.windows.ts.dtype).eps) / UNSEEN)
     units = units_of(slopes, np.append(np.asarray(u.shared), np.zeros(len(names) - p)), least)
     lengths = 1 / np.where(units > 0, units, 1.0)
     sizes, right, seen = seen_directions(slopes * units, least)
@@ -281,11 +281,10 @@ def _doubts(names, eigenvalues, directions, unseen, off):
             words.append(f"no peak but a saddle or a flat: the density does not fall along {_direction(names, row)}.")
     if off > OFF_PEAK:
         words.append(f"the estimate is no peak: that of the parabola is {off:.2g} standard deviations away.")
-    for value, row in zip(eigenvalues, directions):
-        if value > LEAST and abs(1 / np.sqrt(value) - 1) > DIFFERS:
-            words.append(
-                f"along {_direction(names, row)} the ± is {1 / np.sqrt(value):.2g} times that of Gauss and Newton."
-            )
+    peaks = [i for i, value in enumerate(eigenvalues) if value > LEAST and abs(1 / np.sqrt(value) - 1) > DIFFERS]
+    for i in sorted(peaks, key=lambda i: -abs(np.log(eigenvalues[i])))[:3]:
+        times = 1 / np.sqrt(eigenvalues[i])
+        words.append(f"along {_direction(names, directions[i])} the ± is {times:.2g} times that of Gauss and Newton.")
     return words
 
 

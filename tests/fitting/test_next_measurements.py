@@ -289,6 +289,7 @@ RUN = {"q0": 0.0, "v0": 0.0}
     [
         ({"shrink": "h"}, ValueError, "shrink names 'h', which is not among what is found: 'g'"),
         ({"candidates": {"a": fallen}}, ValueError, 'shrink="g"'),
+        ({"shrink": "g", "free": []}, ValueError, "no parameter is found"),
         ({"shrink": "g", "candidates": {}}, ValueError, "candidates is empty"),
         ({"shrink": "g", "candidates": {"a": T}}, TypeError, "candidate 'a' must be a lj.Record"),
         (
@@ -303,3 +304,10 @@ def test_words(more, error, words):
     """What makes no sense is refused in the user's words."""
     with pytest.raises(error, match=words):
         lj.identifiability(fall, fallen, {"g": 9.81}, **more)
+
+
+def test_words_where_it_is_traced():
+    """It looks at numbers, and says so in a program."""
+    of = lambda q: lj.identifiability(fall, lj.Record(T, q=q, sigma=SIGMA), {"g": 9.81}, shrink="g").next.now
+    with pytest.raises(TypeError, match="not in jit, vmap or lj.sweep"):
+        jax.jit(of)(5.0 * T**2)
