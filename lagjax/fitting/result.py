@@ -23,6 +23,7 @@ from lagjax.fitting.search import Seen
 from lagjax.fitting.table import lines_of
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.compiled import compiled
+from lagjax.mechanics.diagnosis import listed
 from lagjax.motion.integrate import integrate
 from lagjax.motion.reported import Report
 from lagjax.motion.trajectory import RESULTS, Trajectory
