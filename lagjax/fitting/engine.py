@@ -183,7 +183,7 @@ def identifiability(
     >>> record = lj.Record(t, q=jnp.cos(t), sigma=0.01)
     >>> asked = identifiability(spring, record, {"m": 1.0, "k": 1.0}, free="k", shrink="k")
     >>> print(asked.next.best.name, asked.next.best.times.round(1), asked.next.best.sd < asked.next.now)
-    q [20.3] True
+    q [20.2] True
 
     **Arguments:** as for `lj.fit`. Only the times, what was measured, and `sigma` count, not the measured values;
     `params` and the starts are where it is asked.

@@ -54,11 +54,9 @@ def test_a_linear_motion_has_this_posterior():
     # Twin: another prior has another evidence, its own.
     assert other.log_evidence == pytest.approx(exact(y, (9.9, 0.02))[2], abs=1e-6)
     assert abs(other.log_evidence - evidence) > 0.3
-    density, point = found.log_posterior, {"g": 9.7, "starts": told.unknowns(jnp.ones(3))["starts"]}
-    prior = -0.5 * ((9.7 - 9.81) / 0.1) ** 2
-    assert float(density(point) - found.log_likelihood(point)) == pytest.approx(prior, rel=1e-9)
 
 
+@pytest.mark.slow
 def test_draws():
     """Draws of the fall have its covariance, and their density is that of a standard normal one."""
     y = measured()
@@ -76,6 +74,9 @@ def test_draws():
     # Twin: of the likelihood alone it is not.
     of = jax.vmap(told.standardised(found.log_likelihood))(z) - told.standardised(found.log_likelihood)(jnp.zeros(3))
     assert not np.allclose(of, -0.5 * np.sum(np.asarray(z) ** 2, axis=1), rtol=0.05)
+    density, point = found.log_posterior, {"g": 9.7, "starts": told.unknowns(jnp.ones(3))["starts"]}
+    prior = -0.5 * ((9.7 - 9.81) / 0.1) ** 2
+    assert float(density(point) - found.log_likelihood(point)) == pytest.approx(prior, rel=1e-9)
 
 
 @pytest.fixture(scope="module")
