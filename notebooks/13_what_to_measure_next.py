@@ -156,10 +156,10 @@ exact /= exact.sum()
 
 # %% [markdown]
 # The same by a sampler. `log_posterior` is a plain function of the unknowns; `standardised` makes of it one of a
-# vector in which each unknown has about the size one and none depends on another, as NUTS likes it.
+# vector in which each unknown has about the size one and none depends on another, as NUTS likes it. The run begins at
+# its first time, when nothing is measured yet; it is known to begin at rest.
 
 # %%
-# The run begins at its first time, when nothing is measured yet; it is known to begin at rest.
 seen = lj.Record(np.append(0.0, ts), q=np.append(np.nan, data), q0=2.0, v0=0.0, hold_v=True, sigma=rough)
 few_data = lj.fit(free_swing, seen, {"w2": 4.0}, priors={"w2": prior}, bounds={"w2": (0.0, None)}, progress=False)
 normal = few_data.laplace()
