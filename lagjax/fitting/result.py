@@ -58,7 +58,8 @@ class Fit:
     - `covariance`, `correlation` (p, p).
     - `start_sd`: standard deviations of `q0` and `v0`, as two lists of pytrees; 0 of what was held, NaN of what the
       data do not determine.
-    - `identifiability`: which combinations the data see.
+    - `identifiability`: which combinations the data see. `laplace()`: a normal distribution by the true second
+      derivatives. `log_likelihood`, `log_posterior`: for samplers.
     - `chi2`, `freedom`: the sum of squared residuals in sigmas (of the unit that is estimated, without sigmas), and the
       number of measurements less that of unknowns. `noise`: the estimated sigma, where none was given.
     - `result`: a `RESULTS` item: `lj.RESULTS.successful`, `not_converged` or `misfit`. `converged`: whether it is the
