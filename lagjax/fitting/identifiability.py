@@ -16,6 +16,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Float
 
+from lagjax.fitting.candidates import NextMeasurements
 from lagjax.mechanics.diagnosis import listed
 from lagjax.numerics.rank import null_space
 
@@ -32,6 +33,7 @@ class Identifiability(eqx.Module):
     - `singular_values` (p,): the largest first; the reciprocal of a relative error, in units of `noise`.
     - `combinations` (p, p): by row, the relative changes that belong to them.
     - `noise`: the size of an error in sigmas: 1 where these were given; else estimated, and unknown before a fit.
+    - `next`: what to measure next, where it was asked for (`shrink=`): `next.best`, `next.candidates`, `next.now`.
     """
 
     names: tuple[str, ...] = eqx.field(static=True)
@@ -39,6 +41,7 @@ class Identifiability(eqx.Module):
     singular_values: Float[Array, " p"]
     combinations: Float[Array, "p p"]
     noise: Float[Array, ""] | None
+    next: NextMeasurements | None = None
 
     @property
     def rank(self) -> int:
@@ -62,6 +65,10 @@ class Identifiability(eqx.Module):
         return [name for name, s in zip(self.names, seen) if not s]
 
     def __repr__(self):
+        following = [] if self.next is None else [f"  {line}" for line in repr(self.next).splitlines()]
+        return "\n".join([self._of_now(), *following])
+
+    def _of_now(self):
         names, rank = listed(list(self.names)), self.rank
         if not self.names:
             return "Identifiability: no parameter is asked for, only starts"

@@ -216,6 +216,11 @@ class Windows(NamedTuple):
         return xp.stack(rows)
 
 
+def padded(t: Float[np.ndarray, " n"], length: int, step: float) -> Float[np.ndarray, " length"]:
+    """Times that are filled up by others, which follow each other closely."""
+    return np.concatenate([t, t[-1] + step * (1 + np.arange(length - len(t)))])
+
+
 def cut(records: Sequence[Record], window: float | None, dtype) -> Windows:
     """Cut records into windows of a length in time, or one each."""
     pieces = []
@@ -237,9 +242,8 @@ def cut(records: Sequence[Record], window: float | None, dtype) -> Windows:
     real = np.zeros((len(pieces), length), bool)
     for w, (r, start, stop, seamed) in enumerate(pieces):
         t, n = records[r].t, stop - start
-        kept = t[start : stop + seamed]
         step = max(PADDING * np.min(np.diff(t)), 8 * np.finfo(dtype).eps * np.max(np.abs(t)))
-        ts[w] = np.concatenate([kept, kept[-1] + step * (1 + np.arange(length - len(kept)))])
+        ts[w] = padded(t[start : stop + seamed], length, step)
         sample[w, :n], real[w, :n] = np.arange(start, stop), True
     last = np.array([stop - start + seamed - 1 for _, start, stop, seamed in pieces])
     return Windows(

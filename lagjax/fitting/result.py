@@ -1,5 +1,6 @@
 """The answer of a fit: estimates, how certain they are, and whether the residuals look like measurement errors."""
 
+import warnings
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
@@ -15,9 +16,11 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 from lagjax import plot
 from lagjax.fitting.equations import LOSSES, WHOLE, Problem, dampened, equations, starts_at
 from lagjax.fitting.identifiability import Identifiability
+from lagjax.fitting.laplace import Laplace, laplace
 from lagjax.fitting.misfit import Misfit
 from lagjax.fitting.records import channel_name
 from lagjax.fitting.search import Seen
+from lagjax.fitting.table import lines_of
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.compiled import compiled
 from lagjax.mechanics.diagnosis import listed
@@ -55,7 +58,8 @@ class Fit:
     - `covariance`, `correlation` (p, p).
     - `start_sd`: standard deviations of `q0` and `v0`, as two lists of pytrees; 0 of what was held, NaN of what the
       data do not determine.
-    - `identifiability`: which combinations the data see.
+    - `identifiability`: which combinations the data see. `laplace()`: a normal distribution by the true second
+      derivatives. `log_likelihood`, `log_posterior`: for samplers.
     - `chi2`, `freedom`: the sum of squared residuals in sigmas (of the unit that is estimated, without sigmas), and the
       number of measurements less that of unknowns. `noise`: the estimated sigma, where none was given.
     - `result`: a `RESULTS` item: `lj.RESULTS.successful`, `not_converged` or `misfit`. `converged`: whether it is the
@@ -293,6 +297,41 @@ class Fit:
 
         return density
 
+    @property
+    def log_posterior(self) -> Callable[[Mapping[str, Array]], Float[Array, ""]]:
+        """`log_likelihood` with the fit's priors, up to a constant."""
+        found, likelihood = self.problem.found, self.log_likelihood
+
+        def density(unknowns):
+            known = self.sampling | dict(unknowns)
+            off = [(known[name] - found.mean[i]) / found.sd[i] for i, name in enumerate(self.names)]
+            return likelihood(unknowns) - 0.5 * sum((jnp.asarray(x) ** 2 for x in off), jnp.zeros(()))
+
+        return density
+
+    def laplace(self) -> Laplace:
+        """The normal distribution with the peak and the true second derivatives of `log_posterior`, and its evidence.
+
+        It says where these differ from those of `covariance`, and where there is no peak (with an `lj.FitWarning`).
+
+        **Raises:** `ValueError` for joined windows, whose starts are no unknowns; `TypeError` where the fit is traced.
+        """
+        if self._traced:
+            raise TypeError("laplace() looks at numbers, and this fit is traced.\nFix: call it outside of the program.")
+        seen = self._seen()
+        priors = np.isfinite(self.problem.found.sd).sum()
+        apart = self.known().sum() + priors - sum(np.sum(d) for d in seen.determined)
+        # A seam takes away an unknown: it shows in the freedom.
+        if self.freedom > apart + 0.5:
+            raise ValueError(
+                "the windows of this fit are joined, and log_likelihood has each with a start of its own.\n"
+                "Fix: lj.fit(system, records, found.params), without window=, from what was found."
+            )
+        found = laplace(self.problem, self.unknowns, float(self.variance))
+        if not found.positive_definite:
+            warnings.warn(f"Laplace: {found.doubts[0]}", FitWarning, stacklevel=2)
+        return found
+
     def at_bounds(self) -> list[str]:
         """The names of numbers that ended at a bound."""
         found, x = self.problem.found, np.asarray(self.values)
@@ -308,7 +347,7 @@ class Fit:
     def __repr__(self):
         if coordinates.is_traced(self.cost):
             return f"Fit of {listed(list(self.names))}, being traced"
-        return "\n".join(_lines(self))
+        return "\n".join(lines_of(self))
 
 
 @partial(compiled, in_numpy=True)
@@ -321,68 +360,3 @@ def _of_forgiven_errors(r, known, loss):
     r = jnp.where(r == 0, constant * 1e-9, r)
     mean = lambda x: jnp.sum(jnp.where(known, x, 0.0)) / jnp.sum(known)
     return mean(slope(r) ** 2) / mean(curvature(r)) ** 2
-
-
-def _lines(fit: Fit):
-    how = "converged" if bool(fit.rested) else "NOT converged"
-    how += ", and the residuals are NO errors of measurement," if bool(fit.misfit.any) else ""
-    windows = np.asarray(fit.problem.windows.record)
-    lines = [f"Fit: {how} after {int(fit.steps)} steps"]
-    tried = int(np.sum(np.isfinite(fit.costs)))
-    if tried > 1:
-        near = int(np.sum(np.asarray(fit.costs) <= 1.01 * float(fit.cost) + 1e-300))
-        lines[0] += f"; {near} of {tried} starts ended here"
-    if fit.seen is None:
-        lines.append(f"  {len(fit.names)} numbers, uncertainties not computed; cost {float(fit.cost):.6g}")
-        return lines
-    units, rows = dict(fit.units), []
-    for name, x, sd in zip(fit.names, np.asarray(fit.values), np.asarray(fit.sd)):
-        unit = units.get(name) or units.get(name.partition("[")[0], "")
-        rows.append((name, _plus_minus(x, sd), unit))
-    many = len(rows) > 40
-    rows = rows[:40]
-    starts = fit.starts()
-    for r, ((q, v), q_sd, v_sd) in enumerate(zip(starts, *fit.start_sd)):
-        if r < 4:
-            of = f" of record {r}" if len(starts) > 1 else ""
-            for label, x, sd in (("", q, q_sd), ("v.", v, v_sd)):
-                x, sd = (np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(y)]) for y in (x, sd))
-                told = zip(coordinates.names(q), x, sd)
-                rows += [(f"{label}{name}(0){of}", _plus_minus(a, b), "") for name, a, b in told if b != 0]
-    width, wide = max(len(row[0]) for row in rows) if rows else 0, max((len(row[1]) for row in rows), default=0)
-    lines += [f"  {name:<{width}}  {value:<{wide}}  {unit}".rstrip() for name, value, unit in rows]
-    if many:
-        lines.append(f"  ... and {len(fit.names) - 40} more")
-    if windows.max() + 1 < len(windows):
-        lines.append(f"  {len(windows)} windows, each from a start of its own")
-    told = ", ".join(f"{name} {value:.3g}" for name, value in fit.rms().items())
-    size = (
-        f"chi2/freedom {float(fit.chi2 / fit.freedom):.3g}" if fit.problem.absolute else f"noise {float(fit.noise):.3g}"
-    )
-    lines.append(f"  residuals: rms {told}; {size}, {int(fit.freedom)} degrees of freedom")
-    lines += _whiteness(fit)
-    lines += ["  " + line for line in repr(fit.identifiability).splitlines()[1:]]
-    if at := fit.at_bounds():
-        lines.append(f"  at a bound: {listed(at)}")
-    return lines
-
-
-def _whiteness(fit):
-    lag, count = fit.whiteness(), int(np.sum(np.asarray(fit.known())))
-    worst = max(lag, key=lambda name: abs(np.nan_to_num(lag[name])))
-    if abs(np.nan_to_num(lag[worst])) < 3 / np.sqrt(max(count / len(lag), 1)):
-        return []
-    rho = min(lag[worst], 0.999)
-    wider = np.sqrt((1 + rho) / (1 - rho)) if rho > 0 else 1.0
-    words = f"  NOT white: residuals of {worst} correlate by {lag[worst]:.2f} with the next"
-    return [words + (f"; the ± are about {wider:.1f} times too small" if wider > 1.1 else "")]
-
-
-def _plus_minus(x, sd):
-    if not np.isfinite(sd):
-        return f"{x:.6g} (not determined)"
-    if sd == 0:
-        return f"{x:.9g}"
-    digits = max(0, int(np.floor(np.log10(abs(x) / sd))) + 2) if x else 2
-    digits = min(max(digits, 2), 12)
-    return f"{x:#.{digits}g} ± {sd:.2g}"
