@@ -1,11 +1,11 @@
 """What learns a motion in `learned.py`: three kinds of model with networks of the same size, behind one interface.
 
-    ours          L = ½ |Cᵀ(q) v|² - V(q): a mass matrix C Cᵀ that is positive definite, and a potential; where there is
-                  friction the force -D Dᵀ v. `lj.accelerations` and `lj.integrate` do the rest
-    free L        L(q, v) is one network, as in Cranmer et al. (2020), beside ½ |v|²
-    neural ODE    v' = f(q, v), one network; by diffrax
-    Hamiltonian   q' = ∂H/∂p, p' = -∂H/∂q - D Dᵀ q', H(q, p) one network beside ½ |p|². Its momenta are known: they come
-                  from velocities by the true mass matrix, which ours has to learn
+ours          L = ½ |Cᵀ(q) v|² - V(q): a mass matrix C Cᵀ that is positive definite, and a potential; where there is
+              friction the force -D Dᵀ v. `lj.accelerations` and `lj.integrate` do the rest
+free L        L(q, v) is one network, as in Cranmer et al. (2020), beside ½ |v|²
+neural ODE    v' = f(q, v), one network; by diffrax
+Hamiltonian   q' = ∂H/∂p, p' = -∂H/∂q - D Dᵀ q', H(q, p) one network beside ½ |p|². Its momenta are known: they come
+              from velocities by the true mass matrix, which ours has to learn
 """
 
 from typing import Any, NamedTuple

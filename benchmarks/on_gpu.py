@@ -14,8 +14,8 @@ on `SAMPLE` of the lanes are within `ERROR`, motions in radians, gradients relat
     ours / diffrax          next times; the first call with its compiling stands beside
     memory                  what the device reports as its peak over what the compiled program states beforehand
     operations on the host  in the compiled program (`host_operations.py`), and in one with a `jax.debug.callback`
-    single precision        a tolerance that float32 cannot reach is refused; at the tightest one allowed: the error over
-                            it, and motions that are worse than a departure of 1 allows and do not say so
+    single precision        a tolerance that float32 cannot reach is refused; at the tightest one allowed: the error
+                            over it, and motions that are worse than a departure of 1 allows and do not say so
 
 Ready for a machine with one GPU; `--small` is for any other, and for the tests. Float64 is on throughout: float32 is
 asked for by the arrays.
@@ -25,7 +25,6 @@ asked for by the arrays.
 
 import argparse
 import functools
-import json
 import os
 import sys
 import time
@@ -300,7 +299,9 @@ def rows(wanted):
     """Each case in both precisions; then what float32 says of itself."""
     small = OPTIONS["small"]
     clock = "process_time" if CLOCK["seconds"] is time.process_time else "perf_counter"
-    cases = [(name, what) for name in LANES for what in ("motions", "gradient") if (name, what) != ("network", "motions")]
+    cases = [
+        (name, what) for name in LANES for what in ("motions", "gradient") if (name, what) != ("network", "motions")
+    ]
     for name, what in cases:
         for dtype in ERROR:
             title = f"{(SMALL if small else LANES)[name]:,} {name}, {dtype}, {what}"
