@@ -48,7 +48,7 @@ import learned_pendulum  # noqa: E402
 import learned_systems  # noqa: E402
 from learned_models import as_wide, count, free, hamiltonian, neural_ode, ours  # noqa: E402
 from learned_scores import HORIZONS, OUTPUTS_A_TIME, errors_of, starts_of  # noqa: E402
-from learned_systems import DAMPED, STARS, NATURAL, PUBLISHED  # noqa: E402
+from learned_systems import DAMPED, NATURAL, PUBLISHED, STARS  # noqa: E402
 from learned_training import Trainer, by_motions, by_states  # noqa: E402
 from measure import main, row  # noqa: E402
 

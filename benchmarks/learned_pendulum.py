@@ -4,17 +4,18 @@ The record is that of `fit_measured_pendulum.py`, where it comes from, how a fil
 
     L/B = A θ1'²/2 + θ2'²/2 + C θ1' θ2' cos(θ1 - θ2) - D cos θ1 - E cos θ2
 
-It is no part of this project: `--record FILE`, or `LAGJAX_DOUBLE_PENDULUM`, names it. Without one a record is made: the
-motion that follows from the published parameters, with errors of 0.2 mrad; its friction is viscous, and there is nothing
-else to be found.
+It is no part of this project: `--record FILE`, or `LAGJAX_DOUBLE_PENDULUM`, names it. Without one a record is made:
+the motion that follows from the published parameters, with errors of 0.2 mrad; its friction is viscous, and there is
+nothing else to be found.
 
     viscous           the six coefficients, trained from the published ones
     learned friction  A, C, D, E likewise, and the force -D(q, v) v with a network for its positive-definite matrix
 
 beside the neural ODE and the Hamiltonian network, which start from nothing, and what is published. Trained are 60 s
-in three parts; the starts of what is judged lie in the 10 s after the first and after the second. After 1 and 10 natural times of 0.83 s:
-the largest error of an angle until then, in its median over the starts. Last, a motion from the start of the record to
-its end: phases are lost, and what is judged is the energy, by the published coefficients, that friction leaves.
+in three parts; the starts of what is judged lie in the 10 s after the first and after the second. After 1 and 10
+natural times of 0.83 s: the largest error of an angle until then, in its median over the starts. Last, a motion from
+the start of the record to its end: phases are lost, and what is judged is the energy, by the published coefficients and
+over E, that friction leaves: its largest error. Smoothed positions are the starts, and the limit of what can be right.
 """
 
 import jax
