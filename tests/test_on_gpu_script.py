@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.experimental import io_callback
 
 import lagjax as lj
 from benchmarks.host_operations import host_operations, with_a_look
@@ -48,7 +49,7 @@ def test_operations_on_the_host_are_found():
     for function in (
         with_a_look(jnp.sin),
         lambda x: jax.pure_callback(np.sin, shape, x),
-        lambda x: jax.experimental.io_callback(np.sin, shape, x),
+        lambda x: io_callback(np.sin, shape, x),
     ):
         assert len(host_operations(jax.jit(function).lower(1.0).compile().as_text())) == 1
     assert host_operations(jax.jit(jnp.sin).lower(1.0).compile().as_text()) == []
@@ -78,7 +79,7 @@ def test_a_callback_in_the_lagrangian_is_found():
 
 @pytest.mark.slow
 def test_the_script_runs_small(tmp_path):
-    """On any machine: rods in both precisions, each target met but for speeds, which a shared machine may miss."""
+    """On any machine: motions of rods, and what float32 says. A shared machine may miss the target of speed alone."""
     file = tmp_path / "rows.json"
     run = [sys.executable, "benchmarks/on_gpu.py", "--small", "--processor-time", "--json", str(file), "--only"]
     for what in ("rods, float64, motions", "single precision, rods"):
