@@ -254,5 +254,5 @@ def staged(program: ClosedJaxpr, first: Sequence[int], then: Sequence[int]):
 
 
 def _divides_numbers(equation):
-    result = equation.outvars[0].aval
-    return equation.primitive.name == "div" and not result.shape and jnp.issubdtype(result.dtype, jnp.floating)
+    results = [x.aval for x in equation.outvars if equation.primitive.name == "div"]
+    return any(not result.shape and jnp.issubdtype(result.dtype, jnp.floating) for result in results)

@@ -1,0 +1,90 @@
+"""What `benchmarks/on_gpu.py` rests on: no part of a batch and its gradient needs the host, and the check can tell."""
+
+import json
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.experimental import io_callback
+
+import lagjax as lj
+from benchmarks.host_operations import host_operations, with_a_look
+
+TS, WEIGHTS = np.array([0.0, 1.0]), np.random.default_rng(0).normal(size=(3, 10))
+
+
+def learned(looked_at=False):
+    """A particle in a potential of 30 numbers, more than are pushed forward; with a callback in L."""
+
+    def lagrangian(t, q, v, weights):
+        if looked_at:
+            jax.debug.callback(lambda x: None, q)
+        return 0.5 * v**2 - 0.5 * q**2 - jnp.dot(weights[2], jnp.tanh(weights[0] * q + weights[1]))
+
+    return lj.System(lagrangian)
+
+
+def text_of_gradient(system):
+    """The compiled program of the gradient by 30 numbers of 4 motions, which replays steps backward."""
+
+    def end(weights, q0):
+        return lj.integrate(system, q0, 0.0, weights, ts=TS, rtol=1e-6, method=lj.Tsit5(), throw=False).q[-1]
+
+    loss = lambda weights, q0: jnp.sum(jax.vmap(end, (None, 0))(weights, q0) ** 2)
+    return jax.jit(jax.grad(loss)).lower(WEIGHTS, np.linspace(0.0, 1.0, 4)).compile().as_text()
+
+
+@pytest.mark.slow
+def test_a_gradient_that_replays_steps_stays_on_the_device():
+    """The compiled gradient has no operation on the host."""
+    assert host_operations(text_of_gradient(learned())) == []
+
+
+def test_operations_on_the_host_are_found():
+    """A callback of any kind in a compiled program, and transfers in the words of XLA."""
+    shape = jax.ShapeDtypeStruct((), jnp.float64)
+    for function in (
+        with_a_look(jnp.sin),
+        lambda x: jax.pure_callback(np.sin, shape, x),
+        lambda x: io_callback(np.sin, shape, x),
+    ):
+        assert len(host_operations(jax.jit(function).lower(1.0).compile().as_text())) == 1
+    assert host_operations(jax.jit(jnp.sin).lower(1.0).compile().as_text()) == []
+    transfers = (
+        "  %infeed.1 = ((f32[3]{0}, pred[]), token[]) infeed(%token.0)\n"
+        "  %outfeed.1 = token[] outfeed(%p.0, %token.0), outfeed_shape=(f32[2]{0})\n"
+        "  %send.1 = (f32[], u32[], token[]) send(%p.0, %token.0), channel_id=1, is_host_transfer=true\n"
+    )
+    assert host_operations(transfers) == ["infeed", "outfeed", "send"]
+
+
+def test_names_are_no_operations():
+    """What is called a callback in the metadata of other operations does not count, nor a fusion named outfeed."""
+    named = (
+        '  %sine.1 = f64[] sine(%x.1), metadata={op_name="jit(callback)/sin"}\n'
+        '  %solve.1 = f64[2,2] custom-call(%x.1), custom_call_target="lapack_dgetrf_ffi"\n'
+        "  %outfeed_fusion = f64[] fusion(%infeed.2), kind=kLoop\n"
+    )
+    assert host_operations(named) == []
+
+
+@pytest.mark.slow
+def test_a_callback_in_the_lagrangian_is_found():
+    """The failing twin: in the gradient's program, too."""
+    assert host_operations(text_of_gradient(learned(looked_at=True)))
+
+
+@pytest.mark.slow
+def test_the_script_runs_small(tmp_path):
+    """On any machine: motions of rods, and what float32 says. A shared machine may miss the target of speed alone."""
+    file = tmp_path / "rows.json"
+    run = [sys.executable, "benchmarks/on_gpu.py", "--small", "--processor-time", "--json", str(file), "--only"]
+    for what in ("rods, float64, motions", "single precision, rods"):
+        subprocess.run([*run, what], check=True, capture_output=True, text=True, timeout=900)
+        rows = json.loads(file.read_text())["rows"]
+        assert len(rows) >= 3
+        for row in rows:
+            assert row["met"] is not False or "ours / diffrax" in row["what"], row
