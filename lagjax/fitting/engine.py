@@ -4,6 +4,7 @@ import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import contextmanager
 from functools import lru_cache
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -14,11 +15,14 @@ from jaxtyping import PyTree
 from lagjax.fitting.doubts import doubts
 from lagjax.fitting.equations import WHOLE, Problem, Stage
 from lagjax.fitting.identifiability import Identifiability
+from lagjax.fitting.optimisers import is_of_optax
 from lagjax.fitting.problem import problem_of
 from lagjax.fitting.records import Record
 from lagjax.fitting.result import Fit, FitWarning
 from lagjax.fitting.search import Course, listening, look, search
+from lagjax.fitting.trained import held_problem, parted_records, train
 from lagjax.mechanics import coordinates
+from lagjax.mechanics.diagnosis import listed
 from lagjax.mechanics.hybrid import Hybrid
 from lagjax.mechanics.system import System
 from lagjax.meter import meter, waiting
@@ -60,8 +64,11 @@ def fit(
     restarts: int | None = None,
     spread: float = 0.3,
     seed: int = 0,
-    optimiser: optx.AbstractLeastSquaresSolver | optx.AbstractMinimiser | None = None,
-    iterations: int = 100,
+    optimiser: Any = None,
+    iterations: int | None = None,
+    batch: int | None = None,
+    held_back: float | Record | Sequence[Record] | None = None,
+    patience: int | None = None,
     progress: bool | None = None,
     **options,
 ) -> Fit:
@@ -102,9 +109,21 @@ def fit(
       between two bounds; `seed` says which. The best end counts. By default 8, of up to 20 numbers, and these only as
       long as the best end is doubtful: not at rest, or with residuals that errors of measurement would hardly leave.
     - `optimiser`: by default `optimistix.LevenbergMarquardt`, with derivatives taken forward. Any other of optimistix's
-      least-squares solvers; or a minimiser of it, with derivatives in reverse, for thousands of parameters, such as
-      `optimistix.BFGS(rtol, atol)` or `optimistix.OptaxMinimiser(optax.adam(1e-3), rtol, atol)`.
-    - `iterations`: the largest number in each stage.
+      least-squares solvers; or a minimiser of it, with derivatives in reverse, such as `optimistix.BFGS(rtol, atol)`.
+    - `iterations`: the largest number in each stage, 100 by default.
+
+    **Training,** with an `optimiser` of optax, such as `optax.adam(1e-2)`, for thousands of parameters; its windows are
+    whole and on their own (`joined=False`), and it searches once:
+
+    - `iterations`: how many steps there may be, 1000 by default. `batch`: how many windows a step sees, drawn anew by
+      `seed` in each round through all; by default all. Derivatives come in reverse, of all windows at once.
+    - `held_back`: records, or which part of those given, that are only to judge by, every so many steps, with starts
+      fitted to them. The best parameters count; without it those with the smallest residuals of the last batches.
+    - `patience`: after how many judgements without improvement training stops; 10 where records are held back.
+    - Starts of windows are no matter of the optimiser: with each batch they go half of the way of Newton.
+
+    **Further:**
+
     - `progress`: show stage, steps and cost (tqdm); by default where somebody may look.
     - `options` go to `lj.integrate`: `rtol`, `atol`, `method`, `event`, `max_steps`, ...
 
@@ -123,12 +142,17 @@ def fit(
     (multiple shooting); Huber, *Robust Statistics*, §7.8 (scale by the median); Bierman, *Factorization Methods for
     Discrete Sequential Estimation* (covariance); Box & Pierce, *J. Am. Stat. Assoc.* 65 (1970) 1509 (residuals).
     """
-    if optimiser is not None and not isinstance(optimiser, optx.AbstractLeastSquaresSolver | optx.AbstractMinimiser):
-        raise TypeError(
-            f"optimiser must be one of optimistix's least-squares solvers or minimisers, not {optimiser!r:.60}.\n"
-            "Fix: leave it out; or optimistix.OptaxMinimiser(optax.adam(1e-3), rtol=1e-6, atol=1e-6)."
-        )
-    problem = problem_of(system, records, params, free, observe, bounds, priors, loss, window, options)
+    if is_of_optax(optimiser):
+        _check_training(window is not None and joined, restarts)
+        records, apart = parted_records(records, held_back, seed)
+    else:
+        _check_optimiser(optimiser, {"batch": batch, "held_back": held_back, "patience": patience})
+    problem = problem_of(system, records, params, free, observe, bounds, priors, loss, window, dict(options))
+    if is_of_optax(optimiser):
+        check = lambda: _check_motion(problem, np.zeros(problem.windows.count, bool), problem.start)
+        held = held_problem(problem, apart, system, params, observe, loss, window, options)
+        trained = train(problem, held, optimiser, batch, iterations, patience, seed, progress, check)
+        return _told(Fit(problem, *trained.searched, trained.seen, _sorted(units), trained.course))
     further = restarts
     if restarts is None:
         further = AGAIN if optimiser is None and 0 < problem.found.start.size <= AGAIN_UP_TO else 0
@@ -136,22 +160,18 @@ def fit(
     course = _course(problem, grow, joined and window is not None, scattered, bool(restarts))
     last = jax.tree.map(lambda x: x[-1], course.stages)
     with _shown(problem, course, progress) as tell:
-        searched, seen = search(problem, course, optimiser, iterations, tell)
+        searched, seen = search(problem, course, optimiser, 100 if iterations is None else iterations, tell)
     costs = coordinates.numpy_of(searched.costs).asarray(searched.costs)[: int(course.count)]
     searched = searched._replace(costs=costs)
     if seen is None and problem.found.start.size <= COVARIANCE_UP_TO:
         seen = look(problem, searched.unknowns, last)
     if seen is not None and not coordinates.is_traced(seen) and not np.any(np.asarray(seen.well)):
-        _check_motion(problem, seen, problem.start)
-    found = reported(Fit(problem, *searched, seen, tuple(sorted((units or {}).items()))), Fit.report)
-    if coordinates.is_traced(found.cost):
-        return found
-    if seen is not None and found.at_bounds():
+        _check_motion(problem, seen.well, problem.start)
+    found = Fit(problem, *searched, seen, _sorted(units))
+    if seen is not None and not coordinates.is_traced(found.cost) and found.at_bounds():
         # There the search's own slopes vanish.
         found = eqx.tree_at(lambda f: f.seen, found, look(problem, searched.unknowns, last))
-    for words in doubts(found):
-        warnings.warn(words, FitWarning, stacklevel=2)
-    return found
+    return _told(found)
 
 
 def identifiability(
@@ -184,9 +204,44 @@ def identifiability(
     """
     problem = problem_of(system, records, params, free, observe, None, priors, "squares", window, options)
     seen = look(problem, problem.start, WHOLE)
-    _check_motion(problem, seen, problem.start)
+    _check_motion(problem, seen.well, problem.start)
     noise = np.asarray(1.0) if problem.absolute else None
     return Identifiability(problem.found.names, problem.found.start, seen.singular_values, seen.combinations, noise)
+
+
+def _told(found: Fit) -> Fit:
+    """The fit, after it was reported to who runs it, and its doubts to who called."""
+    found = reported(found, Fit.report)
+    if not coordinates.is_traced(found.cost):
+        for words in doubts(found):
+            warnings.warn(words, FitWarning, stacklevel=3)
+    return found
+
+
+def _sorted(units):
+    return tuple(sorted((units or {}).items()))
+
+
+def _check_training(joined, restarts):
+    if joined:
+        raise ValueError(
+            "an optimiser of optax sees a batch of windows at a time, and does not join them.\nFix: joined=False."
+        )
+    if restarts:
+        raise ValueError("restarts= is for a search, and an optimiser of optax trains once.\nFix: leave it out.")
+
+
+def _check_optimiser(optimiser, of_training):
+    if optimiser is not None and not isinstance(optimiser, optx.AbstractLeastSquaresSolver | optx.AbstractMinimiser):
+        raise TypeError(
+            "optimiser must be one of optimistix's least-squares solvers or minimisers, or a gradient transformation "
+            f"of optax, not {optimiser!r:.60}.\nFix: leave it out; or optax.adam(1e-3), called with its learning rate."
+        )
+    if given := [name for name, value in of_training.items() if value is not None]:
+        raise ValueError(
+            f"{listed(given)} is for training by an optimiser of optax.\n"
+            "Fix: optimiser=optax.adam(1e-2), or leave it out."
+        )
 
 
 def _course(problem: Problem, grow: bool, joined: bool, scattered, all_of_them: bool) -> Course:
@@ -292,9 +347,9 @@ def _drawn(seed, shape):
     return random.normal(size=shape), random.uniform(0.01, 0.99, shape)
 
 
-def _check_motion(problem, seen, u):
+def _check_motion(problem, well, u):
     """Raise, in the words of the integration, where a motion fails."""
-    failed = np.flatnonzero(~np.asarray(seen.well))
+    failed = np.flatnonzero(~np.asarray(well))
     if not failed.size:
         return
     w = int(failed[0])
