@@ -49,6 +49,7 @@ from lagjax.sweeps.result import Sweep, open_sweep
 
 # isort: split
 # From measured motion.
+from lagjax import learned
 from lagjax.fitting.engine import fit, identifiability
 from lagjax.fitting.identifiability import Identifiability
 from lagjax.fitting.records import Record
@@ -126,6 +127,7 @@ __all__ = [
     "FitWarning",
     "identifiability",
     "Identifiability",
+    "learned",
     "WorkPrecision",
     "work_precision",
     "scenes",
