@@ -51,7 +51,8 @@ def squares(problem: Problem, x, own) -> Squares:
         return Squares(jnp.sum(r[0] ** 2), pushed @ r[0], pushed @ pushed.T, well[0])
 
     windows = jnp.arange(problem.windows.count), own
-    return lax.map(of, windows, batch_size=min(LANES, problem.windows.count))
+    # JAX's `map` in batches takes no arrays of nothing, as of starts that are known.
+    return lax.map(of, windows, batch_size=min(LANES, len(own))) if own.size else jax.vmap(of)(windows)
 
 
 def inverse_of(curvatures: Float[Array, "W k k"], damping: Float[Array, " W"]) -> Float[Array, "W k k"]:

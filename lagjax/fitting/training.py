@@ -118,7 +118,9 @@ def begun(task: Task) -> State:
         check_predicted(task.problem)
         problem, own = task.problem, jnp.asarray(task.problem.start.own)
         y, (windows, k), zero = problem.found.free(problem.found.start), own.shape, jnp.zeros((), int)
-        held, score = jnp.zeros((0, k), own.dtype), jnp.asarray(jnp.inf, own.dtype)
+        # From starts that are off, slopes are so large that optimisers that remember them, as Adam does, hardly move.
+        own, at = settled(problem, problem.found.natural(y), own, JUDGING)
+        held, score = jnp.zeros((0, k), own.dtype), jnp.sum(at.sums) / jnp.maximum(jnp.sum(task.known), 1)
         if task.held is not None:
             held, score = _judged(task, y, jnp.asarray(task.held.start.own), ENDING)
         return State(
