@@ -142,8 +142,8 @@ def positive_definite(
     sizes = jnp.broadcast_to(jnp.asarray(sizes, numbers.dtype), (n,))
     x = numbers[:n]
     root = jnp.sqrt(x**2 + 4)
-    # Of a large negative number the sum would be what rounding leaves.
-    diagonal = jnp.where(x > 0, (x + root) / 2, 2 / (root - jnp.minimum(x, 0.0)))
+    # Of a large negative number the sum would be what rounding leaves. (`minimum` has half a slope at 0.)
+    diagonal = jnp.where(x > 0, (x + root) / 2, 2 / (root - jnp.where(x > 0, 0.0, x)))
     triangle = jnp.diag(diagonal).at[np.tril_indices(n, -1)].set(numbers[n:])
     scale = jnp.sqrt(sizes)
     return scale[:, None] * (floor * jnp.eye(n, dtype=numbers.dtype) + triangle @ triangle.T) * scale[None, :]
