@@ -118,7 +118,7 @@ def fit(
     - `iterations`: how many steps there may be, 1000 by default. `batch`: how many windows a step sees, drawn anew by
       `seed` in each round through all; by default all. Derivatives come in reverse, of all windows at once.
     - `held_back`: records, or which part of those given, that are only to judge by, every so many steps, with starts
-      fitted to them. The best parameters count; without it those with the smallest residuals of the last batches.
+      fitted to them. The best parameters count; without it those with the smallest residuals of all.
     - `patience`: after how many judgements without improvement training stops; 10 where records are held back.
     - Starts of windows are no matter of the optimiser: with each batch they go half of the way of Newton.
 

@@ -41,7 +41,7 @@ class Training:
     - `losses` (S,): the mean squared residual of each step's batch, in sigmas (without sigmas in units of the data's
       spread); NaN of steps that were not taken.
     - `judged` (J,): the step after which the parameters were judged. `scores` (J,): the mean squared residual of what
-      is held back, or, where nothing is, of the last batches before.
+      is held back, or, where nothing is, of all windows.
     - `best`: the step whose parameters count, those with the smallest score. `early`: whether it stopped for want of
       patience.
     - `held_back`: the records that were held back as a `Fit` of their starts alone, or None.
@@ -86,7 +86,7 @@ class Training:
     def __repr__(self):
         if coordinates.is_traced(self.scores):
             return "Training, being traced"
-        of = "held-back records" if self.held_back is not None else "last batches"
+        of = "held-back records" if self.held_back is not None else "all windows"
         best = float(np.min(self.scores, initial=np.inf, where=np.isfinite(self.scores)))
         end = "; stopped early" if self.early else ""
         lines = [
@@ -188,7 +188,8 @@ def train(
         xp.minimum(each * state.best.round, steps), state.step, stopped, state.failed, state.skipped, held_back,
         batch, windows,
     )  # fmt: skip
-    seen = look(problem, end.unknowns, WHOLE) if problem.found.start.size <= SLOPES_UP_TO else None
+    numbers = problem.found.start.size + end.unknowns.own.size // windows
+    seen = look(problem, end.unknowns, WHOLE) if 0 < numbers <= SLOPES_UP_TO else None
     searched = Searched(end.unknowns, end.cost, state.step, course.rested, end.misfit, end.cost[None])
     return Trained(searched, seen, course)
 
@@ -219,6 +220,7 @@ def _held_back(task: Task, state: State, end: Ended, end_held: Ended) -> Fit:
     """The records that were held back as a fit of their starts."""
     held: Any = task.held
     problem = with_params(held, task.problem, end.unknowns.shared)
-    seen = look(problem, end_held.unknowns, WHOLE)
+    # Of starts that are known nothing is to be said.
+    seen = look(problem, end_held.unknowns, WHOLE) if end_held.unknowns.own.size else None
     rested = jnp.ones((), bool) if coordinates.is_traced(end_held) else np.asarray(True)
     return Fit(problem, *end_held[:2], state.step, rested, end_held.misfit, end_held.cost[None], seen, ())

@@ -8,8 +8,8 @@ stands for that of all,
 
 Its gradient comes back in reverse through the motions of the batch, all at once. With it comes, for nothing, the
 gradient by each window's own start, and that is worth more than one step of the optimiser: with the curvature JᵀJ of
-that start, which hardly changes while parameters do, and is computed in the rounds 0, 1, 2, 4, 8, ..., the start goes
-half of the way of Newton. So starts have no learning rate, and move only with the batches that they are in.
+that start, which hardly changes while parameters do and is computed once a round, the start goes half of the way of
+Newton. So starts have no learning rate, and move only with the batches that they are in.
 
 The starts of windows that are held back are fitted to them, and nothing else is: what is left says how well the
 parameters do where they were not trained.
@@ -28,7 +28,7 @@ from jaxtyping import Array, Float, Int
 from lagjax.fitting.equations import WHOLE, Problem, dampened, equations, known_before, of_window
 from lagjax.fitting.misfit import OF_NORMAL, Misfit, misfit
 from lagjax.fitting.optimisers import Optimiser
-from lagjax.fitting.own_starts import DAMPING, inverse_of, settled, squares
+from lagjax.fitting.own_starts import DAMPING, Squares, inverse_of, settled, squares
 from lagjax.fitting.predicted import check_predicted
 from lagjax.fitting.search import in_turn
 from lagjax.mechanics.compiled import compiled
@@ -124,7 +124,7 @@ def begun(task: Task) -> State:
         if task.held is not None:
             held, score = _judged(task, y, jnp.asarray(task.held.start.own), ENDING)
         return State(
-            y, own, held, task.optimiser.init(problem.found, y), jnp.zeros((windows, k, k), own.dtype),
+            y, own, held, task.optimiser.init(problem.found, y), _inverses(at),
             jnp.arange(windows), jnp.full((), windows), zero, zero, zero, zero, Best(score, zero, y, own, held),
         )  # fmt: skip
 
@@ -181,30 +181,22 @@ def with_params(held: Problem, problem: Problem, x) -> Problem:
 
 
 def _round(task: Task, state: State):
-    # In the rounds 0, 1, 2, 4, ...
-    again = (state.round & (state.round - 1)) == 0
-    x = lambda state: task.problem.found.natural(state.y)
-
-    def curvatures(state):
-        found = squares(task.problem, x(state), state.own).curvatures
-        return inverse_of(found, jnp.full(len(found), DAMPING, found.dtype))
-
-    state = state._replace(inverses=lax.cond(again, curvatures, lambda state: state.inverses, state))
-    begin = state
     stays = lambda state: (state, jnp.asarray(jnp.nan, state.y.dtype))
     one = lambda state, _: lax.cond(state.step < task.limit, partial(_step, task), stays, state)
     state, losses = lax.scan(one, state, length=task.steps)
-    if task.held is None:
-        # What the last steps of a round say of their parameters, as many as see all windows.
-        last = jnp.arange(task.steps) >= (state.step - begin.step) - -(-task.problem.windows.count // task.batch)
-        score = jnp.nanmean(jnp.where(last, losses, jnp.nan))
-    else:
+    at = squares(task.problem, task.problem.found.natural(state.y), state.own)
+    state, score = state._replace(inverses=_inverses(at)), jnp.sum(at.sums) / jnp.maximum(jnp.sum(task.known), 1)
+    if task.held is not None:
         held, score = _judged(task, state.y, state.held, JUDGING)
         state = state._replace(held=held)
     number = state.round + 1
     new = Best(score, number, state.y, state.own, state.held)
     best = jax.tree.map(lambda a, b: jnp.where(score < state.best.score, a, b), new, state.best)
     return state._replace(round=number, best=best), Round(losses, score)
+
+
+def _inverses(at: Squares):
+    return inverse_of(at.curvatures, jnp.full(len(at.sums), DAMPING, at.sums.dtype))
 
 
 def _judged(task: Task, y, held, most):
