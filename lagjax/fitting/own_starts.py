@@ -62,7 +62,7 @@ def inverse_of(curvatures: Float[Array, "W k k"], damping: Float[Array, " W"]) -
     return jnp.linalg.inv(curvatures + jax.vmap(jnp.diag)(damped))
 
 
-def settled(problem: Problem, x, own, most: int) -> tuple[Array, Squares]:
+def settled(problem: Problem, x, own, most: int, same: float = SAME) -> tuple[Array, Squares]:
     """The starts with the smallest sums of squares for given parameters, after at most so many steps."""
 
     def steps(at, damping):
@@ -71,7 +71,7 @@ def settled(problem: Problem, x, own, most: int) -> tuple[Array, Squares]:
     def go_on(state):
         i, _, at, damping = state
         falls = jnp.sum(steps(at, damping) * at.slopes, axis=1)
-        return (i < most) & jnp.any(falls > SAME * at.sums)
+        return (i < most) & jnp.any(falls > same * at.sums)
 
     def step(state):
         i, own, at, damping = state

@@ -38,6 +38,8 @@ from lagjax.numerics.chained import Unknowns
 OF_NEWTON, FARTHEST = 0.5, 0.1
 # Steps for the starts of windows when the parameters are judged, and at the end.
 JUDGING, ENDING = 4, 20
+# At the end they come to rest where a step makes no sum of squares smaller by this part.
+AT_REST = 1e-9
 
 
 class Best(NamedTuple):
@@ -170,7 +172,7 @@ def ended(task: Task, state: State) -> tuple[Ended, Ended | None]:
 
 
 def _ended(problem, x, own) -> Ended:
-    u = Unknowns(x, settled(problem, x, own, ENDING)[0])
+    u = Unknowns(x, settled(problem, x, own, ENDING, AT_REST)[0])
     values = equations(problem, u, WHOLE)
     return Ended(u, 0.5 * sum(jnp.sum(r**2) for r in values), misfit(problem, values))
 

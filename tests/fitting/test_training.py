@@ -98,7 +98,9 @@ def test_starts_of_their_own():
     records = [record(i, known=False, amplitude=a) for i, a in enumerate((1.0, 0.5))]
     problem = problem_with(records)
     problem = jax.tree.map(lambda x: jnp.asarray(x) if isinstance(x, np.ndarray) else x, problem)
-    own, at = jax.jit(lambda x, own: settled(problem, x, own, 20))(jnp.array([3.0]), jnp.asarray(problem.start.own))
+    own, at = jax.jit(lambda x, own: settled(problem, x, own, 20, 1e-14))(
+        jnp.array([3.0]), jnp.asarray(problem.start.own)
+    )
     w = np.sqrt(3.0)
     for i, r in enumerate(records):
         q = r.measured["q"]
