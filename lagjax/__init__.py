@@ -50,7 +50,9 @@ from lagjax.sweeps.result import Sweep, open_sweep
 
 # isort: split
 # From measured motion.
-from lagjax.fitting.engine import fit, identifiability
+from lagjax import learned
+from lagjax.fitting.asked import identifiability
+from lagjax.fitting.engine import fit
 from lagjax.fitting.identifiability import Identifiability
 from lagjax.fitting.records import Record
 from lagjax.fitting.result import Fit, FitWarning
@@ -128,6 +130,7 @@ __all__ = [
     "FitWarning",
     "identifiability",
     "Identifiability",
+    "learned",
     "WorkPrecision",
     "work_precision",
     "scenes",

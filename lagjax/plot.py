@@ -276,6 +276,23 @@ def fits(panels: dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]]):
     return fig
 
 
+def training(curves: dict[str, tuple[np.ndarray, np.ndarray]], best: int):
+    """Draw mean squared residuals against the steps of a training, and mark the `best` one.
+
+    **Arguments:** `curves` by name: steps (S,) and values (S,), NaN where there is none.
+
+    **Returns:** a matplotlib `Figure`.
+    """
+    fig, axes = figure(size=(6.0, 3.2))
+    axis = axes[0, 0]
+    for i, (name, (steps, values)) in enumerate(curves.items()):
+        axis.plot(steps, values, label=name, marker="" if len(steps) > 200 or i == 0 else ".", **style(i))
+    axis.axvline(best, color="black", linewidth=0.8)
+    axis.set(xlabel="step", ylabel="mean squared residual", yscale="log", title=f"The best parameters: step {best}")
+    axis.legend(fontsize=8, frameon=False)
+    return fig
+
+
 def lines(label: str, x, panels: dict[str, np.ndarray], bad):
     """Draw values against one axis of a sweep, one panel a value; points that are `bad` are marked at the bottom."""
     fig, axes = figure(len(panels), 1, size=(6.0, 2.8), sharex=True)

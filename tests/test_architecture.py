@@ -15,7 +15,18 @@ ROOT = Path(lagjax.__file__).parent
 FILES = sorted(ROOT.rglob("*.py"))
 # From the ground up: a module imports only from its own layer or from those before it.
 LAYERS = (
-    *("jax_internals", "numerics", "mechanics", "plot", "animation", "meter", "motion", "comparison", "sweeps"),
+    *(
+        "jax_internals",
+        "numerics",
+        "mechanics",
+        "learned",
+        "plot",
+        "animation",
+        "meter",
+        "motion",
+        "comparison",
+        "sweeps",
+    ),
     *("fitting", "report", "mechanisms", "scenes", "stability"),
 )
 TOP = {"__init__", "__main__", "job"}

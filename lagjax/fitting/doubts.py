@@ -14,7 +14,7 @@ ASTRAY = 1e6
 
 def doubts(fit: Fit) -> list[str]:
     """What a user has to know of a fit, the gravest first."""
-    words = [_of_search(fit), _astray(fit), _against_sigma(fit) or _on_a_curve(fit)]
+    words = [_of_search(fit), _of_training(fit), _astray(fit), _against_sigma(fit) or _on_a_curve(fit)]
     if fit.seen is not None:
         words += [_of_parameters(fit), _of_motion(fit)]
         words += [] if fit.problem.absolute else [_without_freedom(fit)]
@@ -26,6 +26,11 @@ def doubts(fit: Fit) -> list[str]:
 def _of_search(fit):
     if bool(fit.rested):
         return ""
+    if fit.training is not None:
+        return (
+            f"training ended after {int(fit.steps)} steps while the residuals were still getting smaller.\n"
+            "Fix: more iterations=; or params=found.params, to go on from here. found.training.plot() shows it."
+        )
     return (
         f"the search stopped after {int(fit.steps)} steps without converging; this is its best point.\n"
         "Usual cause: a guess too far off, parameters that the data hardly see, noise in the motion itself.\n"
@@ -33,7 +38,21 @@ def _of_search(fit):
     )
 
 
+def _of_training(fit):
+    of = fit.training
+    if of is None or not (int(of.failed) or int(of.skipped)):
+        return ""
+    return (
+        f"in training {int(of.failed)} of {int(of.motions)} motions stopped early, and {int(of.skipped)} of "
+        f"{int(of.steps)} steps had no finite gradient. These moved nothing.\n"
+        "Usual cause: steps that are too long, a mass matrix near to a singular one, windows that are too long.\n"
+        "Fix: a smaller learning rate, optax.clip_by_global_norm, a shorter window=; lj.learned.positive_definite."
+    )
+
+
 def _astray(fit):
+    if fit.training is not None:
+        return ""
     guesses = zip(fit.names, np.asarray(fit.problem.found.start), np.asarray(fit.values))
     for name, guess, x in guesses:
         if guess and abs(x) > ASTRAY * abs(guess):

@@ -4,6 +4,7 @@ import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import contextmanager
 from functools import lru_cache
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -11,19 +12,20 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import PyTree
 
-from lagjax.fitting.design import next_measurements, surveyed
 from lagjax.fitting.doubts import doubts
-from lagjax.fitting.equations import WHOLE, Problem, Stage
-from lagjax.fitting.identifiability import Identifiability
+from lagjax.fitting.equations import Problem, Stage
+from lagjax.fitting.optimisers import is_of_optax
+from lagjax.fitting.predicted import check_motion
 from lagjax.fitting.problem import problem_of
 from lagjax.fitting.records import Record
 from lagjax.fitting.result import Fit, FitWarning
 from lagjax.fitting.search import Course, listening, look, search
+from lagjax.fitting.trained import held_problem, parted_records, train
 from lagjax.mechanics import coordinates
+from lagjax.mechanics.diagnosis import listed
 from lagjax.mechanics.hybrid import Hybrid
 from lagjax.mechanics.system import System
 from lagjax.meter import meter, waiting
-from lagjax.motion.integrate import integrate
 from lagjax.motion.reported import reported
 
 # The first part of a record has so many measurements an unknown, and each next stage twice as many.
@@ -61,8 +63,11 @@ def fit(
     restarts: int | None = None,
     spread: float = 0.3,
     seed: int = 0,
-    optimiser: optx.AbstractLeastSquaresSolver | optx.AbstractMinimiser | None = None,
-    iterations: int = 100,
+    optimiser: Any = None,
+    iterations: int | None = None,
+    batch: int | None = None,
+    held_back: float | Record | Sequence[Record] | None = None,
+    patience: int | None = None,
     progress: bool | None = None,
     **options,
 ) -> Fit:
@@ -103,9 +108,21 @@ def fit(
       between two bounds; `seed` says which. The best end counts. By default 8, of up to 20 numbers, and these only as
       long as the best end is doubtful: not at rest, or with residuals that errors of measurement would hardly leave.
     - `optimiser`: by default `optimistix.LevenbergMarquardt`, with derivatives taken forward. Any other of optimistix's
-      least-squares solvers; or a minimiser of it, with derivatives in reverse, for thousands of parameters, such as
-      `optimistix.BFGS(rtol, atol)` or `optimistix.OptaxMinimiser(optax.adam(1e-3), rtol, atol)`.
-    - `iterations`: the largest number in each stage.
+      least-squares solvers; or a minimiser of it, with derivatives in reverse, such as `optimistix.BFGS(rtol, atol)`.
+    - `iterations`: the largest number in each stage, 100 by default.
+
+    **Training,** with an `optimiser` of optax, such as `optax.adam(1e-2)`, for thousands of parameters; its windows are
+    whole and on their own (`joined=False`), and it searches once:
+
+    - `iterations`: how many steps there may be, 1000 by default. `batch`: how many windows a step sees, drawn anew by
+      `seed` in each round through all; by default all. Derivatives come in reverse, of all windows at once.
+    - `held_back`: records, or which part of those given, that are only to judge by, every so many steps, with starts
+      fitted to them. The best parameters count; without it those with the smallest residuals of all.
+    - `patience`: after how many judgements without improvement training stops; 10 where records are held back.
+    - Starts of windows are no matter of the optimiser: with each batch they go half of the way of Newton.
+
+    **Further:**
+
     - `progress`: show stage, steps and cost (tqdm); by default where somebody may look.
     - `options` go to `lj.integrate`: `rtol`, `atol`, `method`, `event`, `max_steps`, ...
 
@@ -124,12 +141,17 @@ def fit(
     (multiple shooting); Huber, *Robust Statistics*, §7.8 (scale by the median); Bierman, *Factorization Methods for
     Discrete Sequential Estimation* (covariance); Box & Pierce, *J. Am. Stat. Assoc.* 65 (1970) 1509 (residuals).
     """
-    if optimiser is not None and not isinstance(optimiser, optx.AbstractLeastSquaresSolver | optx.AbstractMinimiser):
-        raise TypeError(
-            f"optimiser must be one of optimistix's least-squares solvers or minimisers, not {optimiser!r:.60}.\n"
-            "Fix: leave it out; or optimistix.OptaxMinimiser(optax.adam(1e-3), rtol=1e-6, atol=1e-6)."
-        )
-    problem = problem_of(system, records, params, free, observe, bounds, priors, loss, window, options)
+    if is_of_optax(optimiser):
+        _check_training(window is not None and joined, restarts)
+        records, apart = parted_records(records, held_back, seed)
+    else:
+        _check_optimiser(optimiser, {"batch": batch, "held_back": held_back, "patience": patience})
+    problem = problem_of(system, records, params, free, observe, bounds, priors, loss, window, dict(options))
+    if is_of_optax(optimiser):
+        check = lambda: check_motion(problem, np.zeros(problem.windows.count, bool), problem.start)
+        held = held_problem(problem, apart, system, params, observe, loss, window, options)
+        trained = train(problem, held, optimiser, batch, iterations, patience, seed, progress, check)
+        return _told(Fit(problem, *trained.searched, trained.seen, _sorted(units), trained.course))
     further = restarts
     if restarts is None:
         further = AGAIN if optimiser is None and 0 < problem.found.start.size <= AGAIN_UP_TO else 0
@@ -137,95 +159,53 @@ def fit(
     course = _course(problem, grow, joined and window is not None, scattered, bool(restarts))
     last = jax.tree.map(lambda x: x[-1], course.stages)
     with _shown(problem, course, progress) as tell:
-        searched, seen = search(problem, course, optimiser, iterations, tell)
+        searched, seen = search(problem, course, optimiser, 100 if iterations is None else iterations, tell)
     costs = coordinates.numpy_of(searched.costs).asarray(searched.costs)[: int(course.count)]
     searched = searched._replace(costs=costs)
     if seen is None and problem.found.start.size <= COVARIANCE_UP_TO:
         seen = look(problem, searched.unknowns, last)
     if seen is not None and not coordinates.is_traced(seen) and not np.any(np.asarray(seen.well)):
-        _check_motion(problem, seen, problem.start)
-    found = reported(Fit(problem, *searched, seen, tuple(sorted((units or {}).items()))), Fit.report)
-    if coordinates.is_traced(found.cost):
-        return found
-    if seen is not None and found.at_bounds():
+        check_motion(problem, seen.well, problem.start)
+    found = Fit(problem, *searched, seen, _sorted(units))
+    if seen is not None and not coordinates.is_traced(found.cost) and found.at_bounds():
         # There the search's own slopes vanish.
         found = eqx.tree_at(lambda f: f.seen, found, look(problem, searched.unknowns, last))
-    for words in doubts(found):
-        warnings.warn(words, FitWarning, stacklevel=2)
+    return _told(found)
+
+
+def _told(found: Fit) -> Fit:
+    """The fit, after it was reported to who runs it, and its doubts to who called."""
+    found = reported(found, Fit.report)
+    if not coordinates.is_traced(found.cost):
+        for words in doubts(found):
+            warnings.warn(words, FitWarning, stacklevel=3)
     return found
 
 
-def identifiability(
-    system: System | Hybrid,
-    records: Record | Sequence[Record],
-    params: PyTree,
-    *,
-    free: str | Iterable[str] | None = None,
-    observe: Callable | None = None,
-    priors: Mapping[str, tuple[float, float]] | None = None,
-    window: float | None = None,
-    shrink: str | Callable | None = None,
-    candidates: Mapping[str, Record] | None = None,
-    **options,
-) -> Identifiability:
-    """Say which combinations of parameters measurements like these can see, before anything is fitted.
+def _sorted(units):
+    return tuple(sorted((units or {}).items()))
 
-    >>> import jax.numpy as jnp
-    >>> import lagjax as lj
-    >>> spring = lj.System(lambda t, q, v, params: 0.5 * params["m"] * v**2 - 0.5 * params["k"] * q**2)
-    >>> t = jnp.linspace(0.0, 10.0, 60)
-    >>> print(identifiability(spring, lj.Record(t, q=jnp.cos(t)), {"m": 1.0, "k": 1.0}))
-    Identifiability: of 'k' and 'm' the data see only
-      k/m
 
-    What next to measure, so as to know k better (all of `next.candidates`, the best of them, when):
-
-    >>> record = lj.Record(t, q=jnp.cos(t), sigma=0.01)
-    >>> asked = identifiability(spring, record, {"m": 1.0, "k": 1.0}, free="k", shrink="k")
-    >>> print(asked.next.best.name, asked.next.best.times.round(1), asked.next.best.sd < asked.next.now)
-    q [20.2] True
-
-    **Arguments:** as for `lj.fit`. Only the times, what was measured, and `sigma` count, not the measured values;
-    `params` and the starts are where it is asked.
-
-    - `shrink`: the name of a number that is to be better known, `"k"`; or a function of `params` whose value is.
-    - `candidates`: by name, a `lj.Record` of each run that could be measured next: its times, what would be measured
-      (any numbers, such as `np.zeros(50)`; NaN where nothing), `sigma`, the start `q0` and `v0`, which is as unknown as
-      that of a fit unless `hold_q` and `hold_v` say that it is known, `params` of its own. Left out, it is one further
-      measurement of each coordinate and velocity in the runs that there are, at their times or as long again after
-      them. What the records do not measure is taken to be measured as well as `sigma` says, where that is one number
-      or has one for the kind; else it is left out.
-
-    **Returns:** an `Identifiability`; with `shrink` its `next` says how certain the number is now, and would be after
-    each candidate, where errors are small enough for the slopes at `params` to serve.
-
-    **Raises:** as `lj.fit`; `ValueError` where `shrink` is not among what is found, or the motion of a candidate fails.
-
-    Source: Pukelsheim, *Optimal Design of Experiments*, ch. 2.
-    """
-    settings = lambda observe: (free, observe, None, priors, "squares", window, dict(options))
-    problem = problem_of(system, records, params, *settings(observe))
-    if shrink is None and candidates is not None:
-        raise ValueError('candidates= are judged by what they shrink.\nFix: shrink="g", the number to know better.')
-    at = None if shrink is None else surveyed(problem, problem.start)
-    seen = look(problem, problem.start, WHOLE) if at is None else at.seen
-    if coordinates.is_traced(seen):
-        raise TypeError(
-            "identifiability looks at numbers, and here it is traced.\n"
-            "Fix: call it in a Python loop, not in jit, vmap or lj.sweep: it is compiled once."
+def _check_training(joined, restarts):
+    if joined:
+        raise ValueError(
+            "an optimiser of optax sees a batch of windows at a time, and does not join them.\nFix: joined=False."
         )
-    _check_motion(problem, seen, problem.start)
-    following = None
-    if at is not None:
-        # `observe` belongs to those that are measured by it.
-        observing = lambda runs: observe if "observed" in runs[0].measured else None
-        of = lambda runs: problem_of(system, runs, params, *settings(observing(runs)))
-        runs = [records] if isinstance(records, Record) else list(records)
-        following = next_measurements(problem, runs, at, shrink, candidates, of)
-    noise = np.asarray(1.0) if problem.absolute else None
-    return Identifiability(
-        problem.found.names, problem.found.start, seen.singular_values, seen.combinations, noise, following
-    )
+    if restarts:
+        raise ValueError("restarts= is for a search, and an optimiser of optax trains once.\nFix: leave it out.")
+
+
+def _check_optimiser(optimiser, of_training):
+    if optimiser is not None and not isinstance(optimiser, optx.AbstractLeastSquaresSolver | optx.AbstractMinimiser):
+        raise TypeError(
+            "optimiser must be one of optimistix's least-squares solvers or minimisers, or a gradient transformation "
+            f"of optax, not {optimiser!r:.60}.\nFix: leave it out; or optax.adam(1e-3), called with its learning rate."
+        )
+    if given := [name for name, value in of_training.items() if value is not None]:
+        raise ValueError(
+            f"{listed(given)} is for training by an optimiser of optax.\n"
+            "Fix: optimiser=optax.adam(1e-2), or leave it out."
+        )
 
 
 def _course(problem: Problem, grow: bool, joined: bool, scattered, all_of_them: bool) -> Course:
@@ -329,21 +309,3 @@ def _drawn(seed, shape):
     """Normal numbers, and uniform ones between 0 and 1 but for the ends."""
     random = np.random.default_rng(seed)
     return random.normal(size=shape), random.uniform(0.01, 0.99, shape)
-
-
-def _check_motion(problem, seen, u):
-    """Raise, in the words of the integration, where a motion fails."""
-    failed = np.flatnonzero(~np.asarray(seen.well))
-    if not failed.size:
-        return
-    w = int(failed[0])
-    ts, params, (q, v), options = problem.setting(u.shared, u.own[w], w, WHOLE)
-    reason = "it stops early"
-    try:
-        integrate(problem.system, q, v, params, ts=ts, **(options | {"throw": True}))
-    except (ValueError, RuntimeError) as error:
-        reason = str(error)
-    raise ValueError(
-        f"from the guess the motion of record {int(problem.windows.record[w])} fails: {reason}\n"
-        "Fix: guess params, q0 and v0 nearer to the truth; try them with lj.integrate first."
-    )

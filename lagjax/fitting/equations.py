@@ -190,7 +190,7 @@ def of_window(problem: Problem, x, s, w, stage: Stage, adjoint=None, loss: str |
 def together(problem: Problem, u: Unknowns, parts: OfWindow, stage: Stage) -> Equations:
     """All equations, from what the windows contribute (leading axis W)."""
     gap = jnp.where(_seamed(problem, stage) > 0, parts.end - jnp.roll(parts.begin, -1, axis=0), 0.0)
-    known, weight = _known_before(problem, stage)
+    known, weight = known_before(problem, stage)
     return Equations(parts.rows, _seamed(problem, stage) * gap, weight * (u.shared - known))
 
 
@@ -204,11 +204,11 @@ def slopes_together(problem: Problem, by_shared: OfWindow, by_own: OfWindow, sta
         seamed * (by_shared.end - following(by_shared.begin)),
         seamed * by_own.end,
         -seamed * following(by_own.begin),
-        jnp.diag(_known_before(problem, stage)[1]),
+        jnp.diag(known_before(problem, stage)[1]),
     )
 
 
-def _known_before(problem, stage):
+def known_before(problem, stage):
     """What is known of the shared unknowns before the data: a mean, and the inverse of its standard deviation.
 
     A prior and a hold are two squares of one unknown, which are one square and a constant.

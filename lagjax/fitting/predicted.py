@@ -1,4 +1,4 @@
-"""Whether the measurements have the shapes of what a motion says, or an error in the user's words."""
+"""Whether a motion goes through, and measurements have the shapes of what it says, or an error in the user's words."""
 
 from typing import Any
 
@@ -6,12 +6,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import numpy as np
 
-from lagjax.fitting.equations import Problem
+from lagjax.fitting.equations import WHOLE, Problem
 from lagjax.fitting.records import channel_name
 from lagjax.mechanics import constraints
 from lagjax.mechanics.diagnosis import listed
 from lagjax.mechanics.hybrid import phases_of
+from lagjax.motion.integrate import integrate
 
 
 def check_predicted(problem: Problem):
@@ -54,3 +56,21 @@ def _match(kind: str, said: Any, measured: Any, axes: int, path=()):
                 f"'{channel_name(kind, path)}' was measured with the shape {y.shape[axes:]} at each time, and the "
                 f"motion has {x.shape}.\nUsual cause: an array of one entry where a number is meant."
             )
+
+
+def check_motion(problem, well, u):
+    """Raise, in the words of the integration, where a motion fails."""
+    failed = np.flatnonzero(~np.asarray(well))
+    if not failed.size:
+        return
+    w = int(failed[0])
+    ts, params, (q, v), options = problem.setting(u.shared, u.own[w], w, WHOLE)
+    reason = "it stops early"
+    try:
+        integrate(problem.system, q, v, params, ts=ts, **(options | {"throw": True}))
+    except (ValueError, RuntimeError) as error:
+        reason = str(error)
+    raise ValueError(
+        f"from the guess the motion of record {int(problem.windows.record[w])} fails: {reason}\n"
+        "Fix: guess params, q0 and v0 nearer to the truth; try them with lj.integrate first."
+    )

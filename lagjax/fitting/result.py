@@ -2,7 +2,7 @@
 
 import warnings
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, NamedTuple, cast
 
@@ -66,6 +66,7 @@ class Fit:
       first: the search came to rest, and the residuals neither contradict `sigma` nor follow a curve.
     - Arrays are NumPy's, but where the fit is part of a program.
     - `steps`, `cost`: of the search. `costs`: from each start, the guess first; NaN where none was needed.
+    - `training`: how an optimiser of optax went, `found.training.plot()`, and what was held back.
     """
 
     problem: Problem
@@ -77,6 +78,7 @@ class Fit:
     costs: Float[Array, " starts"]
     seen: Seen | None
     units: tuple[tuple[str, str], ...] = eqx.field(static=True)
+    training: Any = None
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -197,7 +199,7 @@ class Fit:
     def _seen(self) -> Seen:
         if self.seen is None:
             raise ValueError(
-                f"uncertainties and residuals of {len(self.names)} numbers are not computed.\n"
+                f"uncertainties of {len(self.names)} numbers are not computed.\n"
                 "Fix: fit fewer of them: freeze a network with free=[...]."
             )
         return self.seen
@@ -258,11 +260,12 @@ class Fit:
         windows, at = self.problem.windows, 0
         chosen = np.asarray(windows.record) == (np.asarray(windows.record) if record is None else record)
         real = np.asarray(windows.real)[chosen]
+        rows = _rows(self.problem, self.unknowns) if self.seen is None else self.seen.rows
         for kind, tree in self.problem.measured.items():
             sigmas = jax.tree.leaves(self.problem.sigma[kind])
             for (path, x), sigma in zip(jax.tree_util.tree_leaves_with_path(tree), sigmas):
                 x, size = np.asarray(x), int(np.prod(x.shape[1:]))
-                r = np.asarray(self._seen().rows[:, at : at + size]).reshape(x.shape) * np.asarray(sigma)
+                r = np.asarray(rows[:, at : at + size]).reshape(x.shape) * np.asarray(sigma)
                 r = np.where(np.isfinite(x), r, np.nan)
                 at += size
                 if kind == "end":
@@ -347,7 +350,13 @@ class Fit:
     def __repr__(self):
         if coordinates.is_traced(self.cost):
             return f"Fit of {listed(list(self.names))}, being traced"
-        return "\n".join(lines_of(self))
+        return "\n".join(lines_of(self) + ([] if self.training is None else [repr(self.training)]))
+
+
+@partial(compiled, in_numpy=True)
+def _rows(problem: Problem, u: Unknowns):
+    """The plain residuals of all windows."""
+    return equations(replace(problem, loss="squares"), u, WHOLE).rows
 
 
 @partial(compiled, in_numpy=True)

@@ -164,7 +164,7 @@ def look(problem: Problem, u: Unknowns, stage: Stage) -> Seen:
     """What the data say at `u`."""
     check_predicted(problem)
     at = lambda problem, u, stage: seen_from(problem, u, linearised(problem, u, stage, "squares"), stage)
-    return _in_turn(at, problem, u, stage)
+    return in_turn(at, problem, u, stage)
 
 
 def _natural(problem, y: Unknowns) -> Unknowns:
@@ -232,7 +232,7 @@ def search(problem: Problem, course: Course, optimiser: Any, limit: int, tell: b
     """
     # Here while it is traced: of the same functions and shapes it need not be asked again.
     check_predicted(problem)
-    return _in_turn(lambda *args: _search(*args, limit, tell), problem, course, optimiser)
+    return in_turn(lambda *args: _search(*args, limit, tell), problem, course, optimiser)
 
 
 # Who hears of each step; outside of the program, which is kept for the next search.
@@ -255,7 +255,7 @@ def _heard(stage, cost):
         listener(int(stage), float(cost))
 
 
-def _in_turn(function: Callable, *args):
+def in_turn(function: Callable, *args):
     """`function(*args)`; on a CPU lanes of a `vmap` run one after the other, which compiles once and wastes no steps.
 
     A sweep of fits does not hear of the motions that a search tries.

@@ -46,7 +46,7 @@ def lines_of(fit) -> list[str]:
     )
     lines.append(f"  residuals: rms {told}; {size}, {int(fit.freedom)} degrees of freedom")
     lines += _whiteness(fit)
-    lines += ["  " + line for line in repr(fit.identifiability).splitlines()[1:]]
+    lines += ["  " + line for line in (repr(fit.identifiability) if fit.names else "").splitlines()[1:]]
     if at := fit.at_bounds():
         lines.append(f"  at a bound: {listed(at)}")
     return lines

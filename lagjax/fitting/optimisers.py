@@ -1,0 +1,72 @@
+"""Optimisers of optax, by what they are: a pair of functions, `init(params)` and `update(gradients, state, params)`.
+
+They see the numbers that are found in the structure of `params`, None in place of what is not found, so that what goes
+by names (`optax.multi_transform`, `optax.masked`) works; numbers with bounds as free ones. Of an array of which some
+entries are found they see these, in a row.
+"""
+
+import inspect
+from collections.abc import Hashable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+
+from lagjax.fitting.parameters import Found
+from lagjax.mechanics.outside import meaning_of
+
+
+def is_of_optax(optimiser: Any) -> bool:
+    """Whether something looks like a gradient transformation of optax."""
+    return isinstance(optimiser, tuple) and all(callable(getattr(optimiser, x, None)) for x in ("init", "update"))
+
+
+class Optimiser:
+    """A gradient transformation, equal to all that mean the same: `optax.adam(1e-2)` is another object each time."""
+
+    def __init__(self, given: Any):
+        self.given = given
+        meanings = meaning_of(given.init), meaning_of(given.update)
+        self.meaning: Hashable = id(given) if None in meanings else meanings
+        # Some ask for the value, too, such as `optax.contrib.reduce_on_plateau`.
+        kinds = [p.kind for p in inspect.signature(given.update).parameters.values()]
+        self.asks_for_more = inspect.Parameter.VAR_KEYWORD in kinds
+
+    def __hash__(self):
+        return hash(self.meaning)
+
+    def __eq__(self, other):
+        return isinstance(other, Optimiser) and self.meaning == other.meaning
+
+    def init(self, found: Found, y):
+        """The state of the optimiser at free numbers `y` (p,)."""
+        return self.given.init(as_params(found, y))
+
+    def step(self, found: Found, y, slopes, state, value, value_of):
+        """Free numbers after a step, and the state; `value` is that of the function `value_of(y)` with these slopes."""
+        more = {}
+        if self.asks_for_more:
+            of_tree = lambda tree: value_of(as_vector(tree, y))
+            more = {"value": value, "grad": as_params(found, slopes), "value_fn": of_tree}
+        changes, state = self.given.update(as_params(found, slopes), state, as_params(found, y), **more)
+        return y + as_vector(changes, y), state
+
+
+def as_params(found: Found, y):
+    """Numbers (p,) in the structure of `params`, None in place of what is not found."""
+    leaves, structure = jtu.tree_flatten(found.params)
+    chosen: list[Any] = [None] * len(leaves)
+    at = 0
+    for number, places in found.leaves:
+        shape = leaves[number].shape if places is None else (len(places),)
+        size = leaves[number].size if places is None else len(places)
+        chosen[number] = y[at : at + size].reshape(shape)
+        at += size
+    return jtu.tree_unflatten(structure, chosen)
+
+
+def as_vector(tree, like):
+    """All numbers of a tree in a row, with the dtype of `like`."""
+    leaves = [jnp.ravel(x).astype(like.dtype) for x in jax.tree.leaves(tree)]
+    return jnp.concatenate(leaves) if leaves else jnp.zeros_like(like)

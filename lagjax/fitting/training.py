@@ -1,0 +1,275 @@
+"""Training: steps of an optimiser of optax on batches of windows, judged on records that are held back.
+
+The cost is that of a fit, half of the sum of squared residuals and of what is known before, over the number of
+measurements N. A step sees a batch of B of the W windows, drawn anew in each round through all of them, whose sum
+stands for that of all,
+
+    cost = (W/B Σ_batch r² / 2 + Σ ((x - mean)/sd)² / 2) / N.
+
+Its gradient comes back in reverse through the motions of the batch, all at once. With it comes, for nothing, the
+gradient by each window's own start, and that is worth more than one step of the optimiser: with the curvature JᵀJ of
+that start, which hardly changes while parameters do and is computed once a round, the start goes half of the way of
+Newton. So starts have no learning rate, and move only with the batches that they are in.
+
+The starts of windows that are held back are fitted to them, and nothing else is: what is left says how well the
+parameters do where they were not trained.
+"""
+
+from dataclasses import replace
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float, Int
+
+from lagjax.fitting.equations import WHOLE, Problem, dampened, equations, known_before, of_window
+from lagjax.fitting.misfit import OF_NORMAL, Misfit, misfit
+from lagjax.fitting.optimisers import Optimiser
+from lagjax.fitting.own_starts import DAMPING, Squares, inverse_of, settled, squares
+from lagjax.fitting.predicted import check_predicted
+from lagjax.fitting.search import in_turn
+from lagjax.mechanics.compiled import compiled
+from lagjax.numerics.chained import Unknowns
+
+# Of the way of Newton a start goes so much at a time, and no further than so much of the spread of the starts.
+OF_NEWTON, FARTHEST = 0.5, 0.1
+# Steps for the starts of windows when the parameters are judged, and at the end.
+JUDGING, ENDING = 4, 20
+# At the end they come to rest where a step makes no sum of squares smaller by this part.
+AT_REST = 1e-9
+
+
+class Best(NamedTuple):
+    """The best judgement so far: its score, the round, and what was judged."""
+
+    score: Float[Array, ""]
+    round: Int[Array, ""]
+    y: Float[Array, " p"]
+    own: Float[Array, "W k"]
+    held: Float[Array, "H k"]
+
+
+class State(NamedTuple):
+    """How far a training has come.
+
+    - `y` (p,): free numbers. `own` (W, k), `held` (H, k): starts of windows, and of those that are held back.
+    - `optimiser`: its state. `inverses` (W, k, k): of the curvatures of the starts.
+    - `order` (W,): in which windows come; those before `at` have come. `step`, `round`: how many have been done.
+    - `failed`: motions that ended early. `skipped`: steps without a finite gradient.
+    """
+
+    y: Float[Array, " p"]
+    own: Float[Array, "W k"]
+    held: Float[Array, "H k"]
+    optimiser: Any
+    inverses: Float[Array, "W k k"]
+    order: Int[Array, " W"]
+    at: Int[Array, ""]
+    step: Int[Array, ""]
+    round: Int[Array, ""]
+    failed: Int[Array, ""]
+    skipped: Int[Array, ""]
+    best: Best
+
+
+class Round(NamedTuple):
+    """Of a round: the mean squared residual of each batch, in sigmas (NaN after the last step), and its score."""
+
+    losses: Float[Array, " steps"]
+    score: Float[Array, ""]
+
+
+class Task(NamedTuple):
+    """All that a training is about, but for how far it has come.
+
+    `held` is None where no records are held back. A round has so many steps, of so many windows each.
+    """
+
+    problem: Problem
+    held: Problem | None
+    optimiser: Optimiser
+    batch: int
+    steps: int
+    seed: Any
+    limit: Any
+    patience: Any
+
+    @property
+    def known(self):
+        """The number of measurements of each window."""
+        count = lambda x, s: jnp.sum((jnp.isfinite(x) & jnp.isfinite(s)).reshape(x.shape[0], -1), axis=1)
+        return sum(count(x, s) for x, s in zip(*map(jax.tree.leaves, self.problem.data)))
+
+
+class Ended(NamedTuple):
+    """The end of a training, or of what was held back: as of a search."""
+
+    unknowns: Unknowns
+    cost: Float[Array, ""]
+    misfit: Misfit
+
+
+@partial(compiled, in_numpy=True)
+def begun(task: Task) -> State:
+    """The state before the first step."""
+
+    def begin(task):
+        check_predicted(task.problem)
+        problem, own = task.problem, jnp.asarray(task.problem.start.own)
+        y, (windows, k), zero = problem.found.free(problem.found.start), own.shape, jnp.zeros((), int)
+        # From starts that are off, slopes are so large that optimisers that remember them, as Adam does, hardly move.
+        own, at = settled(problem, problem.found.natural(y), own, JUDGING)
+        held, score = jnp.zeros((0, k), own.dtype), jnp.sum(at.sums) / jnp.maximum(jnp.sum(task.known), 1)
+        if task.held is not None:
+            held, score = _judged(task, y, jnp.asarray(task.held.start.own), ENDING)
+        return State(
+            y, own, held, task.optimiser.init(problem.found, y), _inverses(at),
+            jnp.arange(windows), jnp.full((), windows), zero, zero, zero, zero, Best(score, zero, y, own, held),
+        )  # fmt: skip
+
+    return in_turn(begin, task)
+
+
+@partial(compiled, in_numpy=True)
+def round_of(task: Task, state: State) -> tuple[State, Round]:
+    """One round: so many steps, and a judgement."""
+    return in_turn(_round, task, state)
+
+
+@compiled
+def all_rounds(task: Task, rounds: int) -> tuple[State, State, Round]:
+    """All rounds in one program, for a fit that is part of another one; the state before them comes first."""
+
+    def run(task):
+        nan = lambda state, *shape: jnp.full(shape, jnp.nan, state.y.dtype)
+        nothing = lambda state: (state, Round(nan(state, task.steps), nan(state)))
+        turn = lambda state, _: lax.cond(goes_on(task, state), partial(_round, task), nothing, state)
+        first = begun(task)
+        return first, *lax.scan(turn, first, length=rounds)
+
+    return in_turn(run, task)
+
+
+def goes_on(task: Task, state: State):
+    """Whether there is another round."""
+    return (state.step < task.limit) & (state.round - state.best.round < task.patience)
+
+
+@partial(compiled, in_numpy=True)
+def ended(task: Task, state: State) -> tuple[Ended, Ended | None]:
+    """The best judgement, with all starts fitted to it; and what was held back."""
+
+    def end(task, state):
+        problem, best = task.problem, state.best
+        x = problem.found.natural(best.y)
+        found = _ended(problem, x, best.own)
+        return found, None if task.held is None else _ended(with_params(task.held, problem, x), x[:0], best.held)
+
+    return in_turn(end, task, state)
+
+
+def _ended(problem, x, own) -> Ended:
+    u = Unknowns(x, settled(problem, x, own, ENDING, AT_REST)[0])
+    values = equations(problem, u, WHOLE)
+    return Ended(u, 0.5 * sum(jnp.sum(r**2) for r in values), misfit(problem, values))
+
+
+def with_params(held: Problem, problem: Problem, x) -> Problem:
+    """The problem of what is held back, with these parameters, none of which it finds."""
+    return replace(held, found=replace(held.found, params=problem.found.into(x)))
+
+
+def _round(task: Task, state: State):
+    stays = lambda state: (state, jnp.asarray(jnp.nan, state.y.dtype))
+    one = lambda state, _: lax.cond(state.step < task.limit, partial(_step, task), stays, state)
+    state, losses = lax.scan(one, state, length=task.steps)
+    at = squares(task.problem, task.problem.found.natural(state.y), state.own)
+    state, score = state._replace(inverses=_inverses(at)), jnp.sum(at.sums) / jnp.maximum(jnp.sum(task.known), 1)
+    if task.held is not None:
+        held, score = _judged(task, state.y, state.held, JUDGING)
+        state = state._replace(held=held)
+    number = state.round + 1
+    new = Best(score, number, state.y, state.own, state.held)
+    best = jax.tree.map(lambda a, b: jnp.where(score < state.best.score, a, b), new, state.best)
+    return state._replace(round=number, best=best), Round(losses, score)
+
+
+def _inverses(at: Squares):
+    return inverse_of(at.curvatures, jnp.full(len(at.sums), DAMPING, at.sums.dtype))
+
+
+def _judged(task: Task, y, held, most):
+    """The starts of what is held back, and its mean squared residual, at free numbers."""
+    problem: Any = task.held
+    fixed = with_params(problem, task.problem, task.problem.found.natural(y))
+    held, at = settled(fixed, y[:0], held, most)
+    known = sum(jnp.sum(jnp.isfinite(a) & jnp.isfinite(b)) for a, b in zip(*map(jax.tree.leaves, problem.data)))
+    return held, jnp.sum(at.sums) / jnp.maximum(known, 1)
+
+
+def _step(task: Task, state: State):
+    """One step of the optimiser, and half of one of Newton for the starts of its batch."""
+    problem, found, known = task.problem, task.problem.found, task.known
+    count, total = problem.windows.count, jnp.maximum(jnp.sum(known), 1)
+    drawn = lambda: jax.random.permutation(jax.random.fold_in(jax.random.key(task.seed), state.step), count)
+    anew = state.at + task.batch > count
+    order = lax.cond(anew, drawn, lambda: state.order)
+    at = jnp.where(anew, 0, state.at)
+    chosen = lax.dynamic_slice(order, (at,), (task.batch,))
+
+    def cost(y, own):
+        x = found.natural(y)
+        sums, well = _sums(problem, x, own, chosen)
+        mean, weight = known_before(problem, WHOLE)
+        before = jnp.sum((weight * (x - mean)) ** 2)
+        return 0.5 * (count / task.batch * jnp.sum(sums) + before) / total, (jnp.sum(sums), well)
+
+    own = state.own[chosen]
+    (value, (squared, well)), (by_y, by_own) = jax.value_and_grad(cost, (0, 1), has_aux=True)(state.y, own)
+    y, optimiser = task.optimiser.step(
+        found, state.y, by_y, state.optimiser, value, lambda y: cost(y, own)[0]
+    )  # fmt: skip
+    finite = jnp.all(jnp.isfinite(by_y)) & jnp.all(jnp.isfinite(y))
+    kept = lambda new, old: jax.tree.map(lambda a, b: jnp.where(finite, a, b), new, old)
+    y, optimiser = kept((y, optimiser), (state.y, state.optimiser))
+    slopes = by_own * (total * task.batch / count)
+    own = own + _towards(problem, chosen, state.inverses[chosen], slopes)
+    state = state._replace(
+        y=y, optimiser=optimiser, own=state.own.at[chosen].set(own), order=order, at=at + task.batch,
+        step=state.step + 1, failed=state.failed + jnp.sum(~well), skipped=state.skipped + ~finite,
+    )  # fmt: skip
+    return state, squared / jnp.maximum(jnp.sum(known[chosen]), 1)
+
+
+def _sums(problem, x, own, chosen):
+    """The sum of squares of each chosen window, and which motions ended well. All lanes share the parameters."""
+
+    def one(s, w):
+        found, well = of_window(problem, x, s, w, WHOLE, loss="squares")
+        # Where a motion fails, what it misses is a constant cost.
+        return jnp.where(well, found.rows, lax.stop_gradient(found.rows)), well
+
+    rows, well = jax.vmap(one)(own, chosen)
+    if problem.loss != "squares":
+        # Far from the truth every residual would look like an outlier, and such a loss has no slope there.
+        half = jnp.nanmedian(jnp.where(rows == 0, jnp.nan, jnp.abs(rows)))
+        ordinary = jnp.maximum(OF_NORMAL * jnp.where(jnp.isfinite(half), half, 0.0), 1.0)
+        rows = dampened(rows, problem.loss, lax.stop_gradient(ordinary))
+    return jnp.sum(rows**2, axis=1), well
+
+
+def _towards(problem, chosen, inverses, slopes):
+    """The steps of the starts of some windows; none where a slope is not finite."""
+    slopes = jnp.where(jnp.all(jnp.isfinite(slopes), axis=1, keepdims=True), slopes, 0.0)
+    steps = -OF_NEWTON * jnp.einsum("bij,bj->bi", inverses, slopes)
+    moved = [jnp.einsum("bij,bj->bi", chart.along[chosen], steps) for chart in problem.starts]
+    far = jnp.max(jnp.abs(jnp.concatenate(moved, axis=1)) / problem.unit[None], axis=1, initial=0.0)
+    return steps * jnp.minimum(1.0, FARTHEST / jnp.maximum(far, FARTHEST))[:, None]
+
+
+def steps_of_a_round(windows: int, batch: int, limit: int) -> int:
+    """How many steps a round has: such that judging costs little beside them, and rounds are alike."""
+    return int(np.ceil(limit / np.ceil(limit / max(10, int(np.ceil(4 * windows / batch))))))
