@@ -107,7 +107,7 @@ class Network(eqx.Module):
 
 
 def positive_definite(
-    numbers: Float[ArrayLike, " n(n+1)/2"], sizes: ArrayLike = 1.0, floor: float = 1e-3
+    numbers: Float[ArrayLike, " k"], sizes: ArrayLike = 1.0, floor: float = 1e-3
 ) -> Float[Array, "n n"]:
     """Return a positive definite matrix made of any numbers: a mass matrix, or one of damping.
 

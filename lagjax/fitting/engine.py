@@ -141,6 +141,7 @@ def fit(
     (multiple shooting); Huber, *Robust Statistics*, §7.8 (scale by the median); Bierman, *Factorization Methods for
     Discrete Sequential Estimation* (covariance); Box & Pierce, *J. Am. Stat. Assoc.* 65 (1970) 1509 (residuals).
     """
+    apart = None
     if is_of_optax(optimiser):
         _check_training(window is not None and joined, restarts)
         records, apart = parted_records(records, held_back, seed)

@@ -98,7 +98,7 @@ class Task(NamedTuple):
     patience: Any
 
     @property
-    def known(self):
+    def known(self) -> Any:
         """The number of measurements of each window."""
         count = lambda x, s: jnp.sum((jnp.isfinite(x) & jnp.isfinite(s)).reshape(x.shape[0], -1), axis=1)
         return sum(count(x, s) for x, s in zip(*map(jax.tree.leaves, self.problem.data)))

@@ -59,7 +59,7 @@ class Problem(NamedTuple):
     dt0: Float[Array, ""] | None
     y0: PyTree[Float[Array, "..."]]
     args: PyTree
-    room: Room | None = None
+    room: Room = Room(ROWS, PLACES)
 
 
 class Place(NamedTuple):

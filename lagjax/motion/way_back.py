@@ -230,7 +230,7 @@ class _Way:
         if self.lanes is None and all(x.size <= PRODUCT for x in self.leaves):
             return solver
         program = jax.make_jaxpr(lambda t, y: solver.terms.vf(t, y, None))(t0, y)
-        if length(program.jaxpr) * evaluations_a_step(method) > COPIES:
+        if length(program.jaxpr) * (evaluations_a_step(method) or 0) > COPIES:
             return solver
         return replace(solver, solver=replace(method, in_a_loop=False))
 

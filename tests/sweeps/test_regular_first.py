@@ -10,7 +10,7 @@ import pytest
 from jax import lax
 
 import lagjax as lj
-from lagjax.fitting.search import _in_turn
+from lagjax.fitting.search import in_turn
 from lagjax.jax_internals.tracing import REGULAR_FIRST, WATCHED, takes_for_regular
 from lagjax.motion import reported
 from lagjax.sweeps import lanes, remembered
@@ -232,5 +232,5 @@ def test_a_fit_takes_nothing_for_regular():
     with WATCHED(True), REGULAR_FIRST(True):
         assert takes_for_regular()
         inside = []
-        _in_turn(lambda x: inside.append(takes_for_regular()) or x, jnp.asarray(1.0))
+        in_turn(lambda x: inside.append(takes_for_regular()) or x, jnp.asarray(1.0))
     assert inside == [False]
