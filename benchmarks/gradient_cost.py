@@ -136,9 +136,9 @@ def rows(wanted):
 def by_network(name, problem):
     """The gradient of a motion with a network in L: ours, beside our solve and diffrax's."""
     clock = "process_time" if CLOCK["seconds"] is time.process_time else "perf_counter"
-    run = lambda who, method="": in_new_process(
+    run = lambda who: in_new_process(
         f"import json, sys\nsys.path.insert(0, {str(Path(__file__).parent)!r})\nfrom networks import measured\n"
-        f"print(json.dumps(measured({name!r}, {who!r}, {method!r}, {clock!r})))"
+        f"print(json.dumps(measured({name!r}, {who!r}, clock={clock!r})))"
     )
     ours = run("lagjax")
     target = 4.0 if problem.kind == "rod" else 3.5 if problem.lanes else 3.0
@@ -152,11 +152,6 @@ def by_network(name, problem):
     yield row(f"{name}: first gradient / diffrax's", ours["first"] / theirs["first"], 1.0, s=ours["first"])
     target = 0.5 if problem.outputs == 20 else 0.35
     yield row(f"{name}: gradient / diffrax's", ours["next"] / theirs["next"], target, **shown, **theirs_shown)
-    if problem.outputs == 20:
-        # Each output is the end of a step: with so many of them a lower order is enough.
-        eight = run("lagjax", "Nystrom8")
-        shown = {"ms": 1e3 * eight["next"], "error": eight["error"]}
-        yield row(f"{name}: gradient by Nystrom8 / diffrax's", eight["next"] / theirs["next"], target, **shown)
 
 
 def by_parameters(wanted):
