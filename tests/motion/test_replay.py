@@ -70,6 +70,7 @@ def test_a_cotangent_that_is_dropped_is_seen(monkeypatch):
         modes_agree(lambda p: end(system, 0.75, 0.25, p), PARAMS)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("room", exhaustive_but(((4, 2),), ((16, 64), (16, 4), (4, 2))))
 def test_more_steps_than_there_is_room_for(monkeypatch, room):
     """Steps run again from the places that are kept, each of them or every other one, are the same steps."""
