@@ -238,9 +238,9 @@ fig
 
 # %% [markdown]
 # In windows that stay inside, or step out for a moment at one end, the residuals are errors of measurement. In the two
-# that are outside for longer they are up to 30 sigma, and follow a curve. So it is with any record that is held back, and
-# no ensemble is needed; but the ensemble says where to expect it before there is such a record, and so where the next
-# one should go.
+# that are outside for longer they are up to 30 sigma, and follow a curve. So it is with any record that is held back,
+# and no ensemble is needed; but the ensemble says where to expect it before there is such a record, and so where the
+# next one should go.
 
 # %%
 assert 0.8 < found.chi2 / found.freedom < 1.15 and len(found.names) == 31
