@@ -17,7 +17,7 @@ def run(*words):
     return found.stdout
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_more_time_makes_a_better_model():
     """The published double pendulum for four seconds and for a tenth of one: the first is five times closer."""
     found = run(
@@ -44,7 +44,7 @@ print(json.dumps([float(loss(trainer.train(first, seconds, PEAK).weights, other)
     assert longer < 0.2 * shorter
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_what_is_learned_from_is_true():
     """Accelerations by a formula by hand and energies by T + V; smoothed states of known motions; the momenta's M."""
     run(

@@ -77,7 +77,7 @@ def test_a_callback_in_the_lagrangian_is_found():
     assert host_operations(text_of_gradient(learned(looked_at=True)))
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_the_script_runs_small(tmp_path):
     """On any machine: motions of rods, and what float32 says. A shared machine may miss the target of speed alone."""
     file = tmp_path / "rows.json"

@@ -163,7 +163,7 @@ def test_no_peak(rough):
         jax.jit(lambda x: lj.fit(fall, lj.Record(T, q=x), {"g": 9.0}, restarts=0).laplace().mean)(measured())
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_windows_records_and_a_loss_that_forgives():
     """Windows on their own, losses that forgive: as JAX has the Hessian of all unknowns; joined windows are refused."""
     of_all = lambda f: jax.jit(jax.hessian(lambda x: -f.log_likelihood(ravel_pytree(f.sampling)[1](x))))

@@ -226,7 +226,7 @@ def test_patience():
     assert int(quietly(spring, [record()], {"k": 4.0}, patience=4, **options).steps) == 40
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_inside_of_a_program():
     """Under jit, and in lanes, a training is that of a call by itself."""
 
