@@ -15,10 +15,10 @@ from lagjax.mechanics.hybrid import Hybrid
 from lagjax.mechanics.saddle_point import examined
 from lagjax.mechanics.structure import Structure, is_free_of_velocities, structure
 from lagjax.mechanics.system import System
-from lagjax.mechanics.written_out import has_networks
 from lagjax.motion.consistency import departures, to_manifold, within
 from lagjax.motion.consistent_state import consistent_state
 from lagjax.motion.phase_graph import HybridExplanation, explained
+from lagjax.motion.solve import nystrom_for
 from lagjax.numerics.rank import independent_rows
 
 # A state is taken for one on the constraints that was rounded, and moved there, where it is this near.
@@ -127,7 +127,7 @@ def _explain(system: System, s: coordinates.State) -> Explanation:
     rows += [(name, "yes") for name in ("force", "dissipation") if getattr(system, name) is not None]
     rows.append(("solved", _how_solved(equations_of(system, *s, quickly=True), found_structure)))
     if is_free_of_velocities(system, *s):
-        by = "Nystrom8" if has_networks(system, s.params) else "Nystrom12"
+        by = type(nystrom_for(system, s.params)).__name__
         rows.append(("velocities", f"accelerations do not depend on them: stepped by {by}"))
     if problem:
         rows.append(("problem", problem.replace("\n", "\n    ")))

@@ -188,11 +188,12 @@ def recorded_again(problem: Problem, record: Record, number, end) -> Rows:
     taken, place = k < run.accepted, run.place
     t0, t1, y0 = run.rows
     t1 = jnp.where(taken & (k < count - 1), t1, p.t1)
-    return Rows(jnp.where(taken, t0, p.t1), t1, jax.tree.map(lambda x, y: _chosen(taken, x, y), y0, place.y))
+    return Rows(jnp.where(taken, t0, p.t1), t1, jax.tree.map(lambda x, y: jnp.where(like(taken, x), x, y), y0, place.y))
 
 
-def _chosen(mask, x, y):
-    return jnp.where(mask.reshape(mask.shape + (1,) * (x.ndim - mask.ndim)), x, y)
+def like(mask, x):
+    """A mask of rows or lanes with as many axes as x has."""
+    return mask.reshape(mask.shape + (1,) * (jnp.ndim(x) - jnp.ndim(mask)))
 
 
 def _well():

@@ -49,7 +49,10 @@ class Replay:
 
     It is what `adjoint=None` does. `record` is for lagjax alone.
 
-    **Raises:** `ValueError` where a motion is integrated for which the memory is too small.
+    **Raises:** `ValueError` where it is no positive number, where a motion is integrated for which it is too small, and
+    where steps are not recorded (a controller of one's own, a condition for diffrax, `progress`).
+
+    Source: Griewank & Walther, *Evaluating Derivatives*, ch. 12 (reversal by checkpoints).
     """
 
     memory: float | None = None

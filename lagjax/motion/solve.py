@@ -205,9 +205,7 @@ def method_of(settings, system, *state):
         pairs = not isinstance(settings.adjoint, diffrax.BacksolveAdjoint)
         if not pairs or not _are_free_of_velocities(system, *state):
             return Dopri8()
-        # A network's own motion is less smooth than that of closed forms: at equal error, from 1e-3 to 1e-11, order 8
-        # takes two thirds to nine tenths of the evaluations of order 12, with many outputs half.
-        return Nystrom8() if has_networks(system, state[-1]) else Nystrom12()
+        return nystrom_for(system, state[-1])
     if isinstance(chosen, Nystrom) and not _are_free_of_velocities(system, *state):
         cause = "there are constraints" if any(phase.constraints for phase in phases_of(system)) else "these do"
         raise ValueError(
@@ -219,6 +217,13 @@ def method_of(settings, system, *state):
     # With other adjoints, and for conditions that ask it, the solver stays the one that was given.
     ours = in_our_form(chosen) if settings.event is None and isinstance(settings.adjoint, FOLLOWED) else None
     return chosen if ours is None else ours
+
+
+def nystrom_for(system, params) -> Nystrom:
+    """The method by default for accelerations that do not depend on velocities."""
+    # A network's own motion is less smooth than that of closed forms: at equal error, from 1e-3 to 1e-11, order 8
+    # takes two thirds to nine tenths of the evaluations of order 12, with many outputs half.
+    return Nystrom8() if has_networks(system, params) else Nystrom12()
 
 
 def _are_free_of_velocities(system, *state):

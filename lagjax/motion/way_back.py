@@ -21,7 +21,7 @@ from jaxtyping import Array, Int, PyTree
 
 from lagjax.jax_internals.one_function import PRODUCT
 from lagjax.jax_internals.programs import length
-from lagjax.motion.recording import Problem, Record, Recorded, Rows, recorded_again
+from lagjax.motion.recording import Problem, Record, Recorded, Rows, like, recorded_again
 from lagjax.motion.stepping import OnManifold
 from lagjax.numerics.evaluations import evaluations_a_step
 from lagjax.numerics.nystrom import Nystrom
@@ -187,7 +187,7 @@ class _Way:
         if self.lanes is None:
             return tree
         idle, longest = self.record.count == 0, jnp.argmax(self.record.count)
-        return jax.tree.map(lambda x: jnp.where(_like(idle, x), x[longest][None], x), tree)
+        return jax.tree.map(lambda x: jnp.where(like(idle, x), x[longest][None], x), tree)
 
     def added(self, total, i, ct):
         """The cotangents of the arrays with one more, of the i-th, if it is asked for."""
@@ -246,7 +246,7 @@ class _Way:
         output = jnp.maximum(s.output, 0)
         time = self.at(self.ts, output)
         hit = here & (s.output >= 0) & (time > t0) & (time <= t1)
-        only = lambda condition, tree: jax.tree.map(lambda x: jnp.where(_like(condition, x), x, 0.0), tree)
+        only = lambda condition, tree: jax.tree.map(lambda x: jnp.where(like(condition, x), x, 0.0), tree)
         ct = jax.tree.map(jnp.add, s.y, only(hit, self.at(self.of_outputs, output)))
         of_arrays, of_t0, of_t1, of_y = self.pulled(t0, t1, y0, only(here, ct))
         total = [x + (only(here, d) if self.is_lane(i) else d) for x, d, i in zip(s.moved, of_arrays, self.moved)]
@@ -255,7 +255,7 @@ class _Way:
             total = self.added(total, self.where.t0, only(first, of_t0))
             total = self.added(total, ends, self.at_time(t1, only(here, of_t1)))
             total = self.added(total, ends, self.at_time(t0, only(here & ~first, of_t0)))
-        y = jax.tree.map(lambda x, ct: jnp.where(_like(here, x), x, ct), of_y, ct)
+        y = jax.tree.map(lambda x, ct: jnp.where(like(here, x), x, ct), of_y, ct)
         return Sweep(s.k - on, s.number, s.rows, y, total, jnp.where(hit, self.at(self.first, output - 1), s.output))
 
     def piece(self, s: Sweep) -> Sweep:
@@ -266,7 +266,7 @@ class _Way:
 
         def again():
             rows = self.safe(self.each(recorded_again, 3)(*self.leaves, self.record, number, end))
-            return jax.tree.map(lambda x, old: jnp.where(_like(further, x), x, old), rows, s.rows)
+            return jax.tree.map(lambda x, old: jnp.where(like(further, x), x, old), rows, s.rows)
 
         rows = lax.cond(eqxi.unvmap_any(further), again, lambda: s.rows)
         return lax.while_loop(lambda s: eqxi.unvmap_any(self.is_on(s)), self.turn, s._replace(number=number, rows=rows))
@@ -276,7 +276,3 @@ def _outputs(leaves, motion, lanes):
     """The times of the outputs, and the first at each of them, of one lane or of all."""
     of = lambda *leaves: (motion.problem(leaves).ts, motion.problem(leaves).first)
     return of(*leaves) if lanes is None else lanes.each(of)(*leaves)
-
-
-def _like(mask, x):
-    return mask.reshape(mask.shape + (1,) * (jnp.ndim(x) - jnp.ndim(mask)))
