@@ -18,7 +18,7 @@ along every axis of them. Those by many numbers are in `pulled.py`. So `jacfwd(j
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial, reduce
 
 import diffrax
@@ -60,7 +60,7 @@ def solve_in_both_modes(solve: Callable, x: PyTree, fixed: PyTree, recorded: boo
     def outputs(adjoint, *operands):
         leaves, record = operands[: structure.num_leaves], operands[structure.num_leaves :]
         if isinstance(adjoint, Replay):
-            adjoint = Replay(record=jtu.tree_unflatten(shapes[Replay], record) if record else None)
+            adjoint = replace(adjoint, record=jtu.tree_unflatten(shapes[Replay], record) if record else None)
         return [y for y in by(adjoint, True, *leaves)[0] if _is_float(y)]
 
     # What is not differentiated is a program that others may look into, as they do with a call.

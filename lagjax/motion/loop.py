@@ -118,7 +118,7 @@ def _loop(equations, start, y0, refused, scales, settings, ts, adjoint, guards=N
             terms, solver, controller, ts, first, after, ts[0], ts[-1], settings.dt0, y0, start.params
         )  # fmt: skip
         problem = with_room(problem, settings.memory)
-        return _replayed(replayed(problem, settings.max_steps, not own(), adjoint.record), ts)
+        return _replayed(replayed(problem, settings.max_steps, not own(), adjoint), ts)
     # Reverse mode has to look inside.
     if isinstance(adjoint, diffrax.ForwardMode):
         reached, outputs, *rest = one_function(solve, *arguments, checked=not own(), in_blocks=True)

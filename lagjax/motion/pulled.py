@@ -45,13 +45,13 @@ def _pull_jvp(primals, tangents, *, which, outputs):
     return values, type(values)(ad.instantiate_zeros(d) for d in derivative)
 
 
-def _pulled(x, fixed, cotangents, which, outputs):
+def _pulled(x, fixed, cotangents, which, outputs, bent=False):
     wanted, asked = which
 
     def of_wanted(*chosen):
         chosen = iter(chosen)
         every = [next(chosen) if w else a for a, w in zip(x, wanted)]
-        return tuple(y for y, a in zip(outputs(Replay(), *every, *fixed), asked) if a)
+        return tuple(y for y, a in zip(outputs(Replay(bent=bent), *every, *fixed), asked) if a)
 
     return jax.vjp(of_wanted, *[a for a, w in zip(x, wanted) if w])[1](tuple(cotangents))
 
@@ -60,7 +60,7 @@ def _bent(x, fixed, cotangents, which, outputs, at, direction):
     """The derivative of a pull as the x that are `at` these places move in a direction."""
 
     def of_moved(*chosen):
-        return _pulled(filled(x, at, chosen), fixed, cotangents, which, outputs)
+        return _pulled(filled(x, at, chosen), fixed, cotangents, which, outputs, bent=True)
 
     return jax.jvp(of_moved, tuple(x[i] for i in at), tuple(direction))[1]
 
@@ -87,7 +87,7 @@ class Pull:
         """Along directions of the points that are moved."""
 
         def of_moved(*chosen):
-            return _pulled(*self._parted(filled(points, moved, chosen)), self.which, self.outputs)
+            return _pulled(*self._parted(filled(points, moved, chosen)), self.which, self.outputs, bent=True)
 
         return jax.jvp(of_moved, tuple(points[i] for i in moved), tuple(moving))[1]
 

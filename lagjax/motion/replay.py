@@ -47,7 +47,7 @@ class Replay:
       places a motion of up to r steps not at all, one of up to r p steps once. A batch has a record for each motion,
       and a program other memory beside: outputs, and what a step itself takes.
 
-    It is what `adjoint=None` does. `record` is for lagjax alone.
+    It is what `adjoint=None` does. `record` and `bent` are for lagjax alone.
 
     **Raises:** `ValueError` where it is no positive number, where a motion is integrated for which it is too small, and
     where steps are not recorded (a controller of one's own, a condition for diffrax, `progress`).
@@ -58,6 +58,8 @@ class Replay:
     memory: float | None = None
     # What an earlier call at the same point found; the motion is then not stepped through again.
     record: Recorded | None = None
+    # Whether this derivative is itself pushed forward.
+    bent: bool = False
 
     def __post_init__(self):
         if self.memory is not None and not (isinstance(self.memory, int | float) and self.memory > 0):
@@ -66,8 +68,12 @@ class Replay:
             )
 
 
-def replayed(problem: Problem, max_steps: int | None, checked: bool, known: Recorded | None = None) -> Recorded:
-    """The motion, which is replayed where it is differentiated in reverse; its values, where they are `known`."""
+def replayed(problem: Problem, max_steps: int | None, checked: bool, adjoint: Replay) -> Recorded:
+    """The motion, which is replayed where it is differentiated in reverse; its values, where they are known.
+
+    Compiled another time a motion may take other steps. A derivative in reverse needs those of the record; pushed
+    forward it needs the tangents of their starts too, which then have to be of the same steps: of one run.
+    """
     arrays, static = eqx.partition(problem, eqx.is_array)
     given, structure = jtu.tree_flatten(arrays)
     # What is passed twice, as by a solver and by the controller that asks it, is one operand.
@@ -82,24 +88,25 @@ def replayed(problem: Problem, max_steps: int | None, checked: bool, known: Reco
 
     # Jitted, so that it is traced once.
     places = tuple(number[id(x)] for x in given)
-    motion = Motion(structure, places, static, max_steps, checked, jax.jit(results), [])
-    if known is None:
-        return motion.recorded(_run_p.bind(*leaves, motion=motion, lanes=None))
-    values, rest = eqx.partition(known, eqx.is_array)
+    motion = Motion(structure, places, static, max_steps, checked, adjoint.bent, jax.jit(results), [])
+    if adjoint.record is None or adjoint.bent:
+        return motion.recorded(_run_p.bind(*leaves, motion=motion, lanes=None, at_once=False))
+    values, rest = eqx.partition(adjoint.record, eqx.is_array)
     values, structure = jtu.tree_flatten(values)
     motion.found.append((structure, rest))
     return motion.recorded(_known_p.bind(*leaves, *values, motion=motion, lanes=None))
 
 
-# The operands of the first primitive are the arrays of the problem, its results those of the record. Those of its
-# derivative are both, and tangents of the arrays that are `moved`; its results the tangents of the floating ones.
+# The operands of the first primitive are the arrays of the problem, its results those of the record. `at_once`: values
+# and tangents are to be of one run. The operands of its derivative are both, and tangents of the arrays that are
+# `moved`; its results the tangents of the floating ones.
 
 
-def _run(*leaves, motion, lanes):
+def _run(*leaves, motion, lanes, at_once=False):
     return motion.results(*leaves) if lanes is None else lanes.each(motion.results)(*leaves)
 
 
-def _run_shapes(*leaves, motion, lanes):
+def _run_shapes(*leaves, motion, lanes, at_once):
     like = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in leaves]
     found = jax.eval_shape(lambda *leaves: _run(*leaves, motion=motion, lanes=lanes), *like)
     return [ShapedArray(x.shape, x.dtype) for x in found]
@@ -131,30 +138,48 @@ def _known_batched(operands, axes, *, motion, lanes):
     return found, [0] * len(found)
 
 
-def _run_jvp(primals, tangents, *, motion, lanes):
-    values = _run_p.bind(*primals, motion=motion, lanes=lanes)
+def _run_jvp(primals, tangents, *, motion, lanes, at_once):
+    if at_once:
+        return _pushed(primals, tangents, motion, lanes)
+    values = _run_p.bind(*primals, motion=motion, lanes=lanes, at_once=motion.bent)
     return values, _derivative(primals, values, tangents, motion, lanes)
 
 
+def _pushed(leaves, tangents, motion, lanes):
+    """Values and tangents of one run: no linear map, which could be transposed."""
+    moved, moving = _moving(tangents)
+    of_moved = lambda *chosen: _run(*filled(leaves, moved, chosen), motion=motion, lanes=lanes)
+    values, found = jax.jvp(of_moved, tuple(leaves[i] for i in moved), tuple(moving))
+    return values, [d if _is_float(x) else _zero(x) for x, d in zip(values, found)]
+
+
 def _derivative(leaves, values, tangents, motion, lanes):
-    moved = tuple(i for i, t in enumerate(tangents) if not isinstance(t, ad.Zero))
-    zero = lambda x: ad.Zero(jax.typeof(x).to_tangent_aval())
+    moved, moving = _moving(tangents)
     if not moved:
-        return [zero(x) for x in values]
-    moving = [tangents[i] for i in moved]
+        return [_zero(x) for x in values]
     found = iter(_moved_p.bind(*leaves, *values, *moving, motion=motion, lanes=lanes, moved=moved))
-    return [next(found) if _is_float(x) else zero(x) for x in values]
+    return [next(found) if _is_float(x) else _zero(x) for x in values]
 
 
-def _run_batched(operands, axes, *, motion, lanes):
+def _moving(tangents):
+    """Which operands move, and along what."""
+    moved = tuple(i for i, t in enumerate(tangents) if not isinstance(t, ad.Zero))
+    return moved, [tangents[i] for i in moved]
+
+
+def _zero(x):
+    return ad.Zero(jax.typeof(x).to_tangent_aval())
+
+
+def _run_batched(operands, axes, *, motion, lanes, at_once):
     front = [x if axis is None else jnp.moveaxis(x, axis, 0) for x, axis in zip(operands, axes)]
     batched = tuple(axis is not None for axis in axes)
     count = next(x.shape[0] for x, b in zip(front, batched) if b)
     if lanes is None:
-        found = _run_p.bind(*front, motion=motion, lanes=Lanes(count, batched))
+        found = _run_p.bind(*front, motion=motion, lanes=Lanes(count, batched), at_once=at_once)
         return found, [0] * len(found)
     flat, both = _lanes_of_lanes(front, batched, lanes, count)
-    found = _run_p.bind(*flat, motion=motion, lanes=both)
+    found = _run_p.bind(*flat, motion=motion, lanes=both, at_once=at_once)
     return [x.reshape(count, lanes.count, *x.shape[1:]) for x in found], [0] * len(found)
 
 

@@ -53,6 +53,7 @@ class Motion:
     static: PyTree
     max_steps: int | None
     checked: bool
+    bent: bool
     results: Callable
     # The structure of the record, once it has been traced.
     found: list

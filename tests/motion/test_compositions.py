@@ -12,6 +12,8 @@ import pytest
 from jax import lax
 
 import lagjax as lj
+from lagjax.motion import pulled, recording
+from lagjax.motion.replay import Replay
 
 TS, NODES = np.array([0.0, 0.4, 0.9]), 11
 P = 0.3 * np.sin(np.arange(1.0, 3 * NODES + 1))
@@ -94,7 +96,15 @@ FAST = {("free", "grad")}
 SLOW = {
     *(
         ("free", name)
-        for name in ("jvp of grad", "grad of grad", "hessian", "grad of vmap", "grad of scan", "grad of cond")
+        for name in (
+            "jvp of grad",
+            "grad of grad",
+            "hessian",
+            "vmap of jvp of grad",
+            "grad of vmap",
+            "grad of scan",
+            "grad of cond",
+        )
     ),
     ("stiff", "jvp of grad"),
 }
@@ -131,3 +141,22 @@ def test_third_derivatives_are_refused():
     twice = lambda p: jax.jvp(jax.grad(of_free), (p,), (W,))[1] @ U
     with pytest.raises(NotImplementedError, match="(?s)a third derivative.*Fix: jax.jvp of jax.jvp"):
         jax.jvp(twice, (P,), (U,))
+
+
+@pytest.mark.slow
+def test_a_second_derivative_is_of_one_run(monkeypatch):
+    """Compiled again a motion may take other steps, as here by force; twin: tangents of another run than the values."""
+    first, traced = recording._first, []
+
+    def other_each_time(problem):
+        place = first(problem)
+        traced.append(None)
+        return place._replace(t1=place.t + (place.t1 - place.t) / (1 + len(traced) % 3))
+
+    monkeypatch.setattr(recording, "_first", other_each_time)
+    curvature = lambda: jax.jvp(jax.grad(of_free), (P,), (W,))[1] @ U
+    expected = pushed(of_free, "jvp of grad")
+    np.testing.assert_allclose(curvature(), expected, rtol=1e-7)
+    jax.clear_caches()
+    monkeypatch.setattr(pulled, "Replay", lambda bent: Replay())
+    assert abs(curvature() / expected - 1) > 1e-6
