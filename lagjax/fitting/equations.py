@@ -216,11 +216,18 @@ def known_before(problem, stage):
     found = problem.found
     if stage.around is None:
         return found.mean, 1 / found.sd
-    # A number that was guessed to be 0 has no size to be held by.
-    held = jnp.where(found.start != 0, stage.held / jnp.where(found.start != 0, found.start, 1.0), 0.0) ** 2
+    held = hold(problem, stage) ** 2
     both = 1 / found.sd**2 + held
     mean = (found.mean / found.sd**2 + held * stage.around) / jnp.where(both > 0, both, 1.0)
     return mean, jnp.sqrt(both)
+
+
+def hold(problem, stage):
+    """What a change of each shared unknown costs by the hold; one guessed to be 0 has no size to be held by."""
+    start = problem.found.start
+    if stage.held is None:
+        return jnp.zeros_like(start)
+    return jnp.where(start != 0, stage.held / jnp.abs(jnp.where(start != 0, start, 1.0)), 0.0)
 
 
 def _seamed(problem, stage):

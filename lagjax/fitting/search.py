@@ -6,7 +6,7 @@ slopes of all equations are computed together with their values, forward, in one
 The first part of a record cannot see everything. What it does not see would go wherever its errors send it, and the
 next part begins there. So every part but the last is fitted with a hold, a square that costs a change by `REACH` (of
 the engine) as much as an error of measurement: beside the data it is nothing where the part sees, and all where it does
-not.
+not. The last has one that is beside nothing but round-off.
 
 An end that its residuals contradict (`misfit`) is not the last word: the whole record from the guess itself comes next,
 then other starts. They are further turns of the same compiled loop, and the best end counts.
@@ -26,7 +26,18 @@ import optimistix as optx
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from lagjax.fitting.equations import Problem, Stage, equations, of_window, over_windows, slopes_together, together
+from lagjax.fitting.equations import (
+    WHOLE,
+    Problem,
+    Stage,
+    equations,
+    hold,
+    known_before,
+    of_window,
+    over_windows,
+    slopes_together,
+    together,
+)
 from lagjax.fitting.misfit import OF_NORMAL, Misfit, misfit
 from lagjax.fitting.predicted import check_predicted
 from lagjax.jax_internals.tracing import WATCHED
@@ -50,6 +61,8 @@ FLOOR = 1e-10
 SAME = 1e-6
 # An uncertainty so many times (over √eps) larger than with all else known is none: the data do not see it.
 UNSEEN = 0.15
+# A parameter whose slopes are not so many times its hold is held by that alone: what they are is round-off.
+BESIDE_HOLD = 2.0
 # A parameter with no larger part (squared) in what is not seen is determined.
 NO_PART = 1e-8
 
@@ -137,6 +150,7 @@ def seen_from(problem: Problem, u: Unknowns, linear: Linear, stage: Stage) -> Se
     triangular = eliminate(linear.slopes, linear.values, floor)
     # In units of the slopes: what the data do not see has a singular value of about FLOOR.
     size = filled(sizes).shared
+    size = jnp.where(size > BESIDE_HOLD * hold(problem, stage), size, jnp.inf)
     left, singular, right = jnp.linalg.svd(triangular.shared / size[None])
     unseen = UNSEEN / np.sqrt(np.finfo(size.dtype).eps)
     seen = singular > 1 / unseen
@@ -341,7 +355,11 @@ def _search(problem, course, optimiser, limit, tell):
     u, seen = _natural(problem, best.y), None
     if best.slopes is not None:
         _, rate = jax.jvp(problem.found.natural, (best.y.shared,), (jnp.ones_like(best.y.shared),))
-        linear = Linear(best.values, best.slopes.scaled(jnp.where(rate != 0, 1 / rate, 0.0)), best.well)
+        slopes = best.slopes.scaled(jnp.where(rate != 0, 1 / rate, 0.0))
+        # What is known is not what the search held.
+        mean, weight = known_before(problem, WHOLE)
+        values = best.values._replace(shared=weight * (u.shared - mean))
+        linear = Linear(values, slopes._replace(shared=jnp.diag(weight)), best.well)
         seen = seen_from(problem, u, linear, jax.tree.map(lambda x: x[-1], course.stages))
     return Searched(u, best.cost, steps, best.rested, best.misfit, costs), seen
 

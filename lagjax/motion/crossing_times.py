@@ -3,7 +3,9 @@
 A crossing is the end of a step (`watching.py`): its time is not differentiated there, the state at that time is.
 `_exact` gives both what follows from g(t, y(t)) = 0,
 
-    dt = -dg / (dg/dt),    dy = ∂y + (dy/dt) dt.
+    dt = -dg / (dg/dt),    dy = ∂y + (dy/dt) dt,
+
+and from their derivatives in turn, in which all that is written here is at a time that moves, ∂y too.
 
 Source: Hairer, Nørsett & Wanner, *Solving ODEs I*, §II.6 (event location); Chen, Amos & Nickel, arXiv:2011.03902,
 App. A (its derivative).
@@ -48,7 +50,7 @@ def locate(watching: Watching, watched: Watched) -> Located:
     equations, guards = sight.motion.equations, sight.guards
 
     def found(owner, row):
-        t, y = _exact((guards, equations), *row, owner, sight.resolution)
+        t, y = _exact((guards, equations), *row, owner, sight.resolution, _flow)
         return t, y, equations.multipliers(t, *y)
 
     t, y, multipliers = _each(found, guards, jnp.isfinite(watched.t), (watched.t, watched.y))
@@ -56,15 +58,17 @@ def locate(watching: Watching, watched: Watched) -> Located:
     return Located(t, y, multipliers, counts, uncertain)
 
 
-def at_known_times(guards: Guards, equations: Equations, resolution, located: Located, y) -> Located:
-    """The same with the derivatives of the states `y` (S, ...) at the times that were found.
+def at_known_times(guards: Guards, equations: Equations, resolution, located: Located, y, bent: bool) -> Located:
+    """The same with the derivatives of the states `y` (S, ...) at the times that were found, in reverse.
 
+    `bent`: these derivatives may be differentiated in turn.
     Their values are those of the roots: `y` comes by other steps, and is on the guards to the tolerance only.
     """
     y = jtu.tree_map(lambda root, y: root + (y - lax.stop_gradient(y)), located.y, y)
+    flow = _flow_twice if bent else _flow
 
     def found(owner, known):
-        t, y = _exact((guards, equations), lax.stop_gradient(known[0]), known[1], owner, resolution)
+        t, y = _exact((guards, equations), lax.stop_gradient(known[0]), known[1], owner, resolution, flow)
         return t, y, equations.accelerations(t, *y)[1]
 
     t, y, multipliers = _each(found, guards, jnp.isfinite(located.t), (located.t, y))
@@ -119,34 +123,74 @@ def by_name(guards: Guards, located: Located, end, valid) -> dict[str, Crossings
     return found
 
 
-@eqx.filter_custom_jvp
-def _exact(live, t, y, owner, resolution):
+def _exact(live, t, y, owner, resolution, flow):
     """A time and a state on a guard as they are; with the derivatives that follow from staying on it."""
-    return t, y
+    z = lax.stop_gradient(t), y
+    return flow(live, _wait(live, z, owner, resolution, flow=flow), z, rate=_rate)
 
 
-@_exact.def_jvp
-def _exact_jvp(primals, tangents):
-    (live, t, y, owner, resolution), (moves, _, dy, *_) = primals, tangents
-    dy = jtu.tree_map(lambda x, dx: jnp.zeros_like(x) if dx is None else dx, y, dy, is_leaf=lambda x: x is None)
+def _rate(live, z):
+    t, y = z
+    return jnp.ones_like(t), (y[1], live[1].accelerations(t, *y)[0])
 
-    def value(live, t, y):
-        guards, equations = live
-        return jnp.stack(guards(t, *y, equations.accelerations(t, *y)[1], equations.params))[owner]
 
-    a = live[1].accelerations(t, *y)[0]
-    g, rate = jax.jvp(lambda t, y: value(live, t, y), (t, y), (jnp.ones_like(t), (y[1], a)))
-    _, dg = eqx.filter_jvp(value, (live, t, y), (moves, jnp.zeros_like(t), dy))
+def _guard(live, z, owner):
+    (guards, equations), (t, y) = live, z
+    return jnp.stack(guards(t, *y, equations.accelerations(t, *y)[1], equations.params))[owner]
+
+
+@eqx.filter_custom_jvp
+def _flow(live, tau, z, *, rate):
+    """Where `dz/dtau = rate(live, z)` takes z in a time that is zero: z, with all derivatives."""
+    return z
+
+
+@_flow.def_jvp
+def _flow_jvp(primals, tangents, *, rate):
+    (live, tau, z), (moves, dtau, dz) = primals, tangents
+    still = lambda x, dx: jnp.zeros_like(x) if dx is None else dx
+    filled = lambda z, dz: jtu.tree_map(still, z, dz, is_leaf=lambda x: x is None)
+    dz = filled(z, dz)
+
+    def of_both(live, z):
+        value, change = eqx.filter_jvp(rate, (live[0], z[0]), (live[1], z[1]))
+        return value, filled(value, change)
+
+    # What is near flows along, by the linear equations.
+    z, dz = _flow((live, moves), tau, (z, dz), rate=of_both)
+    return z, dz if dtau is None else jtu.tree_map(lambda x, dx: x + dx * dtau, dz, rate(live, z))
+
+
+def _flow_twice(live, tau, z, *, rate):
+    """The same to second derivatives, of which the first may be transposed: by Taylor's polynomial."""
+    once = rate(live, z)
+    _, twice = jax.jvp(lambda z: rate(live, z), (z,), (once,))
+    return jtu.tree_map(lambda x, d, dd: x + tau * d + tau**2 / 2 * dd, z, once, twice)
+
+
+@eqx.filter_custom_jvp
+def _wait(live, z, owner, resolution, *, flow):
+    """The time until a state that is on a guard comes to it: zero."""
+    return jnp.zeros_like(z[0])
+
+
+@_wait.def_jvp
+def _wait_jvp(primals, tangents, *, flow):
+    (live, z, owner, resolution), (moves, dz, *_) = primals, tangents
+    tau = _wait(live, z, owner, resolution, flow=flow)
+    after = lambda live, tau, z: _guard(live, flow(live, tau, z, rate=_rate), owner)
+    g, rate = jax.jvp(lambda tau: after(live, tau, z), (tau,), (jnp.ones_like(tau),))
+    _, dg = eqx.filter_jvp(lambda live, z: after(live, tau, z), (live, z), (moves, dz))
     # Where it jumps, nothing follows.
-    jumps = jnp.abs(g) > JUMPS * (jnp.abs(rate) * resolution + jnp.finfo(t.dtype).eps * _terms(live, t, y, value))
-    dt = -dg / jnp.where(jumps, jnp.nan, rate)
-    along = lambda dx, rate: dx + rate * dt
-    return (t, y), (dt, (jtu.tree_map(along, dy[0], y[1]), jtu.tree_map(along, dy[1], a)))
+    size = jnp.finfo(tau.dtype).eps * _terms(live, z, owner)
+    jumps = jnp.abs(g) > JUMPS * (jnp.abs(rate) * resolution + size)
+    return tau, -dg / jnp.where(jumps, jnp.nan, rate)
 
 
-def _terms(live, t, y, value):
+def _terms(live, z, owner):
     """How large the terms are whose sum the guard is."""
-    _, change = jax.jvp(lambda t, y: value(live, t, y), (t, y), (t, uneven(y)))
+    t, y = z
+    _, change = jax.jvp(lambda t, y: _guard(live, (t, y), owner), (t, y), (t, uneven(y)))
     return jnp.abs(change)
 
 

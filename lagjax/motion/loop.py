@@ -68,7 +68,7 @@ def solution_of(
     order = jnp.argsort(times)
     without = eqx.tree_at(lambda s: s.event, settings, None, is_leaf=lambda x: x is None)
     again = _loop(*problem, without, times[order], adjoint, repeated=True)
-    place = jnp.argsort(order)
+    place, bent = jnp.argsort(order), not isinstance(adjoint, Replay) or adjoint.bent
     of_outputs, of_crossings = (
         jax.tree.map(lambda x: x[place[part]], again.outputs) for part in (slice(ts.size), slice(ts.size, None))
     )
@@ -76,7 +76,7 @@ def solution_of(
         reached=jnp.where(jnp.isfinite(again.reached[place[: ts.size]]), found.reached, jnp.inf),
         outputs=of_outputs,
         end=again.end,
-        located=at_known_times(guards, equations, resolution(ts), found.located, of_crossings),
+        located=at_known_times(guards, equations, resolution(ts), found.located, of_crossings, bent),
     )
 
 

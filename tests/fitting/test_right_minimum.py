@@ -54,6 +54,30 @@ def test_a_stage_does_not_move_what_it_cannot_see(clean, monkeypatch):
     assert bool(again.converged) and "1 of 2 starts ended here" in repr(again)
 
 
+@pytest.mark.slow
+def test_what_only_round_off_sees_keeps_its_guess(monkeypatch):
+    """The mass of a pendulum on a rod, from its positions: near its guess, not determined, and the rest as without."""
+    free = lambda t, q, v, p: p["m"] * (0.5 * (v["x"] ** 2 + v["y"] ** 2) - p["g"] * q["y"])
+    rod = lj.System(free, {"rod": lj.Holonomic(lambda t, q, p: q["x"] ** 2 + q["y"] ** 2 - 1.0)})
+    ts = np.linspace(0.0, 3.0, 40)
+    motion = lj.integrate(rod, {"x": 1.0, "y": 0.0}, {"x": 0.0, "y": 0.0}, {"m": 1.0, "g": 9.8}, ts=ts).q
+    errors = 0.01 * np.random.default_rng(0).normal(size=(2, ts.size))
+    record = lj.Record(ts, {"x": motion["x"] + errors[0], "y": motion["y"] + errors[1]})
+
+    def fitted(**free):
+        with pytest.warns(lj.FitWarning, match="do not determine all"):
+            return lj.fit(rod, record, {"m": 2.0, "g": 9.0}, restarts=0, **free)
+
+    found = fitted()
+    assert abs(float(found.params["m"]) - 2.0) < 0.2 and "(not determined)" in repr(found)
+    alone = lj.fit(rod, record, {"m": 2.0, "g": 9.0}, free="g", restarts=0)
+    np.testing.assert_allclose(found.params["g"], alone.params["g"], rtol=1e-8)
+    np.testing.assert_allclose(found.sd[found.names.index("g")], alone.sd[0], rtol=1e-3)
+    # Twin: where nothing holds it at the end it goes anywhere.
+    monkeypatch.setattr(engine, "BARELY", 0.0)
+    assert not abs(float(fitted().params["m"]) - 2.0) < 10.0
+
+
 def test_what_contradicts_sigma_is_no_success(clean):
     """Something that the system leaves out, an error in size: not converged, in words, from whatever start."""
     data = measured(clean, 3) + SIGMA * np.sin(7 * TS)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import lagjax as lj
+from lagjax.motion import crossing_times
 from tests.tiers import exhaustive_but
 
 TS = np.array([0.0, 0.9])
@@ -61,3 +62,44 @@ def test_a_hessian_times_a_vector_by_many_numbers():
     product = lambda f: jax.jvp(jax.grad(f), (MANY,), (along,))[1]
     found, expected = product(of_thirty), product(of_thirty_by_hand)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-7), found, expected)
+
+
+falling = lj.System(lambda t, q, v, p: 0.5 * v**2 - p[0] * q)
+FLOOR = lj.Crossing(lambda t, q, v, p: q, direction=-1)
+BOUNCE = lj.Switch("falling", to="falling", when=lambda t, q, v, p: q, reset=lambda t, q, v, p: -p[1] * v)
+bouncing = lj.Hybrid({"falling": falling}, [BOUNCE], most_switches=4)
+
+
+def landed(p):
+    """When and how fast a stone from 0.5, thrown at 0.2, comes to the floor."""
+    end = lj.integrate(falling, 0.5, 0.2, p, ts=TS, events={"floor": FLOOR}).end
+    return jnp.stack([end.t, end.v])
+
+
+def landed_by_formula(p):
+    """The same by its formula."""
+    speed = jnp.sqrt(0.04 + p[0])
+    return jnp.stack([(0.2 + speed) / p[0], -speed])
+
+
+def bounced(p):
+    """Where it is a while after it bounced."""
+    return lj.integrate(bouncing, 0.5, 0.2, p, ts=TS).q[-1]
+
+
+def bounced_by_formula(p):
+    """The same by its formula."""
+    t, v = landed_by_formula(p)
+    return -p[1] * v * (TS[-1] - t) - 0.5 * p[0] * (TS[-1] - t) ** 2
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("found, exact", [(landed, landed_by_formula), (bounced, bounced_by_formula)])
+def test_at_a_crossing_that_moves(found, exact, monkeypatch):
+    """Second derivatives of the time and state of a crossing, and through it; twin: of states at a time that stays."""
+    p = jnp.array([4.0, 0.7])
+    second = lambda: jax.jacfwd(jax.jacfwd(found))(p)
+    np.testing.assert_allclose(second(), jax.jacfwd(jax.jacfwd(exact))(p), atol=1e-9)
+    jax.clear_caches()
+    monkeypatch.setattr(crossing_times, "_flow", lambda live, tau, z, *, rate: (z[0] + tau, z[1]))
+    assert not np.max(np.abs(second() - jax.jacfwd(jax.jacfwd(exact))(p))) < 1e-3
