@@ -171,7 +171,8 @@ def _flow_twice(live, tau, z, *, rate):
 @eqx.filter_custom_jvp
 def _wait(live, z, owner, resolution, *, flow):
     """The time until a state that is on a guard comes to it: zero."""
-    return jnp.zeros_like(z[0])
+    # In lanes it has lanes, as its derivative has.
+    return jnp.where(z[0] > 0, 0.0, jnp.zeros_like(z[0]))
 
 
 @_wait.def_jvp
