@@ -43,6 +43,14 @@ from lagjax.numerics.radau import Radau5
 from lagjax.numerics.runge_kutta import Dopri8, Tsit5
 
 # isort: split
+# What a system is like.
+from lagjax.analysis.found import Symmetries
+from lagjax.analysis.symmetries import symmetries
+from lagjax.analysis.symmetry import SymmetryTest, is_symmetry
+from lagjax.mechanics.generators import Generator
+from lagjax.mechanics.noether import NoetherCharge, noether_charge
+
+# isort: split
 # Many motions.
 from lagjax.sweeps.engine import sweep
 from lagjax.sweeps.lanes import Status
@@ -120,6 +128,13 @@ __all__ = [
     "Animation",
     "RESULTS",
     "AccuracyWarning",
+    "Generator",
+    "noether_charge",
+    "NoetherCharge",
+    "is_symmetry",
+    "SymmetryTest",
+    "symmetries",
+    "Symmetries",
     "sweep",
     "Sweep",
     "Status",

@@ -88,8 +88,8 @@ def rates_of(system, affine, generators, s, places) -> Rates:
         flows = [flow(generator, t, q, v, s.params) for generator in generators]
         moved = jtu.tree_map(lambda first, *rest: jnp.concatenate([first, *(y[None] for y in rest)]),
                              affine.at(t, x, u), *flows)  # fmt: skip
-        turned = moved.xi_rate - u * moved.tau_rate[:, None]
-        displaced = moved.xi - moved.tau[:, None] * u
+        turned = moved.xi_rate - jnp.outer(moved.tau_rate, u)
+        displaced = moved.xi - jnp.outer(moved.tau, u)
         # ρ, as `noether.py` has it.
         of_L = moved.tau * slope_t + moved.xi @ slope + turned @ p + value * moved.tau_rate - moved.gauge_rate
         none = jnp.zeros(constraints.count(system, t, q, v, s.params), x.dtype)
@@ -99,7 +99,7 @@ def rates_of(system, affine, generators, s, places) -> Rates:
         force = applied_force(system, t, q, v, s.params, none)
         energy = jnp.abs(p) @ jnp.abs(u) + (jnp.abs(slope) + jnp.abs(force)) @ scales.x
         forbidden, changed = _of_constraints(system, s.params, unflatten, scales, (t, x, u), moved, turned, displaced)
-        size = jnp.sqrt(jnp.sum((moved.xi / scales.x) ** 2, axis=1)) + jnp.abs(moved.tau) / scales.t
+        size = jnp.sqrt(moved.xi**2 @ (1 / scales.x**2)) + jnp.abs(moved.tau) / scales.t
         return of_L, displaced @ force, forbidden, changed, size, energy, moved.xi, moved.tau, value
 
     of_L, force, forbidden, changed, size, energy, xi, tau, value = jax.vmap(at)(*states[:3])
@@ -113,8 +113,8 @@ def rates_of(system, affine, generators, s, places) -> Rates:
     # A state where nothing happens has no scale of its own.
     energy = jnp.where(states.found, energy + 1e-12 * jnp.max(energy), 1.0)
     energy = jnp.where(energy > 0, energy, 1.0)
-    relative = lambda y: seen(y) / energy[:, None] / size
-    of_rows = lambda y: seen(y) / size
+    relative = lambda y: seen(y) / jnp.outer(energy, size)
+    of_rows = lambda y: seen(y) / size[None, None]
     return Rates(
         states, relative(of_L + force), relative(of_L), relative(force), of_rows(forbidden), of_rows(changed), size,
         energy, seen(xi), seen(tau), seen(value) / energy,
@@ -122,7 +122,7 @@ def rates_of(system, affine, generators, s, places) -> Rates:
 
 
 def _of_constraints(system, params, unflatten, scales, state, moved, turned, displaced):
-    """A (ξ - τ v), and the change of each constraint of velocities, of every generator; (m, K), relative to the rows."""
+    """A (ξ - τ v), and the change of each constraint of velocities, of every generator; relative, (m, K)."""
     t, x, u = state
     if not system.constraints:
         none = jnp.zeros((0, moved.tau.size), x.dtype)

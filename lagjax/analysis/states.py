@@ -1,9 +1,9 @@
 """States around a given one that satisfy the constraints: where a claim about all states is tested.
 
 Positions lie around the given one in several widths, up to one and a half times its size, so that what is symmetric on
-one side of a plane alone is seen; times and velocities likewise, some of them zero, where a small force is not hidden by
-fast motion. The size of a coordinate is that of its array or point, 1 where that is at zero. States are moved onto the
-constraints by Newton's method, each step the shortest in units of these sizes.
+one side of a plane alone is seen; times and velocities likewise, some of them zero, where a small force is not hidden
+by fast motion. The size of a coordinate is that of its array or point, 1 where that is at zero. States are moved onto
+the constraints by Newton's method, each step the shortest in units of these sizes.
 """
 
 from typing import NamedTuple
@@ -62,7 +62,7 @@ def around(system, s: coordinates.State, places) -> tuple[States, Scales]:
     scales = sizes(s.q, x, u)
     places = jnp.asarray(places, x.dtype)
     t = s.t + scales.t * places[:, 0]
-    xs, us = x + scales.x * places[:, 1 : n + 1], u + scales.u * places[:, n + 1 :]
+    xs, us = x[None] + scales.x[None] * places[:, 1 : n + 1], u[None] + scales.u[None] * places[:, n + 1 :]
     # Where velocities are drawn as zero they are so: not those of the given state.
     us = jnp.where(jnp.any(places[1:, n + 1 :] != 0, axis=1)[:, None], us[1:], 0.0)
     us = jnp.concatenate([u[None], us])
@@ -88,7 +88,7 @@ def sizes(q, x, u) -> Scales:
 
 def _groups(q) -> np.ndarray:
     """Which coordinates are of one size, (n, n): those of an array, and those of a point."""
-    label, start = np.zeros(0, int), 0
+    label = np.zeros(0, int)
     for i, leaf in enumerate(jax.tree.leaves(q)):
         label = np.concatenate([label, np.full(int(np.prod(np.shape(leaf))), i)])
     for point in points(q):
@@ -111,7 +111,7 @@ def _on_constraints(system, params, unflatten, scales, t, x, u):
 
 def _newton(residual, y, scale):
     def step(_, y):
-        rows = jax.jacfwd(residual)(y) * scale
+        rows = jax.jacfwd(residual)(y) * scale[None]
         return y - scale * (jnp.linalg.pinv(rows, rtol=DEPENDENT_BELOW) @ residual(y))
 
     return lax.fori_loop(0, ITERATIONS, step, y)

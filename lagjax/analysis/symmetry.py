@@ -1,10 +1,10 @@
 """Is a claimed symmetry one? Tested on states that satisfy the constraints, and against these.
 
 A generator conserves its charge where L does not change by more than a total derivative, forces do no work along the
-displacement ξ - τ v, and every constraint allows it (`mechanics/noether.py`). The last is asked of the constraints alone
-and not of their forces, which may vanish by accident: for a holonomic one it says that the set g = 0 stays. A constraint
-of velocities may look the same from everywhere and still forbid the displacement: a rolling disk rolls alike on all of
-the table, and its momentum changes.
+displacement ξ - τ v, and every constraint allows it (`mechanics/noether.py`). The last is asked of the constraints
+alone and not of their forces, which may vanish by accident: for a holonomic one it says that the set g = 0 stays. A
+constraint of velocities may look the same from everywhere and still forbid the displacement: a rolling disk rolls alike
+on all of the table, and its momentum changes.
 """
 
 import equinox as eqx
@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from lagjax.analysis.precision import precision_of
 from lagjax.analysis.rates import Affine, rates_of
 from lagjax.analysis.states import draws
 from lagjax.mechanics import constraints, coordinates
@@ -23,8 +24,6 @@ from lagjax.mechanics.first_call import looked_at
 from lagjax.mechanics.generators import Generator, as_generator
 from lagjax.mechanics.noether import NoetherCharge
 
-# A rate of change is none up to this part of what it could be.
-NONE_BELOW = {np.dtype("float64"): 1e-9, np.dtype("float32"): 2e-4}
 STATES, AT_LEAST = 64, 8
 
 
@@ -57,7 +56,7 @@ class SymmetryTest(eqx.Module):
     @property
     def tolerance(self) -> float:
         """Up to which residual nothing counts as broken, of the dtype."""
-        return NONE_BELOW[np.dtype(self.residual.dtype)]
+        return precision_of(self.residual.dtype).null
 
     @property
     def holds(self) -> Array:
@@ -112,12 +111,12 @@ def is_symmetry(system, generator, q, v, params=None, *, t=0.0) -> SymmetryTest:
       charge          0, at t = 0, q = (x = 0, y = 1), v = (x = 2, y = 0)
       its rate there  -10
 
-    **Arguments:** `generator` as for `noether_charge`; `q` and `v` alike, `params` as the system takes it, `t` scalar: a
-    state, around which others are drawn, always the same, on the constraints. It sets the size of the motions, so it
-    should not be at rest at zero.
+    **Arguments:** `generator` as for `noether_charge`; `q` and `v` alike, `params` as the system takes it, `t` scalar:
+    a state, around which others are drawn, always the same, on the constraints. Its size sets theirs.
 
-    **Returns:** a `SymmetryTest`, true where it is one, with the residual, what breaks it, and the rate of change of the
-    charge that this predicts; a charge that no symmetry keeps may still stay, where constraints happen not to push. Inside `jit`, `vmap` or a sweep ask for `.holds` or `.residual`.
+    **Returns:** a `SymmetryTest`, true where it is one, with the residual, what breaks it, and the rate of change of
+    the charge that this predicts; a charge that no symmetry keeps may still stay, where constraints happen not to push.
+    Inside `jit`, `vmap` or a sweep ask for `.holds` or `.residual`.
 
     **Raises:** as `noether_charge`; `ValueError` where no states are found that satisfy the constraints and where L is
     finite (while JAX is tracing the residual is NaN instead).

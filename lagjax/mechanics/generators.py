@@ -34,8 +34,8 @@ class Generator(eqx.Module):
     - `gauge`: `F(t, q, params)` -> scalar, `[L] [t]/[ε]`; L changes by dF/dt, as under a boost.
     - `name`: what its charge is called.
 
-    Ready ones are `Generator.shift`, `translation`, `rotation`, `screw`, `boost` and `time_translation`; they add up, and
-    may be multiplied by numbers.
+    Ready ones are `Generator.shift`, `translation`, `rotation`, `screw`, `boost` and `time_translation`; they add up,
+    and may be multiplied by numbers.
 
     **Raises:** `TypeError` for what is no function.
 
@@ -54,7 +54,7 @@ class Generator(eqx.Module):
             if function is not None and not callable(function):
                 raise TypeError(
                     f"{role} of a generator must be a function of (t, q, params), not {type(function).__name__}.\n"
-                    f'Fix: {role}=lambda t, q, params: {"q" if role == "delta" else "t"}.'
+                    f"Fix: {role}=lambda t, q, params: {'q' if role == 'delta' else 't'}."
                 )
         if delta is None and time is None and gauge is None:
             raise TypeError(
@@ -62,7 +62,7 @@ class Generator(eqx.Module):
                 'Fix: lj.Generator(lambda t, q, params: {"x": 1.0, "y": 0.0}), or lj.Generator(time=1.0).'
             )
         self.delta = delta
-        self.time = _Constant(jnp.asarray(float(time))) if isinstance(time, numbers.Real) else time
+        self.time = _Constant(np.asarray(float(time))) if isinstance(time, numbers.Real) else time
         self.gauge = gauge
         self.name = name or getattr(delta, "__name__", None) or "charge"
 
@@ -170,7 +170,7 @@ def added(terms, digits: str = ".6g") -> str:
 
 
 class _Constant(eqx.Module):
-    value: jnp.ndarray
+    value: np.ndarray
 
     def __call__(self, t, q, params):
         return self.value

@@ -17,13 +17,11 @@ Source: Noether, Nachr. Ges. Wiss. Göttingen (1918) 235, §2; Goldstein, *Class
 Neĭmark & Fufaev, *Dynamics of Nonholonomic Systems*, §III.6 (velocity constraints).
 """
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import jax.tree_util as jtu
 from jaxtyping import Array, Float, PyTree
 
 from lagjax.mechanics import constraints, coordinates
@@ -80,8 +78,8 @@ def noether_charge(system: System, generator) -> NoetherCharge:
     >>> print(L_z(0.0, {"x": 3.0, "y": 0.0}, {"x": 1.0, "y": 2.0}, {"k": 1.0}))
     6.0
 
-    A translation gives the momentum p, a rotation the angular momentum, `lj.Generator.time_translation()`, which sets the clock
-    back (τ = -1), the Jacobi integral v·p - L; a `time` of +1 gives minus that.
+    A translation gives the momentum p, a rotation the angular momentum; `lj.Generator.time_translation()`, which sets
+    the clock back (τ = -1), the Jacobi integral v·p - L, and a `time` of +1 minus that.
 
     **Arguments:**
 

@@ -179,6 +179,22 @@ def angles(system, t, q, v, params) -> PyTree[bool]:
     return jtu.tree_unflatten(structure, found)
 
 
+def conserved_momenta(system, t, q, v, params) -> list[str]:
+    """The coordinates whose momentum is known to stay: neither L nor a constraint contains them, and no force acts."""
+    names = coordinates.names(q)
+    holonomic = all(isinstance(c, Holonomic) for c in system.constraints.values())
+    if system.force is not None or system.dissipation is not None or not holonomic or len(names) > UP_TO:
+        return []
+    _, unflatten = coordinates.flatten(q)
+    system = in_numbers(system, unflatten)
+    args = (system, t, coordinates.numbers(q), coordinates.numbers(v), params)
+    try:
+        seen = [_depends_on(_numbers(lambda _, *state, f=f: f(*state), args), names) for f in _seen(system)]
+    except TooLong:
+        return []
+    return [name for name in names if not any(name in found for found in seen)]
+
+
 def conserves_jacobi_integral(system, t, q, v, params) -> bool:
     """Whether the Jacobi integral is known to be constant: no explicit time, no force, only positions constrained."""
     return next(what_changes_jacobi_integral(system, t, q, v, params), None) is None
