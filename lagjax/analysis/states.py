@@ -16,6 +16,7 @@ from jaxtyping import Array, Bool, Float
 
 from lagjax.mechanics import constraints, coordinates
 from lagjax.mechanics.cartesian import points
+from lagjax.mechanics.compiled import compiled
 
 WIDTHS = np.array([1.5, 1.0, 0.5, 0.1])
 OF_VELOCITIES = np.array([1.0, 0.3, 1.0, 0.0])
@@ -55,35 +56,35 @@ def draws(count: int, n: int) -> np.ndarray:
 
 
 def around(system, s: coordinates.State, places) -> tuple[States, Scales]:
-    """The states at `draws` around a given one, moved onto the constraints."""
-    x, unflatten = coordinates.flatten(s.q)
-    u, _ = coordinates.flatten(s.v)
-    n = x.size
-    scales = sizes(s.q, x, u)
-    places = jnp.asarray(places, x.dtype)
+    """The states at `draws` around a given one, moved onto the constraints; of NumPy where values are known."""
+    # What is known compiles nothing here; the program that moves states serves all questions about a system.
+    xp = coordinates.numpy_of((s, system))
+    vector = lambda tree: xp.concatenate([xp.ravel(xp.asarray(x)) for x in jax.tree.leaves(tree)])
+    x, u = vector(s.q), vector(s.v)
+    n, scales = len(x), sizes(s.q, x, u)
+    places = places.astype(x.dtype)
     t = s.t + scales.t * places[:, 0]
     xs, us = x[None] + scales.x[None] * places[:, 1 : n + 1], u[None] + scales.u[None] * places[:, n + 1 :]
-    # Where velocities are drawn as zero they are so: not those of the given state.
-    us = jnp.where(jnp.any(places[1:, n + 1 :] != 0, axis=1)[:, None], us[1:], 0.0)
-    us = jnp.concatenate([u[None], us])
+    # Where velocities are drawn as zero they are so, and not those of the given state.
+    resting = np.all(places[:, n + 1 :] == 0, axis=1) & (np.arange(len(places)) > 0)
+    us = xp.where(resting[:, None], xp.zeros_like(us), us)
     if not system.constraints:
-        return States(t, xs, us, jnp.ones(len(places), bool)), scales
-    move = lambda t, x, u: _on_constraints(system, s.params, unflatten, scales, t, x, u)
-    xs, us, found = jax.vmap(move)(t, xs, us)
-    return States(t, xs, us, found), scales
+        return States(t, xs, us, np.ones(len(places), bool)), scales
+    moved = _onto_constraints(system, s, scales, t, xs, us)
+    return States(t, *(xp.asarray(y) for y in moved)), scales
 
 
 def sizes(q, x, u) -> Scales:
     """The size of each coordinate and velocity of a state."""
-    same = _groups(q)
-    together = lambda y: jnp.sqrt(same.astype(y.dtype) @ y**2)
+    xp, same = coordinates.numpy_of((x, u)), _groups(q)
+    together = lambda y: xp.sqrt(same.astype(y.dtype) @ y**2)
     of_x = together(x)
-    of_x = jnp.where(of_x > 0, of_x, 1.0)
+    of_x = xp.where(of_x > 0, of_x, xp.ones_like(x))
     of_u = together(u)
     # A velocity of zero says nothing: then the pace of the others, or one length in one unit of time.
-    pace = jnp.sqrt(jnp.mean((of_u / of_x) ** 2))
-    pace = jnp.where(pace > 0, pace, 1.0)
-    return Scales(of_x, jnp.where(of_u > 0, of_u, pace * of_x), 1 / pace)
+    pace = xp.sqrt(xp.mean((of_u / of_x) ** 2))
+    pace = xp.where(pace > 0, pace, xp.ones_like(pace))
+    return Scales(of_x, xp.where(of_u > 0, of_u, pace * of_x), 1 / pace)
 
 
 def _groups(q) -> np.ndarray:
@@ -95,6 +96,13 @@ def _groups(q) -> np.ndarray:
         places = [place for place in point.places if place is not None]
         label[places] = label[places[0]]
     return label[:, None] == label[None, :]
+
+
+@compiled
+def _onto_constraints(system, s, scales, t, xs, us):
+    _, unflatten = coordinates.flatten(s.q)
+    move = lambda t, x, u: _on_constraints(system, s.params, unflatten, scales, t, x, u)
+    return jax.vmap(move)(t, xs, us)
 
 
 def _on_constraints(system, params, unflatten, scales, t, x, u):

@@ -98,8 +98,10 @@ def _given(basis, s) -> tuple[Generator, ...]:
 def _those_found(seen: Rates) -> Rates:
     """The rows of states that are on the constraints and finite, in NumPy."""
     kept = np.asarray(seen.states.found)
-    rows = lambda y: np.asarray(y) if y is seen.size else np.asarray(y)[kept]
-    return Rates(type(seen.states)(*map(rows, seen.states)), *map(rows, seen[1:]))
+    of_states = seen._asdict()
+    states = type(seen.states)(*(np.asarray(y)[kept] for y in of_states.pop("states")))
+    whole = {"size", "first", "pushed"}
+    return Rates(states, **{name: y if name in whole else y[kept] for name, y in of_states.items()})
 
 
 class _Columns(NamedTuple):

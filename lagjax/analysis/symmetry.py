@@ -8,21 +8,18 @@ on all of the table, and its momentum changes.
 """
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from lagjax.analysis.precision import precision_of
-from lagjax.analysis.rates import Affine, rates_of
+from lagjax.analysis.rates import Affine, rates
 from lagjax.analysis.states import draws
 from lagjax.mechanics import constraints, coordinates
-from lagjax.mechanics.closures import lift
-from lagjax.mechanics.compiled import compiled
 from lagjax.mechanics.constraints import Holonomic
 from lagjax.mechanics.diagnosis import describe
 from lagjax.mechanics.first_call import looked_at
-from lagjax.mechanics.generators import Generator, as_generator
-from lagjax.mechanics.noether import NoetherCharge
+from lagjax.mechanics.generators import as_generator
+from lagjax.mechanics.multipliers import accelerations
 
 STATES, AT_LEAST = 64, 8
 
@@ -127,18 +124,37 @@ def is_symmetry(system, generator, q, v, params=None, *, t=0.0) -> SymmetryTest:
     s = coordinates.state(t, q, v, params)
     system = looked_at(system, s)
     generator.check(s)
-    n = coordinates.flatten(s.q)[0].size
-    found = _tested(system, generator, s, draws(STATES, n))
-    count, place, parts, displacement, invariance = found
-    if not coordinates.is_traced(count) and count < AT_LEAST:
+    n = len(coordinates.names(s.q))
+    none = np.zeros((0, n))
+    affine = Affine(none, np.zeros((0, n, n)), none, np.zeros(0), np.zeros(0))
+    found = rates(system, affine, (generator,), s, draws(STATES, n))
+    xp = coordinates.numpy_of(found)
+    count = xp.sum(found.states.found)
+    if xp is np and count < AT_LEAST:
         raise ValueError(too_few(system, s, int(count)))
-    at = coordinates.State(*place, s.params)
-    charge = NoetherCharge(system, generator)
-    values = charge(*at), charge.rate(*at)
-    traced = coordinates.is_traced((s, count))
-    where = "" if traced else f"t = {float(s.t):.6g}, q = {describe(at.q)}, v = {describe(at.v)}"
-    forces = system.force is not None or system.dissipation is not None
-    return SymmetryTest(generator.name, *parts, forces, displacement, invariance, *values, count, where)
+    largest = lambda y: xp.max(xp.abs(y))
+    by_name = lambda y: {
+        name: largest(value)
+        for name, value in constraints.split(system, xp.max(xp.abs(y[:, :, 0]), axis=0), *s).items()
+    }
+    displacement, invariance = by_name(found.displacement), by_name(found.invariance)
+    of_velocities = {name for name, c in system.constraints.items() if not isinstance(c, Holonomic)}
+    residual = xp.max(xp.stack([largest(found.charge), *displacement.values()]))
+    _, unflatten = coordinates.flatten(s.q)
+    at = s._replace(t=found.states.t[0], q=unflatten(found.states.x[0]), v=unflatten(found.states.u[0]))
+    rate = found.first[0]
+    if system.constraints:
+        multipliers = accelerations(system, *at)[1]
+        rate = rate + xp.concatenate([xp.ravel(multipliers[name]) for name in system.constraints]) @ found.pushed[:, 0]
+    return SymmetryTest(
+        generator.name,
+        xp.where(count < AT_LEAST, xp.full_like(residual, xp.nan), residual),
+        largest(found.charge), largest(found.lagrangian), largest(found.force),
+        system.force is not None or system.dissipation is not None,
+        displacement, {name: invariance[name] for name in sorted(of_velocities)},
+        found.charges[0, 0], rate, count,
+        "" if xp is not np else f"t = {float(s.t):.6g}, q = {describe(at.q)}, v = {describe(at.v)}",
+    )  # fmt: skip
 
 
 def too_few(system, s, count) -> str:
@@ -149,23 +165,3 @@ def too_few(system, s, count) -> str:
         f"\nUsual cause: {cause}, or a state at the edge of where L is defined.\n"
         "Fix: a state amid the motion; lj.consistent_state(system, t, q, v, params) moves one onto the constraints."
     )
-
-
-@compiled
-def _tested(system, generator: Generator, s, places):
-    x, unflatten = coordinates.flatten(s.q)
-    none = np.zeros((0, x.size))
-    nothing = Affine(none, np.zeros((0, x.size, x.size)), none, np.zeros(0), np.zeros(0))
-    found = rates_of(lift(system, s), nothing, (generator,), s, places)
-    largest = lambda y: jnp.max(jnp.abs(y), initial=0.0)
-    count = jnp.sum(found.states.found)
-    by_name = lambda y: constraints.split(system, jnp.max(jnp.abs(y[:, :, 0]), axis=0, initial=0.0), *s)
-    displacement = {name: jnp.max(value) for name, value in by_name(found.displacement).items()}
-    invariance = {name: jnp.max(value) for name, value in by_name(found.invariance).items()}
-    of_velocities = {name for name, c in system.constraints.items() if not isinstance(c, Holonomic)}
-    rate = largest(found.charge)
-    residual = jnp.max(jnp.stack([rate, *displacement.values()]))
-    residual = jnp.where(count < AT_LEAST, jnp.nan, residual)
-    parts = residual, rate, largest(found.lagrangian), largest(found.force)
-    place = found.states.t[0], unflatten(found.states.x[0]), unflatten(found.states.u[0])
-    return count, place, parts, displacement, {name: invariance[name] for name in sorted(of_velocities)}

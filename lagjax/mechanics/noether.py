@@ -99,10 +99,11 @@ def noether_charge(system: System, generator) -> NoetherCharge:
 
 
 class Flow(NamedTuple):
-    """A generator at one state: ξ and τ, and the total derivatives of ξ, τ and F along the motion; ξ in vector form."""
+    """A generator at one state: ξ, τ and F, and their total derivatives along the motion; ξ in vector form."""
 
     xi: Float[Array, " n"]
     tau: Float[Array, ""]
+    gauge: Float[Array, ""]
     xi_rate: Float[Array, " n"]
     tau_rate: Float[Array, ""]
     gauge_rate: Float[Array, ""]
@@ -111,9 +112,9 @@ class Flow(NamedTuple):
 def flow(generator: Generator, t, q, v, params) -> Flow:
     """What a generator does at one state."""
     at = lambda t, q: generator.at(t, q, params)
-    (xi, tau, _), (xi_rate, tau_rate, gauge_rate) = jax.jvp(at, (t, q), (jnp.ones_like(t), v))
+    (xi, tau, gauge), (xi_rate, tau_rate, gauge_rate) = jax.jvp(at, (t, q), (jnp.ones_like(t), v))
     vector = lambda y: coordinates.flatten(y)[0]
-    return Flow(vector(xi), tau, vector(xi_rate), tau_rate, gauge_rate)
+    return Flow(vector(xi), tau, gauge, vector(xi_rate), tau_rate, gauge_rate)
 
 
 def applied_force(system, t, q, v, params, multipliers) -> PyTree:

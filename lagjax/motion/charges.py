@@ -17,7 +17,7 @@ from lagjax.mechanics.noether import NoetherCharge
 from lagjax.mechanics.structure import conserved_momenta, conserves_jacobi_integral
 from lagjax.motion.curves import columns, curves
 
-PANEL = "change of charges"
+PANEL, LONG = "change of charges", 28
 
 
 def panels(trajectory, charges) -> dict[str, dict[str, np.ndarray]]:
@@ -31,7 +31,11 @@ def panels(trajectory, charges) -> dict[str, dict[str, np.ndarray]]:
             name + suffix: curve for name, values in trajectory.multipliers.items() for suffix, curve in columns(values)
         }
     if charges is not False and charges is not None:
-        found[PANEL] = changes(trajectory, charges)
+        drawn = changes(trajectory, charges)
+        # Longer ones would leave no room for the curves.
+        short = [name.split(" with ")[0] for name in drawn]
+        short = [name if len(name) <= LONG else f"{name[:LONG]}…" for name in short]
+        found[PANEL] = dict(zip(short if len(set(short)) == len(short) else drawn, drawn.values()))
     return found
 
 
