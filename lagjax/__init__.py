@@ -45,6 +45,9 @@ from lagjax.numerics.runge_kutta import Dopri8, Tsit5
 # isort: split
 # What a system is like.
 from lagjax.analysis.found import Symmetries
+from lagjax.analysis.hamilton import Hamiltonian, hamiltonian
+from lagjax.analysis.least_action import action
+from lagjax.analysis.routh import routhian
 from lagjax.analysis.symmetries import symmetries
 from lagjax.analysis.symmetry import SymmetryTest, is_symmetry
 from lagjax.mechanics.generators import Generator
@@ -135,6 +138,10 @@ __all__ = [
     "SymmetryTest",
     "symmetries",
     "Symmetries",
+    "hamiltonian",
+    "Hamiltonian",
+    "routhian",
+    "action",
     "sweep",
     "Sweep",
     "Status",

@@ -33,6 +33,7 @@ from lagjax.mechanics.hybrid import phases_of
 from lagjax.mechanics.in_numbers import WRITTEN, Numbers, in_numbers
 from lagjax.mechanics.lagrangian import mass_and_forcing
 from lagjax.mechanics.reactions import force_with_ones
+from lagjax.mechanics.system import System
 from lagjax.numerics import banded
 from lagjax.numerics.scalars import TooLong
 
@@ -193,6 +194,43 @@ def conserved_momenta(system, t, q, v, params) -> list[str]:
     except TooLong:
         return []
     return [name for name in names if not any(name in found for found in seen)]
+
+
+def what_changes_momentum(system, name, t, q, v, params) -> Iterator[str]:
+    """What may change the momentum of a coordinate, in words."""
+    if not _contains(system.lagrangian, name, t, q, v, params, argument=2):
+        yield "L does not contain its velocity"
+    if system.force is not None:
+        yield "there is a force"
+    if system.dissipation is not None:
+        yield "there is dissipation"
+    functions = {"L contains it": system.lagrangian}
+    for other, c in system.constraints.items():
+        if isinstance(c, Holonomic):
+            functions[f"constraint '{other}' contains it"] = _of_state(c)
+        else:
+            yield f"constraint '{other}' is one of velocities"
+    for words, function in functions.items():
+        if _contains(function, name, t, q, v, params):
+            yield words
+
+
+def _contains(function, name, t, q, v, params, argument=1) -> bool:
+    """Whether a function depends on a coordinate, or with `argument` 2 on a velocity; also where that is not known."""
+    sizes = [np.size(leaf) for leaf in jtu.tree_leaves(q)]
+    leaf = int(np.searchsorted(np.cumsum(sizes), coordinates.names(q).index(name), side="right"))
+    if sizes[leaf] == 1:
+        found = _dependence(function, (t, q, v, params), lambda args: jtu.tree_leaves(args[argument])[leaf])
+        return found != Depends.NOT
+    _, unflatten = coordinates.flatten(q)
+    alone = in_numbers(System(function), unflatten)
+    try:
+        args = alone, t, coordinates.numbers(q), coordinates.numbers(v), params
+        return name in _depends_on(
+            _numbers(lambda system, *state: system.lagrangian(*state), args), coordinates.names(q)
+        )
+    except TooLong:
+        return True
 
 
 def conserves_jacobi_integral(system, t, q, v, params) -> bool:

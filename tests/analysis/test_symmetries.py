@@ -181,7 +181,7 @@ def test_bad_input():
 
 @pytest.mark.slow
 def test_charges_of_a_trajectory_are_drawn():
-    """True draws what the structure shows, a mapping what is given; both stay. Twins: what is not known, no function."""
+    """True draws what the structure shows, a mapping what is given. Twins: what is not known, no function."""
     params = sliding_wedge.PARAMS
     start = sliding_wedge.start_on_incline(params, along=1.0, along_rate=0.25)
     motion = lj.integrate(sliding_wedge.system, *start, params, ts=np.linspace(0.0, 1.0, 9))
