@@ -2,7 +2,7 @@
 
 A path is a function of time, whose velocity is its derivative, or a trajectory. Between the outputs of one q is the
 cubic with their positions and velocities; since S is stationary on true motions, S is off by the square of what the
-cubic is off.
+cubic is off, but for ends between outputs, where by as much.
 
 Source: Goldstein, *Classical Mechanics*, Eq. (2.1), (2.2).
 """

@@ -223,14 +223,14 @@ def _contains(function, name, t, q, v, params, argument=1) -> bool:
         found = _dependence(function, (t, q, v, params), lambda args: jtu.tree_leaves(args[argument])[leaf])
         return found != Depends.NOT
     _, unflatten = coordinates.flatten(q)
-    alone = in_numbers(System(function), unflatten)
+    alone, known = in_numbers(System(function), unflatten), coordinates.names(q)
+    args = alone, t, coordinates.numbers(q), coordinates.numbers(v), params
     try:
-        args = alone, t, coordinates.numbers(q), coordinates.numbers(v), params
-        return name in _depends_on(
-            _numbers(lambda system, *state: system.lagrangian(*state), args), coordinates.names(q)
-        )
+        numbers = _numbers(lambda system, *state: system.lagrangian(*state), args)
     except TooLong:
         return True
+    place = 1 + (argument - 1) * len(known) + known.index(name)
+    return depends(numbers.program.jaxpr, [numbers.state_variables[place]])
 
 
 def conserves_jacobi_integral(system, t, q, v, params) -> bool:
