@@ -47,7 +47,7 @@ from lagjax.numerics.runge_kutta import Dopri8, Tsit5
 from lagjax.analysis.found import Symmetries
 from lagjax.analysis.hamilton import Hamiltonian, hamiltonian
 from lagjax.analysis.least_action import action
-from lagjax.analysis.routh import routhian
+from lagjax.analysis.routh import Routhian, routhian
 from lagjax.analysis.symmetries import symmetries
 from lagjax.analysis.symmetry import SymmetryTest, is_symmetry
 from lagjax.mechanics.generators import Generator
@@ -141,6 +141,7 @@ __all__ = [
     "hamiltonian",
     "Hamiltonian",
     "routhian",
+    "Routhian",
     "action",
     "sweep",
     "Sweep",

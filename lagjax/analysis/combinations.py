@@ -31,7 +31,7 @@ def null_space(columns: np.ndarray, precision: Precision) -> NullSpace:
     if count == 0:
         return NullSpace(np.zeros((0, 0)), np.zeros(0), np.inf)
     if len(columns) > count:
-        columns = np.linalg.qr(columns, mode="r")
+        columns = np.asarray(np.linalg.qr(columns, mode="r"))
     _, found, directions = np.linalg.svd(columns)
     sizes = np.zeros(count)
     sizes[: len(found)] = found

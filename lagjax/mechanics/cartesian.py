@@ -34,7 +34,7 @@ def points(q) -> list[Point]:
     """
     found, named, start = [], {}, 0
     for (path, leaf), name in zip(jtu.tree_flatten_with_path(q)[0], leaf_names(q)):
-        shape = np.shape(leaf)
+        shape: tuple[int, ...] = tuple(np.shape(leaf))
         size = int(np.prod(shape))
         if shape and shape[-1] in (2, 3) and len(shape) <= 2:
             for i in range(size // shape[-1]):

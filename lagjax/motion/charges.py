@@ -52,7 +52,9 @@ def changes(trajectory, charges) -> dict[str, np.ndarray]:
         )
     values = _along(functions, trajectory.t, trajectory.q, trajectory.v, trajectory.params)
     found = {}
-    for name, (value, size) in values.items():
+    # Compiled programs sort their results.
+    for name in functions:
+        value, size = values[name]
         value, size = np.asarray(value), np.asarray(size)
         if value.ndim != 1:
             raise ValueError(

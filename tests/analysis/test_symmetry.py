@@ -104,31 +104,30 @@ def test_a_boost_needs_its_gauge_term():
     assert lj.is_symmetry(STONE, fall, *start, OF_STONE)
 
 
+def moved_and_predicted(system, generator, q, v, params):
+    """By how much a charge changes on a motion, and the integral of its predicted rate; the first rate."""
+    nodes, weights = np.polynomial.legendre.leggauss(12)
+    ts = np.concatenate([[0.0], 0.5 * (nodes + 1), [1.0]])
+    motion = lj.integrate(system, q, v, params, ts=ts, rtol=1e-11, atol=1e-11)
+    charge = lj.noether_charge(system, generator)
+    both = lambda t, q, v: (charge(t, q, v, params), charge.rate(t, q, v, params))
+    values, rates = (np.asarray(x) for x in jax.jit(jax.vmap(both))(motion.t, motion.q, motion.v))
+    return values[-1] - values[0], 0.5 * weights @ rates[1:-1], rates[0]
+
+
 @pytest.mark.slow
 def test_the_rate_of_a_broken_charge_is_that_of_the_motion():
     """dC/dt along motions is what `rate` says: by L, by friction, by constraints of velocities. Twin: without these."""
-    turn = lj.Generator.rotation("z")
     squashed = lambda t, q, v, p: central(t, q, v, p) - 0.25 * q[0] ** 2 * jnp.cos(t)
     rubbed = lj.System(squashed, dissipation=lambda t, q, v, params: 0.125 * v @ v)
-    ts = np.linspace(0.0, 1.0, 9)
-    cases = [
-        (rubbed, turn + 0.5 * lj.Generator.time_translation(), *IN_SPACE, OF_KEPLER),
-        (DISK, lj.Generator.shift("x") + lj.Generator.shift("phi"), ON_PLANE, rolling(), RADIUS),
-    ]
-    nodes, weights = np.polynomial.legendre.leggauss(12)
-    for system, generator, q, v, params in cases:
-        ts = np.concatenate([[0.0], 0.5 * (nodes + 1), [1.0]])
-        motion = lj.integrate(system, q, v, params, ts=ts, rtol=1e-11, atol=1e-11)
-        charge = lj.noether_charge(system, generator)
-        states = motion.t, motion.q, motion.v
-        values, rates = jax.jit(
-            jax.vmap(lambda t, q, v: (charge(t, q, v, params), charge.rate(t, q, v, params)))
-        )(*states)  # fmt: skip
-        changed = float(values[-1] - values[0])
-        np.testing.assert_allclose(0.5 * weights @ np.asarray(rates)[1:-1], changed, atol=1e-9)
+    turn = lj.Generator.rotation("z") + 0.5 * lj.Generator.time_translation()
+    slide = lj.Generator.shift("x") + lj.Generator.shift("phi")
+    for case in ((rubbed, turn, *IN_SPACE, OF_KEPLER), (DISK, slide, ON_PLANE, rolling(), RADIUS)):
+        changed, predicted, first = moved_and_predicted(*case)
+        np.testing.assert_allclose(predicted, changed, atol=1e-9)
         assert abs(changed) > 1e-2
-    without = lj.System(DISK.lagrangian)
-    assert abs(lj.noether_charge(without, generator).rate(0.0, q, v, params) - rates[0]) > 1e-2
+        without = lj.noether_charge(lj.System(case[0].lagrangian), case[1])
+        assert abs(without.rate(0.0, *case[2:]) - first) > 1e-2
 
 
 def test_constraints_forbid_and_allow():
