@@ -47,6 +47,7 @@ from lagjax.numerics.runge_kutta import Dopri8, Tsit5
 from lagjax.analysis.found import Symmetries
 from lagjax.analysis.hamilton import Hamiltonian, hamiltonian
 from lagjax.analysis.least_action import action
+from lagjax.analysis.read_back import EquationsOfMotion, latex
 from lagjax.analysis.routh import Routhian, routhian
 from lagjax.analysis.symmetries import symmetries
 from lagjax.analysis.symmetry import SymmetryTest, is_symmetry
@@ -143,6 +144,8 @@ __all__ = [
     "routhian",
     "Routhian",
     "action",
+    "latex",
+    "EquationsOfMotion",
     "sweep",
     "Sweep",
     "Status",

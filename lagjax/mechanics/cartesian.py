@@ -34,12 +34,13 @@ def points(q) -> list[Point]:
     """
     found, named, start = [], {}, 0
     for (path, leaf), name in zip(jtu.tree_flatten_with_path(q)[0], leaf_names(q)):
-        shape: tuple[int, ...] = tuple(np.shape(leaf))
+        shape = np.shape(leaf)
         size = int(np.prod(shape))
-        if shape and shape[-1] in (2, 3) and len(shape) <= 2:
-            for i in range(size // shape[-1]):
+        last = shape[len(shape) - 1] if shape else 0
+        if last in (2, 3) and len(shape) <= 2:
+            for i in range(size // last):
                 label = name if len(shape) == 1 else f"{name}[{i}]"
-                where = [start + i * shape[-1] + k for k in range(shape[-1])]
+                where = [start + i * last + k for k in range(last)]
                 found.append(Point(label, (where[0], where[1], where[2] if len(where) > 2 else None)))
         elif path and not shape and (match := NAMES.fullmatch(name)):
             key = match["before"], match["after"], match["axis"].isupper()
