@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
+from jax.core import eval_jaxpr
 
 from lagjax.analysis import expressions, typeset
 from lagjax.analysis.expressions import Formula, function, number, symbol, tidy
@@ -166,6 +167,12 @@ def _applied(equation, operands) -> list[np.ndarray]:
         return [operands[0][tuple(map(slice, params["start_indices"], params["limit_indices"], strides))]]
     if name == "concatenate":
         return [np.concatenate(operands, params["dimension"])]
+    if name == "unstack":
+        parts = np.moveaxis(operands[0], params["axis"], 0)
+        return [_filled(list(part.reshape(-1)), shape) for part, shape in zip(parts, shapes)]
+    if name == "stack":
+        axis = params["axis"]
+        return [np.stack([x.reshape(shapes[0][:axis] + shapes[0][axis + 1 :]) for x in operands], axis)]
     if name in ("convert_element_type", "copy", "stop_gradient"):
         return [operands[0]]
     if name == "sincos":
@@ -210,7 +217,7 @@ def _verified(program, formulas, names, alone, s) -> float:
     given = jtu.tree_leaves(eqx.filter(alone, eqx.is_array))
     leaves = [np.asarray(x) for x in jtu.tree_leaves(eqx.filter((s.t, *s[1:]), eqx.is_array))]
     flat = np.concatenate([np.ravel(x) for x in leaves])
-    run = jax.jit(lambda *inputs: jax.core.eval_jaxpr(program.jaxpr, program.consts, *inputs))
+    run = jax.jit(lambda *inputs: eval_jaxpr(program.jaxpr, program.consts, *inputs))
     worst, seen = 0.0, 0
     random = np.random.default_rng(4)
     for _ in range(4 * STATES):

@@ -47,7 +47,9 @@ def exact_charge(q, p, t, params):
 
 
 @pytest.mark.parametrize(
-    "system, exact, params", [(FAST, exact_fast, OF_FAST), (CHARGE, exact_charge, OF_CHARGE)], ids=["fast", "charge"]
+    "system, exact, params",
+    [pytest.param(FAST, exact_fast, OF_FAST, marks=pytest.mark.slow), (CHARGE, exact_charge, OF_CHARGE)],
+    ids=["fast", "charge"],
 )
 def test_hamiltonians_in_closed_form(system, exact, params):
     """H, its first and second derivatives; Hamilton's equations are Lagrange's. Twin: a wrong sign."""
@@ -79,6 +81,7 @@ def test_hamiltonians_in_closed_form(system, exact, params):
     assert np.max(np.abs(lagrange[1] - slopes[0])) > 0.1
 
 
+@pytest.mark.slow
 def test_forces_and_batches():
     """In a dict, with friction: ṗ is Lagrange's; a batch of momenta is one lane each; NaN where there is none."""
     friction = lambda t, q, v, params: 0.25 * (v["x"] ** 2 + v["y"] ** 2)
@@ -119,6 +122,7 @@ def reduced_top():
     return lj.routhian(TOP, ["phi", "psi"]), [{"theta": x["theta"]} for x in SPINNING], params
 
 
+@pytest.mark.slow
 def test_the_top_without_its_cyclic_angles():
     """Its nutation is Lagrange's, its cyclic velocities come back; twin: the other momentum, R with the other sign."""
     reduced, state, params = reduced_top()
@@ -198,6 +202,7 @@ def test_the_action_is_stationary_on_motions():
     np.testing.assert_allclose(jax.grad(lambda q1: off(0.0, q1))(1.0), w / np.tan(w * end), rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_the_action_of_a_trajectory():
     """The same from outputs, cut within them and backward; twin: without what is cut off."""
     system, params, w = lj.System(swinging), {"k": 4.0}, 2.0

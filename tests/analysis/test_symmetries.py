@@ -8,7 +8,7 @@ import lagjax as lj
 from lagjax.scenes import cross_rails, mass_distributions, sliding_wedge
 from tests.analysis.test_symmetry import DISK, IN_SPACE, KEPLER, OF_KEPLER, OF_STONE, ON_PLANE, RADIUS, STONE, rolling
 
-SLOW = ("finite cylinder", "elliptic cylinder")
+SLOW = ("finite cylinder", "elliptic cylinder", "helix")
 TABLE = {
     "plane": {"p_x", "p_y", "L_z", "Jacobi integral"},
     "half plane": {"p_x", "Jacobi integral"},
@@ -39,6 +39,7 @@ def test_the_seven_mass_distributions(name):
         np.testing.assert_allclose(found[key](0.0, q, v, params), exact[words.get(key, key)], rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_left_handed_helix_of_any_pitch():
     """The sign and the size of the screw follow h; and what is printed as conserved is not."""
     params = mass_distributions.PARAMS["helix"] | {"h": -1.7}
@@ -97,6 +98,7 @@ def test_kepler_and_what_is_no_motion_of_points():
     np.testing.assert_allclose(charge(t, q, v, OF_KEPLER), OF_KEPLER["m"] * q @ v - 2 * t * energy, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_two_bodies_and_free_fall():
     """All ten of Galilei's for two bodies, with both masses by name; of a falling stone also what has t in it."""
 

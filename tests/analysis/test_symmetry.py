@@ -130,6 +130,7 @@ def test_the_rate_of_a_broken_charge_is_that_of_the_motion():
         assert abs(without.rate(0.0, *case[2:]) - first) > 1e-2
 
 
+@pytest.mark.slow
 def test_constraints_forbid_and_allow():
     """The wedge's p_X + p_x; on the disk's constraints a shift is no symmetry, though they look the same."""
     start = sliding_wedge.start_on_incline(sliding_wedge.PARAMS, along=1.0, along_rate=0.25)
@@ -146,6 +147,7 @@ def test_constraints_forbid_and_allow():
     assert lj.is_symmetry(DISK, lj.Generator.shift("theta"), ON_PLANE, rolling(), RADIUS).residual < 1e-12
 
 
+@pytest.mark.slow
 def test_a_moving_constraint_does_work():
     """On a hoop that turns at a given rate E is not conserved, E - ω L_z is; twin: the other sign."""
     bead = lambda t, q, v, p: 0.5 * v @ v - p["g"] * q[2]
@@ -226,6 +228,7 @@ def test_no_states_no_verdict():
         lj.is_symmetry(undefined, lj.Generator.shift("q"), 0.5, 0.5)
 
 
+@pytest.mark.slow
 def test_float32_and_a_force_that_reacts():
     """In float32 a rotation passes at its round-off. Coulomb's friction takes the momentum along its normal force."""
     q, v = (x.astype(np.float32) for x in IN_SPACE)
