@@ -169,7 +169,7 @@ def _applied(equation, operands) -> list[np.ndarray]:
         return [np.concatenate(operands, params["dimension"])]
     if name == "unstack":
         parts = np.moveaxis(operands[0], params["axis"], 0)
-        return [_filled(list(part.reshape(-1)), shape) for part, shape in zip(parts, shapes)]
+        return [_filled(list(parts[i : i + 1].reshape(-1)), shape) for i, shape in enumerate(shapes)]
     if name == "stack":
         axis = params["axis"]
         return [np.stack([x.reshape(shapes[0][:axis] + shapes[0][axis + 1 :]) for x in operands], axis)]

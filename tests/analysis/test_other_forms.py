@@ -185,6 +185,7 @@ def swinging(t, q, v, params):
     return 0.5 * v**2 - 0.5 * params["k"] * q**2
 
 
+@pytest.mark.slow
 def test_the_action_is_stationary_on_motions():
     """S of an oscillator in closed form; δS = 0 there, and ½ δ²S as known; twin: a straight path. ∂S/∂q₁ is p."""
     system, params, end = lj.System(swinging), {"k": 4.0}, 0.5

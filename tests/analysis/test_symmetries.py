@@ -135,6 +135,7 @@ def test_fields_that_are_tilted():
     np.testing.assert_allclose([found[w].rate(0.0, *IN_SPACE, {"m": 1.3, "B": 2.5}) for w in words], 0.0, atol=1e-13)
 
 
+@pytest.mark.slow
 def test_constraints_of_velocities():
     """A rolling disk under a pull along x: E, and its spin about the vertical; nothing of the plane's symmetry."""
     found = lj.symmetries(DISK, ON_PLANE, rolling(), RADIUS)
