@@ -109,7 +109,7 @@ def _recognized(value: float, params, agrees, parameters_first) -> Number | None
     if parameters_first:
         order = [*plain[:1], *single, *pairs, *plain, *pitch, *rest]
     else:
-        order = [*plain, *single, *pitch, *rest, *pairs]
+        order = [*plain, *single, *pitch, *pairs, *rest]
     alike = [found for number in order if (found := _agreeing(value, number, params, agrees)) is not None]
     # Two parameters of the same value: it is open which of them is meant.
     clear = [found for found in alike[:1] if not found.params or _only(found, alike)]

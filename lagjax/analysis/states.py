@@ -2,8 +2,8 @@
 
 Positions lie around the given one in several widths, up to one and a half times its size, so that what is symmetric on
 one side of a plane alone is seen; times and velocities likewise, some of them zero, where a small force is not hidden
-by fast motion. The size of a coordinate is that of its array or point, 1 where that is at zero. States are moved onto
-the constraints by Newton's method, each step the shortest in units of these sizes.
+by fast motion. The size of a coordinate is that of its array or point, 1 where that is at zero or the coordinate is an
+angle. States are moved onto the constraints by Newton's method, each step the shortest in units of these sizes.
 """
 
 from typing import NamedTuple
@@ -17,6 +17,7 @@ from jaxtyping import Array, Bool, Float
 from lagjax.mechanics import constraints, coordinates
 from lagjax.mechanics.cartesian import points
 from lagjax.mechanics.compiled import compiled
+from lagjax.mechanics.structure import angles
 
 WIDTHS = np.array([1.5, 1.0, 0.5, 0.1])
 OF_VELOCITIES = np.array([1.0, 0.3, 1.0, 0.0])
@@ -61,7 +62,7 @@ def around(system, s: coordinates.State, places) -> tuple[States, Scales]:
     xp = coordinates.numpy_of((s, system))
     vector = lambda tree: xp.concatenate([xp.ravel(xp.asarray(x)) for x in jax.tree.leaves(tree)])
     x, u = vector(s.q), vector(s.v)
-    n, scales = len(x), sizes(s.q, x, u)
+    n, scales = len(x), sizes(system, s, x, u)
     places = places.astype(x.dtype)
     t = s.t + scales.t * places[:, 0]
     xs, us = x[None] + scales.x[None] * places[:, 1 : n + 1], u[None] + scales.u[None] * places[:, n + 1 :]
@@ -74,12 +75,16 @@ def around(system, s: coordinates.State, places) -> tuple[States, Scales]:
     return States(t, *(xp.asarray(y) for y in moved)), scales
 
 
-def sizes(q, x, u) -> Scales:
+def sizes(system, s: coordinates.State, x, u) -> Scales:
     """The size of each coordinate and velocity of a state."""
-    xp, same = coordinates.numpy_of((x, u)), _groups(q)
+    xp, same = coordinates.numpy_of((x, u)), _groups(s.q)
     together = lambda y: xp.sqrt(same.astype(y.dtype) @ y**2)
     of_x = together(x)
     of_x = xp.where(of_x > 0, of_x, xp.ones_like(x))
+    # A small angle is no small motion: near zero a pendulum would look like any oscillator.
+    leaves = zip(jax.tree.leaves(angles(system, *s)), jax.tree.leaves(s.q))
+    is_angle = np.concatenate([np.full(int(np.prod(np.shape(leaf))), angle) for angle, leaf in leaves])
+    of_x = xp.where(is_angle, xp.maximum(of_x, 1.0).astype(of_x.dtype), of_x)
     of_u = together(u)
     # A velocity of zero says nothing: then the pace of the others, or one length in one unit of time.
     pace = xp.sqrt(xp.mean((of_u / of_x) ** 2))

@@ -31,7 +31,7 @@ from lagjax.mechanics.first_call import looked_at
 from lagjax.mechanics.generators import Generator, as_generator
 from lagjax.mechanics.memory import filled_up
 from lagjax.mechanics.noether import NoetherCharge
-from lagjax.mechanics.structure import structure
+from lagjax.mechanics.structure import conserved_momenta
 
 
 def symmetries(system, q, v, params=None, *, basis: Iterable | Mapping | None = None, t=0.0) -> Symmetries:
@@ -104,6 +104,10 @@ def _those_found(seen: Rates) -> Rates:
     return Rates(states, **{name: y if name in whole else y[kept] for name, y in of_states.items()})
 
 
+# A combination that changes by so many times what counts as none was kept by round-off alone.
+DOUBTFUL = 100.0
+
+
 class _Columns(NamedTuple):
     """What the motions make of each state; own generators first, for they have the user's names."""
 
@@ -145,7 +149,7 @@ def _found(system, s, tried: Basis, own, gauge: Gauge, seen: Rates) -> Symmetrie
     later = np.concatenate([boosted, beyond(with_t.vectors, np.concatenate([embedded, boosted]), precision)])
 
     parameters = named_parameters(s.params)
-    cyclic = _cyclic(system, s)
+    cyclic = {f"p_{name}" for name in conserved_momenta(system, *s)}
     details: dict[str, Found] = {}
     last = [i for i in range(len(every)) if kinds[every[i]] == "time"]
     embedded = sorted(embedded, key=lambda v: bool(np.any(v[last])))
@@ -158,6 +162,8 @@ def _found(system, s, tried: Basis, own, gauge: Gauge, seen: Rates) -> Symmetrie
         physical, weights = physical * words.factor, weights * words.factor
         generator = _generator(physical, weights, tried, own, gauge, order, words.text)
         residual = _residual(columns, whole, weights / words.factor)
+        if residual > DOUBTFUL * precision.null:
+            continue
         single = len(np.flatnonzero(whole)) == 1 and not np.any(weights)
         is_cyclic = single and names[int(np.flatnonzero(whole)[0])] in cyclic
         name = words.text
@@ -257,17 +263,10 @@ def _generator(physical, weights, tried: Basis, own, gauge, order, name) -> Gene
     affine = physical[n_own:]
     total = Affine(*(np.tensordot(affine, getattr(tried.affine, f), 1) for f in Affine.__annotations__))
     moves = any(np.any(x) for x in (total.shift, total.matrix, total.drift))
-    delta = (
-        Combination(total.shift, total.matrix, total.drift) if moves or not (total.clock or total.clock_rate) else None
-    )
-    time = Clock(float(total.clock), float(total.clock_rate)) if total.clock or total.clock_rate else None
+    sets_clock = bool(total.clock or total.clock_rate)
+    delta = Combination(total.shift, total.matrix, total.drift) if moves or not sets_clock else None
+    time = Clock(float(total.clock), float(total.clock_rate)) if sets_clock else None
     generator = Generator(delta, time, gauge.combined(weights) if np.any(weights) else None, name)
     for weight, one in zip(physical[:n_own], own):
         generator = generator + float(weight) * one if weight else generator
     return Generator(generator.delta, generator.time, generator.gauge, name)
-
-
-def _cyclic(system, s) -> set[str]:
-    known = structure(system, *s)
-    free = known is not None and system.force is None and system.dissipation is None and not system.constraints
-    return {f"p_{name}" for name in known.cyclic} if free and known is not None else set()
