@@ -50,6 +50,12 @@ class Hamiltonian(eqx.Module):
         return v, pushed
 
     def _at(self, t, q, p, params):
+        if jax.tree.structure(p) != jax.tree.structure(q):
+            has = [", ".join(coordinates.names(tree)) for tree in (q, p)]
+            raise ValueError(
+                f"p must have the structure of q.\n  q: {has[0]}\n  p: {has[1]}\n"
+                "Fix: p = lj.momentum(system, t, q, v, params)."
+            )
         s = coordinates.state(t, q, p, params)
         system = looked_at(self.system, s)
         value, v, pushed, mass, regular, reached = _hamiltonian(system, *s)

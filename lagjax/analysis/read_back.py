@@ -77,8 +77,13 @@ def latex(system, q, v, params=None, *, t=0.0) -> EquationsOfMotion:
 
     Source: Goldstein, *Classical Mechanics*, Eq. (1.57), (2.26).
     """
-    s = coordinates.state(t, q, v, params)
-    system = looked_at(system, s)
+    s = coordinates.state(t, q, v, jax.tree.map(lambda x: float(x) if type(x) is int else x, params))
+    try:
+        system = looked_at(system, s)
+    except (TypeError, IndexError):
+        # A whole number that counts something has to stay one.
+        s = coordinates.state(t, q, v, params)
+        system = looked_at(system, s)
     n = len(coordinates.names(s.q))
     if n > COORDINATES:
         raise ValueError(f"the system has {n} coordinates, and equations are written of up to {COORDINATES}.")
@@ -122,10 +127,13 @@ def _symbols(s) -> tuple[list[Formula], list[str]]:
     if jtu.treedef_is_leaf(jtu.tree_structure(s.params)):
         known = [name.replace("q", "params", 1) for name in known]
     position = lambda name: typeset.written(name)
+    short = [name.split(".")[-1] for name in known]
+    # Of two masses of two bodies each gets its body as an index.
+    letters = [x if short.count(x) == 1 else "_".join(reversed(name.split("."))) for x, name in zip(short, known)]
     found = [("t", "t", 1)]
     found += [(f"q:{name}", position(name), 2) for name in names]
     found += [(f"v:{name}", rf"\dot{{{position(name)}}}", 3) for name in names]
-    found += [(f"p:{name}", typeset.written(name.split(".")[-1]), 0) for name in known]
+    found += [(f"p:{name}", typeset.written(letter), 0) for name, letter in zip(known, letters)]
     return [symbol(*one) for one in found], [name for name, *_ in found]
 
 

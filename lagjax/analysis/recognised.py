@@ -97,6 +97,8 @@ def _value(number: Number, params) -> float:
 
 def _recognized(value: float, params, agrees, parameters_first) -> Number | None:
     """What a number looks like; None for nothing known."""
+    if abs(value - 1.0) <= agrees:
+        return Number(Fraction(1))
     plain = [Number(fraction) for fraction in WHOLE]
     single = [Number(f, 0, ((name, e),)) for f in WHOLE for name in params for e in (1, -1)]
     pitch = [

@@ -17,6 +17,7 @@ from jaxtyping import Array, Bool, Float
 from lagjax.mechanics import constraints, coordinates
 from lagjax.mechanics.cartesian import points
 from lagjax.mechanics.compiled import compiled
+from lagjax.mechanics.memory import kinds, remembered
 from lagjax.mechanics.structure import angles
 
 WIDTHS = np.array([1.5, 1.0, 0.5, 0.1])
@@ -82,7 +83,8 @@ def sizes(system, s: coordinates.State, x, u) -> Scales:
     of_x = together(x)
     of_x = xp.where(of_x > 0, of_x, xp.ones_like(x))
     # A small angle is no small motion: near zero a pendulum would look like any oscillator.
-    leaves = zip(jax.tree.leaves(angles(system, *s)), jax.tree.leaves(s.q))
+    known = remembered(system, (angles, system.read, kinds(s)), lambda: angles(system, *s))
+    leaves = zip(jax.tree.leaves(known), jax.tree.leaves(s.q))
     is_angle = np.concatenate([np.full(int(np.prod(np.shape(leaf))), angle) for angle, leaf in leaves])
     of_x = xp.where(is_angle, xp.maximum(of_x, 1.0).astype(of_x.dtype), of_x)
     of_u = together(u)

@@ -29,7 +29,7 @@ from lagjax.mechanics import coordinates
 from lagjax.mechanics.diagnosis import describe
 from lagjax.mechanics.first_call import looked_at
 from lagjax.mechanics.generators import Generator, as_generator
-from lagjax.mechanics.memory import filled_up
+from lagjax.mechanics.memory import filled_up, remembered
 from lagjax.mechanics.noether import NoetherCharge
 from lagjax.mechanics.structure import conserved_momenta
 
@@ -149,7 +149,8 @@ def _found(system, s, tried: Basis, own, gauge: Gauge, seen: Rates) -> Symmetrie
     later = np.concatenate([boosted, beyond(with_t.vectors, np.concatenate([embedded, boosted]), precision)])
 
     parameters = named_parameters(s.params)
-    cyclic = {f"p_{name}" for name in conserved_momenta(system, *s)}
+    shown = remembered(system, (conserved_momenta, system.read, kinds(s)), lambda: conserved_momenta(system, *s))
+    cyclic = {f"p_{name}" for name in shown}
     details: dict[str, Found] = {}
     last = [i for i in range(len(every)) if kinds[every[i]] == "time"]
     embedded = sorted(embedded, key=lambda v: bool(np.any(v[last])))

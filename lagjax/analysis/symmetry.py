@@ -83,7 +83,7 @@ class SymmetryTest(eqx.Module):
             words = "allows it" if allowed else "forbids it"
             unchanged = name in self.invariance and self.invariance[name] <= self.tolerance and not allowed
             rows.append((f"constraint '{name}'", words + (", though it looks the same" if unchanged else "")))
-        rows.append(("charge", f"{float(self.charge):.9g}, at {self.at}"))
+        rows.append(("charge", f"{float(self.charge):.9g}" + (f", at {self.at}" if self.at else "")))
         rows.append(("its rate there", "0" if self else f"{float(self.rate):.9g}"))
         width = max(len(name) for name, _ in rows)
         verdict = "conserved by a symmetry" if self else f"no symmetry: broken by {' and '.join(self.broken_by())}"

@@ -160,7 +160,7 @@ def added(terms, digits: str = ".6g") -> str:
     """A sum in words, of (coefficient, name)."""
     words = ""
     for coefficient, name in terms:
-        if isinstance(coefficient, numbers.Real):
+        if not coordinates.is_traced(coefficient) and np.ndim(coefficient) == 0:
             size = f"{abs(float(coefficient)):{digits}}"
             sign = "-" if coefficient < 0 else "+"
         else:
