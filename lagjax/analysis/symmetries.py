@@ -120,7 +120,7 @@ class _Columns(NamedTuple):
 def _found(system, s, tried: Basis, own, gauge: Gauge, seen: Rates) -> Symmetries:
     count, n_own = len(tried.names), len(own)
     names = (*(g.name for g in own), *tried.names)
-    kinds = (*("own" for _ in own), *tried.kinds)
+    sorts = (*("own" for _ in own), *tried.kinds)
     order = np.concatenate([np.arange(count, count + n_own), np.arange(count)]).astype(int)
     precision = precision_of(s.t.dtype)
     states = len(seen.value)
@@ -135,7 +135,7 @@ def _found(system, s, tried: Basis, own, gauge: Gauge, seen: Rates) -> Symmetrie
         (np.moveaxis(seen.xi, 1, 0) / np.maximum(np.std(seen.xi, axis=(0, 1)), 1e-300)).reshape(count + n_own, -1),
         seen.tau.T / max(float(np.std(seen.tau)), 1e-300),
     ], axis=1)[order].T  # fmt: skip
-    steady = np.array([kind in ("own", "space", "time") for kind in kinds])
+    steady = np.array([kind in ("own", "space", "time") for kind in sorts])
     first = np.flatnonzero(steady)
     first = first[independent(moves[:, first], precision)]
     every = np.concatenate([first, np.flatnonzero(~steady)])
@@ -152,7 +152,7 @@ def _found(system, s, tried: Basis, own, gauge: Gauge, seen: Rates) -> Symmetrie
     shown = remembered(system, (conserved_momenta, system.read, kinds(s)), lambda: conserved_momenta(system, *s))
     cyclic = {f"p_{name}" for name in shown}
     details: dict[str, Found] = {}
-    last = [i for i in range(len(every)) if kinds[every[i]] == "time"]
+    last = [i for i in range(len(every)) if sorts[every[i]] == "time"]
     embedded = sorted(embedded, key=lambda v: bool(np.any(v[last])))
     for vector, timed in [*((v, False) for v in embedded), *((v, True) for v in later)]:
         whole = np.zeros(len(order))
