@@ -29,7 +29,7 @@ from lagjax.mechanics import coordinates
 from lagjax.mechanics.diagnosis import describe
 from lagjax.mechanics.first_call import looked_at
 from lagjax.mechanics.generators import Generator, as_generator
-from lagjax.mechanics.memory import filled_up, remembered
+from lagjax.mechanics.memory import filled_up, kinds, remembered
 from lagjax.mechanics.noether import NoetherCharge
 from lagjax.mechanics.structure import conserved_momenta
 
