@@ -109,70 +109,94 @@ DOUBTFUL = 100.0
 
 
 class _Columns(NamedTuple):
-    """What the motions make of each state; own generators first, for they have the user's names."""
+    """What the motions make of each state, one column a motion, in units of their sizes; the user's own come first.
 
+    `charge`, `forbidden`: the rates, and by how much constraints forbid them; `gauge`: the rates of gauge functions.
+    `moves`: each motion as what it does at all states; `order`: where it is in `Rates`.
+    """
+
+    names: tuple[str, ...]
+    kinds: tuple[str, ...]
     order: np.ndarray
+    size: np.ndarray
     charge: np.ndarray
     forbidden: np.ndarray
     gauge: np.ndarray
+    moves: np.ndarray
+
+
+class _Spaces(NamedTuple):
+    """The symmetries without t, and those with t beyond them, (d, K) in the columns `every`; and how clear that is."""
+
+    every: np.ndarray
+    steady: np.ndarray
+    timed: np.ndarray
+    singular_values: tuple[np.ndarray, np.ndarray]
+    gap: float
 
 
 def _found(system, s, tried: Basis, own, gauge: Gauge, seen: Rates) -> Symmetries:
-    count, n_own = len(tried.names), len(own)
-    names = (*(g.name for g in own), *tried.names)
-    sorts = (*("own" for _ in own), *tried.kinds)
-    order = np.concatenate([np.arange(count, count + n_own), np.arange(count)]).astype(int)
     precision = precision_of(s.t.dtype)
-    states = len(seen.value)
+    columns = _columns(tried, own, gauge, seen)
+    spaces = _spaces(columns, gauge, precision)
+    parameters = named_parameters(s.params)
+    shown = remembered(system, (conserved_momenta, system.read, kinds(s)), lambda: conserved_momenta(system, *s))
+    cyclic = {f"p_{name}" for name in shown}
+    # What moves in time comes last, as energies do in a list of constants.
+    clocks = [kind == "time" for kind in columns.kinds]
+    steady = sorted(spaces.steady, key=lambda vector: bool(np.any(vector[np.array(clocks)[spaces.every]])))
+    details: dict[str, Found] = {}
+    for vector, timed in [*((v, False) for v in steady), *((v, True) for v in spaces.timed)]:
+        whole = np.zeros(len(columns.order))
+        whole[spaces.every] = vector
+        weights = _gauge_of(columns, whole, gauge, timed, _pushed(whole[len(own) :], tried.affine), precision)
+        residual = _residual(columns, whole, weights)
+        if residual > DOUBTFUL * precision.null:
+            continue
+        words = _words(whole / columns.size, columns.names, weights, gauge, parameters, precision.agrees)
+        physical = whole / columns.size * words.factor
+        generator = _generator(physical, weights * words.factor, tried, own, gauge, words.text)
+        single = len(np.flatnonzero(whole)) == 1 and not np.any(weights)
+        is_cyclic = single and columns.names[int(np.flatnonzero(whole)[0])] in cyclic
+        details[words.text] = Found(NoetherCharge(system, generator), residual, timed, physical, is_cyclic)
+    return Symmetries(
+        details, scalings_of(system, s, tried, seen, precision), columns.names, len(seen.value),
+        spaces.singular_values, spaces.gap,
+        f"t = {float(s.t):.6g}, q = {describe(s.q)}, v = {describe(s.v)}", repr(system),
+    )  # fmt: skip
+
+
+def _columns(tried: Basis, own, gauge: Gauge, seen: Rates) -> _Columns:
+    count, n_own, states = len(tried.names), len(own), len(seen.value)
+    order = np.concatenate([np.arange(count, count + n_own), np.arange(count)]).astype(int)
+    rows = lambda y: y.reshape(-1, y.shape[-1])[:, order] / np.sqrt(states)
     of_gauge = gauge.rates(*map(np.asarray, seen.states[:3])) / seen.energy[:, None]
-    root = np.sqrt(states)
-    rows = lambda y: y.reshape(-1, y.shape[-1])[:, order] / root
-    columns = _Columns(order, rows(seen.charge), rows(seen.displacement), of_gauge / root)
-    size = seen.size[order]
+    unit = lambda y, axes: y / np.maximum(np.std(y, axis=axes), np.finfo(float).tiny)
+    moves = np.concatenate(
+        [np.moveaxis(unit(seen.xi, (0, 1)), 1, 0).reshape(count + n_own, -1), unit(seen.tau, (0, 1)).T], axis=1
+    )
+    return _Columns(
+        (*(generator.name for generator in own), *tried.names), (*("own" for _ in own), *tried.kinds),
+        order, seen.size[order], rows(seen.charge), rows(seen.displacement), of_gauge / np.sqrt(states), moves[order].T,
+    )  # fmt: skip
 
-    # Each motion as what it does at all states.
-    moves = np.concatenate([
-        (np.moveaxis(seen.xi, 1, 0) / np.maximum(np.std(seen.xi, axis=(0, 1)), 1e-300)).reshape(count + n_own, -1),
-        seen.tau.T / max(float(np.std(seen.tau)), 1e-300),
-    ], axis=1)[order].T  # fmt: skip
-    steady = np.array([kind in ("own", "space", "time") for kind in sorts])
+
+def _spaces(columns: _Columns, gauge: Gauge, precision: Precision) -> _Spaces:
+    """The null spaces, first of the motions without t, then of all."""
+    steady = np.array([kind in ("own", "space", "time") for kind in columns.kinds])
     first = np.flatnonzero(steady)
-    first = first[independent(moves[:, first], precision)]
+    first = first[independent(columns.moves[:, first], precision)]
     every = np.concatenate([first, np.flatnonzero(~steady)])
-    every = every[independent(moves[:, every], precision)]
-
+    every = every[independent(columns.moves[:, every], precision)]
     without_t = null_space(_up_to(columns, first, ~gauge.timed), precision)
     with_t = null_space(_up_to(columns, every, np.ones(len(gauge.timed), bool)), precision)
     embedded = np.zeros((len(without_t.vectors), len(every)))
     embedded[:, _where(every, first)] = without_t.vectors
-    boosted = _boosted(embedded, every, names, columns, gauge, precision.null)
-    later = np.concatenate([boosted, beyond(with_t.vectors, np.concatenate([embedded, boosted]), precision)])
-
-    parameters = named_parameters(s.params)
-    shown = remembered(system, (conserved_momenta, system.read, kinds(s)), lambda: conserved_momenta(system, *s))
-    cyclic = {f"p_{name}" for name in shown}
-    details: dict[str, Found] = {}
-    last = [i for i in range(len(every)) if sorts[every[i]] == "time"]
-    embedded = sorted(embedded, key=lambda v: bool(np.any(v[last])))
-    for vector, timed in [*((v, False) for v in embedded), *((v, True) for v in later)]:
-        whole = np.zeros(len(order))
-        whole[every] = vector
-        weights = _gauge_of(columns, whole, gauge, timed, _pushed(whole[n_own:], tried.affine), precision)
-        physical = whole / size
-        words = _words(physical, names, weights, gauge, parameters, precision.agrees)
-        physical, weights = physical * words.factor, weights * words.factor
-        generator = _generator(physical, weights, tried, own, gauge, order, words.text)
-        residual = _residual(columns, whole, weights / words.factor)
-        if residual > DOUBTFUL * precision.null:
-            continue
-        single = len(np.flatnonzero(whole)) == 1 and not np.any(weights)
-        is_cyclic = single and names[int(np.flatnonzero(whole)[0])] in cyclic
-        name = words.text
-        details[name] = Found(NoetherCharge(system, generator), residual, timed, physical, is_cyclic)
-    return Symmetries(
-        details, scalings_of(system, s, tried, seen, precision), names, states,
+    boosted = _boosted(embedded, every, columns.names, columns, gauge, precision.null)
+    later = beyond(with_t.vectors, np.concatenate([embedded, boosted]), precision)
+    return _Spaces(
+        every, embedded, np.concatenate([boosted, later]),
         (without_t.singular_values, with_t.singular_values), min(without_t.gap, with_t.gap),
-        f"t = {float(s.t):.6g}, q = {describe(s.q)}, v = {describe(s.v)}", repr(system),
     )  # fmt: skip
 
 
@@ -258,7 +282,7 @@ def _words(physical, names, weights, gauge: Gauge, parameters, agrees) -> Words:
     return in_words(numbers, named, parameters, agrees, first=[gauge.names[i] for i in of_gauge])
 
 
-def _generator(physical, weights, tried: Basis, own, gauge, order, name) -> Generator:
+def _generator(physical, weights, tried: Basis, own, gauge, name) -> Generator:
     """The combination as one generator."""
     n_own = len(own)
     affine = physical[n_own:]
