@@ -221,6 +221,14 @@ in_lab = laboratory[name](0.0, *at_lab, rails.PARAMS)
 print(f"the same number: {in_frame:.12f} and {in_lab:.12f}")
 
 # %% [markdown]
+# The equations of motion in the frame of the rails, with Coriolis' force and the centrifugal one, are read back from the
+# program that computes them:
+
+# %%
+equations = lj.latex(rails.rotating_system, rails.Q0, rails.V0, rails.PARAMS)
+equations
+
+# %% [markdown]
 # ## Two constants from no symmetry of space
 #
 # Noether's list is not complete: `symmetries` looks among motions of points, and finds none of these. Inside the
@@ -270,7 +278,7 @@ assert swept.ok.all() and np.max(swept.values[:, at_two_pi]) < 1e-12
 assert np.min(np.delete(swept.values, at_two_pi, axis=1)) > 1e-4
 assert set(on_wedge.steady) == {"p_X + p_x", "Jacobi integral"}
 assert name == "helix" and list(laboratory) == ["Jacobi integral - omega L_z with omega = 2.5"]
-assert abs(in_frame - in_lab) < 1e-12
+assert abs(in_frame - in_lab) < 1e-12 and equations.error < 1e-12
 assert max(masses.drift(values) for values in energies["inside"]) < 1e-8
 assert max(masses.drift(values) for values in energies["outside"]) > 0.1
 assert masses.drift(euler[0.0]) < 1e-8 and masses.drift(euler[0.25]) > 1e-3

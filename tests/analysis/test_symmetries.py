@@ -37,6 +37,12 @@ def test_the_seven_mass_distributions(name):
     words = {"Jacobi integral": "E", "h p_z + 2π L_z with h = 0.5": "h p_z + 2 pi L_z"}
     for key in found.steady:
         np.testing.assert_allclose(found[key](0.0, q, v, params), exact[words.get(key, key)], rtol=1e-12)
+    random = np.random.default_rng(7)
+    for _ in range(4):
+        other = {key: value * random.uniform(0.7, 1.3) for key, value in params.items()}
+        q, v = (mass_distributions.vector(*random.uniform(-3.0, 3.0, 3)) for _ in range(2))
+        found = lj.symmetries(mass_distributions.SYSTEMS[name], q, v, other)
+        assert {key.split(" with ")[0] for key in found.steady} == {key.split(" with ")[0] for key in TABLE[name]}
 
 
 @pytest.mark.slow
@@ -164,6 +170,24 @@ def test_a_weak_disturbance_is_seen():
     disturbed = lambda size: lj.System(lambda t, q, v, p: KEPLER.lagrangian(t, q, v, p) + size * q[0])
     found = lj.symmetries(disturbed(1e-6), *IN_SPACE, OF_KEPLER)
     assert list(found) == ["L_x", "Jacobi integral"] and found.gap < 1e10
+
+
+def test_small_angles_are_no_small_system():
+    """Near rest a pendulum on a cart looks linear, with more symmetries than it has; its angle is drawn in radians."""
+
+    def cart(t, q, v, p):
+        bob = 2.0 * p["l"] * v["x"] * v["theta"] * jnp.cos(q["theta"]) + (p["l"] * v["theta"]) ** 2
+        return 0.5 * (p["M"] + p["m"]) * v["x"] ** 2 + 0.5 * p["m"] * bob + p["m"] * p["l"] * jnp.cos(q["theta"])
+
+    state, params = ({"x": 0.0, "theta": 1e-4}, {"x": 0.0, "theta": 0.0}), {"M": 2.0, "m": 0.3, "l": 0.7}
+    assert list(lj.symmetries(lj.System(cart), *state, params)) == ["p_x", "Jacobi integral"]
+
+
+def test_a_wave_that_travels():
+    """Neither p nor E, but ω p - k E; a chain of rods in space keeps all that two bodies do."""
+    wave = lj.System(lambda t, q, v, p: 0.5 * v**2 - jnp.cos(p["k"] * q - p["w"] * t))
+    found = lj.symmetries(wave, 0.3, 0.5, {"k": 2.1, "w": 3.3})
+    assert list(found) == ["w p_q - k Jacobi integral with w = 3.3, k = 2.1"]
 
 
 def test_bad_input():
