@@ -221,8 +221,8 @@ in_lab = laboratory[name](0.0, *at_lab, rails.PARAMS)
 print(f"the same number: {in_frame:.12f} and {in_lab:.12f}")
 
 # %% [markdown]
-# The equations of motion in the frame of the rails, with Coriolis' force and the centrifugal one, are read back from the
-# program that computes them:
+# The equations of motion in the frame of the rails, with Coriolis' force and the centrifugal one, are read back from
+# the program that computes them:
 
 # %%
 equations = lj.latex(rails.rotating_system, rails.Q0, rails.V0, rails.PARAMS)

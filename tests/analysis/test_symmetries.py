@@ -184,7 +184,7 @@ def test_small_angles_are_no_small_system():
 
 
 def test_a_wave_that_travels():
-    """Neither p nor E, but ω p - k E; a chain of rods in space keeps all that two bodies do."""
+    """Neither p nor E is conserved, but ω p - k E."""
     wave = lj.System(lambda t, q, v, p: 0.5 * v**2 - jnp.cos(p["k"] * q - p["w"] * t))
     found = lj.symmetries(wave, 0.3, 0.5, {"k": 2.1, "w": 3.3})
     assert list(found) == ["w p_q - k Jacobi integral with w = 3.3, k = 2.1"]
