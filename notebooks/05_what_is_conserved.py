@@ -74,9 +74,9 @@ for name in ("plane", "helix"):
 # largest value:
 
 # %%
+G = lj.Generator
 # The potentials are long: diffrax's own loop over the stages compiles faster than lagjax's unrolled one.
 settings = {"rtol": 1e-9, "atol": 1e-9, "method": diffrax.Dopri8()}
-G = lj.Generator
 generators = {f"p_{axis}": G.translation(axis) for axis in "xyz"} | {f"L_{axis}": G.rotation(axis) for axis in "xyz"}
 generators["E"] = G.time_translation()
 changes, orbits = {}, {}
