@@ -43,6 +43,18 @@ from lagjax.numerics.radau import Radau5
 from lagjax.numerics.runge_kutta import Dopri8, Tsit5
 
 # isort: split
+# What a system is like.
+from lagjax.analysis.found import Symmetries
+from lagjax.analysis.hamilton import Hamiltonian, hamiltonian
+from lagjax.analysis.least_action import action
+from lagjax.analysis.read_back import EquationsOfMotion, latex
+from lagjax.analysis.routh import Routhian, routhian
+from lagjax.analysis.symmetries import symmetries
+from lagjax.analysis.symmetry import SymmetryTest, is_symmetry
+from lagjax.mechanics.generators import Generator
+from lagjax.mechanics.noether import NoetherCharge, noether_charge
+
+# isort: split
 # Many motions.
 from lagjax.sweeps.engine import sweep
 from lagjax.sweeps.lanes import Status
@@ -120,6 +132,20 @@ __all__ = [
     "Animation",
     "RESULTS",
     "AccuracyWarning",
+    "Generator",
+    "noether_charge",
+    "NoetherCharge",
+    "is_symmetry",
+    "SymmetryTest",
+    "symmetries",
+    "Symmetries",
+    "hamiltonian",
+    "Hamiltonian",
+    "routhian",
+    "Routhian",
+    "action",
+    "latex",
+    "EquationsOfMotion",
     "sweep",
     "Sweep",
     "Status",

@@ -33,6 +33,7 @@ from lagjax.mechanics.hybrid import phases_of
 from lagjax.mechanics.in_numbers import WRITTEN, Numbers, in_numbers
 from lagjax.mechanics.lagrangian import mass_and_forcing
 from lagjax.mechanics.reactions import force_with_ones
+from lagjax.mechanics.system import System
 from lagjax.numerics import banded
 from lagjax.numerics.scalars import TooLong
 
@@ -177,6 +178,59 @@ def angles(system, t, q, v, params) -> PyTree[bool]:
         }
         found.append(kinds - {Depends.NOT} == {Depends.PERIODICALLY})
     return jtu.tree_unflatten(structure, found)
+
+
+def conserved_momenta(system, t, q, v, params) -> list[str]:
+    """The coordinates whose momentum is known to stay: neither L nor a constraint contains them, and no force acts."""
+    names = coordinates.names(q)
+    holonomic = all(isinstance(c, Holonomic) for c in system.constraints.values())
+    if system.force is not None or system.dissipation is not None or not holonomic or len(names) > UP_TO:
+        return []
+    _, unflatten = coordinates.flatten(q)
+    system = in_numbers(system, unflatten)
+    args = (system, t, coordinates.numbers(q), coordinates.numbers(v), params)
+    try:
+        seen = [_depends_on(_numbers(lambda _, *state, f=f: f(*state), args), names) for f in _seen(system)]
+    except TooLong:
+        return []
+    return [name for name in names if not any(name in found for found in seen)]
+
+
+def what_changes_momentum(system, name, t, q, v, params) -> Iterator[str]:
+    """What may change the momentum of a coordinate, in words."""
+    if not _contains(system.lagrangian, name, t, q, v, params, argument=2):
+        yield "L does not contain its velocity"
+    if system.force is not None:
+        yield "there is a force"
+    if system.dissipation is not None:
+        yield "there is dissipation"
+    functions = {"L contains it": system.lagrangian}
+    for other, c in system.constraints.items():
+        if isinstance(c, Holonomic):
+            functions[f"constraint '{other}' contains it"] = _of_state(c)
+        else:
+            yield f"constraint '{other}' is one of velocities"
+    for words, function in functions.items():
+        if _contains(function, name, t, q, v, params):
+            yield words
+
+
+def _contains(function, name, t, q, v, params, argument=1) -> bool:
+    """Whether a function depends on a coordinate, or with `argument` 2 on a velocity; also where that is not known."""
+    sizes = [np.size(leaf) for leaf in jtu.tree_leaves(q)]
+    leaf = int(np.searchsorted(np.cumsum(sizes), coordinates.names(q).index(name), side="right"))
+    if sizes[leaf] == 1:
+        found = _dependence(function, (t, q, v, params), lambda args: jtu.tree_leaves(args[argument])[leaf])
+        return found != Depends.NOT
+    _, unflatten = coordinates.flatten(q)
+    alone, known = in_numbers(System(function), unflatten), coordinates.names(q)
+    args = alone, t, coordinates.numbers(q), coordinates.numbers(v), params
+    try:
+        numbers = _numbers(lambda system, *state: system.lagrangian(*state), args)
+    except TooLong:
+        return True
+    place = 1 + (argument - 1) * len(known) + known.index(name)
+    return depends(numbers.program.jaxpr, [numbers.state_variables[place]])
 
 
 def conserves_jacobi_integral(system, t, q, v, params) -> bool:

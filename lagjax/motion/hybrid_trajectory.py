@@ -117,12 +117,12 @@ class HybridTrajectory(Trajectory):
         worst = [_residual_in(system, i, self) for i, system in enumerate(self.system.systems) if system.constraints]
         return jnp.max(jnp.stack([*worst, jnp.zeros_like(self.departure)]))
 
-    def plot(self):
+    def plot(self, charges=False):
         """Plot coordinates, velocities and multipliers against time, with the switches; returns a matplotlib `Figure`.
 
         **Raises:** `ImportError` without matplotlib; `ValueError` for a batched trajectory.
         """
-        fig = super().plot()
+        fig = super().plot(charges)
         for axis in fig.axes:
             for t in np.asarray(self.switches.t)[: len(self.switches)]:
                 axis.axvline(t, color=plot.COLOURS[-1], linewidth=0.6, linestyle=":", zorder=0)

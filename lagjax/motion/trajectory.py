@@ -18,9 +18,10 @@ from lagjax.mechanics.structure import angles, what_changes_jacobi_integral
 from lagjax.mechanics.system import System
 from lagjax.motion import account, frames
 from lagjax.motion.accuracy import Errors
+from lagjax.motion.charges import panels
 from lagjax.motion.consistency import worst_residual
 from lagjax.motion.crossings import Crossings
-from lagjax.motion.curves import columns, curves, finite
+from lagjax.motion.curves import curves, finite
 
 
 # For checkers equinox's enumerations are Python's, of which none can have more items than its parent.
@@ -190,18 +191,16 @@ class Trajectory(eqx.Module):
             return jnp.zeros_like(self.departure)
         return _worst_residual(self.system, self.t, self.q, self.v, self.params)
 
-    def plot(self):
+    def plot(self, charges=False):
         """Plot coordinates, velocities and multipliers against time; returns a matplotlib `Figure`.
 
-        **Raises:** `ImportError` without matplotlib; `ValueError` for a batched trajectory.
+        `charges=True` adds what is known to be conserved, its relative change; so do `lj.symmetries(...)`, or functions
+        of (t, q, v, params) by name.
+
+        **Raises:** `ImportError` without matplotlib; `ValueError` for a batched trajectory, or no charges.
         """
         self._check_alone("plot()")
-        panels = {"q": curves(self.q), "v": curves(self.v)}
-        if self.multipliers:
-            panels["multipliers"] = {
-                name + suffix: curve for name, values in self.multipliers.items() for suffix, curve in columns(values)
-            }
-        return plot.time_series(np.asarray(self.t), panels)
+        return plot.time_series(np.asarray(self.t), panels(self, charges))
 
     def phase_portrait(self):
         """Plot velocities against coordinates, a panel a coordinate; returns a matplotlib `Figure`.

@@ -28,6 +28,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax import plot
+from lagjax.analysis.symmetries import symmetries
 from lagjax.mechanics.system import System
 from lagjax.motion.integrate import integrate
 from lagjax.report import Case, Run, Scene, relative_error
@@ -235,6 +236,7 @@ def cases():
         _flat_case(),
         *_helix_cases(),
         _left_handed_case(),
+        _symmetries_case(),
     ]
 
 
@@ -336,6 +338,19 @@ def _left_handed_case():
     printed = float(np.ptp(found["h p_z + L_z"]))
     happened = f"|h| p_z - 2π L_z kept; h p_z + L_z moves by {printed:.1f}"
     return Case("g: left-handed, h = -2", happened, drift(found["h p_z + 2 pi L_z"]), 1e-9)
+
+
+def _symmetries_case():
+    lines = {name: set(found_conserved(name)) == set(CONSERVED[name]) for name in SYSTEMS}
+    happened = f"found: {sum(lines.values())} of {len(lines)} lists of constants, none longer or shorter"
+    return Case("a-g: symmetries", happened, float(len(lines) - sum(lines.values())), 0.5)
+
+
+def found_conserved(name) -> list[str]:
+    """What `symmetries` finds, in the words of `CONSERVED`; boosts along free directions left out."""
+    q, v, _ = ORBITS[name]
+    words = {"Jacobi integral": "E", f"h p_z + 2π L_z with h = {PARAMS['helix']['h']:g}": "h p_z + 2 pi L_z"}
+    return [words.get(key, key) for key in symmetries(SYSTEMS[name], q, v, PARAMS[name]).steady]
 
 
 def picture():

@@ -1,0 +1,193 @@
+"""Among which motions symmetries are looked for: translations, rotations, shifts, time, boosts, scalings.
+
+All are affine, ξ = a + B x + t c and τ = α + β t, and so they are a few arrays. Those of all points together come
+before those of one: the first of several that depend on each other is kept. Boosts, and what else has t in it, come
+last. L may change by the total derivative of a gauge function, of which a polynomial is tried.
+"""
+
+from itertools import combinations_with_replacement
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from lagjax.analysis.rates import Affine
+from lagjax.mechanics import coordinates
+from lagjax.mechanics.cartesian import AXES, points, turned
+
+# Points that are turned one by one, coordinates of which each is boosted and scaled, and that have products as gauge.
+EACH_POINT_UP_TO, EACH_UP_TO, PRODUCTS_UP_TO = 8, 24, 6
+TIME = "Jacobi integral"
+
+
+class Element(NamedTuple):
+    """One motion; `kind`: "space", "time", "boost" or "scaling"."""
+
+    name: str
+    kind: str
+    shift: np.ndarray
+    matrix: np.ndarray
+    drift: np.ndarray
+    clock: float
+    clock_rate: float
+
+
+class Basis(NamedTuple):
+    """What is looked among: affine motions, their names and kinds."""
+
+    affine: Affine
+    names: tuple[str, ...]
+    kinds: tuple[str, ...]
+
+
+def motions(q) -> Basis:
+    """The motions that are tried for coordinates like these."""
+    found, n = points(q), len(coordinates.names(q))
+    elements = [*_shifts(q, found, n), _moved(TIME, "time", n, clock=-1.0), *_turns(found, n)]
+    elements += [_moved(f"t {e.name}", "boost", n, drift=e.shift) for e in elements if e.kind == "space" and _pushes(e)]
+    if n > EACH_UP_TO:
+        elements = [e for e in elements if e.kind != "boost" or e.name.startswith("t P_")]
+    elements += _scalings(q, n)
+    stacked = [np.stack([np.asarray(getattr(e, field), float) for e in elements]) for field in Affine.__annotations__]
+    return Basis(Affine(*stacked), tuple(e.name for e in elements), tuple(e.kind for e in elements))
+
+
+def _shifts(q, found, n):
+    elements = []
+    for k, axis in enumerate(AXES):
+        moved = [point.places[k] for point in found if point.places[k] is not None]
+        if len(moved) > 1:
+            elements.append(_moved(f"P_{axis}", "space", n, shift=_at(moved, n)))
+    return elements + [_moved(f"p_{x}", "space", n, shift=_at([i], n)) for i, x in enumerate(coordinates.names(q))]
+
+
+def _turns(found, n):
+    elements = []
+    for axis in AXES:
+        pairs = [(point.label, pair) for point in found if (pair := turned(point, axis))]
+        if pairs:
+            elements.append(_moved(f"L_{axis}", "space", n, matrix=_turning([pair for _, pair in pairs], n)))
+    if 1 < len(found) <= EACH_POINT_UP_TO:
+        for axis in AXES:
+            for point in found:
+                if pair := turned(point, axis):
+                    name = f"L_{axis}({point.label})"
+                    elements.append(_moved(name, "space", n, matrix=_turning([pair], n)))
+    return elements
+
+
+def _scalings(q, n):
+    elements = [_moved("q·p", "scaling", n, matrix=np.eye(n))]
+    if 1 < n <= EACH_UP_TO:
+        for i, name in enumerate(coordinates.names(q)):
+            elements.append(_moved(f"{name} p_{name}", "scaling", n, matrix=np.diag(_at([i], n))))
+    return [*elements, _moved(f"t ({TIME})", "scaling", n, clock_rate=-1.0)]
+
+
+def _moved(name, kind, n, shift=None, matrix=None, drift=None, clock=0.0, clock_rate=0.0):
+    zero = np.zeros(n)
+    given = lambda x, nothing: nothing if x is None else x
+    return Element(
+        name, kind, given(shift, zero), given(matrix, np.zeros((n, n))), given(drift, zero), clock, clock_rate
+    )
+
+
+def _pushes(element):
+    return bool(np.any(element.shift != 0))
+
+
+def _at(places, n):
+    found = np.zeros(n)
+    found[places] = 1.0
+    return found
+
+
+def _turning(pairs, n):
+    matrix = np.zeros((n, n))
+    for first, second in pairs:
+        matrix[first, second], matrix[second, first] = -1.0, 1.0
+    return matrix
+
+
+class Gauge(NamedTuple):
+    """Gauge functions: t^power times a product of coordinates, none, one or two of them; names, and which have a t."""
+
+    powers: tuple[int, ...]
+    factors: tuple[tuple[int, ...], ...]
+    names: tuple[str, ...]
+    timed: np.ndarray
+
+    def rates(self, t, x, u) -> np.ndarray:
+        """dF/dt of each at states (N,), (N, n), (N, n): (N, G)."""
+        columns = []
+        for power, factors in zip(self.powers, self.factors):
+            product = np.prod(x[:, list(factors)], axis=1)
+            slope = sum((u[:, i] * np.prod(np.delete(x[:, list(factors)], k, axis=1), axis=1)
+                         for k, i in enumerate(factors)), np.zeros(len(t)))  # fmt: skip
+            columns.append(power * t ** max(power - 1, 0) * product + t**power * slope)
+        return np.stack(columns, axis=1)
+
+    def combined(self, weights) -> "Polynomial":
+        """Their sum with these weights."""
+        kept = np.flatnonzero(weights)
+        return Polynomial(tuple(self.powers[k] for k in kept), tuple(self.factors[k] for k in kept), weights[kept])
+
+
+def gauges(q) -> Gauge:
+    """The gauge functions that are tried."""
+    names = coordinates.names(q)
+    n, found = len(names), []
+    found += [(0, (i,)) for i in range(n)]
+    if n <= PRODUCTS_UP_TO:
+        found += [(0, pair) for pair in combinations_with_replacement(range(n), 2)]
+    found += [(1, ()), (2, ()), *((1, (i,)) for i in range(n))]
+    powers, factors = zip(*found)
+    return Gauge(powers, factors, tuple(_named(p, f, names) for p, f in found), np.asarray(powers) > 0)
+
+
+def _named(power, factors, names):
+    by_count = {i: factors.count(i) for i in factors}
+    parts = ["t" if power == 1 else f"t^{power}"] if power else []
+    parts += [names[i] if count == 1 else f"{names[i]}^2" for i, count in by_count.items()]
+    return " ".join(parts)
+
+
+class Polynomial(NamedTuple):
+    """A gauge function: a combination of those that were tried."""
+
+    powers: tuple[int, ...]
+    factors: tuple[tuple[int, ...], ...]
+    weights: np.ndarray
+
+    def __call__(self, t, q, params):
+        """F at a place."""
+        x, _ = coordinates.flatten(q)
+        total = jnp.zeros_like(x[0])
+        for weight, power, factors in zip(self.weights, self.powers, self.factors):
+            total = total + weight * t**power * jnp.prod(x[np.asarray(factors, int)])
+        return total
+
+
+class Combination(NamedTuple):
+    """The displacement ξ = a + B x + t c of a combination of affine motions."""
+
+    shift: np.ndarray
+    matrix: np.ndarray
+    drift: np.ndarray
+
+    def __call__(self, t, q, params):
+        """ξ, like q."""
+        x, unflatten = coordinates.flatten(q)
+        to = lambda y: jnp.asarray(y, x.dtype)
+        return unflatten(to(self.shift) + to(self.matrix) @ x + t * to(self.drift))
+
+
+class Clock(NamedTuple):
+    """The change τ = α + β t of the clock."""
+
+    start: float
+    rate: float
+
+    def __call__(self, t, q, params):
+        """τ."""
+        return self.start + self.rate * t

@@ -1,0 +1,115 @@
+"""Which combinations of columns vanish: the null space of a matrix that carries round-off, in few and plain numbers.
+
+Singular values below a tolerance count as zero, and the gap to the next one says how surely. The null space has no
+basis of its own; the one with the most zeros is what a reader wants, and elimination finds it: each vector gets an
+entry in which all others have zero, the first ones first. An entry counts only where it is not small, so that no
+round-off is magnified. Each vector is then found again among its own columns.
+
+Source: Golub & Van Loan, *Matrix Computations*, §5.5.8 (numerical rank), §3.4 (elimination).
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from lagjax.analysis.precision import Precision
+
+PIVOT_ABOVE = 1e-2
+
+
+class NullSpace(NamedTuple):
+    """Vectors (d, K), reduced; all singular values (K,), the smallest last; how far above the rest the next one is."""
+
+    vectors: np.ndarray
+    singular_values: np.ndarray
+    gap: float
+
+
+def null_space(columns: np.ndarray, precision: Precision) -> NullSpace:
+    """The combinations of columns (N, K) that vanish, where singular values are relative to the root of N."""
+    count, columns = columns.shape[1], np.asarray(columns, float)
+    if count == 0:
+        return NullSpace(np.zeros((0, 0)), np.zeros(0), np.inf)
+    if len(columns) > count:
+        columns = np.asarray(np.linalg.qr(columns, mode="r"))
+    _, found, directions = np.linalg.svd(columns)
+    sizes = np.zeros(count)
+    sizes[: len(found)] = found
+    rank = int(np.sum(sizes > precision.null))
+    least = max(float(sizes[rank]) if rank < count else 0.0, precision.exact / 1e3)
+    gap = float(sizes[rank - 1]) / least if rank else np.inf
+    vectors = reduced(directions[rank:], precision)
+    return NullSpace(
+        np.stack([_again(columns, v, precision.null) for v in vectors]) if len(vectors) else vectors, sizes, gap
+    )
+
+
+def reduced(vectors: np.ndarray, precision: Precision) -> np.ndarray:
+    """A basis of the same space with as many zeros as elimination finds, the first entries first."""
+    rows, free = vectors.copy(), list(range(len(vectors)))
+    pivots = []
+    for least in (PIVOT_ABOVE, precision.zero):
+        for k in range(rows.shape[1]):
+            if not free or k in pivots:
+                continue
+            chosen = max(free, key=lambda i: abs(rows[i, k]))
+            if abs(rows[chosen, k]) <= least:
+                continue
+            rows[chosen] /= rows[chosen, k]
+            others = np.arange(len(rows)) != chosen
+            rows[others] -= np.outer(rows[others, k], rows[chosen])
+            pivots.append(k)
+            free.remove(chosen)
+            # So that entries compare with one.
+            for i in free:
+                rows[i] /= max(np.max(np.abs(rows[i])), np.finfo(rows.dtype).tiny)
+    rows = np.stack([_cleaned(row, precision.zero) for row in rows]) if len(rows) else rows
+    order = sorted(range(len(rows)), key=lambda i: tuple(np.flatnonzero(rows[i])[:1]))
+    return rows[order]
+
+
+def beyond(vectors: np.ndarray, known: np.ndarray, precision: Precision) -> np.ndarray:
+    """What of a space (d, K) is not in another (k, K), reduced."""
+    if len(known) == 0 or len(vectors) == 0:
+        return reduced(vectors, precision)
+    first = np.linalg.qr(known.T)[0]
+    rest = vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+    rest = rest - (rest @ first) @ first.T
+    _, sizes, directions = np.linalg.svd(rest)
+    directions = directions[: int(np.sum(sizes > 100 * precision.zero))]
+    # Free of the entries by which the known vectors are told apart.
+    together = reduced(np.concatenate([known, directions]), precision)
+    leading = {int(np.flatnonzero(v)[0]) for v in reduced(known, precision)}
+    return np.stack([v for v in together if int(np.flatnonzero(v)[0]) not in leading]) if len(directions) else rest[:0]
+
+
+def independent(columns: np.ndarray, precision: Precision) -> np.ndarray:
+    """Which columns (N, K) depend on none before them, (K,) booleans."""
+    kept, basis = np.zeros(columns.shape[1], bool), np.zeros((len(columns), 0))
+    for k, column in enumerate(columns.T):
+        size = np.linalg.norm(column)
+        rest = column / size if size > 0 else column
+        for _ in range(2):
+            rest = rest - basis @ (basis.T @ rest)
+        length = np.linalg.norm(rest)
+        if length > precision.zero:
+            kept[k] = True
+            basis = np.concatenate([basis, (rest / length)[:, None]], axis=1)
+    return kept
+
+
+def _again(columns, vector, tolerance):
+    """The same vector from its own columns alone, if that is the only one there."""
+    support = np.flatnonzero(vector)
+    if len(support) == 1:
+        return vector
+    _, sizes, directions = np.linalg.svd(columns[:, support])
+    if len(sizes) < len(support) or (len(sizes) > 1 and sizes[-2] <= tolerance):
+        return vector
+    found = np.zeros_like(vector)
+    found[support] = directions[-1] / directions[-1][0] * vector[support[0]]
+    return found
+
+
+def _cleaned(row, zero_below):
+    return np.where(np.abs(row) > zero_below * np.max(np.abs(row)), row, 0.0)

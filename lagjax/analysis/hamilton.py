@@ -1,0 +1,139 @@
+"""Hamilton's function of any regular Lagrangian, by the Legendre transform, and his equations.
+
+    H(t, q, p) = p·v - L(t, q, v)        with v from p = ∂L/∂v
+    q̇ = ∂H/∂p,    ṗ = -∂H/∂q + Q - ∂R/∂v
+
+`legendre.py` solves for v. H is the Jacobi integral, as a function of momenta.
+
+Source: Goldstein, *Classical Mechanics*, Eq. (8.15), (8.18).
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PyTree
+
+from lagjax.analysis.legendre import velocity_of
+from lagjax.mechanics import coordinates
+from lagjax.mechanics.compiled import compiled
+from lagjax.mechanics.diagnosis import describe
+from lagjax.mechanics.first_call import looked_at
+from lagjax.mechanics.noether import applied_force
+from lagjax.mechanics.reactions import reacts
+from lagjax.mechanics.system import System
+
+
+class Hamiltonian(eqx.Module):
+    """Hamilton's function `H(t, q, p, params)` of a system; `lj.hamiltonian` makes it."""
+
+    system: System
+
+    def __call__(self, t, q, p, params) -> Float[Array, ""]:
+        """H at a place and a momentum, `[L]`."""
+        return self._at(t, q, p, params)[0]
+
+    def velocity(self, t, q, p, params) -> PyTree[Float[Array, "..."]]:
+        """The velocity that belongs to a momentum, like q, `[q]/[t]`."""
+        return self._at(t, q, p, params)[1]
+
+    def rates(self, t, q, p, params) -> tuple[PyTree[Array], PyTree[Array]]:
+        """Hamilton's equations: `(q̇, ṗ)`, each like q, with the forces that L does not contain."""
+        if self.system.constraints:
+            raise ValueError(
+                f"Hamilton's equations are those of free coordinates, and {self.system} has constraints, whose forces "
+                "H does not contain.\n"
+                "Fix: lj.accelerations(system, t, q, v, params) with v = H.velocity(t, q, p, params), or coordinates "
+                "that satisfy the constraints by themselves."
+            )
+        _, v, pushed = self._at(t, q, p, params)
+        return v, pushed
+
+    def _at(self, t, q, p, params):
+        if jax.tree.structure(p) != jax.tree.structure(q):
+            has = [", ".join(coordinates.names(tree)) for tree in (q, p)]
+            raise ValueError(
+                f"p must have the structure of q.\n  q: {has[0]}\n  p: {has[1]}\n"
+                "Fix: p = lj.momentum(system, t, q, v, params)."
+            )
+        s = coordinates.state(t, q, p, params)
+        system = looked_at(self.system, s)
+        value, v, pushed, mass, regular, reached = _hamiltonian(system, *s)
+        if coordinates.is_traced((value, regular)):
+            known = regular & reached
+            return jax.tree.map(lambda x: jnp.where(known, x, jnp.nan), (value, v, pushed))
+        if not (regular and reached):
+            raise ValueError(_no_velocity(s, np.asarray(mass), bool(regular)))
+        return value, v, pushed
+
+    def __repr__(self):
+        return f"Hamiltonian of {self.system}"
+
+
+def hamiltonian(system: System) -> Hamiltonian:
+    """Return Hamilton's function of a system, by a numerical Legendre transform of any regular L.
+
+    >>> import lagjax as lj
+    >>> pendulum = lj.System(lambda t, q, v, params: 0.5 * params["m"] * v**2 - params["k"] * q**2 / 2)
+    >>> H = hamiltonian(pendulum)
+    >>> print(H(0.0, 1.0, 6.0, {"m": 2.0, "k": 10.0}), H.velocity(0.0, 1.0, 6.0, {"m": 2.0, "k": 10.0}))
+    14.0 3.0
+
+    **Arguments:** `system`, of whose L is taken the transform. Constraints and forces are no part of H.
+
+    **Returns:** `H(t, q, p, params)` -> scalar, `[L]`, with p like q, `[L] [t]/[q]`. `H.velocity` of the same arguments
+    gives v, and `H.rates` the pair (q̇, ṗ) of Hamilton's equations. All of them have derivatives of any order, in both
+    modes, and may be batched. One linear solve where L is quadratic in v, else Newton's method.
+
+    **Raises:** when it is called: `ValueError` where L is degenerate, with the coordinate whose velocity the momenta do
+    not tell, or where no velocity has this momentum (while JAX is tracing the values are NaN instead); `TypeError`,
+    `ValueError` for a state of the wrong dtype or shape.
+
+    Source: Goldstein, Eq. (8.15), (8.18).
+    """
+    if not isinstance(system, System):
+        raise TypeError(
+            f"a Hamiltonian is made of a lj.System, not of {type(system).__name__}.\n"
+            "Fix: lj.hamiltonian(lj.System(lagrangian))."
+        )
+    return Hamiltonian(system)
+
+
+@compiled
+def _hamiltonian(system, t, q, p, params):
+    x, unflatten = coordinates.flatten(q)
+    pressed, _ = coordinates.flatten(p)
+    of = lambda x, u: system.lagrangian(t, unflatten(x), unflatten(u), params)
+    found = velocity_of(lambda u: jax.grad(of, argnums=1)(x, u), pressed)
+    value, slope = jax.value_and_grad(of)(x, found.v)
+    q, v = unflatten(x), unflatten(found.v)
+    # -∂H/∂q at p held is ∂L/∂q at v held.
+    if not system.constraints and not reacts(system):
+        slope = slope + applied_force(system, t, q, v, params, jnp.zeros(0, x.dtype))
+    return pressed @ found.v - value, v, unflatten(slope), found.mass, found.regular, found.reached
+
+
+def _no_velocity(s, mass, regular):
+    names = coordinates.names(s.q)
+    at = f"at t = {float(s.t):.6g}, q = {describe(s.q)}, p = {describe(s.v)}"
+    if regular:
+        return (
+            f"no velocity was found that has this momentum, {at}.\n"
+            "Usual cause: a momentum that L cannot have, as where ∂L/∂v is bounded, or L that is not finite at rest.\n"
+            "Fix: take p from a velocity, p = lj.momentum(system, t, q, v, params)."
+        )
+    name = names[degenerate(mass)] if np.all(np.isfinite(mass)) else names[0]
+    return (
+        f"L is degenerate in '{name}', {at}: the momenta do not tell its velocity, and there is no Hamiltonian.\n"
+        "Usual cause: a coordinate whose velocity is missing from L, or stands in it linearly alone; a zero mass; a "
+        "coordinate singularity (an azimuth at the pole).\n"
+        f"Fix: give '{name}' a kinetic energy, or leave it out of q; lj.explain(system, q, v, params) shows the masses."
+    )
+
+
+def degenerate(mass: np.ndarray) -> int:
+    """Which coordinate has the largest part in the direction in which a mass matrix is singular."""
+    scale = np.sqrt(np.max(np.abs(mass), axis=1))
+    if not np.all(scale):
+        return int(np.argmin(scale))
+    return int(np.argmax(np.abs(np.linalg.svd(mass / np.outer(scale, scale))[2][-1])))

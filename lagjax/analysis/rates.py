@@ -1,0 +1,159 @@
+"""At what rate the charge of each of many generators changes, at many states: one program for all.
+
+    dC/dt = ρ + (Q - ∂R/∂v)·(ξ - τ v) + λ·A (ξ - τ v)
+
+(`mechanics/noether.py`). The last part vanishes for every λ where the constraints allow the displacement ξ - τ v: these
+are kept apart, (m,) numbers a state. Rates are told in units of what they would be if nothing were conserved: of
+
+    e = |p|·|v| + |∂L/∂q|·ℓ + |Q - ∂R/∂v|·ℓ        times        |ξ|/ℓ + |τ|/T
+
+with ℓ the size of each coordinate, and T the time in which velocities make such lengths.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+from jaxtyping import Array, Float
+
+from lagjax.analysis.states import States, around
+from lagjax.mechanics import constraints, coordinates
+from lagjax.mechanics.closures import lift
+from lagjax.mechanics.compiled import compiled
+from lagjax.mechanics.equations import equations_of
+from lagjax.mechanics.generators import Generator
+from lagjax.mechanics.noether import Flow, applied_force, flow
+from lagjax.mechanics.reactions import reacts
+
+
+class Affine(eqx.Module):
+    """Many generators of the kind ξ = shift + matrix x + t drift, τ = clock + t clock_rate, K of each."""
+
+    shift: np.ndarray
+    matrix: np.ndarray
+    drift: np.ndarray
+    clock: np.ndarray
+    clock_rate: np.ndarray
+
+    def at(self, t, x, u) -> Flow:
+        """What each of them does at a state."""
+        to = lambda y: jnp.asarray(y, x.dtype)
+        xi = to(self.shift) + to(self.matrix) @ x + t * to(self.drift)
+        xi_rate = to(self.matrix) @ u + to(self.drift)
+        tau, tau_rate = to(self.clock) + t * to(self.clock_rate), to(self.clock_rate)
+        return Flow(xi, tau, jnp.zeros_like(tau), xi_rate, tau_rate, jnp.zeros_like(tau))
+
+
+class Rates(NamedTuple):
+    """Of N states, m constraint equations and K generators, all in units of what they could be.
+
+    `charge` (N, K): the rate by L, force and dissipation together; of it `lagrangian` and `force`. `displacement`
+    (N, m, K): by how much each constraint equation forbids ξ - τ v. `invariance` (N, m, K): by how much a constraint of
+    velocities is changed by the motion. `value` (N,): L.
+
+    In their own units: `size` (K,) of each generator; `energy` (N,), the e of each state; `xi` (N, K, n), `tau` (N, K);
+    `charges` (N, K), the charges themselves; `first` (K,) and `pushed` (m, K), of the first state, the rate without
+    constraints, and A (ξ - τ v).
+    """
+
+    states: States
+    charge: Float[Array, "N K"]
+    lagrangian: Float[Array, "N K"]
+    force: Float[Array, "N K"]
+    displacement: Float[Array, "N m K"]
+    invariance: Float[Array, "N m K"]
+    value: Float[Array, " N"]
+    size: Float[Array, " K"]
+    energy: Float[Array, " N"]
+    xi: Float[Array, "N K n"]
+    tau: Float[Array, "N K"]
+    charges: Float[Array, "N K"]
+    first: Float[Array, " K"]
+    pushed: Float[Array, "m K"]
+
+
+class _Of(NamedTuple):
+    """Of one state, in its own units."""
+
+    by_lagrangian: Array
+    by_force: Array
+    forbidden: Array
+    slope: Array
+    changed: Array
+    size: Array
+    energy: Array
+    xi: Array
+    tau: Array
+    value: Array
+    charges: Array
+
+
+def rates(system, affine: Affine, generators: tuple[Generator, ...], s, places) -> Rates:
+    """The rates of change of all charges at states around the given one."""
+    states, scales = around(system, s, places)
+    of = _rates(system, affine, generators, s, states, scales)
+    xp = coordinates.numpy_of(of)
+    of = _Of(*(xp.asarray(y) for y in of))
+    finite = xp.isfinite(of.energy) & xp.all(xp.isfinite(of.by_lagrangian + of.by_force), axis=1)
+    found = states.found & finite
+    seen = lambda y: xp.where(found.reshape(-1, *[1] * (y.ndim - 1)), y, xp.zeros_like(y))
+    count = xp.maximum(xp.sum(found), 1).astype(of.energy.dtype)
+    size = xp.sqrt(xp.sum(seen(of.size) ** 2, axis=0) / count)
+    size = xp.where(size > 0, size, xp.ones_like(size))
+    # A state where nothing happens has no scale of its own.
+    energy = seen(of.energy) + of.energy.dtype.type(1e-12) * xp.max(seen(of.energy))
+    energy = xp.where(found & (energy > 0), energy, xp.ones_like(energy))
+    relative = lambda y: seen(y) / (energy[:, None] * size[None])
+    slope = xp.where(of.slope > 0, of.slope, xp.ones_like(of.slope))[:, :, None] * size[None, None]
+    return Rates(
+        states._replace(found=found),
+        relative(of.by_lagrangian + of.by_force), relative(of.by_lagrangian), relative(of.by_force),
+        seen(of.forbidden) / slope, seen(of.changed) * scales.t / slope, seen(of.value) / energy,
+        size, energy, seen(of.xi), seen(of.tau), of.charges, (of.by_lagrangian + of.by_force)[0], of.forbidden[0],
+    )  # fmt: skip
+
+
+@compiled
+def _rates(system, affine, generators, s, states, scales) -> _Of:
+    _, unflatten = coordinates.flatten(s.q)
+    equations = equations_of(lift(system, s), *s) if reacts(system) else None
+
+    def at(t, x, u):
+        lagrangian = lambda t, x, u: system.lagrangian(t, unflatten(x), unflatten(u), s.params)
+        value, (slope_t, slope, p) = jax.value_and_grad(lagrangian, argnums=(0, 1, 2))(t, x, u)
+        q, v = unflatten(x), unflatten(u)
+        flows = [flow(generator, t, q, v, s.params) for generator in generators]
+        moved = jtu.tree_map(
+            lambda first, *rest: jnp.concatenate([first, *(y[None] for y in rest)]), affine.at(t, x, u), *flows
+        )
+        turned = moved.xi_rate - jnp.outer(moved.tau_rate, u)
+        displaced = moved.xi - jnp.outer(moved.tau, u)
+        # ρ and C, as `noether.py` has them.
+        of_L = moved.tau * slope_t + moved.xi @ slope + turned @ p + value * moved.tau_rate - moved.gauge_rate
+        charges = displaced @ p + moved.tau * value - moved.gauge
+        multipliers = jnp.zeros(constraints.count(system, t, q, v, s.params), x.dtype)
+        if equations is not None:
+            by_name = equations.accelerations(t, q, v)[1]
+            multipliers = jnp.concatenate([jnp.atleast_1d(by_name[name]) for name in system.constraints])
+        force = applied_force(system, t, q, v, s.params, multipliers)
+        energy = jnp.abs(p) @ jnp.abs(u) + (jnp.abs(slope) + jnp.abs(force)) @ scales.x
+        size = jnp.sqrt(moved.xi**2 @ (1 / scales.x**2)) + jnp.abs(moved.tau) / scales.t
+        rows = _of_constraints(system, s.params, unflatten, scales, (t, x, u), moved, turned, displaced)
+        return _Of(of_L, displaced @ force, *rows, size, energy, moved.xi, moved.tau, value, charges)
+
+    return jax.vmap(at)(*states[:3])
+
+
+def _of_constraints(system, params, unflatten, scales, state, moved, turned, displaced):
+    """A (ξ - τ v), the size of each row of A, and the change of each constraint of velocities; (m, K)."""
+    t, x, u = state
+    if not system.constraints:
+        none = jnp.zeros((0, moved.tau.size), x.dtype)
+        return none, jnp.zeros(0, x.dtype), none
+    residual = lambda t, x, u: constraints.velocity_residual(system, t, x, u, params, unflatten)
+    of_t, of_x, rows = jax.jacfwd(residual, argnums=(0, 1, 2))(t, x, u)
+    change = jnp.outer(of_t, moved.tau) + of_x @ moved.xi.T + rows @ turned.T
+    return rows @ displaced.T, jnp.abs(rows) @ scales.x, change

@@ -1,0 +1,137 @@
+"""States around a given one that satisfy the constraints: where a claim about all states is tested.
+
+Positions lie around the given one in several widths, up to one and a half times its size, so that what is symmetric on
+one side of a plane alone is seen; times and velocities likewise, some of them zero, where a small force is not hidden
+by fast motion. The size of a coordinate is that of its array or point, 1 where that is at zero or the coordinate is an
+angle. States are moved onto the constraints by Newton's method, each step the shortest in units of these sizes.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Float
+
+from lagjax.mechanics import constraints, coordinates
+from lagjax.mechanics.cartesian import points
+from lagjax.mechanics.compiled import compiled
+from lagjax.mechanics.memory import kinds, remembered
+from lagjax.mechanics.structure import angles
+
+WIDTHS = np.array([1.5, 1.0, 0.5, 0.1])
+OF_VELOCITIES = np.array([1.0, 0.3, 1.0, 0.0])
+ITERATIONS = 30
+# Singular values of the constraints' rows up to this part of the largest belong to dependent ones.
+DEPENDENT_BELOW = 1e-6
+# A constraint holds where so many round-offs of its terms are left.
+ROUND_OFFS = 1e4
+
+
+class Scales(NamedTuple):
+    """The size of each coordinate and of each velocity, and the time in which one makes the other."""
+
+    x: Float[Array, " n"]
+    u: Float[Array, " n"]
+    t: Float[Array, ""]
+
+
+class States(NamedTuple):
+    """States in vector form, (N,), (N, n), (N, n), and which of them are on the constraints."""
+
+    t: Float[Array, " N"]
+    x: Float[Array, "N n"]
+    u: Float[Array, "N n"]
+    found: Bool[Array, " N"]
+
+
+def draws(count: int, n: int) -> np.ndarray:
+    """Where around a state to look, (count, 2 n + 1), the first of them the state itself; always the same."""
+    random = np.random.default_rng(20).standard_normal((count, 2 * n + 1))
+    which = np.arange(count) % len(WIDTHS)
+    random[:, : n + 1] *= WIDTHS[which, None]
+    # In another order, so that each width of positions meets each of the velocities.
+    random[:, n + 1 :] *= OF_VELOCITIES[(np.arange(count) // len(WIDTHS)) % len(WIDTHS), None]
+    random[0] = 0.0
+    return random
+
+
+def around(system, s: coordinates.State, places) -> tuple[States, Scales]:
+    """The states at `draws` around a given one, moved onto the constraints; of NumPy where values are known."""
+    # What is known compiles nothing here; the program that moves states serves all questions about a system.
+    xp = coordinates.numpy_of((s, system))
+    vector = lambda tree: xp.concatenate([xp.ravel(xp.asarray(x)) for x in jax.tree.leaves(tree)])
+    x, u = vector(s.q), vector(s.v)
+    n, scales = len(x), sizes(system, s, x, u)
+    places = places.astype(x.dtype)
+    t = s.t + scales.t * places[:, 0]
+    xs, us = x[None] + scales.x[None] * places[:, 1 : n + 1], u[None] + scales.u[None] * places[:, n + 1 :]
+    # Where velocities are drawn as zero they are so, and not those of the given state.
+    resting = np.all(places[:, n + 1 :] == 0, axis=1) & (np.arange(len(places)) > 0)
+    us = xp.where(resting[:, None], xp.zeros_like(us), us)
+    if not system.constraints:
+        return States(t, xs, us, np.ones(len(places), bool)), scales
+    moved = _onto_constraints(system, s, scales, t, xs, us)
+    return States(t, *(xp.asarray(y) for y in moved)), scales
+
+
+def sizes(system, s: coordinates.State, x, u) -> Scales:
+    """The size of each coordinate and velocity of a state."""
+    xp, same = coordinates.numpy_of((x, u)), _groups(s.q)
+    together = lambda y: xp.sqrt(same.astype(y.dtype) @ y**2)
+    of_x = together(x)
+    of_x = xp.where(of_x > 0, of_x, xp.ones_like(x))
+    # A small angle is no small motion: near zero a pendulum would look like any oscillator.
+    known = remembered(system, (angles, system.read, kinds(s)), lambda: angles(system, *s))
+    leaves = zip(jax.tree.leaves(known), jax.tree.leaves(s.q))
+    is_angle = np.concatenate([np.full(int(np.prod(np.shape(leaf))), angle) for angle, leaf in leaves])
+    of_x = xp.where(is_angle, xp.maximum(of_x, 1.0).astype(of_x.dtype), of_x)
+    of_u = together(u)
+    # A velocity of zero says nothing: then the pace of the others, or one length in one unit of time.
+    pace = xp.sqrt(xp.mean((of_u / of_x) ** 2))
+    pace = xp.where(pace > 0, pace, xp.ones_like(pace))
+    return Scales(of_x, xp.where(of_u > 0, of_u, pace * of_x), 1 / pace)
+
+
+def _groups(q) -> np.ndarray:
+    """Which coordinates are of one size, (n, n): those of an array, and those of a point."""
+    label = np.zeros(0, int)
+    for i, leaf in enumerate(jax.tree.leaves(q)):
+        label = np.concatenate([label, np.full(int(np.prod(np.shape(leaf))), i)])
+    for point in points(q):
+        places = [place for place in point.places if place is not None]
+        label[places] = label[places[0]]
+    return label[:, None] == label[None, :]
+
+
+@compiled
+def _onto_constraints(system, s, scales, t, xs, us):
+    _, unflatten = coordinates.flatten(s.q)
+    move = lambda t, x, u: _on_constraints(system, s.params, unflatten, scales, t, x, u)
+    return jax.vmap(move)(t, xs, us)
+
+
+def _on_constraints(system, params, unflatten, scales, t, x, u):
+    position = lambda x: constraints.position_residual(system, t, x, params, unflatten)
+    velocity = lambda x, u: constraints.velocity_residual(system, t, x, u, params, unflatten)
+    at = unflatten(x), unflatten(u)
+    holds = jnp.asarray(True)
+    if constraints.holonomic_equations(system, t, *at, params).any():
+        x = _newton(position, x, scales.x)
+        holds = _vanishes(position, x, scales.x)
+    u = _newton(lambda u: velocity(x, u), u, scales.u)
+    return x, u, holds & _vanishes(lambda u: velocity(x, u), u, scales.u)
+
+
+def _newton(residual, y, scale):
+    def step(_, y):
+        rows = jax.jacfwd(residual)(y) * scale[None]
+        return y - scale * (jnp.linalg.pinv(rows, rtol=DEPENDENT_BELOW) @ residual(y))
+
+    return lax.fori_loop(0, ITERATIONS, step, y)
+
+
+def _vanishes(residual, y, scale):
+    terms = jnp.abs(jax.jacfwd(residual)(y)) @ jnp.maximum(scale, jnp.abs(y))
+    return jnp.all(jnp.abs(residual(y)) <= ROUND_OFFS * jnp.finfo(y.dtype).eps * terms)

@@ -1,0 +1,319 @@
+"""Infinitesimal motions of a system: of its coordinates, of its clock, and of L by a total derivative.
+
+Translations, rotations and boosts move the points that `cartesian.py` finds among the coordinates, all together.
+"""
+
+import numbers
+from collections.abc import Callable, Mapping, Sequence
+
+import equinox as eqx
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+
+from lagjax.mechanics import coordinates
+from lagjax.mechanics.arguments import OF_POSITION
+from lagjax.mechanics.cartesian import AXES, leaf_names, points
+from lagjax.mechanics.diagnosis import listed
+from lagjax.mechanics.first_call import Call, check_arguments, in_words
+from lagjax.mechanics.memory import shape_of
+
+
+class Generator(eqx.Module):
+    """Generate a one-parameter group: the coordinates move by ε ξ, the time by ε τ, and L changes by ε dF/dt.
+
+    >>> import lagjax as lj
+    >>> turn = lj.Generator(lambda t, q, params: {"x": -q["y"], "y": q["x"]}, name="L_z")
+    >>> lj.Generator.rotation("z") + 0.5 * lj.Generator.translation("z")
+    Generator(L_z + 0.5 p_z)
+
+    **Arguments:**
+
+    - `delta`: `ξ(t, q, params)` -> like q, `[q]/[ε]`. None where the coordinates stay.
+    - `time`: `τ(t, q, params)` -> scalar, or a number, `[t]/[ε]`.
+    - `gauge`: `F(t, q, params)` -> scalar, `[L] [t]/[ε]`; L changes by dF/dt, as under a boost.
+    - `name`: what its charge is called.
+
+    Ready ones are `Generator.shift`, `translation`, `rotation`, `screw`, `boost` and `time_translation`; they add up,
+    and may be multiplied by numbers.
+
+    **Raises:** `TypeError` for what is no function.
+
+    Source: Goldstein, *Classical Mechanics*, §13.7.
+    """
+
+    delta: Callable | None
+    time: Callable | None
+    gauge: Callable | None
+    name: str = eqx.field(static=True)
+
+    def __init__(self, delta=None, time=None, gauge=None, name: str | None = None):
+        for role, function in (("delta", delta), ("time", time), ("gauge", gauge)):
+            if role == "time" and isinstance(function, numbers.Real):
+                continue
+            if function is not None and not callable(function):
+                raise TypeError(
+                    f"{role} of a generator must be a function of (t, q, params), not {type(function).__name__}.\n"
+                    f"Fix: {role}=lambda t, q, params: {'q' if role == 'delta' else 't'}."
+                )
+        if delta is None and time is None and gauge is None:
+            raise TypeError(
+                "a generator must move something.\n"
+                'Fix: lj.Generator(lambda t, q, params: {"x": 1.0, "y": 0.0}), or lj.Generator(time=1.0).'
+            )
+        self.delta = delta
+        self.time = _Constant(np.asarray(float(time))) if isinstance(time, numbers.Real) else time
+        self.gauge = gauge
+        self.name = name or getattr(delta, "__name__", None) or "charge"
+
+    def at(self, t, q, params):
+        """ξ, like q, τ and F at a place, in the dtype of the coordinates."""
+        like = lambda x, y: jnp.broadcast_to(jnp.asarray(y, x.dtype), x.shape)
+        xi = jtu.tree_map(jnp.zeros_like, q) if self.delta is None else jtu.tree_map(like, q, self.delta(t, q, params))
+        number = lambda f: jnp.zeros_like(t) if f is None else like(t, f(t, q, params))
+        return xi, number(self.time), number(self.gauge)
+
+    def check(self, s: coordinates.State):
+        """Raise where this is no generator for such coordinates."""
+        given = {"t": s.t, "q": s.q, "params": s.params}
+        for role, function in (("delta", self.delta), ("time", self.time), ("gauge", self.gauge)):
+            if function is None:
+                continue
+            call = Call(role, function, OF_POSITION, f" of the generator '{self.name}'")
+            check_arguments(call, "a function of the velocities too; a generator moves positions")
+            with in_words(call, given):
+                value = shape_of(function, s.t, s.q, s.params)
+            if role == "delta":
+                _check_displacement(call, value, s.q)
+            elif np.shape(value) != ():
+                raise ValueError(
+                    f"{call} must return one number, and returned shape {np.shape(value)}.\n"
+                    "Usual cause: a sum over coordinates that was left out.\nFix: jnp.sum(...)."
+                )
+
+    @staticmethod
+    def shift(by) -> "Generator":
+        """Shift coordinates by name, `"x"` or `{"x": 1.0, "X": 1.0}`: the charge is their momentum."""
+        by = {by: 1.0} if isinstance(by, str) else dict(by)
+        return Generator(_Shift(tuple(by), _array(by.values())), name=added((c, f"p_{n}") for n, c in by.items()))
+
+    @staticmethod
+    def translation(axis) -> "Generator":
+        """Move all points along an axis, `"x"`, `"y"`, `"z"` or a vector: the charge is a momentum."""
+        return Generator(_Translation(_vector(axis)), name=_about("p", axis))
+
+    @staticmethod
+    def rotation(axis, about=(0.0, 0.0, 0.0)) -> "Generator":
+        """Turn all points about an axis through a point, counterclockwise: the charge is an angular momentum."""
+        return Generator(_Rotation(_vector(axis), _array((*about, 0.0, 0.0)[:3])), name=_about("L", axis))
+
+    @staticmethod
+    def screw(axis, pitch: float) -> "Generator":
+        """Move all points along a screw by `pitch` a turn, right-handed: the charge is pitch p + 2π L."""
+        moved = pitch * Generator.translation(axis) + 2 * np.pi * Generator.rotation(axis)
+        name = added([(pitch, _about("p", axis))]) + f" + 2π {_about('L', axis)}"
+        return Generator(moved.delta, name=name)
+
+    @staticmethod
+    def boost(axis, gauge: Callable) -> "Generator":
+        """Let all points drift along an axis, by ε t; `gauge(t, q, params)` is Σ m x. The charge is t p - Σ m x."""
+        return Generator(_Boost(_Translation(_vector(axis))), gauge=gauge, name=f"t {_about('p', axis)} - m {axis}")
+
+    @staticmethod
+    def time_translation() -> "Generator":
+        """Set the clock back, τ = -1: the charge is the Jacobi integral v·p - L."""
+        return Generator(time=-1.0, name="Jacobi integral")
+
+    def __add__(self, other):
+        other = as_generator(other)
+        return _combined((1.0, self), (1.0, other), f"{self.name} + {other.name}")
+
+    def __sub__(self, other):
+        other = as_generator(other)
+        return _combined((1.0, self), (-1.0, other), f"{self.name} - {other.name}")
+
+    def __mul__(self, factor):
+        return _combined((factor, self), None, added([(factor, self.name)]) if np.ndim(factor) == 0 else self.name)
+
+    __rmul__ = __mul__
+
+    def __neg__(self):
+        return -1.0 * self
+
+    def __repr__(self):
+        return f"Generator({self.name})"
+
+
+def as_generator(given) -> Generator:
+    """A generator, of one or of the function that moves the coordinates."""
+    if isinstance(given, Generator):
+        return given
+    if not callable(given):
+        raise TypeError(
+            f"a generator is a lj.Generator or a function of (t, q, params), not {type(given).__name__}.\n"
+            'Fix: lambda t, q, params: {"x": 1.0, "y": 0.0}, or lj.Generator.shift("x").'
+        )
+    return Generator(given)
+
+
+def added(terms, digits: str = ".6g") -> str:
+    """A sum in words, of (coefficient, name)."""
+    words = ""
+    for coefficient, name in terms:
+        if not coordinates.is_traced(coefficient) and np.ndim(coefficient) == 0:
+            size = f"{abs(float(coefficient)):{digits}}"
+            sign = "-" if coefficient < 0 else "+"
+        else:
+            size, sign = "c", "+"
+        words += (f" {sign} " if words else "-" * (sign == "-")) + ("" if size == "1" else f"{size} ") + name
+    return words
+
+
+class _Constant(eqx.Module):
+    value: np.ndarray
+
+    def __call__(self, t, q, params):
+        return self.value
+
+
+class _Shift(eqx.Module):
+    names: tuple[str, ...] = eqx.field(static=True)
+    amounts: np.ndarray
+
+    def __call__(self, t, q, params):
+        x, unflatten = coordinates.flatten(q)
+        known, moved = coordinates.names(q), jnp.zeros_like(x)
+        for name, amount in zip(self.names, self.amounts):
+            moved = moved.at[np.asarray(places_of(name, q, known))].add(amount)
+        return unflatten(moved)
+
+
+class _Translation(eqx.Module):
+    direction: np.ndarray
+
+    def __call__(self, t, q, params):
+        x, unflatten = coordinates.flatten(q)
+        moved = jnp.zeros_like(x)
+        for point in _points(q):
+            for place, amount in zip(point.places, self.direction):
+                moved = moved if place is None else moved.at[place].add(amount)
+        return unflatten(moved)
+
+
+class _Rotation(eqx.Module):
+    axis: np.ndarray
+    about: np.ndarray
+
+    def __call__(self, t, q, params):
+        x, unflatten = coordinates.flatten(q)
+        moved = jnp.zeros_like(x)
+        for point in _points(q):
+            at = jnp.stack([jnp.zeros_like(x[0]) if place is None else x[place] for place in point.places])
+            turned = jnp.cross(jnp.asarray(self.axis, x.dtype), at - jnp.asarray(self.about, x.dtype))
+            for place, amount in zip(point.places, turned):
+                moved = moved if place is None else moved.at[place].add(amount)
+        return unflatten(moved)
+
+
+class _Boost(eqx.Module):
+    translation: Callable
+
+    def __call__(self, t, q, params):
+        return jtu.tree_map(lambda x: t * x, self.translation(t, q, params))
+
+
+class _Sum(eqx.Module):
+    """A linear combination of functions of (t, q, params); `place`: of the ξ, τ, F of a generator."""
+
+    generators: tuple[Generator, ...]
+    weights: tuple
+    place: int = eqx.field(static=True)
+
+    def __call__(self, t, q, params):
+        found = [generator.at(t, q, params)[self.place] for generator in self.generators]
+        return jtu.tree_map(lambda *x: sum(w * y for w, y in zip(self.weights, x)), *found)
+
+
+def _combined(first, second, name):
+    weights, generators = zip(*(pair for pair in (first, second) if pair is not None))
+    weights = tuple(float(w) if isinstance(w, numbers.Real) else w for w in weights)
+    moved = []
+    for place, role in enumerate(("delta", "time", "gauge")):
+        has = any(getattr(generator, role) is not None for generator in generators)
+        moved.append(_Sum(generators, weights, place) if has else None)
+    return Generator(*moved, name=name)
+
+
+def places_of(name, q, known=None) -> list[int]:
+    """Where the coordinates of a name are in the vector of all; a leaf's name stands for all of it."""
+    known = coordinates.names(q) if known is None else known
+    found = [i for i, other in enumerate(known) if other == name]
+    if not found and name in leaf_names(q):
+        found = [i for i, other in enumerate(known) if other.startswith(f"{name}[")]
+    if not found:
+        raise ValueError(
+            f"there is no coordinate '{name}'; the coordinates are {listed(known)}.\nFix: name one of these."
+        )
+    return found
+
+
+def _points(q):
+    found = points(q)
+    if not found:
+        raise ValueError(
+            f"there are no points to move in space among the coordinates {listed(coordinates.names(q))}.\n"
+            "Usual cause: angles or lengths, whose symmetries are shifts.\n"
+            f'Fix: lj.Generator.shift("{coordinates.names(q)[0]}"), or a function delta(t, q, params) of your own.'
+        )
+    return found
+
+
+def _vector(axis) -> np.ndarray:
+    if isinstance(axis, str):
+        if axis not in AXES:
+            raise ValueError(f'an axis is "x", "y", "z" or a vector, not "{axis}".\nFix: "z", or (0.0, 0.0, 1.0).')
+        return np.eye(3)[AXES.index(axis)]
+    if np.shape(axis) not in ((2,), (3,)):
+        raise ValueError(f'an axis is "x", "y", "z" or a vector, not {axis!r}.\nFix: "z", or (0.0, 0.0, 1.0).')
+    return _array((*axis, 0.0)[:3])
+
+
+def _about(letter, axis):
+    return f"{letter}_{axis}" if isinstance(axis, str) else f"{letter}·({', '.join(f'{x:g}' for x in axis)})"
+
+
+def _array(values: Sequence | Mapping):
+    return np.asarray([float(x) for x in values])
+
+
+def _check_displacement(call, value, q):
+    names = leaf_names(q)
+    structure, expected = jtu.tree_structure(value), jtu.tree_structure(q)
+    if structure != expected:
+        has = _named(value)
+        missing = [name for name in names if name not in has] if has is not None else []
+        unknown = [name for name in has if name not in names] if has is not None else []
+        about = "; ".join(
+            f"{word} {listed(some)}" for word, some in (("it lacks", missing), ("q has no", unknown)) if some
+        )
+        returned = about or f"it is {_kind(value)} where q has {listed(names)}"
+        raise ValueError(
+            f"{call} must return one velocity a coordinate, like q: {returned}.\n"
+            "Usual cause: a coordinate that does not move left out.\n"
+            f"Fix: return the structure of q, with 0.0 for {missing[0] if missing else 'what stays'}."
+        )
+    for name, x, y in zip(names, jtu.tree_leaves(q), jtu.tree_leaves(value)):
+        if np.shape(y) not in ((), np.shape(x)):
+            raise ValueError(
+                f"{call} moves '{name}', of shape {np.shape(x)}, by something of shape {np.shape(y)}.\n"
+                "Usual cause: a coordinate moved by all of q.\nFix: give each coordinate a velocity of its own shape."
+            )
+
+
+def _named(value):
+    return leaf_names(value) if isinstance(value, Mapping) or hasattr(value, "_fields") else None
+
+
+def _kind(value):
+    shape = getattr(value, "shape", None)
+    return f"an array of shape {shape}" if shape is not None else f"a {type(value).__name__}"

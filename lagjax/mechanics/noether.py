@@ -1,0 +1,163 @@
+"""One-parameter groups of motions of a system, and what each of them conserves.
+
+A generator moves the coordinates by ε ξ(t, q) and the time by ε τ(t, q). It is a symmetry of L where the action changes
+by what does not count, the ends: by ε times the total derivative of a function F(t, q), the gauge term,
+
+    τ ∂L/∂t + ξ·∂L/∂q + (dξ/dt - v dτ/dt)·p + L dτ/dt - dF/dt = 0,        p = ∂L/∂v
+
+with d/dt = ∂/∂t + v·∂/∂q. Call the left side ρ. With all forces f = Q - ∂R/∂v + Aᵀ λ that L does not contain, the
+equations of motion `dp/dt = ∂L/∂q + f` give
+
+    C = p·ξ - τ (v·p - L) - F,        dC/dt = ρ + f·(ξ - τ v)
+
+at every state, symmetry or not. So C stays where ρ = 0 and no force acts along ξ - τ v; a constraint's own force
+λ·A (ξ - τ v) vanishes for all λ where the displacement is one that the constraint allows.
+
+Source: Noether, Nachr. Ges. Wiss. Göttingen (1918) 235, §2; Goldstein, *Classical Mechanics*, §13.7;
+Neĭmark & Fufaev, *Dynamics of Nonholonomic Systems*, §III.6 (velocity constraints).
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PyTree
+
+from lagjax.mechanics import constraints, coordinates
+from lagjax.mechanics.compiled import compiled
+from lagjax.mechanics.first_call import looked_at
+from lagjax.mechanics.generators import Generator, as_generator
+from lagjax.mechanics.multipliers import accelerations
+from lagjax.mechanics.reactions import force_at
+from lagjax.mechanics.system import System
+
+
+class NoetherCharge(eqx.Module):
+    """What a generator conserves: a function of (t, q, v, params), `[L] [t]`; `noether_charge` makes it.
+
+    `rate(t, q, v, params)`: its rate of change on a motion, zero where it is conserved, and right where it is not.
+    """
+
+    system: System
+    generator: Generator
+
+    def __call__(self, t, q, v, params) -> Float[Array, ""]:
+        """The charge at one state."""
+        system, s = self._checked(t, q, v, params)
+        return _charge(system, self.generator, *s)
+
+    def rate(self, t, q, v, params) -> Float[Array, ""]:
+        """How fast the charge changes at one state, `[L]`: ρ + f·(ξ - τ v)."""
+        system, s = self._checked(t, q, v, params)
+        multipliers = accelerations(system, *s)[1] if system.constraints else {}
+        return _rate(system, self.generator, *s, multipliers)
+
+    def size(self, t, q, v, params) -> Float[Array, ""]:
+        """The size of the terms that the charge is a sum of: what a change of it is compared with."""
+        system, s = self._checked(t, q, v, params)
+        return _size(system, self.generator, *s)
+
+    def _checked(self, *state):
+        s = coordinates.state(*state)
+        self.generator.check(s)
+        return looked_at(self.system, s), s
+
+    def __repr__(self):
+        return f"NoetherCharge({self.generator.name} of {self.system})"
+
+
+def noether_charge(system: System, generator) -> NoetherCharge:
+    """Return the charge `C = p·ξ - τ (v·p - L) - F` that a one-parameter group conserves where it is a symmetry.
+
+    >>> import lagjax as lj
+    >>> def kepler(t, q, v, params):
+    ...     return 0.5 * (v["x"] ** 2 + v["y"] ** 2) + params["k"] / (q["x"] ** 2 + q["y"] ** 2) ** 0.5
+    >>> turn = lambda t, q, params: {"x": -q["y"], "y": q["x"]}
+    >>> L_z = noether_charge(lj.System(kepler), turn)
+    >>> print(L_z(0.0, {"x": 3.0, "y": 0.0}, {"x": 1.0, "y": 2.0}, {"k": 1.0}))
+    6.0
+
+    A translation gives the momentum p, a rotation the angular momentum; `lj.Generator.time_translation()`, which sets
+    the clock back (τ = -1), the Jacobi integral v·p - L, and a `time` of +1 minus that.
+
+    **Arguments:**
+
+    - `system`: as for `integrate`.
+    - `generator`: a `lj.Generator`, or the function `delta(t, q, params)` -> like q, the velocity ξ with which the
+      group moves the coordinates, `[q]/[ε]`.
+
+    **Returns:** a function of (t, q, v, params) -> scalar, `[L] [t]/[ε]`, for `jit`, `vmap` and derivatives; its
+    `rate` of the same arguments is dC/dt on a motion, also where that is not zero.
+
+    **Raises:** `TypeError` for a generator that is no function; `ValueError`, when it is called, for one whose
+    displacement does not have the structure of q, with the coordinate by name.
+
+    Source: Goldstein, §13.7; the gauge term as in Derivation 8 of its chapter 1.
+    """
+    return NoetherCharge(system, as_generator(generator))
+
+
+class Flow(NamedTuple):
+    """A generator at one state: ξ, τ and F, and their total derivatives along the motion; ξ in vector form."""
+
+    xi: Float[Array, " n"]
+    tau: Float[Array, ""]
+    gauge: Float[Array, ""]
+    xi_rate: Float[Array, " n"]
+    tau_rate: Float[Array, ""]
+    gauge_rate: Float[Array, ""]
+
+
+def flow(generator: Generator, t, q, v, params) -> Flow:
+    """What a generator does at one state."""
+    at = lambda t, q: generator.at(t, q, params)
+    (xi, tau, gauge), (xi_rate, tau_rate, gauge_rate) = jax.jvp(at, (t, q), (jnp.ones_like(t), v))
+    vector = lambda y: coordinates.flatten(y)[0]
+    return Flow(vector(xi), tau, gauge, vector(xi_rate), tau_rate, gauge_rate)
+
+
+def applied_force(system, t, q, v, params, multipliers) -> PyTree:
+    """`Q - ∂R/∂v` in vector form, with the multipliers stacked."""
+    x, unflatten = coordinates.flatten(v)
+    force = jnp.zeros_like(x)
+    if system.force is not None:
+        force = force + coordinates.flatten(force_at(system, t, q, v, params, multipliers))[0].astype(x.dtype)
+    if system.dissipation is not None:
+        force = force - jax.grad(lambda u: system.dissipation(t, q, unflatten(u), params))(x)
+    return force
+
+
+def _terms(system, generator, t, q, v, params):
+    value, p = jax.value_and_grad(system.lagrangian, argnums=2)(t, q, v, params)
+    xi, tau, gauge = generator.at(t, q, params)
+    p, xi, u = (coordinates.flatten(y)[0] for y in (p, xi, v))
+    return p * xi, tau * p * u, tau * value, gauge
+
+
+@compiled
+def _charge(system, generator, t, q, v, params):
+    moved, power, value, gauge = _terms(system, generator, t, q, v, params)
+    return jnp.sum(moved - power) + value - gauge
+
+
+@compiled
+def _size(system, generator, t, q, v, params):
+    return sum(jnp.sum(jnp.abs(term)) for term in _terms(system, generator, t, q, v, params))
+
+
+@compiled
+def _rate(system, generator, t, q, v, params, multipliers):
+    x, unflatten = coordinates.flatten(q)
+    u, _ = coordinates.flatten(v)
+    moved = flow(generator, t, q, v, params)
+    lagrangian = lambda t, x, u: system.lagrangian(t, unflatten(x), unflatten(u), params)
+    change = (moved.tau, moved.xi, moved.xi_rate - u * moved.tau_rate)
+    value, rate = jax.jvp(lagrangian, (t, x, u), change)
+    rate = rate + value * moved.tau_rate - moved.gauge_rate
+    stacked = [jnp.atleast_1d(multipliers[name]) for name in system.constraints]
+    stacked = jnp.concatenate(stacked) if stacked else jnp.zeros(0, x.dtype)
+    force = applied_force(system, t, q, v, params, stacked)
+    if system.constraints:
+        force = force + stacked @ constraints.jacobian(system, t, x, u, params, unflatten)
+    return rate + force @ (moved.xi - moved.tau * u)

@@ -1,0 +1,223 @@
+"""Hamilton's and Routh's functions and the action: against closed forms and Lagrange's equations."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import lagjax as lj
+
+Q = np.array([0.25, 0.5, -0.125])
+P = np.array([3.0, 1.0, -2.0])
+
+
+def relativistic(t, q, v, params):
+    """A fast particle on a spring, whose push grows with time."""
+    m, c = params["m"], params["c"]
+    return -m * c**2 * jnp.sqrt(1 - v @ v / c**2) - 0.5 * params["k"] * (1 + t) * q @ q
+
+
+def magnetic(t, q, v, params):
+    """A charge in a uniform magnetic field along z, and an electric one along x that swings."""
+    B, m = params["B"], params["m"]
+    return 0.5 * m * v @ v + 0.5 * B * (q[0] * v[1] - q[1] * v[0]) + jnp.cos(t) * q[0]
+
+
+def top(t, q, v, params):
+    """A heavy symmetric top: two of its angles are cyclic."""
+    spin = v["psi"] + v["phi"] * jnp.cos(q["theta"])
+    tilting = v["theta"] ** 2 + (v["phi"] * jnp.sin(q["theta"])) ** 2
+    return 0.5 * params["I1"] * tilting + 0.5 * params["I3"] * spin**2 - params["mgl"] * jnp.cos(q["theta"])
+
+
+FAST, CHARGE, TOP = lj.System(relativistic), lj.System(magnetic), lj.System(top)
+OF_FAST, OF_CHARGE, OF_TOP = {"m": 1.25, "c": 2.0, "k": 0.75}, {"m": 1.5, "B": 2.5}, {"I1": 1.0, "I3": 0.5, "mgl": 2.0}
+
+
+def exact_fast(q, p, t, params):
+    """√(p²c² + m²c⁴) + V."""
+    m, c = params["m"], params["c"]
+    return jnp.sqrt(p @ p * c**2 + m**2 * c**4) + 0.5 * params["k"] * (1 + t) * q @ q
+
+
+def exact_charge(q, p, t, params):
+    """(p - A)²/2m + V, with A = B/2 (-y, x, 0)."""
+    A = 0.5 * params["B"] * jnp.stack([-q[1], q[0], 0.0 * q[2]])
+    return (p - A) @ (p - A) / (2 * params["m"]) - jnp.cos(t) * q[0]
+
+
+@pytest.mark.parametrize(
+    "system, exact, params",
+    [pytest.param(FAST, exact_fast, OF_FAST, marks=pytest.mark.slow), (CHARGE, exact_charge, OF_CHARGE)],
+    ids=["fast", "charge"],
+)
+def test_hamiltonians_in_closed_form(system, exact, params):
+    """H, its first and second derivatives; Hamilton's equations are Lagrange's. Twin: a wrong sign."""
+    H, t = lj.hamiltonian(system), 0.5
+
+    @jax.jit
+    def both(q, p):
+        at = lambda f: (
+            f(q, p),
+            jax.grad(f, argnums=(0, 1))(q, p),
+            jax.jacfwd(jax.grad(f, argnums=1), argnums=(0, 1))(q, p),
+        )
+        mass = lambda f: jax.grad(lambda m: f(params | {"m": m}))(params["m"])
+        found = at(lambda q, p: H(t, q, p, params)), mass(lambda params: H(t, q, p, params))
+        known = at(lambda q, p: exact(q, p, t, params)), mass(lambda params: exact(q, p, t, params))
+        v = H.velocity(t, q, p, params)
+        a = lj.accelerations(system, t, q, v, params)[0]
+        momentum = lambda t, q, v: lj.momentum(system, t, q, v, params)
+        p_again, p_rate = jax.jvp(momentum, (jnp.asarray(t), q, v), (jnp.ones(()), v, a))
+        return found, known, (p_again, (v, p_rate), H.rates(t, q, p, params), found[0][1])
+
+    found, known, (p_again, lagrange, hamilton, slopes) = both(Q, P)
+    for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(known)):
+        np.testing.assert_allclose(one, other, atol=1e-12)
+    np.testing.assert_allclose(p_again, P, rtol=1e-13)
+    for one, other, slope in zip(lagrange, hamilton, (slopes[1], -slopes[0])):
+        np.testing.assert_allclose(one, other, atol=1e-12)
+        np.testing.assert_allclose(one, slope, atol=1e-12)
+    assert np.max(np.abs(lagrange[1] - slopes[0])) > 0.1
+
+
+@pytest.mark.slow
+def test_forces_and_batches():
+    """In a dict, with friction: ṗ is Lagrange's; a batch of momenta is one lane each; NaN where there is none."""
+    friction = lambda t, q, v, params: 0.25 * (v["x"] ** 2 + v["y"] ** 2)
+    cosh = lambda t, q, v, params: jnp.log(jnp.cosh(v["x"])) + 0.5 * v["y"] ** 2 - q["x"] * q["y"]
+    H = lj.hamiltonian(lj.System(cosh, dissipation=friction))
+    q = {"x": 0.5, "y": 0.25}
+    rates = jax.jit(jax.vmap(lambda x: H.rates(0.0, q, {"x": x, "y": 1.0}, None)))(np.array([0.5, -0.9, 1.5]))
+    exact = np.arctanh([0.5, -0.9])
+    np.testing.assert_allclose(rates[0]["x"][:2], exact, rtol=1e-12)
+    np.testing.assert_allclose(rates[1]["x"][:2], -0.25 - 0.5 * exact, rtol=1e-12)
+    assert np.isnan(rates[0]["x"][2])
+    with pytest.raises(ValueError, match="no velocity was found that has this momentum"):
+        H(0.0, q, {"x": 1.5, "y": 1.0}, None)
+
+
+def test_a_degenerate_lagrangian_is_named():
+    """The coordinate whose velocity the momenta do not tell; constraints have no Hamilton's equations of their own."""
+    linear = lj.System(lambda t, q, v, params: 0.5 * v["x"] ** 2 + q["x"] * v["y"])
+    state = 0.0, {"x": 1.0, "y": 1.0}, {"x": 1.0, "y": 1.0}, None
+    with pytest.raises(ValueError, match="L is degenerate in 'y'"):
+        lj.hamiltonian(linear)(*state)
+    assert np.isnan(jax.jit(lambda x: lj.hamiltonian(linear)(0.0, {"x": x, "y": 1.0}, *state[2:]))(1.0))
+    free = lambda t, q, v, params: 0.5 * (v["x"] ** 2 + v["y"] ** 2)
+    held = lj.System(free, {"line": lj.Holonomic(lambda t, q, params: q["x"] - q["y"])})
+    with pytest.raises(ValueError, match="Hamilton's equations are those of free coordinates"):
+        lj.hamiltonian(held).rates(*state)
+    with pytest.raises(TypeError, match="a Hamiltonian is made of a lj.System"):
+        lj.hamiltonian(free)
+
+
+SPINNING = {"phi": 0.1, "psi": 0.2, "theta": 0.5}, {"phi": 1.0, "psi": 20.0, "theta": 0.125}
+
+
+def reduced_top():
+    """The top without its cyclic angles, at the state above."""
+    momenta = lj.momentum(TOP, 0.0, *SPINNING, OF_TOP)
+    params = {"params": OF_TOP, "momenta": {name: momenta[name] for name in ("phi", "psi")}}
+    return lj.routhian(TOP, ["phi", "psi"]), [{"theta": x["theta"]} for x in SPINNING], params
+
+
+@pytest.mark.slow
+def test_the_top_without_its_cyclic_angles():
+    """Its nutation is Lagrange's, its cyclic velocities come back; twin: the other momentum, R with the other sign."""
+    reduced, state, params = reduced_top()
+    full = lj.accelerations(TOP, 0.0, *SPINNING, OF_TOP)[0]["theta"]
+    found = lj.accelerations(reduced, 0.0, *state, params)[0]["theta"]
+    np.testing.assert_allclose(found, full, rtol=1e-13)
+    wrong = params | {"momenta": {name: 1.01 * p for name, p in params["momenta"].items()}}
+    assert abs(lj.accelerations(reduced, 0.0, *state, wrong)[0]["theta"] - full) > 1e-2
+    assert isinstance(reduced.lagrangian, lj.Routhian)
+    back = reduced.lagrangian.velocities(0.0, *state, params)
+    np.testing.assert_allclose([back[name] for name in ("phi", "psi")], [1.0, 20.0], rtol=1e-13)
+    # The effective potential of Goldstein, Eq. (5.60), for the rest of the motion.
+    a, b = params["momenta"]["psi"] / OF_TOP["I1"], params["momenta"]["phi"] / OF_TOP["I1"]
+    potential = lambda x: 0.5 * OF_TOP["I1"] * ((b - a * jnp.cos(x)) / jnp.sin(x)) ** 2 + OF_TOP["mgl"] * jnp.cos(x)
+    np.testing.assert_allclose(found, -jax.grad(potential)(0.5) / OF_TOP["I1"], rtol=1e-12)
+
+
+@pytest.mark.slow
+def test_a_routhian_moves_as_the_whole():
+    """A nutation, and an array with one entry less, with what is not quadratic: a fast particle in a central field."""
+    reduced, state, params = reduced_top()
+    ts = np.linspace(0.0, 2.0, 9)
+    whole = lj.integrate(TOP, *SPINNING, OF_TOP, ts=ts, rtol=1e-11, atol=1e-11)
+    alone = lj.integrate(reduced, *state, params, ts=ts, rtol=1e-11, atol=1e-11)
+    np.testing.assert_allclose(alone.q["theta"], whole.q["theta"], atol=1e-9)
+    polar = lambda t, q, v, p: -jnp.sqrt(1 - v[1] ** 2 - (q[1] * v[0]) ** 2) + p["k"] / q[1]
+    system, start, p = lj.System(polar), (np.array([0.25, 1.0]), np.array([0.5, 0.125])), {"k": 0.25}
+    params = {"params": p, "momenta": {"q[0]": lj.momentum(system, 0.0, *start, p)[0]}}
+    whole = lj.integrate(system, *start, p, ts=ts, rtol=1e-11, atol=1e-11)
+    alone = lj.integrate(lj.routhian(system, "q[0]"), start[0][1:], start[1][1:], params, ts=ts, rtol=1e-11, atol=1e-11)
+    np.testing.assert_allclose(alone.q[:, 0], whole.q[:, 1], atol=1e-9)
+
+
+def test_what_is_not_cyclic_is_named():
+    """A coordinate that L contains, a force, a constraint; parameters without momenta; one eliminated and given."""
+    of_theta = {"phi": 0.1, "psi": 0.2}, {"phi": 0.1, "psi": 0.2}
+    of_phi = {"theta": 0.5, "psi": 0.2}, {"theta": 0.1, "psi": 0.2}
+    momenta = {"params": OF_TOP, "momenta": {"theta": 1.0, "phi": 1.0, "x": 1.0}}
+    rubbed = lj.System(top, dissipation=lambda t, q, v, params: 0.5 * v["phi"] ** 2)
+    held = lj.System(top, {"held": lj.Holonomic(lambda t, q, params: q["phi"] - q["psi"])})
+    cases = [
+        (TOP, "theta", of_theta, momenta, "'theta' is not cyclic: L contains it"),
+        (TOP, "x", of_phi, momenta, "'x' is not cyclic: L does not contain its velocity"),
+        (rubbed, "phi", of_phi, momenta, "'phi' is not cyclic: there is dissipation"),
+        (held, "phi", of_phi, momenta, "'phi' is not cyclic: constraint 'held' contains it"),
+        (TOP, "phi", of_phi, OF_TOP, "the parameters of a Routhian are those of the system and the momenta"),
+        (TOP, "phi", of_phi, {"params": OF_TOP, "momenta": {}}, "the momentum of 'phi' is missing"),
+        (TOP, "phi", SPINNING, momenta, "'phi' is eliminated, and among the coordinates still"),
+    ]
+    for system, name, state, params, words in cases:
+        reduced = lj.routhian(system, name)
+        if words.startswith("'x'"):
+            state = ({**state[0], "phi": 0.1}, {**state[1], "phi": 0.1})
+        with pytest.raises(ValueError, match=words):
+            reduced.lagrangian(0.0, *[{k: jnp.asarray(x) for k, x in y.items()} for y in state], params)
+
+
+def swinging(t, q, v, params):
+    """An oscillator."""
+    return 0.5 * v**2 - 0.5 * params["k"] * q**2
+
+
+@pytest.mark.slow
+def test_the_action_is_stationary_on_motions():
+    """S of an oscillator in closed form; δS = 0 there, and ½ δ²S as known; twin: a straight path. ∂S/∂q₁ is p."""
+    system, params, end = lj.System(swinging), {"k": 4.0}, 0.5
+    w = 2.0
+
+    def off(size, q1=1.0, straight=0.0):
+        motion = lambda t: q1 * jnp.sin(w * t) / jnp.sin(w * end)
+        path = lambda t: (1 - straight) * motion(t) + straight * q1 * t / end + size * jnp.sin(jnp.pi * t / end)
+        return lj.action(system, path, params, 0.0, end)
+
+    np.testing.assert_allclose(off(0.0), w / (2 * np.tan(w * end)), rtol=1e-13)
+    first, second = jax.grad(off)(0.0), jax.grad(jax.grad(off))(0.0)
+    assert abs(first) < 1e-13 and abs(jax.grad(lambda size: off(size, straight=1.0))(0.0)) > 0.1
+    np.testing.assert_allclose(second, ((np.pi / end) ** 2 - params["k"]) * end / 2, rtol=1e-12)
+    np.testing.assert_allclose(jax.grad(lambda q1: off(0.0, q1))(1.0), w / np.tan(w * end), rtol=1e-12)
+
+
+@pytest.mark.slow
+def test_the_action_of_a_trajectory():
+    """The same from outputs, cut within them and backward; twin: without what is cut off."""
+    system, params, w = lj.System(swinging), {"k": 4.0}, 2.0
+    motion = lj.integrate(system, 0.0, w, params, ts=np.linspace(0.0, 1.0, 41), rtol=1e-12, atol=1e-12)
+    exact = lambda a, b: 0.25 * w * (np.sin(2 * w * b) - np.sin(2 * w * a))
+    np.testing.assert_allclose(lj.action(system, motion), exact(0.0, 1.0), rtol=1e-10)
+    part = lj.action(system, motion, t0=0.11, t1=0.87)
+    # Between outputs an end is as good as the cubic.
+    np.testing.assert_allclose(part, exact(0.11, 0.87), rtol=1e-7)
+    np.testing.assert_allclose(lj.action(system, motion, t0=0.87, t1=0.11), -part, rtol=1e-12)
+    assert abs(part - exact(0.0, 1.0)) > 1e-4
+    with pytest.raises(ValueError, match="the action is asked from 0 to 2"):
+        lj.action(system, motion, t0=0.0, t1=2.0)
+    with pytest.raises(ValueError, match="a path that is a function needs its ends"):
+        lj.action(system, lambda t: t, params)
+    with pytest.raises(TypeError, match="a path is a function of t or a lj.Trajectory"):
+        lj.action(system, 1.0, params, 0.0, 1.0)
