@@ -43,6 +43,10 @@ from lagjax.numerics.radau import Radau5
 from lagjax.numerics.runge_kutta import Dopri8, Tsit5
 
 # isort: split
+# What a system is like.
+from lagjax.analysis.linearised import Linearisation, linearise
+
+# isort: split
 # Many motions.
 from lagjax.sweeps.engine import sweep
 from lagjax.sweeps.lanes import Status
@@ -120,6 +124,8 @@ __all__ = [
     "Animation",
     "RESULTS",
     "AccuracyWarning",
+    "linearise",
+    "Linearisation",
     "sweep",
     "Sweep",
     "Status",
