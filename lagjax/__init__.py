@@ -45,6 +45,7 @@ from lagjax.numerics.runge_kutta import Dopri8, Tsit5
 # isort: split
 # What a system is like.
 from lagjax.analysis.linearised import Linearisation, linearise
+from lagjax.analysis.modes import Mode, NormalModes, normal_modes
 
 # isort: split
 # Many motions.
@@ -126,6 +127,9 @@ __all__ = [
     "AccuracyWarning",
     "linearise",
     "Linearisation",
+    "normal_modes",
+    "NormalModes",
+    "Mode",
     "sweep",
     "Sweep",
     "Status",

@@ -116,6 +116,10 @@ def parts_of(kind: Kind, system, t, q, v, params) -> Parts:
     live, positions_live = rows[chosen], rows[chosen & holonomic][:, ~unseen]
     velocities, lift = _null_space(live, all_independent[chosen])
     kept, _ = _null_space(positions_live, all_independent[chosen & holonomic])
+    positions = jnp.zeros((n, kept.shape[1]), x.dtype).at[~unseen].set(kept)
+    if holonomic.all():
+        # The same directions for both, first the coordinates that nothing depends on.
+        velocities = jnp.concatenate([jnp.eye(n, dtype=x.dtype)[:, unseen], positions], axis=1)
     left = velocities if friction is None else _null_space(pushing.T[chosen], all_independent[chosen])[0]
 
     # What balances the force at a steady motion, a = 0.
@@ -138,7 +142,6 @@ def parts_of(kind: Kind, system, t, q, v, params) -> Parts:
         position = (position + position.T) / 2
 
     turning = -lift @ slopes[chosen]
-    positions = jnp.zeros((n, kept.shape[1]), x.dtype).at[~unseen].set(kept)
     drift, moved = turning @ positions, mass @ turning + velocity
     # P⁺ of an all but orthonormal P, of which only rows that something depends on count.
     back = _left_inverse(kept)

@@ -9,7 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Complex, Float, PyTree
+from jaxtyping import Array, Bool, Complex, Float
 
 from lagjax.analysis.linear_parts import Kind, Parts, parts_of
 from lagjax.analysis.steadiness import Steadiness, check_steady, steadiness_of

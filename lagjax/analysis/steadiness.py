@@ -50,8 +50,9 @@ def steadiness_of(kind: Kind, s: State, parts: Parts) -> Steadiness:
     holonomic = slopes[np.array(kind.holonomic, bool)]
     allowed = jnp.concatenate([holonomic * size, slopes * jnp.where(speed > 0, speed, size)])
     off = jnp.abs(parts.off) / jnp.where(allowed > 0, allowed, 1.0)
-    # NaN, of what is not finite, counts as far off.
-    relative = jnp.nan_to_num(jax.lax.stop_gradient(jnp.concatenate([relative, off])), nan=jnp.inf)
+    # What is not finite counts as far off.
+    relative = jax.lax.stop_gradient(jnp.concatenate([relative, off]))
+    relative = jnp.where(jnp.isfinite(relative) & parts.sound, relative, jnp.inf)
     return Steadiness(relative, jnp.max(relative, initial=0.0))
 
 
