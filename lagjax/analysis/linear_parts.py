@@ -33,6 +33,7 @@ from jaxtyping import Array, Bool, Float, PyTree
 from lagjax.mechanics import constraints, coordinates
 from lagjax.mechanics.lagrangian import forcing_and_inertia
 from lagjax.mechanics.reactions import response
+from lagjax.numerics import dense, lapack
 from lagjax.numerics.rank import independent_rows
 
 # Reciprocal condition, after scaling, below which the reduced mass matrix has no inverse.
@@ -154,9 +155,9 @@ def parts_of(kind: Kind, system, t, q, v, params) -> Parts:
     sound = jnp.asarray(True)
     for part in parts:
         sound = sound & jnp.all(jnp.isfinite(part))
-    sound = sound & (_reciprocal_condition(reduced_mass) > SINGULAR_BELOW[np.dtype(x.dtype)])
+    sound = sound & (dense.reciprocal_condition(lax.stop_gradient(reduced_mass)) > SINGULAR_BELOW[np.dtype(x.dtype)])
     safe = jnp.where(sound, reduced_mass, jnp.eye(reduced_mass.shape[0], dtype=x.dtype))
-    a = onto + velocities @ jnp.linalg.solve(safe, left.T @ (forcing - mass @ onto))
+    a = onto + velocities @ dense.solved(safe, left.T @ (forcing - mass @ onto))
     off = [constraints.position_residual(system, t, x, params, unflatten)] if holonomic.any() else []
     off += [constraints.velocity_residual(*problem)] if m else []
     held = pushing @ stacked if m else jnp.zeros_like(x)
@@ -177,14 +178,14 @@ def _null_space(rows, independent):
         return jnp.eye(n, dtype=rows.dtype), jnp.zeros((n, 0), rows.dtype)
     # What depends on others is left out, so that nothing here is NaN; who asks is told.
     rows = jnp.where(independent[:, None], rows, 0.0)
-    start = jnp.linalg.qr(lax.stop_gradient(rows).T, mode="complete")[0][:, r:]
+    start = lapack.complement(rows.T)
     gram = rows @ rows.T + jnp.diag(jnp.where(independent, 0.0, 1.0).astype(rows.dtype))
-    lift = jnp.linalg.solve(gram, rows).T
+    lift = dense.solved(gram, rows).T
     return start - lift @ (rows @ start), lift
 
 
 def _left_inverse(basis):
-    return jnp.linalg.solve(basis.T @ basis, basis.T) if basis.shape[1] else basis.T
+    return dense.solved(basis.T @ basis, basis.T) if basis.shape[1] else basis.T
 
 
 def _least_squares(columns, target):
@@ -193,7 +194,7 @@ def _least_squares(columns, target):
         return jnp.zeros(0, target.dtype)
     gram = columns.T @ columns
     size = jnp.diag(gram)
-    return jnp.linalg.solve(gram + jnp.diag(jnp.where(size > 0, 0.0, 1.0)), columns.T @ target)
+    return dense.solved(gram + jnp.diag(jnp.where(size > 0, 0.0, 1.0)), columns.T @ target)
 
 
 def _spread(rows, live, lift, chosen, multipliers):
@@ -202,14 +203,4 @@ def _spread(rows, live, lift, chosen, multipliers):
         return multipliers
     # Each row as a combination of the chosen ones.
     combination = rows @ lift
-    return combination @ jnp.linalg.solve(combination.T @ combination, multipliers)
-
-
-def _reciprocal_condition(matrix):
-    """Of a matrix whose rows and columns are scaled by its diagonal."""
-    matrix = lax.stop_gradient(matrix)
-    largest = jnp.sqrt(jnp.maximum(jnp.max(jnp.abs(matrix), axis=0), jnp.max(jnp.abs(matrix), axis=1)))
-    scale = jnp.where(largest > 0, largest, 1.0)
-    scaled = matrix / (scale[:, None] * scale[None, :])
-    sizes = jnp.linalg.svd(jnp.where(jnp.isfinite(scaled), scaled, 0.0), compute_uv=False)
-    return sizes[-1] / jnp.where(sizes[0] > 0, sizes[0], 1.0)
+    return combination @ dense.solved(combination.T @ combination, multipliers)

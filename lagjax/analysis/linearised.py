@@ -21,6 +21,7 @@ from lagjax.mechanics.coordinates import State
 from lagjax.mechanics.first_call import looked_at
 from lagjax.mechanics.memory import kinds, remembered
 from lagjax.mechanics.structure import structure, unseen_coordinates
+from lagjax.numerics import dense
 from lagjax.numerics.rank import DEPENDENT_BELOW
 
 
@@ -73,7 +74,7 @@ class Linearisation(eqx.Module):
         """Return all characteristic roots, `[1/t]`; a zero for each coordinate that nothing depends on."""
         E, A = self.first_order()
         safe = jnp.where(self.sound, E, jnp.eye(E.shape[0], dtype=E.dtype))
-        A = jnp.where(self.sound, jnp.linalg.solve(safe, A), 0.0)
+        A = jnp.where(self.sound, dense.solved(safe, A), 0.0)
         found = jnp.linalg.eigvals(A)
         return jnp.concatenate([found, jnp.zeros(len(self.shifts), found.dtype)])
 

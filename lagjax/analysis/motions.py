@@ -23,6 +23,7 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 
 from lagjax.analysis.linearised import Linearisation
 from lagjax.analysis.roots import Roots, general_roots, symmetric_roots, zero_count
+from lagjax.numerics import dense, lapack
 
 STABLE, ASYMPTOTIC, GYROSCOPIC, DIVERGENCE, FLUTTER, UNDECIDED, UNSTEADY = range(7)
 STEADY_BELOW = 1e-5
@@ -75,8 +76,8 @@ def _routh(found) -> _Reduced:
     if not c:
         return _Reduced(M, G, K, M[:0], M[:0])
     inner = mass[:c, :c]
-    with_rate = jnp.linalg.solve(inner, mass[:c, c:])
-    follow = jnp.linalg.solve(inner, velocity[:c, c:])
+    with_rate = dense.solved(inner, mass[:c, c:])
+    follow = dense.solved(inner, velocity[:c, c:])
     reduced = G - mass[c:, :c] @ follow - velocity[c:, :c] @ with_rate
     return _Reduced(
         M - mass[c:, :c] @ with_rate, (reduced - reduced.T) / 2, K - velocity[c:, :c] @ follow, -follow, -with_rate
@@ -109,7 +110,7 @@ def _gyroscopic(found) -> Motions:
     eye, nil = jnp.eye(d, dtype=M.dtype), jnp.zeros_like(M)
     A, E = jnp.block([[nil, eye], [-K, -G]]), jnp.block([[eye, nil], [nil, M]])
     roots = general_roots(A, E)
-    values, zero = _cleaned(roots, zero_count(A, E))
+    values, zero = _cleaned(roots, zero_count(A, E, roots.values))
     # On the imaginary axis or off it, what round-off cannot decide is on it.
     real = jnp.where(jnp.abs(values.real) <= roots.round_off, 0.0, values.real)
     values = lax.complex(real, values.imag)
@@ -150,10 +151,10 @@ def _of_first_order(found) -> Motions:
     A = jnp.block([[drift, transfer], [-K, -C]])
     E = jnp.block([[jnp.eye(count, dtype=M.dtype), nil], [nil.T, M]])
     roots = general_roots(A, E)
-    zeros = zero_count(A, E)
+    zeros = zero_count(A, E, roots.values)
     values, zero = _cleaned(roots, zeros)
     # Other speeds of what nothing depends on: no position has a part in them.
-    columns = jnp.linalg.svd(jnp.concatenate([transfer, C]), compute_uv=False)
+    columns = lapack.singular_values(jnp.concatenate([transfer, C]))
     speeds = jnp.sum(columns <= 1e-12 * jnp.max(columns, initial=0.0))
     unexplained = jnp.where(all(found.kind.holonomic), jnp.maximum(zeros - speeds, 0), 0)
     rho, w = of_q[:, None] * roots.vectors[:count], of_w[:, None] * roots.vectors[count:] * rate

@@ -23,12 +23,17 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Inexact
 
+from lagjax.numerics import dense, lapack
+
 # Roots nearer to each other than this part of the largest are one double root.
 DOUBLE_BELOW = {np.dtype("float64"): 1e-8, np.dtype("float32"): 1e-4}
 # With a condition above this a root has not vectors enough.
 DEFECTIVE_ABOVE = {np.dtype("float64"): 1e6, np.dtype("float32"): 1e3}
 # Singular values below this part of the largest are zero.
 ZERO_BELOW = {np.dtype("float64"): 1e-13, np.dtype("float32"): 1e-6}
+
+# A double root of zero is found as the square root of round-off.
+NEARLY_ZERO = 1e-3
 
 
 class Roots(NamedTuple):
@@ -49,11 +54,7 @@ def symmetric_roots(stiffness, mass) -> Roots:
     """All s of `K x = s M x`, ascending, of symmetric K and positive definite M; NaN where M is not."""
     dtype = np.dtype(mass.dtype)
     K, M = lax.stop_gradient((stiffness, mass))
-    lower = jnp.linalg.cholesky(M)
-    inner = lax.linalg.triangular_solve(lower, K, left_side=True, lower=True)
-    inner = lax.linalg.triangular_solve(lower, inner.T, left_side=True, lower=True)
-    values, vectors = jnp.linalg.eigh((inner + inner.T) / 2)
-    vectors = lax.linalg.triangular_solve(lower, vectors, left_side=True, lower=True, transpose_a=True)
+    values, vectors = lapack.symmetric_definite(K, M)
     largest = jnp.max(jnp.abs(values), initial=0.0)
     values = jnp.where(jnp.abs(values) <= ZERO_BELOW[dtype] * largest, 0.0, values)
     return _followed(values, vectors, vectors.T, stiffness, mass, largest, jnp.ones_like(values))
@@ -62,13 +63,12 @@ def symmetric_roots(stiffness, mass) -> Roots:
 def general_roots(matrix, inertia) -> Roots:
     """All λ of `A x = λ E x`, of a regular E."""
     A, E = lax.stop_gradient((matrix, inertia))
-    standard = jnp.linalg.solve(E, A)
-    values, vectors = lax.linalg.eig(standard, compute_left_eigenvectors=False)
-    left = jnp.linalg.inv(vectors)
+    standard = dense.solved(E, A)
+    values, vectors, left = lapack.eigen(standard)
     norm = lambda x, axis: jnp.sqrt(jnp.sum(jnp.abs(x) ** 2, axis=axis))
     condition = norm(vectors, 0) * norm(left, 1)
     condition = jnp.where(jnp.isfinite(condition), condition, jnp.inf)
-    left = jnp.where(jnp.isfinite(left), left, 0.0) @ jnp.linalg.inv(E).astype(left.dtype)
+    left = jnp.where(jnp.isfinite(left), left, 0.0) @ dense.inverse(E).astype(left.dtype)
     largest = jnp.max(jnp.abs(values), initial=0.0)
     return _followed(values, vectors, left, matrix, inertia, largest, condition)
 
@@ -106,15 +106,20 @@ def _followed(values, vectors, left, matrix, inertia, largest, condition) -> Roo
     return Roots(start, new_vectors, round_off, double, defective)
 
 
-def zero_count(matrix, inertia):
+def zero_count(matrix, inertia, values):
     """How often zero is a root of `A x = λ E x`: vectors that A takes to zero, and those that it takes to these."""
-    A, E = lax.stop_gradient((matrix, inertia))
-    left, sizes, right = jnp.linalg.svd(A)
-    least = ZERO_BELOW[np.dtype(A.dtype)]
-    null = sizes <= least * jnp.max(sizes, initial=0.0)
-    # A x = E n has a solution where E n has no part in what A does not reach.
-    between = left.T @ E @ right.T
-    between = jnp.where(null[:, None] & null[None, :], between, 0.0)
-    reached = jnp.linalg.svd(between, compute_uv=False)
-    rank = jnp.sum(reached > 1e-9 * jnp.max(jnp.abs(E)))
-    return 2 * jnp.sum(null) - rank
+    least = jnp.min(jnp.abs(values)) if values.size else jnp.ones(())
+    return _zero_count(matrix, inertia, least <= NEARLY_ZERO * jnp.max(jnp.abs(values), initial=0.0))
+
+
+@lapack.one_by_one
+def _zero_count(A, E, possible):
+    def counted():
+        left, sizes, right = jnp.linalg.svd(A)
+        null = sizes <= ZERO_BELOW[np.dtype(A.dtype)] * jnp.max(sizes, initial=0.0)
+        # A x = E n has a solution where E n has no part in what A does not reach.
+        between = jnp.where(null[:, None] & null[None, :], left.T @ E @ right.T, 0.0)
+        reached = jnp.linalg.svd(between, compute_uv=False)
+        return (2 * jnp.sum(null) - jnp.sum(reached > 1e-9 * jnp.max(jnp.abs(E)))).astype(jnp.int32)
+
+    return lax.cond(possible, counted, lambda: jnp.zeros((), jnp.int32))
