@@ -104,9 +104,9 @@ def parts_of(kind: Kind, system, t, q, v, params) -> Parts:
     unseen, holonomic = np.array(kind.unseen, bool), np.array(kind.holonomic, bool)
     chosen = np.array(kind.independent, bool)
 
-    forcing, inertia = forcing_and_inertia(*problem)
-    mass = jax.vmap(inertia)(jnp.eye(n, dtype=x.dtype)).astype(x.dtype)
+    mass = jax.jacfwd(lambda u: _momentum(system, t, x, u, params, unflatten))(u).astype(x.dtype)
     mass = (mass + mass.T) / 2
+    velocity, position, forcing = _forces(kind, problem)
     rows, gamma = constraints.acceleration_rows(*problem)
     slopes = jax.jacfwd(lambda x: constraints.velocity_residual(system, t, x, u, params, unflatten))(x)
     slopes = jnp.where(holonomic[:, None], 0.0, slopes).astype(x.dtype)
@@ -126,15 +126,16 @@ def parts_of(kind: Kind, system, t, q, v, params) -> Parts:
     # What balances the force at a steady motion, a = 0.
     stacked = _spread(rows, live, lift, chosen, -_least_squares(pushing[:, chosen], forcing))
 
-    def total(x, u):
-        at = system, t, x, u, params, unflatten
-        force, _ = forcing_and_inertia(*at)
-        if m:
-            force = force + jax.grad(lambda u: stacked @ constraints.velocity_residual(*at[:3], u, *at[4:]))(u)
-        return force if friction is None else force + response(*at) @ stacked
-
-    by_position, by_velocity = jax.jacfwd(total, argnums=(0, 1))(x, u)
-    velocity, position = -by_velocity.astype(x.dtype), -by_position.astype(x.dtype)
+    if m:
+        held = lambda x, u: jax.grad(
+            lambda u: stacked @ constraints.velocity_residual(system, t, x, u, params, unflatten)
+        )(u)
+        by_position, by_velocity = jax.jacfwd(held, argnums=(0, 1))(x, u)
+        velocity, position = velocity - by_velocity.astype(x.dtype), position - by_position.astype(x.dtype)
+    if friction is not None:
+        rubbing = lambda x, u: response(system, t, x, u, params, unflatten) @ stacked
+        by_position, by_velocity = jax.jacfwd(rubbing, argnums=(0, 1))(x, u)
+        velocity, position = velocity - by_velocity.astype(x.dtype), position - by_position.astype(x.dtype)
     if kind.at_rest:
         velocity = jnp.zeros_like(velocity)
     elif kind.conservative:
@@ -142,33 +143,66 @@ def parts_of(kind: Kind, system, t, q, v, params) -> Parts:
     if kind.conservative:
         position = (position + position.T) / 2
 
-    turning = -lift @ slopes[chosen]
-    drift, moved = turning @ positions, mass @ turning + velocity
-    # P⁺ of an all but orthonormal P, of which only rows that something depends on count.
-    back = _left_inverse(kept)
     reduced_mass = left.T @ mass @ velocities
+    if holonomic.all():
+        turning = jnp.zeros((n, n), x.dtype)
+        shifts = int(unseen.sum())
+        drift, transfer = (
+            jnp.zeros((kept.shape[1],) * 2, x.dtype),
+            jnp.eye(n - int(chosen.sum()), dtype=x.dtype)[shifts:],
+        )
+    else:
+        turning = -lift @ slopes[chosen]
+        # P⁺ of an all but orthonormal P, of which only rows that something depends on count.
+        back = _left_inverse(kept)
+        drift, transfer = back @ (turning @ positions)[~unseen], back @ velocities[~unseen]
+    moved = mass @ turning + velocity
     parts = (
-        reduced_mass, left.T @ moved @ velocities, left.T @ (moved @ turning + position) @ positions,
-        back @ drift[~unseen], back @ velocities[~unseen],
-    )  # fmt: skip
+        reduced_mass,
+        left.T @ moved @ velocities,
+        left.T @ (moved @ turning + position) @ positions,
+        drift,
+        transfer,
+    )
     onto = lift @ gamma[chosen] if m else jnp.zeros_like(x)
     sound = jnp.asarray(True)
     for part in parts:
         sound = sound & jnp.all(jnp.isfinite(part))
-    sound = sound & (dense.reciprocal_condition(lax.stop_gradient(reduced_mass)) > SINGULAR_BELOW[np.dtype(x.dtype)])
+    sound = sound & (_reciprocal_condition(reduced_mass) > SINGULAR_BELOW[np.dtype(x.dtype)])
     safe = jnp.where(sound, reduced_mass, jnp.eye(reduced_mass.shape[0], dtype=x.dtype))
-    a = onto + velocities @ dense.solved(safe, left.T @ (forcing - mass @ onto))
+    a = onto + velocities @ lapack.solve(safe, (left.T @ (forcing - mass @ onto))[:, None])[:, 0]
     off = [constraints.position_residual(system, t, x, params, unflatten)] if holonomic.any() else []
     off += [constraints.velocity_residual(*problem)] if m else []
     held = pushing @ stacked if m else jnp.zeros_like(x)
     diagonal = jnp.abs(jnp.diag(mass))
     forces = (jnp.abs(forcing) + jnp.abs(held)) / jnp.where(diagonal > 0, diagonal, 1.0)
     return Parts(
-        *parts, positions, velocities, drift,
+        *parts, positions, velocities, turning @ positions,
         constraints.split(system, stacked, t, q, v, params), a,
         jnp.concatenate(off) if off else jnp.zeros(0, x.dtype), forces, sound, all_independent,
         Raw(mass, velocity, position, rows, slopes),
     )  # fmt: skip
+
+
+def _momentum(system, t, x, u, params, unflatten):
+    return jax.grad(lambda u: system.lagrangian(t, unflatten(x), unflatten(u), params))(u)
+
+
+def _forces(kind: Kind, problem):
+    """-∂F/∂u, -∂F/∂x and F itself, without constraint forces."""
+    system, t, x, u, params, unflatten = problem
+    if kind.at_rest:
+        # No momentum at rest: the force is that of the potential.
+        slope = jax.grad(lambda x: system.lagrangian(t, unflatten(x), unflatten(jnp.zeros_like(u)), params))
+        position, forcing = jax.jacfwd(lambda x: 2 * (slope(x),), has_aux=True)(x)
+        return jnp.zeros((x.size, x.size), x.dtype), -position.astype(x.dtype), forcing.astype(x.dtype)
+
+    def force(x, u):
+        found, _ = forcing_and_inertia(system, t, x, u, params, unflatten)
+        return found, found
+
+    (position, velocity), forcing = jax.jacfwd(force, argnums=(0, 1), has_aux=True)(x, u)
+    return -velocity.astype(x.dtype), -position.astype(x.dtype), forcing
 
 
 def _null_space(rows, independent):
@@ -204,3 +238,12 @@ def _spread(rows, live, lift, chosen, multipliers):
     # Each row as a combination of the chosen ones.
     combination = rows @ lift
     return combination @ dense.solved(combination.T @ combination, multipliers)
+
+
+def _reciprocal_condition(matrix):
+    """Of a matrix whose rows and columns are scaled by their largest entries."""
+    matrix = jnp.where(jnp.isfinite(matrix), lax.stop_gradient(matrix), 0.0)
+    largest = jnp.sqrt(jnp.maximum(jnp.max(jnp.abs(matrix), axis=0), jnp.max(jnp.abs(matrix), axis=1)))
+    scale = jnp.where(largest > 0, largest, 1.0)
+    sizes = lapack.singular_values(matrix / (scale[:, None] * scale[None, :]))
+    return sizes[-1] / jnp.where(sizes[0] > 0, sizes[0], 1.0)

@@ -124,7 +124,7 @@ def linearise(system, t, q, v, params) -> Linearisation:
     if not np.all(np.asarray(found.parts.independent)[list(kind.independent)]):
         kind = kind._replace(independent=_chosen(kind, system, s, traced))
         found, steadiness = _linearised(kind, system, *s)
-    check_steady(system, found, steadiness, lambda *later: _linearised(kind, system, *later)[0])
+    check_steady(system, found, steadiness, lambda *later: linearised(kind, system, State(*later)))
     return found
 
 
@@ -169,6 +169,11 @@ def _chosen(kind, system, s, traced) -> tuple[bool, ...]:
             direction = rest[farthest] / left[farthest]
             rest = rest - np.outer(rest @ direction, direction)
     return tuple(bool(x) for x in chosen)
+
+
+def linearised(kind: Kind, system, s: State) -> Linearisation:
+    """The linear equations at another state of the same kind, whether it is steady or not."""
+    return _linearised(kind, system, *s)[0]
 
 
 @compiled

@@ -9,9 +9,10 @@ import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int, PyTree
 
 from lagjax.analysis.drawn_modes import animated, drawn_mode, drawn_roots
-from lagjax.analysis.linearised import Linearisation, linearise
-from lagjax.analysis.motions import GYROSCOPIC, Motions, motions_of
-from lagjax.analysis.neutral import with_neutral
+from lagjax.analysis.linearised import Linearisation, linearise, linearised
+from lagjax.analysis.motions import ASYMPTOTIC, GYROSCOPIC, STABLE, UNDECIDED, Motions, motions_of
+from lagjax.analysis.neutral import leads_to_others, with_neutral
+from lagjax.analysis.steadiness import STEADY_BELOW
 from lagjax.analysis.verdicts import VERDICTS, label_of, reason_of
 from lagjax.jax_internals.tracing import is_eager
 from lagjax.mechanics import coordinates
@@ -78,7 +79,8 @@ class NormalModes(eqx.Module):
     - `zero` (k,): roots that are zero. `growing` (k,): those that grow. `double` (k,): another one is the same: then
       derivatives are of the mean of both, or zero where both share their shape.
     - `code`, `stable`: the `verdict` as a number (its place in `lj.NormalModes.VERDICTS`), and whether nothing grows.
-    - `unexplained`: how many zeros may be those of a critical point.
+    - `unexplained`: how many zeros may be those of a critical point; outside of compiled programs it has been tried
+      whether they lead to other equilibria.
     - `linearisation`: the `Linearisation` that this is of.
 
     Derivatives flow to `roots`, of first and second order, and to `shapes`, of first.
@@ -93,6 +95,7 @@ class NormalModes(eqx.Module):
     code: Int[Array, ""]
     unexplained: Int[Array, ""]
     linearisation: Linearisation
+    zero_words: tuple[str, ...] = eqx.field(static=True, default=())
 
     VERDICTS: ClassVar[tuple[str, ...]] = tuple(VERDICTS.values())
 
@@ -192,9 +195,29 @@ def normal_modes(system, t=None, q=None, v=None, params=None) -> NormalModes:
         motions = _motions(found, False)
     kept = ~np.asarray(motions.mirrored)
     of_modes = jax.tree.map(lambda x: np.asarray(x)[kept] if np.ndim(x) else np.asarray(x), motions)
+    words = []
     if not found.kind.conservative:
-        of_modes = of_modes._replace(shapes=with_neutral(found, of_modes.shapes, of_modes.zero))
-    return _collected(found, of_modes)
+        shapes, words = with_neutral(found, of_modes.shapes, of_modes.zero)
+        of_modes = of_modes._replace(shapes=shapes)
+    if int(of_modes.code) == UNDECIDED and int(of_modes.unexplained) and not isinstance(system, Linearisation):
+        of_modes = _with_symmetries(system, found, of_modes)
+    return _collected(found, of_modes, tuple(words))
+
+
+def _with_symmetries(system, found, motions: Motions) -> Motions:
+    """The motions, stable where what is zero leads to other equilibria."""
+    x, unflatten = coordinates.flatten(found.state.q)
+
+    def steady_at(displacement):
+        s = found.state._replace(q=unflatten(x + displacement.astype(x.dtype)))
+        return float(linearised(found.kind, system, s).residual) <= STEADY_BELOW[np.dtype(x.dtype)]
+
+    if not leads_to_others(motions.shapes, motions.zero, np.array(found.kind.unseen, bool), steady_at):
+        return motions
+    lasting = ~motions.zero
+    decays = not found.kind.conservative and bool(np.all(motions.roots.real[lasting] < 0))
+    code = ASYMPTOTIC if decays else GYROSCOPIC if np.any(motions.energies < 0) else STABLE
+    return motions._replace(code=np.asarray(code, motions.code.dtype), unexplained=np.zeros_like(motions.unexplained))
 
 
 @compiled
@@ -202,7 +225,7 @@ def _motions(found: Linearisation, definite: bool) -> Motions:
     return motions_of(found, definite)
 
 
-def _collected(found, motions: Motions) -> NormalModes:
+def _collected(found, motions: Motions, zero_words=()) -> NormalModes:
     shapes, start = [], 0
     for leaf in jax.tree.leaves(found.state.q):
         size = int(np.size(leaf))
@@ -218,4 +241,5 @@ def _collected(found, motions: Motions) -> NormalModes:
         code=motions.code,
         unexplained=motions.unexplained,
         linearisation=found,
+        zero_words=zero_words,
     )

@@ -89,7 +89,12 @@ def _at_rest(found) -> Motions:
     reduced = _routh(found)
     roots = symmetric_roots(reduced.position, reduced.mass)
     squares = roots.values
-    positive, zero = squares > 0, squares == 0
+    # What is left of terms that cancel.
+    x = lax.stop_gradient(jnp.abs(roots.vectors))
+    noise = jnp.sum(x * (jnp.abs(lax.stop_gradient(reduced.position)) @ x), axis=0)
+    zero = jnp.abs(squares) <= 1e2 * jnp.finfo(squares.dtype).eps * noise
+    squares = jnp.where(zero, 0.0, squares)
+    positive = squares > 0
     size = jnp.sqrt(jnp.where(zero, 1.0, jnp.abs(squares)))
     values = jnp.where(zero, 0.0, lax.complex(jnp.where(positive, 0.0, size), jnp.where(positive, size, 0.0)))
     x = roots.vectors.astype(values.dtype)
@@ -167,24 +172,29 @@ def _of_first_order(found) -> Motions:
     unseen = np.array(found.kind.unseen, bool)[:, None]
     drifting = jnp.where(only_speed[None, :], moving, still)
     full = jnp.where(zero[None, :], drifting, jnp.where(unseen, moving / nonzero[None, :], still))
-    values = values * rate
     grow = roots.round_off * rate
+    values = values * rate
+    # Round-off is no growth; what its derivative is, stays.
+    real = values.real
+    nothing = (jnp.abs(real) <= grow) & (values.imag != 0)
+    values = lax.complex(jnp.where(nothing, real - lax.stop_gradient(real), real), values.imag)
     mirrored = values.imag < 0
     order = _order(values, mirrored)
+    code = _unstable_or(values, grow, zero, roots, unexplained)
     return Motions(
         values[order], _normalised(full.T[order]), mirrored[order], jnp.zeros(values.size, int), roots.double[order],
-        zero[order], ((values.real > grow) & ~zero)[order], unexplained, _unstable_or(values, grow, zero, roots),
+        zero[order], ((values.real > grow) & ~zero)[order], unexplained, code,
     )  # fmt: skip
 
 
-def _unstable_or(values, allowed, zero, roots: Roots):
+def _unstable_or(values, allowed, zero, roots: Roots, unexplained):
     """The verdict of roots as they are, without energies."""
     growth = jnp.where(zero, -jnp.inf, values.real - allowed)
     worst = jnp.argmax(growth)
     flutters = jnp.abs(values.imag[worst]) > 0
     decays = jnp.all(zero | (values.real < -allowed))
     touching = jnp.any(roots.defective & ~zero & (values.real >= -allowed))
-    settled = jnp.where(touching, UNDECIDED, jnp.where(decays, ASYMPTOTIC, STABLE))
+    settled = jnp.where(touching | (unexplained > 0), UNDECIDED, jnp.where(decays, ASYMPTOTIC, STABLE))
     return jnp.where(growth[worst] > 0, jnp.where(flutters, FLUTTER, DIVERGENCE), settled)
 
 
@@ -203,15 +213,30 @@ def _rate(position, velocity, drift=0.0):
 
 def _cleaned(roots: Roots, zeros):
     """The roots with the smallest so many of them zero, and which these are."""
-    rank = jnp.argsort(jnp.argsort(jnp.abs(roots.values)))
-    zero = rank < zeros
+    zero = _rank((jnp.abs(roots.values),)) < zeros
     values = jnp.where(zero, 0.0, roots.values)
     return values, zero
 
 
 def _order(values, mirrored):
     """By frequency, of equal ones the fastest growing first; mirror images last."""
-    return jnp.lexsort((-values.real, values.imag, mirrored))
+    rank = _rank((mirrored, values.imag, -values.real))
+    return jnp.zeros_like(rank).at[rank].set(jnp.arange(rank.size))
+
+
+def _rank(keys):
+    """The place of each in ascending order, by the first key, and where it is the same by the next ones.
+
+    By comparing all with each other: a sort takes longer to compile than the rest.
+    """
+    place = jnp.arange(keys[0].size)
+    before = jnp.zeros((place.size, place.size), bool)
+    same = ~before
+    for key in (*map(lax.stop_gradient, keys), place):
+        key = key.astype(int) if key.dtype == bool else key
+        before = before | (same & (key[:, None] < key[None, :]))
+        same = same & (key[:, None] == key[None, :])
+    return jnp.sum(before, axis=0)
 
 
 def _with_shifts(found, reduced, values, x, mirrored, energies, double, zero, growing, defective=None) -> Motions:

@@ -12,10 +12,14 @@ ZERO_BELOW = 1e-9
 
 
 def with_neutral(found, shapes, zero):
-    """The shapes (k, N), those of zero roots replaced by a reduced basis."""
+    """The shapes (k, N), those of zero roots replaced by a reduced basis; and what each zero root is, in words.
+
+    There may be fewer such directions than zero roots: the rest grow with time, along them.
+    """
+    words = [""] * len(zero)
     if not np.any(zero):
-        return shapes
-    p = found.parts
+        return shapes, words
+    p, kind = found.parts, found.kind
     drift, transfer, position, velocity = (np.asarray(x) for x in (p.drift, p.transfer, p.position, p.velocity))
     A = np.block([[drift, transfer], [-position, -velocity]])
     # Rows of different units.
@@ -28,9 +32,33 @@ def with_neutral(found, shapes, zero):
     reduced = _reduced(np.concatenate([still, moving], axis=1))
     shapes, n = np.array(shapes), shapes.shape[1]
     for i, row in zip(np.flatnonzero(zero), reduced):
-        row = row[:n] if np.max(np.abs(row[:n])) > 1e-6 else row[n:]
+        shifts = np.max(np.abs(row[:n])) > 1e-6
+        row = row[:n] if shifts else row[n:]
         shapes[i] = row / row[np.argmax(np.abs(row))]
-    return shapes
+        moved = _listed(found.names, shapes[i])
+        if not shifts:
+            words[i] = f"other speeds in {moved}"
+        elif all(kind.holonomic):
+            words[i] = f"along {moved}"
+        else:
+            words[i] = f"shift of {moved}, which the velocity constraints leave free"
+    for i in np.flatnonzero(zero)[len(reduced) :]:
+        words[i] = "a shift or a speed named before, growing with time"
+    return shapes, words
+
+
+def leads_to_others(shapes, zero, unseen, steady_at) -> bool:
+    """Whether all zero modes lead straight to further equilibria; `steady_at(displacement)` says so of one.
+
+    It is the difference between a symmetry and a critical point, where terms of higher order decide.
+    """
+    displacements = [np.real(x) for x in shapes[zero] if np.any(np.abs(x[~unseen]) > 1e-6)]
+    return bool(displacements) and all(steady_at(size * x) for x in displacements for size in (0.37, -1.3))
+
+
+def _listed(names, shape):
+    entries = [name for name, x in zip(names, shape) if abs(x) > 1e-6]
+    return ", ".join(entries[:4]) + (", ..." if len(entries) > 4 else "")
 
 
 def _reduced(rows):

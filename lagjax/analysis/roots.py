@@ -23,14 +23,12 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Inexact
 
-from lagjax.numerics import dense, lapack
+from lagjax.numerics import lapack
 
 # Roots nearer to each other than this part of the largest are one double root.
 DOUBLE_BELOW = {np.dtype("float64"): 1e-8, np.dtype("float32"): 1e-4}
 # With a condition above this a root has not vectors enough.
 DEFECTIVE_ABOVE = {np.dtype("float64"): 1e6, np.dtype("float32"): 1e3}
-# Singular values below this part of the largest are zero.
-ZERO_BELOW = {np.dtype("float64"): 1e-13, np.dtype("float32"): 1e-6}
 
 # A double root of zero is found as the square root of round-off.
 NEARLY_ZERO = 1e-3
@@ -52,23 +50,18 @@ class Roots(NamedTuple):
 
 def symmetric_roots(stiffness, mass) -> Roots:
     """All s of `K x = s M x`, ascending, of symmetric K and positive definite M; NaN where M is not."""
-    dtype = np.dtype(mass.dtype)
-    K, M = lax.stop_gradient((stiffness, mass))
-    values, vectors = lapack.symmetric_definite(K, M)
+    values, vectors = lapack.symmetric_definite(stiffness, mass)
     largest = jnp.max(jnp.abs(values), initial=0.0)
-    values = jnp.where(jnp.abs(values) <= ZERO_BELOW[dtype] * largest, 0.0, values)
     return _followed(values, vectors, vectors.T, stiffness, mass, largest, jnp.ones_like(values))
 
 
 def general_roots(matrix, inertia) -> Roots:
     """All λ of `A x = λ E x`, of a regular E."""
-    A, E = lax.stop_gradient((matrix, inertia))
-    standard = dense.solved(E, A)
-    values, vectors, left = lapack.eigen(standard)
+    values, vectors, left = lapack.eigen(matrix, inertia)
     norm = lambda x, axis: jnp.sqrt(jnp.sum(jnp.abs(x) ** 2, axis=axis))
     condition = norm(vectors, 0) * norm(left, 1)
     condition = jnp.where(jnp.isfinite(condition), condition, jnp.inf)
-    left = jnp.where(jnp.isfinite(left), left, 0.0) @ dense.inverse(E).astype(left.dtype)
+    left = jnp.where(jnp.isfinite(left), left, 0.0)
     largest = jnp.max(jnp.abs(values), initial=0.0)
     return _followed(values, vectors, left, matrix, inertia, largest, condition)
 
@@ -116,7 +109,10 @@ def zero_count(matrix, inertia, values):
 def _zero_count(A, E, possible):
     def counted():
         left, sizes, right = jnp.linalg.svd(A)
-        null = sizes <= ZERO_BELOW[np.dtype(A.dtype)] * jnp.max(sizes, initial=0.0)
+        # Round-off of the largest, or of the terms that cancel.
+        eps = jnp.finfo(A.dtype).eps
+        terms = 1e2 * jnp.sum(jnp.abs(left) * (jnp.abs(A) @ jnp.abs(right.T)), axis=0)
+        null = sizes <= eps * jnp.minimum(1e3 * sizes[0], jnp.maximum(terms, 4 * A.shape[0] * sizes[0]))
         # A x = E n has a solution where E n has no part in what A does not reach.
         between = jnp.where(null[:, None] & null[None, :], left.T @ E @ right.T, 0.0)
         reached = jnp.linalg.svd(between, compute_uv=False)

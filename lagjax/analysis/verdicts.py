@@ -24,56 +24,45 @@ def reason_of(modes) -> str:
     growth = np.asarray(modes.growth)
     worst = int(np.argmax(growth)) if growth.size else 0
     if code == UNSTEADY:
-        return (
-            f"the state is none of equilibrium (residual {float(modes.linearisation.residual):.2g}), or its mass matrix "
-            "is singular"
-        )
+        off = float(modes.linearisation.residual)
+        return f"the state is no equilibrium (residual {off:.2g}), or its mass matrix is singular"
     if code == DIVERGENCE:
         return f"mode {worst} grows by a factor e in {1 / growth[worst]:.4g}, without swinging"
     if code == FLUTTER:
         return f"mode {worst} swings and grows by a factor e in {1 / growth[worst]:.4g}"
     if code == UNDECIDED:
-        if np.any(np.asarray(modes.zero) & ~_of_shifts(modes)) and int(modes.unexplained):
+        if int(modes.unexplained):
             return (
-                "a root of zero that no coordinate explains: a symmetry of several coordinates together, or a critical "
-                "point, at which terms of higher order decide"
+                "a root of zero that no coordinate explains: a symmetry of several together, or a critical point, at "
+                "which terms of higher order decide"
             )
         return "two modes share root and shape, and grow together as a power of t: the edge of flutter"
     if code == GYROSCOPIC:
-        which = ", ".join(str(i) for i in np.flatnonzero(np.asarray(modes.energy) < 0))
+        which = [str(i) for i in np.flatnonzero(np.asarray(modes.energy) < 0)]
+        have = f"mode {which[0]} has" if len(which) == 1 else f"modes {', '.join(which)} have"
         return (
-            f"no mode grows, but mode{'s' * (',' in which)} {which} {'have' if ',' in which else 'has'} negative energy: "
-            "gyroscopic forces hold what the stiffness does not, and any damping lets it grow"
+            f"no mode grows, but {have} negative energy: gyroscopic forces hold what the stiffness does not, and any "
+            "damping lets it grow"
         )
     if code == ASYMPTOTIC:
-        lasting = "; what lasts are zero modes" if np.any(np.asarray(modes.zero)) else ""
-        return f"every mode decays, the slowest by a factor e in {-1 / np.max(growth[~np.asarray(modes.zero)]):.4g}{lasting}"
+        zero = np.asarray(modes.zero)
+        lasting = "; what lasts are zero modes" if np.any(zero) else ""
+        return f"every mode decays, the slowest by a factor e in {-1 / np.max(growth[~zero]):.4g}{lasting}"
     if kind.conservative:
         return "all that oscillates has positive energy, which is conserved"
     return "no mode grows, and not all decay"
 
 
-def _of_shifts(modes):
-    """Which modes only shift a coordinate that nothing depends on."""
-    moved = np.abs(_flat(modes)) > NAMED_ABOVE
-    return np.asarray(modes.zero) & ~moved[:, ~np.array(modes.linearisation.kind.unseen, bool)].any(axis=1)
-
-
 def label_of(i: int, modes) -> str:
     """What one mode is, in a few words."""
-    linearisation = modes.linearisation
-    entries = [name for name, x in zip(linearisation.names, _flat(modes)[i]) if abs(x) > NAMED_ABOVE]
-    named = ", ".join(entries[:4]) + (", ..." if len(entries) > 4 else "")
+    linearisation, shape = modes.linearisation, np.abs(_flat(modes)[i])
+    moved = [linearisation.names[j] for j in np.argsort(-shape.round(6), kind="stable") if shape[j] > NAMED_ABOVE]
+    named = ", ".join(moved[:4]) + (", ..." if len(moved) > 4 else "")
     if bool(modes.zero[i]):
-        if bool(_of_shifts(modes)[i]):
-            if linearisation.kind.conservative and len(entries) == 1:
-                return f"zero: any {named} and any speed in it will do"
-            return (
-                f"zero: other speeds in {named}" if not linearisation.kind.conservative else f"zero: shift of {named}"
-            )
-        if not all(linearisation.kind.holonomic):
-            return f"zero: shift of {named}, which the velocity constraints leave free"
-        return f"zero: along {named}"
+        if modes.zero_words and modes.zero_words[i]:
+            return f"zero: {modes.zero_words[i]}"
+        shifted = len(moved) == 1 and moved[0] in linearisation.shifts
+        return f"zero: any {named} and any speed in it will do" if shifted else f"zero: along {named}"
     growth, frequency = float(modes.growth[i]), float(modes.frequency[i])
     words = "swings" if frequency else ("grows" if growth > 0 else "decays")
     if frequency and bool(modes.growing[i]):

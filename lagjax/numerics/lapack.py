@@ -58,7 +58,13 @@ def symmetric_definite(stiffness, mass):
 
 
 @one_by_one
-def eigen(matrix):
-    """λ and X of `A x = λ x`, and X⁻¹."""
-    values, vectors = lax.linalg.eig(matrix, compute_left_eigenvectors=False)
-    return values, vectors, jnp.linalg.inv(vectors)
+def eigen(matrix, inertia):
+    """λ and X of `A x = λ E x`, and Z with `Z E X` = 1."""
+    values, vectors = lax.linalg.eig(jnp.linalg.solve(inertia, matrix), compute_left_eigenvectors=False)
+    return values, vectors, jnp.linalg.inv(inertia.astype(vectors.dtype) @ vectors)
+
+
+@one_by_one
+def solve(matrix, rhs):
+    """`matrix⁻¹ rhs`."""
+    return jnp.linalg.solve(matrix, rhs)
