@@ -85,5 +85,7 @@ top = lj.System(top_lagrangian)
 charge = lj.System(charge_lagrangian)
 disk = lj.System(disk_lagrangian, {"rolling": lj.Nonholonomic(rolling)})
 circulating = lj.System(
-    plane_lagrangian, force=follower, dissipation=lambda t, q, v, params: 0.5 * params["c"] * (v["x"] ** 2 + v["y"] ** 2)
+    plane_lagrangian,
+    force=follower,
+    dissipation=lambda t, q, v, params: 0.5 * params["c"] * (v["x"] ** 2 + v["y"] ** 2),
 )
