@@ -22,7 +22,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Complex, Float, Int
 
 from lagjax.analysis.linearised import Linearisation
-from lagjax.analysis.roots import Roots, general_roots, symmetric_roots, zero_count
+from lagjax.analysis.roots import Roots, general_roots, roots_beside_zeros, symmetric_roots, zero_count
 from lagjax.numerics import dense, lapack
 
 STABLE, ASYMPTOTIC, GYROSCOPIC, DIVERGENCE, FLUTTER, UNDECIDED, UNSTEADY = range(7)
@@ -155,13 +155,12 @@ def _of_first_order(found) -> Motions:
     nil = jnp.zeros_like(transfer)
     A = jnp.block([[drift, transfer], [-K, -C]])
     E = jnp.block([[jnp.eye(count, dtype=M.dtype), nil], [nil.T, M]])
-    roots = general_roots(A, E)
-    zeros = zero_count(A, E, roots.values)
-    values, zero = _cleaned(roots, zeros)
+    roots, zero = roots_beside_zeros(A, E)
+    values = jnp.where(zero, 0.0, roots.values)
     # Other speeds of what nothing depends on: no position has a part in them.
     columns = lapack.singular_values(jnp.concatenate([transfer, C]))
     speeds = jnp.sum(columns <= 1e-12 * jnp.max(columns, initial=0.0))
-    unexplained = jnp.where(all(found.kind.holonomic), jnp.maximum(zeros - speeds, 0), 0)
+    unexplained = jnp.where(all(found.kind.holonomic), jnp.maximum(jnp.sum(zero) - speeds, 0), 0)
     rho, w = of_q[:, None] * roots.vectors[:count], of_w[:, None] * roots.vectors[count:] * rate
     moving = p.velocities @ w + p.turning @ rho
     still = p.positions @ rho
