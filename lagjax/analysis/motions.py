@@ -63,7 +63,7 @@ def motions_of(found: Linearisation, definite: bool = True) -> Motions:
     """The motions of a linearisation; `definite`: take the mass matrix for positive definite."""
     if not found.kind.conservative:
         return _judged(found, _of_first_order(found))
-    if definite and (found.kind.at_rest or found.parts.positions.shape[1] == 1):
+    if definite and (found.kind.at_rest or found.parts.positions.shape[1] < 2):
         return _judged(found, _at_rest(found))
     return _judged(found, _gyroscopic(found))
 
@@ -87,7 +87,11 @@ def _routh(found) -> _Reduced:
 def _at_rest(found) -> Motions:
     """No gyroscopic forces: squares of frequencies."""
     reduced = _routh(found)
-    roots = symmetric_roots(reduced.position, reduced.mass)
+    if reduced.mass.shape[0]:
+        roots = symmetric_roots(reduced.position, reduced.mass)
+    else:
+        none = jnp.zeros(0, found.mass.dtype)
+        roots = Roots(none, jnp.zeros((0, 0), found.mass.dtype), none, none > 0, none > 0)
     squares = roots.values
     # What is left of terms that cancel.
     x = lax.stop_gradient(jnp.abs(roots.vectors))
@@ -260,8 +264,10 @@ def _with_shifts(found, reduced, values, x, mirrored, energies, double, zero, gr
 
 
 def _conservative(values, energies, zero, growing, defective):
+    if not values.size:
+        return jnp.asarray(STABLE)
     growth = jnp.where(growing, values.real, -jnp.inf)
-    flutters = values.imag[jnp.argmax(growth)] != 0 if values.size else False
+    flutters = values.imag[jnp.argmax(growth)] != 0
     settled = jnp.where(jnp.any(energies < 0), GYROSCOPIC, STABLE)
     undecided = jnp.any(zero) if defective is None else jnp.any(zero | defective)
     settled = jnp.where(undecided, UNDECIDED, settled)
