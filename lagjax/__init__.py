@@ -47,6 +47,8 @@ from lagjax.numerics.runge_kutta import Dopri8, Tsit5
 from lagjax.analysis.found import Symmetries
 from lagjax.analysis.hamilton import Hamiltonian, hamiltonian
 from lagjax.analysis.least_action import action
+from lagjax.analysis.linearised import Linearisation, linearise
+from lagjax.analysis.modes import Mode, NormalModes, normal_modes
 from lagjax.analysis.read_back import EquationsOfMotion, latex
 from lagjax.analysis.routh import Routhian, routhian
 from lagjax.analysis.symmetries import symmetries
@@ -146,6 +148,11 @@ __all__ = [
     "action",
     "latex",
     "EquationsOfMotion",
+    "linearise",
+    "Linearisation",
+    "normal_modes",
+    "NormalModes",
+    "Mode",
     "sweep",
     "Sweep",
     "Status",
