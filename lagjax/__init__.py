@@ -43,6 +43,11 @@ from lagjax.numerics.radau import Radau5
 from lagjax.numerics.runge_kutta import Dopri8, Tsit5
 
 # isort: split
+# What a system is like.
+from lagjax.analysis.equilibria import equilibria
+from lagjax.analysis.found_equilibria import Equilibria
+
+# isort: split
 # Many motions.
 from lagjax.sweeps.engine import sweep
 from lagjax.sweeps.lanes import Status
@@ -120,6 +125,8 @@ __all__ = [
     "Animation",
     "RESULTS",
     "AccuracyWarning",
+    "equilibria",
+    "Equilibria",
     "sweep",
     "Sweep",
     "Status",
