@@ -46,6 +46,7 @@ from lagjax.numerics.runge_kutta import Dopri8, Tsit5
 # What a system is like.
 from lagjax.analysis.equilibria import equilibria
 from lagjax.analysis.found_equilibria import Equilibria
+from lagjax.analysis.linearised import Linearisation, linearise
 
 # isort: split
 # Many motions.
@@ -127,6 +128,8 @@ __all__ = [
     "AccuracyWarning",
     "equilibria",
     "Equilibria",
+    "linearise",
+    "Linearisation",
     "sweep",
     "Sweep",
     "Status",

@@ -97,6 +97,36 @@ def _structure(args, names):
     )
 
 
+def unseen_coordinates(system, t, q, v, params) -> np.ndarray:
+    """Which coordinates nothing is known to depend on, L, R, Q and constraints: (n,) booleans.
+
+    All of them may be shifted, and nothing of the motion changes.
+    """
+    x, unflatten = coordinates.flatten(q)
+    if x.size + constraints.count(system, t, q, v, params) > UP_TO:
+        return _unseen_leaves(system, t, q, v, params)
+    written = in_numbers(system, unflatten), t, coordinates.numbers(q), coordinates.numbers(v), params
+    seen = np.zeros(x.size, bool)
+    try:
+        for f in _seen(written[0]):
+            numbers = _numbers(lambda _, *state, f=f: f(*state), written)
+            _, *state = numbers.state_variables
+            seen |= np.array([depends(numbers.program.jaxpr, [y]) for y in state[: x.size]])
+    except TooLong:
+        return _unseen_leaves(system, t, q, v, params)
+    return ~seen
+
+
+def _unseen_leaves(system, t, q, v, params):
+    """The same by whole leaves of q."""
+    unseen = []
+    for i, leaf in enumerate(jtu.tree_leaves(q)):
+        at = lambda args, i=i: jtu.tree_leaves(args[1])[i]
+        kinds = {_dependence(f, (t, q, v, params), at) for f in _seen(system)}
+        unseen += [kinds == {Depends.NOT}] * int(np.size(leaf))
+    return np.array(unseen)
+
+
 def is_diagonal(system, t, q, v, params) -> bool:
     """Whether the mass matrix is known to be diagonal."""
     x, _ = coordinates.flatten(q)

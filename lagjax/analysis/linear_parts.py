@@ -1,0 +1,212 @@
+"""The linear equations of small motions about a steady one, as matrices on the constraint surface.
+
+With `x = x₀ + u₀ t + ξ` and f = F + (A + B)ᵀ λ, the force with that of the constraints at their multipliers,
+
+    M ξ̈ + C ξ̇ + K ξ = Aᵀ δλ,    C = -∂f/∂u,    K = -∂f/∂x        (λ·∂²g is in K)
+
+Holonomic constraints leave the positions ξ = P η, with A_h P = 0. Velocity constraints, A_v ξ̇ + B_v ξ = 0 with
+B_v = ∂phi/∂q, leave fewer velocities, which need not be zero where a position is not:
+
+    ξ̇ = V w + W ξ,    A V = 0,    A W = -B_v (and zero of what is holonomic)
+
+Multiplied from the left with what no constraint force reaches, Lᵀ Aᵀ = 0 (L = V, but for friction), the equations are
+
+    (Lᵀ M V) ẇ + Lᵀ (M W + C) V w + Lᵀ ((M W + C) W + K) P η = 0,    η̇ = P⁺ (V w + W P η)
+
+A coordinate that nothing depends on has no part in them: it is found from ξ̇ afterwards, and is left out of η.
+
+Null spaces are found without derivatives, and then moved to where A takes them to zero: `N = (1 - A⁺ A) N₀` is a smooth
+basis, whose derivatives are those of what is computed with it.
+
+Source: Goldstein, *Classical Mechanics*, §6.1-6.2; Neimark & Fufaev, *Dynamics of Nonholonomic Systems*, ch. V;
+Meijaard, Papadopoulos, Ruina & Schwab, *Proc. R. Soc. A* 463 (2007) 1955, Appendix B (linearised velocity constraints).
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Float, PyTree
+
+from lagjax.mechanics import constraints, coordinates
+from lagjax.mechanics.lagrangian import forcing_and_inertia
+from lagjax.mechanics.reactions import response
+from lagjax.numerics.rank import independent_rows
+
+# Reciprocal condition, after scaling, below which the reduced mass matrix has no inverse.
+SINGULAR_BELOW = {np.dtype("float64"): 1e-13, np.dtype("float32"): 1e-6}
+
+
+class Kind(NamedTuple):
+    """What of a linearisation is known before any number is: hashable.
+
+    - `unseen` (n,): coordinates that nothing depends on. `holonomic` (m,): which constraint equations are.
+    - `independent` (m,): which of them to work with.
+    - `conservative`: no force, no dissipation and no velocity constraint; `at_rest`: no velocity, no term linear in
+      velocities.
+    - `timeless`: nothing depends on time.
+    """
+
+    unseen: tuple[bool, ...]
+    holonomic: tuple[bool, ...]
+    independent: tuple[bool, ...]
+    conservative: bool
+    at_rest: bool
+    timeless: bool
+
+
+class Raw(NamedTuple):
+    """All matrices in the coordinates themselves: they must not change along a steady motion."""
+
+    mass: Float[Array, "n n"]
+    velocity: Float[Array, "n n"]
+    position: Float[Array, "n n"]
+    rows: Float[Array, "m n"]
+    slopes: Float[Array, "m n"]
+
+
+class Parts(NamedTuple):
+    """The reduced equations, `mass ẇ + velocity w + position η = 0` and `η̇ = drift η + transfer w`.
+
+    - `positions` (n, n_p): P of the coordinates that something depends on, zero in the others; `velocities`: V;
+      `turning`: W P.
+    - `a`: the accelerations at the state itself, zero of a steady motion; `off`: residuals of the constraints, of
+      positions and velocities; `forces`: the size of what balances in each coordinate over its inertia.
+    - `sound`: the reduced mass matrix is regular and everything finite; `independent` (m,): the constraint equations.
+    """
+
+    mass: Float[Array, "k k"]
+    velocity: Float[Array, "k k"]
+    position: Float[Array, "k p"]
+    drift: Float[Array, "p p"]
+    transfer: Float[Array, "p k"]
+    positions: Float[Array, "n p"]
+    velocities: Float[Array, "n k"]
+    turning: Float[Array, "n p"]
+    multipliers: PyTree[Array]
+    a: Float[Array, " n"]
+    off: Float[Array, " r"]
+    forces: Float[Array, " n"]
+    sound: Bool[Array, ""]
+    independent: Bool[Array, " m"]
+    raw: Raw
+
+
+def parts_of(kind: Kind, system, t, q, v, params) -> Parts:
+    """The reduced equations at one state."""
+    x, unflatten = coordinates.flatten(q)
+    u, _ = coordinates.flatten(v)
+    n, m = x.size, len(kind.holonomic)
+    problem = system, t, x, u, params, unflatten
+    unseen, holonomic = np.array(kind.unseen, bool), np.array(kind.holonomic, bool)
+    chosen = np.array(kind.independent, bool)
+
+    forcing, inertia = forcing_and_inertia(*problem)
+    mass = jax.vmap(inertia)(jnp.eye(n, dtype=x.dtype)).astype(x.dtype)
+    mass = (mass + mass.T) / 2
+    rows, gamma = constraints.acceleration_rows(*problem)
+    slopes = jax.jacfwd(lambda x: constraints.velocity_residual(system, t, x, u, params, unflatten))(x)
+    slopes = jnp.where(holonomic[:, None], 0.0, slopes).astype(x.dtype)
+    friction = response(*problem)
+    pushing = rows.T if friction is None else rows.T + friction
+
+    all_independent = independent_rows(rows) if m else jnp.zeros(0, bool)
+    live, positions_live = rows[chosen], rows[chosen & holonomic][:, ~unseen]
+    velocities, lift = _null_space(live, all_independent[chosen])
+    kept, _ = _null_space(positions_live, all_independent[chosen & holonomic])
+    left = velocities if friction is None else _null_space(pushing.T[chosen], all_independent[chosen])[0]
+
+    # What balances the force at a steady motion, a = 0.
+    stacked = _spread(rows, live, lift, chosen, -_least_squares(pushing[:, chosen], forcing))
+
+    def total(x, u):
+        at = system, t, x, u, params, unflatten
+        force, _ = forcing_and_inertia(*at)
+        if m:
+            force = force + jax.grad(lambda u: stacked @ constraints.velocity_residual(*at[:3], u, *at[4:]))(u)
+        return force if friction is None else force + response(*at) @ stacked
+
+    by_position, by_velocity = jax.jacfwd(total, argnums=(0, 1))(x, u)
+    velocity, position = -by_velocity.astype(x.dtype), -by_position.astype(x.dtype)
+    if kind.at_rest:
+        velocity = jnp.zeros_like(velocity)
+    elif kind.conservative:
+        velocity = (velocity - velocity.T) / 2
+    if kind.conservative:
+        position = (position + position.T) / 2
+
+    turning = -lift @ slopes[chosen]
+    positions = jnp.zeros((n, kept.shape[1]), x.dtype).at[~unseen].set(kept)
+    drift, moved = turning @ positions, mass @ turning + velocity
+    # P⁺ of an all but orthonormal P, of which only rows that something depends on count.
+    back = _left_inverse(kept)
+    reduced_mass = left.T @ mass @ velocities
+    parts = (
+        reduced_mass, left.T @ moved @ velocities, left.T @ (moved @ turning + position) @ positions,
+        back @ drift[~unseen], back @ velocities[~unseen],
+    )  # fmt: skip
+    onto = lift @ gamma[chosen] if m else jnp.zeros_like(x)
+    sound = jnp.asarray(True)
+    for part in parts:
+        sound = sound & jnp.all(jnp.isfinite(part))
+    sound = sound & (_reciprocal_condition(reduced_mass) > SINGULAR_BELOW[np.dtype(x.dtype)])
+    safe = jnp.where(sound, reduced_mass, jnp.eye(reduced_mass.shape[0], dtype=x.dtype))
+    a = onto + velocities @ jnp.linalg.solve(safe, left.T @ (forcing - mass @ onto))
+    off = [constraints.position_residual(system, t, x, params, unflatten)] if holonomic.any() else []
+    off += [constraints.velocity_residual(*problem)] if m else []
+    held = pushing @ stacked if m else jnp.zeros_like(x)
+    diagonal = jnp.abs(jnp.diag(mass))
+    forces = (jnp.abs(forcing) + jnp.abs(held)) / jnp.where(diagonal > 0, diagonal, 1.0)
+    return Parts(
+        *parts, positions, velocities, drift,
+        constraints.split(system, stacked, t, q, v, params), a,
+        jnp.concatenate(off) if off else jnp.zeros(0, x.dtype), forces, sound, all_independent,
+        Raw(mass, velocity, position, rows, slopes),
+    )  # fmt: skip
+
+
+def _null_space(rows, independent):
+    """A basis (n, n - r) of what rows (r, n) take to zero, and their right inverse (n, r); smooth in the rows."""
+    r, n = rows.shape
+    if r == 0:
+        return jnp.eye(n, dtype=rows.dtype), jnp.zeros((n, 0), rows.dtype)
+    # What depends on others is left out, so that nothing here is NaN; who asks is told.
+    rows = jnp.where(independent[:, None], rows, 0.0)
+    start = jnp.linalg.qr(lax.stop_gradient(rows).T, mode="complete")[0][:, r:]
+    gram = rows @ rows.T + jnp.diag(jnp.where(independent, 0.0, 1.0).astype(rows.dtype))
+    lift = jnp.linalg.solve(gram, rows).T
+    return start - lift @ (rows @ start), lift
+
+
+def _left_inverse(basis):
+    return jnp.linalg.solve(basis.T @ basis, basis.T) if basis.shape[1] else basis.T
+
+
+def _least_squares(columns, target):
+    """The y for which `columns y` is nearest to the target, of independent columns."""
+    if columns.shape[1] == 0:
+        return jnp.zeros(0, target.dtype)
+    gram = columns.T @ columns
+    size = jnp.diag(gram)
+    return jnp.linalg.solve(gram + jnp.diag(jnp.where(size > 0, 0.0, 1.0)), columns.T @ target)
+
+
+def _spread(rows, live, lift, chosen, multipliers):
+    """The shortest multipliers of all equations that push as those of the chosen ones do."""
+    if chosen.all():
+        return multipliers
+    # Each row as a combination of the chosen ones.
+    combination = rows @ lift
+    return combination @ jnp.linalg.solve(combination.T @ combination, multipliers)
+
+
+def _reciprocal_condition(matrix):
+    """Of a matrix whose rows and columns are scaled by its diagonal."""
+    matrix = lax.stop_gradient(matrix)
+    largest = jnp.sqrt(jnp.maximum(jnp.max(jnp.abs(matrix), axis=0), jnp.max(jnp.abs(matrix), axis=1)))
+    scale = jnp.where(largest > 0, largest, 1.0)
+    scaled = matrix / (scale[:, None] * scale[None, :])
+    sizes = jnp.linalg.svd(jnp.where(jnp.isfinite(scaled), scaled, 0.0), compute_uv=False)
+    return sizes[-1] / jnp.where(sizes[0] > 0, sizes[0], 1.0)

@@ -1,0 +1,203 @@
+"""Small motions about an equilibrium or a steady motion: the linear equations, on the constraint surface.
+
+`linear_parts.py` has the derivation. Of the matrix that multiplies velocities the antisymmetric part is gyroscopic and
+does no work, the symmetric one damps; of that which multiplies positions the symmetric part is stiffness, and the
+antisymmetric one circulatory, which is neither: a force of it can feed energy in without end.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Complex, Float, PyTree
+
+from lagjax.analysis.linear_parts import Kind, Parts, parts_of
+from lagjax.analysis.steadiness import Steadiness, check_steady, steadiness_of
+from lagjax.jax_internals.tracing import is_eager
+from lagjax.mechanics import constraints, coordinates
+from lagjax.mechanics.closures import lift
+from lagjax.mechanics.compiled import compiled
+from lagjax.mechanics.coordinates import State
+from lagjax.mechanics.first_call import looked_at
+from lagjax.mechanics.memory import kinds, remembered
+from lagjax.mechanics.structure import structure, unseen_coordinates
+from lagjax.numerics.rank import DEPENDENT_BELOW
+
+
+class Linearisation(eqx.Module):
+    """The linear equations of small motions, `mass ẇ + (gyroscopic + damping) w + (stiffness + circulatory) η = 0`.
+
+    w (n,) are the velocities that all constraints leave, along the columns of `velocities`, and η the positions along
+    the same directions. Where there are velocity constraints, positions have more freedom than velocities:
+
+    - `mass`, `gyroscopic`, `damping`, `circulatory`, `stiffness` (n, n).
+    - `positions` (N, p): a basis of what holonomic constraints leave of the N coordinates; `velocities` (N, n): of what
+      all constraints leave of their velocities.
+    - `multipliers`: by constraint name, at the state itself; their force bends with the surface, and is in `stiffness`.
+    - `residual`: by how much the state is no steady motion: accelerations over what small motions of its own size
+      have, or the violation of a constraint. `lj.linearise` raises where it is large, but not while JAX is tracing.
+    - `state`: (t, q, v, params), about which this is. `sound`: whether the mass matrix is regular and all constraint
+      equations are independent; if not, nothing else here means anything.
+    """
+
+    mass: Float[Array, "n n"]
+    gyroscopic: Float[Array, "n n"]
+    damping: Float[Array, "n n"]
+    circulatory: Float[Array, "n n"]
+    stiffness: Float[Array, "n n"]
+    positions: Float[Array, "N p"]
+    velocities: Float[Array, "N n"]
+    multipliers: dict[str, Array]
+    residual: Float[Array, ""]
+    sound: Bool[Array, ""]
+    state: State
+    parts: Parts
+    kind: Kind = eqx.field(static=True)
+    names: tuple[str, ...] = eqx.field(static=True)
+
+    @property
+    def shifts(self) -> tuple[str, ...]:
+        """The coordinates that nothing depends on: each value of them is as good as another."""
+        return tuple(name for name, unseen in zip(self.names, self.kind.unseen) if unseen)
+
+    def first_order(self) -> tuple[Float[Array, "k k"], Float[Array, "k k"]]:
+        """Return E and A of `E ẏ = A y`, y = (positions, velocities); without positions that nothing depends on."""
+        p = self.parts
+        eye, corner = jnp.eye(p.drift.shape[0], dtype=p.mass.dtype), jnp.zeros_like(p.transfer)
+        return (
+            jnp.block([[eye, corner], [corner.T, p.mass]]),
+            jnp.block([[p.drift, p.transfer], [-p.position, -p.velocity]]),
+        )
+
+    def eigenvalues(self) -> Complex[Array, " k"]:
+        """Return all characteristic roots, `[1/t]`; a zero for each coordinate that nothing depends on."""
+        E, A = self.first_order()
+        safe = jnp.where(self.sound, E, jnp.eye(E.shape[0], dtype=E.dtype))
+        A = jnp.where(self.sound, jnp.linalg.solve(safe, A), 0.0)
+        found = jnp.linalg.eigvals(A)
+        return jnp.concatenate([found, jnp.zeros(len(self.shifts), found.dtype)])
+
+    def __repr__(self):
+        return f"Linearisation of {len(self.names)} coordinates, {self.mass.shape[-1]} freedoms"
+
+
+def linearise(system, t, q, v, params) -> Linearisation:
+    """Return the linear equations of small motions about an equilibrium or a steady motion.
+
+    >>> import jax.numpy as jnp
+    >>> import lagjax as lj
+    >>> def bead(t, q, v, params):
+    ...     turning = 0.5 * (params["omega"] * jnp.sin(q)) ** 2
+    ...     return 0.5 * v**2 + turning + params["g"] * jnp.cos(q)
+    >>> small = linearise(lj.System(bead), 0.0, 0.0, 0.0, {"omega": 2.0, "g": 9.0})
+    >>> print(small.mass, small.stiffness)
+    [[1.]] [[5.]]
+
+    **Arguments:** `t` scalar, `q`, `v` alike, `params` as L takes it: a state of rest, or of a motion that goes on with
+    these velocities while nothing else changes, as in coordinates that L does not contain.
+
+    **Returns:** a `Linearisation`, with derivatives by the state and `params`.
+
+    **Raises:**
+
+    - `ValueError` where the state is no equilibrium and no steady motion, with the coordinate that accelerates or the
+      constraint that is violated; where the equations change along the motion; where a mass matrix is singular. Not
+      while JAX is tracing: `residual` and `sound` tell.
+    - `TypeError`, `ValueError` for a state of the wrong shape or dtype.
+
+    Source: Goldstein, *Classical Mechanics*, §6.1-6.2; Meijaard et al., *Proc. R. Soc. A* 463 (2007) 1955, Appendix B.
+    """
+    s = coordinates.state(t, q, v, params)
+    system = looked_at(system, s)
+    traced = not is_eager() or coordinates.is_traced((s, eqx.filter(system, eqx.is_array)))
+    if traced:
+        system = lift(system, s)
+    kind = _kind(system, s)
+    n, m = len(kind.unseen), len(kind.holonomic)
+    if m >= n:
+        # Of so many equations some depend on others: which, only numbers tell.
+        kind = kind._replace(independent=_chosen(kind, system, s, traced))
+    if traced:
+        return _linearised(kind, system, *s)[0]
+    found, steadiness = _linearised(kind, system, *s)
+    if not np.all(np.asarray(found.parts.independent)[list(kind.independent)]):
+        kind = kind._replace(independent=_chosen(kind, system, s, traced))
+        found, steadiness = _linearised(kind, system, *s)
+    check_steady(system, found, steadiness, lambda *later: _linearised(kind, system, *later)[0])
+    return found
+
+
+def _kind(system, s: State) -> Kind:
+    """What is known of the linearisation before any number is."""
+    holonomic = tuple(bool(x) for x in constraints.holonomic_equations(system, *s))
+    alike = (_kind, system.read, kinds(s))
+    unseen, linear_terms, timeless = remembered(system, alike, lambda: _read_off(system, s))
+    at_rest = not coordinates.is_traced(s.v) and not any(np.any(x) for x in jax.tree.leaves(s.v))
+    conservative = system.force is None and system.dissipation is None and all(holonomic)
+    at_rest = conservative and at_rest and not linear_terms
+    return Kind(unseen, holonomic, (True,) * len(holonomic), conservative, at_rest, timeless)
+
+
+def _read_off(system, s):
+    found = structure(system, *s)
+    unseen = tuple(bool(x) for x in unseen_coordinates(system, *s))
+    return unseen, found is None or bool(found.linear_terms), found is not None and not found.explicit_time
+
+
+def _chosen(kind, system, s, traced) -> tuple[bool, ...]:
+    """A largest set of independent constraint equations, those of positions first."""
+    if traced:
+        raise ValueError(
+            f"{len(kind.holonomic)} constraint equations on {len(kind.unseen)} coordinates: some depend on others, and "
+            "while JAX is tracing it cannot be seen which.\n"
+            "Fix: leave out what depends on others; print(lj.explain(system, t, q, v, params)) names it."
+        )
+    x, unflatten = coordinates.flatten(s.q)
+    u, _ = coordinates.flatten(s.v)
+    rest = np.array(constraints.jacobian(system, s.t, x, u, s.params, unflatten))
+    size = np.linalg.norm(rest, axis=1)
+    rest /= np.where(size > 0, size, 1.0)[:, None]
+    holonomic, chosen = np.array(kind.holonomic, bool), np.zeros(len(size), bool)
+    for kept in (holonomic, ~holonomic):
+        for _ in range(np.sum(kept)):
+            left = np.where(kept & ~chosen, np.linalg.norm(rest, axis=1), 0.0)
+            farthest = int(np.argmax(left))
+            if left[farthest] <= DEPENDENT_BELOW[rest.dtype]:
+                break
+            chosen[farthest] = True
+            direction = rest[farthest] / left[farthest]
+            rest = rest - np.outer(rest @ direction, direction)
+    return tuple(bool(x) for x in chosen)
+
+
+@compiled
+def _linearised(kind: Kind, system, t, q, v, params) -> tuple[Linearisation, Steadiness]:
+    """The matrices by what they do, and how far the state is from a steady motion."""
+    s = State(t, q, v, params)
+    parts = parts_of(kind, system, *s)
+    # P⁺ V: the positions of displacements along the velocities.
+    along = parts.position @ parts.transfer
+    half = lambda matrix, sign: (matrix + sign * matrix.T) / 2
+    n, _ = coordinates.flatten(q)
+    shifts = jnp.eye(n.size, dtype=n.dtype)[:, np.array(kind.unseen, bool)]
+    steadiness = steadiness_of(kind, s, parts)
+    sound = parts.sound
+    if all(kind.independent) and kind.independent:
+        sound = sound & jnp.all(parts.independent)
+    found = Linearisation(
+        mass=parts.mass,
+        gyroscopic=half(parts.velocity, -1),
+        damping=half(parts.velocity, 1),
+        circulatory=half(along, -1),
+        stiffness=half(along, 1),
+        positions=jnp.concatenate([shifts, parts.positions], axis=1),
+        velocities=parts.velocities,
+        multipliers=parts.multipliers,
+        residual=steadiness.residual,
+        sound=sound,
+        state=s,
+        parts=parts,
+        kind=kind,
+        names=tuple(coordinates.names(q)),
+    )
+    return found, steadiness
