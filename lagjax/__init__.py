@@ -44,6 +44,8 @@ from lagjax.numerics.runge_kutta import Dopri8, Tsit5
 
 # isort: split
 # What a system is like.
+from lagjax.analysis.branches import Branch, Branches, Critical
+from lagjax.analysis.continuation import continue_equilibria
 from lagjax.analysis.equilibria import equilibria
 from lagjax.analysis.found_equilibria import Equilibria
 from lagjax.analysis.linearised import Linearisation, linearise
@@ -128,6 +130,10 @@ __all__ = [
     "AccuracyWarning",
     "equilibria",
     "Equilibria",
+    "continue_equilibria",
+    "Branches",
+    "Branch",
+    "Critical",
     "linearise",
     "Linearisation",
     "sweep",
