@@ -140,7 +140,7 @@ def escape(tracer: Tracer, point: Point) -> Found | None:
     # Elsewhere on the way the Jacobian is the same: the equations are linear.
     if np.max(np.abs(tracer.at(half)[1][:, :-1] - here)) > 1e-9 * np.max(np.abs(here)):
         return None
-    psi, _ = _null_vectors(here)
+    psi = np.linalg.svd(here)[0][:, -1]
     guide = np.append(np.zeros(n), 0.0)
     start = np.concatenate([np.zeros(n), point.z[-1:], psi])
     solved = _solved(tracer, ESCAPE, start, guide)
