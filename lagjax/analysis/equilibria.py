@@ -20,7 +20,7 @@ from jaxtyping import ArrayLike, PyTree
 from lagjax.analysis import balance as equations
 from lagjax.analysis.balance import MOMENTUM, VELOCITY, Steady
 from lagjax.analysis.found_equilibria import (
-    CONSTRAINED, LASTS_NOT, NO_BALANCE, NOT_FINITE, OK, Equilibria, Row, merged,
+    CONSTRAINED, LASTS_NOT, NO_BALANCE, NOT_FINITE, OK, UNFINISHED, Equilibria, Row, merged,
 )  # fmt: skip
 from lagjax.analysis.starts import checked, stacked, symmetries_of
 from lagjax.jax_internals.tracing import is_eager
@@ -30,7 +30,7 @@ from lagjax.mechanics.compiled import compiled
 from lagjax.mechanics.reactions import force_with_ones
 from lagjax.mechanics.structure import angles, sees_time
 from lagjax.motion.consistency import stopped
-from lagjax.numerics.roots import differentiable, least_squares_root, zero_below
+from lagjax.numerics.roots import MOST, differentiable, least_squares_root, zero_below
 
 # Of the imbalance, in units of what a displacement as large as the coordinates makes.
 BALANCED = {np.dtype("float64"): 1e-7, np.dtype("float32"): 1e-3}
@@ -193,6 +193,7 @@ def described(steady: Steady, y, root, y0, lasting) -> Row:
     return Row(
         fill(steady.unflatten(x)), fill(steady.unflatten(u)), fill(by_name), fill(rates), fill(momenta),
         stable, fill(roots), there, zero_modes, departure, status,
+        steady.unflatten(root.y[: steady.n]),
     )  # fmt: skip
 
 
@@ -216,7 +217,10 @@ def _verdict(steady: Steady, root, y0, lasting):
     # A force that fades is next to nothing far away.
     far = of_x > FAR * jnp.max(jnp.abs(y0[:n])) if steady.n else False
     status = jnp.where((departure <= limit) & ~(far & (jnp.max(jnp.abs(y0[:n])) > 0)), status, NO_BALANCE)
-    status = jnp.where(jnp.any(off[at] > limit), CONSTRAINED, status) if steady.m else status
+    if steady.m:
+        violated = jnp.max(off[at])
+        status = jnp.where((violated > limit) & (violated >= jnp.max(off[:n])), CONSTRAINED, status)
+    status = jnp.where((status == NO_BALANCE) & (root.steps >= MOST), UNFINISHED, status)
     status = jnp.where(jnp.isfinite(departure) & jnp.all(jnp.isfinite(root.y)), status, NOT_FINITE)
     return lax.stop_gradient((status, departure, _zero_modes(steady, root)))
 

@@ -14,13 +14,14 @@ from lagjax.mechanics import coordinates
 from lagjax.mechanics.diagnosis import describe
 from lagjax.mechanics.system import System
 
-OK, NO_BALANCE, CONSTRAINED, NOT_FINITE, LASTS_NOT = range(5)
+OK, NO_BALANCE, CONSTRAINED, NOT_FINITE, LASTS_NOT, UNFINISHED = range(6)
 WORDS = (
     "found",
     "no equilibrium near it: the imbalance of forces has a least value there that is not zero, or fades far away",
     "the constraints cannot be met there: they contradict each other, or the velocity that is held",
     "L, a force or a constraint is not finite on the way",
     "a balance at this instant alone: it depends on t, or moves off its place",
+    "the search is still on its way: start again from where it is, `last`",
 )
 # Coordinates that agree to this part of the largest are the same.
 SAME = 1e-6
@@ -40,6 +41,7 @@ class Row(NamedTuple):
     zero_modes: Int[Array, ""]
     departure: Float[Array, ""]
     status: Int[Array, ""]
+    last: PyTree[Float[Array, "..."]]
 
 
 class Equilibria(eqx.Module):
@@ -55,7 +57,8 @@ class Equilibria(eqx.Module):
       one of a family, the one nearest to its start, or a critical point where branches meet.
     - `departure` (E,): the imbalance, relative to what a displacement as large as the coordinates makes.
     - `found` (E,), `status` (S,): 0 where a start led to one; `describe(status)` says what another number means.
-    - `of_start` (S,): to which row each start led, -1 for none.
+    - `of_start` (S,): to which row each start led, -1 for none. `starts`, `last`: each leaf with a leading axis S, where
+      each search began and ended, also of those that found nothing.
 
     While JAX traces, E is S and what was not found is NaN.
     """
@@ -72,6 +75,7 @@ class Equilibria(eqx.Module):
     zero_modes: Int[Array, " E"]
     departure: Float[Array, " E"]
     status: Int[Array, " S"]
+    last: PyTree[Float[Array, "S ..."]]
     starts: PyTree[Float[Array, "S ..."]]
     params: PyTree
     system: System
@@ -123,7 +127,7 @@ def merged(rows: Equilibria, is_angle: PyTree[bool]) -> Equilibria:
             of_start[i] = len(kept)
             kept.append(i)
     pick = lambda tree: jax.tree.map(lambda x: x[np.array(kept, int)], tree)
-    of_rows = [name for name in Row._fields if name != "status"]
+    of_rows = [name for name in Row._fields if name not in ("status", "last")]
     return replace(rows, **{name: pick(getattr(rows, name)) for name in of_rows}, of_start=jnp.asarray(of_start))
 
 
@@ -159,8 +163,12 @@ def _lines(found: Equilibria):
     for code in range(1, len(WORDS)):
         lost = np.flatnonzero(status == code)
         if lost.size:
-            some = ", ".join(_start(found, i) for i in lost[:3]) + (", ..." if lost.size > 3 else "")
-            yield f"  {lost.size} start{'s' * (lost.size > 1)} led to none, {some}: {WORDS[code]}"
+            yield f"  {lost.size} start{'s' * (lost.size > 1)} led to none: {WORDS[code]}"
+            for i in lost[:3]:
+                at = lambda tree, i=i: describe(jax.tree.map(lambda x: x[i], tree))
+                yield f"    from {at(found.starts)} as far as {at(found.last)}"
+            if lost.size > 3:
+                yield "    ..."
 
 
 def _row(found, i):
@@ -191,6 +199,3 @@ def _number(x, largest=0.0):
     # What is nothing beside the others, and beside a radian, is round-off.
     return "0" if abs(x) < 1e-12 * max(largest, 1.0) else f"{float(x):.6g}"
 
-
-def _start(found, i):
-    return describe(jax.tree.map(lambda x: x[i], found.starts))

@@ -21,7 +21,8 @@ from jaxtyping import Array, Float, Int
 
 # Singular values below this part of the largest are zero.
 ZERO_BELOW = 1e3
-MOST = 150
+# A stiff system is followed along a narrow valley; a start that leads nowhere ends much earlier.
+MOST = 600
 
 
 class Root(NamedTuple):
