@@ -32,8 +32,11 @@ from lagjax.mechanics.constraints import Holonomic
 from lagjax.mechanics.lagrangian import forcing_and_inertia
 from lagjax.mechanics.reactions import response
 from lagjax.mechanics.system import System
+from lagjax.numerics.dense import reciprocal_condition
 from lagjax.numerics.rank import independent_rows
 
+# Reciprocal condition of the equations of motion below which they have no solution.
+SINGULAR_BELOW = {np.dtype("float64"): 1e-13, np.dtype("float32"): 1e-6}
 # What is held of each symmetry.
 VELOCITY, MOMENTUM = "velocity", "momentum"
 
@@ -225,7 +228,8 @@ def directions(s: Steady, d: Departures, y):
 def characteristic_roots(s: Steady, y):
     """All roots s of departures e^(st), and how many there are: beyond these are zeros, the smallest first.
 
-    Departures along the symmetry, which lead to the same motion, are left out.
+    Departures along the symmetry, which lead to the same motion, are left out. All NaN where the equations of motion are
+    singular. `lj.linearise` has more to say of one state; this is for many, inside of programs and along any symmetry.
     """
     d, n = departures(s, y), s.n
     project, count = directions(s, d, y)
@@ -235,11 +239,15 @@ def characteristic_roots(s: Steady, y):
     matrix = jnp.block([[d.mass, -pushes.T], [rows, jnp.diag(jnp.where(kept, 0.0, 1.0))]])
     slopes = jnp.where(kept[:, None], d.slopes, 0.0)
     known = jnp.block([[-d.stiffness, -d.damping], [jnp.zeros_like(rows), -slopes]])
-    accelerations = jnp.linalg.solve(matrix, known)[:n]
+    # Where a coordinate has no inertia, as an azimuth at the pole, its small motions have no equation.
+    sizes = jnp.maximum(jnp.max(jnp.abs(d.mass), axis=1), jnp.max(jnp.abs(rows), axis=0, initial=0.0))
+    sound = reciprocal_condition(matrix) > SINGULAR_BELOW[np.dtype(matrix.dtype)]
+    sound = sound & (jnp.min(sizes) > jnp.finfo(sizes.dtype).eps ** 1.3 * jnp.max(sizes))
+    accelerations = jnp.linalg.solve(jnp.where(sound, matrix, jnp.eye(n + m, dtype=matrix.dtype)), known)[:n]
     unit = jnp.eye(n, dtype=rows.dtype)
     whole = jnp.concatenate([jnp.concatenate([jnp.zeros_like(unit), unit], axis=1), accelerations])
     roots = jnp.linalg.eigvals(project @ whole @ project)
-    return roots[jnp.argsort(jnp.abs(roots))], count
+    return jnp.where(sound, roots[jnp.argsort(jnp.abs(roots))], jnp.nan), count
 
 
 def shortest(pushes, known):

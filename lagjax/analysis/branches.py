@@ -20,8 +20,9 @@ class Critical(eqx.Module):
 
     - `kind`: `"fold"`; `"pitchfork"` and `"transcritical"`, where branches cross; `"line of equilibria"`, where one of
       these exists at this parameter alone; `"flutter"`, where a pair of roots leaves the imaginary axis, by itself
-      (Hopf) or as two frequencies meet (without damping); `"divergence"`, where several roots are zero together, or one
-      without a crossing branch; `"escape"`, where the solution of linear equations is at infinity.
+      (Hopf) or as two frequencies meet (without damping); `"multiple zero"`, where the stiffness vanishes in several
+      directions together, as by symmetry (the branches that leave it are not followed); `"divergence"`, where a root
+      becomes positive and no branch crosses; `"escape"`, where the solution of linear equations is at infinity.
     - `parameter`: its value, and `accuracy`, the last step of Newton's method for it.
     - `q`, `v`, `multipliers`: the state there. `frequency` of flutter, `1/[t]`.
     - `derivative`: of `parameter` by every number in `params`, a tree like these; 0 of itself. None where the place is
@@ -104,18 +105,23 @@ class Branches(eqx.Module):
         ]
         width = max([12, *(len(c.kind) for c in self.critical)])
         for c in self.critical:
-            value = f"{self.along} = {float(c.parameter):.10g}"
+            value = f"{self.along} = {self._number(c.parameter)}"
             on = ", ".join(str(i + 1) for i in c.branches)
             more = f", frequency {float(c.frequency):.6g}" if c.kind == "flutter" else ""
             doubt = "" if c.derivative is not None else f" (to {float(c.accuracy):.0e})"
             lines.append(f"  {c.kind:<{width}}  {value + doubt:<19}  branch{'es' * (len(c.branches) > 1)} {on}{more}")
         for i, b in enumerate(self.branches):
             low, high = np.min(b.parameter), np.max(b.parameter)
-            span = f"{self.along} {low:.6g} to {high:.6g}" if high - low > 1e-9 * abs(high) else f"{self.along} {low:.6g}"
+            ends = self._number(low, 6), self._number(high, 6)
+            span = f"{self.along} {ends[0]} to {ends[1]}" if ends[0] != ends[1] else f"{self.along} {ends[0]}"
             lines.append(f"  {f'branch {i + 1}':<{width}}  {span:<19}  {_stability(b)}; ends at {b.status}")
         if self.status != "all followed":
             lines.append(f"  {self.status}")
         return "\n".join(lines)
+
+    def _number(self, x, digits=10):
+        # What is nothing beside the range is round-off.
+        return f"{0.0 if abs(x) < 1e-13 * abs(self.last - self.first) else float(x):.{digits}g}"
 
     def plot(self, *names: str):
         """Draw coordinates against the parameter: stable branches solid, unstable dashed, critical points marked.
@@ -157,15 +163,13 @@ class Branches(eqx.Module):
         inner = []
         for i, (branch, x) in enumerate(zip(self.branches, curves)):
             colour = plot.COLOURS[i % (len(plot.COLOURS) - 1)]
-            for where, stable in _runs(branch.stable):
-                axis.plot(
-                    branch.parameter[where], x[where, j], color=colour, linewidth=1.8 if stable else 1.3,
-                    linestyle="-" if stable else "--", zorder=2,
-                )  # fmt: skip
+            for where, verdict in _runs(branch):
+                _, dash, width = LOOKS[verdict]
+                axis.plot(branch.parameter[where], x[where, j], dash, color=colour, linewidth=width, zorder=2)
             inner.append(x[:, j])
-        for stable, label in ((True, "stable"), (False, "unstable")):
-            if any(np.any(b.stable == stable) for b in self.branches):
-                axis.plot([], [], color="0.2", linestyle="-" if stable else "--", label=label)
+        for verdict, (label, dash, _) in LOOKS.items():
+            if any(np.any(_verdicts(b) == verdict) for b in self.branches):
+                axis.plot([], [], dash, color="0.2", label=label)
         for c in self.critical:
             y = coordinates.flatten(c.q)[0][j]
             if c.kind == "escape":
@@ -176,11 +180,12 @@ class Branches(eqx.Module):
                 float(c.parameter), float(y), marker, color=plot.COLOURS[colour], markeredgecolor="white",
                 markersize=7, linestyle="", label=c.kind, zorder=4,
             )  # fmt: skip
-        # A branch that goes to infinity leaves the picture.
-        values = np.concatenate(inner)
-        if np.ptp(values) > 20 * np.subtract(*np.percentile(values, [90, 10])) > 0:
-            low, high = np.percentile(values, [5, 80])
-            axis.set_ylim(low - 0.5 * (high - low), high + 0.5 * (high - low))
+        if any(b.status.startswith("infinity") for b in self.branches):
+            # A branch that goes to infinity leaves the picture.
+            values = np.concatenate(inner)
+            near = values[np.abs(values) <= 8 * np.median(np.abs(values))]
+            middle, half = 0.5 * (near.min() + near.max()), 0.55 * np.ptp(near)
+            axis.set_ylim(middle - max(half, 1e-12), middle + max(half, 1e-12))
         axis.set(xlabel=self.along, ylabel=name)
 
 
@@ -197,15 +202,28 @@ def _columns(tree, rows):
     return np.concatenate([np.asarray(x).reshape(rows, -1) for x in jax.tree.leaves(tree)], axis=1)
 
 
-def _runs(stable):
-    """Runs of points alike, each with the first of the next: (slice, stable)."""
-    edges = [0, *(np.flatnonzero(np.diff(stable.astype(int))) + 1), len(stable)]
+UNKNOWN, UNSTABLE, STABLE = -1, 0, 1
+LOOKS = {
+    STABLE: ("stable", "-", 1.8), UNSTABLE: ("unstable", "--", 1.3), UNKNOWN: ("stability not known", ":", 1.3)
+}  # fmt: skip
+
+
+def _verdicts(branch):
+    """Of each point whether it is stable, as a number."""
+    known = np.any(np.isfinite(branch.eigenvalues), axis=1)
+    return np.where(known, np.asarray(branch.stable).astype(int), UNKNOWN)
+
+
+def _runs(branch):
+    """Runs of points alike, each with the first of the next: (slice, verdict)."""
+    verdicts = _verdicts(branch)
+    edges = [0, *(np.flatnonzero(np.diff(verdicts)) + 1), len(verdicts)]
     for start, end in zip(edges, edges[1:]):
-        yield slice(start, min(end + 1, len(stable))), bool(stable[start])
+        yield slice(start, min(end + 1, len(verdicts))), int(verdicts[start])
 
 
 def _stability(branch):
-    kinds = ["stable" if stable else "unstable" for _, stable in _runs(np.asarray(branch.stable))]
+    kinds = [LOOKS[verdict][0] for _, verdict in _runs(branch)]
     if len(kinds) > 4:
         return f"stable and unstable in turn ({len(kinds)} times)"
     return ", then ".join(kinds)

@@ -18,7 +18,7 @@ from lagjax.analysis.branches import Branch, Branches, Critical
 from lagjax.analysis.critical_points import Found, between, escape
 from lagjax.analysis.equilibria import held_at, searched
 from lagjax.analysis.found_equilibria import OK, WORDS
-from lagjax.analysis.starts import checked, stacked, symmetries_of
+from lagjax.analysis.starts import checked, stacked, stacked_one, symmetries_of
 from lagjax.analysis.tracing import FIRST, Path, Point, Tracer
 from lagjax.jax_internals.tracing import is_eager
 from lagjax.mechanics import coordinates
@@ -33,7 +33,7 @@ MOST_BRANCHES = 24
 NEARBY = 1.234e-3
 DEPENDENT = 1e-9
 # Points beyond which a branch at one value of the parameter is a line of equilibria.
-LINE, LINE_WITHIN = 8, 1e-9
+LINE, LINE_WITHIN = 40, 1e-9
 
 
 def continue_equilibria(
@@ -82,8 +82,7 @@ def continue_equilibria(
     Source: Keller, in *Applications of Bifurcation Theory* (1977) 359; Govaerts, *Numerical Methods for Bifurcations of
     Dynamical Equilibria*, ch. 2-4.
     """
-    q = jax.tree.map(lambda x: x[0], stacked([start], "start"))
-    v = jax.tree.map(jnp.zeros_like, q)
+    q, v = stacked_one(start)
     if velocity is not None:
         v = jax.tree.map(lambda x: x[0], stacked([velocity], "velocity"))
     if not is_eager() or coordinates.is_traced((q, v, params, t, to)):
@@ -233,7 +232,7 @@ class _Run:
         seen = self.tracer.point(critical.z, sign * launch.direction)
         if isinstance(seen, str):
             return Path([], seen)
-        begin = Point(critical.z, jacobian, sign * launch.direction, 0.0, seen.seen, None, launch.critical)
+        begin = Point(critical.z, jacobian, sign * launch.direction, 0.0, seen.seen, None, seen.negative, launch.critical)
         path = self.tracer.trace(begin, self.most, self._step, FIRST)
         self._far(path)
         return path
@@ -287,7 +286,7 @@ class _Run:
         point = self.tracer.point(found.z, after.tangent)
         if isinstance(point, str):
             point = after
-        return Point(found.z, point.jacobian, after.tangent, after.sign, point.seen, None, number)
+        return Point(found.z, point.jacobian, after.tangent, after.sign, point.seen, None, after.negative, number)
 
     def _number(self, found: Found) -> tuple[int, bool]:
         """Its number among those found, and whether it was known."""

@@ -19,11 +19,13 @@ import numpy as np
 from lagjax.analysis.branch_equations import (
     BRANCH, COLLISION, ESCAPE, FLUTTER, FOLD, MULTIPLE, curvature, dynamic_at, extended_at, extended_by_params,
 )  # fmt: skip
-from lagjax.analysis.tracing import Point, Tracer, growing
+from lagjax.analysis.tracing import Point, Tracer
 
 NEWTON = 12
 # Directions whose share of the parameter is less run across it.
 ACROSS = 1e-5
+# Changes of the parameter, of its range, that are none.
+CONSTANT = 1e-9
 # The unfolding β of a branch point, beside equations of the size of one, below which branches really meet.
 MEETS = 1e-8
 
@@ -44,6 +46,9 @@ class Found:
 def between(tracer: Tracer, a: Point, b: Point) -> list[Found]:
     """All that is critical between two neighbouring points of a branch."""
     found = []
+    if max(abs(b.z[-1] - a.z[-1]), abs(a.tangent[-1]), abs(b.tangent[-1])) < CONSTANT:
+        # On a line of equilibria nothing but round-off changes.
+        return []
     crosses, folds = a.sign * b.sign < 0, a.tangent[-1] * b.tangent[-1] < 0
     if crosses and (point := _branch_point(tracer, a, b)):
         found.append(point)
@@ -52,7 +57,25 @@ def between(tracer: Tracer, a: Point, b: Point) -> list[Found]:
     known = a.growing is not None and b.growing is not None
     if known and a.growing != b.growing and not found and (point := _loses_stability(tracer, a, b)):
         found.append(point)
+    if not found and (a.negative - b.negative) % 2 == 0 and a.negative != b.negative:
+        point = _multiple_zero(tracer, *_halved(tracer, a, b, lambda p: p.negative))
+        found += [point] if point else []
     return found
+
+
+def _halved(tracer, a, b, of):
+    """Two points of a branch much nearer to where a count changes that changes between a and b."""
+    low, high, left, right = 0.0, 1.0, a, b
+    for _ in range(14):
+        share = 0.5 * (low + high)
+        middle = tracer.between(a, b, share)
+        if middle is None or of(middle) is None:
+            break
+        if of(middle) == of(left):
+            low, left = share, middle
+        else:
+            high, right = share, middle
+    return left, right
 
 
 def _null_vectors(jacobian):
@@ -153,34 +176,22 @@ def escape(tracer: Tracer, point: Point) -> Found | None:
 
 def _loses_stability(tracer, a, b):
     """Where the number of growing roots changes without a crossing branch or a fold: flutter, or several zeros."""
-    few, many = (a, b) if a.growing < b.growing else (b, a)
-    low, high, left, right = 0.0, 1.0, a, b
-    for _ in range(14):
-        share = 0.5 * (low + high)
-        middle = tracer.between(a, b, share)
-        if middle is None or middle.growing is None:
-            break
-        if middle.growing == left.growing:
-            low, left = share, middle
-        else:
-            high, right = share, middle
+    left, right = _halved(tracer, a, b, lambda p: p.growing)
     few, many = (left, right) if left.growing < right.growing else (right, left)
-    new = _leaving(few.seen[-1], many.seen[-1])
+    new = _leaving(few, many)
     size = np.nanmax(np.abs(many.seen[-1]))
     if abs(new.imag) < 1e-3 * abs(size) and abs(new.imag) <= 30 * abs(new.real):
-        return _multiple_zero(tracer, few, many)
+        z, off = 0.5 * (few.z + many.z), float(np.max(np.abs(few.z - many.z)))
+        return _multiple_zero(tracer, few, many) or Found("divergence", z, [], 0.0, None, off, [])
     return _flutter(tracer, few, many, new)
 
 
-def _leaving(before, after):
+def _leaving(few, many):
     """The root that grows after and did not before."""
-    known = after[np.isfinite(after)]
-    grows = known[known.real > 0.0]
-    before = before[np.isfinite(before)]
+    known = many.seen[-1][np.isfinite(many.seen[-1])]
+    grows = known[np.argsort(-known.real)][: many.growing]
     # Of several the slowest is the one that has just begun to.
-    limit = 1e-7 * np.max(np.abs(known))
-    grows = grows[grows.real > limit]
-    root = grows[np.argmin(grows.real)] if growing(before) else grows[np.argmax(grows.real)]
+    root = grows[np.argmin(grows.real)]
     return complex(root.real, abs(root.imag))
 
 
@@ -189,12 +200,10 @@ def _multiple_zero(tracer, few, many):
     _, phi = _null_vectors(few.jacobian)
     solved = _solved(tracer, MULTIPLE, np.concatenate([z, phi]), phi)
     if solved is None or not _near(tracer, few, many, solved[0][: n + 1]):
-        z = 0.5 * (few.z + many.z)
-        off = float(np.max(np.abs(few.z - many.z)))
-        return Found("divergence", z, [], 0.0, None, off, [])
+        return None
     big, accuracy = solved
     derivative = _derivative(tracer, MULTIPLE, big, phi)
-    return Found("divergence", big[: n + 1], [], 0.0, derivative, accuracy, [])
+    return Found("multiple zero", big[: n + 1], [], 0.0, derivative, accuracy, [])
 
 
 def _near(tracer, a, b, z):
@@ -205,10 +214,10 @@ def _flutter(tracer, few, many, root):
     """The start of flutter: a pair of roots that crosses the axis, or two pairs that meet on it."""
     n = tracer.frame.columns.size
     roots = many.seen[-1][np.isfinite(many.seen[-1])]
-    # Without damping the mirror image of a growing root decays.
-    mirrored = np.min(np.abs(roots + np.conj(root))) < 1e-4 * abs(root)
-    kind = COLLISION if mirrored else FLUTTER
     omega = abs(root.imag)
+    # Without damping the mirror image of a growing root decays: there are two beside this place on the axis.
+    beside = np.sum(np.abs(roots - 1j * omega) < max(4 * abs(root.real), 1e-9 * omega))
+    kind = COLLISION if beside > 1 else FLUTTER
     stiffness, damping, mass = (np.asarray(x, float) for x in dynamic_at(tracer.frame, few.z.astype(tracer.dtype)))
     matrix = stiffness + 1j * omega * damping - omega**2 * mass
     size = np.max(np.abs(stiffness) + omega * np.abs(damping) + omega**2 * np.abs(mass), axis=1)

@@ -22,7 +22,7 @@ from lagjax.analysis.balance import MOMENTUM, VELOCITY, Steady
 from lagjax.analysis.found_equilibria import (
     CONSTRAINED, LASTS_NOT, NO_BALANCE, NOT_FINITE, OK, UNFINISHED, Equilibria, Row, merged,
 )  # fmt: skip
-from lagjax.analysis.starts import checked, stacked, symmetries_of
+from lagjax.analysis.starts import checked, stacked, stacked_one, symmetries_of
 from lagjax.jax_internals.tracing import is_eager
 from lagjax.mechanics import constraints, coordinates
 from lagjax.mechanics.closures import lift
@@ -71,7 +71,8 @@ def equilibria(
     **Arguments:**
 
     - `params`: as the system takes it.
-    - `starts`: a list of positions like q, or one tree like q whose leaves have a leading axis, one entry a start.
+    - `starts`: a list of positions like q, `[q]` for one; or one tree like q whose leaves have a leading axis, one
+      entry a start.
     - `velocities`: like v, one for all starts or as many; zero by default. Coordinates that move in them move steadily.
     - `cyclic`: what moves steadily: names of cyclic coordinates; or functions `motion(q, params)` -> like v, the
       velocity along a symmetry at a unit rate, as `{"x": -q["y"], "y": q["x"]}` of a rotation. By default the
@@ -94,7 +95,12 @@ def equilibria(
     count = jax.tree.leaves(q)[0].shape[0]
     v = jax.tree.map(jnp.zeros_like, q) if velocities is None else _velocities(velocities, q, count)
     first = jax.tree.map(lambda x: x[0], (q, v))
-    system, s = checked(system, t, *first, params)
+    try:
+        system, s = checked(system, t, *first, params)
+    except (TypeError, ValueError, IndexError):
+        if isinstance(starts, list) or velocities is not None or not _is_a_state(system, t, starts, params):
+            raise
+        return equilibria(system, params, starts=[starts], cyclic=cyclic, hold=hold, t=t)
     moving = None if velocities is None or coordinates.is_traced(v) else _moving(v, count)
     if cyclic is None and velocities is not None and moving is None:
         raise ValueError(
@@ -112,6 +118,15 @@ def equilibria(
     if not plain:
         return found
     return merged(found, angles(system, *s))
+
+
+def _is_a_state(system, t, q, params) -> bool:
+    """Whether what was given as several starts is one."""
+    try:
+        checked(system, t, *stacked_one(q), params)
+    except (TypeError, ValueError, IndexError):
+        return False
+    return True
 
 
 def conserves_balance(system, s) -> bool:

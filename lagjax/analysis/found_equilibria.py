@@ -19,7 +19,7 @@ WORDS = (
     "found",
     "no equilibrium near it: the imbalance of forces has a least value there that is not zero, or fades far away",
     "the constraints cannot be met there: they contradict each other, or the velocity that is held",
-    "L, a force or a constraint is not finite on the way",
+    "L, a force or a constraint is not finite on the way, or the way leads to infinity",
     "a balance at this instant alone: it depends on t, or moves off its place",
     "the search is still on its way: start again from where it is, `last`",
 )

@@ -47,6 +47,12 @@ def stacked(starts, what="starts") -> PyTree:
     return starts
 
 
+def stacked_one(q):
+    """A state of rest at q."""
+    q = jax.tree.map(lambda x: x[0], stacked([q]))
+    return q, jax.tree.map(jnp.zeros_like, q)
+
+
 def _float(x):
     """Whole numbers as floats of the default size."""
     if isinstance(x, bool | int) or isinstance(x, np.ndarray) and np.issubdtype(x.dtype, np.integer):

@@ -7,7 +7,8 @@ with the Jacobian `J = (E_y, E_μ)` and the tangent τ, `J τ = 0`,
 
 Lengths are those of positions and of the parameter. What is watched from point to point: the sign of `det (J; τ)`,
 which changes where another branch crosses (also where this one only touches the critical parameter, as the side branch
-of a pitchfork does); that of τ_μ, which changes at a fold; and the number of roots that grow.
+of a pitchfork does); that of τ_μ, which changes at a fold; the number of roots that grow; and that of
+negative eigenvalues of E_y, which changes by two where two are zero together.
 
 Source: Keller, in *Applications of Bifurcation Theory* (1977) 359; Allgower & Georg, *Introduction to Numerical
 Continuation Methods*, §8.1 (the determinant) and ch. 6 (steps).
@@ -35,7 +36,10 @@ LOST = "the equations that followed from others where the branch starts do so no
 
 @dataclass
 class Point:
-    """A point of a branch: z, the Jacobian and the tangent there, and what a user sees."""
+    """A point of a branch: z, the Jacobian and the tangent there, and what a user sees.
+
+    `sign` of the determinant, how many roots are `growing`, and how many eigenvalues of E_y are `negative`.
+    """
 
     z: np.ndarray
     jacobian: np.ndarray
@@ -43,6 +47,7 @@ class Point:
     sign: float
     seen: tuple
     growing: int | None
+    negative: int
     critical: int | None = None
 
 
@@ -67,6 +72,8 @@ class Tracer:
         self.dtype = np.dtype(frame.columns.dtype)
         self.eps = float(np.finfo(self.dtype).eps)
         self.unit = float(frame.unit)
+        # The fastest root so far, beside which one is round-off.
+        self.fastest = 0.0
 
     def at(self, z):
         """E, J and the largest of all equations."""
@@ -113,7 +120,8 @@ class Tracer:
         tangent = self.tangent(jacobian, along)
         seen = jax.tree.map(np.asarray, seen_at(self.frame, z.astype(self.dtype)))
         sign = np.linalg.slogdet(np.concatenate([jacobian, (self.weights * tangent)[None]]))[0]
-        return Point(z, jacobian, tangent, float(sign), seen, growing(seen[-1]))
+        negative = int(np.sum(np.linalg.eigvals(jacobian[:, :-1]).real < 0))
+        return Point(z, jacobian, tangent, float(sign), seen, self.growing(seen[-1]), negative)
 
     def trace(self, start: Point, most: int, on_step: Callable, first: float = FIRST) -> Path:
         """Follow a branch until it leaves the range of the parameter, ends or closes.
@@ -193,11 +201,10 @@ class Tracer:
         off = np.sqrt(self.weights @ (last.z - first.z) ** 2)
         return off < max(step, CLOSED_WITHIN) and (self.weights * first.tangent) @ last.tangent > 0.9
 
-
-def growing(roots) -> int | None:
-    """How many roots grow; None where they are not known."""
-    known = roots[np.isfinite(roots)]
-    if not known.size:
-        return None
-    limit = GROWS_ABOVE[np.dtype(known.real.dtype)] * np.max(np.abs(known))
-    return int(np.sum(known.real > limit))
+    def growing(self, roots) -> int | None:
+        """How many roots grow; None where they are not known."""
+        known = roots[np.isfinite(roots)]
+        if not known.size:
+            return None
+        self.fastest = max(self.fastest, float(np.max(np.abs(known))))
+        return int(np.sum(known.real > GROWS_ABOVE[self.dtype] * self.fastest))
