@@ -94,7 +94,7 @@ class Frame(eqx.Module):
 
 
 def place_of(steady: Steady, along: str) -> Place:
-    """Find a parameter by its name, `"omega"`, `"spring.k"`, `"k[1]"`; `"v.psi"` is a held velocity, `"p.psi"` a momentum."""
+    """Find a parameter by its name, `"omega"`, `"spring.k"`, `"k[1]"`; or what is held, `"v.psi"` or `"p.psi"`."""
     names = coordinates.names(steady.like)
     for kind, hold in (("v", equations.VELOCITY), ("p", equations.MOMENTUM)):
         of = [f"{kind}.{names[i]}" if names[i] != "q" else kind for i in steady.symmetries.places]
@@ -113,8 +113,9 @@ def place_of(steady: Steady, along: str) -> Place:
         if place.name == along:
             return place
     known = [place.name for place in found]
+    there = f"there {'are' if len(known) != 1 else 'is'} {listed(known) or 'none'}"
     raise ValueError(
-        f"along={along!r} is no number in params; there {'are' if len(known) != 1 else 'is'} {listed(known) or 'none'}.\n"
+        f"along={along!r} is no number in params; {there}.\n"
         'Fix: one of these; "spring.k" for params["spring"]["k"], and "v.psi" for the velocity of a cyclic coordinate '
         'psi that is held (with hold="momentum": "p.psi").'
     )
@@ -144,10 +145,9 @@ def seen_at(frame: Frame, z):
     if s.m > 1:
         pushes = equations.forces(s, s.t, x, u)
         multipliers = equations.shortest(pushes, multipliers @ pushes)
-        y = jnp.concatenate([x, rates, multipliers])
     by_name = equations.constraints.split(s.system, multipliers, s.t, s.like, s.like, s.params) if s.m else {}
-    roots, count = equations.characteristic_roots(s, y)
-    roots = jnp.where(jnp.arange(roots.size) < roots.size - count, jnp.nan, roots)
+    jacobian = jax.jacfwd(lambda y: equations.balance(s, y))(y)
+    roots = equations.characteristic_roots(s, y, jacobian)
     return z[-1] * frame.unit, s.unflatten(x), s.unflatten(u), by_name, roots
 
 
@@ -161,7 +161,7 @@ def curvature(frame: Frame, z, a, b):
 def dynamic(frame: Frame, z):
     """K, C, M of `D(s)`, bordered by the independent constraints."""
     s, y = frame.split(z)
-    d = equations.departures(s, y[: s.n + s.symmetries.count + s.m])
+    d = equations.departures(s, y, jax.jacfwd(lambda y: equations.balance(s, y))(y))
     m = d.rows.shape[0]
     kept = independent_rows(d.rows) & jnp.any(d.rows != 0, axis=1) if m else jnp.zeros(0, bool)
     keep = lambda rows: jnp.where(kept[:, None], rows, 0.0)

@@ -9,7 +9,6 @@ from jaxtyping import Array, Bool, Complex, Float, PyTree
 
 from lagjax import plot
 from lagjax.mechanics import coordinates
-from lagjax.mechanics.system import System
 
 MARKS = {"fold": ("s", 1), "pitchfork": ("o", 2), "transcritical": ("D", 3), "flutter": ("^", 4)}
 OTHER_MARK = ("X", 6)
@@ -82,7 +81,6 @@ class Branches(eqx.Module):
     first: float = eqx.field(static=True)
     last: float = eqx.field(static=True)
     names: tuple[str, ...] = eqx.field(static=True)
-    system: System
     params: PyTree
     status: str = eqx.field(static=True)
 

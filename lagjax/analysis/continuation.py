@@ -109,7 +109,7 @@ def continue_equilibria(
     tracer = Tracer(frame, low, high)
     run = _Run(tracer, most_points, crossings)
     run.main(z, np.sign(last - first))
-    return run.result(along, first, last, s, system)
+    return run.result(along, first, last, s)
 
 
 @compiled
@@ -232,7 +232,9 @@ class _Run:
         seen = self.tracer.point(critical.z, sign * launch.direction)
         if isinstance(seen, str):
             return Path([], seen)
-        begin = Point(critical.z, jacobian, sign * launch.direction, 0.0, seen.seen, None, seen.negative, launch.critical)
+        begin = Point(
+            critical.z, jacobian, sign * launch.direction, 0.0, seen.seen, None, seen.negative, launch.critical
+        )
         path = self.tracer.trace(begin, self.most, self._step, FIRST)
         self._far(path)
         return path
@@ -270,7 +272,7 @@ class _Run:
             if own is not None:
                 kept.used.append(own)
                 self.waiting = [w for w in self.waiting if w.critical != number or abs(w.direction @ along) <
-                                0.95 * np.sqrt((along @ along))]  # fmt: skip
+                                0.95 * np.sqrt(along @ along)]  # fmt: skip
                 if not known and self.crossings:
                     others = [d for d in kept.directions if d is not own]
                     self.waiting += [_Launch(number, d) for d in others]
@@ -297,7 +299,7 @@ class _Run:
         self.on.append(set())
         return len(self.found) - 1, False
 
-    def result(self, along, first, last, s, system) -> Branches:
+    def result(self, along, first, last, s) -> Branches:
         """All of it in the user's structure."""
         branches = [_branch(path, self.tracer) for path in self.paths]
         critical = [self._critical(i) for i in range(len(self.found))]
@@ -305,7 +307,7 @@ class _Run:
         names = coordinates.names(s.q)
         status = "all followed" if not self.waiting else f"{len(self.waiting)} crossing branches were not followed"
         return Branches(
-            branches, [critical[i] for i in order], along, float(first), float(last), tuple(names), system, s.params,
+            branches, [critical[i] for i in order], along, float(first), float(last), tuple(names), s.params,
             status,
         )  # fmt: skip
 

@@ -17,7 +17,16 @@ import jax
 import numpy as np
 
 from lagjax.analysis.branch_equations import (
-    BRANCH, COLLISION, ESCAPE, FLUTTER, FOLD, MULTIPLE, curvature, dynamic_at, extended_at, extended_by_params,
+    BRANCH,
+    COLLISION,
+    ESCAPE,
+    FLUTTER,
+    FOLD,
+    MULTIPLE,
+    curvature,
+    dynamic_at,
+    extended_at,
+    extended_by_params,
 )  # fmt: skip
 from lagjax.analysis.tracing import Point, Tracer
 

@@ -20,7 +20,15 @@ from jaxtyping import ArrayLike, PyTree
 from lagjax.analysis import balance as equations
 from lagjax.analysis.balance import MOMENTUM, VELOCITY, Steady
 from lagjax.analysis.found_equilibria import (
-    CONSTRAINED, LASTS_NOT, NO_BALANCE, NOT_FINITE, OK, UNFINISHED, Equilibria, Row, merged,
+    CONSTRAINED,
+    LASTS_NOT,
+    NO_BALANCE,
+    NOT_FINITE,
+    OK,
+    UNFINISHED,
+    Equilibria,
+    Row,
+    merged,
 )  # fmt: skip
 from lagjax.analysis.starts import checked, stacked, stacked_one, symmetries_of
 from lagjax.jax_internals.tracing import is_eager
@@ -114,7 +122,7 @@ def equilibria(
     lasting = not symmetries.count and conserves_balance(system, s)
     plain = is_eager() and not coordinates.is_traced((steady, q, v))
     rows = searched(steady, q, v, lasting, plain)
-    found = Equilibria(t=s.t, params=s.params, system=system, symmetries=symmetries, starts=q, **rows._asdict())
+    found = Equilibria(t=s.t, params=s.params, symmetries=symmetries, starts=q, **rows._asdict())
     if not plain:
         return found
     return merged(found, angles(system, *s))
@@ -193,12 +201,11 @@ def described(steady: Steady, y, root, y0, lasting) -> Row:
     if steady.m > 1:
         pushes = equations.forces(steady, steady.t, x, u)
         multipliers = equations.shortest(pushes, multipliers @ pushes)
-        y = jnp.concatenate([x, rates, multipliers])
     if steady.m:
         of_names = steady.system, multipliers, steady.t, steady.like, steady.like, steady.params
         by_name = constraints.split(*of_names)
-    roots, count = equations.characteristic_roots(steady, y)
-    roots = jnp.where(jnp.arange(roots.size) < roots.size - count, jnp.nan, roots)
+    # Roots that coincide have no derivatives: those of `lj.normal_modes` say where.
+    roots = equations.characteristic_roots(*stopped((steady, y, root.jacobian)))
     status, departure, zero_modes = _verdict(steady, root, y0, lasting)
     grows = GROWS_ABOVE[np.dtype(x.dtype)] * jnp.nanmax(jnp.abs(roots))
     stable = ~jnp.any(roots.real > grows) & jnp.any(jnp.isfinite(roots)) & (status == OK)
@@ -251,7 +258,7 @@ def _zero_modes(steady: Steady, root):
     of_rows = jnp.max(jnp.abs(matrix), axis=1).at[: n + steady.m].max(root.rows[: n + steady.m])
     matrix = matrix / positive(of_rows)[:, None]
     columns = jnp.max(jnp.abs(matrix), axis=0)
-    matrix = matrix / jnp.maximum(columns, least)[None, :]
+    matrix = matrix / jnp.where(columns > least, columns, 1.0)[None, :]
     matrix = jnp.where(jnp.isfinite(matrix), matrix, 0.0)
     sizes = lambda matrix: jnp.linalg.svd(matrix, compute_uv=False)
     rank = lambda matrix: jnp.sum(sizes(matrix) > least) if matrix.size else 0

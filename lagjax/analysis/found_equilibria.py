@@ -12,7 +12,6 @@ from jaxtyping import Array, Bool, Complex, Float, Int, PyTree
 from lagjax.analysis.balance import Symmetries
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.diagnosis import describe
-from lagjax.mechanics.system import System
 
 OK, NO_BALANCE, CONSTRAINED, NOT_FINITE, LASTS_NOT, UNFINISHED = range(6)
 WORDS = (
@@ -52,7 +51,7 @@ class Equilibria(eqx.Module):
     - `rates`, `momenta` (E, k): of each cyclic motion, `1/[t]` (`[q]/[t]` for a coordinate) and `[L][t]`.
     - `stable` (E,): no small departure grows. (Where none decays either, as without friction, of the linear equations:
       roots on the imaginary axis are their border.)
-    - `eigenvalues` (E, 2n): the roots s of departures e^(st), `1/[t]`, NaN beyond the last one.
+    - `eigenvalues` (E, 2n): the roots s of departures e^(st), `1/[t]`, NaN beyond the last one; without derivatives.
     - `zero_modes` (E,): along how many directions, besides the cyclic ones, the balance is kept to first order: it is
       one of a family, the one nearest to its start, or a critical point where branches meet.
     - `departure` (E,): the imbalance, relative to what a displacement as large as the coordinates makes.
@@ -78,7 +77,6 @@ class Equilibria(eqx.Module):
     last: PyTree[Float[Array, "S ..."]]
     starts: PyTree[Float[Array, "S ..."]]
     params: PyTree
-    system: System
     symmetries: Symmetries = eqx.field(static=True)
     of_start: Int[Array, " S"] | None = None
     words: ClassVar[tuple[str, ...]] = WORDS
@@ -97,7 +95,10 @@ class Equilibria(eqx.Module):
 
     def __repr__(self):
         if coordinates.is_traced((self.q, self.found)):
-            return f"Equilibria, being traced, of {self.found.shape[0]} starts"
+            return f"Equilibria, being traced, of {self.found.shape[-1]} starts"
+        if self.found.ndim > 1:
+            of = " x ".join(map(str, self.found.shape[:-1]))
+            return f"Equilibria, {int(np.sum(self.found))} from a batch of {of} with {self.found.shape[-1]} starts each"
         return "\n".join(_lines(self))
 
 
@@ -198,4 +199,3 @@ def _row(found, i):
 def _number(x, largest=0.0):
     # What is nothing beside the others, and beside a radian, is round-off.
     return "0" if abs(x) < 1e-12 * max(largest, 1.0) else f"{float(x):.6g}"
-

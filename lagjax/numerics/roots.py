@@ -100,7 +100,19 @@ def least_squares_root(residual: Callable, y0: Float[Array, " n"], linear: np.nd
     count = jax.eval_shape(residual, y0).shape[0]
     of = lambda *shape: jnp.zeros(shape, y0.dtype)
     one = jnp.ones((), y0.dtype)
-    start = (0, y0, of(count) * jnp.nan, of(count, y0.size), y0, of(count) + 1, of(y0.size), 1e-3 * one, 2 * one, of(), 2)
+    start = (
+        0,
+        y0,
+        of(count) * jnp.nan,
+        of(count, y0.size),
+        y0,
+        of(count) + 1,
+        of(y0.size),
+        1e-3 * one,
+        2 * one,
+        of(),
+        2,
+    )
     steps, y, r, jacobian, _, rows, *_ = lax.while_loop(unfinished, iterate, start)
     return Root(y, r, jacobian, rows, steps)
 
