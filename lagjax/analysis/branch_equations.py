@@ -114,6 +114,7 @@ def place_of(steady: Steady, along: str) -> Place:
             return place
     known = [place.name for place in found]
     there = f"there {'are' if len(known) != 1 else 'is'} {listed(known) or 'none'}"
+    there = f"there {'are' if len(known) != 1 else 'is'} {listed(known) or 'none'}"
     raise ValueError(
         f"along={along!r} is no number in params; {there}.\n"
         'Fix: one of these; "spring.k" for params["spring"]["k"], and "v.psi" for the velocity of a cyclic coordinate '

@@ -54,10 +54,11 @@ def continue_equilibria(
 
     >>> import jax.numpy as jnp
     >>> import lagjax as lj
-    >>> def bead(t, q, v, params):
-    ...     turning = 0.5 * (params["omega"] * jnp.sin(q)) ** 2
-    ...     return 0.5 * v**2 + turning + params["g"] * jnp.cos(q)
-    >>> found = lj.continue_equilibria(lj.System(bead), {"omega": 1.0, "g": 9.0}, 0.0, along="omega", to=5.0)
+    >>> def bead_on_hoop(t, q, v, params):
+    ...     height = -params["g"] * jnp.cos(q)
+    ...     return 0.5 * (v**2 + (params["omega"] * jnp.sin(q)) ** 2) - height
+    >>> system = lj.System(bead_on_hoop)
+    >>> found = lj.continue_equilibria(system, {"omega": 1.0, "g": 9.0}, 0.0, along="omega", to=5.0)
     >>> print(found)
     Branches of equilibria along omega, from 1 to 5: 2, with 1 critical point
       pitchfork     omega = 3            branches 1, 2

@@ -251,7 +251,7 @@ def _flutter(tracer, few, many, root):
 def _solved(tracer, kind, big, guide):
     """The larger system by Newton's method, shortest steps where it leaves some freedom; and its last step."""
     cast = lambda x: np.asarray(x, tracer.dtype)
-    last, n = np.inf, tracer.frame.columns.size
+    last, n, step, length = np.inf, tracer.frame.columns.size, big, np.inf
     for i in range(NEWTON):
         value, jacobian = (np.asarray(x, float) for x in extended_at(kind, tracer.frame, cast(big), cast(guide)))
         if not (np.all(np.isfinite(value)) and np.all(np.isfinite(jacobian))):

@@ -19,7 +19,7 @@ AS_STARTS = 'starts=[{"theta": 0.1}, {"theta": 3.0}], or starts={"theta": jnp.li
 
 
 def stacked(starts, what="starts") -> PyTree:
-    """Starts as one tree whose leaves have a leading axis: from a list of states, from such a tree, or from one state."""
+    """Starts as one tree whose leaves have a leading axis: of a list of states, such a tree, or one state."""
     if isinstance(starts, list):
         if not starts:
             raise ValueError(f"{what} is an empty list: a search needs a place to start from.\nFix: {AS_STARTS}.")

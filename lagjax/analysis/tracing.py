@@ -199,7 +199,7 @@ class Tracer:
             return False
         first, last = path.points[0], path.points[-1]
         off = np.sqrt(self.weights @ (last.z - first.z) ** 2)
-        return off < max(step, CLOSED_WITHIN) and (self.weights * first.tangent) @ last.tangent > 0.9
+        return bool(off < max(step, CLOSED_WITHIN) and (self.weights * first.tangent) @ last.tangent > 0.9)
 
     def growing(self, roots) -> int | None:
         """How many roots grow; None where they are not known."""

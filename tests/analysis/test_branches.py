@@ -53,7 +53,7 @@ def check(critical, exact, params, along):
 
 @pytest.mark.parametrize("from_the_side", [False, True])
 def test_bead(from_the_side):
-    """ω_c = √(g/a), dω_c/da = -½ √(g/a³), coming along the bottom or along the tilt, whose eigenvalue only touches zero."""
+    """ω_c = √(g/a), dω_c/da = -½ √(g/a³), along the bottom, or the tilt, whose eigenvalue only touches zero."""
     found = bead(8.0, 1.3, 1.0) if from_the_side else bead(1.0, 0.0, 8.0)
     (critical,) = found.critical
     assert critical.kind == "pitchfork" and critical.branches == (0, 1) and len(found) == 2
@@ -120,7 +120,8 @@ def test_column():
 def test_cross_rails():
     """ω² = k/m: a line of equilibria; ω² = K/m: the equilibrium goes to infinity, from either side."""
     params = cross_rails.PARAMS
-    system, root = cross_rails.rotating_system, lambda name: lambda p: jnp.sqrt(p[name] / p["m"]) + 0 * sum(p.values())
+    system = cross_rails.rotating_system
+    root = lambda name: lambda p: jnp.sqrt(p[name] / p["m"]) + 0 * jnp.sum(jnp.stack([*p.values()]))
     found = lj.continue_equilibria(system, params | {"omega": 1.0}, {"R": 0.8, "r": 0.0}, along="omega", to=9.0)
     assert [c.kind for c in found.critical] == ["line of equilibria", "escape"]
     check(found.critical[0], root("k"), params, "omega")

@@ -65,7 +65,7 @@ def test_multiplier_and_redundant_rods():
 
 @pytest.mark.slow
 def test_bead_and_its_derivatives():
-    """cos α = g/(a ω²) with first and second derivatives by a, in programs and lanes; twin: the derivative of the bottom."""
+    """cos α = g/(a ω²) with first and second derivatives by a, in programs and lanes; twin: the bottom's."""
     at = lambda a: lj.equilibria(bead_on_hoop.system, BEAD | {"a": a}, starts=[1.0]).q[0]
     exact = lambda a: tilt_of(BEAD | {"a": a})
     a = jnp.linspace(0.5, 2.0, 4)
@@ -200,7 +200,7 @@ def test_governor():
 
 
 def test_starts_that_lead_nowhere():
-    """A least imbalance, a force that fades, a root of a negative number: reported with their starts, and the rest found."""
+    """A least imbalance that is not zero is none; the starts are reported, and others find what there is."""
     hill = lj.System(lambda t, q, v, p: 0.5 * v**2 - q**3 / 3 - p["c"] * q)
     none = lj.equilibria(hill, {"c": 1.0}, starts=[1.0, -2.0])
     assert len(none) == 0 and none.status.tolist() == [NO_BALANCE] * 2
