@@ -150,6 +150,13 @@ class Branches(eqx.Module):
         )  # fmt: skip
         return fig
 
+    def _not_far(self, branch):
+        """Which points are shown: a branch that goes to infinity leaves the picture."""
+        ends = np.concatenate([branch.parameter[:1], branch.parameter[-1:]])
+        off = np.min(np.abs(branch.parameter[:, None] - ends), axis=1)
+        far = "infinity" in branch.status
+        return (off > 0.03 * abs(self.last - self.first)) | (not far)
+
     def _varying(self, curves):
         all_of = np.concatenate(curves)
         spread = np.ptp(all_of, axis=0)
@@ -178,10 +185,8 @@ class Branches(eqx.Module):
                 float(c.parameter), float(y), marker, color=plot.COLOURS[colour], markeredgecolor="white",
                 markersize=7, linestyle="", label=c.kind, zorder=4,
             )  # fmt: skip
-        if any(b.status.startswith("infinity") for b in self.branches):
-            # A branch that goes to infinity leaves the picture.
-            values = np.concatenate(inner)
-            near = values[np.abs(values) <= 8 * np.median(np.abs(values))]
+        if any("infinity" in b.status for b in self.branches):
+            near = np.concatenate([x[self._not_far(b)] for b, x in zip(self.branches, inner)])
             middle, half = 0.5 * (near.min() + near.max()), 0.55 * np.ptp(near)
             axis.set_ylim(middle - max(half, 1e-12), middle + max(half, 1e-12))
         axis.set(xlabel=self.along, ylabel=name)

@@ -56,8 +56,8 @@ class Equilibria(eqx.Module):
       one of a family, the one nearest to its start, or a critical point where branches meet.
     - `departure` (E,): the imbalance, relative to what a displacement as large as the coordinates makes.
     - `found` (E,), `status` (S,): 0 where a start led to one; `describe(status)` says what another number means.
-    - `of_start` (S,): to which row each start led, -1 for none. `starts`, `last`: leaves with a leading axis S, where each
-      search began and ended, also of those that found nothing.
+    - `of_start` (S,): to which row each start led, -1 for none. `starts`, `last`: leaves with a leading axis S, where
+      each search began and ended, also of those that found nothing.
 
     While JAX traces, E is S and what was not found is NaN.
     """

@@ -121,7 +121,10 @@ def test_cross_rails():
     """ω² = k/m: a line of equilibria; ω² = K/m: the equilibrium goes to infinity, from either side."""
     params = cross_rails.PARAMS
     system = cross_rails.rotating_system
-    root = lambda name: lambda p: jnp.sqrt(p[name] / p["m"]) + 0 * jnp.sum(jnp.stack([*p.values()]))
+
+    def root(name):
+        return lambda p: jnp.sqrt(p[name] / p["m"]) + 0 * (p["omega"] + p["R0"] + p["K"] + p["k"])
+
     found = lj.continue_equilibria(system, params | {"omega": 1.0}, {"R": 0.8, "r": 0.0}, along="omega", to=9.0)
     assert [c.kind for c in found.critical] == ["line of equilibria", "escape"]
     check(found.critical[0], root("k"), params, "omega")
