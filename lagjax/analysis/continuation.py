@@ -19,7 +19,7 @@ from lagjax.analysis.critical_points import Found, between, escape
 from lagjax.analysis.equilibria import held_at, searched
 from lagjax.analysis.found_equilibria import OK, WORDS
 from lagjax.analysis.starts import checked, stacked, stacked_one, symmetries_of
-from lagjax.analysis.tracing import FIRST, Path, Point, Tracer
+from lagjax.analysis.tracing import AGAIN, FIRST, Path, Point, Tracer
 from lagjax.jax_internals.tracing import is_eager
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.compiled import compiled
@@ -32,6 +32,8 @@ MOST_BRANCHES = 24
 # How far along the parameter the rank of the equations is asked again, in parts of its range.
 NEARBY = 1.234e-3
 DEPENDENT = 1e-9
+# A start that is next to nothing says nothing of the size of coordinates: what is far for it is asked in larger units.
+UNITS, NOTHING = (1.0, 1e3, 1e6, 1e9, 1e12), 1e-2
 # Points beyond which a branch at one value of the parameter is a line of equilibria.
 LINE, LINE_WITHIN = 40, 1e-9
 
@@ -105,12 +107,18 @@ def continue_equilibria(
             f"to={to} gives the parameter {along!r} no way to go from {first:.6g}.\n"
             f"Fix: to={2 * first or 1.0:.6g}, and the first value in params."
         )
-    frame, z = _frame(steady, place, first, last, s.v)
-    low, high = sorted((first / abs(last - first), last / abs(last - first)))
-    tracer = Tracer(frame, low, high)
-    run = _Run(tracer, most_points, crossings)
-    run.main(z, np.sign(last - first))
-    return run.result(along, first, last, s)
+    runs = []
+    for units in UNITS:
+        frame, z = _frame(steady, place, first, last, s.v, units)
+        # Where the start is a critical point, the branch begins a little before it.
+        low, high = sorted((float(z[-1]), last / abs(last - first)))
+        runs.append(_Run(Tracer(frame, low, high), most_points, crossings))
+        runs[-1].main(z, np.sign(last - first))
+        if "infinity" not in runs[-1].paths[0].status:
+            return runs[-1].result(along, first, last, s)
+        if np.max(frame.columns[: steady.n]) > NOTHING:
+            break
+    return runs[0].result(along, first, last, s)
 
 
 @compiled
@@ -128,7 +136,7 @@ def _solution(steady: Steady, v) -> np.ndarray | str:
     return np.concatenate([flat(row.q), row.rates, flat(row.multipliers)])
 
 
-def _frame(steady: Steady, place: Place, first: float, last: float, v) -> tuple[Frame, np.ndarray]:
+def _frame(steady: Steady, place: Place, first: float, last: float, v, units) -> tuple[Frame, np.ndarray]:
     """Units, and which combinations of equations are solved; and the point at which the branch begins."""
     y = _solution(steady, v)
     if isinstance(y, str):
@@ -144,7 +152,7 @@ def _frame(steady: Steady, place: Place, first: float, last: float, v) -> tuple[
         [np.full(np.size(x), yes) for yes, x in zip(*map(jax.tree.leaves, (_angles(steady), steady.like)))]
     )
     length = np.max(np.abs(y[:n])[~angle], initial=0.0)
-    positions = np.where(angle, 1.0, length if length > 0 else 1.0)
+    positions = np.where(angle, 1.0, units * length if length > 0 else 1.0)
     rows, columns, u, sizes, vt = _parts(steady, y, positions)
     rank = int(np.sum(sizes > DEPENDENT * sizes[0]))
     # At a critical point more is dependent than elsewhere: the rank is asked once more close by.
@@ -157,6 +165,9 @@ def _frame(steady: Steady, place: Place, first: float, last: float, v) -> tuple[
         if int(np.sum(those[1] > DEPENDENT * those[1][0])) > rank:
             u, sizes, vt = those
             rank = int(np.sum(sizes > DEPENDENT * sizes[0]))
+            before = first - NEARBY * (last - first)
+            earlier = _solution(place.put(beside, before), v)
+            first, y = (first, y) if isinstance(earlier, str) else (before, earlier)
     dtype = steady.t.dtype
     arrays = [jnp.asarray(a, dtype) for a in (u[:, :rank].T, vt[rank:], y / columns, rows, columns, unit)]
     frame = Frame(steady, *arrays, place)
@@ -261,14 +272,17 @@ class _Run:
                 self.found[points[0].critical].kind = "line of equilibria"
                 return "a line of equilibria, which goes on"
         ended = None
-        for found in between(self.tracer, before, after):
+        all_found = between(self.tracer, before, after)
+        if before.sign * after.sign < 0 and not any(found.directions for found in all_found):
+            return AGAIN
+        for found in all_found:
             number, known = self._number(found)
             kept = self.found[number]
             along = (self.tracer.weights * (after.z - before.z)) / np.linalg.norm(after.z - before.z)
             self.on[number].add(len(self.paths))
             if known and any(abs(_cosine(self.tracer, d, after.z - before.z)) > 0.95 for d in kept.used):
                 if kept.directions:
-                    ended = f"a branch that is known, at {self._value(kept)}"
+                    ended = f"a crossing that is known, at {self._value(kept)}"
             own = max(kept.directions, key=lambda d: abs(d @ along)) if kept.directions else None
             if own is not None:
                 kept.used.append(own)

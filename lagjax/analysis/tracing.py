@@ -31,6 +31,8 @@ MOST_TURN, TURN = 0.4, 0.12
 # Positions so many times their unit are at infinity.
 INFINITY = 1e4
 CLOSED_WITHIN = 1e-3
+# A crossing that is none shows that a step went from one branch to another; steps that short do not.
+AGAIN, SHORT = "again", 1e-6
 LOST = "the equations that followed from others where the branch starts do so no longer"
 
 
@@ -126,11 +128,13 @@ class Tracer:
     def trace(self, start: Point, most: int, on_step: Callable, first: float = FIRST) -> Path:
         """Follow a branch until it leaves the range of the parameter, ends or closes.
 
-        `on_step(before, after, path)` finds what lies between two points; it may return why the path ends.
+        `on_step(before, after, path)` finds what lies between two points; it may return why the path ends, or `AGAIN`
+        where a shorter step would tell.
         """
         path, point, step = Path([start]), start, first
         while len(path.points) < most:
-            after, step, why = self.next_point(point, step)
+            tried = step
+            after, step, why = self.next_point(point, tried)
             if after is None:
                 path.status = why
                 return path
@@ -138,6 +142,11 @@ class Tracer:
             if outside:
                 after = self.at_edge(point, after) or after
             ended = on_step(point, after, path)
+            if ended == AGAIN:
+                step = min(tried, float(np.sqrt(self.weights @ (after.z - point.z) ** 2))) / 4
+                if step > SHORT * self.size(point.z):
+                    continue
+                ended = None
             if ended:
                 path.status = ended
                 return path
