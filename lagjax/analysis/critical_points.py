@@ -10,10 +10,12 @@ One of them across the parameter (τ_μ = 0) makes it a pitchfork, or a line of 
 Source: Keller, *Lectures on Numerical Methods in Bifurcation Problems* (1987), §5.20-5.26; Govaerts, ch. 3.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
+import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from lagjax.analysis.branch_equations import (
@@ -190,8 +192,7 @@ def _loses_stability(tracer, a, b):
     new = _leaving(few, many)
     size = np.nanmax(np.abs(many.seen[-1]))
     if abs(new.imag) < 1e-3 * abs(size) and abs(new.imag) <= 30 * abs(new.real):
-        z, off = 0.5 * (few.z + many.z), float(np.max(np.abs(few.z - many.z)))
-        return _multiple_zero(tracer, few, many) or Found("divergence", z, [], 0.0, None, off, [])
+        return _multiple_zero(tracer, few, many) or _divergence(tracer, a, b, few, many)
     return _flutter(tracer, few, many, new)
 
 
@@ -213,6 +214,75 @@ def _multiple_zero(tracer, few, many):
     big, accuracy = solved
     derivative = _derivative(tracer, MULTIPLE, big, phi)
     return Found("multiple zero", big[: n + 1], [], 0.0, derivative, accuracy, [])
+
+
+def _divergence(tracer, a, b, few, many):
+    """Where a root leaves zero, among others that are always zero.
+
+    The characteristic polynomial begins with `c s^k` for k such roots, and c changes its sign. Of computed roots all
+    coefficients are those of a matrix that is off by round-off, although zeros of multiplicity k are off by its root.
+    """
+    fastest = tracer.fastest
+    tiny = lambda point: int(np.sum(np.abs(point.seen[-1]) < 1e-5 * fastest))
+    zeros = min(tiny(a), tiny(b))
+
+    def product(roots):
+        known = roots[np.isfinite(roots)]
+        return float(np.poly(known / fastest)[known.size - zeros].real)
+
+    low, high, left, right = 0.0, 1.0, product(a.seen[-1]), product(b.seen[-1])
+    best, off, last = many, float(np.max(np.abs(few.z - many.z))), np.inf
+    for i in range(60 if left * right < 0 else 0):
+        # A chord, and every third time the middle, so that neither end stays where it is.
+        share = low + (high - low) * (left / (left - right) if i % 3 < 2 else 0.5)
+        point = tracer.between(a, b, share)
+        if point is None or not 0 < high - low or share in (low, high):
+            break
+        value = product(point.seen[-1])
+        off, last, best = abs(float((point.z - best.z)[-1])), off, point
+        if value == 0 or max(off, last) < 4 * tracer.eps * tracer.size(point.z):
+            break
+        low, high, left, right = (share, high, value, right) if value * left > 0 else (low, share, left, value)
+    if left * right >= 0 or off > tracer.eps**0.6 * tracer.size(best.z):
+        return Found("divergence", best.z, [], 0.0, None, max(off, float(np.max(np.abs(few.z - many.z)))), [])
+    derivative = _slopes(tracer, best, lambda z, other: product(other.point(z, best.tangent).seen[-1]))
+    return Found("divergence", best.z, [], 0.0, derivative, off, [])
+
+
+def _slopes(tracer, point, value):
+    """Derivatives of the parameter at which `value(z, tracer)` is zero along a branch, by central differences."""
+    place, steady = tracer.frame.place, tracer.frame.steady
+    row = np.zeros_like(point.z)
+    row[-1] = 1.0
+    h = tracer.eps ** (1 / 3)
+
+    def at(other, z, parameter):
+        found = other.corrected(z, row, parameter)
+        return np.nan if found is None else value(found, other)
+
+    here = point.z[-1]
+    by_parameter = (at(tracer, point.z, here + h) - at(tracer, point.z, here - h)) / (2 * h)
+    floats, rest = eqx.partition(steady.params, eqx.is_inexact_array)
+    leaves, structure = jax.tree.flatten(floats)
+
+    def by(i, entry):
+        step = h * max(abs(float(np.ravel(leaves[i])[entry])), h)
+
+        def moved(sign):
+            leaf = np.array(leaves[i])
+            leaf.reshape(-1)[entry] += sign * step
+            params = eqx.combine(structure.unflatten([*leaves[:i], jnp.asarray(leaf), *leaves[i + 1 :]]), rest)
+            frame = replace(tracer.frame, steady=replace(steady, params=params))
+            return at(Tracer(frame, tracer.low, tracer.high), point.z, here)
+
+        return -tracer.unit * (moved(1) - moved(-1)) / (2 * step) / by_parameter
+
+    own = lambda i, entry: (
+        place.leaf is not None and leaves[i] is jax.tree.leaves(steady.params)[place.leaf] and (entry == place.entry)
+    )
+    found = [np.reshape([0.0 if own(i, j) else by(i, j) for j in range(np.size(x))], np.shape(x))
+             for i, x in enumerate(leaves)]  # fmt: skip
+    return structure.unflatten(found)
 
 
 def _near(tracer, a, b, z):

@@ -117,3 +117,35 @@ EXCHANGE = {"mu": -1.0, "c": 0.3, "d": 1.7}
 TOP = {"I1": 2.0, "I3": 0.7, "Mgl": 3.0}
 UPRIGHT = {"a": 0.0, "b": 0.0, "spin": 0.0}
 ZIEGLER = {"m": 1.3, "l": 0.7, "c": 2.0, "b": 0.2, "P": 0.1}
+
+
+def disk_lagrangian(t, q, v, params):
+    """A thin uniform disk on a plane: its centre, and its heading, lean and spin."""
+    m, r, lean = params["m"], params["r"], q["lean"]
+    across = v["lean"] ** 2 + (v["heading"] * jnp.cos(lean)) ** 2
+    about = (v["spin"] + v["heading"] * jnp.sin(lean)) ** 2
+    moving = v["x"] ** 2 + v["y"] ** 2 + (r * jnp.sin(lean) * v["lean"]) ** 2
+    return m * r**2 * (across / 8 + about / 4) + 0.5 * m * moving - m * params["g"] * r * jnp.cos(lean)
+
+
+def rolling(t, q, v, params):
+    """Its point of contact does not slide, forward or sideways."""
+    r, cos, sin = params["r"], jnp.cos(q["heading"]), jnp.sin(q["heading"])
+    forward = v["x"] * cos + v["y"] * sin - r * (v["spin"] + v["heading"] * jnp.sin(q["lean"]))
+    sideways = v["y"] * cos - v["x"] * sin + r * jnp.cos(q["lean"]) * v["lean"]
+    return jnp.stack([forward, sideways])
+
+
+disk = lj.System(disk_lagrangian, {"rolling": lj.Nonholonomic(rolling)})
+DISK = {"m": 2.0, "r": 0.6, "g": 9.8125}
+UPRIGHT_DISK = {"x": 0.0, "y": 0.0, "heading": 0.0, "lean": 0.0, "spin": 0.0}
+
+
+def straight_on(q, params):
+    """Rolling along x at one radian a unit of time."""
+    return UPRIGHT_DISK | {"spin": 1.0, "x": params["r"]}
+
+
+def slowest_rolling(params):
+    """Upright it is stable for a spin above √(g/(3 r))."""
+    return jnp.sqrt(params["g"] / (3 * params["r"]))

@@ -10,18 +10,23 @@ from lagjax.scenes import bead_on_hoop, cross_rails
 from tests.analysis.steady_systems import (
     BUCKLING,
     COLUMN,
+    DISK,
     EXCHANGE,
     TOP,
     TRUSS,
     UPRIGHT,
+    UPRIGHT_DISK,
     ZIEGLER,
     column,
     damped_flutter_load,
     damped_ziegler,
+    disk,
     exchange,
     flutter_load,
+    slowest_rolling,
     slowest_sleeping_spin,
     snap_through,
+    straight_on,
     top,
     truss,
     turning_pendulum,
@@ -188,6 +193,45 @@ def test_a_moving_constraint():
     check(critical, lambda p: jnp.sqrt(p["g"] / p["a"]) + 0 * p["m"], BEAD, "omega")
     np.testing.assert_allclose(found[1].v["theta"], found[1].parameter, rtol=1e-12)
     np.testing.assert_allclose(found[1].multipliers["motor"], 0.0, atol=1e-10)
+
+
+@pytest.mark.slow
+def test_rolling_disk():
+    """Rolling on straight ahead it is stable above √(g/(3 r)): a root leaves many zeros, and no branch crosses."""
+    velocity = {name: 8.0 * rate for name, rate in straight_on(UPRIGHT_DISK, DISK).items()}
+    settings = {"velocity": velocity, "cyclic": straight_on, "along": "v[0]", "to": 0.5}
+    (critical,) = lj.continue_equilibria(disk, DISK, UPRIGHT_DISK, **settings).critical
+    assert critical.kind == "divergence"
+    check(critical, lambda p: slowest_rolling(p) + 0 * p["m"], DISK, "v[0]")
+
+
+def test_closed_curve_and_folds_of_a_side_branch():
+    """A circle that crosses at both of its ends; a subcritical pitchfork whose branch folds at mu = -1/4."""
+    one = lambda potential: lj.System(lambda t, q, v, p: 0.5 * v**2 - potential(q, p["mu"]))
+    circle = one(lambda q, mu: 0.25 * q**4 - 0.5 * (1 - mu**2) * q**2)
+    found = lj.continue_equilibria(circle, {"mu": -2.0}, 0.0, along="mu", to=2.0)
+    assert [c.kind for c in found.critical] == ["pitchfork", "pitchfork"] and len(found) == 2
+    np.testing.assert_allclose([c.parameter for c in found.critical], [-1.0, 1.0], rtol=1e-12)
+    np.testing.assert_allclose(found[1].parameter ** 2 + found[1].q ** 2, 1.0, rtol=1e-12)
+    sudden = one(lambda q, mu: q**6 / 6 - 0.25 * q**4 - 0.5 * mu * q**2)
+    found = lj.continue_equilibria(sudden, {"mu": -1.0}, 0.0, along="mu", to=1.0)
+    np.testing.assert_allclose([c.parameter for c in found.of_kind("fold")], [-0.25, -0.25], rtol=1e-12)
+    np.testing.assert_allclose(sorted(float(c.q) for c in found.of_kind("fold")), [-(0.5**0.5), 0.5**0.5], rtol=1e-9)
+    assert float(found.of_kind("pitchfork")[0].parameter) == pytest.approx(0.0, abs=1e-13)
+
+
+@pytest.mark.parametrize("e", [1e-3, 1e-6])
+def test_nearly_a_pitchfork(e):
+    """With a small push there is no crossing, and steps do not jump to the other side: the branch stays stable."""
+    pushed = lj.System(lambda t, q, v, p: 0.5 * v**2 + 0.5 * p["mu"] * q**2 - 0.25 * q**4 + p["e"] * q)
+    found = lj.continue_equilibria(pushed, {"mu": -1.0, "e": e}, 0.0, along="mu", to=1.0)
+    assert len(found) == 1 and not found.critical and found[0].stable.all() and found[0].q[-1] > 0.9
+    back = lj.continue_equilibria(pushed, {"mu": 1.0, "e": e}, -1.0, along="mu", to=-1.0)
+    # The other side folds where mu³ = 27 e²/4.
+    (critical,) = back.critical
+    assert critical.kind == "fold"
+    np.testing.assert_allclose(critical.parameter, np.cbrt(6.75 * e**2), rtol=1e-10)
+    np.testing.assert_allclose(critical.derivative["e"], 2 / 3 * np.cbrt(6.75 / e), rtol=1e-8)
 
 
 # What is said.

@@ -9,7 +9,18 @@ import lagjax as lj
 from lagjax.analysis.found_equilibria import LASTS_NOT, NO_BALANCE, NOT_FINITE
 from lagjax.mechanisms import governor
 from lagjax.scenes import bead_on_hoop, cross_rails
-from tests.analysis.steady_systems import TOP, UPRIGHT, about_z, conical, slowest_sleeping_spin, top
+from tests.analysis.steady_systems import (
+    DISK,
+    TOP,
+    UPRIGHT,
+    UPRIGHT_DISK,
+    about_z,
+    conical,
+    disk,
+    slowest_sleeping_spin,
+    straight_on,
+    top,
+)
 from tests.systems import PARAMS, cartesian_lagrangian, double_pendulum, pendulum, rod, rod_pendulum
 
 BEAD = bead_on_hoop.PARAMS
@@ -194,6 +205,39 @@ def test_governor():
     assert found.stable.tolist() == [True]
     hanging = lj.equilibria(governor.system, p, starts=[start.q0])
     np.testing.assert_allclose([hanging.q.C[0, 0], hanging.q.C[0, 2]], [p["b"], 0.0], atol=1e-9)
+
+
+@pytest.mark.slow
+def test_roots_are_those_of_the_linearisation():
+    """Two derivations agree: gyroscopic, on constraints of positions and of velocities, with all kinds of forces."""
+    rng = np.random.default_rng(3)
+    matrices = {name: rng.normal(size=(4, 4)) for name in "KMDGN"}
+    params = {name: x @ x.T + np.eye(4) if name in "KMD" else x for name, x in matrices.items()}
+    params |= {"f": rng.normal(size=4), "c": rng.normal(size=4)}
+
+    def lagrangian(t, q, v, p):
+        return 0.5 * (v @ p["M"] @ v - q @ p["K"] @ q) + q @ p["G"] @ v + p["f"] @ q - 0.1 * jnp.sum(q**4)
+
+    surface = lj.Holonomic(lambda t, q, p: p["c"] @ q - 0.3 + 0.2 * q @ q)
+    general = lj.System(
+        lagrangian, {"surface": surface}, lambda t, q, v, p: 0.1 * p["N"] @ q, lambda t, q, v, p: 0.05 * v @ p["D"] @ v
+    )
+    straight = {name: np.asarray(x) * 3.0 for name, x in straight_on(UPRIGHT_DISK, DISK).items()}
+    cases = [
+        (general, params, np.zeros(4), {}),
+        (cross_rails.rotating_system, cross_rails.PARAMS | {"omega": 8.0}, {"R": -0.8, "r": 0.0}, {}),
+        (disk, DISK, UPRIGHT_DISK, {"velocities": straight, "cyclic": straight_on}),
+    ]
+    for system, p, start, settings in cases:
+        found = lj.equilibria(system, p, starts=[start], **settings)
+        theirs = np.asarray(lj.linearise(system, *found[0]).eigenvalues())
+        mine = np.asarray(found.eigenvalues[0])
+        mine = mine[np.isfinite(mine)]
+        largest = np.max(np.abs(theirs))
+        mine, theirs = (x[np.abs(x) > 1e-6 * largest] for x in (mine, theirs))
+        assert mine.size == theirs.size > 0
+        off = np.abs(mine[:, None] - theirs[None, :])
+        assert max(off.min(axis=0).max(), off.min(axis=1).max()) < 1e-12 * largest
 
 
 # Where there is none.
