@@ -49,6 +49,7 @@ from lagjax.analysis.continuation import continue_equilibria
 from lagjax.analysis.equilibria import equilibria
 from lagjax.analysis.found_equilibria import Equilibria
 from lagjax.analysis.linearised import Linearisation, linearise
+from lagjax.analysis.modes import Mode, NormalModes, normal_modes
 
 # isort: split
 # Many motions.
@@ -136,6 +137,9 @@ __all__ = [
     "Critical",
     "linearise",
     "Linearisation",
+    "normal_modes",
+    "NormalModes",
+    "Mode",
     "sweep",
     "Sweep",
     "Status",

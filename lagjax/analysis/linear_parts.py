@@ -33,6 +33,7 @@ from jaxtyping import Array, Bool, Float, PyTree
 from lagjax.mechanics import constraints, coordinates
 from lagjax.mechanics.lagrangian import forcing_and_inertia
 from lagjax.mechanics.reactions import response
+from lagjax.numerics import dense, lapack
 from lagjax.numerics.rank import independent_rows
 
 # Reciprocal condition, after scaling, below which the reduced mass matrix has no inverse.
@@ -103,9 +104,9 @@ def parts_of(kind: Kind, system, t, q, v, params) -> Parts:
     unseen, holonomic = np.array(kind.unseen, bool), np.array(kind.holonomic, bool)
     chosen = np.array(kind.independent, bool)
 
-    forcing, inertia = forcing_and_inertia(*problem)
-    mass = jax.vmap(inertia)(jnp.eye(n, dtype=x.dtype)).astype(x.dtype)
+    mass = jax.jacfwd(lambda u: _momentum(system, t, x, u, params, unflatten))(u).astype(x.dtype)
     mass = (mass + mass.T) / 2
+    velocity, position, forcing = _forces(kind, problem)
     rows, gamma = constraints.acceleration_rows(*problem)
     slopes = jax.jacfwd(lambda x: constraints.velocity_residual(system, t, x, u, params, unflatten))(x)
     slopes = jnp.where(holonomic[:, None], 0.0, slopes).astype(x.dtype)
@@ -116,20 +117,25 @@ def parts_of(kind: Kind, system, t, q, v, params) -> Parts:
     live, positions_live = rows[chosen], rows[chosen & holonomic][:, ~unseen]
     velocities, lift = _null_space(live, all_independent[chosen])
     kept, _ = _null_space(positions_live, all_independent[chosen & holonomic])
+    positions = jnp.zeros((n, kept.shape[1]), x.dtype).at[~unseen].set(kept)
+    if holonomic.all():
+        # The same directions for both, first the coordinates that nothing depends on.
+        velocities = jnp.concatenate([jnp.eye(n, dtype=x.dtype)[:, unseen], positions], axis=1)
     left = velocities if friction is None else _null_space(pushing.T[chosen], all_independent[chosen])[0]
 
     # What balances the force at a steady motion, a = 0.
     stacked = _spread(rows, live, lift, chosen, -_least_squares(pushing[:, chosen], forcing))
 
-    def total(x, u):
-        at = system, t, x, u, params, unflatten
-        force, _ = forcing_and_inertia(*at)
-        if m:
-            force = force + jax.grad(lambda u: stacked @ constraints.velocity_residual(*at[:3], u, *at[4:]))(u)
-        return force if friction is None else force + response(*at) @ stacked
-
-    by_position, by_velocity = jax.jacfwd(total, argnums=(0, 1))(x, u)
-    velocity, position = -by_velocity.astype(x.dtype), -by_position.astype(x.dtype)
+    if m:
+        held = lambda x, u: jax.grad(
+            lambda u: stacked @ constraints.velocity_residual(system, t, x, u, params, unflatten)
+        )(u)
+        by_position, by_velocity = jax.jacfwd(held, argnums=(0, 1))(x, u)
+        velocity, position = velocity - by_velocity.astype(x.dtype), position - by_position.astype(x.dtype)
+    if friction is not None:
+        rubbing = lambda x, u: response(system, t, x, u, params, unflatten) @ stacked
+        by_position, by_velocity = jax.jacfwd(rubbing, argnums=(0, 1))(x, u)
+        velocity, position = velocity - by_velocity.astype(x.dtype), position - by_position.astype(x.dtype)
     if kind.at_rest:
         velocity = jnp.zeros_like(velocity)
     elif kind.conservative:
@@ -137,34 +143,66 @@ def parts_of(kind: Kind, system, t, q, v, params) -> Parts:
     if kind.conservative:
         position = (position + position.T) / 2
 
-    turning = -lift @ slopes[chosen]
-    positions = jnp.zeros((n, kept.shape[1]), x.dtype).at[~unseen].set(kept)
-    drift, moved = turning @ positions, mass @ turning + velocity
-    # P⁺ of an all but orthonormal P, of which only rows that something depends on count.
-    back = _left_inverse(kept)
     reduced_mass = left.T @ mass @ velocities
+    if holonomic.all():
+        turning = jnp.zeros((n, n), x.dtype)
+        shifts = int(unseen.sum())
+        drift, transfer = (
+            jnp.zeros((kept.shape[1],) * 2, x.dtype),
+            jnp.eye(n - int(chosen.sum()), dtype=x.dtype)[shifts:],
+        )
+    else:
+        turning = -lift @ slopes[chosen]
+        # P⁺ of an all but orthonormal P, of which only rows that something depends on count.
+        back = _left_inverse(kept)
+        drift, transfer = back @ (turning @ positions)[~unseen], back @ velocities[~unseen]
+    moved = mass @ turning + velocity
     parts = (
-        reduced_mass, left.T @ moved @ velocities, left.T @ (moved @ turning + position) @ positions,
-        back @ drift[~unseen], back @ velocities[~unseen],
-    )  # fmt: skip
+        reduced_mass,
+        left.T @ moved @ velocities,
+        left.T @ (moved @ turning + position) @ positions,
+        drift,
+        transfer,
+    )
     onto = lift @ gamma[chosen] if m else jnp.zeros_like(x)
     sound = jnp.asarray(True)
     for part in parts:
         sound = sound & jnp.all(jnp.isfinite(part))
     sound = sound & (_reciprocal_condition(reduced_mass) > SINGULAR_BELOW[np.dtype(x.dtype)])
     safe = jnp.where(sound, reduced_mass, jnp.eye(reduced_mass.shape[0], dtype=x.dtype))
-    a = onto + velocities @ jnp.linalg.solve(safe, left.T @ (forcing - mass @ onto))
+    a = onto + velocities @ lapack.solve(safe, (left.T @ (forcing - mass @ onto))[:, None])[:, 0]
     off = [constraints.position_residual(system, t, x, params, unflatten)] if holonomic.any() else []
     off += [constraints.velocity_residual(*problem)] if m else []
     held = pushing @ stacked if m else jnp.zeros_like(x)
     diagonal = jnp.abs(jnp.diag(mass))
     forces = (jnp.abs(forcing) + jnp.abs(held)) / jnp.where(diagonal > 0, diagonal, 1.0)
     return Parts(
-        *parts, positions, velocities, drift,
+        *parts, positions, velocities, turning @ positions,
         constraints.split(system, stacked, t, q, v, params), a,
         jnp.concatenate(off) if off else jnp.zeros(0, x.dtype), forces, sound, all_independent,
         Raw(mass, velocity, position, rows, slopes),
     )  # fmt: skip
+
+
+def _momentum(system, t, x, u, params, unflatten):
+    return jax.grad(lambda u: system.lagrangian(t, unflatten(x), unflatten(u), params))(u)
+
+
+def _forces(kind: Kind, problem):
+    """-∂F/∂u, -∂F/∂x and F itself, without constraint forces."""
+    system, t, x, u, params, unflatten = problem
+    if kind.at_rest:
+        # No momentum at rest: the force is that of the potential.
+        slope = jax.grad(lambda x: system.lagrangian(t, unflatten(x), unflatten(jnp.zeros_like(u)), params))
+        position, forcing = jax.jacfwd(lambda x: 2 * (slope(x),), has_aux=True)(x)
+        return jnp.zeros((x.size, x.size), x.dtype), -position.astype(x.dtype), forcing.astype(x.dtype)
+
+    def force(x, u):
+        found, _ = forcing_and_inertia(system, t, x, u, params, unflatten)
+        return found, found
+
+    (position, velocity), forcing = jax.jacfwd(force, argnums=(0, 1), has_aux=True)(x, u)
+    return -velocity.astype(x.dtype), -position.astype(x.dtype), forcing
 
 
 def _null_space(rows, independent):
@@ -174,14 +212,14 @@ def _null_space(rows, independent):
         return jnp.eye(n, dtype=rows.dtype), jnp.zeros((n, 0), rows.dtype)
     # What depends on others is left out, so that nothing here is NaN; who asks is told.
     rows = jnp.where(independent[:, None], rows, 0.0)
-    start = jnp.linalg.qr(lax.stop_gradient(rows).T, mode="complete")[0][:, r:]
+    start = lapack.complement(rows.T)
     gram = rows @ rows.T + jnp.diag(jnp.where(independent, 0.0, 1.0).astype(rows.dtype))
-    lift = jnp.linalg.solve(gram, rows).T
+    lift = dense.solved(gram, rows).T
     return start - lift @ (rows @ start), lift
 
 
 def _left_inverse(basis):
-    return jnp.linalg.solve(basis.T @ basis, basis.T) if basis.shape[1] else basis.T
+    return dense.solved(basis.T @ basis, basis.T) if basis.shape[1] else basis.T
 
 
 def _least_squares(columns, target):
@@ -190,7 +228,7 @@ def _least_squares(columns, target):
         return jnp.zeros(0, target.dtype)
     gram = columns.T @ columns
     size = jnp.diag(gram)
-    return jnp.linalg.solve(gram + jnp.diag(jnp.where(size > 0, 0.0, 1.0)), columns.T @ target)
+    return dense.solved(gram + jnp.diag(jnp.where(size > 0, 0.0, 1.0)), columns.T @ target)
 
 
 def _spread(rows, live, lift, chosen, multipliers):
@@ -199,14 +237,13 @@ def _spread(rows, live, lift, chosen, multipliers):
         return multipliers
     # Each row as a combination of the chosen ones.
     combination = rows @ lift
-    return combination @ jnp.linalg.solve(combination.T @ combination, multipliers)
+    return combination @ dense.solved(combination.T @ combination, multipliers)
 
 
 def _reciprocal_condition(matrix):
-    """Of a matrix whose rows and columns are scaled by its diagonal."""
-    matrix = lax.stop_gradient(matrix)
+    """Of a matrix whose rows and columns are scaled by their largest entries."""
+    matrix = jnp.where(jnp.isfinite(matrix), lax.stop_gradient(matrix), 0.0)
     largest = jnp.sqrt(jnp.maximum(jnp.max(jnp.abs(matrix), axis=0), jnp.max(jnp.abs(matrix), axis=1)))
     scale = jnp.where(largest > 0, largest, 1.0)
-    scaled = matrix / (scale[:, None] * scale[None, :])
-    sizes = jnp.linalg.svd(jnp.where(jnp.isfinite(scaled), scaled, 0.0), compute_uv=False)
+    sizes = lapack.singular_values(matrix / (scale[:, None] * scale[None, :]))
     return sizes[-1] / jnp.where(sizes[0] > 0, sizes[0], 1.0)

@@ -9,7 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Complex, Float, PyTree
+from jaxtyping import Array, Bool, Complex, Float
 
 from lagjax.analysis.linear_parts import Kind, Parts, parts_of
 from lagjax.analysis.steadiness import Steadiness, check_steady, steadiness_of
@@ -21,6 +21,7 @@ from lagjax.mechanics.coordinates import State
 from lagjax.mechanics.first_call import looked_at
 from lagjax.mechanics.memory import kinds, remembered
 from lagjax.mechanics.structure import structure, unseen_coordinates
+from lagjax.numerics import dense
 from lagjax.numerics.rank import DEPENDENT_BELOW
 
 
@@ -73,7 +74,7 @@ class Linearisation(eqx.Module):
         """Return all characteristic roots, `[1/t]`; a zero for each coordinate that nothing depends on."""
         E, A = self.first_order()
         safe = jnp.where(self.sound, E, jnp.eye(E.shape[0], dtype=E.dtype))
-        A = jnp.where(self.sound, jnp.linalg.solve(safe, A), 0.0)
+        A = jnp.where(self.sound, dense.solved(safe, A), 0.0)
         found = jnp.linalg.eigvals(A)
         return jnp.concatenate([found, jnp.zeros(len(self.shifts), found.dtype)])
 
@@ -123,7 +124,7 @@ def linearise(system, t, q, v, params) -> Linearisation:
     if not np.all(np.asarray(found.parts.independent)[list(kind.independent)]):
         kind = kind._replace(independent=_chosen(kind, system, s, traced))
         found, steadiness = _linearised(kind, system, *s)
-    check_steady(system, found, steadiness, lambda *later: _linearised(kind, system, *later)[0])
+    check_steady(system, found, steadiness, lambda *later: linearised(kind, system, State(*later)))
     return found
 
 
@@ -168,6 +169,11 @@ def _chosen(kind, system, s, traced) -> tuple[bool, ...]:
             direction = rest[farthest] / left[farthest]
             rest = rest - np.outer(rest @ direction, direction)
     return tuple(bool(x) for x in chosen)
+
+
+def linearised(kind: Kind, system, s: State) -> Linearisation:
+    """The linear equations at another state of the same kind, whether it is steady or not."""
+    return _linearised(kind, system, *s)[0]
 
 
 @compiled

@@ -16,6 +16,7 @@ from lagjax.analysis.linear_parts import Kind, Parts
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.coordinates import State
 from lagjax.mechanics.diagnosis import equation_names, explain_failure, where
+from lagjax.numerics import lapack
 
 # A state that is typed with seven digits is near enough; frequencies are then known to as many.
 STEADY_BELOW = {np.dtype("float64"): 1e-6, np.dtype("float32"): 1e-3}
@@ -40,7 +41,7 @@ def steadiness_of(kind: Kind, s: State, parts: Parts) -> Steadiness:
     size, speed = jnp.where(size > 0, size, 1.0), largest(u)
     row_sum = lambda matrix: jnp.max(jnp.sum(jnp.abs(matrix), axis=1), initial=0.0)
     mass = jnp.where(parts.sound, parts.mass, jnp.eye(parts.mass.shape[0], dtype=x.dtype))
-    per_mass = lambda matrix: row_sum(jnp.linalg.solve(mass, jnp.nan_to_num(matrix)))
+    per_mass = lambda matrix: row_sum(lapack.solve(mass, jnp.nan_to_num(matrix)))
     rate = per_mass(parts.velocity) + row_sum(parts.drift)
     own = (per_mass(parts.position) + rate**2) * size + rate * speed
     left = jnp.maximum(jnp.abs(parts.a) - 1e4 * eps * (largest(parts.forces) + speed**2 / size), 0.0)
@@ -50,8 +51,9 @@ def steadiness_of(kind: Kind, s: State, parts: Parts) -> Steadiness:
     holonomic = slopes[np.array(kind.holonomic, bool)]
     allowed = jnp.concatenate([holonomic * size, slopes * jnp.where(speed > 0, speed, size)])
     off = jnp.abs(parts.off) / jnp.where(allowed > 0, allowed, 1.0)
-    # NaN, of what is not finite, counts as far off.
-    relative = jnp.nan_to_num(jax.lax.stop_gradient(jnp.concatenate([relative, off])), nan=jnp.inf)
+    # What is not finite counts as far off.
+    relative = jax.lax.stop_gradient(jnp.concatenate([relative, off]))
+    relative = jnp.where(jnp.isfinite(relative) & parts.sound, relative, jnp.inf)
     return Steadiness(relative, jnp.max(relative, initial=0.0))
 
 

@@ -35,7 +35,7 @@ def film(
             "Fix: traj.animate(positions, seconds=10.0), and a trail of zero or more seconds."
         )
     at = np.linspace(t[0], t[-1], count)
-    points = _drawn(positions, at, hermite(t, q, v, at), traj.params)
+    points = drawn(positions, at, hermite(t, q, v, at), traj.params)
     _check_dense(positions, t, q, v, traj.params, points)
     return Animation(at, points, rate, int(min(trail * rate, count)))
 
@@ -75,7 +75,7 @@ def _reached(traj, ended_by_event):
     return t, q, v
 
 
-def _drawn(positions, t, q, params) -> dict[str, np.ndarray]:
+def drawn(positions, t, q, params) -> dict[str, np.ndarray]:
     """What `positions` makes of each state: by name, (T, k, 2)."""
     frames = []
     for i, now in enumerate(t):
@@ -124,8 +124,8 @@ def _check_dense(positions, t, q, v, params, points):
     """Raise where the outputs are too far apart for what is drawn between them."""
     every_other, skipped = slice(None, None, 2), slice(1, len(t) - 1, 2)
     half = lambda tree: jax.tree.map(lambda x: x[every_other], tree)
-    guessed = _drawn(positions, t[skipped], hermite(t[every_other], half(q), half(v), t[skipped]), params)
-    known = _drawn(positions, t[skipped], jax.tree.map(lambda x: x[skipped], q), params)
+    guessed = drawn(positions, t[skipped], hermite(t[every_other], half(q), half(v), t[skipped]), params)
+    known = drawn(positions, t[skipped], jax.tree.map(lambda x: x[skipped], q), params)
     size = max(np.ptp(x.reshape(-1, 2), axis=0).max() for x in points.values())
     missed = max(np.abs(guessed[name] - known[name]).max() for name in known)
     if missed > MAY_MISS * size:

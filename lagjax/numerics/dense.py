@@ -68,10 +68,18 @@ def refined(inverted, matrix, rhs):
     return x + inverted @ (rhs - matrix @ x)
 
 
+def solved(matrix: Float[Array, "n n"], rhs: Array) -> Array:
+    """`matrix^-1 @ rhs` of one or several right-hand sides, by the inverse, refined once; derivatives of any order.
+
+    Where lanes are many, XLA's own batches of LAPACK's solve can wait for each other without end.
+    """
+    return refined(inverse(matrix), matrix, rhs)
+
+
 def inverse(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
     """Invert a matrix: by elimination that XLA fuses where it is small, by LAPACK above."""
     n = matrix.shape[0]
-    if n == 1:
+    if n < 2:
         return 1 / matrix
     if n > ELIMINATE_INSIDE_UP_TO:
         return jnp.linalg.inv(matrix)

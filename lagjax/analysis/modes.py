@@ -1,0 +1,245 @@
+"""Normal modes: how a system moves near an equilibrium or a steady motion, and whether it stays there."""
+
+from typing import ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Complex, Float, Int, PyTree
+
+from lagjax.analysis.drawn_modes import animated, drawn_mode, drawn_roots
+from lagjax.analysis.linearised import Linearisation, linearise, linearised
+from lagjax.analysis.motions import ASYMPTOTIC, GYROSCOPIC, STABLE, UNDECIDED, Motions, motions_of
+from lagjax.analysis.neutral import leads_to_others, with_neutral
+from lagjax.analysis.steadiness import STEADY_BELOW
+from lagjax.analysis.verdicts import VERDICTS, label_of, reason_of
+from lagjax.jax_internals.tracing import is_eager
+from lagjax.mechanics import coordinates
+from lagjax.mechanics.compiled import compiled
+
+
+class Mode(eqx.Module):
+    """One small motion, `Re(shape · exp(root · t))` times any size.
+
+    - `root`: growth + i frequency, `[1/t]`. `shape`: like q, complex, its largest entry one.
+    - `energy`: its sign, 0 where it does not oscillate steadily or the system is not conservative.
+    - `double`: another mode has the same root.
+    """
+
+    root: Complex[Array, ""]
+    shape: PyTree[Complex[Array, "..."]]
+    energy: Int[Array, ""]
+    double: Bool[Array, ""]
+    linearisation: Linearisation
+    label: str = eqx.field(static=True)
+
+    @property
+    def frequency(self) -> Float[Array, ""]:
+        """Radians a unit of time."""
+        return jnp.imag(self.root)
+
+    @property
+    def growth(self) -> Float[Array, ""]:
+        """By how much the logarithm of its size grows in a unit of time."""
+        return jnp.real(self.root)
+
+    def plot(self):
+        """Plot how much each coordinate moves, with its phase, and the motion; returns a matplotlib `Figure`.
+
+        **Raises:** `ImportError` without matplotlib.
+        """
+        return drawn_mode(self)
+
+    def animate(self, positions, *, amplitude=0.2, seconds: float = 6.0, rate: float = 25.0, trail: float = 0.0):
+        """Play the mode: points in the plane, as `Trajectory.animate` draws them.
+
+        **Arguments:** `positions(t, q, params)` -> points, see `lj.Trajectory.animate`; `amplitude`: how far the
+        coordinate moves that moves farthest, `[q]`; `seconds`, `rate`, `trail`: of the film.
+
+        **Returns:** an `Animation` of some periods on top of the steady motion; of a mode that grows or decays, of a
+        few times in which it does by a factor e.
+
+        **Raises:** `ValueError` for positions that are no points of the plane.
+        """
+        return animated(self, positions, amplitude, seconds, rate, trail)
+
+    def __repr__(self):
+        return f"Mode(root = {complex(self.root):.6g}; {self.label})"
+
+
+class NormalModes(eqx.Module):
+    """The small motions about a steady one, by ascending frequency. They print and plot themselves; `modes[i]` is one.
+
+    - `roots` (k,): growth + i frequency of each, `[1/t]`; `frequency`, `growth`: its parts. Of two roots that are one
+      motion (conjugates; in a conservative system also λ and -λ) there is one; while JAX is tracing, all roots of a
+      system that is not conservative are here, those of negative frequency last.
+    - `shapes`: like q, complex, with a leading axis k; the largest entry of each is one.
+    - `energy` (k,): the sign of the energy of what oscillates; 0 for all else.
+    - `zero` (k,): roots that are zero. `growing` (k,): those that grow. `double` (k,): another one is the same: then
+      derivatives are of the mean of both, or zero where both share their shape.
+    - `code`, `stable`: the `verdict` as a number (its place in `lj.NormalModes.VERDICTS`), and whether nothing grows.
+    - `unexplained`: how many zeros may be those of a critical point; outside of compiled programs it has been tried
+      whether they lead to other equilibria.
+    - `linearisation`: the `Linearisation` that this is of.
+
+    Derivatives flow to `roots`, of first and second order, and to `shapes`, of first.
+    """
+
+    roots: Complex[Array, " k"]
+    shapes: PyTree[Complex[Array, "k ..."]]
+    energy: Int[Array, " k"]
+    zero: Bool[Array, " k"]
+    growing: Bool[Array, " k"]
+    double: Bool[Array, " k"]
+    code: Int[Array, ""]
+    unexplained: Int[Array, ""]
+    linearisation: Linearisation
+    zero_words: tuple[str, ...] = eqx.field(static=True, default=())
+
+    VERDICTS: ClassVar[tuple[str, ...]] = tuple(VERDICTS.values())
+
+    @property
+    def frequency(self) -> Float[Array, " k"]:
+        """Radians a unit of time, of each mode."""
+        return jnp.imag(self.roots)
+
+    @property
+    def growth(self) -> Float[Array, " k"]:
+        """By how much the logarithm of each mode grows in a unit of time."""
+        return jnp.real(self.roots)
+
+    @property
+    def stable(self) -> Bool[Array, ""]:
+        """Whether no small motion grows, but for zero modes, along which a shift lasts."""
+        return self.code <= GYROSCOPIC
+
+    @property
+    def verdict(self) -> str:
+        """What the system does near this motion."""
+        return VERDICTS[int(self.code)]
+
+    @property
+    def reason(self) -> str:
+        """Why."""
+        return reason_of(self)
+
+    def __len__(self):
+        return len(self.roots)
+
+    def __getitem__(self, i: int) -> Mode:
+        if not -len(self) <= i < len(self):
+            raise IndexError(f"there are {len(self)} modes, modes[0] to modes[{len(self) - 1}].")
+        shape = jax.tree.map(lambda x: x[i], self.shapes)
+        label = "" if coordinates.is_traced(self.roots) else label_of(i % len(self), self)
+        return Mode(self.roots[i], shape, self.energy[i], self.double[i], self.linearisation, label)
+
+    def plot(self):
+        """Plot all roots, growth to the right and frequency upward; returns a matplotlib `Figure`.
+
+        **Raises:** `ImportError` without matplotlib.
+        """
+        growing, zero = np.asarray(self.growing), np.asarray(self.zero)
+        return drawn_roots(self.roots, growing, zero, None)
+
+    def __repr__(self):
+        if coordinates.is_traced(self.roots) or np.ndim(self.code):
+            return f"NormalModes of shape {np.shape(self.roots)}"
+        rows = [f"{len(self)} modes: {self.verdict}", f"  {self.reason}"]
+        for i in range(len(self)):
+            values = (
+                ""
+                if self.zero[i]
+                else f"frequency {float(self.frequency[i]):<12.8g} growth {float(self.growth[i]):<12.6g}"
+            )
+            rows.append(f"  {i}  {values:<46}{label_of(i, self)}")
+        if np.any(np.asarray(self.double) & ~np.asarray(self.zero)):
+            rows.append("  double roots: their derivatives are those of the mean, or zero where they share a shape")
+        residual = float(self.linearisation.residual)
+        if residual > 1e-10:
+            rows.append(f"  the state is steady to {residual:.1e} of its size: roots are known to as much")
+        return "\n".join(rows)
+
+
+def normal_modes(system, t=None, q=None, v=None, params=None) -> NormalModes:
+    """Return the modes of small motions about an equilibrium or a steady motion, and whether they stay small.
+
+    >>> import jax.numpy as jnp
+    >>> import lagjax as lj
+    >>> def bead(t, q, v, params):
+    ...     turning = 0.5 * (params["omega"] * jnp.sin(q)) ** 2
+    ...     return 0.5 * v**2 + turning + params["g"] * jnp.cos(q)
+    >>> system = lj.System(bead)
+    >>> normal_modes(system, 0.0, 0.0, 0.0, {"omega": 2.0, "g": 20.0})
+    1 modes: stable
+      all that oscillates has positive energy, which is conserved
+      0  frequency 4            growth 0           swings: q
+    >>> print(normal_modes(system, 0.0, 0.0, 0.0, {"omega": 5.0, "g": 9.0}).verdict)
+    divergence
+
+    **Arguments:** as for `lj.linearise`; or a `Linearisation` alone.
+
+    **Returns:** `NormalModes`.
+
+    **Raises:** as `lj.linearise`.
+
+    Source: Goldstein, *Classical Mechanics*, §6.2-6.3; Meirovitch, *Methods of Analytical Dynamics*, §6 and §9;
+    Kirillov, *Nonconservative Stability Problems of Modern Physics*, ch. 3 and 5.
+    """
+    found = system if isinstance(system, Linearisation) else linearise(system, t, q, v, params)
+    motions = _motions(found, True)
+    if not is_eager() or coordinates.is_traced(motions):
+        return _collected(found, motions)
+    if not np.all(np.isfinite(motions.roots)):
+        # A mass matrix that is regular and not positive definite.
+        motions = _motions(found, False)
+    kept = ~np.asarray(motions.mirrored)
+    of_modes = jax.tree.map(lambda x: np.asarray(x)[kept] if np.ndim(x) else np.asarray(x), motions)
+    words = []
+    if not found.kind.conservative:
+        shapes, words = with_neutral(found, of_modes.shapes, of_modes.zero)
+        of_modes = of_modes._replace(shapes=shapes)
+    if int(of_modes.code) == UNDECIDED and int(of_modes.unexplained) and not isinstance(system, Linearisation):
+        of_modes = _with_symmetries(system, found, of_modes)
+    return _collected(found, of_modes, tuple(words))
+
+
+def _with_symmetries(system, found, motions: Motions) -> Motions:
+    """The motions, stable where what is zero leads to other equilibria."""
+    x, unflatten = coordinates.flatten(found.state.q)
+
+    def steady_at(displacement):
+        s = found.state._replace(q=unflatten(x + displacement.astype(x.dtype)))
+        return float(linearised(found.kind, system, s).residual) <= STEADY_BELOW[np.dtype(x.dtype)]
+
+    if not leads_to_others(motions.shapes, motions.zero, np.array(found.kind.unseen, bool), steady_at):
+        return motions
+    lasting = ~motions.zero
+    decays = not found.kind.conservative and bool(np.all(motions.roots.real[lasting] < 0))
+    code = ASYMPTOTIC if decays else GYROSCOPIC if np.any(motions.energies < 0) else STABLE
+    return motions._replace(code=np.asarray(code, motions.code.dtype), unexplained=np.zeros_like(motions.unexplained))
+
+
+@compiled
+def _motions(found: Linearisation, definite: bool) -> Motions:
+    return motions_of(found, definite)
+
+
+def _collected(found, motions: Motions, zero_words=()) -> NormalModes:
+    shapes, start = [], 0
+    for leaf in jax.tree.leaves(found.state.q):
+        size = int(np.size(leaf))
+        shapes.append(motions.shapes[:, start : start + size].reshape(-1, *np.shape(leaf)))
+        start += size
+    return NormalModes(
+        roots=motions.roots,
+        shapes=jax.tree.unflatten(jax.tree.structure(found.state.q), shapes),
+        energy=motions.energies,
+        zero=motions.zero,
+        growing=motions.growing,
+        double=motions.double,
+        code=motions.code,
+        unexplained=motions.unexplained,
+        linearisation=found,
+        zero_words=zero_words,
+    )

@@ -1,0 +1,76 @@
+"""Directions in which nothing changes: shifts to another equilibrium, and other speeds of a steady motion.
+
+They are the vectors y = (positions, velocities) with A y = 0. LAPACK gives any basis of them; here it is reduced until
+each has an entry that the others do not have, other speeds first.
+"""
+
+import numpy as np
+
+from lagjax.numerics.rank import null_space
+
+ZERO_BELOW = 1e-9
+
+
+def with_neutral(found, shapes, zero):
+    """The shapes (k, N), those of zero roots replaced by a reduced basis; and what each zero root is, in words.
+
+    There may be fewer such directions than zero roots: the rest grow with time, along them.
+    """
+    words = [""] * len(zero)
+    if not np.any(zero):
+        return shapes, words
+    p, kind = found.parts, found.kind
+    drift, transfer, position, velocity = (np.asarray(x) for x in (p.drift, p.transfer, p.position, p.velocity))
+    A = np.block([[drift, transfer], [-position, -velocity]])
+    # Rows of different units.
+    size = np.max(np.abs(A), axis=1, keepdims=True)
+    basis = null_space(A / np.where(size > 0, size, 1.0), ZERO_BELOW).T
+    count = drift.shape[0]
+    # Velocities of coordinates, where no position is displaced; positions, where one is.
+    still = basis[:, :count] @ np.asarray(p.positions).T
+    moving = basis[:, count:] @ np.asarray(p.velocities).T + basis[:, :count] @ np.asarray(p.turning).T
+    reduced = _reduced(np.concatenate([still, moving], axis=1))
+    shapes, n = np.array(shapes), shapes.shape[1]
+    for i, row in zip(np.flatnonzero(zero), reduced):
+        shifts = np.max(np.abs(row[:n])) > 1e-6
+        row = row[:n] if shifts else row[n:]
+        shapes[i] = row / row[np.argmax(np.abs(row))]
+        moved = _listed(found.names, shapes[i])
+        if not shifts:
+            words[i] = f"other speeds in {moved}"
+        elif all(kind.holonomic):
+            words[i] = f"along {moved}"
+        else:
+            words[i] = f"shift of {moved}, which the velocity constraints leave free"
+    for i in np.flatnonzero(zero)[len(reduced) :]:
+        words[i] = "a shift or a speed named before, growing with time"
+    return shapes, words
+
+
+def leads_to_others(shapes, zero, unseen, steady_at) -> bool:
+    """Whether all zero modes lead straight to further equilibria; `steady_at(displacement)` says so of one.
+
+    It is the difference between a symmetry and a critical point, where terms of higher order decide.
+    """
+    displacements = [np.real(x) for x in shapes[zero] if np.any(np.abs(x[~unseen]) > 1e-6)]
+    return bool(displacements) and all(steady_at(size * x) for x in displacements for size in (0.37, -1.3))
+
+
+def _listed(names, shape):
+    entries = [name for name, x in zip(names, shape) if abs(x) > 1e-6]
+    return ", ".join(entries[:4]) + (", ..." if len(entries) > 4 else "")
+
+
+def _reduced(rows):
+    """Gauss-Jordan with full pivoting."""
+    rows, done = np.array(rows), []
+    for i in range(len(rows)):
+        left = np.abs(rows)
+        left[done] = 0.0
+        k, j = np.unravel_index(int(np.argmax(left)), left.shape)
+        rows[k] /= rows[k, j]
+        others = np.arange(len(rows)) != k
+        rows[others] -= np.outer(rows[others, j], rows[k])
+        done.append(k)
+    rows[np.abs(rows) < 1e-12] = 0.0
+    return rows

@@ -1,0 +1,121 @@
+"""Characteristic roots with their vectors and derivatives: of `K x = s M x`, and of `A x = λ E x`.
+
+LAPACK's roots of A are off by round-off of the largest of them, and so are its vectors. With left vectors z and right
+vectors x the quotient
+
+    λ = z A x / z E x
+
+is off by the product of the errors of z and x, which gives the small roots their digits. The same quotient has the
+derivatives: with `c_ij = z_i (A - λ_j E) x_j / (λ_j - λ_i)` the vectors X + X c and (1 - c) Z follow a change of the
+matrices to first order, and so the quotient to third.
+
+Where roots are double, c has no meaning and is left out; what is then left of a derivative is shared by those roots,
+the derivative of their mean. Where there are not enough vectors (a defective root), it is dropped. Both are told.
+
+Source: Golub & Van Loan, *Matrix Computations*, §7.2.2 (condition of a root), §8.7 (symmetric-definite problems);
+Magnus, Econometric Theory 1 (1985) 179 (derivatives).
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Float, Inexact
+
+from lagjax.numerics import lapack
+
+# Roots nearer to each other than this part of the largest are one double root.
+DOUBLE_BELOW = {np.dtype("float64"): 1e-8, np.dtype("float32"): 1e-4}
+# With a condition above this a root has not vectors enough.
+DEFECTIVE_ABOVE = {np.dtype("float64"): 1e6, np.dtype("float32"): 1e3}
+
+# A double root of zero is found as the square root of round-off.
+NEARLY_ZERO = 1e-3
+
+
+class Roots(NamedTuple):
+    """Roots (k,) with right vectors as columns (n, k).
+
+    - `round_off`: what each may be off by. `double`: another one is as near as that, or `defective`: and shares its
+      vector.
+    """
+
+    values: Inexact[Array, " k"]
+    vectors: Inexact[Array, "n k"]
+    round_off: Float[Array, " k"]
+    double: Bool[Array, " k"]
+    defective: Bool[Array, " k"]
+
+
+def symmetric_roots(stiffness, mass) -> Roots:
+    """All s of `K x = s M x`, ascending, of symmetric K and positive definite M; NaN where M is not."""
+    values, vectors = lapack.symmetric_definite(stiffness, mass)
+    largest = jnp.max(jnp.abs(values), initial=0.0)
+    return _followed(values, vectors, vectors.T, stiffness, mass, largest, jnp.ones_like(values))
+
+
+def general_roots(matrix, inertia) -> Roots:
+    """All λ of `A x = λ E x`, of a regular E."""
+    values, vectors, left = lapack.eigen(matrix, inertia)
+    norm = lambda x, axis: jnp.sqrt(jnp.sum(jnp.abs(x) ** 2, axis=axis))
+    condition = norm(vectors, 0) * norm(left, 1)
+    condition = jnp.where(jnp.isfinite(condition), condition, jnp.inf)
+    left = jnp.where(jnp.isfinite(left), left, 0.0)
+    largest = jnp.max(jnp.abs(values), initial=0.0)
+    return _followed(values, vectors, left, matrix, inertia, largest, condition)
+
+
+def _followed(values, vectors, left, matrix, inertia, largest, condition) -> Roots:
+    """The roots by their quotients, which follow the matrices; `left` (k, n) with `left @ inertia @ vectors` = 1."""
+    real = jnp.zeros(0, values.dtype).real.dtype
+    apart = jnp.abs(values[:, None] - values[None, :])
+    alike = apart <= DOUBLE_BELOW[np.dtype(real)] * largest
+    defective = condition > DEFECTIVE_ABOVE[np.dtype(real)]
+    double = (jnp.sum(alike, axis=1) > 1) | defective
+    follows = ~alike & ~defective[None, :] & ~defective[:, None]
+    start = values
+    # Twice: the first time for the digits of small roots.
+    for live in (False, True):
+        A, E = (matrix, inertia) if live else lax.stop_gradient((matrix, inertia))
+        left_of = left @ (A @ vectors - (E @ vectors) * start[None, :])
+        change = jnp.where(follows, left_of / jnp.where(follows, start[None, :] - start[:, None], 1.0), 0.0)
+        if live:
+            new_vectors, new_left = vectors + vectors @ change, left - change @ left
+        else:
+            new_vectors, new_left = vectors, left
+        over = new_left.T * (A @ new_vectors - (E @ new_vectors) * start[None, :])
+        under = jnp.sum(new_left.T * (E @ new_vectors), axis=0)
+        correction = jnp.sum(over, axis=0) / jnp.where(under != 0, under, 1.0)
+        correction = jnp.where(defective, 0.0, correction)
+        if jnp.iscomplexobj(values):
+            # A real root stays one: the others come in pairs.
+            correction = jnp.where(values.imag == 0, correction.real, correction)
+        shared = jnp.where(alike & double[:, None], 1.0, jnp.eye(values.size, dtype=real))
+        shared = jnp.where(defective[None, :] & ~jnp.eye(values.size, dtype=bool), 0.0, shared)
+        correction = (shared / jnp.sum(shared, axis=1, keepdims=True)) @ correction
+        start = start + correction if live else lax.stop_gradient(start + correction)
+    round_off = 1e2 * jnp.finfo(real).eps * largest * jnp.where(defective, jnp.minimum(condition, 1e9), condition)
+    return Roots(start, new_vectors, round_off, double, defective)
+
+
+def zero_count(matrix, inertia, values):
+    """How often zero is a root of `A x = λ E x`: vectors that A takes to zero, and those that it takes to these."""
+    least = jnp.min(jnp.abs(values)) if values.size else jnp.ones(())
+    return _zero_count(matrix, inertia, least <= NEARLY_ZERO * jnp.max(jnp.abs(values), initial=0.0))
+
+
+@lapack.one_by_one
+def _zero_count(A, E, possible):
+    def counted():
+        left, sizes, right = jnp.linalg.svd(A)
+        # Round-off of the largest, or of the terms that cancel.
+        eps = jnp.finfo(A.dtype).eps
+        terms = 1e2 * jnp.sum(jnp.abs(left) * (jnp.abs(A) @ jnp.abs(right.T)), axis=0)
+        null = sizes <= eps * jnp.minimum(1e3 * sizes[0], jnp.maximum(terms, 4 * A.shape[0] * sizes[0]))
+        # A x = E n has a solution where E n has no part in what A does not reach.
+        between = jnp.where(null[:, None] & null[None, :], left.T @ E @ right.T, 0.0)
+        reached = jnp.linalg.svd(between, compute_uv=False)
+        return (2 * jnp.sum(null) - jnp.sum(reached > 1e-9 * jnp.max(jnp.abs(E)))).astype(jnp.int32)
+
+    return lax.cond(possible, counted, lambda: jnp.zeros((), jnp.int32))

@@ -1,0 +1,91 @@
+"""Systems with small motions in closed form, that several tests share."""
+
+import jax.numpy as jnp
+
+import lagjax as lj
+
+
+def bead_lagrangian(t, q, v, params):
+    """A bead on a hoop that turns about its vertical diameter, by the angle from the bottom."""
+    a, g, omega = params["a"], params["g"], params["omega"]
+    return 0.5 * a**2 * (v**2 + (omega * jnp.sin(q)) ** 2) + g * a * jnp.cos(q)
+
+
+def chain_lagrangian(t, q, v, params):
+    """Equal masses in a row between two walls, and springs."""
+    ends = jnp.concatenate([jnp.zeros(1, q.dtype), q, jnp.zeros(1, q.dtype)])
+    return 0.5 * params["m"] * jnp.sum(v**2) - 0.5 * params["k"] * jnp.sum(jnp.diff(ends) ** 2)
+
+
+def free_chain_lagrangian(t, q, v, params):
+    """The same without walls."""
+    return 0.5 * params["m"] * jnp.sum(v**2) - 0.5 * params["k"] * jnp.sum(jnp.diff(q) ** 2)
+
+
+def foucault_lagrangian(t, q, v, params):
+    """An isotropic oscillator in a frame that turns."""
+    turn = params["turn"]
+    moving = (v["x"] - turn * q["y"]) ** 2 + (v["y"] + turn * q["x"]) ** 2
+    return 0.5 * moving - 0.5 * params["omega"] ** 2 * (q["x"] ** 2 + q["y"] ** 2)
+
+
+def spherical_lagrangian(t, q, v, params):
+    """A spherical pendulum of unit mass, by the angle from the bottom and the azimuth."""
+    length, g = params["l"], params["g"]
+    kinetic = 0.5 * length**2 * (v["theta"] ** 2 + (jnp.sin(q["theta"]) * v["phi"]) ** 2)
+    return kinetic + g * length * jnp.cos(q["theta"])
+
+
+def top_lagrangian(t, q, v, params):
+    """A symmetric top on its tip, by two tilts and its spin: regular where it stands upright."""
+    spin = v["spin"] + v["alpha"] * jnp.sin(q["beta"])
+    tilting = (v["alpha"] * jnp.cos(q["beta"])) ** 2 + v["beta"] ** 2
+    height = jnp.cos(q["alpha"]) * jnp.cos(q["beta"])
+    return 0.5 * params["I1"] * tilting + 0.5 * params["I3"] * spin**2 - params["Mgl"] * height
+
+
+def charge_lagrangian(t, q, v, params):
+    """A unit charge in a homogeneous magnetic field."""
+    return 0.5 * (v["x"] ** 2 + v["y"] ** 2) + params["B"] * q["x"] * v["y"]
+
+
+def disk_lagrangian(t, q, v, params):
+    """A disk on its edge, by its contact (x, y), yaw, lean and spin; n is its axle, level to the left when upright."""
+    m, r, A, C, g = (params[name] for name in ("m", "r", "A", "C", "g"))
+    sin, cos, s, c = jnp.sin(q["lean"]), jnp.cos(q["lean"]), jnp.sin(q["yaw"]), jnp.cos(q["yaw"])
+    x = v["x"] + r * (v["lean"] * cos * s + sin * c * v["yaw"])
+    y = v["y"] - r * (v["lean"] * cos * c - sin * s * v["yaw"])
+    z = -r * sin * v["lean"]
+    turning = A * (v["lean"] ** 2 + (v["yaw"] * cos) ** 2) + C * (v["spin"] + v["yaw"] * sin) ** 2
+    return 0.5 * m * (x**2 + y**2 + z**2) + 0.5 * turning - m * g * r * cos
+
+
+def rolling(t, q, v, params):
+    """The contact moves along the heading by what the rim unrolls."""
+    r = params["r"]
+    return jnp.stack([v["x"] - r * v["spin"] * jnp.cos(q["yaw"]), v["y"] - r * v["spin"] * jnp.sin(q["yaw"])])
+
+
+def plane_lagrangian(t, q, v, params):
+    """A unit mass in a plane without forces but Q and R."""
+    return 0.5 * (v["x"] ** 2 + v["y"] ** 2) - 0.5 * (params["k1"] * q["x"] ** 2 + params["k2"] * q["y"] ** 2)
+
+
+def follower(t, q, v, params):
+    """A circulatory force."""
+    return {"x": params["n"] * q["y"], "y": -params["n"] * q["x"]}
+
+
+bead = lj.System(bead_lagrangian)
+chain = lj.System(chain_lagrangian)
+free_chain = lj.System(free_chain_lagrangian)
+foucault = lj.System(foucault_lagrangian)
+spherical = lj.System(spherical_lagrangian)
+top = lj.System(top_lagrangian)
+charge = lj.System(charge_lagrangian)
+disk = lj.System(disk_lagrangian, {"rolling": lj.Nonholonomic(rolling)})
+circulating = lj.System(
+    plane_lagrangian,
+    force=follower,
+    dissipation=lambda t, q, v, params: 0.5 * params["c"] * (v["x"] ** 2 + v["y"] ** 2),
+)
