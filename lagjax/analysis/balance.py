@@ -31,6 +31,7 @@ from lagjax.mechanics import constraints, coordinates
 from lagjax.mechanics.lagrangian import forcing_and_inertia
 from lagjax.mechanics.reactions import response
 from lagjax.mechanics.system import System
+from lagjax.numerics import lapack
 from lagjax.numerics.dense import reciprocal_condition
 from lagjax.numerics.rank import independent_rows
 
@@ -220,7 +221,7 @@ def directions(s: Steady, d: Departures, y):
     kept = independent_rows(barred) & jnp.any(barred != 0, axis=1)
     used = jnp.where(kept[:, None], barred, 0.0)
     gram = used @ used.T + jnp.diag(jnp.where(kept, 0.0, 1.0))
-    return jnp.eye(2 * n, dtype=rows.dtype) - used.T @ jnp.linalg.solve(gram, used), 2 * n - jnp.sum(kept)
+    return jnp.eye(2 * n, dtype=rows.dtype) - used.T @ lapack.solve(gram, used), 2 * n - jnp.sum(kept)
 
 
 def characteristic_roots(s: Steady, y, jacobian):
@@ -241,10 +242,10 @@ def characteristic_roots(s: Steady, y, jacobian):
     sizes = jnp.maximum(jnp.max(jnp.abs(d.mass), axis=1), jnp.max(jnp.abs(rows), axis=0, initial=0.0))
     sound = reciprocal_condition(matrix) > SINGULAR_BELOW[np.dtype(matrix.dtype)]
     sound = sound & (jnp.min(sizes) > jnp.finfo(sizes.dtype).eps ** 1.3 * jnp.max(sizes))
-    accelerations = jnp.linalg.solve(jnp.where(sound, matrix, jnp.eye(n + m, dtype=matrix.dtype)), known)[:n]
+    accelerations = lapack.solve(jnp.where(sound, matrix, jnp.eye(n + m, dtype=matrix.dtype)), known)[:n]
     unit = jnp.eye(n, dtype=rows.dtype)
     whole = jnp.concatenate([jnp.concatenate([jnp.zeros_like(unit), unit], axis=1), accelerations])
-    roots = jnp.linalg.eigvals(project @ whole @ project)
+    roots = lapack.characteristic(project @ whole @ project)
     # Ranked by comparisons, as sorting takes long to compile; the nearest to zero belong to what is left out.
     size, order = jnp.abs(roots), np.arange(2 * n)
     before = (size[None, :] < size[:, None]) | (size[None, :] == size[:, None]) & (order[None, :] < order[:, None])

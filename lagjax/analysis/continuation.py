@@ -16,13 +16,14 @@ from lagjax.analysis.balance import VELOCITY, Steady
 from lagjax.analysis.branch_equations import Frame, Place, full_jacobian, place_of
 from lagjax.analysis.branches import Branch, Branches, Critical
 from lagjax.analysis.critical_points import Found, between, escape
-from lagjax.analysis.equilibria import held_at, searched
+from lagjax.analysis.equilibria import conserves_balance, held_at, searched
 from lagjax.analysis.found_equilibria import OK, WORDS
 from lagjax.analysis.starts import checked, stacked, stacked_one, symmetries_of
 from lagjax.analysis.tracing import AGAIN, FIRST, Path, Point, Tracer
 from lagjax.jax_internals.tracing import is_eager
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.compiled import compiled
+from lagjax.mechanics.coordinates import State
 from lagjax.mechanics.diagnosis import describe
 from lagjax.mechanics.structure import angles
 
@@ -126,10 +127,19 @@ def _held(steady, x, u):
     return held_at(steady, x, u)[1]
 
 
+@compiled
+def _velocity(steady, x):
+    return steady.velocity(x, steady.held)
+
+
 def _solution(steady: Steady, v) -> np.ndarray | str:
     """The unknowns of the equilibrium near `steady.like`, or in words why there is none."""
+    if steady.symmetries.count and steady.symmetries.hold == VELOCITY:
+        v = steady.unflatten(_velocity(steady, coordinates.flatten(steady.like)[0]))
     one = lambda tree: jax.tree.map(lambda x: jnp.asarray(x)[None], tree)
-    row = jax.tree.map(lambda x: np.asarray(x)[0], searched(steady, one(steady.like), one(v), True, True))
+    s = State(steady.t, steady.like, v, steady.params)
+    lasting = not steady.symmetries.count and conserves_balance(steady.system, s)
+    row = jax.tree.map(lambda x: np.asarray(x)[0], searched(steady, one(steady.like), one(v), lasting, True))
     if row.status != OK:
         return WORDS[row.status]
     flat = lambda tree: np.concatenate([np.ravel(x) for x in jax.tree.leaves(tree)] or [np.zeros(0)])
@@ -218,7 +228,8 @@ class _Run:
         """The first branch, and all that cross."""
         start = np.zeros_like(z)
         start[-1] = towards
-        begin = self.tracer.point(z, start)
+        corrected = self.tracer.corrected(z, np.eye(z.size)[-1])
+        begin = self.tracer.point(z if corrected is None else corrected, start)
         if isinstance(begin, str):
             raise ValueError(f"the equations at the start are no guide: {begin}.")
         self._follow(begin)

@@ -38,6 +38,7 @@ from lagjax.mechanics.compiled import compiled
 from lagjax.mechanics.reactions import force_with_ones
 from lagjax.mechanics.structure import angles, sees_time
 from lagjax.motion.consistency import stopped
+from lagjax.numerics import lapack
 from lagjax.numerics.roots import MOST, differentiable, least_squares_root, zero_below
 
 # Of the imbalance, in units of what a displacement as large as the coordinates makes.
@@ -260,6 +261,5 @@ def _zero_modes(steady: Steady, root):
     columns = jnp.max(jnp.abs(matrix), axis=0)
     matrix = matrix / jnp.where(columns > least, columns, 1.0)[None, :]
     matrix = jnp.where(jnp.isfinite(matrix), matrix, 0.0)
-    sizes = lambda matrix: jnp.linalg.svd(matrix, compute_uv=False)
-    rank = lambda matrix: jnp.sum(sizes(matrix) > least) if matrix.size else 0
+    rank = lambda matrix: jnp.sum(lapack.singular_values(matrix) > least) if matrix.size else 0
     return n + rank(matrix[:, n:]) - rank(matrix)

@@ -1,7 +1,7 @@
 """What a search for steady motions found: a table that prints itself, and what became of each start."""
 
 from dataclasses import replace
-from typing import ClassVar, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -79,7 +79,6 @@ class Equilibria(eqx.Module):
     params: PyTree
     symmetries: Symmetries = eqx.field(static=True)
     of_start: Int[Array, " S"] | None = None
-    words: ClassVar[tuple[str, ...]] = WORDS
 
     def __len__(self):
         return self.found.shape[0]

@@ -19,6 +19,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
+from lagjax.numerics import lapack
+
 # Singular values below this part of the largest are zero.
 ZERO_BELOW = 1e3
 # A stiff system is followed along a narrow valley; a start that leads nowhere ends much earlier.
@@ -55,7 +57,7 @@ def least_squares_root(residual: Callable, y0: Float[Array, " n"], linear: np.nd
     positive = lambda x: jnp.where(x > 0, x, 1.0)
 
     def step_of(r, jacobian, rows, columns, damping):
-        u, s, vt = jnp.linalg.svd(jacobian / rows[:, None] / columns[None, :], full_matrices=False)
+        u, s, vt = lapack.decomposed(jacobian / rows[:, None] / columns[None, :])
         kept = s > zero_below(y0.dtype) * jnp.maximum(s[0], tiny)
         gain = jnp.where(kept, s / jnp.where(kept, s**2 + damping, 1.0), 0.0)
         return -(vt.T @ (gain * (u.T @ (r / rows)))) / columns

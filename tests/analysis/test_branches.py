@@ -136,7 +136,7 @@ def test_cross_rails():
     check(found.critical[1], root("K"), params, "omega")
     main, line = found[0], found[1]
     inner = main.parameter < 0.999 * np.sqrt(params["K"] / params["m"])
-    exact = cross_rails.equilibrium_length(params | {"omega": main.parameter})
+    exact = np.asarray(cross_rails.equilibrium_length(params | {"omega": main.parameter}))
     np.testing.assert_allclose(main.q["R"][inner], exact[inner], rtol=1e-11)
     np.testing.assert_array_equal(main.stable[1:-1], cross_rails.is_stable(params | {"omega": main.parameter[1:-1]}))
     assert np.ptp(line.parameter) < 1e-12 and np.ptp(line.q["r"]) > 0.5 and "infinity" in main.status
@@ -205,6 +205,7 @@ def test_rolling_disk():
     check(critical, lambda p: slowest_rolling(p) + 0 * p["m"], DISK, "v[0]")
 
 
+@pytest.mark.slow
 def test_closed_curve_and_folds_of_a_side_branch():
     """A circle that crosses at both of its ends; a subcritical pitchfork whose branch folds at mu = -1/4."""
     one = lambda potential: lj.System(lambda t, q, v, p: 0.5 * v**2 - potential(q, p["mu"]))
@@ -220,7 +221,7 @@ def test_closed_curve_and_folds_of_a_side_branch():
     assert float(found.of_kind("pitchfork")[0].parameter) == pytest.approx(0.0, abs=1e-13)
 
 
-@pytest.mark.parametrize("e", [1e-3, 1e-6])
+@pytest.mark.parametrize("e", [1e-6, pytest.param(1e-3, marks=pytest.mark.slow)])
 def test_nearly_a_pitchfork(e):
     """With a small push there is no crossing, and steps do not jump to the other side: the branch stays stable."""
     pushed = lj.System(lambda t, q, v, p: 0.5 * v**2 + 0.5 * p["mu"] * q**2 - 0.25 * q**4 + p["e"] * q)
