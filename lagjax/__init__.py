@@ -44,7 +44,11 @@ from lagjax.numerics.runge_kutta import Dopri8, Tsit5
 
 # isort: split
 # What a system is like.
+from lagjax.analysis.branches import Branch, Branches, Critical
+from lagjax.analysis.continuation import continue_equilibria
+from lagjax.analysis.equilibria import equilibria
 from lagjax.analysis.found import Symmetries
+from lagjax.analysis.found_equilibria import Equilibria
 from lagjax.analysis.hamilton import Hamiltonian, hamiltonian
 from lagjax.analysis.least_action import action
 from lagjax.analysis.linearised import Linearisation, linearise
@@ -148,6 +152,12 @@ __all__ = [
     "action",
     "latex",
     "EquationsOfMotion",
+    "equilibria",
+    "Equilibria",
+    "continue_equilibria",
+    "Branches",
+    "Branch",
+    "Critical",
     "linearise",
     "Linearisation",
     "normal_modes",

@@ -96,3 +96,15 @@ def eigen_without_null_space(matrix, inertia, zero_below):
 def solve(matrix, rhs):
     """`matrix⁻¹ rhs`."""
     return jnp.linalg.solve(matrix, rhs)
+
+
+@one_by_one
+def decomposed(matrix):
+    """U, σ and Vᵀ of any matrix, without what belongs to no singular value."""
+    return jnp.linalg.svd(matrix, full_matrices=False)
+
+
+@one_by_one
+def characteristic(matrix):
+    """All eigenvalues, complex."""
+    return jnp.linalg.eigvals(matrix)

@@ -1,0 +1,236 @@
+"""The equations of a branch: those of steady motion with one parameter free, made square and of the size of one.
+
+`balance.py` gives more equations than unknowns where some follow from others (of redundant constraints, along a
+symmetry), and fewer independent ones where there is a family. At a start with Jacobian `J = U Σ Vᵀ` of rank r, the r
+combinations `U_rᵀ r(y)` are kept, and the n - r directions in which V leaves y free are held:
+
+    E(y, μ) = (U_rᵀ r(y, μ), V_0ᵀ (y - y_0)) = 0,    as many equations as unknowns
+
+z = (y, μ) is measured in units in which entries of the Jacobian and the range of μ are one.
+
+Critical points are regular solutions of larger systems. With ψ, the left null vector of E_y,
+
+    fold            E = 0,         E_yᵀ ψ = 0,                ψ·ψ = 1
+    branch point    E + β ψ = 0,   E_yᵀ ψ = 0,   E_μ·ψ = 0,   ψ·ψ = 1          (β = 0 where branches really meet)
+    multiple zero   E = 0,         E_y φ = 0,                 φ·φ₀ = 1
+    flutter         E = 0,         D(iω) w = 0,               w₀*·w = 1
+    collision       the same, and  D(iω) w₂ + D'(iω) w = 0,   w₀*·w₂ = 0
+
+with `D(s) = K + s C + s² M`, bordered by the constraints, of departures e^(st). A collision, of two frequencies without
+damping, has two equations more than unknowns, which symmetry of D makes consistent.
+
+Source: Moore & Spence, SIAM J. Numer. Anal. 17 (1980) 567 (folds); Moore, *Numer. Funct. Anal. Optim.* 2 (1980) 441
+(branch points); Govaerts, *Numerical Methods for Bifurcations of Dynamical Equilibria*, ch. 3-5.
+"""
+
+from dataclasses import replace
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float
+
+from lagjax.analysis import balance as equations
+from lagjax.analysis.balance import Steady
+from lagjax.mechanics import coordinates
+from lagjax.mechanics.compiled import compiled
+from lagjax.mechanics.diagnosis import listed
+from lagjax.numerics.rank import independent_rows
+
+FOLD, BRANCH, MULTIPLE, FLUTTER, COLLISION, ESCAPE = "fold", "branch", "multiple", "flutter", "collision", "escape"
+
+
+class Place(eqx.Module):
+    """Where the parameter of a branch is: an entry of a leaf of `params`, or of what is held of the symmetries."""
+
+    name: str = eqx.field(static=True)
+    leaf: int | None = eqx.field(static=True)
+    entry: int = eqx.field(static=True)
+
+    def put(self, s: Steady, value) -> Steady:
+        """The problem at this value of the parameter."""
+        if self.leaf is None:
+            return replace(s, held=s.held.at[self.entry].set(value))
+        leaves, structure = jtu.tree_flatten(s.params)
+        leaf = jnp.asarray(leaves[self.leaf])
+        leaves[self.leaf] = leaf.reshape(-1).at[self.entry].set(value).reshape(leaf.shape).astype(leaf.dtype)
+        return replace(s, params=jtu.tree_unflatten(structure, leaves))
+
+    def get(self, s: Steady):
+        """Its value in the problem."""
+        if self.leaf is None:
+            return s.held[self.entry]
+        return jnp.ravel(jtu.tree_leaves(s.params)[self.leaf])[self.entry]
+
+
+class Frame(eqx.Module):
+    """What stays along all branches: the problem, its units and which combinations are solved.
+
+    `combinations` (r, R), `free` (N - r, N), `reference` (N,); `rows` (R,) and `columns` (N,) are units, `unit` that of
+    the parameter.
+    """
+
+    steady: Steady
+    combinations: Float[Array, "r R"]
+    free: Float[Array, "d N"]
+    reference: Float[Array, " N"]
+    rows: Float[Array, " R"]
+    columns: Float[Array, " N"]
+    unit: Float[Array, ""]
+    place: Place
+
+    def split(self, z):
+        """The problem at a point, and its unknowns in their own units."""
+        return self.place.put(self.steady, z[-1] * self.unit), z[:-1] * self.columns
+
+    def residual(self, z):
+        """E(y, μ)."""
+        s, y = self.split(z)
+        full = equations.balance(s, y) / self.rows
+        return jnp.concatenate([self.combinations @ full, self.free @ (z[:-1] - self.reference)])
+
+
+def place_of(steady: Steady, along: str) -> Place:
+    """Find a parameter by its name, `"omega"`, `"spring.k"`, `"k[1]"`; or what is held, `"v.psi"` or `"p.psi"`."""
+    names = coordinates.names(steady.like)
+    for kind, hold in (("v", equations.VELOCITY), ("p", equations.MOMENTUM)):
+        of = [f"{kind}.{names[i]}" if names[i] != "q" else kind for i in steady.symmetries.places]
+        of = of or [f"{kind}[{i}]" for i in range(steady.symmetries.count)]
+        if along in of and steady.symmetries.hold == hold:
+            return Place(along, None, of.index(along))
+    found = []
+    for i, (path, leaf) in enumerate(jtu.tree_flatten_with_path(steady.params)[0]):
+        name = jtu.keystr(path, simple=True, separator=".") or "params"
+        if not eqx.is_array_like(leaf) or not jnp.issubdtype(jnp.result_type(leaf), jnp.floating):
+            continue
+        for entry, index in enumerate(np.ndindex(jnp.shape(leaf))):
+            suffix = "[" + ", ".join(map(str, index)) + "]" if index else ""
+            found.append(Place(name + suffix, i, entry))
+    for place in found:
+        if place.name == along:
+            return place
+    known = [place.name for place in found]
+    there = f"there {'are' if len(known) != 1 else 'is'} {listed(known) or 'none'}"
+    there = f"there {'are' if len(known) != 1 else 'is'} {listed(known) or 'none'}"
+    raise ValueError(
+        f"along={along!r} is no number in params; {there}.\n"
+        'Fix: one of these; "spring.k" for params["spring"]["k"], and "v.psi" for the velocity of a cyclic coordinate '
+        'psi that is held (with hold="momentum": "p.psi").'
+    )
+
+
+@compiled
+def evaluated(frame: Frame, z):
+    """E, its Jacobian by z, and the largest of all equations in their units."""
+    jacobian = jax.jacfwd(frame.residual)(z)
+    s, y = frame.split(z)
+    full = equations.balance(s, y) / frame.rows
+    return frame.residual(z), jacobian, jnp.max(jnp.abs(full), initial=0.0)
+
+
+@compiled
+def full_jacobian(steady: Steady, y):
+    """All equations at a point, and their Jacobian."""
+    return equations.balance(steady, y), jax.jacfwd(lambda y: equations.balance(steady, y))(y)
+
+
+@compiled
+def seen_at(frame: Frame, z):
+    """What a user sees of a point: parameter, q, v, multipliers, and the roots of its small motions."""
+    s, y = frame.split(z)
+    x, rates, multipliers = s.parts(y)
+    u = s.velocity(x, rates)
+    if s.m > 1:
+        pushes = equations.forces(s, s.t, x, u)
+        multipliers = equations.shortest(pushes, multipliers @ pushes)
+    by_name = equations.constraints.split(s.system, multipliers, s.t, s.like, s.like, s.params) if s.m else {}
+    jacobian = jax.jacfwd(lambda y: equations.balance(s, y))(y)
+    roots = equations.characteristic_roots(s, y, jacobian)
+    return z[-1] * frame.unit, s.unflatten(x), s.unflatten(u), by_name, roots
+
+
+@compiled
+def curvature(frame: Frame, z, a, b):
+    """`D²E[a, b]`."""
+    along = lambda direction: lambda z: jax.jvp(frame.residual, (z,), (direction,))[1]
+    return jax.jvp(along(a), (z,), (b,))[1]
+
+
+def dynamic(frame: Frame, z):
+    """K, C, M of `D(s)`, bordered by the independent constraints."""
+    s, y = frame.split(z)
+    d = equations.departures(s, y, jax.jacfwd(lambda y: equations.balance(s, y))(y))
+    m = d.rows.shape[0]
+    kept = independent_rows(d.rows) & jnp.any(d.rows != 0, axis=1) if m else jnp.zeros(0, bool)
+    keep = lambda rows: jnp.where(kept[:, None], rows, 0.0)
+    holonomic = equations.holonomic(s)[:, None]
+    rows, slopes, none = keep(d.rows), keep(d.slopes), jnp.zeros((s.n, m), d.rows.dtype)
+    corner = jnp.diag(jnp.where(kept, 0.0, 1.0)).astype(d.rows.dtype)
+    stiffness = jnp.block([[d.stiffness, -keep(d.pushes).T], [jnp.where(holonomic, rows, slopes), corner]])
+    damping = jnp.block([[d.damping, none], [jnp.where(holonomic, 0.0, rows), 0 * corner]])
+    mass = jnp.block([[d.mass, none], [0 * rows, 0 * corner]])
+    return stiffness, damping, mass
+
+
+@compiled
+def dynamic_at(frame: Frame, z):
+    """The same, as a program."""
+    return dynamic(frame, z)
+
+
+def extended(kind: str, frame: Frame, big, guide):
+    """The larger system whose regular solution is a critical point; `guide` fixes what is free of null vectors."""
+    n = frame.columns.size
+    z, rest = big[: n + 1], big[n + 1 :]
+    if kind in (FOLD, BRANCH, ESCAPE):
+        psi = rest[:n]
+        value, pull = jax.vjp(frame.residual, z)
+        slopes = pull(psi)[0]
+        norm = psi @ psi - 1
+        if kind == FOLD:
+            return jnp.concatenate([value, slopes[:n], norm[None]])
+        if kind == ESCAPE:
+            # The equations are linear, and their solution far away: only its direction counts.
+            return jnp.concatenate([z[:-1] - guide[:n], slopes[:n], norm[None]])
+        return jnp.concatenate([value + rest[n] * psi, slopes, norm[None]])
+    if kind == MULTIPLE:
+        value, push = jax.linearize(frame.residual, z)
+        return jnp.concatenate([value, push(jnp.append(rest, 0.0)), (rest @ guide - 1)[None]])
+    value = frame.residual(z)
+    stiffness, damping, mass = dynamic(frame, z)
+    size = stiffness.shape[0]
+    omega, (re, im, re2, im2) = rest[0], jnp.split(jnp.append(rest[1:], jnp.zeros(4 * size - rest.size + 1)), 4)
+    rows = lax.stop_gradient(jnp.max(jnp.abs(stiffness) + jnp.abs(omega * damping) + omega**2 * jnp.abs(mass), axis=1))
+    rows = jnp.where(rows > 0, rows, 1.0)
+    real, imaginary = (stiffness - omega**2 * mass) / rows[:, None], omega * damping / rows[:, None]
+    times = lambda a, b: (real @ a - imaginary @ b, real @ b + imaginary @ a)
+    unit = lambda a, b, one: jnp.stack([guide[:size] @ a + guide[size:] @ b - one, guide[:size] @ b - guide[size:] @ a])
+    found = [value, *times(re, im), unit(re, im, 1.0)]
+    if kind == COLLISION:
+        # ω D'(iω), with D' = C + 2 i ω M.
+        slope, turn = omega * damping / rows[:, None], 2 * omega**2 * mass / rows[:, None]
+        first, second = times(re2, im2)
+        found += [first + slope @ re - turn @ im, second + slope @ im + turn @ re, unit(re2, im2, 0.0)]
+    return jnp.concatenate(found)
+
+
+@compiled
+def extended_at(kind: str, frame: Frame, big, guide):
+    """The larger system and its Jacobian."""
+    of = lambda big: extended(kind, frame, big, guide)
+    return of(big), jax.jacfwd(of)(big)
+
+
+@compiled
+def extended_by_params(kind: str, frame: Frame, big, guide):
+    """How the larger system changes with each number in `params`: a tree like these, of (rows, ...)."""
+    floats, rest = eqx.partition(frame.steady.params, eqx.is_inexact_array)
+
+    def of(floats):
+        steady = replace(frame.steady, params=eqx.combine(floats, rest))
+        return extended(kind, replace(frame, steady=steady), big, guide)
+
+    return jax.jacfwd(of)(floats)

@@ -1,0 +1,383 @@
+"""How equilibria change with a parameter: branches, where they fold and cross, and where they become unstable.
+
+A branch is traced (`tracing.py`), what is critical between two of its points is found exactly (`critical_points.py`),
+and the branches that cross there are traced in turn, each once.
+"""
+
+from collections.abc import Callable, Iterable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import ArrayLike, PyTree
+
+from lagjax.analysis.balance import VELOCITY, Steady
+from lagjax.analysis.branch_equations import Frame, Place, full_jacobian, place_of
+from lagjax.analysis.branches import Branch, Branches, Critical
+from lagjax.analysis.critical_points import Found, between, escape
+from lagjax.analysis.equilibria import conserves_balance, held_at, searched
+from lagjax.analysis.found_equilibria import OK, WORDS
+from lagjax.analysis.starts import checked, stacked, stacked_one, symmetries_of
+from lagjax.analysis.tracing import AGAIN, FIRST, Path, Point, Tracer
+from lagjax.jax_internals.tracing import is_eager
+from lagjax.mechanics import coordinates
+from lagjax.mechanics.compiled import compiled
+from lagjax.mechanics.coordinates import State
+from lagjax.mechanics.diagnosis import describe
+from lagjax.mechanics.structure import angles
+
+# Points at which a branch begins and critical points are the same within so much.
+SAME = 1e-5
+MOST_BRANCHES = 24
+# How far along the parameter the rank of the equations is asked again, in parts of its range.
+NEARBY = 1.234e-3
+DEPENDENT = 1e-9
+# A start that is next to nothing says nothing of the size of coordinates: what is far for it is asked in larger units.
+UNITS, NOTHING = (1.0, 1e3, 1e6, 1e9, 1e12), 1e-2
+# Points beyond which a branch at one value of the parameter is a line of equilibria.
+LINE, LINE_WITHIN = 40, 1e-9
+
+
+def continue_equilibria(
+    system,
+    params: PyTree,
+    start: PyTree[ArrayLike],
+    *,
+    along: str,
+    to: float,
+    velocity: PyTree[ArrayLike] | None = None,
+    cyclic: str | Callable | Iterable | None = None,
+    hold: str | None = VELOCITY,
+    t: ArrayLike = 0.0,
+    crossings: bool = True,
+    most_points: int = 1000,
+) -> Branches:
+    """Follow an equilibrium as a parameter changes, through folds, and onto the branches that cross.
+
+    >>> import jax.numpy as jnp
+    >>> import lagjax as lj
+    >>> def bead_on_hoop(t, q, v, params):
+    ...     height = -params["g"] * jnp.cos(q)
+    ...     return 0.5 * (v**2 + (params["omega"] * jnp.sin(q)) ** 2) - height
+    >>> system = lj.System(bead_on_hoop)
+    >>> found = lj.continue_equilibria(system, {"omega": 1.0, "g": 9.0}, 0.0, along="omega", to=5.0)
+    >>> print(found)
+    Branches of equilibria along omega, from 1 to 5: 2, with 1 critical point
+      pitchfork     omega = 3            branches 1, 2
+      branch 1      omega 1 to 5         stable, then unstable; ends at the end of the range
+      branch 2      omega 3 to 5         stable; ends at the end of the range
+
+    **Arguments:**
+
+    - `params`, `start`: where the branch begins: near an equilibrium for `params`; a position like q.
+    - `along`: which number changes, by its name in `params`: `"omega"`, `"spring.k"`, `"k[1]"`. `"v.psi"` for the held
+      velocity of a cyclic coordinate psi, `"p.psi"` for its momentum (with `hold="momentum"`).
+    - `to`: its last value; the first is that in `params`. Branches are followed within this range.
+    - `velocity`, `cyclic`, `hold`, `t`: as in `lj.equilibria`.
+    - `crossings`: whether branches that cross are followed, too. `most_points`: of a branch.
+
+    **Returns:** `Branches`. What was found before a branch ends is there, and its `status` says why it does.
+
+    **Raises:** `ValueError` where no equilibrium is near the start, for an `along` that is no number in `params`, and
+    what `lj.equilibria` raises. `TypeError` inside of `jax.jit`, `vmap` or `grad`: how many points there are depends on
+    values. Derivatives of critical parameters are in the result.
+
+    Source: Keller, in *Applications of Bifurcation Theory* (1977) 359; Govaerts, *Numerical Methods for Bifurcations of
+    Dynamical Equilibria*, ch. 2-4.
+    """
+    q, v = stacked_one(start)
+    if velocity is not None:
+        v = jax.tree.map(lambda x: x[0], stacked([velocity], "velocity"))
+    if not is_eager() or coordinates.is_traced((q, v, params, t, to)):
+        raise TypeError(
+            "lj.continue_equilibria decides by values how it goes on, and JAX is tracing.\n"
+            "Fix: call it outside of jit, vmap and grad; critical points carry their derivatives, "
+            "branches.critical[0].derivative, and lj.equilibria works inside."
+        )
+    system, s = checked(system, t, q, v, params)
+    moving = np.concatenate([np.ravel(x) for x in jax.tree.leaves(s.v)]) != 0
+    symmetries = symmetries_of(system, s, cyclic, hold, None if velocity is None else moving)
+    x, u = coordinates.flatten(s.q)[0], coordinates.flatten(s.v)[0]
+    steady = Steady(system, s.t, s.params, jnp.zeros(symmetries.count, s.t.dtype), s.q, symmetries)
+    steady = Steady(system, s.t, s.params, _held(steady, x, u), s.q, symmetries)
+    place = place_of(steady, along)
+    first, last = float(place.get(steady)), float(to)
+    if not np.isfinite(last) or first == last:
+        raise ValueError(
+            f"to={to} gives the parameter {along!r} no way to go from {first:.6g}.\n"
+            f"Fix: to={2 * first or 1.0:.6g}, and the first value in params."
+        )
+    runs = []
+    for units in UNITS:
+        frame, z = _frame(steady, place, first, last, s.v, units)
+        # Where the start is a critical point, the branch begins a little before it.
+        low, high = sorted((float(z[-1]), last / abs(last - first)))
+        runs.append(_Run(Tracer(frame, low, high), most_points, crossings))
+        runs[-1].main(z, np.sign(last - first))
+        if "infinity" not in runs[-1].paths[0].status:
+            return runs[-1].result(along, first, last, s)
+        if np.max(frame.columns[: steady.n]) > NOTHING:
+            break
+    return runs[0].result(along, first, last, s)
+
+
+@compiled
+def _held(steady, x, u):
+    return held_at(steady, x, u)[1]
+
+
+@compiled
+def _velocity(steady, x):
+    return steady.velocity(x, steady.held)
+
+
+def _solution(steady: Steady, v) -> np.ndarray | str:
+    """The unknowns of the equilibrium near `steady.like`, or in words why there is none."""
+    if steady.symmetries.count and steady.symmetries.hold == VELOCITY:
+        v = steady.unflatten(_velocity(steady, coordinates.flatten(steady.like)[0]))
+    one = lambda tree: jax.tree.map(lambda x: jnp.asarray(x)[None], tree)
+    s = State(steady.t, steady.like, v, steady.params)
+    lasting = not steady.symmetries.count and conserves_balance(steady.system, s)
+    row = jax.tree.map(lambda x: np.asarray(x)[0], searched(steady, one(steady.like), one(v), lasting, True))
+    if row.status != OK:
+        return WORDS[row.status]
+    flat = lambda tree: np.concatenate([np.ravel(x) for x in jax.tree.leaves(tree)] or [np.zeros(0)])
+    return np.concatenate([flat(row.q), row.rates, flat(row.multipliers)])
+
+
+def _frame(steady: Steady, place: Place, first: float, last: float, v, units) -> tuple[Frame, np.ndarray]:
+    """Units, and which combinations of equations are solved; and the point at which the branch begins."""
+    y = _solution(steady, v)
+    if isinstance(y, str):
+        raise ValueError(
+            f"no equilibrium was found from the start {describe(steady.like)}, {place.name} = {first:.6g}: {y}.\n"
+            "Usual cause: a start that is far from one, or a parameter at which there is none.\n"
+            "Fix: found = lj.equilibria(system, params, starts=[...]) from several starts shows what there is; "
+            "start from one of them."
+        )
+    unit = abs(last - first)
+    n = steady.n
+    angle = np.concatenate(
+        [np.full(np.size(x), yes) for yes, x in zip(*map(jax.tree.leaves, (_angles(steady), steady.like)))]
+    )
+    length = np.max(np.abs(y[:n])[~angle], initial=0.0)
+    positions = np.where(angle, 1.0, units * length if length > 0 else 1.0)
+    rows, columns, u, sizes, vt = _parts(steady, y, positions)
+    rank = int(np.sum(sizes > DEPENDENT * sizes[0]))
+    # At a critical point more is dependent than elsewhere: the rank is asked once more close by.
+    x = coordinates.flatten(steady.like)[1](jnp.asarray(y[:n], steady.t.dtype))
+    beside = Steady(steady.system, steady.t, steady.params, steady.held, x, steady.symmetries)
+    beside = place.put(beside, first + NEARBY * (last - first))
+    other = _solution(beside, v)
+    if not isinstance(other, str):
+        _, _, *those = _parts(beside, other, positions, (rows, columns))
+        if int(np.sum(those[1] > DEPENDENT * those[1][0])) > rank:
+            u, sizes, vt = those
+            rank = int(np.sum(sizes > DEPENDENT * sizes[0]))
+            before = first - NEARBY * (last - first)
+            earlier = _solution(place.put(beside, before), v)
+            first, y = (first, y) if isinstance(earlier, str) else (before, earlier)
+    dtype = steady.t.dtype
+    arrays = [jnp.asarray(a, dtype) for a in (u[:, :rank].T, vt[rank:], y / columns, rows, columns, unit)]
+    frame = Frame(steady, *arrays, place)
+    return frame, np.append(y / columns, first / unit)
+
+
+def _parts(steady, y, positions, units=None):
+    """Units of equations and unknowns, and the singular values of the Jacobian in these."""
+    jacobian = np.asarray(full_jacobian(steady, np.asarray(y, steady.t.dtype))[1], float)
+    if units is None:
+        n = steady.n
+        positive = lambda x: np.where(x > 0, x, 1.0)
+        rows = np.max(np.abs(jacobian[:, :n] * positions), axis=1)
+        rows = positive(np.where(rows > 0, rows, np.max(np.abs(jacobian), axis=1)))
+        # A row that is small where the branch begins need not be elsewhere.
+        rows[:n] = np.maximum(rows[:n], 1e-6 * np.max(rows[:n]))
+        columns = positive(np.max(np.abs(jacobian / rows[:, None]), axis=0))
+        columns = np.concatenate([positions, 1 / columns[n:]])
+        units = rows, columns
+    rows, columns = units
+    u, sizes, vt = np.linalg.svd(jacobian / rows[:, None] * columns[None, :])
+    sizes = np.append(sizes, np.zeros(max(0, vt.shape[0] - sizes.size)))
+    return rows, columns, u, sizes, vt
+
+
+def _angles(steady):
+    return angles(steady.system, steady.t, steady.like, steady.like, steady.params)
+
+
+class _Launch(NamedTuple):
+    """A branch that is to be traced: from a critical point in a direction."""
+
+    critical: int
+    direction: np.ndarray
+
+
+class _Run:
+    """The branches and critical points found so far, and those that are to be traced."""
+
+    def __init__(self, tracer: Tracer, most: int, crossings: bool):
+        self.tracer, self.most, self.crossings = tracer, most, crossings
+        self.paths: list[Path] = []
+        self.found: list[Found] = []
+        self.on: list[set[int]] = []
+        self.waiting: list[_Launch] = []
+
+    def main(self, z, towards):
+        """The first branch, and all that cross."""
+        start = np.zeros_like(z)
+        start[-1] = towards
+        corrected = self.tracer.corrected(z, np.eye(z.size)[-1])
+        begin = self.tracer.point(z if corrected is None else corrected, start)
+        if isinstance(begin, str):
+            raise ValueError(f"the equations at the start are no guide: {begin}.")
+        self._follow(begin)
+        while self.waiting and len(self.paths) < MOST_BRANCHES:
+            launch = self.waiting.pop(0)
+            halves = [self._from(launch, sign) for sign in (1.0, -1.0)]
+            whole = _joined(halves)
+            if whole.points[1:]:
+                self.paths.append(whole)
+            else:
+                for on in self.on:
+                    on.discard(len(self.paths))
+
+    def _follow(self, begin: Point):
+        path = self.tracer.trace(begin, self.most, self._step)
+        self._far(path)
+        self.paths.append(path)
+
+    def _from(self, launch: _Launch, sign: float) -> Path:
+        """One half of a branch that crosses another."""
+        critical = self.found[launch.critical]
+        jacobian = self.tracer.at(critical.z)[1]
+        seen = self.tracer.point(critical.z, sign * launch.direction)
+        if isinstance(seen, str):
+            return Path([], seen)
+        begin = Point(
+            critical.z, jacobian, sign * launch.direction, 0.0, seen.seen, None, seen.negative, launch.critical
+        )
+        path = self.tracer.trace(begin, self.most, self._step, FIRST)
+        self._far(path)
+        return path
+
+    def _far(self, path):
+        """What becomes of a branch that goes to infinity."""
+        if path.status != "infinity":
+            return
+        point, name = path.points[-1], self.tracer.frame.place.name
+        path.status = f"infinity, near {name} = {point.z[-1] * self.tracer.unit:.6g}"
+        found = escape(self.tracer, point)
+        if found:
+            path.status = f"infinity, at {name} = {found.z[-1] * self.tracer.unit:.10g}"
+            self.found.append(found)
+            self.on.append({len(self.paths)})
+
+    def _step(self, before: Point, after: Point, path: Path) -> str | None:
+        """What lies between two points, put into the path; why it ends, where it does."""
+        points = path.points
+        if len(points) >= LINE and points[0].critical is not None:
+            last = np.array([p.z[-1] for p in points[-LINE:]])
+            if np.ptp(last) < LINE_WITHIN:
+                self.found[points[0].critical].kind = "line of equilibria"
+                return "a line of equilibria, which goes on"
+        ended = None
+        all_found = between(self.tracer, before, after)
+        if before.sign * after.sign < 0 and not any(found.directions for found in all_found):
+            return AGAIN
+        for found in all_found:
+            number, known = self._number(found)
+            kept = self.found[number]
+            along = (self.tracer.weights * (after.z - before.z)) / np.linalg.norm(after.z - before.z)
+            self.on[number].add(len(self.paths))
+            if known and any(abs(_cosine(self.tracer, d, after.z - before.z)) > 0.95 for d in kept.used):
+                if kept.directions:
+                    ended = f"a crossing that is known, at {self._value(kept)}"
+            own = max(kept.directions, key=lambda d: abs(d @ along)) if kept.directions else None
+            if own is not None:
+                kept.used.append(own)
+                self.waiting = [w for w in self.waiting if w.critical != number or abs(w.direction @ along) <
+                                0.95 * np.sqrt(along @ along)]  # fmt: skip
+                if not known and self.crossings:
+                    others = [d for d in kept.directions if d is not own]
+                    self.waiting += [_Launch(number, d) for d in others]
+                    kept.used += others
+            path.points.append(self._point(kept, number, after))
+        return ended
+
+    def _value(self, found):
+        return f"{self.tracer.frame.place.name} = {found.z[-1] * self.tracer.unit:.6g}"
+
+    def _point(self, found, number, after):
+        """A critical point as a point of a branch."""
+        point = self.tracer.point(found.z, after.tangent)
+        if isinstance(point, str):
+            point = after
+        return Point(found.z, point.jacobian, after.tangent, after.sign, point.seen, None, after.negative, number)
+
+    def _number(self, found: Found) -> tuple[int, bool]:
+        """Its number among those found, and whether it was known."""
+        for i, other in enumerate(self.found):
+            if np.max(np.abs(self.tracer.weights * (other.z - found.z))) < SAME * self.tracer.size(found.z):
+                return i, True
+        self.found.append(found)
+        self.on.append(set())
+        return len(self.found) - 1, False
+
+    def result(self, along, first, last, s) -> Branches:
+        """All of it in the user's structure."""
+        branches = [_branch(path, self.tracer) for path in self.paths]
+        critical = [self._critical(i) for i in range(len(self.found))]
+        order = sorted(range(len(critical)), key=lambda i: abs(critical[i].parameter - first))
+        names = coordinates.names(s.q)
+        status = "all followed" if not self.waiting else f"{len(self.waiting)} crossing branches were not followed"
+        return Branches(
+            branches, [critical[i] for i in order], along, float(first), float(last), tuple(names), s.params,
+            status,
+        )  # fmt: skip
+
+    def _critical(self, i) -> Critical:
+        found = self.found[i]
+        on = {k for k in self.on[i] if k < len(self.paths)}
+        on |= {k for k, path in enumerate(self.paths) if any(p.critical == i for p in path.points)}
+        point = self.tracer.point(found.z, self._any(found))
+        seen = point.seen if not isinstance(point, str) else None
+        seen = seen or jax.tree.map(lambda x: x * np.nan, self.paths[0].points[0].seen)
+        value = found.z[-1] * self.tracer.unit
+        _, q, v, multipliers, _ = seen
+        if found.kind == "escape":
+            q = jax.tree.map(lambda x: np.full_like(x, np.inf), q)
+        return Critical(
+            found.kind, np.asarray(value), q, v, multipliers, found.derivative, np.asarray(found.frequency),
+            np.asarray(found.accuracy * self.tracer.unit), tuple(sorted(on)),
+        )  # fmt: skip
+
+    def _any(self, found):
+        return found.directions[0] if found.directions else np.ones_like(found.z)
+
+
+def _cosine(tracer, a, b):
+    inner = lambda a, b: (tracer.weights * a) @ b
+    return inner(a, b) / np.sqrt(inner(a, a) * inner(b, b))
+
+
+def _joined(halves: list[Path]) -> Path:
+    """Both halves of a branch from its end, through the critical point, to the other end."""
+    first, second = halves
+    points = [*second.points[:0:-1], *first.points]
+    status = first.status if not second.points[1:] else f"{second.status}, and {first.status}"
+    if first.status == second.status:
+        status = first.status
+    return Path(points, status)
+
+
+def _branch(path: Path, tracer: Tracer) -> Branch:
+    seen = [p.seen for p in path.points]
+    parameter, q, v, multipliers, roots = jax.tree.map(lambda *x: np.stack(x), *seen)
+    stable = np.array([p.growing for p in path.points], object)
+    # At a critical point itself roots are zero to round-off alone: what is beside it counts.
+    known = [i for i, n in enumerate(stable) if n is not None]
+    filled = [stable[min(known, key=lambda j: (abs(j - i), -j))] if known else 0 for i in range(len(stable))]
+    critical = tuple(sorted({p.critical for p in path.points if p.critical is not None}))
+    return Branch(parameter, q, v, multipliers, np.array([n == 0 for n in filled]), roots, path.status, critical)

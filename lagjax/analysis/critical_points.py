@@ -1,0 +1,370 @@
+"""Critical points between two points of a branch: found by Newton's method, named, with derivatives by all parameters.
+
+The larger systems are those of `branch_equations.py`. At a branch point the two directions are the roots of the
+algebraic bifurcation equation: with b₁, b₂ a basis of the null space of `(E_y, E_μ)`, and τ = α b₁ + β b₂,
+
+    ψ·D²E[τ, τ] = a α² + 2 b α β + c β² = 0
+
+One of them across the parameter (τ_μ = 0) makes it a pitchfork, or a line of equilibria; else it is transcritical.
+
+Source: Keller, *Lectures on Numerical Methods in Bifurcation Problems* (1987), §5.20-5.26; Govaerts, ch. 3.
+"""
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lagjax.analysis.branch_equations import (
+    BRANCH,
+    COLLISION,
+    ESCAPE,
+    FLUTTER,
+    FOLD,
+    MULTIPLE,
+    curvature,
+    dynamic_at,
+    extended_at,
+    extended_by_params,
+)  # fmt: skip
+from lagjax.analysis.tracing import Point, Tracer
+
+NEWTON = 12
+# Directions whose share of the parameter is less run across it.
+ACROSS = 1e-5
+# Changes of the parameter, of its range, that are none.
+CONSTANT = 1e-9
+# The unfolding β of a branch point, beside equations of the size of one, below which branches really meet.
+MEETS = 1e-8
+
+
+@dataclass
+class Found:
+    """A critical point: its kind, z, the directions that cross there, a frequency, the derivatives of the parameter."""
+
+    kind: str
+    z: np.ndarray
+    directions: list[np.ndarray]
+    frequency: float
+    derivative: Any
+    accuracy: float
+    used: list[np.ndarray]
+
+
+def between(tracer: Tracer, a: Point, b: Point) -> list[Found]:
+    """All that is critical between two neighbouring points of a branch."""
+    found = []
+    if max(abs(b.z[-1] - a.z[-1]), abs(a.tangent[-1]), abs(b.tangent[-1])) < CONSTANT:
+        # On a line of equilibria nothing but round-off changes.
+        return []
+    crosses, folds = a.sign * b.sign < 0, a.tangent[-1] * b.tangent[-1] < 0
+    if crosses and (point := _branch_point(tracer, a, b)):
+        found.append(point)
+    if folds and not found and (point := _fold(tracer, a, b)):
+        found.append(point)
+    known = a.growing is not None and b.growing is not None
+    if known and a.growing != b.growing and not found and (point := _loses_stability(tracer, a, b)):
+        found.append(point)
+    if not found and (a.negative - b.negative) % 2 == 0 and a.negative != b.negative:
+        point = _multiple_zero(tracer, *_halved(tracer, a, b, lambda p: p.negative))
+        found += [point] if point else []
+    return found
+
+
+def _halved(tracer, a, b, of):
+    """Two points of a branch much nearer to where a count changes that changes between a and b."""
+    low, high, left, right = 0.0, 1.0, a, b
+    for _ in range(14):
+        share = 0.5 * (low + high)
+        middle = tracer.between(a, b, share)
+        if middle is None or of(middle) is None:
+            break
+        if of(middle) == of(left):
+            low, left = share, middle
+        else:
+            high, right = share, middle
+    return left, right
+
+
+def _null_vectors(jacobian):
+    """The left null vector of E_y, nearly."""
+    u, _, vt = np.linalg.svd(jacobian[:, :-1])
+    return u[:, -1], vt[-1]
+
+
+def _middle(tracer, a, b, share):
+    """A guess between two points."""
+    share = float(np.clip(share, 0.02, 0.98))
+    point = tracer.between(a, b, share)
+    return point.z if point else a.z + share * (b.z - a.z)
+
+
+def _inside(tracer, a, b, z):
+    """Whether a solution lies between the points, or as good as."""
+    step = b.z - a.z
+    length = np.sqrt(tracer.weights @ step**2)
+    share = (tracer.weights * step) @ (z - a.z) / length**2
+    aside = z - a.z - share * step
+    return -0.2 < share < 1.2 and np.sqrt(tracer.weights @ aside**2) < 0.5 * length
+
+
+def _branch_point(tracer, a, b):
+    sizes = [np.linalg.slogdet(np.concatenate([p.jacobian, (tracer.weights * p.tangent)[None]]))[1] for p in (a, b)]
+    share = 1 / (1 + np.exp(np.clip(sizes[1] - sizes[0], -50, 50)))
+    z = _middle(tracer, a, b, share)
+    psi, _ = _null_vectors(tracer.at(z)[1])
+    big = _solved(tracer, BRANCH, np.concatenate([z, psi, [0.0]]), np.zeros(1))
+    if big is None or not _inside(tracer, a, b, big[0][: z.size]):
+        return None
+    big, accuracy = big
+    if abs(big[-1]) > MEETS:
+        return None
+    directions = _directions(tracer, big)
+    if not directions:
+        return None
+    kind = "pitchfork" if any(abs(t[-1]) < ACROSS for t in directions) else "transcritical"
+    return Found(kind, big[: z.size], directions, 0.0, _derivative(tracer, BRANCH, big, np.zeros(1)), accuracy, [])
+
+
+def _directions(tracer, big):
+    """The unit tangents of both branches through a branch point."""
+    n = tracer.frame.columns.size
+    z, psi = big[: n + 1], big[n + 1 : 2 * n + 1]
+    jacobian = tracer.at(z)[1]
+    basis = np.linalg.svd(jacobian)[2][-2:]
+    form = lambda i, j: float(psi @ np.asarray(_curvature(tracer, z, basis[i], basis[j])))
+    a, b, c = form(0, 0), form(0, 1), form(1, 1)
+    disc, size = b * b - a * c, max(abs(a), abs(b), abs(c))
+    if not np.isfinite(size) or size == 0 or disc <= 1e-9 * size**2:
+        return []
+    # Both roots without cancellation.
+    root = -(b + np.copysign(np.sqrt(disc), b))
+    pairs = [(root, a), (c, root)]
+    found = []
+    for alpha, beta in pairs:
+        t = alpha * basis[0] + beta * basis[1]
+        found.append(t / np.sqrt(tracer.weights @ t**2))
+    return found
+
+
+def _curvature(tracer, z, a, b):
+    cast = lambda x: np.asarray(x, tracer.dtype)
+    return curvature(tracer.frame, cast(z), cast(a), cast(b))
+
+
+def _fold(tracer, a, b):
+    share = a.tangent[-1] / (a.tangent[-1] - b.tangent[-1])
+    z = _middle(tracer, a, b, share)
+    psi, phi = _null_vectors(tracer.at(z)[1])
+    solved = _solved(tracer, FOLD, np.concatenate([z, psi]), np.zeros(1))
+    if solved is None or not _inside(tracer, a, b, solved[0][: z.size]):
+        return None
+    big, accuracy = solved
+    return Found("fold", big[: z.size], [], 0.0, _derivative(tracer, FOLD, big, np.zeros(1)), accuracy, [])
+
+
+def escape(tracer: Tracer, point: Point) -> Found | None:
+    """The parameter at which the solution of linear equations is at infinity, from a point far out."""
+    n = tracer.frame.columns.size
+    half, here = point.z.copy(), tracer.at(point.z)[1][:, :-1]
+    half[:n] *= 0.5
+    # Elsewhere on the way the Jacobian is the same: the equations are linear.
+    if np.max(np.abs(tracer.at(half)[1][:, :-1] - here)) > 1e-9 * np.max(np.abs(here)):
+        return None
+    psi = np.linalg.svd(here)[0][:, -1]
+    guide = np.append(np.zeros(n), 0.0)
+    start = np.concatenate([np.zeros(n), point.z[-1:], psi])
+    solved = _solved(tracer, ESCAPE, start, guide)
+    if solved is None:
+        return None
+    big, accuracy = solved
+    z = np.concatenate([point.z[:n], big[n : n + 1]])
+    return Found("escape", z, [], 0.0, _derivative(tracer, ESCAPE, big, guide), accuracy, [])
+
+
+def _loses_stability(tracer, a, b):
+    """Where the number of growing roots changes without a crossing branch or a fold: flutter, or several zeros."""
+    left, right = _halved(tracer, a, b, lambda p: p.growing)
+    few, many = (left, right) if left.growing < right.growing else (right, left)
+    new = _leaving(few, many)
+    size = np.nanmax(np.abs(many.seen[-1]))
+    if abs(new.imag) < 1e-3 * abs(size) and abs(new.imag) <= 30 * abs(new.real):
+        return _multiple_zero(tracer, few, many) or _divergence(tracer, a, b, few, many)
+    return _flutter(tracer, few, many, new)
+
+
+def _leaving(few, many):
+    """The root that grows after and did not before."""
+    known = many.seen[-1][np.isfinite(many.seen[-1])]
+    grows = known[np.argsort(-known.real)][: many.growing]
+    # Of several the slowest is the one that has just begun to.
+    root = grows[np.argmin(grows.real)]
+    return complex(root.real, abs(root.imag))
+
+
+def _multiple_zero(tracer, few, many):
+    z, n = few.z, tracer.frame.columns.size
+    _, phi = _null_vectors(few.jacobian)
+    solved = _solved(tracer, MULTIPLE, np.concatenate([z, phi]), phi)
+    if solved is None or not _near(tracer, few, many, solved[0][: n + 1]):
+        return None
+    big, accuracy = solved
+    derivative = _derivative(tracer, MULTIPLE, big, phi)
+    return Found("multiple zero", big[: n + 1], [], 0.0, derivative, accuracy, [])
+
+
+def _divergence(tracer, a, b, few, many):
+    """Where a root leaves zero, among others that are always zero.
+
+    The characteristic polynomial begins with `c s^k` for k such roots, and c changes its sign. Of computed roots all
+    coefficients are those of a matrix that is off by round-off, although zeros of multiplicity k are off by its root.
+    """
+    fastest = tracer.fastest
+    tiny = lambda point: int(np.sum(np.abs(point.seen[-1]) < 1e-5 * fastest))
+    zeros = min(tiny(a), tiny(b))
+
+    def product(roots):
+        known = roots[np.isfinite(roots)]
+        return float(np.poly(known / fastest)[known.size - zeros].real)
+
+    low, high, left, right = 0.0, 1.0, product(a.seen[-1]), product(b.seen[-1])
+    best, off, last = many, float(np.max(np.abs(few.z - many.z))), np.inf
+    for i in range(60 if left * right < 0 else 0):
+        # A chord, and every third time the middle, so that neither end stays where it is.
+        share = low + (high - low) * (left / (left - right) if i % 3 < 2 else 0.5)
+        point = tracer.between(a, b, share)
+        if point is None or not 0 < high - low or share in (low, high):
+            break
+        value = product(point.seen[-1])
+        off, last, best = abs(float((point.z - best.z)[-1])), off, point
+        if value == 0 or max(off, last) < 4 * tracer.eps * tracer.size(point.z):
+            break
+        low, high, left, right = (share, high, value, right) if value * left > 0 else (low, share, left, value)
+    if left * right >= 0 or off > tracer.eps**0.6 * tracer.size(best.z):
+        return Found("divergence", best.z, [], 0.0, None, max(off, float(np.max(np.abs(few.z - many.z)))), [])
+    derivative = _slopes(tracer, best, lambda z, other: product(other.point(z, best.tangent).seen[-1]))
+    return Found("divergence", best.z, [], 0.0, derivative, off, [])
+
+
+def _slopes(tracer, point, value):
+    """Derivatives of the parameter at which `value(z, tracer)` is zero along a branch, by central differences."""
+    place, steady = tracer.frame.place, tracer.frame.steady
+    row = np.zeros_like(point.z)
+    row[-1] = 1.0
+    h = tracer.eps ** (1 / 3)
+
+    def at(other, z, parameter):
+        found = other.corrected(z, row, parameter)
+        return np.nan if found is None else value(found, other)
+
+    here = point.z[-1]
+    by_parameter = (at(tracer, point.z, here + h) - at(tracer, point.z, here - h)) / (2 * h)
+    floats, rest = eqx.partition(steady.params, eqx.is_inexact_array)
+    leaves, structure = jax.tree.flatten(floats)
+
+    def by(i, entry):
+        step = h * max(abs(float(np.ravel(leaves[i])[entry])), h)
+
+        def moved(sign):
+            leaf = np.array(leaves[i])
+            leaf.reshape(-1)[entry] += sign * step
+            params = eqx.combine(structure.unflatten([*leaves[:i], jnp.asarray(leaf), *leaves[i + 1 :]]), rest)
+            frame = replace(tracer.frame, steady=replace(steady, params=params))
+            return at(Tracer(frame, tracer.low, tracer.high), point.z, here)
+
+        return -tracer.unit * (moved(1) - moved(-1)) / (2 * step) / by_parameter
+
+    own = lambda i, entry: (
+        place.leaf is not None and leaves[i] is jax.tree.leaves(steady.params)[place.leaf] and (entry == place.entry)
+    )
+    found = [np.reshape([0.0 if own(i, j) else by(i, j) for j in range(np.size(x))], np.shape(x))
+             for i, x in enumerate(leaves)]  # fmt: skip
+    return structure.unflatten(found)
+
+
+def _near(tracer, a, b, z):
+    return np.max(np.abs(tracer.weights * (z - a.z))) < 1e-2 + 10 * np.max(np.abs(b.z - a.z))
+
+
+def _flutter(tracer, few, many, root):
+    """The start of flutter: a pair of roots that crosses the axis, or two pairs that meet on it."""
+    n = tracer.frame.columns.size
+    roots = many.seen[-1][np.isfinite(many.seen[-1])]
+    omega = abs(root.imag)
+    # Without damping the mirror image of a growing root decays: there are two beside this place on the axis.
+    beside = np.sum(np.abs(roots - 1j * omega) < max(4 * abs(root.real), 1e-9 * omega))
+    kind = COLLISION if beside > 1 else FLUTTER
+    stiffness, damping, mass = (np.asarray(x, float) for x in dynamic_at(tracer.frame, few.z.astype(tracer.dtype)))
+    matrix = stiffness + 1j * omega * damping - omega**2 * mass
+    size = np.max(np.abs(stiffness) + omega * np.abs(damping) + omega**2 * np.abs(mass), axis=1)
+    matrix = matrix / np.where(size > 0, size, 1.0)[:, None]
+    w = np.conj(np.linalg.svd(matrix)[2][-1])
+    guide = np.concatenate([w.real, w.imag])
+    start = [few.z, [omega], w.real, w.imag]
+    if kind == COLLISION:
+        slope = omega * (damping + 2j * omega * mass) / np.where(size > 0, size, 1.0)[:, None]
+        second = -np.linalg.pinv(matrix, rcond=1e-5) @ (slope @ w)
+        second = second - w * (np.conj(w) @ second)
+        start += [second.real, second.imag]
+    solved = _solved(tracer, kind, np.concatenate(start), guide)
+    if solved is None or not _near(tracer, few, many, solved[0][: n + 1]):
+        return Found("flutter", few.z, [], omega, None, float(np.max(np.abs(few.z - many.z))), [])
+    big, accuracy = solved
+    return Found(
+        "flutter", big[: n + 1], [], abs(float(big[n + 1])), _derivative(tracer, kind, big, guide), accuracy, []
+    )
+
+
+def _solved(tracer, kind, big, guide):
+    """The larger system by Newton's method, shortest steps where it leaves some freedom; and its last step."""
+    cast = lambda x: np.asarray(x, tracer.dtype)
+    last, n, step, length = np.inf, tracer.frame.columns.size, big, np.inf
+    for i in range(NEWTON):
+        value, jacobian = (np.asarray(x, float) for x in extended_at(kind, tracer.frame, cast(big), cast(guide)))
+        if not (np.all(np.isfinite(value)) and np.all(np.isfinite(jacobian))):
+            return None
+        step = _least(jacobian, value)
+        length = float(np.max(np.abs(step)))
+        if i > 3 and length > last and length > tracer.eps**0.5 * tracer.size(big):
+            return None
+        big = big - step
+        if length <= 4 * tracer.eps * tracer.size(big) or i > 3 and length >= last:
+            break
+        last = length
+    accuracy = abs(float(step[n]))
+    return (big, accuracy) if length < tracer.eps**0.6 * tracer.size(big) else None
+
+
+def _least(matrix, known):
+    """The shortest least-squares solution, columns in units of their own."""
+    columns = np.max(np.abs(matrix), axis=0)
+    columns = np.where(columns > 0, columns, 1.0)
+    rows = np.max(np.abs(matrix / columns), axis=1)
+    rows = np.where(rows > 0, rows, 1.0)
+    scaled = matrix / columns / rows[:, None]
+    known = (known.T / rows).T
+    return (np.linalg.lstsq(scaled, known, rcond=1e-10)[0].T / columns).T
+
+
+def _derivative(tracer, kind, big, guide):
+    """The derivatives of the critical parameter by every number in `params`, like these."""
+    cast = lambda x: np.asarray(x, tracer.dtype)
+    _, jacobian = extended_at(kind, tracer.frame, cast(big), cast(guide))
+    by_params = extended_by_params(kind, tracer.frame, cast(big), cast(guide))
+    n, unit = tracer.frame.columns.size, tracer.unit
+    leaves, structure = jax.tree.flatten(by_params)
+    if not leaves:
+        return by_params
+    flat = np.concatenate([np.asarray(x, float).reshape(big_rows(x), -1) for x in leaves], axis=1)
+    slopes = -unit * _least(np.asarray(jacobian, float), flat)[n]
+    places = np.cumsum([0, *(np.asarray(x)[0].size for x in leaves)])
+    parts = [slopes[i:j].reshape(np.shape(x)[1:]) for i, j, x in zip(places, places[1:], leaves)]
+    return jax.tree.unflatten(structure, parts)
+
+
+def big_rows(x) -> int:
+    """How many equations a derivative is of."""
+    return np.shape(x)[0]

@@ -1,0 +1,200 @@
+"""What a search for steady motions found: a table that prints itself, and what became of each start."""
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Complex, Float, Int, PyTree
+
+from lagjax.analysis.balance import Symmetries
+from lagjax.mechanics import coordinates
+from lagjax.mechanics.diagnosis import describe
+
+OK, NO_BALANCE, CONSTRAINED, NOT_FINITE, LASTS_NOT, UNFINISHED = range(6)
+WORDS = (
+    "found",
+    "no equilibrium near it: the imbalance of forces has a least value there that is not zero, or fades far away",
+    "the constraints cannot be met there: they contradict each other, or the velocity that is held",
+    "L, a force or a constraint is not finite on the way, or the way leads to infinity",
+    "a balance at this instant alone: it depends on t, or moves off its place",
+    "the search is still on its way: start again from where it is, `last`",
+)
+# Coordinates that agree to this part of the largest are the same.
+SAME = 1e-6
+
+
+class Row(NamedTuple):
+    """What a start leads to; the names are those of `Equilibria`."""
+
+    q: PyTree[Float[Array, "..."]]
+    v: PyTree[Float[Array, "..."]]
+    multipliers: dict[str, Float[Array, "..."]]
+    rates: Float[Array, " k"]
+    momenta: Float[Array, " k"]
+    stable: Bool[Array, ""]
+    eigenvalues: Complex[Array, " s"]
+    found: Bool[Array, ""]
+    zero_modes: Int[Array, ""]
+    departure: Float[Array, ""]
+    status: Int[Array, ""]
+    last: PyTree[Float[Array, "..."]]
+
+
+class Equilibria(eqx.Module):
+    """States of rest and of steady motion, one row each (E,), and what became of each start (S,). It prints itself.
+
+    - `t`; `q`, `v`: the states, each leaf with a leading axis E, `[q]`, `[q]/[t]`.
+    - `multipliers`: by constraint name, (E, ...), `[L]/[g]`; where constraints depend on each other the shortest.
+    - `rates`, `momenta` (E, k): of each cyclic motion, `1/[t]` (`[q]/[t]` for a coordinate) and `[L][t]`.
+    - `stable` (E,): no small departure grows. (Where none decays either, as without friction, of the linear equations:
+      roots on the imaginary axis are their border.)
+    - `eigenvalues` (E, 2n): the roots s of departures e^(st), `1/[t]`, NaN beyond the last one; without derivatives.
+    - `zero_modes` (E,): along how many directions, besides the cyclic ones, the balance is kept to first order: it is
+      one of a family, the one nearest to its start, or a critical point where branches meet.
+    - `departure` (E,): the imbalance, relative to what a displacement as large as the coordinates makes.
+    - `found` (E,), `status` (S,): 0 where a start led to one; `describe(status)` says what another number means.
+    - `of_start` (S,): to which row each start led, -1 for none. `starts`, `last`: leaves with a leading axis S, where
+      each search began and ended, also of those that found nothing.
+
+    While JAX traces, E is S and what was not found is NaN.
+    """
+
+    t: Float[Array, ""]
+    q: PyTree[Float[Array, "E ..."]]
+    v: PyTree[Float[Array, "E ..."]]
+    multipliers: dict[str, Float[Array, "E ..."]]
+    rates: Float[Array, "E k"]
+    momenta: Float[Array, "E k"]
+    stable: Bool[Array, " E"]
+    eigenvalues: Complex[Array, "E s"]
+    found: Bool[Array, " E"]
+    zero_modes: Int[Array, " E"]
+    departure: Float[Array, " E"]
+    status: Int[Array, " S"]
+    last: PyTree[Float[Array, "S ..."]]
+    starts: PyTree[Float[Array, "S ..."]]
+    params: PyTree
+    symmetries: Symmetries = eqx.field(static=True)
+    of_start: Int[Array, " S"] | None = None
+
+    def __len__(self):
+        return self.found.shape[0]
+
+    def describe(self, status: int) -> str:
+        """What a status means, in words."""
+        return WORDS[int(status)]
+
+    def __getitem__(self, i: int) -> tuple:
+        """The state (t, q, v, params) of one equilibrium, as other functions take it."""
+        q, v = jax.tree.map(lambda x: x[i], (self.q, self.v))
+        return self.t, q, v, self.params
+
+    def __repr__(self):
+        if coordinates.is_traced((self.q, self.found)):
+            return f"Equilibria, being traced, of {self.found.shape[-1]} starts"
+        if self.found.ndim > 1:
+            of = " x ".join(map(str, self.found.shape[:-1]))
+            return f"Equilibria, {int(np.sum(self.found))} from a batch of {of} with {self.found.shape[-1]} starts each"
+        return "\n".join(_lines(self))
+
+
+def merged(rows: Equilibria, is_angle: PyTree[bool]) -> Equilibria:
+    """Each equilibrium once, in the order in which starts led to them."""
+    there = np.flatnonzero(np.asarray(rows.found))
+    first = jax.tree.map(lambda x: x[0], rows.q)
+    angle = np.concatenate([np.full(np.size(x), yes) for yes, x in zip(*map(jax.tree.leaves, (is_angle, first)))])
+    angle[list(rows.symmetries.places)] = False
+    x, u = _columns(rows.q), _columns(rows.v)
+    x[:, list(rows.symmetries.places)] = 0.0
+    other = np.concatenate([u, _columns(rows.multipliers)], axis=1) if rows.multipliers else u
+    roots = np.asarray(rows.eigenvalues)
+    kept: list[int] = []
+    of_start = np.full(len(x), -1)
+    for i in there:
+        for place, j in enumerate(kept):
+            off = x[i] - x[j]
+            off = np.where(angle, off - 2 * np.pi * np.round(off / (2 * np.pi)), off)
+            same = _close(off, np.maximum(np.abs(x[i]), np.abs(x[j])), angle)
+            # An angle that counts twice or half is not the same a turn later.
+            alike = _close(other[i] - other[j], np.abs(other[i]), np.zeros(other.shape[1], bool))
+            if same and alike and rows.stable[i] == rows.stable[j] and _same_roots(roots[i], roots[j]):
+                of_start[i] = place
+                break
+        else:
+            of_start[i] = len(kept)
+            kept.append(i)
+    pick = lambda tree: jax.tree.map(lambda x: x[np.array(kept, int)], tree)
+    of_rows = [name for name in Row._fields if name not in ("status", "last")]
+    return replace(rows, **{name: pick(getattr(rows, name)) for name in of_rows}, of_start=jnp.asarray(of_start))
+
+
+def _close(off, size, angle):
+    largest = max(np.max(size, initial=0.0), 1e-300)
+    return bool(np.all(np.abs(off) <= SAME * np.where(angle, 1.0, largest)))
+
+
+def _same_roots(a, b):
+    a, b = (np.sort_complex(x[np.isfinite(x)]) for x in (a, b))
+    return a.size == b.size and np.all(np.abs(np.abs(a) - np.abs(b)) <= 1e-3 * max(np.abs(a).max(initial=0.0), 1e-300))
+
+
+def _columns(tree):
+    leaves = [np.array(x, float) for x in jax.tree.leaves(tree)]
+    return np.concatenate([x.reshape(x.shape[0], -1) for x in leaves], axis=1)
+
+
+def _lines(found: Equilibria):
+    count, starts = int(np.sum(found.found)), found.status.shape[0]
+    kind = "steady motions" if found.symmetries.count else "equilibria"
+    yield f"{kind.capitalize()}: {count} from {starts} start{'s' * (starts != 1)}"
+    rows = [_row(found, i) for i in range(len(found)) if found.found[i]]
+    if rows:
+        heads = list(rows[0])
+        widths = [max(len(head), *(len(row[head]) for row in rows)) for head in heads]
+        yield "  " + "  ".join(head.rjust(width) for head, width in zip(heads, widths)).rstrip()
+        for row in rows:
+            yield "  " + "  ".join(row[head].rjust(width) for head, width in zip(heads, widths)).rstrip()
+    if any(found.zero_modes[i] for i in range(len(found)) if found.found[i]):
+        yield "  A zero mode: equilibria lie beside it, and it is the nearest to its start; or branches meet there."
+    status = np.asarray(found.status)
+    for code in range(1, len(WORDS)):
+        lost = np.flatnonzero(status == code)
+        if lost.size:
+            yield f"  {lost.size} start{'s' * (lost.size > 1)} led to none: {WORDS[code]}"
+            for i in lost[:3]:
+                at = lambda tree, i=i: describe(jax.tree.map(lambda x: x[i], tree))
+                yield f"    from {at(found.starts)} as far as {at(found.last)}"
+            if lost.size > 3:
+                yield "    ..."
+
+
+def _row(found, i):
+    """One equilibrium, by the heads of the table."""
+    pick = lambda tree: jax.tree.map(lambda x: x[i], tree)
+    q, v = pick(found.q), pick(found.v)
+    x = np.asarray(coordinates.flatten(q)[0])
+    row = {name: _number(x, np.abs(x).max()) for name, x in zip(coordinates.names(q), x)}
+    moves = np.any(np.concatenate([np.asarray(x).reshape(len(found), -1) for x in jax.tree.leaves(found.v)], 1), axis=0)
+    u = coordinates.flatten(v)[0]
+    for name, x, shown in zip(coordinates.names(v), u, moves):
+        if shown:
+            row[f"v{name[1:]}" if name == "q" or name.startswith("q[") else f"v.{name}"] = _number(x)
+    for name, value in pick(found.multipliers).items():
+        entries = np.ravel(value)
+        for j, x in enumerate(entries):
+            row[f"λ {name}" + (f"[{j}]" if np.ndim(value) else "")] = _number(x)
+    roots = np.asarray(found.eigenvalues[i])
+    known = np.any(np.isfinite(roots))
+    row[""] = ("stable" if found.stable[i] else "unstable") if known else "stability not known"
+    if found.zero_modes[i]:
+        count = int(found.zero_modes[i])
+        row[""] += f", {count} zero mode{'s' * (count > 1)}"
+    return row
+
+
+def _number(x, largest=0.0):
+    # What is nothing beside the others, and beside a radian, is round-off.
+    return "0" if abs(x) < 1e-12 * max(largest, 1.0) else f"{float(x):.6g}"

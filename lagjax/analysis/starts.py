@@ -1,0 +1,142 @@
+"""What a search for steady motions begins with: starts, what moves in them, and numbers that are whole."""
+
+from collections.abc import Callable, Iterable
+
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+from jaxtyping import PyTree
+
+from lagjax.analysis.balance import MOMENTUM, VELOCITY, Symmetries
+from lagjax.mechanics import coordinates
+from lagjax.mechanics.coordinates import State
+from lagjax.mechanics.diagnosis import listed
+from lagjax.mechanics.first_call import looked_at
+from lagjax.mechanics.structure import structure
+
+AS_STARTS = 'starts=[{"theta": 0.1}, {"theta": 3.0}], or starts={"theta": jnp.linspace(-3.0, 3.0, 20)}'
+
+
+def stacked(starts, what="starts") -> PyTree:
+    """Starts as one tree whose leaves have a leading axis: of a list of states, such a tree, or one state."""
+    if isinstance(starts, list):
+        if not starts:
+            raise ValueError(f"{what} is an empty list: a search needs a place to start from.\nFix: {AS_STARTS}.")
+        structures = {jtu.tree_structure(start) for start in starts}
+        if len(structures) > 1:
+            raise ValueError(f"the {what} differ in structure: each must be like q.\nFix: {AS_STARTS}.")
+        return jtu.tree_map(lambda *x: jnp.stack([jnp.asarray(_float(y)) for y in x]), *starts)
+    leaves = jtu.tree_leaves(starts)
+    if not leaves:
+        raise ValueError(f"{what} has no coordinates.\nFix: {AS_STARTS}.")
+    starts = jtu.tree_map(lambda x: jnp.asarray(_float(x)), starts)
+    leaves = jtu.tree_leaves(starts)
+    if all(x.ndim == 0 for x in leaves):
+        return jtu.tree_map(lambda x: x[None], starts)
+    counts = {x.shape[:1] for x in leaves}
+    if len(counts) > 1:
+        raise ValueError(
+            f"the leaves of {what} have leading axes of different lengths: "
+            f"{listed(sorted(str(x.shape) for x in leaves))}.\n"
+            "Usual cause: one start whose coordinates are arrays, where several are expected.\n"
+            f"Fix: a list of states, {what}=[q]."
+        )
+    if () in counts or min(counts)[0] == 0:
+        raise ValueError(f"{what} has no start in it.\nFix: {AS_STARTS}.")
+    return starts
+
+
+def stacked_one(q):
+    """A state of rest at q."""
+    q = jax.tree.map(lambda x: x[0], stacked([q]))
+    return q, jax.tree.map(jnp.zeros_like, q)
+
+
+def _float(x):
+    """Whole numbers as floats of the default size."""
+    if isinstance(x, bool | int) or isinstance(x, np.ndarray) and np.issubdtype(x.dtype, np.integer):
+        return np.asarray(x, jax.dtypes.canonicalize_dtype(np.float64))
+    if isinstance(x, jax.Array) and jnp.issubdtype(x.dtype, jnp.integer):
+        return x.astype(jax.dtypes.canonicalize_dtype(np.float64))
+    if isinstance(x, list):
+        return np.asarray(x, jax.dtypes.canonicalize_dtype(np.float64))
+    return x
+
+
+def checked(system, t, q, v, params):
+    """The system and a state for it, with whole numbers in `params` as floats where the functions take floats."""
+    floats = jtu.tree_map(lambda x: float(x) if type(x) is int else x, params)
+    s = coordinates.state(t, q, v, floats)
+    if any(type(x) is int for x in jtu.tree_leaves(params)):
+        try:
+            return looked_at(system, s), s
+        except (TypeError, ValueError):
+            # A count or an index stays whole.
+            s = coordinates.state(t, q, v, params)
+    return looked_at(system, s), s
+
+
+def symmetries_of(system, s: State, cyclic, hold, moving: np.ndarray | None) -> Symmetries:
+    """Along what the motion is steady: what `cyclic` names, or the coordinates that move in the starts, (n,)."""
+    if hold not in (VELOCITY, MOMENTUM, None):
+        raise ValueError(f'hold must be "velocity", "momentum" or None, not {hold!r}.')
+    names = coordinates.names(s.q)
+    if cyclic is None:
+        if moving is None:
+            return Symmetries(hold=hold)
+        chosen = [name for name, moves in zip(names, moving) if moves]
+    else:
+        given = [cyclic] if isinstance(cyclic, str) or callable(cyclic) else list(cyclic)
+        if all(callable(x) for x in given) and given:
+            _check_fields(given, s)
+            return Symmetries(fields=tuple(given), hold=hold)
+        chosen = _names_in(names, given)
+        still = [name for name, moves in zip(names, moving if moving is not None else []) if moves]
+        if others := [name for name in still if name not in chosen]:
+            raise ValueError(
+                f"{listed(others)} moves in the starts and is not among the cyclic coordinates, {listed(chosen)}.\n"
+                f"Fix: a velocity of zero there, or cyclic={[*chosen, *others]}."
+            )
+    _check_cyclic(system, s, chosen)
+    return Symmetries(places=tuple(names.index(name) for name in chosen), hold=hold)
+
+
+def _names_in(names, given: Iterable):
+    """Coordinates by their names, or by that of the array they are in."""
+    found = []
+    for name in given:
+        entries = [x for x in names if x == name or isinstance(name, str) and x.split("[")[0] == name]
+        if not entries:
+            raise ValueError(
+                f"cyclic names {name!r}, and the coordinates are {listed(names)}.\n"
+                "Fix: these names, or functions motion(q, params) that return a velocity like v."
+            )
+        found += entries
+    return list(dict.fromkeys(found))
+
+
+def _check_cyclic(system, s, chosen):
+    known = structure(system, *s) if chosen else None
+    seen = [name for name in chosen if known is not None and name not in known.cyclic]
+    if seen:
+        raise ValueError(
+            f"L depends on {listed(seen)}, which moves at a constant rate: there is no steady motion along it.\n"
+            "Usual cause: a velocity in the starts of a coordinate that is not cyclic, or a rotation that several "
+            "coordinates take part in.\n"
+            "Fix: velocities of zero; or the symmetry as a function, cyclic=lambda q, params: {...}, which returns the "
+            'velocity of a motion at a unit rate, such as {"x": -q["y"], "y": q["x"]}.'
+        )
+
+
+def _check_fields(fields: list[Callable], s: State):
+    for field in fields:
+        value = jax.eval_shape(lambda q, params, field=field: field(q, params), s.q, s.params)
+        if jtu.tree_structure(value) != jtu.tree_structure(s.q) or jtu.tree_map(jnp.shape, value) != jtu.tree_map(
+            jnp.shape, s.q
+        ):
+            raise ValueError(
+                "cyclic=motion(q, params) must return a velocity like v, one number a coordinate.\n"
+                f"  q has shapes {jtu.tree_map(jnp.shape, s.q)}\n  it has {jtu.tree_map(jnp.shape, value)}\n"
+                "Fix: return the structure of q, with 0.0 for what does not move (0.0 * q[...] for arrays)."
+            )

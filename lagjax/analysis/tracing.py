@@ -1,0 +1,219 @@
+"""A branch of steady motions, point by point: pseudo-arclength continuation, which passes folds.
+
+The next point is looked for one step along the tangent and, from there, across it. In units of `branch_equations.py`,
+with the Jacobian `J = (E_y, E_μ)` and the tangent τ, `J τ = 0`,
+
+    E(z) = 0,      τ·(z - z_i - h τ) = 0
+
+Lengths are those of positions and of the parameter. What is watched from point to point: the sign of `det (J; τ)`,
+which changes where another branch crosses (also where this one only touches the critical parameter, as the side branch
+of a pitchfork does); that of τ_μ, which changes at a fold; the number of roots that grow; and that of
+negative eigenvalues of E_y, which changes by two where two are zero together.
+
+Source: Keller, in *Applications of Bifurcation Theory* (1977) 359; Allgower & Georg, *Introduction to Numerical
+Continuation Methods*, §8.1 (the determinant) and ch. 6 (steps).
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import jax
+import numpy as np
+
+from lagjax.analysis.branch_equations import Frame, evaluated, seen_at
+from lagjax.analysis.equilibria import GROWS_ABOVE
+
+ITERATIONS = 10
+# Steps by length: the first, the longest (relative to how far it is from the origin) and the least.
+FIRST, LONGEST, LEAST = 0.005, 0.03, 1e-7
+# How far a tangent may turn in a step, in radians, and how far it should.
+MOST_TURN, TURN = 0.4, 0.12
+# Positions so many times their unit are at infinity.
+INFINITY = 1e4
+CLOSED_WITHIN = 1e-3
+# A crossing that is none shows that a step went from one branch to another; steps that short do not.
+AGAIN, SHORT = "again", 1e-6
+LOST = "the equations that followed from others where the branch starts do so no longer"
+
+
+@dataclass
+class Point:
+    """A point of a branch: z, the Jacobian and the tangent there, and what a user sees.
+
+    `sign` of the determinant, how many roots are `growing`, and how many eigenvalues of E_y are `negative`.
+    """
+
+    z: np.ndarray
+    jacobian: np.ndarray
+    tangent: np.ndarray
+    sign: float
+    seen: tuple
+    growing: int | None
+    negative: int
+    critical: int | None = None
+
+
+@dataclass
+class Path:
+    """The points of a branch in their order, and why it ends, at either end."""
+
+    points: list[Point] = field(default_factory=list)
+    status: str = ""
+    others: list[str] = field(default_factory=list)
+
+
+class Tracer:
+    """What is common to all branches of a run: the frame, what lengths are, and the tolerance of Newton's method."""
+
+    def __init__(self, frame: Frame, low: float, high: float):
+        self.frame, self.low, self.high = frame, low, high
+        size, positions = frame.columns.size, frame.steady.n
+        self.weights = np.zeros(size + 1)
+        self.weights[:positions] = 1.0
+        self.weights[-1] = 1.0
+        self.dtype = np.dtype(frame.columns.dtype)
+        self.eps = float(np.finfo(self.dtype).eps)
+        self.unit = float(frame.unit)
+        # The fastest root so far, beside which one is round-off.
+        self.fastest = 0.0
+
+    def at(self, z):
+        """E, J and the largest of all equations."""
+        return jax.tree.map(np.asarray, evaluated(self.frame, z.astype(self.dtype)))
+
+    def tangent(self, jacobian, along):
+        """The unit tangent that leads on from `along`."""
+        direction = np.linalg.svd(jacobian)[2][-1].astype(float)
+        direction /= np.sqrt(max(self.weights @ direction**2, 1e-300))
+        return direction if (self.weights * direction) @ along >= 0 else -direction
+
+    def corrected(self, z, row, known=None):
+        """Newton's method from z across a `row`, which keeps its value; None where it fails."""
+        known = row @ z if known is None else known
+        z, last = z.copy(), np.inf
+        for i in range(ITERATIONS):
+            value, jacobian, _ = self.at(z)
+            if not (np.all(np.isfinite(value)) and np.all(np.isfinite(jacobian))):
+                return None
+            matrix = np.concatenate([jacobian, row[None]])
+            left = np.append(value, row @ z - known)
+            try:
+                step = np.linalg.solve(matrix, left)
+            except np.linalg.LinAlgError:
+                return None
+            length = float(np.max(np.abs(step)))
+            if not np.isfinite(length) or i > 1 and length > 0.7 * last and length > 1e3 * self.eps * self.size(z):
+                return None
+            z = z - step
+            if length <= 50 * self.eps * self.size(z) or i > 2 and length >= last:
+                return z
+            last = length
+        return None
+
+    def size(self, z):
+        return max(1.0, float(np.max(np.abs(z))))
+
+    def point(self, z, along) -> Point | str:
+        """All about a point of a branch; in words what is wrong with it."""
+        _, jacobian, off = self.at(z)
+        # Compared with what is left of equations that are solved: these are of the size of one.
+        if off > self.eps**0.5 * self.size(z):
+            return LOST
+        tangent = self.tangent(jacobian, along)
+        seen = jax.tree.map(np.asarray, seen_at(self.frame, z.astype(self.dtype)))
+        sign = np.linalg.slogdet(np.concatenate([jacobian, (self.weights * tangent)[None]]))[0]
+        negative = int(np.sum(np.linalg.eigvals(jacobian[:, :-1]).real < 0))
+        return Point(z, jacobian, tangent, float(sign), seen, self.growing(seen[-1]), negative)
+
+    def trace(self, start: Point, most: int, on_step: Callable, first: float = FIRST) -> Path:
+        """Follow a branch until it leaves the range of the parameter, ends or closes.
+
+        `on_step(before, after, path)` finds what lies between two points; it may return why the path ends, or `AGAIN`
+        where a shorter step would tell.
+        """
+        path, point, step = Path([start]), start, first
+        while len(path.points) < most:
+            tried = step
+            after, step, why = self.next_point(point, tried)
+            if after is None:
+                path.status = why
+                return path
+            outside = not self.low <= after.z[-1] <= self.high
+            if outside:
+                after = self.at_edge(point, after) or after
+            ended = on_step(point, after, path)
+            if ended == AGAIN:
+                step = min(tried, float(np.sqrt(self.weights @ (after.z - point.z) ** 2))) / 4
+                if step > SHORT * self.size(point.z):
+                    continue
+                ended = None
+            if ended:
+                path.status = ended
+                return path
+            path.points.append(after)
+            if outside:
+                path.status = "the end of the range"
+                return path
+            if np.max(np.abs(after.z[: self.frame.steady.n])) > INFINITY:
+                path.status = "infinity"
+                return path
+            if self.closes(path, step):
+                path.status = "closed"
+                return path
+            point = after
+        path.status = f"the limit of {most} points"
+        return path
+
+    def next_point(self, point: Point, step: float):
+        """The next point, the step after it, and why there is none."""
+        longest = LONGEST * max(1.0, float(np.max(np.abs(point.z[: self.frame.steady.n]))))
+        why = "Newton's method does not converge, however short the step"
+        while step > LEAST * self.size(point.z):
+            step = min(step, longest)
+            row = self.weights * point.tangent
+            z = self.corrected(point.z + step * point.tangent, row)
+            found = self.point(z, point.tangent) if z is not None else None
+            if isinstance(found, Point):
+                turn = np.arccos(np.clip((self.weights * found.tangent) @ point.tangent, -1, 1))
+                moved = np.sqrt(self.weights @ (found.z - point.z) ** 2)
+                if turn < MOST_TURN and moved < 2 * step:
+                    return found, step * float(np.clip(TURN / max(turn, 1e-3), 0.5, 2.0)), ""
+                why = "the branch turns more sharply than steps can follow: a corner of L, or a cusp"
+            elif isinstance(found, str):
+                why = found
+            step /= 3
+        return None, step, why
+
+    def between(self, a: Point, b: Point, share: float) -> Point | None:
+        """A point of the branch between two others."""
+        row = self.weights * a.tangent
+        guess = a.z + share * (b.z - a.z)
+        z = self.corrected(guess, row)
+        found = self.point(z, a.tangent) if z is not None else None
+        return found if isinstance(found, Point) else None
+
+    def at_edge(self, a: Point, b: Point) -> Point | None:
+        """The point of the branch where the parameter is at the end of its range."""
+        edge = self.low if b.z[-1] < self.low else self.high
+        share = np.clip((edge - a.z[-1]) / (b.z[-1] - a.z[-1]), 0.0, 1.0) if b.z[-1] != a.z[-1] else 0.0
+        row = np.zeros_like(a.z)
+        row[-1] = 1.0
+        z = self.corrected(a.z + share * (b.z - a.z), row, edge)
+        found = self.point(z, a.tangent) if z is not None else None
+        return found if isinstance(found, Point) else None
+
+    def closes(self, path: Path, step: float) -> bool:
+        """Whether a path is back where it began."""
+        if len(path.points) < 10:
+            return False
+        first, last = path.points[0], path.points[-1]
+        off = np.sqrt(self.weights @ (last.z - first.z) ** 2)
+        return bool(off < max(step, CLOSED_WITHIN) and (self.weights * first.tangent) @ last.tangent > 0.9)
+
+    def growing(self, roots) -> int | None:
+        """How many roots grow; None where they are not known."""
+        known = roots[np.isfinite(roots)]
+        if not known.size:
+            return None
+        self.fastest = max(self.fastest, float(np.max(np.abs(known))))
+        return int(np.sum(known.real > GROWS_ABOVE[self.dtype] * self.fastest))

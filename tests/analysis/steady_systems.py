@@ -1,0 +1,151 @@
+"""Systems whose equilibria and critical parameters are known in closed form."""
+
+import jax.numpy as jnp
+import numpy as np
+
+import lagjax as lj
+
+
+def truss_lagrangian(t, q, v, params):
+    """Von Mises' truss: two elastic bars from (±a, 0) to the apex (0, q), loaded there by P downward."""
+    rest = jnp.sqrt(params["a"] ** 2 + params["h"] ** 2)
+    stretch = jnp.sqrt(params["a"] ** 2 + q**2) - rest
+    return 0.5 * v**2 - params["k"] * stretch**2 - params["P"] * q
+
+
+def snap_through(params):
+    """The load at which it snaps: P = 2 k (l0/l - 1) q is largest at l³ = l0 a²."""
+    a, h, k = params["a"], params["h"], params["k"]
+    rest = jnp.sqrt(a**2 + h**2)
+    length = jnp.cbrt(rest * a**2)
+    return 2 * k * (rest / length - 1) * jnp.sqrt(length**2 - a**2)
+
+
+def column_lagrangian(t, q, v, params):
+    """Two links with springs at their joints, pressed by P: their angles from the upright."""
+    bending = 0.5 * params["c"] * (q[0] ** 2 + (q[1] - q[0]) ** 2)
+    return 0.5 * jnp.sum(v**2) - bending - params["P"] * params["l"] * jnp.sum(jnp.cos(q))
+
+
+# P l / c at which it buckles: 1 - 3 x + x² = 0 up to their order.
+BUCKLING = (3 - np.sqrt(5)) / 2, (3 + np.sqrt(5)) / 2
+
+
+def exchange_lagrangian(t, q, v, params):
+    """Rest at 0 and at (mu - c)/d, which exchange their stability where they meet."""
+    return 0.5 * v**2 + 0.5 * (params["mu"] - params["c"]) * q**2 - params["d"] * q**3 / 3
+
+
+def top_lagrangian(t, q, v, params):
+    """A symmetric top by two tilts, about x and then about the new y, and its spin: regular where it is upright."""
+    a, b = q["a"], q["b"]
+    across = 0.5 * params["I1"] * ((v["a"] * jnp.cos(b)) ** 2 + v["b"] ** 2)
+    about = 0.5 * params["I3"] * (v["spin"] + v["a"] * jnp.sin(b)) ** 2
+    return across + about - params["Mgl"] * jnp.cos(a) * jnp.cos(b)
+
+
+def slowest_sleeping_spin(params):
+    """ω_c = 2 √(M g l I1) / I3."""
+    return 2 * jnp.sqrt(params["Mgl"] * params["I1"]) / params["I3"]
+
+
+def ziegler_lagrangian(t, q, v, params):
+    """Ziegler's column: two links of length l with 2 m at the joint and m at the tip, and springs c."""
+    m, l = params["m"], params["l"]
+    tip = v[0] ** 2 + v[1] ** 2 + 2 * v[0] * v[1] * jnp.cos(q[0] - q[1])
+    return m * (l * v[0]) ** 2 + 0.5 * m * l**2 * tip - 0.5 * params["c"] * (q[0] ** 2 + (q[1] - q[0]) ** 2)
+
+
+def follower_force(t, q, v, params):
+    """P at the tip, along the outer link, whichever way that points."""
+    return params["P"] * params["l"] * jnp.stack([jnp.sin(q[0] - q[1]), 0.0 * q[1]])
+
+
+def joint_friction(t, q, v, params):
+    """The same damping in both joints."""
+    return 0.5 * params["b"] * (v[0] ** 2 + (v[1] - v[0]) ** 2)
+
+
+def flutter_load(params):
+    """Without damping, P l / c = 7/2 - √2."""
+    return (3.5 - jnp.sqrt(2.0)) * params["c"] / params["l"]
+
+
+def damped_flutter_load(params):
+    """With it, P l / c = 41/28 + b²/(2 m l² c), which for b → 0 is much less."""
+    share = params["b"] ** 2 / (params["m"] * params["l"] ** 2 * params["c"])
+    return (41 / 28 + 0.5 * share) * params["c"] / params["l"]
+
+
+def conical_lagrangian(t, q, v, params):
+    """A mass on a rod in three dimensions."""
+    return 0.5 * v["r"] @ v["r"] - params["g"] * q["r"][2]
+
+
+def rod_3d(t, q, params):
+    """The squared length of the rod."""
+    return q["r"] @ q["r"] - params["l"] ** 2
+
+
+def about_z(q, params):
+    """A rotation about the vertical, at one radian a unit of time."""
+    x, y, z = q["r"]
+    return {"r": jnp.stack([-y, x, 0 * z])}
+
+
+def rail_pendulum_lagrangian(t, q, v, params):
+    """A mass on a round table with a pole at its centre: a spherical pendulum seen from a frame that turns."""
+    x, y = q
+    u = jnp.stack([v[0] - params["omega"] * y, v[1] + params["omega"] * x])
+    depth = jnp.sqrt(1 - x**2 - y**2)
+    fall = -(x * v[0] + y * v[1]) / depth
+    return 0.5 * (u @ u + fall**2) + params["g"] * depth
+
+
+truss = lj.System(truss_lagrangian)
+column = lj.System(column_lagrangian)
+exchange = lj.System(exchange_lagrangian)
+top = lj.System(top_lagrangian)
+ziegler = lj.System(ziegler_lagrangian, force=follower_force)
+damped_ziegler = lj.System(ziegler_lagrangian, force=follower_force, dissipation=joint_friction)
+conical = lj.System(conical_lagrangian, {"rod": lj.Holonomic(rod_3d)})
+turning_pendulum = lj.System(rail_pendulum_lagrangian)
+
+TRUSS = {"a": 1.0, "h": 0.5, "k": 100.0, "P": -6.0}
+COLUMN = {"c": 3.0, "l": 2.0, "P": 0.1}
+EXCHANGE = {"mu": -1.0, "c": 0.3, "d": 1.7}
+TOP = {"I1": 2.0, "I3": 0.7, "Mgl": 3.0}
+UPRIGHT = {"a": 0.0, "b": 0.0, "spin": 0.0}
+ZIEGLER = {"m": 1.3, "l": 0.7, "c": 2.0, "b": 0.2, "P": 0.1}
+
+
+def disk_lagrangian(t, q, v, params):
+    """A thin uniform disk on a plane: its centre, and its heading, lean and spin."""
+    m, r, lean = params["m"], params["r"], q["lean"]
+    across = v["lean"] ** 2 + (v["heading"] * jnp.cos(lean)) ** 2
+    about = (v["spin"] + v["heading"] * jnp.sin(lean)) ** 2
+    moving = v["x"] ** 2 + v["y"] ** 2 + (r * jnp.sin(lean) * v["lean"]) ** 2
+    return m * r**2 * (across / 8 + about / 4) + 0.5 * m * moving - m * params["g"] * r * jnp.cos(lean)
+
+
+def rolling(t, q, v, params):
+    """Its point of contact does not slide, forward or sideways."""
+    r, cos, sin = params["r"], jnp.cos(q["heading"]), jnp.sin(q["heading"])
+    forward = v["x"] * cos + v["y"] * sin - r * (v["spin"] + v["heading"] * jnp.sin(q["lean"]))
+    sideways = v["y"] * cos - v["x"] * sin + r * jnp.cos(q["lean"]) * v["lean"]
+    return jnp.stack([forward, sideways])
+
+
+disk = lj.System(disk_lagrangian, {"rolling": lj.Nonholonomic(rolling)})
+DISK = {"m": 2.0, "r": 0.6, "g": 9.8125}
+UPRIGHT_DISK = {"x": 0.0, "y": 0.0, "heading": 0.0, "lean": 0.0, "spin": 0.0}
+
+
+def straight_on(q, params):
+    """Rolling along x at one radian a unit of time."""
+    return UPRIGHT_DISK | {"spin": 1.0, "x": params["r"]}
+
+
+def slowest_rolling(params):
+    """Upright it is stable for a spin above √(g/(3 r))."""
+    return jnp.sqrt(params["g"] / (3 * params["r"]))

@@ -1,0 +1,306 @@
+"""Equilibria and steady motions: against closed forms, on constraints, in programs, and where there are none."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import lagjax as lj
+from lagjax.analysis.found_equilibria import LASTS_NOT, NO_BALANCE, NOT_FINITE
+from lagjax.mechanisms import governor
+from lagjax.scenes import bead_on_hoop, cross_rails
+from tests.analysis.steady_systems import (
+    DISK,
+    TOP,
+    UPRIGHT,
+    UPRIGHT_DISK,
+    about_z,
+    conical,
+    disk,
+    slowest_sleeping_spin,
+    straight_on,
+    top,
+)
+from tests.systems import PARAMS, cartesian_lagrangian, double_pendulum, pendulum, rod, rod_pendulum
+
+BEAD = bead_on_hoop.PARAMS
+CHAIN = {"m1": 1.0, "m2": 2.0, "l1": 1.0, "l2": 0.5, "g": 9.8125}
+tilt_of = lambda params: jnp.arccos(params["g"] / (params["a"] * params["omega"] ** 2))
+
+
+# One system at rest.
+
+
+def test_pendulum():
+    """It rests below, stable, and above, not; starts a turn apart lead to the same; twin: with -g it is the reverse."""
+    found = lj.equilibria(pendulum, PARAMS, starts=[0.3, 3.0, -3.0, 2 * np.pi + 0.2])
+    assert len(found) == 2 and np.asarray(found.of_start).tolist() == [0, 1, 1, 0]
+    np.testing.assert_allclose(found.q, [0.0, np.pi], atol=1e-14)
+    assert found.stable.tolist() == [True, False]
+    rate = np.sqrt(PARAMS["g"] / PARAMS["l"])
+    np.testing.assert_allclose(np.sort(found.eigenvalues[0].imag), [-rate, rate], rtol=1e-12)
+    np.testing.assert_allclose(np.sort(found.eigenvalues[1].real), [-rate, rate], rtol=1e-12)
+    upward = lj.equilibria(pendulum, PARAMS | {"g": -PARAMS["g"]}, starts=[0.3, 3.0])
+    assert upward.stable.tolist() == [False, True]
+
+
+@pytest.mark.slow
+def test_double_pendulum():
+    """Four equilibria from a grid of starts, one stable; those a turn away are merged."""
+    starts = np.stack(np.meshgrid(*[np.linspace(-3.5, 3.5, 6)] * 2), axis=-1).reshape(-1, 2)
+    found = lj.equilibria(double_pendulum, CHAIN, starts=starts)
+    assert len(found) == 4 and np.all(found.status == 0)
+    np.testing.assert_allclose(np.sin(found.q), 0.0, atol=1e-13)
+    up = np.cos(np.asarray(found.q)) < 0
+    assert sorted(map(tuple, up)) == [(False, False), (False, True), (True, False), (True, True)]
+    np.testing.assert_array_equal(found.stable, ~up.any(axis=1))
+    roots = lj.linearise(double_pendulum, *found[int(np.argmax(found.stable))]).eigenvalues()
+    mine = found.eigenvalues[int(np.argmax(found.stable))]
+    np.testing.assert_allclose(np.sort(np.abs(mine)), np.sort(np.abs(roots)), rtol=1e-10)
+
+
+def test_multiplier_and_redundant_rods():
+    """2 y λ = g, shared by rods that say the same as the shortest multipliers are; twin: the sign of λ above."""
+    again = lj.Holonomic(lambda t, q, params: 2 * rod(t, q, params))
+    two = lj.System(cartesian_lagrangian, {"rod": lj.Holonomic(rod), "again": again})
+    starts = [{"x": 0.3, "y": -1.0}, {"x": 0.3, "y": 1.0}]
+    g, l = PARAMS["g"], PARAMS["l"]
+    for system, share in ((rod_pendulum, 1.0), (two, 0.2)):
+        found = lj.equilibria(system, PARAMS, starts=starts)
+        np.testing.assert_allclose(found.q["y"], [-l, l], rtol=1e-14)
+        np.testing.assert_allclose(found.multipliers["rod"], share * g / (2 * found.q["y"]), rtol=1e-13)
+        assert found.stable.tolist() == [True, False]
+    np.testing.assert_allclose(found.multipliers["again"], 0.4 * g / (2 * found.q["y"]), rtol=1e-13)
+    assert found.multipliers["rod"][0] < 0 < found.multipliers["rod"][1]
+
+
+@pytest.mark.slow
+def test_bead_and_its_derivatives():
+    """cos α = g/(a ω²) with first and second derivatives by a, in programs and lanes; twin: the bottom's."""
+    at = lambda a: lj.equilibria(bead_on_hoop.system, BEAD | {"a": a}, starts=[1.0]).q[0]
+    exact = lambda a: tilt_of(BEAD | {"a": a})
+    a = jnp.linspace(0.5, 2.0, 4)
+    for order in (lambda f: f, jax.grad, lambda f: jax.jacfwd(jax.grad(f))):
+        found = jax.jit(jax.vmap(order(at)))(a)
+        np.testing.assert_allclose(found, jax.vmap(order(exact))(a), rtol=1e-12)
+    bottom = lambda a: lj.equilibria(bead_on_hoop.system, BEAD | {"a": a}, starts=[0.0]).q[0]
+    assert jax.grad(bottom)(0.75) == 0.0 != jax.grad(at)(0.75)
+
+
+@pytest.mark.slow
+def test_whole_numbers_and_one_start():
+    """Integers are numbers like others; a state by itself is a start."""
+    found = lj.equilibria(pendulum, {"g": 10, "l": 2}, starts=[3])
+    np.testing.assert_allclose(found.q, [np.pi], rtol=1e-14)
+    one = lj.equilibria(double_pendulum, CHAIN, starts=np.array([0.1, 0.2]))
+    assert len(one) == 1 and bool(one.stable[0])
+
+
+def test_stability_by_the_critical_speed():
+    """1,000 beads at the bottom: stable exactly where ω² < g/a."""
+    rng = np.random.default_rng(0)
+    omega, a = rng.uniform(2.0, 6.0, 1000), rng.uniform(0.5, 1.5, 1000)
+
+    @jax.jit
+    @jax.vmap
+    def stable(omega, a):
+        return lj.equilibria(bead_on_hoop.system, BEAD | {"omega": omega, "a": a}, starts=[0.0]).stable[0]
+
+    np.testing.assert_array_equal(stable(omega, a), omega**2 < BEAD["g"] / a)
+
+
+# Steady motions.
+
+
+def test_cross_rails():
+    """R = K R0/(K - m ω²) on either side of the critical speeds; a line at ω² = k/m; none at ω² = K/m, in words."""
+    params, start = cross_rails.PARAMS, [{"R": 1.0, "r": 0.125}]
+    for omega, stable in ((2.5, True), (5.0, False), (8.0, True)):
+        found = lj.equilibria(cross_rails.rotating_system, params | {"omega": omega}, starts=start)
+        exact = cross_rails.equilibrium_length(params | {"omega": omega})
+        np.testing.assert_allclose([found.q["R"][0], found.q["r"][0]], [exact, 0.0], rtol=1e-13, atol=1e-14)
+        assert bool(found.stable[0]) is stable
+    line = lj.equilibria(cross_rails.rotating_system, params | {"omega": 4.0}, starts=start)
+    assert line.zero_modes.tolist() == [1] and float(line.q["r"][0]) == 0.125
+    assert "1 zero mode" in repr(line)
+    none = lj.equilibria(cross_rails.rotating_system, params | {"omega": np.sqrt(40.0)}, starts=start)
+    assert len(none) == 0 and none.status.tolist() == [NO_BALANCE]
+    assert "1 start led to none" in repr(none)
+
+
+@pytest.mark.slow
+def test_the_driven_hoop():
+    """Its angle turns at ω, which the motor's constraint asks for: given, or found; twin: at rest it does not last."""
+    start = {"psi": 1.0, "theta": 0.0}
+    given = lj.equilibria(bead_on_hoop.driven_system, BEAD, starts=[start], velocities={"psi": 0.0, "theta": 6.0})
+    free = {"cyclic": "theta", "hold": None, "velocities": {"psi": 0.0, "theta": 5.0}}
+    found = lj.equilibria(bead_on_hoop.driven_system, BEAD, starts=[start], **free)
+    for steady in (given, found):
+        np.testing.assert_allclose(steady.q["psi"], tilt_of(BEAD), rtol=1e-13)
+        np.testing.assert_allclose(steady.v["theta"], BEAD["omega"], rtol=1e-13)
+        np.testing.assert_allclose(steady.multipliers["motor"], 0.0, atol=1e-13)
+        assert steady.stable.tolist() == [True]
+    resting = lj.equilibria(bead_on_hoop.driven_system, BEAD, starts=[start])
+    assert len(resting) == 0 and resting.status.tolist() == [LASTS_NOT]
+
+
+@pytest.mark.slow
+def test_conical_pendulum():
+    """Along a symmetry that is a function: cos θ = g/(Ω² l) and λ = -½ Ω²; with the momentum held, Ω l² sin²θ is."""
+    params, omega = {"g": 9.0, "l": 1.25}, 4.0
+    theta = np.arccos(params["g"] / (omega**2 * params["l"]))
+    place = lambda angle: {"r": params["l"] * np.array([np.sin(angle), 0.0, -np.cos(angle)])}
+    speed = lambda angle, rate: {"r": rate * params["l"] * np.array([0.0, np.sin(angle), 0.0])}
+    settings = {"starts": [place(theta + 0.1)], "cyclic": about_z}
+    found = lj.equilibria(conical, params, velocities=speed(theta + 0.1, omega), **settings)
+    np.testing.assert_allclose(found.q["r"][0, 2], -params["l"] * np.cos(theta), rtol=1e-13)
+    np.testing.assert_allclose(found.multipliers["rod"], [-0.5 * omega**2], rtol=1e-13)
+    np.testing.assert_allclose(found.rates, [[omega]], rtol=1e-15)
+    # Small motions about it: Ω² (1 + 3 cos²θ).
+    fastest = np.nanmax(np.abs(found.eigenvalues))
+    np.testing.assert_allclose(fastest, omega * np.sqrt(1 + 3 * np.cos(theta) ** 2), rtol=1e-9)
+    held = lj.equilibria(conical, params, velocities=speed(theta + 0.1, omega), hold="momentum", **settings)
+    kept = omega * (params["l"] * np.sin(theta + 0.1)) ** 2
+    np.testing.assert_allclose(held.momenta, [[kept]], rtol=1e-13)
+    height = -held.q["r"][0, 2]
+    np.testing.assert_allclose(held.rates[0, 0] ** 2 * height, params["g"], rtol=1e-12)
+    assert abs(held.rates[0, 0] - omega) > 0.1
+
+
+@pytest.mark.slow
+def test_sleeping_top():
+    """Upright it is stable above ω_c = 2 √(M g l I1)/I3 and not below."""
+    critical = float(slowest_sleeping_spin(TOP))
+    rates = critical * np.array([0.99, 1.01])
+    velocities = [UPRIGHT | {"spin": rate} for rate in rates]
+    found = lj.equilibria(top, TOP, starts=[UPRIGHT, UPRIGHT], velocities=velocities)
+    assert found.stable.tolist() == [False, True]
+    np.testing.assert_allclose(found.momenta[:, 0], TOP["I3"] * rates, rtol=1e-14)
+
+
+@pytest.mark.slow
+def test_governor():
+    """Its balls' moment about a hinge vanishes: by the equilibrium of one rod and the slider, written by hand."""
+    parts, p, rate = governor.Parts, governor.PARAMS, governor.RATE
+
+    def turn(q, params):
+        around = lambda r: jnp.stack([-r[1], r[0], 0 * r[2]])
+        return parts(psi=1.0, z=0.0 * q.z, C=around(q.C), D=around(q.D))
+
+    start = governor.MECHANISM
+    found = lj.equilibria(governor.system, p, starts=[start.q0], velocities=start.v0, cyclic=turn)
+    sin, cos = (p["h"] - float(found.q.C[0, 2])) / p["l"], (float(found.q.C[0, 0]) - p["b"]) / p["l"]
+    np.testing.assert_allclose(sin**2 + cos**2, 1.0, rtol=1e-12)
+    # A spring from the rod's middle to the slider carries half of the slider's weight.
+    middle = np.array([0.5 * cos, p["h"] - 0.5 * sin - float(found.q.z[0])])
+    length = np.hypot(*middle)
+    pull = p["k"] * (length - p["l0"]) * middle / length
+    np.testing.assert_allclose(2 * pull[1], p["slider"] * p["g"], rtol=1e-7)
+    # Moments about the hinge: of the ball, of the rod (its mass along it), of the spring.
+    arm = p["b"] + p["l"] * cos
+    ball = p["ball"] * (rate**2 * arm * sin - p["g"] * cos)
+    rod_moment = p["rod"] * (rate**2 * (p["b"] / 2 + cos / 3) * sin - 0.5 * p["g"] * cos)
+    spring = -0.5 * (pull[0] * sin + pull[1] * cos)
+    assert abs(ball + rod_moment + spring) < 1e-7 * abs(ball)
+    assert found.stable.tolist() == [True]
+    hanging = lj.equilibria(governor.system, p, starts=[start.q0])
+    np.testing.assert_allclose([hanging.q.C[0, 0], hanging.q.C[0, 2]], [p["b"], 0.0], atol=1e-9)
+
+
+@pytest.mark.slow
+def test_roots_are_those_of_the_linearisation():
+    """Two derivations agree: gyroscopic, on constraints of positions and of velocities, with all kinds of forces."""
+    rng = np.random.default_rng(3)
+    matrices = {name: rng.normal(size=(4, 4)) for name in "KMDGN"}
+    params = {name: x @ x.T + np.eye(4) if name in "KMD" else x for name, x in matrices.items()}
+    params |= {"f": rng.normal(size=4), "c": rng.normal(size=4)}
+
+    def lagrangian(t, q, v, p):
+        return 0.5 * (v @ p["M"] @ v - q @ p["K"] @ q) + q @ p["G"] @ v + p["f"] @ q - 0.1 * jnp.sum(q**4)
+
+    surface = lj.Holonomic(lambda t, q, p: p["c"] @ q - 0.3 + 0.2 * q @ q)
+    general = lj.System(
+        lagrangian, {"surface": surface}, lambda t, q, v, p: 0.1 * p["N"] @ q, lambda t, q, v, p: 0.05 * v @ p["D"] @ v
+    )
+    straight = {name: np.asarray(x) * 3.0 for name, x in straight_on(UPRIGHT_DISK, DISK).items()}
+    cases = [
+        (general, params, np.zeros(4), {}),
+        (cross_rails.rotating_system, cross_rails.PARAMS | {"omega": 8.0}, {"R": -0.8, "r": 0.0}, {}),
+        (disk, DISK, UPRIGHT_DISK, {"velocities": straight, "cyclic": straight_on}),
+    ]
+    for system, p, start, settings in cases:
+        found = lj.equilibria(system, p, starts=[start], **settings)
+        theirs = np.asarray(lj.linearise(system, *found[0]).eigenvalues())
+        mine = np.asarray(found.eigenvalues[0])
+        mine = mine[np.isfinite(mine)]
+        largest = np.max(np.abs(theirs))
+        mine, theirs = (x[np.abs(x) > 1e-6 * largest] for x in (mine, theirs))
+        assert mine.size == theirs.size > 0
+        off = np.abs(mine[:, None] - theirs[None, :])
+        assert max(off.min(axis=0).max(), off.min(axis=1).max()) < 1e-12 * largest
+
+
+# Where there is none.
+
+
+def test_starts_that_lead_nowhere():
+    """A least imbalance that is not zero is none; the starts are reported, and others find what there is."""
+    hill = lj.System(lambda t, q, v, p: 0.5 * v**2 - q**3 / 3 - p["c"] * q)
+    none = lj.equilibria(hill, {"c": 1.0}, starts=[1.0, -2.0])
+    assert len(none) == 0 and none.status.tolist() == [NO_BALANCE] * 2
+    assert len(lj.equilibria(hill, {"c": -1.0}, starts=[1.5, -2.0])) == 2
+    np.testing.assert_array_equal(none.starts, [1.0, -2.0])
+    assert np.all(np.isfinite(none.last))
+    assert "2 starts led to none: no equilibrium near it" in repr(none) and "from (q = 1) as far as" in repr(none)
+
+
+@pytest.mark.slow
+def test_starts_that_lead_out():
+    """A force that fades, and a root of a negative number: neither is taken for an equilibrium."""
+    fading = lj.System(lambda t, q, v, p: 0.5 * v**2 - jnp.exp(-q))
+    assert lj.equilibria(fading, starts=[0.0]).status.tolist() == [NO_BALANCE]
+    root = lj.System(lambda t, q, v, p: 0.5 * v**2 - jnp.sqrt(q) * (q - 1) ** 2)
+    found = lj.equilibria(root, starts=[-1.0, 1.1])
+    assert found.status.tolist() == [NOT_FINITE, 0]
+    np.testing.assert_allclose(found.q, [1.0], rtol=1e-9)
+    assert "1 start led to none: L, a force or a constraint is not finite" in repr(found)
+
+
+def test_a_critical_point_is_one_of_many_for_a_start():
+    """At the critical speed the bottom is found, slowly, and has a zero mode; twin: beside it there is none."""
+    at = lj.equilibria(bead_on_hoop.system, bead_on_hoop.CRITICAL, starts=[0.3])
+    assert abs(float(at.q[0])) < 1e-6 and at.zero_modes.tolist() == [1]
+    beside = lj.equilibria(bead_on_hoop.system, bead_on_hoop.CRITICAL | {"omega": 3.9}, starts=[0.3])
+    assert beside.zero_modes.tolist() == [0]
+
+
+@pytest.mark.parametrize(
+    "settings, words",
+    [
+        ({"starts": []}, "starts is an empty list"),
+        ({"starts": [1.0], "velocities": 1.0}, "L depends on 'q', which moves at a constant rate"),
+        ({"starts": [1.0], "cyclic": "angle"}, "cyclic names 'angle', and the coordinates are 'q'"),
+        ({"starts": [1.0], "hold": "energy"}, "hold must be"),
+        ({"starts": [1.0, {"q": 1.0}]}, "differ in structure"),
+    ],
+)
+def test_bad_input(settings, words):
+    """What is wrong is said, with the names, before anything is computed."""
+    with pytest.raises(ValueError, match=words):
+        lj.equilibria(pendulum, PARAMS, **settings)
+
+
+def test_what_is_printed():
+    """A line each: the state, the multipliers, whether it is stable."""
+    found = lj.equilibria(rod_pendulum, PARAMS, starts=[{"x": 0.3, "y": -1.0}, {"x": 0.3, "y": 1.0}])
+    lines = repr(found).splitlines()
+    assert lines[0] == "Equilibria: 2 from 2 starts"
+    assert lines[1].split() == ["x", "y", "λ", "rod"]
+    assert lines[2].split() == ["0", "-1.25", "-3.925", "stable"] and lines[3].endswith("unstable")
+
+
+@pytest.mark.slow
+def test_a_batch():
+    """Under `vmap` nothing is merged, and what is printed says so."""
+    found = jax.vmap(lambda g: lj.equilibria(pendulum, {"g": g, "l": 1.0}, starts=[0.1, 3.0, -3.0]))(jnp.ones(2))
+    assert found.found.shape == (2, 3) and found.found.all() and "a batch of 2 with 3 starts each" in repr(found)
