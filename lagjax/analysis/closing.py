@@ -29,7 +29,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from lagjax.analysis.flow import Flow, flow_of, scale_of
+from lagjax.analysis.flow import Flow, flow_of
+from lagjax.analysis.guessing import TURN, Asked, Guess, guessed
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.compiled import compiled
 
@@ -40,27 +41,12 @@ LEAST, FIRST_DAMPING, MORE, TOO_MUCH = 0.01, 0.03, 8.0, 1e4
 AIM, ENOUGH = 10.0, 1e3
 # Singular values below this many tolerances, and so small at least, do not count.
 NOTHING, SMALL = 1e4, 1e-8
+# A step that leaves no more than this part of the motion is none.
+SHRUNK = 0.1
 # No step changes the logarithm of the period, or the state in units of its size, by more than this.
 FARTHEST = 0.5
 # The weight of what is held, and of the phase, beside coming back: far away both cannot be had.
 FIRST = 100.0
-TURN = 2 * np.pi
-
-
-class Asked(NamedTuple):
-    """What an orbit is to be, all static.
-
-    - `free`: whether the period is unknown; `moves`: whether the start on the orbit is.
-    - `energy`: whether the Jacobi integral is held; `held`: which entries of (q, v).
-    - `relative` (n,): coordinates that need not come back; `angles` (n,): those that do up to whole turns.
-    """
-
-    free: bool
-    moves: bool
-    energy: bool
-    held: tuple[int, ...]
-    relative: tuple[bool, ...]
-    angles: tuple[bool, ...]
 
 
 class Place(NamedTuple):
@@ -73,7 +59,8 @@ class Place(NamedTuple):
 class Seen(NamedTuple):
     """What the flow says at a place: the residual, its size, the matrix of a Newton step from there, and the end.
 
-    The rows of `matrix` are in units of `measure`, its columns in those of `scale`, along the `bases`.
+    The columns of `matrix` are along the `bases`. `moves`: how far the state would go in a period at its rate, but for
+    what is relative.
     """
 
     size: Float[Array, ""]
@@ -82,15 +69,14 @@ class Seen(NamedTuple):
     bases: Float[Array, "K 2n k"]
     amplified: Float[Array, ""]
     end: Float[Array, " 2n"]
-    measure: Float[Array, " 2n"]
-    scale: Float[Array, " 2n"]
+    moves: Float[Array, ""]
 
 
 class Found(NamedTuple):
     """The best place, and how it went; `apart`: how much the system of a driven orbit changed from period to period."""
 
     place: Place
-    turns: Float[Array, " n"]
+    guess: Guess
     seen: Seen
     converged: Bool[Array, ""]
     iterations: Int[Array, ""]
@@ -103,8 +89,6 @@ class Search(NamedTuple):
     best: Place
     seen: Seen
     damping: Float[Array, ""]
-    scale: Float[Array, " 2n"]
-    turns: Float[Array, " n"]
     iterations: Int[Array, ""]
 
 
@@ -119,16 +103,13 @@ class Goal(NamedTuple):
 def closed(system, t, q, v, params, period, rtol, asked: Asked, rows, parts, turns, most) -> Found:
     """Search for an orbit near a state; `turns` (n,) of the angles, or None for those of the guess."""
     flow = flow_of(system, t, q, v, params, rtol, rows)
-    z, scale = flow.vector(q, v), scale_of(flow.vector(q, v), period)
-    z = flow.onto_constraints(t, z, scale)
-    goal = Goal(_integral(flow, t, z), z)
-    nodes = _nodes(flow, t, z, period, parts, scale)
-    zero = jnp.zeros((), t.dtype)
+    guess = guessed(flow, t, flow.vector(q, v), period, asked, parts, turns)
+    goal = Goal(_integral(flow, t, guess.z), guess.z)
+    zero, size = jnp.zeros((), t.dtype), 2 * flow.size - len(flow.rows)
     rows_of = parts * 2 * flow.size + asked.moves + asked.energy + len(asked.held)
-    matrix = jnp.zeros((rows_of, parts * (2 * flow.size - len(flow.rows)) + 1), t.dtype)
-    bases = jax.vmap(lambda z: flow.tangent_space(t, z, scale))(nodes)
-    unseen = Seen(zero + jnp.inf, matrix[:, 0], matrix, bases, zero + 1, z, scale, scale)
-    begin = Search(Place(nodes, period), unseen, zero + FIRST_DAMPING, scale, jnp.zeros(flow.size, t.dtype), jnp.zeros((), int))
+    matrix, bases = jnp.zeros((rows_of, parts * size + 1), t.dtype), jnp.zeros((parts, 2 * flow.size, size), t.dtype)
+    unseen = Seen(zero + jnp.inf, matrix[:, 0], matrix, bases, zero + 1, guess.z, zero)
+    begin = Search(Place(guess.nodes, guess.period), unseen, zero + FIRST_DAMPING, jnp.zeros((), int))
 
     def unfinished(search):
         limit = rtol * jnp.maximum(1.0, search.seen.amplified)
@@ -137,49 +118,37 @@ def closed(system, t, q, v, params, period, rtol, asked: Asked, rows, parts, tur
         return ((search.iterations == 0) | (going & ~near)) & (search.iterations < most)
 
     def iterate(search):
-        begins = search.iterations == 0
-        place = _moved(flow, t, search, asked)
-        scale_here = jnp.where(begins, scale, search.scale)
-        passed, bases = _passed(flow, t, place, scale_here)
-        # A guess that is all zero, as of a driven system, shows its size at its end only.
-        size = jnp.maximum(scale_of(place.nodes[0], place.period), scale_of(passed.z[-1], place.period))
-        measure = jnp.where(begins, jnp.where(jnp.any(place.nodes != 0), size, scale_of(passed.z[-1], period)), search.scale)
-        gone = passed.z[-1][: flow.size] - place.nodes[0][: flow.size]
-        around = np.array(asked.angles) & ~np.array(asked.relative)
-        own = jnp.where(around, jnp.round(gone / TURN), 0.0) if turns is None else jnp.asarray(turns)
-        own = jnp.where(begins, own, search.turns)
-        seen = _seen(flow, t, place, passed, bases, scale_here, measure, asked, goal, own)
-        better = seen.size < search.seen.size
+        place = _moved(flow, t, search, asked, guess.scale)
+        seen = _seen(flow, t, place, asked, goal, guess)
+        # What shrinks to a state of rest, which comes back after any time, comes no nearer.
+        better = (seen.size < search.seen.size) & ~(seen.moves < SHRUNK * search.seen.moves)
         pick = lambda new, old: jax.tree.map(lambda a, b: jnp.where(better, a, b), new, old)
         damping = jnp.where(better, jnp.maximum(LEAST, search.damping / MORE), MORE * search.damping)
-        return Search(
-            pick(place, search.best), pick(seen, search.seen), damping, measure, own, search.iterations + 1
-        )
+        return Search(pick(place, search.best), pick(seen, search.seen), damping, search.iterations + 1)
 
     search = lax.while_loop(unfinished, iterate, begin)
     enough = ENOUGH * rtol * jnp.maximum(1.0, search.seen.amplified)
     converged = search.seen.size <= enough
     if asked.moves:
         # A state of rest comes back after any time.
-        moves = jnp.max(jnp.abs(flow.rate(t, search.best.nodes[0]) * search.best.period / search.scale))
-        converged = converged & (moves > jnp.sqrt(rtol))
-    apart = zero if asked.moves else _changed(flow, t, search.best, search.scale)
-    return Found(search.best, search.turns, search.seen, converged, search.iterations, apart)
+        converged = converged & (search.seen.moves > jnp.sqrt(rtol))
+    apart = zero if asked.moves else _changed(flow, t, search.best, guess.scale)
+    return Found(search.best, guess, search.seen, converged, search.iterations, apart)
 
 
 def implicit(system, t, q, v, params, rtol, asked: Asked, rows, found: Found) -> Found:
     """The same orbit with its derivatives by the system, the parameters and what is held: one Newton step more."""
     flow = flow_of(system, t, q, v, params, rtol, rows)
     found = lax.stop_gradient(found)
-    seen, scale = found.seen, found.seen.scale
+    seen, scale = found.seen, found.guess.scale
     goal_z = flow.onto_constraints(t, flow.vector(q, v), scale)
     goal = Goal(_integral(flow, t, goal_z), goal_z)
     nodes = jax.vmap(lambda z: flow.onto_constraints(t, z, scale))(found.place.nodes)
     place = Place(nodes, found.place.period)
     none = jnp.zeros((flow.size * 2, 0), nodes.dtype)
-    part = lambda t, z: flow.passage(t, z, found.place.period / len(nodes), none, scale, True).z
+    part = lambda t, z: flow.passage(t, z, found.place.period / len(nodes), none, scale, differentiable=True).z
     ends = jnp.stack([part(t, z) for t, z in zip(_times(t, place), nodes)])
-    residual = _residual(flow, t, place, ends, seen.measure, asked, goal, found.turns)
+    residual = _residual(flow, t, place, ends, asked, goal, found.guess)
     # The value is that of the search, the derivative that of the step.
     change = residual - lax.stop_gradient(residual)
     moves, log_period = _step(seen.matrix, change, seen.bases, asked, lax.stop_gradient(flow.rtol), 0.0)
@@ -189,99 +158,87 @@ def implicit(system, t, q, v, params, rtol, asked: Asked, rows, found: Found) ->
     return found._replace(place=Place(z, period), seen=seen._replace(end=end))
 
 
-def _nodes(flow, t, z, period, parts, scale):
-    """The states at equal parts of a period of the guess."""
-    if parts == 1:
-        return z[None]
-    none = jnp.zeros((z.size, 0), z.dtype)
-
-    def onward(z, t):
-        return flow.onto_constraints(t, flow.passage(t, z, period / parts, none, scale).z, scale), z
-
-    return lax.scan(onward, z, t + period * jnp.arange(parts, dtype=z.dtype) / parts)[1]
-
-
 def _times(t, place):
     count = len(place.nodes)
     return t + place.period * jnp.arange(count, dtype=t.dtype) / count
 
 
-def _moved(flow, t, search, asked):
+def _moved(flow, t, search, asked, scale):
     """Where the next step leads."""
     seen, best = search.seen, search.best
     damping = jnp.where(search.iterations == 0, 0.0, search.damping * seen.size)
     moves, log_period = _step(seen.matrix, seen.residual, seen.bases, asked, flow.rtol, damping)
     farthest = jnp.maximum(jnp.max(jnp.abs(moves)), jnp.abs(log_period))
     part = jnp.minimum(1.0, FARTHEST / jnp.where(farthest > 0, farthest, 1.0))
-    period = best.period * jnp.exp(part * log_period)
-    nodes = best.nodes + part * seen.scale[None] * moves
-    times = _times(t, Place(nodes, period))
-    return Place(jax.vmap(lambda t, z: flow.onto_constraints(t, z, search.scale))(times, nodes), period)
+    place = Place(best.nodes + part * scale[None] * moves, best.period * jnp.exp(part * log_period))
+    onto = lambda t, z: flow.onto_constraints(t, z, scale)
+    return place._replace(nodes=jax.vmap(onto)(_times(t, place), place.nodes))
 
 
-def _passed(flow, t, place, scale):
-    """Where the nodes go, and the bases of the tangent spaces at them."""
-    times, span = _times(t, place), place.period / len(place.nodes)
+def _seen(flow, t, place, asked, goal, guess) -> Seen:
+    """Follow the nodes to their ends, with the tangent spaces at them."""
+    times, span, scale = _times(t, place), place.period / len(place.nodes), guess.scale
     bases = jax.vmap(lambda t, z: flow.tangent_space(t, z, scale))(times, place.nodes)
     part = lambda t, z, basis: flow.passage(t, z, span, basis, scale)
     if len(place.nodes) == 1:
-        return jax.tree.map(lambda x: x[None], part(times[0], place.nodes[0], bases[0])), bases
-    return jax.vmap(part)(times, place.nodes, bases), bases
-
-
-def _seen(flow, t, place, passed, bases, scale, measure, asked, goal, turns) -> Seen:
-    matrix, residual = _equations(flow, t, place, passed, bases, scale, measure, asked, goal, turns)
+        passed = jax.tree.map(lambda x: x[None], part(times[0], place.nodes[0], bases[0]))
+    else:
+        passed = jax.vmap(part)(times, place.nodes, bases)
+    residual = _residual(flow, t, place, passed.z, asked, goal, guess)
+    matrix, moves = _equations(flow, t, place, passed, bases, scale, asked)
     # Not the largest entry: a step lessens the sum of squares.
     size = jnp.sqrt(jnp.mean(residual**2))
     good = jnp.all(passed.ended) & jnp.isfinite(size) & jnp.all(jnp.isfinite(matrix))
     clean = lambda x: jnp.where(good, x, 0.0)
-    amplified = clean(jnp.max(jnp.abs(passed.frame)))
-    size = jnp.where(good, size, jnp.inf)
-    return Seen(size, clean(residual), clean(matrix), bases, amplified, passed.z[-1], measure, scale)
+    amplified, size = clean(jnp.max(jnp.abs(passed.frame))), jnp.where(good, size, jnp.inf)
+    return Seen(size, clean(residual), clean(matrix), bases, amplified, passed.z[-1], moves)
 
 
-def _equations(flow, t, place, passed, bases, scale, measure, asked, goal, turns):
-    """The matrix (rows, K k + 1) of a Newton step, and the residual, in units of `measure`."""
+def _equations(flow, t, place, passed, bases, scale, asked):
+    """The matrix (rows, K k + 1) of a Newton step, in units of `scale`, and how far the state moves."""
     count, size, k = len(place.nodes), 2 * flow.size, bases.shape[2]
-    ratio = scale / measure
-    comes_back = 1.0 - np.concatenate([np.array(asked.relative, float), np.zeros(flow.size)])
-    rates = jax.vmap(flow.rate)(_times(t, place) + place.period / count, passed.z) * place.period / count / measure
+    comes_back = _comes_back(asked, t.dtype)
+    times = _times(t, place)
+    both = jnp.concatenate([times, times + place.period / count]), jnp.concatenate([place.nodes, passed.z])
+    rates = jax.vmap(flow.rate)(*both) * place.period / scale
+    here, rates = rates[0], rates[count:] / count
     blocks = []
     for j in range(count):
-        after, mask = (j + 1) % count, comes_back if j == count - 1 else np.ones(size)
+        after, last = (j + 1) % count, j == count - 1
         row = jnp.zeros((size, count * k + 1), t.dtype)
-        row = row.at[:, j * k : (j + 1) * k].add(ratio[:, None] * passed.frame[j])
-        row = row.at[:, after * k : (after + 1) * k].add(-ratio[:, None] * bases[after])
+        row = row.at[:, j * k : (j + 1) * k].add(passed.frame[j])
+        row = row.at[:, after * k : (after + 1) * k].add(-bases[after])
         row = row.at[:, -1].set(rates[j] if asked.free else 0.0)
-        blocks.append(row * mask[:, None].astype(t.dtype))
-    own = lambda gradient: jnp.concatenate([gradient @ bases[0], jnp.zeros((count - 1) * k + 1, t.dtype)])[None]
-    unit = lambda row: row / jnp.where(jnp.any(row != 0), jnp.linalg.norm(row), 1.0)
-    if asked.moves:
-        blocks.append(own(unit(flow.rate(t, place.nodes[0]) / scale)))
+        blocks.append(row * comes_back[:, None] if last else row)
     # What is asked comes before what is to be made small.
-    blocks = [*blocks[:count], *(FIRST * row for row in blocks[count:])]
-    blocks += [FIRST * own(row) for row in _held_slopes(flow, t, place, scale, asked)]
-    residual = _residual(flow, t, place, passed.z, measure, asked, goal, turns)
-    return jnp.concatenate(blocks), residual
+    own = lambda gradient: FIRST * jnp.append(gradient @ bases[0], jnp.zeros((count - 1) * k + 1, t.dtype))[None]
+    if asked.moves:
+        blocks.append(own(here / jnp.where(jnp.any(here != 0), jnp.linalg.norm(here), 1.0)))
+    blocks += [own(row) for row in _held_slopes(flow, t, place, scale, asked)]
+    return jnp.concatenate(blocks), jnp.max(jnp.abs(here * comes_back))
 
 
-def _residual(flow, t, place, ends, measure, asked, goal, turns):
+def _residual(flow, t, place, ends, asked, goal, guess):
     """What is left, in the order of the rows."""
-    comes_back = 1.0 - np.concatenate([np.array(asked.relative, float), np.zeros(flow.size)])
+    scale, turns = guess.scale, guess.turns
     first = place.nodes[0] + jnp.concatenate([TURN * turns, jnp.zeros_like(turns)])
-    after = jnp.concatenate([place.nodes[1:], first[None]])
-    left = (ends - after) / measure
-    left = left.at[-1].multiply(comes_back.astype(left.dtype))
+    left = (ends - jnp.concatenate([place.nodes[1:], first[None]])) / scale
+    left = left.at[-1].multiply(_comes_back(asked, left.dtype))
     parts = [left.reshape(-1)]
     if asked.moves:
         parts.append(jnp.zeros(1, left.dtype))
     if asked.energy:
-        slope = jax.grad(lambda z: _integral(flow, t, z))(lax.stop_gradient(place.nodes[0])) * measure
+        slope = jax.grad(lambda z: _integral(flow, t, z))(lax.stop_gradient(place.nodes[0])) * scale
         size = lax.stop_gradient(jnp.linalg.norm(slope))
         off = _integral(flow, t, place.nodes[0]) - goal.integral
         parts.append(FIRST * (off / jnp.where(size > 0, size, 1.0))[None])
-    parts += [(FIRST * (place.nodes[0][i] - goal.z[i]) / measure[i])[None] for i in asked.held]
+    parts += [(FIRST * (place.nodes[0][i] - goal.z[i]) / scale[i])[None] for i in asked.held]
     return jnp.concatenate(parts)
+
+
+def _comes_back(asked, dtype):
+    """One for what of (q, v) has to come back."""
+    return jnp.asarray(np.concatenate([1.0 - np.array(asked.relative), np.ones(len(asked.relative))]), dtype)
 
 
 def _held_slopes(flow, t, place, scale, asked):

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import ArrayLike, PyTree
 
 from lagjax.analysis import closing
-from lagjax.analysis.closing import Asked
+from lagjax.analysis.guessing import Asked
 from lagjax.analysis.monodromy import problem_of, tolerance_of
 from lagjax.analysis.orbit import PeriodicOrbit, packed
 from lagjax.jax_internals.tracing import is_eager
@@ -207,10 +207,10 @@ def _complain(found, period, problem, system):
 def _orbit(problem, found, asked) -> PeriodicOrbit:
     s = problem.state
     _, unflatten = coordinates.flatten(s.q)
-    z, n = found.place.nodes[0], found.turns.shape[0]
+    z, n = found.place.nodes[0], found.guess.turns.shape[0]
     shift = jnp.where(np.array(asked.relative), found.seen.end[:n] - z[:n], 0.0)
     arrays, static = packed(problem.system, coordinates.state(*s).params)
     return PeriodicOrbit(
-        jnp.asarray(s.t), unflatten(z[:n]), unflatten(z[n:]), found.place.period, unflatten(found.turns),
+        jnp.asarray(s.t), unflatten(z[:n]), unflatten(z[n:]), found.place.period, unflatten(found.guess.turns),
         unflatten(shift), found.seen.size, found.converged, found.iterations, found.place.nodes, arrays, static,
     )  # fmt: skip

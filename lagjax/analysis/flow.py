@@ -38,6 +38,8 @@ from lagjax.numerics.runge_kutta import Dopri8
 # Tight: what is said of a cycle is read off differences of what a whole period makes.
 TOLERANCE = {np.dtype("float64"): 1e-12, np.dtype("float32"): 1e-5}
 MAX_STEPS = 200_000
+# Of a sketch: steps from one point to the next, and the nodes and weights of the classical method of order 4.
+SUBSTEPS, RUNGE_KUTTA = 8, (np.array([0.0, 0.5, 0.5, 1.0]), np.array([1.0, 2.0, 2.0, 1.0]) / 6)
 # The first step, as a part of the span; a step that is too long is taken again.
 FIRST = 0.02
 # A row of constraints depends on others where no more than this part of it is left beside them.
@@ -48,7 +50,7 @@ ONTO_CONSTRAINTS = 4
 class Passage(NamedTuple):
     """Where a state z (2n,) and a frame of tangents (2n, k) have come, and how.
 
-    `growth`: the logarithm of the change of the frame's volume by Liouville's formula; 0 where the frame is not whole.
+    `growth`: the logarithm of the change of a whole frame's volume by Liouville's formula; 0 where that is not asked for.
     """
 
     z: Float[Array, " 2n"]
@@ -93,9 +95,10 @@ class Flow(eqx.Module):
 
     def onto_constraints(self, t, z, scale):
         """The state near z that satisfies the constraints, nearest in units of `scale`; differentiable."""
-        for _ in range(ONTO_CONSTRAINTS if self.rows else 0):
-            z = z - scale * _shortest(self.normals(t, z, scale), self.residual(t, z))
-        return z
+        if not self.rows:
+            return z
+        nearer = lambda z, _: (z - scale * _shortest(self.normals(t, z, scale), self.residual(t, z)), None)
+        return lax.scan(nearer, z, None, length=ONTO_CONSTRAINTS)[0]
 
     def tangent_space(self, t, z, scale) -> Float[Array, "2n k"]:
         """An orthonormal basis of the tangent space, in units of `scale`."""
@@ -106,10 +109,10 @@ class Flow(eqx.Module):
         # The derivative of a basis that turns as little as it can.
         return basis - _shortest(normals, normals @ basis)
 
-    def passage(self, t0, z, span, frame, scale, differentiable=False) -> Passage:
-        """The state and the frame after a time; errors, z and frame count in units of `scale`, (2n,).
+    def passage(self, t0, z, span, frame, scale, volume=False, differentiable=False) -> Passage:
+        """The state and the frame after a time; errors, and the frame, count in units of `scale`, (2n,).
 
-        The frame is in these units. In both modes derivatives flow through it where it is `differentiable`.
+        `volume`: whether to ask for its growth. In both modes derivatives flow through it where it is `differentiable`.
         """
         arrays, static = eqx.partition((self, t0, z, span, frame, lax.stop_gradient(scale)), eqx.is_array)
         x, fixed = eqx.partition(arrays, eqx.is_inexact_array)
@@ -117,11 +120,30 @@ class Flow(eqx.Module):
         def solve(x, fixed, adjoint, _):
             flow, *given = eqx.combine(x, fixed, static)
             forward = isinstance(adjoint, diffrax.ForwardMode)
-            return _passage(flow, *given, adjoint if forward else diffrax.RecursiveCheckpointAdjoint()), None
+            return _passage(flow, *given, volume, adjoint if forward else diffrax.RecursiveCheckpointAdjoint()), None
 
         if not differentiable:
             return solve(x, fixed, diffrax.ForwardMode(), False)[0]
         return solve_in_both_modes(solve, x, fixed, recorded=False)
+
+    def path(self, t0, z, span, count) -> Float[Array, "count+1 2n"]:
+        """States at equal parts of a time, by short steps of Runge and Kutta: a sketch, that is compiled in no time."""
+        h = span / (count * SUBSTEPS)
+
+        def step(z, t):
+            def stage(rates, c_and_b):
+                c, b = c_and_b
+                rate, total = rates
+                rate = self.rate(t + c * h, z + c * h * rate)
+                return (rate, total + b * rate), None
+
+            nothing = jnp.zeros_like(z)
+            (_, total), _ = lax.scan(stage, (nothing, nothing), tuple(x.astype(z.dtype) for x in RUNGE_KUTTA))
+            return z + h * total, z
+
+        times = t0 + h * jnp.arange(count * SUBSTEPS, dtype=z.dtype)
+        last, path = lax.scan(step, z, times)
+        return jnp.concatenate([path[::SUBSTEPS], last[None]])
 
 
 def flow_of(system, t, q, v, params, rtol, rows=None, in_a_loop=True) -> Flow:
@@ -184,9 +206,10 @@ def _shortest(rows, residual):
     return rows.T @ jnp.linalg.solve(rows @ rows.T, residual)
 
 
-def _passage(flow, t0, z, span, frame, scale, adjoint) -> Passage:
-    whole = frame.shape[1] == z.size - len(flow.rows) > 0
+def _passage(flow, t0, z, span, frame, scale, volume, adjoint) -> Passage:
 
+    # Jitted, so that it is traced once: diffrax traces the body of its loop three times.
+    @eqx.filter_jit
     def field(part, y, args):
         flow, t0, span, scale = args
         t = t0 + span * part
@@ -194,7 +217,7 @@ def _passage(flow, t0, z, span, frame, scale, adjoint) -> Passage:
         if not frame.size:
             return {"z": rate(y["z"]), "frame": jnp.zeros_like(frame), "growth": jnp.zeros_like(span)}
         motion, push = jax.linearize(rate, y["z"])
-        if not whole:
+        if not volume:
             return {"z": motion, "frame": jax.vmap(push, 1, 1)(y["frame"]), "growth": jnp.zeros_like(span)}
         jacobian = jax.vmap(push, 1, 1)(jnp.eye(z.size, dtype=z.dtype))
         growth = jnp.trace(jacobian)

@@ -107,7 +107,7 @@ def _period(system, t, q, v, params, nodes, period, rtol, reasons, rows, is_angl
     count = len(nodes)
     times = t + period * jnp.arange(count, dtype=t.dtype) / count
     bases = [flow.tangent_space(t, z, scale) for t, z in zip(times, nodes)]
-    part = lambda t, z, basis: flow.passage(t, z, period / count, basis, scale, differentiable)
+    part = lambda t, z, basis: flow.passage(t, z, period / count, basis, scale, True, differentiable)
     if count == 1:
         passed = jax.tree.map(lambda x: x[None], part(times[0], nodes[0], bases[0]))
     else:
