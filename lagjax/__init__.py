@@ -43,6 +43,13 @@ from lagjax.numerics.radau import Radau5
 from lagjax.numerics.runge_kutta import Dopri8, Tsit5
 
 # isort: split
+# What a system is like.
+from lagjax.analysis.cycles import OrbitWarning, periodic_orbit
+from lagjax.analysis.floquet import Floquet, floquet
+from lagjax.analysis.lyapunov import LyapunovExponents, lyapunov_exponents
+from lagjax.analysis.orbit import PeriodicOrbit
+
+# isort: split
 # Many motions.
 from lagjax.sweeps.engine import sweep
 from lagjax.sweeps.lanes import Status
@@ -120,6 +127,13 @@ __all__ = [
     "Animation",
     "RESULTS",
     "AccuracyWarning",
+    "periodic_orbit",
+    "PeriodicOrbit",
+    "OrbitWarning",
+    "floquet",
+    "Floquet",
+    "lyapunov_exponents",
+    "LyapunovExponents",
     "sweep",
     "Sweep",
     "Status",

@@ -9,13 +9,13 @@ In tangent coordinates w_j, z_j + B_j w_j, and with θ = log T, the linear equat
     Y_j w_j - B_{j+1} w_{j+1} + f(z_{j+1}) (T/K) θ = -residual
 
 with the frames Y_j that the flow makes of B_j. They do not fix where on the orbit it begins, and of a family of orbits
-not which one it is. The first is settled by a step that is orthogonal to the motion, f·w = 0, the second by what is held
-(an energy, a coordinate), one row each; of what is then left free, as a rotation of the whole, the shortest step is
-taken.
+not which one it is. The first is settled by a step that is orthogonal to the motion, f·w = 0, the second by what is
+held (an energy, a coordinate), one row each; of what is then left free, as a rotation of the whole, the shortest step
+is taken.
 
-The step is Levenberg's and Marquardt's with a damping that shrinks with the residual: it converges quadratically also to
-orbits that are not isolated (Yamashita & Fukushima, *Computing Suppl.* 15 (2001) 239). One that makes the residual no
-smaller is tried again with more of it.
+The step is Levenberg's and Marquardt's with a damping that shrinks with the residual: it converges quadratically also
+to orbits that are not isolated (Yamashita & Fukushima, *Computing Suppl.* 15 (2001) 239). One that makes the residual
+no smaller is tried again with more of it.
 
 Source: Seydel, *Practical Bifurcation and Stability Analysis*, §7.4-7.5; Muñoz-Almaraz et al., *Physica D* 181 (2003) 1
 (families of conservative systems); Stoer & Bulirsch, §7.3.5 (multiple shooting).
@@ -200,7 +200,7 @@ def _equations(flow, t, place, passed, bases, scale, asked):
     comes_back = _comes_back(asked, t.dtype)
     times = _times(t, place)
     both = jnp.concatenate([times, times + place.period / count]), jnp.concatenate([place.nodes, passed.z])
-    rates = jax.vmap(flow.rate)(*both) * place.period / scale
+    rates = jax.vmap(flow.rate)(*both) * place.period / scale[None]
     here, rates = rates[0], rates[count:] / count
     blocks = []
     for j in range(count):
@@ -222,7 +222,7 @@ def _residual(flow, t, place, ends, asked, goal, guess):
     """What is left, in the order of the rows."""
     scale, turns = guess.scale, guess.turns
     first = place.nodes[0] + jnp.concatenate([TURN * turns, jnp.zeros_like(turns)])
-    left = (ends - jnp.concatenate([place.nodes[1:], first[None]])) / scale
+    left = (ends - jnp.concatenate([place.nodes[1:], first[None]])) / scale[None]
     left = left.at[-1].multiply(_comes_back(asked, left.dtype))
     parts = [left.reshape(-1)]
     if asked.moves:

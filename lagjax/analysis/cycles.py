@@ -1,6 +1,6 @@
 """`periodic_orbit`: a motion that comes back, from a guess.
 
-    look at the system  ->  one compiled search (`closing.py`)  ->  say what went wrong, if anything did
+look at the system  ->  one compiled search (`closing.py`)  ->  say what went wrong, if anything did
 """
 
 import difflib
@@ -17,7 +17,6 @@ from lagjax.analysis.monodromy import problem_of, tolerance_of
 from lagjax.analysis.orbit import PeriodicOrbit, packed
 from lagjax.jax_internals.tracing import is_eager
 from lagjax.mechanics import coordinates
-from lagjax.mechanics.coordinates import State
 from lagjax.mechanics.diagnosis import listed
 from lagjax.mechanics.system import System
 from lagjax.motion.consistency import stopped
@@ -51,9 +50,9 @@ def periodic_orbit(
     >>> import jax.numpy as jnp
     >>> import lagjax as lj
     >>> pendulum = lj.System(lambda t, q, v, params: 0.5 * v**2 + params["g"] * jnp.cos(q))
-    >>> orbit = periodic_orbit(pendulum, (2.0, 0.0), 6.0, {"g": 1.0}, hold="q")
-    >>> print(orbit.period.round(9), orbit.q.round(9))
-    8.349... 2.0
+    >>> orbit = periodic_orbit(pendulum, (2.0, 0.0), 6.0, {"g": 1.0})
+    >>> print(orbit.period.round(9), orbit.q.round(6))
+    8.349752927 2.0
 
     **Main arguments:**
 
@@ -82,15 +81,15 @@ def periodic_orbit(
 
     **Raises:**
 
-    - `TypeError`, `ValueError` for a state of the wrong shape or dtype, for names that there are not, for what cannot be
-      held, and where a driven system is not the same after `period`.
+    - `TypeError`, `ValueError` for a state of the wrong shape or dtype, for names that there are not, for what cannot
+      be held, and where a driven system is not the same after `period`.
     - Warns (`lj.OrbitWarning`) where the search did not converge; under `jit` and in lanes look at `converged`.
 
     Source: Seydel, *Practical Bifurcation and Stability Analysis*, §7.4 (shooting, phase condition); Meyer & Offin, §9.
     """
     q, v = _pair(start)
     problem = problem_of(system, t, q, v, params)
-    s, reasons = problem.state, problem.reasons
+    s = problem.state
     dtype, names = s.t.dtype, coordinates.names(s.q)
     asked = _asked(problem, names, hold, relative)
     rtol, period = tolerance_of(rtol, dtype), coordinates.numpy_of(period).asarray(period, dtype)
@@ -138,8 +137,8 @@ def _asked(problem, names, hold, relative) -> Asked:
     seen = [name for name, free in zip(names, problem.reasons.ignorable) if name in wanted and not free]
     if seen:
         raise ValueError(
-            f"'{seen[0]}' is named in relative, and the system depends on it: with another value the motion is not "
-            f"the same.\nFix: leave it out of relative{', or turns={...} for an angle' if any(problem.is_angle) else ''}."
+            f"'{seen[0]}' is named in relative, and the system depends on it: the motion is another one with another "
+            "value of it.\nFix: leave it out; whole turns of an angle are counted without it."
         )
     mask = tuple(name in wanted for name in names)
     if driven:

@@ -16,14 +16,13 @@ Source: Coddington & Levinson, *Theory of ODEs*, §3.5; Guckenheimer & Holmes, *
 """
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Complex, Float, PyTree
+from jaxtyping import Array, Bool, Complex, Float
 
-from lagjax import plot
 from lagjax.analysis.monodromy import period_of, problem_of
 from lagjax.analysis.orbit import PeriodicOrbit
+from lagjax.analysis.unit_circle import unit_circle
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.system import System
 
@@ -34,8 +33,8 @@ COMES_BACK = 1e-5
 class Floquet(eqx.Module):
     """The multipliers of a cycle, and what they say of its stability. It prints and plots itself.
 
-    - `multipliers` (k,): complex, those that are 1 for a reason first, then by falling size. k is twice the coordinates,
-      less the independent equations of the constraints (a position counts twice: its velocity is constrained, too).
+    - `multipliers` (k,): complex, those that are 1 for a reason first, then by falling size. k is twice the number of
+      coordinates, less the independent equations of constraints (of positions twice: the velocity is constrained, too).
     - `trivial` (k,): whether it is 1 for a reason: `reasons` (r,) says which of those in `words` there are.
     - `monodromy` (2n, 2n): M on pushes (q, v) in the order of their names, zero on those off the constraints.
     - `log_volume`: the logarithm of Liouville's product, ∮ tr P J dt.
@@ -116,14 +115,16 @@ class Floquet(eqx.Module):
         """
         lanes = np.asarray(self.multipliers).reshape(-1, self.multipliers.shape[-1])
         trivial = np.asarray(self.trivial).reshape(lanes.shape)
-        return plot.unit_circle(lanes[~trivial], lanes[trivial])
+        return unit_circle(lanes[~trivial], lanes[trivial])
 
     def __repr__(self):
         if coordinates.is_traced(self):
             return f"Floquet(being traced, {self.multipliers.shape[-1]} multipliers)"
         if np.ndim(self.period):
             stable = int(np.sum(np.asarray(self.stable)))
-            return f"Floquet multipliers of {' x '.join(map(str, np.shape(self.period)))} lanes, {stable} of them stable"
+            return (
+                f"Floquet multipliers of {' x '.join(map(str, np.shape(self.period)))} lanes, {stable} of them stable"
+            )
         rows = [("multipliers", ", ".join(_listed(self))), ("period", f"{float(self.period):.9g}")]
         rows.append(("verdict", self.verdict))
         off = abs(float(self.product) - float(self.liouville))
@@ -147,7 +148,7 @@ def floquet(system, t=None, q=None, v=None, params=None, period=None, *, rtol=No
     ...     return 0.5 * v**2 - 0.5 * (params["a"] - 2 * params["q"] * jnp.cos(2 * t)) * q**2
     >>> found = floquet(lj.System(swing), 0.0, 0.0, 0.0, {"a": 1.0, "q": 0.25}, jnp.pi)
     >>> print(found.multipliers.real.round(6), bool(found.stable))
-    [-2.179... -0.458...] False
+    [-1.476792 -0.677143] False
 
     **Arguments:**
 

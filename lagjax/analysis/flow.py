@@ -50,7 +50,7 @@ ONTO_CONSTRAINTS = 4
 class Passage(NamedTuple):
     """Where a state z (2n,) and a frame of tangents (2n, k) have come, and how.
 
-    `growth`: the logarithm of the change of a whole frame's volume by Liouville's formula; 0 where that is not asked for.
+    `growth`: the logarithm of the change of a whole frame's volume by Liouville's formula; 0 where it is not asked for.
     """
 
     z: Float[Array, " 2n"]

@@ -1,7 +1,7 @@
 """What a guess tells of an orbit: how large it is, about how long it takes, and how often angles go around.
 
-The guess is followed for a period, and, where the period is to be found, for another one, with little accuracy. If it is
-not near its start after the period that was given, the time at which it comes nearest is taken in its place.
+The guess is followed for a period, and, where the period is to be found, for another one, with little accuracy. If it
+is not near its start after the period that was given, the time at which it comes nearest is taken in its place.
 """
 
 from typing import NamedTuple
@@ -16,7 +16,7 @@ from lagjax.analysis.flow import Flow, scale_of
 TURN = 2 * np.pi
 # Points of the path in a period that was given, and of how many such periods, where another may be better.
 PIECES, REACH = 48, 2
-# A guess comes back where it is at this part of its size; beside this part of what there is, the given period is as good.
+# A guess comes back where it is at this part of its size; a return must be this much nearer than that which was given.
 NEAR, BETTER = 0.2, 0.5
 # The first part of a path, in which no motion has gone anywhere yet.
 BEGINNING = 0.4
@@ -61,7 +61,9 @@ def guessed(flow: Flow, t, z, period, asked: Asked, parts: int, turns) -> Guess:
     around = np.array(asked.angles) & ~np.array(asked.relative)
     own = jnp.where(around[None], jnp.round(gone / TURN), 0.0)
     if searched:
-        at = _nearest(path - z[None], TURN * (own if turns is None else jnp.asarray(turns)[None] + 0 * own), scale, asked)
+        at = _nearest(
+            path - z[None], TURN * (own if turns is None else jnp.asarray(turns)[None] + 0 * own), scale, asked
+        )
     # Of an unstable motion that is driven a guess may leave all there is: it begins where it was given, in all parts.
     nodes = path[np.arange(parts) * PIECES // parts] if asked.moves else jnp.broadcast_to(z, (parts, z.size))
     onto = lambda node: flow.onto_constraints(t, node, scale)
@@ -81,7 +83,7 @@ def _extent(path, period, otherwise):
 
 
 def _nearest(difference, turned, scale, asked):
-    """The place on the path that is nearest to the start, if that is much nearer than after the period that was given."""
+    """The place on the path that is nearest to the start, if it is much nearer than after the period that was given."""
     mask = 1.0 - np.concatenate([np.array(asked.relative, float), np.zeros(turned.shape[1])])
     difference = difference - jnp.concatenate([turned, jnp.zeros_like(turned)], axis=1)
     apart = jnp.sqrt(jnp.mean((difference / scale[None]) ** 2 * mask[None], axis=1))

@@ -35,8 +35,8 @@ TURN = 2 * np.pi
 class Period(NamedTuple):
     """What a period of a motion says, before it is put in words.
 
-    `multipliers` are sorted, the `trivial` ones first; `reasons` (r,) are those of `trivial.py` that there are. `apart`:
-    how far the end is from the start, in units of the state.
+    `multipliers` are sorted, the `trivial` ones first; `reasons` (r,) are those of `trivial.py` that there are.
+    `apart`: how far the end is from the start, in units of the state.
     """
 
     multipliers: Complex[Array, " k"]
@@ -115,9 +115,7 @@ def _period(system, t, q, v, params, nodes, period, rtol, reasons, rows, is_angl
     whole, after = jnp.eye(bases[0].shape[1], dtype=t.dtype), [*bases[1:], bases[0]]
     for basis, frame in zip(after, passed.frame):
         whole = basis.T @ frame @ whole
-    rows_of, there = orthonormal(
-        reasons, directions(flow, reasons, t, first, scale, bases[0]), TURN / period
-    )
+    rows_of, there = orthonormal(reasons, directions(flow, reasons, t, first, scale, bases[0]), TURN / period)
     multipliers, trivial = _sorted(_without(rows_of, whole), jnp.sum(there))
     matrix = scale[:, None] * (bases[0] @ whole @ bases[0].T) / scale[None]
     ended = jnp.all(passed.ended) & jnp.all(jnp.isfinite(whole))

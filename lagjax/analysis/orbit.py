@@ -2,7 +2,6 @@
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
@@ -21,7 +20,7 @@ class PeriodicOrbit(eqx.Module):
     - `t`, `q`, `v`: a state of it; `period`, `[t]`.
     - `turns`: by how many whole turns each angle has gone around, in the structure of `q`.
     - `shift`: by how much the coordinates named in `relative` have moved on, in the structure of `q`; 0 elsewhere.
-    - `residual`: how far the end is from the start, and what is held from its value, relative to the size of the motion.
+    - `residual`: how far the end is from the start, and what is held from its value, in units of the motion's size.
     - `converged`: whether that is what the tolerance leaves; if not, this is the best that was found.
     - `iterations`: of Newton's method.
     - `nodes` (K, 2n): the states q and v, in the order of their names, at K equal parts of the period.
@@ -84,7 +83,9 @@ class PeriodicOrbit(eqx.Module):
             return f"Periodic orbits, {shape} lanes, {good} converged, periods {low:.9g} to {high:.9g}"
         rows = [("period", f"{float(self.period):.12g}")]
         rows.append(("start", f"t = {float(self.t):.6g}, q = {describe(self.q)}, v = {describe(self.v)}"))
-        rows += [(label, moved) for label, tree in (("turns", self.turns), ("shift", self.shift)) if (moved := _moved(tree))]
+        rows += [
+            (label, moved) for label, tree in (("turns", self.turns), ("shift", self.shift)) if (moved := _moved(tree))
+        ]
         rows.append(("residual", f"{float(self.residual):.1e} (relative), after {int(self.iterations)} iterations"))
         if not bool(self.converged):
             rows.append(("WARNING", "not converged: the best that was found"))

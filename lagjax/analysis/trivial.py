@@ -61,7 +61,9 @@ def reasons_of(system, t, q, v, params) -> Reasons:
     autonomous = not any(sees_time(f, *state) for f in _functions(system))
     potential = system.force is None and system.dissipation is None
     momenta = potential and all(isinstance(c, Holonomic) for c in system.constraints.values())
-    return Reasons(autonomous, autonomous and conserves_jacobi_integral(system, *state), _ignorable(system, *state), momenta)
+    return Reasons(
+        autonomous, autonomous and conserves_jacobi_integral(system, *state), _ignorable(system, *state), momenta
+    )
 
 
 def directions(flow: Flow, reasons: Reasons, t, z, scale, basis) -> Float[Array, "r k"]:
