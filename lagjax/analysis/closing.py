@@ -38,9 +38,11 @@ MOST = 40
 # The damping in units of the residual: least, at first, more where a step failed, and where to give up.
 LEAST, FIRST_DAMPING, MORE, TOO_MUCH = 0.01, 0.03, 8.0, 1e4
 # Residuals, in tolerances: where to stop at once, and what counts as an orbit.
-AIM, ENOUGH = 10.0, 1e3
+AIM, ENOUGH = 1.0, 1e3
 # Singular values below this many tolerances, and so small at least, do not count.
 NOTHING, SMALL = 1e4, 1e-8
+# Of the terms of a sum that is held.
+ROUND_OFFS = 16.0
 # A step that leaves no more than this part of the motion is none.
 SHRUNK = 0.1
 # No step changes the logarithm of the period, or the state in units of its size, by more than this.
@@ -84,11 +86,15 @@ class Found(NamedTuple):
 
 
 class Search(NamedTuple):
-    """The state of the iteration: the best place so far with what was seen, and the damping to try next."""
+    """The state of the iteration: the best place so far with what was seen, and the damping to try next.
+
+    `moves`: how far the guess moved in its period.
+    """
 
     best: Place
     seen: Seen
     damping: Float[Array, ""]
+    moves: Float[Array, ""]
     iterations: Int[Array, ""]
 
 
@@ -109,7 +115,7 @@ def closed(system, t, q, v, params, period, rtol, asked: Asked, rows, parts, tur
     rows_of = parts * 2 * flow.size + asked.moves + asked.energy + len(asked.held)
     matrix, bases = jnp.zeros((rows_of, parts * size + 1), t.dtype), jnp.zeros((parts, 2 * flow.size, size), t.dtype)
     unseen = Seen(zero + jnp.inf, matrix[:, 0], matrix, bases, zero + 1, guess.z, zero)
-    begin = Search(Place(guess.nodes, guess.period), unseen, zero + FIRST_DAMPING, jnp.zeros((), int))
+    begin = Search(Place(guess.nodes, guess.period), unseen, zero + FIRST_DAMPING, zero, jnp.zeros((), int))
 
     def unfinished(search):
         limit = rtol * jnp.maximum(1.0, search.seen.amplified)
@@ -121,10 +127,11 @@ def closed(system, t, q, v, params, period, rtol, asked: Asked, rows, parts, tur
         place = _moved(flow, t, search, asked, guess.scale)
         seen = _seen(flow, t, place, asked, goal, guess)
         # What shrinks to a state of rest, which comes back after any time, comes no nearer.
-        better = (seen.size < search.seen.size) & ~(seen.moves < SHRUNK * search.seen.moves)
+        better = (seen.size < search.seen.size) & ~(seen.moves < SHRUNK * search.moves)
         pick = lambda new, old: jax.tree.map(lambda a, b: jnp.where(better, a, b), new, old)
         damping = jnp.where(better, jnp.maximum(LEAST, search.damping / MORE), MORE * search.damping)
-        return Search(pick(place, search.best), pick(seen, search.seen), damping, search.iterations + 1)
+        moves = jnp.where(search.iterations == 0, seen.moves, search.moves)
+        return Search(pick(place, search.best), pick(seen, search.seen), damping, moves, search.iterations + 1)
 
     search = lax.while_loop(unfinished, iterate, begin)
     enough = ENOUGH * rtol * jnp.maximum(1.0, search.seen.amplified)
@@ -231,6 +238,10 @@ def _residual(flow, t, place, ends, asked, goal, guess):
         slope = jax.grad(lambda z: _integral(flow, t, z))(lax.stop_gradient(place.nodes[0])) * scale
         size = lax.stop_gradient(jnp.linalg.norm(slope))
         off = _integral(flow, t, place.nodes[0]) - goal.integral
+        # Less than the round-off of its terms is nothing, but for its derivative.
+        terms = jnp.abs(goal.integral) + jnp.abs(flow.system.lagrangian(t, *flow.state(goal.z), flow.params))
+        noise = lax.stop_gradient(jnp.abs(off) <= ROUND_OFFS * jnp.finfo(off.dtype).eps * terms)
+        off = jnp.where(noise, off - lax.stop_gradient(off), off)
         parts.append(FIRST * (off / jnp.where(size > 0, size, 1.0))[None])
     parts += [(FIRST * (place.nodes[0][i] - goal.z[i]) / scale[i])[None] for i in asked.held]
     return jnp.concatenate(parts)
