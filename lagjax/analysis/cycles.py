@@ -13,7 +13,7 @@ from jaxtyping import ArrayLike, PyTree
 
 from lagjax.analysis import closing
 from lagjax.analysis.guessing import Asked
-from lagjax.analysis.monodromy import problem_of, tolerance_of
+from lagjax.analysis.monodromy import problem_of, refuse_singular, tolerance_of
 from lagjax.analysis.orbit import PeriodicOrbit, packed
 from lagjax.jax_internals.tracing import is_eager
 from lagjax.mechanics import coordinates
@@ -102,7 +102,7 @@ def periodic_orbit(
     )
     if eager:
         found = search(s, period)
-        _complain(found, float(period), problem, system)
+        _complain(found, float(period), problem)
     else:
         live = coordinates.state(*s)
         still = stopped((live, jnp.asarray(period)))
@@ -183,13 +183,15 @@ def _turns(turns, names, dtype):
     return np.array([turns.get(name, 0) for name in names], dtype)
 
 
-def _complain(found, period, problem, system):
+def _complain(found, period, problem):
     if float(found.apart) > SAME:
         raise ValueError(
             f"the system is not the same after period = {period:.9g}: its accelerations change.\n"
             "Usual cause: a period that is rounded, or none of the drive.\n"
             'Fix: period=2 * jnp.pi / params["omega"] for a drive cos(ωt), or a multiple of it.'
         )
+    if not np.isfinite(float(found.seen.size)):
+        refuse_singular(problem)
     if not bool(found.converged):
         warnings.warn(
             f"no periodic orbit was found near this start: after {int(found.iterations)} flows the motion comes back "

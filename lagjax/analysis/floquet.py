@@ -20,14 +20,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float
 
-from lagjax.analysis.monodromy import period_of, problem_of
+from lagjax.analysis.monodromy import period_of, problem_of, refuse_singular
 from lagjax.analysis.orbit import PeriodicOrbit
 from lagjax.analysis.unit_circle import unit_circle
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.system import System
-
-# A state comes back where no more than this part of it is missing.
-COMES_BACK = 1e-5
 
 
 class Floquet(eqx.Module):
@@ -41,7 +38,8 @@ class Floquet(eqx.Module):
     - `error`: how far the entries of M may be off, in units in which the state has size 1; by a second run of less
       accuracy where nothing is traced, else by Liouville's formula. What is smaller than this of the multipliers is
       not known.
-    - `period`, `ended`: whether the motion could be followed through it.
+    - `period`; `ended`: whether the motion could be followed through it; `apart`: how far it then is from its start, in
+      units of the state, but for whole turns and for what nothing depends on.
 
     Under `vmap` every array has the batch's axes in front.
     """
@@ -54,6 +52,7 @@ class Floquet(eqx.Module):
     error: Float[Array, ""]
     period: Float[Array, ""]
     ended: Bool[Array, ""]
+    apart: Float[Array, ""]
     words: tuple[str, ...] = eqx.field(static=True)
 
     @property
@@ -82,20 +81,27 @@ class Floquet(eqx.Module):
         return jnp.sqrt(jnp.maximum(self.error, 10 * jnp.finfo(self.period.dtype).eps))
 
     @property
+    def comes_back(self) -> Bool[Array, ""]:
+        """Whether the motion is at its start again after the period: else these are no multipliers."""
+        return self.ended & (self.apart <= jnp.finfo(self.period.dtype).eps ** (1 / 3))
+
+    @property
     def stable(self) -> Bool[Array, ""]:
         """Whether no multiplier is outside the unit circle."""
-        return self.ended & (self.largest <= 1 + self.within)
+        return self.comes_back & (self.largest <= 1 + self.within)
 
     @property
     def attracts(self) -> Bool[Array, ""]:
         """Whether all that are not trivial are inside: the cycle is asymptotically stable."""
-        return self.ended & (self.largest < 1 - self.within)
+        return self.comes_back & (self.largest < 1 - self.within)
 
     @property
     def verdict(self) -> str:
         """What the multipliers say, in words. Not for a batch."""
         if not bool(self.ended):
             return "not known: the motion could not be followed through a period"
+        if not bool(self.comes_back):
+            return f"not known: the motion does not come back, by {float(self.apart):.1g} of its size"
         outside = np.asarray(self.multipliers)[~np.asarray(self.trivial)]
         if bool(self.stable):
             if len(outside) and bool(self.attracts):
@@ -177,7 +183,9 @@ def floquet(system, t=None, q=None, v=None, params=None, period=None, *, rtol=No
     problem = problem_of(system, t, q, v, params)
     found, error = period_of(problem, period, rtol)
     named = _named(problem, found, error, period)
-    if not coordinates.is_traced(found) and bool(found.ended) and float(found.apart) > COMES_BACK:
+    if not coordinates.is_traced(found) and not bool(found.ended):
+        refuse_singular(problem)
+    if not coordinates.is_traced(found) and bool(found.ended) and not bool(named.comes_back):
         raise ValueError(
             f"this state does not come back after period = {float(period):.9g}: it is off by {float(found.apart):.2g} "
             "of its size.\n"
@@ -208,7 +216,7 @@ def _named(problem, found, error, period):
     names = problem.reasons.names(problem.state.q)
     return Floquet(
         found.multipliers, found.trivial, found.reasons, found.monodromy, found.log_volume, error, period, found.ended,
-        names,
+        found.apart, names,
     )  # fmt: skip
 
 

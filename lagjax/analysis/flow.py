@@ -40,6 +40,8 @@ TOLERANCE = {np.dtype("float64"): 1e-12, np.dtype("float32"): 1e-5}
 MAX_STEPS = 200_000
 # Of a sketch: steps from one point to the next, and the nodes and weights of the classical method of order 4.
 SUBSTEPS, RUNGE_KUTTA = 8, (np.array([0.0, 0.5, 0.5, 1.0]), np.array([1.0, 2.0, 2.0, 1.0]) / 6)
+# Steps that are shorter, as a part of the span, lead nowhere: the motion is singular there, or not a number.
+SHORTEST = 1e-10
 # The first step, as a part of the span; a step that is too long is taken again.
 FIRST = 0.02
 # A row of constraints depends on others where no more than this part of it is left beside them.
@@ -150,7 +152,7 @@ def flow_of(system, t, q, v, params, rtol, rows=None, in_a_loop=True) -> Flow:
     """The flow of a system, for states like this one; `rows` from `independent_rows_of`, by default all."""
     x, unflatten = coordinates.flatten(q)
     if rows is None:
-        rows = _all_rows(system, t, q, v, params)
+        rows = all_rows(system, t, q, v, params)
     return Flow(system, params, jnp.asarray(rtol, x.dtype), unflatten, x.size, rows, in_a_loop)
 
 
@@ -190,7 +192,8 @@ def _normals(system, t, q, v, params):
     return jax.jacfwd(lambda z: _residual(system, t, z, params, unflatten))(z)
 
 
-def _all_rows(system, t, q, v, params):
+def all_rows(system, t, q, v, params) -> tuple[int, ...]:
+    """All constraint equations, of positions and of velocities."""
     holonomic = constraints.holonomic_equations(system, t, q, v, params)
     return tuple(range(int(holonomic.sum()) + len(holonomic)))
 
@@ -237,7 +240,7 @@ def _passage(flow, t0, z, span, frame, scale, volume, adjoint) -> Passage:
         first,
         y0,
         (flow, t0, span, scale),
-        stepsize_controller=diffrax.PIDController(rtol=flow.rtol, atol=flow.rtol),
+        stepsize_controller=diffrax.PIDController(rtol=flow.rtol, atol=flow.rtol, dtmin=SHORTEST, force_dtmin=False),
         adjoint=adjoint,
         max_steps=MAX_STEPS,
         throw=False,

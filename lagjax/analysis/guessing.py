@@ -93,4 +93,5 @@ def _nearest(difference, turned, scale, asked):
     # Of several returns, as of a motion and of two periods of it, the one nearest to what was given.
     near = jnp.where(lowest & (apart < NEAR), np.abs(np.log(np.maximum(place, 0.5) / PIECES)), jnp.inf)
     nearest = jnp.where(jnp.any(jnp.isfinite(near)), jnp.argmin(near), jnp.argmin(jnp.where(lowest, apart, jnp.inf)))
+    nearest = jnp.where(jnp.any(lowest), nearest, PIECES)
     return jnp.where(apart[nearest] > BETTER * apart[PIECES], PIECES, nearest)

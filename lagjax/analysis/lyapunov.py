@@ -23,7 +23,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, PyTree
 
 from lagjax import plot
 from lagjax.analysis.flow import flow_of
-from lagjax.analysis.monodromy import problem_of
+from lagjax.analysis.monodromy import problem_of, refuse_singular
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.compiled import compiled
 from lagjax.mechanics.system import System
@@ -155,7 +155,10 @@ def lyapunov_exponents(
         )
     rtol = np.asarray(TOLERANCE.get(np.dtype(s.t.dtype), 1e-5) if rtol is None else rtol, s.t.dtype)
     found = _grown(problem.system, *s, ts.astype(s.t.dtype), rtol, problem.rows, count)
-    return LyapunovExponents(*found, count == most)
+    exponents = LyapunovExponents(*found, count == most)
+    if not coordinates.is_traced(exponents) and not bool(exponents.ended):
+        refuse_singular(problem)
+    return exponents
 
 
 def _check(ts):

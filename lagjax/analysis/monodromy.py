@@ -17,15 +17,18 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Complex, Float
 
-from lagjax.analysis.flow import TOLERANCE, flow_of, independent_rows_of, scale_of
+from lagjax.analysis.flow import TOLERANCE, all_rows, flow_of, independent_rows_of, scale_of
 from lagjax.analysis.trivial import Reasons, directions, orthonormal, reasons_of
 from lagjax.jax_internals.tracing import WATCHED, is_eager
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.closures import lift
 from lagjax.mechanics.compiled import compiled
 from lagjax.mechanics.coordinates import State
+from lagjax.mechanics.diagnosis import explain_failure
 from lagjax.mechanics.first_call import looked_at
+from lagjax.mechanics.hybrid import Hybrid
 from lagjax.mechanics.structure import angles
+from lagjax.mechanics.system import System
 
 # The second run's tolerance, by which the first is judged.
 LOOSER = 10.0
@@ -61,11 +64,43 @@ class Problem(NamedTuple):
 
 def problem_of(system, t, q, v, params) -> Problem:
     """Look at a system at a state; where JAX traces nothing, dependent constraints are found and left out."""
-    s = coordinates.prepared(t, q, v, params)
+    if not isinstance(system, System | Hybrid):
+        raise TypeError(
+            f"the first argument must be a lj.System, not {type(system).__name__}.\n"
+            "Fix: system = lj.System(lagrangian)."
+        )
+    s = coordinates.prepared(t, *jax.tree.map(_as_float, (q, v)), params)
     system = lift(looked_at(system, s), s)
     state = coordinates.state(*s)
-    is_angle = angle_entries(system, *state)
-    return Problem(system, s, reasons_of(system, *state), independent_rows_of(system, *state), is_angle)
+    rows = independent_rows_of(system, *state)
+    _check_freedom(system, state, rows)
+    return Problem(system, s, reasons_of(system, *state), rows, angle_entries(system, *state))
+
+
+def refuse_singular(problem: Problem):
+    """Raise in the user's words where the equations fail at the state; for what could not be followed."""
+    words = explain_failure(problem.system, coordinates.state(*problem.state))
+    if words is not None:
+        raise ValueError(words)
+
+
+def _as_float(x):
+    """A whole number as another one."""
+    whole = isinstance(x, int) or isinstance(x, np.ndarray | np.generic) and np.issubdtype(x.dtype, np.integer)
+    return np.asarray(x, float) if whole else x
+
+
+def _check_freedom(system, state, rows):
+    n, known = coordinates.flatten(state.q)[0].size, rows is not None
+    rows = all_rows(system, *state) if rows is None else rows
+    if len(rows) < 2 * n:
+        return
+    cause = "constraints that fix every coordinate" if known else "constraints that depend on each other"
+    fix = "leave one out" + ("" if known else ", or call this outside of jit and vmap, where dependent ones are found")
+    raise ValueError(
+        f"there are {2 * n} coordinates and velocities, and {len(rows)} equations restrict them: nothing is left to "
+        f"move.\nUsual cause: {cause}.\nFix: {fix}."
+    )
 
 
 def angle_entries(system, t, q, v, params) -> tuple[bool, ...]:
@@ -116,9 +151,10 @@ def _period(system, t, q, v, params, nodes, period, rtol, reasons, rows, is_angl
     for basis, frame in zip(after, passed.frame):
         whole = basis.T @ frame @ whole
     rows_of, there = orthonormal(reasons, directions(flow, reasons, t, first, scale, bases[0]), TURN / period)
+    ended = jnp.all(passed.ended) & jnp.all(jnp.isfinite(whole))
     multipliers, trivial = _sorted(_without(rows_of, whole), jnp.sum(there))
     matrix = scale[:, None] * (bases[0] @ whole @ bases[0].T) / scale[None]
-    ended = jnp.all(passed.ended) & jnp.all(jnp.isfinite(whole))
+    multipliers = jnp.where(ended, multipliers, jnp.nan)
     apart = _apart(flow, reasons, is_angle, passed.z[-1] - first, scale)
     return Period(multipliers, trivial, there, whole, matrix, jnp.sum(passed.growth), apart, ended)
 

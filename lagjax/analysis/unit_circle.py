@@ -21,9 +21,7 @@ def unit_circle(multipliers: np.ndarray, trivial: np.ndarray):
     reach = 1.2 * min(FAR, max(1.0, size[np.isfinite(size)].max(initial=1.0)))
     shown = multipliers * np.minimum(1.0, 0.96 * reach / np.maximum(size, 1e-300))
     outside = size > 1 + 1e-6
-    axis.plot(
-        *_parts(trivial), "o", markersize=10, markerfacecolor="none", color=plot.COLOURS[-1], label="trivial"
-    )
+    axis.plot(*_parts(trivial), "o", markersize=10, markerfacecolor="none", color=plot.COLOURS[-1], label="trivial")
     for which, colour, label in ((~outside, plot.COLOURS[0], "inside or on it"), (outside, plot.COLOURS[1], "outside")):
         if which.any():
             axis.plot(*_parts(shown[which]), "o", markersize=5, color=colour, label=label)

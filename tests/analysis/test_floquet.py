@@ -155,7 +155,9 @@ def test_kepler():
     """All four multipliers are 1, two of them for a reason that is known, the others to 1e-5; and M is no identity."""
     mu, speed = 1.25, 1.25
     period = 2 * np.pi / np.sqrt(mu) * (2 - speed**2 / mu) ** -1.5
-    found = lj.floquet(lj.System(kepler_lagrangian), 0.0, jnp.array([1.0, 0.0]), jnp.array([0.0, speed]), {"mu": mu}, period)
+    found = lj.floquet(
+        lj.System(kepler_lagrangian), 0.0, jnp.array([1.0, 0.0]), jnp.array([0.0, speed]), {"mu": mu}, period
+    )
     np.testing.assert_allclose(found.multipliers, 1.0, atol=1e-5)
     assert found.trivial.sum() == 2 and bool(found.stable)
     # All orbits of an energy have one period: M - 1 has rank one, f times the slope of the energy.
