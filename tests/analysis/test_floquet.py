@@ -103,6 +103,7 @@ def upright(Omega, system=kapitza):
     return lj.floquet(system, 0.0, *start, params, 2 * jnp.pi / Omega)
 
 
+@pytest.mark.slow
 def test_kapitza():
     """Upright it is stable exactly where a > a_0(q), a = -4g/(lΩ²), q = 2A/l, near A²Ω² = 2gl; twin: just below not."""
     edge = np.sqrt(-4 * SHAKEN["g"] / SHAKEN["l"] / special.mathieu_a(0, 2 * SHAKEN["A"] / SHAKEN["l"]))
@@ -112,7 +113,7 @@ def test_kapitza():
     assert abs((SHAKEN["A"] * edge) ** 2 / (2 * SHAKEN["g"] * SHAKEN["l"]) - 1) < 0.01
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_kapitza_on_a_moving_constraint():
     """In Cartesian coordinates on a rod whose pivot moves the multipliers are the same, two of them."""
     for Omega in (60.0, 100.0):
@@ -151,6 +152,7 @@ def kepler_lagrangian(t, q, v, p):
     return 0.5 * v @ v + p["mu"] / jnp.sqrt(q @ q)
 
 
+@pytest.mark.slow
 def test_kepler():
     """All four multipliers are 1, two of them for a reason that is known, the others to 1e-5; and M is no identity."""
     mu, speed = 1.25, 1.25
@@ -163,6 +165,41 @@ def test_kepler():
     # All orbits of an energy have one period: M - 1 has rank one, f times the slope of the energy.
     np.testing.assert_allclose(np.linalg.svd(found.monodromy - np.eye(4))[1][1:], 0.0, atol=1e-8)
     assert np.abs(found.monodromy - np.eye(4)).max() > 1
+
+
+def on_a_sphere(t, q, v, p):
+    """A unit mass that hangs, in space."""
+    return 0.5 * v @ v - p["g"] * q[2]
+
+
+@pytest.mark.slow
+def test_conical_pendulum():
+    """Circling at an angle θ it swings about that √(1 + 3 cos² θ) times in a turn, on a constraint that is given twice.
+
+    Landau & Lifshitz, *Mechanics*, §14, problem 1: by the effective potential. The turn is a symmetry that is not known
+    from the coordinates, and here the motion itself.
+    """
+    rod = lj.Holonomic(lambda t, q, p: q @ q - p["l"] ** 2)
+    again = lj.Holonomic(lambda t, q, p: 1.0 - q @ q / p["l"] ** 2)
+    theta, g, l = 1.0, 9.8125, 1.25
+    rate = np.sqrt(g / (l * np.cos(theta)))
+    start = l * np.array([np.sin(theta), 0.0, -np.cos(theta)]), rate * l * np.array([0.0, np.sin(theta), 0.0])
+    system = lj.System(on_a_sphere, {"rod": rod, "again": again})
+    found = lj.floquet(system, 0.0, *start, {"g": g, "l": l}, 2 * np.pi / rate)
+    phase = 2 * np.pi * np.sqrt(1 + 3 * np.cos(theta) ** 2)
+    assert found.multipliers.shape == (4,) and found.trivial.tolist() == [True, True, False, False]
+    np.testing.assert_allclose(
+        found.multipliers[2:], np.cos(phase) + 1j * np.abs(np.sin(phase)) * np.array([1, -1]), atol=1e-9
+    )
+    assert bool(found.stable) and not bool(found.attracts)
+    with pytest.raises(ValueError, match="nothing is left to move.*\n.*depend on each other"):
+        jax.jit(lambda g: lj.floquet(doubled(3), 0.0, *start, {"g": g, "l": l}, 1.0).multipliers)(g)
+
+
+def doubled(count):
+    """The same rod so many times."""
+    rod = lj.Holonomic(lambda t, q, p: q @ q - p["l"] ** 2)
+    return lj.System(on_a_sphere, {f"rod {i}": rod for i in range(count)})
 
 
 def van_der_pol_lagrangian(t, q, v, p):
@@ -178,7 +215,7 @@ PERIOD_AT_1 = 6.663286859323130
 def test_van_der_pol():
     """The cycle attracts; the multiplier is e^∮μ(1-q²)dt by SciPy; twin: under the other sign of μ it repels."""
     orbit = lj.periodic_orbit(van_der_pol, (2.0, 0.0), 6.5, {"mu": 1.0})
-    found = lj.floquet(orbit)
+    found = lj.floquet(van_der_pol, 0.0, orbit.q, orbit.v, {"mu": 1.0}, orbit.period)
     np.testing.assert_allclose(orbit.period, PERIOD_AT_1, rtol=1e-12)
 
     def rate(t, y):
@@ -194,8 +231,9 @@ def test_van_der_pol():
     assert not bool(away.stable) and "above 1" in away.verdict
 
 
+@pytest.mark.slow
 def test_liouville_with_damping():
-    """On the rod and off it, with R = ½ c v², the product is e^(-cT) for each freedom; twin: with 2R it is the square."""
+    """On a rod and off it, with R = ½ c v², the product is e^(-cT) for each freedom; twin: with 2R it is the square."""
     c, period = 0.375, 1.25
     for factor in (1.0, 2.0):
         damped = lj.System(
@@ -213,6 +251,7 @@ def test_liouville_with_damping():
     np.testing.assert_allclose(on_rod.product, np.exp(-c * period), rtol=1e-10)
 
 
+@pytest.mark.slow
 def test_derivatives():
     """Of the largest multiplier of Mathieu's equation in a, both modes, against the discriminant D: μ + 1/μ = D."""
     largest = lambda a: lj.floquet(mathieu, 0.0, 0.0, 0.0, {"a": a, "q": 0.25}, jnp.pi).largest
@@ -243,6 +282,7 @@ def test_sweep_of_stability():
     assert (np.asarray(swept.values["growth"])[~stable] > 0).all() and 0.2 < stable.mean() < 0.9
 
 
+@pytest.mark.slow
 def test_what_is_printed_and_drawn():
     """Multipliers, verdict, Liouville's product, the error; a flip and a pair have their words."""
     found = lj.floquet(mathieu, 0.0, 0.0, 0.0, {"a": 1.0, "q": 0.25}, jnp.pi)
@@ -262,3 +302,16 @@ def test_refused_in_words():
         lj.floquet(pendulum, 0.0, 2.0, 0.0, PARAMS)
     with pytest.raises(TypeError, match="a lj.System or a periodic orbit, not dict"):
         lj.floquet(PARAMS)
+
+
+@pytest.mark.slow
+def test_equations_that_fail():
+    """A degenerate L and a parameter that is not a number are said in words, also where an orbit is looked for."""
+    massless = lj.System(lambda t, q, v, p: 0.5 * v["x"] ** 2 - q["x"] ** 2 - (q["y"] - q["x"]) ** 2)
+    start = {"x": 1.0, "y": 1.0}, {"x": 0.0, "y": 0.0}
+    with pytest.raises(ValueError, match="the mass matrix is singular in coordinate 'y'"):
+        lj.floquet(massless, 0.0, *start, None, 1.0)
+    with pytest.raises(ValueError, match="the mass matrix is singular in coordinate 'y'"):
+        lj.periodic_orbit(massless, start, 4.0)
+    with pytest.raises(ValueError, match="L is nan at t = 0"):
+        lj.periodic_orbit(pendulum, (1.0, 0.0), 2.0, PARAMS | {"g": np.nan})

@@ -32,6 +32,7 @@ def test_linear(c):
     assert bool(found.sensitive)
 
 
+@pytest.mark.slow
 def test_on_a_constraint():
     """A pendulum that stands on its rod parts as e^(±√(g/l) t), two exponents; hanging it does not part."""
     l, ts = PARAMS["l"], np.linspace(0.0, 10.0, 41)
@@ -90,7 +91,7 @@ def by_scipy(start, times):
 
 @pytest.mark.slow
 def test_henon_heiles():
-    """At E = 1/6 most motions are chaotic, at 1/12 none is seen to be; SciPy's exponents agree, within what is uncertain."""
+    """At E = 1/6 most motions are chaotic, at 1/12 none is seen to be; SciPy's agree within what is uncertain."""
     ts = np.linspace(0.0, 1500.0, 751)
     for energy, y, vy, sensitive in ((1 / 6, -0.2, 0.1, True), (1 / 12, 0.1, 0.0, False)):
         start = thrown(energy, y, vy)
@@ -112,7 +113,7 @@ def duffing_lagrangian(t, q, v, p):
     return 0.5 * v**2 + 0.5 * q**2 - 0.25 * q**4 + p["f"] * q * jnp.cos(t)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_lanes_of_the_driven_duffing():
     """Over the strength of the drive lanes are what a loop gives, chaotic or not; both sum to the damping."""
     duffing = lj.System(duffing_lagrangian, dissipation=lambda t, q, v, p: 0.5 * p["c"] * v**2)
