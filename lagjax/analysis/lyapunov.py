@@ -42,8 +42,8 @@ class LyapunovExponents(eqx.Module):
     """The largest Lyapunov exponents of a motion, and how uncertain they are. It prints and plots itself.
 
     - `exponents` (count,), `1/[t]`, in falling order but for their uncertainty.
-    - `uncertainty` (count,), likewise: twice the standard deviation of the mean, the difference of the two halves of
-      the motion, and what a growth by a factor of ten would make that comes once, together.
+    - `uncertainty` (count,), likewise: twice the standard deviation of the mean, what the later half of the motion alone
+      would change, and what a growth by a factor of ten would make that comes once, together.
     - `t` (T,): the times, `[t]`. `growth` (T-1, count): the logarithms of the growth from each to the next.
     - `volume` (T-1,): those of the volume by Liouville's formula where all exponents were asked for; else 0.
     - `settled`: from which time on growth counts.
@@ -220,9 +220,9 @@ def _estimates(ts, growth):
     blocks = jnp.stack([mean(a, b) for a, b in zip(edges[:-1], edges[1:])])
     spread = SURE * jnp.std(blocks, axis=0, ddof=1) / np.sqrt(BLOCKS)
     middle, last = edges[BLOCKS // 2], len(ts) - 1
-    halves = mean(first, middle) - mean(middle, last)
+    later = mean(middle, last) - mean(first, last)
     once = ONCE / (ts[last] - ts[first])
-    return mean(first, last), jnp.sqrt(spread**2 + halves**2 + once**2)
+    return mean(first, last), jnp.sqrt(spread**2 + later**2 + once**2)
 
 
 def _scale(flow, t, z):
