@@ -47,7 +47,7 @@ ROUND_OFFS = 16.0
 SHRUNK = 0.1
 # No step changes the logarithm of the period, or the state in units of its size, by more than this.
 FARTHEST = 0.5
-# The weight of what is held, and of the phase, beside coming back: far away both cannot be had.
+# The weight of what is held beside coming back: far away both cannot be had.
 FIRST = 100.0
 
 
@@ -59,7 +59,7 @@ class Place(NamedTuple):
 
 
 class Seen(NamedTuple):
-    """What the flow says at a place: the residual, its size, the matrix of a Newton step from there, and the end.
+    """What the flow says at a place: the residual, its size, the matrix of a Newton step, and how far it has gone.
 
     The columns of `matrix` are along the `bases`. `moves`: how far the state would go in a period at its rate, but for
     what is relative.
@@ -70,7 +70,7 @@ class Seen(NamedTuple):
     matrix: Float[Array, "r c"]
     bases: Float[Array, "K 2n k"]
     amplified: Float[Array, ""]
-    end: Float[Array, " 2n"]
+    gone: Float[Array, " 2n"]
     moves: Float[Array, ""]
 
 
@@ -96,6 +96,14 @@ class Search(NamedTuple):
     damping: Float[Array, ""]
     moves: Float[Array, ""]
     iterations: Int[Array, ""]
+
+
+class Step(NamedTuple):
+    """A step of the nodes, in units of the state, of the logarithm of the period, and of how far the end then is."""
+
+    moves: Float[Array, "K 2n"]
+    log_period: Float[Array, ""]
+    gone: Float[Array, " 2n"]
 
 
 class Goal(NamedTuple):
@@ -158,11 +166,10 @@ def implicit(system, t, q, v, params, rtol, asked: Asked, rows, found: Found) ->
     residual = _residual(flow, t, place, ends, asked, goal, found.guess)
     # The value is that of the search, the derivative that of the step.
     change = residual - lax.stop_gradient(residual)
-    moves, log_period = _step(seen.matrix, change, seen.bases, asked, lax.stop_gradient(flow.rtol), 0.0)
-    z = nodes + scale[None] * moves
-    period = place.period * (1 + log_period)
-    end = ends[-1] + (z[0] - nodes[0])
-    return found._replace(place=Place(z, period), seen=seen._replace(end=end))
+    step = _step(seen.matrix, change, seen.bases, asked, lax.stop_gradient(flow.rtol), 0.0)
+    place = Place(nodes + scale[None] * step.moves, place.period * (1 + step.log_period))
+    gone = ends[-1] - nodes[0] + scale * step.gone
+    return found._replace(place=place, seen=seen._replace(gone=gone))
 
 
 def _times(t, place):
@@ -174,7 +181,7 @@ def _moved(flow, t, search, asked, scale):
     """Where the next step leads."""
     seen, best = search.seen, search.best
     damping = jnp.where(search.iterations == 0, 0.0, search.damping * seen.size)
-    moves, log_period = _step(seen.matrix, seen.residual, seen.bases, asked, flow.rtol, damping)
+    moves, log_period, _ = _step(seen.matrix, seen.residual, seen.bases, asked, flow.rtol, damping)
     farthest = jnp.maximum(jnp.max(jnp.abs(moves)), jnp.abs(log_period))
     part = jnp.minimum(1.0, FARTHEST / jnp.where(farthest > 0, farthest, 1.0))
     place = Place(best.nodes + part * scale[None] * moves, best.period * jnp.exp(part * log_period))
@@ -191,6 +198,7 @@ def _seen(flow, t, place, asked, goal, guess) -> Seen:
         passed = jax.tree.map(lambda x: x[None], part(times[0], place.nodes[0], bases[0]))
     else:
         passed = jax.vmap(part)(times, place.nodes, bases)
+    gone = passed.z[-1] - place.nodes[0]
     residual = _residual(flow, t, place, passed.z, asked, goal, guess)
     matrix, moves = _equations(flow, t, place, passed, bases, scale, asked)
     # Not the largest entry: a step lessens the sum of squares.
@@ -198,7 +206,7 @@ def _seen(flow, t, place, asked, goal, guess) -> Seen:
     good = jnp.all(passed.ended) & jnp.isfinite(size) & jnp.all(jnp.isfinite(matrix))
     clean = lambda x: jnp.where(good, x, 0.0)
     amplified, size = clean(jnp.max(jnp.abs(passed.frame))), jnp.where(good, size, jnp.inf)
-    return Seen(size, clean(residual), clean(matrix), bases, amplified, passed.z[-1], moves)
+    return Seen(size, clean(residual), clean(matrix), bases, amplified, gone, moves)
 
 
 def _equations(flow, t, place, passed, bases, scale, asked):
@@ -211,17 +219,17 @@ def _equations(flow, t, place, passed, bases, scale, asked):
     here, rates = rates[0], rates[count:] / count
     blocks = []
     for j in range(count):
-        after, last = (j + 1) % count, j == count - 1
+        after = (j + 1) % count
         row = jnp.zeros((size, count * k + 1), t.dtype)
         row = row.at[:, j * k : (j + 1) * k].add(passed.frame[j])
         row = row.at[:, after * k : (after + 1) * k].add(-bases[after])
         row = row.at[:, -1].set(rates[j] if asked.free else 0.0)
-        blocks.append(row * comes_back[:, None] if last else row)
-    # What is asked comes before what is to be made small.
-    own = lambda gradient: FIRST * jnp.append(gradient @ bases[0], jnp.zeros((count - 1) * k + 1, t.dtype))[None]
+        blocks.append(row)
+    own = lambda gradient: jnp.append(gradient @ bases[0], jnp.zeros((count - 1) * k + 1, t.dtype))[None]
     if asked.moves:
         blocks.append(own(here / jnp.where(jnp.any(here != 0), jnp.linalg.norm(here), 1.0)))
-    blocks += [own(row) for row in _held_slopes(flow, t, place, scale, asked)]
+    # What is held comes before what is to be made small.
+    blocks += [FIRST * own(row) for row in _held_slopes(flow, t, place, scale, asked)]
     return jnp.concatenate(blocks), jnp.max(jnp.abs(here * comes_back))
 
 
@@ -263,14 +271,17 @@ def _held_slopes(flow, t, place, scale, asked):
 
 
 def _step(matrix, residual, bases, asked, rtol, damping):
-    """The step that lessens the residual, in units of the state and in the logarithm of the period."""
-    left, sizes, right = jnp.linalg.svd(matrix, full_matrices=False)
+    """The step that lessens the residual."""
+    count, size = bases.shape[:2]
+    last = slice((count - 1) * size, count * size)
+    asked_for = matrix.at[last].multiply(_comes_back(asked, matrix.dtype)[:, None])
+    left, sizes, right = jnp.linalg.svd(asked_for, full_matrices=False)
     nothing = jnp.maximum(NOTHING * rtol, SMALL) * jnp.maximum(1.0, sizes[0] / FIRST)
     counts = sizes > nothing
     inverse = jnp.where(counts, sizes / jnp.where(counts, sizes**2 + damping**2, 1.0), 0.0)
     solved = -right.T @ (inverse * (left.T @ residual))
-    moves = solved[:-1].reshape(bases.shape[0], bases.shape[2])
-    return jnp.einsum("jik,jk->ji", bases, moves), solved[-1] if asked.free else jnp.zeros_like(rtol)
+    moves = jnp.einsum("jik,jk->ji", bases, solved[:-1].reshape(count, -1))
+    return Step(moves, solved[-1] if asked.free else jnp.zeros_like(rtol), matrix[last] @ solved)
 
 
 def _integral(flow, t, z):

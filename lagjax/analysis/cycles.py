@@ -209,7 +209,7 @@ def _orbit(problem, found, asked) -> PeriodicOrbit:
     s = problem.state
     _, unflatten = coordinates.flatten(s.q)
     z, n = found.place.nodes[0], found.guess.turns.shape[0]
-    shift = jnp.where(np.array(asked.relative), found.seen.end[:n] - z[:n], 0.0)
+    shift = jnp.where(np.array(asked.relative), found.seen.gone[:n], 0.0)
     arrays, static = packed(problem.system, coordinates.state(*s).params)
     return PeriodicOrbit(
         jnp.asarray(s.t), unflatten(z[:n]), unflatten(z[n:]), found.place.period, unflatten(found.guess.turns),

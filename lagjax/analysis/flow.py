@@ -39,7 +39,7 @@ from lagjax.numerics.runge_kutta import Dopri8
 TOLERANCE = {np.dtype("float64"): 1e-12, np.dtype("float32"): 1e-5}
 MAX_STEPS = 200_000
 # Of a sketch: steps from one point to the next, and the nodes and weights of the classical method of order 4.
-SUBSTEPS, RUNGE_KUTTA = 8, (np.array([0.0, 0.5, 0.5, 1.0]), np.array([1.0, 2.0, 2.0, 1.0]) / 6)
+SUBSTEPS, RUNGE_KUTTA = 16, (np.array([0.0, 0.5, 0.5, 1.0]), np.array([1.0, 2.0, 2.0, 1.0]) / 6)
 # Steps that are shorter, as a part of the span, lead nowhere: the motion is singular there, or not a number.
 SHORTEST = 1e-10
 # The first step, as a part of the span; a step that is too long is taken again.

@@ -1,6 +1,6 @@
 """What a guess tells of an orbit: how large it is, about how long it takes, and how often angles go around.
 
-The guess is followed for a period, and, where the period is to be found, for another one, with little accuracy. If it
+The guess is followed for a period, and, where the period is to be found, for two more, with little accuracy. If it
 is not near its start after the period that was given, the time at which it comes nearest is taken in its place.
 """
 
@@ -15,9 +15,11 @@ from lagjax.analysis.flow import Flow, scale_of
 
 TURN = 2 * np.pi
 # Points of the path in a period that was given, and of how many such periods, where another may be better.
-PIECES, REACH = 48, 2
+PIECES, REACH = 48, 3
 # A guess comes back where it is at this part of its size; a return must be this much nearer than that which was given.
 NEAR, BETTER = 0.2, 0.5
+# What moves less than this part of others hardly moves.
+STILL = 1e-6
 # The first part of a path, in which no motion has gone anywhere yet.
 BEGINNING = 0.4
 
@@ -56,7 +58,7 @@ def guessed(flow: Flow, t, z, period, asked: Asked, parts: int, turns) -> Guess:
     path = lax.stop_gradient(flow.path(t, z, reach * period, reach * PIECES))
     known = jnp.all(jnp.isfinite(path))
     path = jnp.where(known, path, z[None])
-    scale = _extent(path, period, scale_of(z, period))
+    scale = _extent(path, period, scale_of(z, period), np.array(asked.angles) | np.array(asked.relative))
     at, (gone, _) = PIECES, jnp.split(path - z[None], 2, axis=1)
     around = np.array(asked.angles) & ~np.array(asked.relative)
     own = jnp.where(around[None], jnp.round(gone / TURN), 0.0)
@@ -72,14 +74,21 @@ def guessed(flow: Flow, t, z, period, asked: Asked, parts: int, turns) -> Guess:
     return Guess(z, nodes, period * jnp.asarray(at, z.dtype) / PIECES, scale, given)
 
 
-def _extent(path, period, otherwise):
-    """Half the range of each coordinate and velocity, and what of one the other makes; never zero."""
-    rate = TURN / period
-    x, u = jnp.split(0.5 * jnp.ptp(path, axis=0), 2)
-    own = jnp.maximum(x, u / rate)
-    largest = jnp.max(own)
-    own = jnp.where(own > 1e-6 * largest, own, largest)
-    return lax.stop_gradient(jnp.where(largest > 0, jnp.concatenate([own, own * rate]), otherwise))
+def _extent(path, period, otherwise, goes_on):
+    """Half the range of each coordinate and velocity; never zero.
+
+    What steadily goes on, around or along, counts by how it deviates from that.
+    """
+    rate, x = TURN / period, path[:, : len(goes_on)]
+    steady = jnp.linspace(0.0, 1.0, len(path), dtype=x.dtype)[:, None] * (x[-1] - x[0])[None]
+    x = jnp.where(goes_on[None], x - steady, x)
+    x, u = (0.5 * jnp.ptp(y, axis=0) for y in (x, path[:, len(goes_on) :]))
+    both = jnp.stack([x, u / rate])
+    # Each has its own size, a spike in a velocity too; what hardly moves, that of the other, or of what moves most.
+    of_both, largest = jnp.max(both, axis=0), jnp.max(both)
+    of_both = jnp.where(of_both > STILL * largest, of_both, largest)[None]
+    x, u = jnp.where(both > STILL * of_both, both, of_both)
+    return lax.stop_gradient(jnp.where(largest > 0, jnp.concatenate([x, u * rate]), otherwise))
 
 
 def _nearest(difference, turned, scale, asked):

@@ -42,8 +42,8 @@ class LyapunovExponents(eqx.Module):
     """The largest Lyapunov exponents of a motion, and how uncertain they are. It prints and plots itself.
 
     - `exponents` (count,), `1/[t]`, in falling order but for their uncertainty.
-    - `uncertainty` (count,), likewise: twice the standard deviation of the mean, what the later half of the motion alone
-      would change, and what a growth by a factor of ten would make that comes once, together.
+    - `uncertainty` (count,), likewise: twice the standard deviation of the mean, what the later half of it would
+      change alone, and what a growth by a factor of ten would make that comes once, together.
     - `t` (T,): the times, `[t]`. `growth` (T-1, count): the logarithms of the growth from each to the next.
     - `volume` (T-1,): those of the volume by Liouville's formula where all exponents were asked for; else 0.
     - `settled`: from which time on growth counts.
