@@ -46,13 +46,17 @@ from lagjax.numerics.runge_kutta import Dopri8, Tsit5
 # What a system is like.
 from lagjax.analysis.branches import Branch, Branches, Critical
 from lagjax.analysis.continuation import continue_equilibria
+from lagjax.analysis.cycles import OrbitWarning, periodic_orbit
 from lagjax.analysis.equilibria import equilibria
+from lagjax.analysis.floquet import Floquet, floquet
 from lagjax.analysis.found import Symmetries
 from lagjax.analysis.found_equilibria import Equilibria
 from lagjax.analysis.hamilton import Hamiltonian, hamiltonian
 from lagjax.analysis.least_action import action
 from lagjax.analysis.linearised import Linearisation, linearise
+from lagjax.analysis.lyapunov import LyapunovExponents, lyapunov_exponents
 from lagjax.analysis.modes import Mode, NormalModes, normal_modes
+from lagjax.analysis.orbit import PeriodicOrbit
 from lagjax.analysis.read_back import EquationsOfMotion, latex
 from lagjax.analysis.routh import Routhian, routhian
 from lagjax.analysis.symmetries import symmetries
@@ -163,6 +167,13 @@ __all__ = [
     "normal_modes",
     "NormalModes",
     "Mode",
+    "periodic_orbit",
+    "PeriodicOrbit",
+    "OrbitWarning",
+    "floquet",
+    "Floquet",
+    "lyapunov_exponents",
+    "LyapunovExponents",
     "sweep",
     "Sweep",
     "Status",

@@ -44,7 +44,7 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
     drifted = (
         "The motion was computed, but its error, or the change of what must stay constant, is above what is allowed."
     )
-    not_converged = "The search of a fit did not converge."
+    not_converged = "The search of a fit, or of a periodic orbit, did not converge."
     not_estimated = (
         "The error was not estimated: it was not asked for, and the motion takes more than 20,000 steps; or how to "
         "shorten the steps of its controller is not known."

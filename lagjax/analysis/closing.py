@@ -1,0 +1,298 @@
+"""Newton's method for motions that close.
+
+The unknowns are the states z_j at K equal parts of the period T and, where it is free, T itself; a motion closes where
+
+    Φ(z_j, T/K) - z_{j+1} = 0,        z_K = z_0 + turns + shifts.
+
+In tangent coordinates w_j, z_j + B_j w_j, and with θ = log T, the linear equations of a step are
+
+    Y_j w_j - B_{j+1} w_{j+1} + f(z_{j+1}) (T/K) θ = -residual
+
+with the frames Y_j that the flow makes of B_j. They do not fix where on the orbit it begins, and of a family of orbits
+not which one it is. The first is settled by a step that is orthogonal to the motion, f·w = 0, the second by what is
+held (an energy, a coordinate), one row each; of what is then left free, as a rotation of the whole, the shortest step
+is taken.
+
+The step is Levenberg's and Marquardt's with a damping that shrinks with the residual: it converges quadratically also
+to orbits that are not isolated (Yamashita & Fukushima, *Computing Suppl.* 15 (2001) 239). One that makes the residual
+no smaller is tried again with more of it.
+
+Source: Seydel, *Practical Bifurcation and Stability Analysis*, §7.4-7.5; Muñoz-Almaraz et al., *Physica D* 181 (2003) 1
+(families of conservative systems); Stoer & Bulirsch, §7.3.5 (multiple shooting).
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from lagjax.analysis.flow import Flow, flow_of
+from lagjax.analysis.guessing import TURN, Asked, Guess, guessed
+from lagjax.mechanics import coordinates
+from lagjax.mechanics.compiled import compiled
+
+MOST = 40
+# The damping in units of the residual: least, at first, more where a step failed, and where to give up.
+LEAST, FIRST_DAMPING, MORE, TOO_MUCH = 0.01, 0.03, 8.0, 1e4
+# Residuals, in tolerances: where to stop at once, and what counts as an orbit.
+AIM, ENOUGH = 1.0, 1e3
+# Singular values below this many tolerances, and so small at least, do not count.
+NOTHING, SMALL = 1e4, 1e-8
+# Of the terms of a sum that is held.
+ROUND_OFFS = 16.0
+# A step that leaves no more than this part of the motion is none.
+SHRUNK = 0.1
+# No step changes the logarithm of the period, or the state in units of its size, by more than this.
+FARTHEST = 0.5
+# The weight of what is held beside coming back: far away both cannot be had.
+FIRST = 100.0
+
+
+class Place(NamedTuple):
+    """States (K, 2n) and a period."""
+
+    nodes: Float[Array, "K 2n"]
+    period: Float[Array, ""]
+
+
+class Seen(NamedTuple):
+    """What the flow says at a place: the residual, its size, the matrix of a Newton step, and how far it has gone.
+
+    The columns of `matrix` are along the `bases`. `moves`: how far the state would go in a period at its rate, but for
+    what is relative.
+    """
+
+    size: Float[Array, ""]
+    residual: Float[Array, " r"]
+    matrix: Float[Array, "r c"]
+    bases: Float[Array, "K 2n k"]
+    amplified: Float[Array, ""]
+    gone: Float[Array, " 2n"]
+    moves: Float[Array, ""]
+
+
+class Found(NamedTuple):
+    """The best place, and how it went; `apart`: how much the system of a driven orbit changed from period to period."""
+
+    place: Place
+    guess: Guess
+    seen: Seen
+    converged: Bool[Array, ""]
+    iterations: Int[Array, ""]
+    apart: Float[Array, ""]
+
+
+class Search(NamedTuple):
+    """The state of the iteration: the best place so far with what was seen, and the damping to try next.
+
+    `moves`: how far the guess moved in its period.
+    """
+
+    best: Place
+    seen: Seen
+    damping: Float[Array, ""]
+    moves: Float[Array, ""]
+    iterations: Int[Array, ""]
+
+
+class Step(NamedTuple):
+    """A step of the nodes, in units of the state, of the logarithm of the period, and of how far the end then is."""
+
+    moves: Float[Array, "K 2n"]
+    log_period: Float[Array, ""]
+    gone: Float[Array, " 2n"]
+
+
+class Goal(NamedTuple):
+    """What is held: the Jacobi integral and the state of the guess."""
+
+    integral: Float[Array, ""]
+    z: Float[Array, " 2n"]
+
+
+@compiled
+def closed(system, t, q, v, params, period, rtol, asked: Asked, rows, parts, turns, most) -> Found:
+    """Search for an orbit near a state; `turns` (n,) of the angles, or None for those of the guess."""
+    flow = flow_of(system, t, q, v, params, rtol, rows)
+    guess = guessed(flow, t, flow.vector(q, v), period, asked, parts, turns)
+    goal = Goal(_integral(flow, t, guess.z), guess.z)
+    zero, size = jnp.zeros((), t.dtype), 2 * flow.size - len(flow.rows)
+    rows_of = parts * 2 * flow.size + asked.moves + asked.energy + len(asked.held)
+    matrix, bases = jnp.zeros((rows_of, parts * size + 1), t.dtype), jnp.zeros((parts, 2 * flow.size, size), t.dtype)
+    unseen = Seen(zero + jnp.inf, matrix[:, 0], matrix, bases, zero + 1, guess.z, zero)
+    begin = Search(Place(guess.nodes, guess.period), unseen, zero + FIRST_DAMPING, zero, jnp.zeros((), int))
+
+    def unfinished(search):
+        limit = rtol * jnp.maximum(1.0, search.seen.amplified)
+        going = (search.seen.size > AIM * limit) & (search.damping < TOO_MUCH)
+        near = (search.seen.size <= ENOUGH * limit) & (search.damping > FIRST_DAMPING)
+        return ((search.iterations == 0) | (going & ~near)) & (search.iterations < most)
+
+    def iterate(search):
+        place = _moved(flow, t, search, asked, guess.scale)
+        seen = _seen(flow, t, place, asked, goal, guess)
+        # What shrinks to a state of rest, which comes back after any time, comes no nearer.
+        better = (seen.size < search.seen.size) & ~(seen.moves < SHRUNK * search.moves)
+        pick = lambda new, old: jax.tree.map(lambda a, b: jnp.where(better, a, b), new, old)
+        damping = jnp.where(better, jnp.maximum(LEAST, search.damping / MORE), MORE * search.damping)
+        moves = jnp.where(search.iterations == 0, seen.moves, search.moves)
+        return Search(pick(place, search.best), pick(seen, search.seen), damping, moves, search.iterations + 1)
+
+    search = lax.while_loop(unfinished, iterate, begin)
+    enough = ENOUGH * rtol * jnp.maximum(1.0, search.seen.amplified)
+    converged = search.seen.size <= enough
+    if asked.moves:
+        # A state of rest comes back after any time.
+        converged = converged & (search.seen.moves > jnp.sqrt(rtol))
+    apart = zero if asked.moves else _changed(flow, t, search.best, guess.scale)
+    return Found(search.best, guess, search.seen, converged, search.iterations, apart)
+
+
+def implicit(system, t, q, v, params, rtol, asked: Asked, rows, found: Found) -> Found:
+    """The same orbit with its derivatives by the system, the parameters and what is held: one Newton step more."""
+    flow = flow_of(system, t, q, v, params, rtol, rows)
+    found = lax.stop_gradient(found)
+    seen, scale = found.seen, found.guess.scale
+    goal_z = flow.onto_constraints(t, flow.vector(q, v), scale)
+    goal = Goal(_integral(flow, t, goal_z), goal_z)
+    nodes = jax.vmap(lambda z: flow.onto_constraints(t, z, scale))(found.place.nodes)
+    place = Place(nodes, found.place.period)
+    none = jnp.zeros((flow.size * 2, 0), nodes.dtype)
+    part = lambda t, z: flow.passage(t, z, found.place.period / len(nodes), none, scale, differentiable=True).z
+    ends = jnp.stack([part(t, z) for t, z in zip(_times(t, place), nodes)])
+    residual = _residual(flow, t, place, ends, asked, goal, found.guess)
+    # The value is that of the search, the derivative that of the step.
+    change = residual - lax.stop_gradient(residual)
+    step = _step(seen.matrix, change, seen.bases, asked, lax.stop_gradient(flow.rtol), 0.0)
+    place = Place(nodes + scale[None] * step.moves, place.period * (1 + step.log_period))
+    gone = ends[-1] - nodes[0] + scale * step.gone
+    return found._replace(place=place, seen=seen._replace(gone=gone))
+
+
+def _times(t, place):
+    count = len(place.nodes)
+    return t + place.period * jnp.arange(count, dtype=t.dtype) / count
+
+
+def _moved(flow, t, search, asked, scale):
+    """Where the next step leads."""
+    seen, best = search.seen, search.best
+    damping = jnp.where(search.iterations == 0, 0.0, search.damping * seen.size)
+    moves, log_period, _ = _step(seen.matrix, seen.residual, seen.bases, asked, flow.rtol, damping)
+    farthest = jnp.maximum(jnp.max(jnp.abs(moves)), jnp.abs(log_period))
+    part = jnp.minimum(1.0, FARTHEST / jnp.where(farthest > 0, farthest, 1.0))
+    place = Place(best.nodes + part * scale[None] * moves, best.period * jnp.exp(part * log_period))
+    onto = lambda t, z: flow.onto_constraints(t, z, scale)
+    return place._replace(nodes=jax.vmap(onto)(_times(t, place), place.nodes))
+
+
+def _seen(flow, t, place, asked, goal, guess) -> Seen:
+    """Follow the nodes to their ends, with the tangent spaces at them."""
+    times, span, scale = _times(t, place), place.period / len(place.nodes), guess.scale
+    bases = jax.vmap(lambda t, z: flow.tangent_space(t, z, scale))(times, place.nodes)
+    part = lambda t, z, basis: flow.passage(t, z, span, basis, scale)
+    if len(place.nodes) == 1:
+        passed = jax.tree.map(lambda x: x[None], part(times[0], place.nodes[0], bases[0]))
+    else:
+        passed = jax.vmap(part)(times, place.nodes, bases)
+    gone = passed.z[-1] - place.nodes[0]
+    residual = _residual(flow, t, place, passed.z, asked, goal, guess)
+    matrix, moves = _equations(flow, t, place, passed, bases, scale, asked)
+    # Not the largest entry: a step lessens the sum of squares.
+    size = jnp.sqrt(jnp.mean(residual**2))
+    good = jnp.all(passed.ended) & jnp.isfinite(size) & jnp.all(jnp.isfinite(matrix))
+    clean = lambda x: jnp.where(good, x, 0.0)
+    amplified, size = clean(jnp.max(jnp.abs(passed.frame))), jnp.where(good, size, jnp.inf)
+    return Seen(size, clean(residual), clean(matrix), bases, amplified, gone, moves)
+
+
+def _equations(flow, t, place, passed, bases, scale, asked):
+    """The matrix (rows, K k + 1) of a Newton step, in units of `scale`, and how far the state moves."""
+    count, size, k = len(place.nodes), 2 * flow.size, bases.shape[2]
+    comes_back = _comes_back(asked, t.dtype)
+    times = _times(t, place)
+    both = jnp.concatenate([times, times + place.period / count]), jnp.concatenate([place.nodes, passed.z])
+    rates = jax.vmap(flow.rate)(*both) * place.period / scale[None]
+    here, rates = rates[0], rates[count:] / count
+    blocks = []
+    for j in range(count):
+        after = (j + 1) % count
+        row = jnp.zeros((size, count * k + 1), t.dtype)
+        row = row.at[:, j * k : (j + 1) * k].add(passed.frame[j])
+        row = row.at[:, after * k : (after + 1) * k].add(-bases[after])
+        row = row.at[:, -1].set(rates[j] if asked.free else 0.0)
+        blocks.append(row)
+    own = lambda gradient: jnp.append(gradient @ bases[0], jnp.zeros((count - 1) * k + 1, t.dtype))[None]
+    if asked.moves:
+        blocks.append(own(here / jnp.where(jnp.any(here != 0), jnp.linalg.norm(here), 1.0)))
+    # What is held comes before what is to be made small.
+    blocks += [FIRST * own(row) for row in _held_slopes(flow, t, place, scale, asked)]
+    return jnp.concatenate(blocks), jnp.max(jnp.abs(here * comes_back))
+
+
+def _residual(flow, t, place, ends, asked, goal, guess):
+    """What is left, in the order of the rows."""
+    scale, turns = guess.scale, guess.turns
+    first = place.nodes[0] + jnp.concatenate([TURN * turns, jnp.zeros_like(turns)])
+    left = (ends - jnp.concatenate([place.nodes[1:], first[None]])) / scale[None]
+    left = left.at[-1].multiply(_comes_back(asked, left.dtype))
+    parts = [left.reshape(-1)]
+    if asked.moves:
+        parts.append(jnp.zeros(1, left.dtype))
+    if asked.energy:
+        slope = jax.grad(lambda z: _integral(flow, t, z))(lax.stop_gradient(place.nodes[0])) * scale
+        size = lax.stop_gradient(jnp.linalg.norm(slope))
+        off = _integral(flow, t, place.nodes[0]) - goal.integral
+        # Less than the round-off of its terms is nothing, but for its derivative.
+        terms = jnp.abs(goal.integral) + jnp.abs(flow.system.lagrangian(t, *flow.state(goal.z), flow.params))
+        noise = lax.stop_gradient(jnp.abs(off) <= ROUND_OFFS * jnp.finfo(off.dtype).eps * terms)
+        off = jnp.where(noise, off - lax.stop_gradient(off), off)
+        parts.append(FIRST * (off / jnp.where(size > 0, size, 1.0))[None])
+    parts += [(FIRST * (place.nodes[0][i] - goal.z[i]) / scale[i])[None] for i in asked.held]
+    return jnp.concatenate(parts)
+
+
+def _comes_back(asked, dtype):
+    """One for what of (q, v) has to come back."""
+    return jnp.asarray(np.concatenate([1.0 - np.array(asked.relative), np.ones(len(asked.relative))]), dtype)
+
+
+def _held_slopes(flow, t, place, scale, asked):
+    """The gradients of what is held, of size one, in units of `scale`."""
+    if asked.energy:
+        slope = jax.grad(lambda z: _integral(flow, t, z))(place.nodes[0]) * scale
+        size = jnp.linalg.norm(slope)
+        yield slope / jnp.where(size > 0, size, 1.0)
+    for i in asked.held:
+        yield jnp.eye(2 * flow.size, dtype=scale.dtype)[i]
+
+
+def _step(matrix, residual, bases, asked, rtol, damping):
+    """The step that lessens the residual."""
+    count, size = bases.shape[:2]
+    last = slice((count - 1) * size, count * size)
+    asked_for = matrix.at[last].multiply(_comes_back(asked, matrix.dtype)[:, None])
+    left, sizes, right = jnp.linalg.svd(asked_for, full_matrices=False)
+    nothing = jnp.maximum(NOTHING * rtol, SMALL) * jnp.maximum(1.0, sizes[0] / FIRST)
+    counts = sizes > nothing
+    inverse = jnp.where(counts, sizes / jnp.where(counts, sizes**2 + damping**2, 1.0), 0.0)
+    solved = -right.T @ (inverse * (left.T @ residual))
+    moves = jnp.einsum("jik,jk->ji", bases, solved[:-1].reshape(count, -1))
+    return Step(moves, solved[-1] if asked.free else jnp.zeros_like(rtol), matrix[last] @ solved)
+
+
+def _integral(flow, t, z):
+    """The Jacobi integral v·p - L."""
+    q, v = flow.state(z)
+    value, p = jax.value_and_grad(flow.system.lagrangian, argnums=2)(t, q, v, flow.params)
+    return z[flow.size :] @ coordinates.flatten(p)[0] - value
+
+
+def _changed(flow: Flow, t, place, scale):
+    """How much the accelerations at one state differ a period later, at some times, relative to what a period makes."""
+    times = t + place.period * jnp.asarray([0.0, 0.137, 0.291, 0.443, 0.618, 0.787, 0.912], t.dtype)
+    rate = jax.vmap(lambda t: flow.rate(t, place.nodes[0]) / scale)
+    return jnp.max(jnp.abs(rate(times) - rate(times + place.period))) * place.period

@@ -1,0 +1,217 @@
+"""`periodic_orbit`: a motion that comes back, from a guess.
+
+look at the system  ->  one compiled search (`closing.py`)  ->  say what went wrong, if anything did
+"""
+
+import difflib
+import warnings
+from collections.abc import Iterable, Mapping
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import ArrayLike, PyTree
+
+from lagjax.analysis import closing
+from lagjax.analysis.guessing import Asked
+from lagjax.analysis.monodromy import problem_of, refuse_singular, tolerance_of
+from lagjax.analysis.orbit import PeriodicOrbit, packed
+from lagjax.jax_internals.tracing import is_eager
+from lagjax.mechanics import coordinates
+from lagjax.mechanics.diagnosis import listed
+from lagjax.mechanics.system import System
+from lagjax.motion.consistency import stopped
+from lagjax.motion.reported import Report, reported
+from lagjax.motion.trajectory import RESULTS
+
+# A driven system must be the same after a period to this part of what it does in one.
+SAME = 1e-5
+
+
+class OrbitWarning(UserWarning):
+    """A search for a periodic orbit did not converge; the best that was found is returned."""
+
+
+def periodic_orbit(
+    system: System,
+    start: tuple[PyTree[ArrayLike], PyTree[ArrayLike]],
+    period: ArrayLike,
+    params: PyTree = None,
+    *,
+    t: ArrayLike = 0.0,
+    hold: str | Iterable[str] | None = None,
+    turns: Mapping[str, int] | None = None,
+    relative: str | Iterable[str] = (),
+    parts: int = 1,
+    rtol: ArrayLike | None = None,
+    most: int = closing.MOST,
+) -> PeriodicOrbit:
+    """Find a motion that comes back to its start, near a guess: Newton's method on the flow.
+
+    >>> import jax.numpy as jnp
+    >>> import lagjax as lj
+    >>> pendulum = lj.System(lambda t, q, v, params: 0.5 * v**2 + params["g"] * jnp.cos(q))
+    >>> orbit = periodic_orbit(pendulum, (2.0, 0.0), 6.0, {"g": 1.0})
+    >>> print(orbit.period.round(9), orbit.q.round(6))
+    8.349752927 2.0
+
+    **Main arguments:**
+
+    - `system`, `params`: a `System`, with or without constraints, and its parameters.
+    - `start`: (q, v), a state near the orbit; `[q]`, `[q]/[t]`. On constraints the nearest state that satisfies them is
+      taken.
+    - `period`: about its period, `[t]`. Where the system depends on time it is kept, and must be a multiple of that of
+      the drive; else it is found with the orbit.
+    - `t`: the time of the start, `[t]`, for a system that depends on it.
+    - `hold`: what of the guess the orbit keeps, where there is a family of them: `"energy"` (the Jacobi integral; the
+      default where it is conserved), `"period"`, or coordinates and velocities of the start by name: `"theta"`,
+      `"r[0]"`, `"v.theta"`; `"q"` and `"v"` of a single one. Several are given as a tuple. `()` holds nothing: the
+      orbit nearest to the guess.
+
+    **Other arguments:**
+
+    - `turns`: by how many whole turns angles go around in a period, by name. By default as the guess says, rounded. (A
+      coordinate is an angle if it is seen through sines and cosines alone.)
+    - `relative`: coordinates that need not come back, on which nothing may depend: relative periodic orbits.
+    - `parts`: into how many parts a period is divided, whose ends are all unknown (multiple shooting): for orbits so
+      unstable that a guess does not come near its start again.
+    - `rtol`: the tolerance of the steps; 1e-12 by default in float64, 1e-5 in float32. `most`: flows to try.
+
+    **Returns:** a `PeriodicOrbit`; what was found so far where the search did not converge. Both modes differentiate
+    `q`, `v`, `period` and `nodes` in `params` and what is held.
+
+    **Raises:**
+
+    - `TypeError`, `ValueError` for a state of the wrong shape or dtype, for names that there are not, for what cannot
+      be held, and where a driven system is not the same after `period`.
+    - Warns (`lj.OrbitWarning`) where the search did not converge; under `jit` and in lanes look at `converged`.
+
+    Source: Seydel, *Practical Bifurcation and Stability Analysis*, §7.4 (shooting, phase condition); Meyer & Offin, §9.
+    """
+    q, v = _pair(start)
+    problem = problem_of(system, t, q, v, params)
+    s = problem.state
+    dtype, names = s.t.dtype, coordinates.names(s.q)
+    asked = _asked(problem, names, hold, relative)
+    rtol, period = tolerance_of(rtol, dtype), coordinates.numpy_of(period).asarray(period, dtype)
+    if not coordinates.is_traced(period) and not (np.ndim(period) == 0 and float(period) > 0):
+        raise ValueError(f"period must be one positive number, not {period}.\nFix: about the time of one swing.")
+    given = None if turns is None else _turns(turns, names, dtype)
+    eager = is_eager() and not coordinates.is_traced((s, period))
+    search = lambda state, period: closing.closed(
+        problem.system, *state, period, rtol, asked, problem.rows, parts, given, most
+    )
+    if eager:
+        found = search(s, period)
+        _complain(found, float(period), problem)
+    else:
+        live = coordinates.state(*s)
+        still = stopped((live, jnp.asarray(period)))
+        found = closing.closed(
+            stopped(problem.system), *still[0], still[1], rtol, asked, problem.rows, parts, given, most
+        )
+        found = closing.implicit(problem.system, *live, rtol, asked, problem.rows, found)
+    orbit = _orbit(problem, found, asked)
+    told = lambda orbit: Report(
+        jnp.where(orbit.converged, RESULTS.successful._value, RESULTS.not_converged._value),
+        orbit.iterations, jnp.zeros((), dtype), orbit.residual,
+    )  # fmt: skip
+    return reported(orbit, told)
+
+
+def _pair(start):
+    if not (isinstance(start, (tuple, list)) and len(start) == 2):
+        raise TypeError(
+            f"start must be a pair (q, v), not {type(start).__name__}.\n"
+            "Fix: lj.periodic_orbit(system, (q, v), period, params)."
+        )
+    return start
+
+
+def _asked(problem, names, hold, relative) -> Asked:
+    driven = not problem.reasons.autonomous
+    all_names = [*names, *(_velocity(name) for name in names)]
+    wanted = {relative} if isinstance(relative, str) else set(relative)
+    unknown = sorted(wanted - set(names))
+    if unknown:
+        raise ValueError(_no_such("relative", unknown[0], names))
+    seen = [name for name, free in zip(names, problem.reasons.ignorable) if name in wanted and not free]
+    if seen:
+        raise ValueError(
+            f"'{seen[0]}' is named in relative, and the system depends on it: the motion is another one with another "
+            "value of it.\nFix: leave it out; whole turns of an angle are counted without it."
+        )
+    mask = tuple(name in wanted for name in names)
+    if driven:
+        if hold is not None and hold != "period" and tuple(hold) not in ((), ("period",)):
+            raise ValueError(
+                f"the system depends on time, so its period is that of the drive, and hold={hold!r} is too much.\n"
+                "Fix: leave hold out."
+            )
+        return Asked(False, False, False, (), mask, problem.is_angle)
+    if hold is None:
+        hold = ("energy",) if problem.reasons.energy else ()
+    hold = (hold,) if isinstance(hold, str) else tuple(hold)
+    entries = [name for name in hold if name not in ("energy", "period")]
+    if len(all_names) == 2:
+        all_names = ["q" if names[0] == "q" else names[0], all_names[1]]
+    for name in entries:
+        if name not in all_names:
+            raise ValueError(_no_such("hold", name, ["energy", "period", *all_names]))
+    if "energy" in hold and not problem.reasons.energy:
+        raise ValueError(
+            "the Jacobi integral is not conserved here, so an orbit need not have that of the guess.\n"
+            "Usual cause: a force or dissipation: its cycles do not come in families.\n"
+            "Fix: hold=(), or leave hold out."
+        )
+    held = tuple(all_names.index(name) for name in entries)
+    return Asked("period" not in hold, True, "energy" in hold, held, mask, problem.is_angle)
+
+
+def _velocity(name):
+    return f"v{name[1:]}" if name == "q" or name.startswith("q[") else f"v.{name}"
+
+
+def _no_such(argument, name, names):
+    near = (difflib.get_close_matches(str(name), names, 1) or names)[0]
+    return f"{argument} names '{name}', and there are {listed(names)}.\nFix: {argument}=\"{near}\"."
+
+
+def _turns(turns, names, dtype):
+    unknown = sorted(set(turns) - set(names))
+    if unknown:
+        raise ValueError(_no_such("turns", unknown[0], names))
+    return np.array([turns.get(name, 0) for name in names], dtype)
+
+
+def _complain(found, period, problem):
+    if float(found.apart) > SAME:
+        raise ValueError(
+            f"the system is not the same after period = {period:.9g}: its accelerations change.\n"
+            "Usual cause: a period that is rounded, or none of the drive.\n"
+            'Fix: period=2 * jnp.pi / params["omega"] for a drive cos(ωt), or a multiple of it.'
+        )
+    if not np.isfinite(float(found.seen.size)):
+        refuse_singular(problem)
+    if not bool(found.converged):
+        warnings.warn(
+            f"no periodic orbit was found near this start: after {int(found.iterations)} flows the motion comes back "
+            f"to {float(found.seen.size):.2g} of its size, with the period {float(found.place.period):.9g}. The best "
+            "that was found is returned.\n"
+            "Usual cause: a guess too far away, a family without the energy or coordinate that is held, a state of "
+            "rest, or an orbit so unstable that the guess leaves it.\n"
+            "Fix: another start or period; hold=...; parts=8 for an unstable one.",
+            OrbitWarning,
+            stacklevel=3,
+        )
+
+
+def _orbit(problem, found, asked) -> PeriodicOrbit:
+    s = problem.state
+    _, unflatten = coordinates.flatten(s.q)
+    z, n = found.place.nodes[0], found.guess.turns.shape[0]
+    shift = jnp.where(np.array(asked.relative), found.seen.gone[:n], 0.0)
+    arrays, static = packed(problem.system, coordinates.state(*s).params)
+    return PeriodicOrbit(
+        jnp.asarray(s.t), unflatten(z[:n]), unflatten(z[n:]), found.place.period, unflatten(found.guess.turns),
+        unflatten(shift), found.seen.size, found.converged, found.iterations, found.place.nodes, arrays, static,
+    )  # fmt: skip

@@ -1,0 +1,236 @@
+"""Floquet multipliers: what a period of a motion makes of the states beside it.
+
+Where a motion comes back after a period T, its tangents have gone through the monodromy matrix M, and after k periods
+through M^k. The eigenvalues μ of M are the multipliers, σ = log(μ)/T the exponents. In coordinates of the tangent space
+of the constraints their product is known without M, by Liouville's formula,
+
+    ∏ μ = exp ∮ tr P J dt,
+
+1 for a Lagrangian without damping, e^(-cT) for damping -c v of unit masses; the two are computed independently of each
+other, and their difference is told. Linearly stable is what has no |μ| above 1.
+
+A loss of stability has a name by where a multiplier leaves the unit circle: at +1 (a fold, a loss of symmetry), at -1
+(a motion of twice the period begins), or as a pair between.
+
+Source: Coddington & Levinson, *Theory of ODEs*, §3.5; Guckenheimer & Holmes, *Nonlinear Oscillations*, §1.5 and §3.5.
+"""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Complex, Float
+
+from lagjax.analysis.monodromy import period_of, problem_of, refuse_singular
+from lagjax.analysis.orbit import PeriodicOrbit
+from lagjax.analysis.unit_circle import unit_circle
+from lagjax.mechanics import coordinates
+from lagjax.mechanics.system import System
+
+
+class Floquet(eqx.Module):
+    """The multipliers of a cycle, and what they say of its stability. It prints and plots itself.
+
+    - `multipliers` (k,): complex, those that are 1 for a reason first, then by falling size. k is twice the number of
+      coordinates, less the independent equations of constraints (of positions twice: the velocity is constrained, too).
+    - `trivial` (k,): whether it is 1 for a reason: `reasons` (r,) says which of those in `words` there are.
+    - `monodromy` (2n, 2n): M on pushes (q, v) in the order of their names, zero on those off the constraints.
+    - `log_volume`: the logarithm of Liouville's product, ∮ tr P J dt.
+    - `error`: how far the entries of M may be off, in units in which the state has size 1; by a second run of less
+      accuracy where nothing is traced, else by Liouville's formula. What is smaller than this of the multipliers is
+      not known.
+    - `period`; `ended`: whether the motion could be followed through it; `apart`: how far it then is from its start, in
+      units of the state, but for whole turns and for what nothing depends on.
+
+    Under `vmap` every array has the batch's axes in front.
+    """
+
+    multipliers: Complex[Array, " k"]
+    trivial: Bool[Array, " k"]
+    reasons: Bool[Array, " r"]
+    monodromy: Float[Array, "2n 2n"]
+    log_volume: Float[Array, ""]
+    error: Float[Array, ""]
+    period: Float[Array, ""]
+    ended: Bool[Array, ""]
+    apart: Float[Array, ""]
+    words: tuple[str, ...] = eqx.field(static=True)
+
+    @property
+    def exponents(self) -> Complex[Array, " k"]:
+        """`log(μ)/T`, `1/[t]`; imaginary parts between -π/T and π/T."""
+        return jnp.log(self.multipliers) / self.period[..., None]
+
+    @property
+    def product(self) -> Float[Array, ""]:
+        """The product of the multipliers."""
+        return jnp.real(jnp.prod(self.multipliers, axis=-1))
+
+    @property
+    def liouville(self) -> Float[Array, ""]:
+        """What their product must be, by Liouville's formula."""
+        return jnp.exp(self.log_volume)
+
+    @property
+    def largest(self) -> Float[Array, ""]:
+        """The largest size of a multiplier that is not trivial; 0 where there is none."""
+        return jnp.max(jnp.where(self.trivial, 0.0, jnp.abs(self.multipliers)), axis=-1, initial=0.0)
+
+    @property
+    def within(self) -> Float[Array, ""]:
+        """How far from 1 a size may be for 1: a double root on the circle is off by the root of the error."""
+        return jnp.sqrt(jnp.maximum(self.error, 10 * jnp.finfo(self.period.dtype).eps))
+
+    @property
+    def comes_back(self) -> Bool[Array, ""]:
+        """Whether the motion is at its start again after the period: else these are no multipliers."""
+        return self.ended & (self.apart <= jnp.finfo(self.period.dtype).eps ** (1 / 3))
+
+    @property
+    def stable(self) -> Bool[Array, ""]:
+        """Whether no multiplier is outside the unit circle."""
+        return self.comes_back & (self.largest <= 1 + self.within)
+
+    @property
+    def attracts(self) -> Bool[Array, ""]:
+        """Whether all that are not trivial are inside: the cycle is asymptotically stable."""
+        return self.comes_back & (self.largest < 1 - self.within)
+
+    @property
+    def verdict(self) -> str:
+        """What the multipliers say, in words. Not for a batch."""
+        if not bool(self.ended):
+            return "not known: the motion could not be followed through a period"
+        if not bool(self.comes_back):
+            return f"not known: the motion does not come back, by {float(self.apart):.1g} of its size"
+        outside = np.asarray(self.multipliers)[~np.asarray(self.trivial)]
+        if bool(self.stable):
+            if len(outside) and bool(self.attracts):
+                return "asymptotically stable: all multipliers that are not trivial are inside the unit circle"
+            return "linearly stable: no multiplier is outside the unit circle"
+        worst = outside[np.argmax(np.abs(outside))]
+        if abs(worst.imag) > float(self.within):
+            return f"unstable: a pair of multipliers {_number(worst)} and its conjugate, outside the unit circle"
+        if worst.real < 0:
+            return f"unstable: a multiplier {_number(worst)} below -1; what grows has twice the period"
+        return f"unstable: a multiplier {_number(worst)} above 1"
+
+    def plot(self):
+        """Plot the multipliers in the complex plane, with the unit circle; returns a matplotlib `Figure`.
+
+        **Raises:** `ImportError` without matplotlib.
+        """
+        lanes = np.asarray(self.multipliers).reshape(-1, self.multipliers.shape[-1])
+        trivial = np.asarray(self.trivial).reshape(lanes.shape)
+        return unit_circle(lanes[~trivial], lanes[trivial])
+
+    def __repr__(self):
+        if coordinates.is_traced(self):
+            return f"Floquet(being traced, {self.multipliers.shape[-1]} multipliers)"
+        if np.ndim(self.period):
+            stable = int(np.sum(np.asarray(self.stable)))
+            return (
+                f"Floquet multipliers of {' x '.join(map(str, np.shape(self.period)))} lanes, {stable} of them stable"
+            )
+        rows = [("multipliers", ", ".join(_listed(self))), ("period", f"{float(self.period):.9g}")]
+        rows.append(("verdict", self.verdict))
+        off = abs(float(self.product) - float(self.liouville))
+        rows.append(("product", f"{float(self.product):.9g}; by Liouville's formula {float(self.liouville):.9g}"
+                     f" (apart by {off:.0e})"))  # fmt: skip
+        rows.append(("error of M", f"{float(self.error):.0e} (estimated, in units of the state)"))
+        unknown = int(np.sum(np.abs(np.asarray(self.multipliers)) <= float(self.error)))
+        if unknown:
+            rows.append(("WARNING", f"{unknown} multipliers are smaller than the error of M: they are not known"))
+        return "\n".join(["Floquet multipliers", *(f"  {label:<11}  {value}" for label, value in rows)])
+
+
+def floquet(system, t=None, q=None, v=None, params=None, period=None, *, rtol=None) -> Floquet:
+    """Return the Floquet multipliers of a motion that comes back after a period.
+
+    Of a periodic orbit, or of a state that is known to come back, as that of rest in a system that is driven:
+
+    >>> import jax.numpy as jnp
+    >>> import lagjax as lj
+    >>> def swing(t, q, v, params):
+    ...     return 0.5 * v**2 - 0.5 * (params["a"] - 2 * params["q"] * jnp.cos(2 * t)) * q**2
+    >>> found = floquet(lj.System(swing), 0.0, 0.0, 0.0, {"a": 1.0, "q": 0.25}, jnp.pi)
+    >>> print(found.multipliers.real.round(6), bool(found.stable))
+    [-1.476792 -0.677143] False
+
+    **Arguments:**
+
+    - `system`: what `lj.periodic_orbit` returned, alone; or a `System`, and
+    - `t`, `q`, `v`, `params`: its state at the start; `period`, after which it comes back, `[t]`. Of angles that go
+      around, and of coordinates on which nothing depends, velocities alone have to come back.
+    - `rtol`: the tolerance of the steps, of the motion and of its tangents; 1e-12 by default in float64, 1e-5 in
+      float32.
+
+    **Returns:** a `Floquet`, differentiable in both modes in the state and `params`; a double multiplier has no
+    derivative.
+
+    **Raises:** `TypeError`, `ValueError` for a state of the wrong shape or dtype, for what is left out, and for a state
+    that does not come back (not while JAX is tracing).
+
+    Source: Coddington & Levinson, *Theory of Ordinary Differential Equations*, §3.5.
+    """
+    if not isinstance(system, System):
+        return _of_orbit(system, rtol, (t, q, v, params, period))
+    for name, given in (("t", t), ("q", q), ("v", v), ("period", period)):
+        if given is None:
+            raise TypeError(
+                f"floquet needs {name} with a system.\n"
+                "Fix: lj.floquet(system, t, q, v, params, period), or lj.floquet(orbit) of a lj.periodic_orbit."
+            )
+    problem = problem_of(system, t, q, v, params)
+    found, error = period_of(problem, period, rtol)
+    named = _named(problem, found, error, period)
+    if not coordinates.is_traced(found) and not bool(found.ended):
+        refuse_singular(problem)
+    if not coordinates.is_traced(found) and bool(found.ended) and not bool(named.comes_back):
+        raise ValueError(
+            f"this state does not come back after period = {float(period):.9g}: it is off by {float(found.apart):.2g} "
+            "of its size.\n"
+            "Usual cause: a start or a period that is rounded, or that of a small motion for a large one.\n"
+            "Fix: orbit = lj.periodic_orbit(system, (q, v), period, params), and lj.floquet(orbit)."
+        )
+    return named
+
+
+def _of_orbit(orbit, rtol, given):
+    if not isinstance(orbit, PeriodicOrbit):
+        raise TypeError(
+            f"floquet needs a lj.System or a periodic orbit, not {type(orbit).__name__}.\n"
+            "Fix: lj.floquet(system, t, q, v, params, period), or lj.floquet(orbit) of a lj.periodic_orbit."
+        )
+    if any(x is not None for x in given):
+        raise TypeError(
+            "a periodic orbit has its state, its parameters and its period.\n"
+            "Fix: lj.floquet(orbit) alone; for other parameters find their orbit first."
+        )
+    problem = problem_of(orbit.system, orbit.t, orbit.q, orbit.v, orbit.params)
+    found, error = period_of(problem, orbit.period, rtol, orbit.nodes)
+    return _named(problem, found, error, orbit.period)
+
+
+def _named(problem, found, error, period):
+    period = jnp.asarray(period, found.log_volume.dtype)
+    names = problem.reasons.names(problem.state.q)
+    return Floquet(
+        found.multipliers, found.trivial, found.reasons, found.monodromy, found.log_volume, error, period, found.ended,
+        found.apart, names,
+    )  # fmt: skip
+
+
+def _number(x):
+    return f"{x.real:.6g}" if x.imag == 0 else f"{x.real:.6g} {'+' if x.imag > 0 else '-'} {abs(x.imag):.6g}i"
+
+
+def _listed(found):
+    """The multipliers one by one, those with a reason with it; pairs once."""
+    words = iter([word for word, there in zip(found.words, np.asarray(found.reasons)) if there])
+    for x, trivial in zip(np.asarray(found.multipliers), np.asarray(found.trivial)):
+        if trivial:
+            yield f"1 ({next(words)})"
+        elif abs(x.imag) <= 1e-12 * abs(x):
+            yield f"{x.real:.9g}"
+        elif x.imag > 0:
+            yield f"{x.real:.9g} ± {x.imag:.9g}i"

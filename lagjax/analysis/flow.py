@@ -1,0 +1,250 @@
+"""The flow of a system with its tangents: where a state goes, and where all states beside it go.
+
+With z = (q, v) in vector form and f its rate, a tangent δ of the flow z(t) obeys the variational equation
+
+    z' = f(t, z),        δ' = J δ,        J = ∂f/∂z,
+
+and a frame of tangents, one a column, is carried along. The whole of it is one state to the method, so that steps are
+also short enough for the tangents: at rest in a driven system nothing else moves.
+
+On constraints c(t, z) = 0 of positions and velocities the equations are those of reduced index, under which the
+manifold is invariant; tangents that begin in its tangent space, C δ = 0 with C = ∂c/∂z, stay there. A frame that spans
+it has a volume, which grows as Liouville's formula says, with P the orthogonal projection onto the tangent space:
+
+    d/dt log volume = tr P J,        without constraints tr J
+
+Source: Hairer, Nørsett & Wanner, *Solving ODEs I*, §I.14; Coddington & Levinson, *Theory of ODEs*, Eq. (3.1.5).
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int, PyTree
+
+from lagjax.jax_internals.tracing import is_eager
+from lagjax.mechanics import constraints, coordinates
+from lagjax.mechanics.compiled import compiled
+from lagjax.mechanics.equations import equations_of
+from lagjax.mechanics.system import System
+from lagjax.motion.both_modes import solve_in_both_modes
+from lagjax.numerics.runge_kutta import Dopri8
+
+# Tight: what is said of a cycle is read off differences of what a whole period makes.
+TOLERANCE = {np.dtype("float64"): 1e-12, np.dtype("float32"): 1e-5}
+MAX_STEPS = 200_000
+# Of a sketch: steps from one point to the next, and the nodes and weights of the classical method of order 4.
+SUBSTEPS, RUNGE_KUTTA = 16, (np.array([0.0, 0.5, 0.5, 1.0]), np.array([1.0, 2.0, 2.0, 1.0]) / 6)
+# Steps that are shorter, as a part of the span, lead nowhere: the motion is singular there, or not a number.
+SHORTEST = 1e-10
+# The first step, as a part of the span; a step that is too long is taken again.
+FIRST = 0.02
+# A row of constraints depends on others where no more than this part of it is left beside them.
+DEPENDENT_BELOW = 1e-6
+ONTO_CONSTRAINTS = 4
+
+
+class Passage(NamedTuple):
+    """Where a state z (2n,) and a frame of tangents (2n, k) have come, and how.
+
+    `growth`: the logarithm of the change of a whole frame's volume by Liouville's formula; 0 where it is not asked for.
+    """
+
+    z: Float[Array, " 2n"]
+    frame: Float[Array, "2n k"]
+    growth: Float[Array, ""]
+    steps: Int[Array, ""]
+    ended: Bool[Array, ""]
+
+
+class Flow(eqx.Module):
+    """The motion of a system in vector form; `rows` are the constraint equations that are independent."""
+
+    system: System
+    params: PyTree
+    rtol: Float[Array, ""]
+    unflatten: Callable = eqx.field(static=True)
+    size: int = eqx.field(static=True)
+    rows: tuple[int, ...] = eqx.field(static=True)
+    in_a_loop: bool = eqx.field(static=True)
+
+    def state(self, z):
+        """(q, v) in the user's structure."""
+        return self.unflatten(z[: self.size]), self.unflatten(z[self.size :])
+
+    def vector(self, q, v):
+        """The same back."""
+        return jnp.concatenate([coordinates.flatten(q)[0], coordinates.flatten(v)[0]])
+
+    def rate(self, t, z):
+        """f(t, z), the velocities and accelerations."""
+        q, v = self.state(z)
+        a, _ = equations_of(self.system, t, q, v, self.params).accelerations(t, q, v)
+        return jnp.concatenate([z[self.size :], coordinates.flatten(a)[0]])
+
+    def residual(self, t, z):
+        """c(t, z): of positions and of velocities, the independent ones."""
+        return _residual(self.system, t, z, self.params, self.unflatten)[np.array(self.rows, int)]
+
+    def normals(self, t, z, scale):
+        """C, with z in units of `scale`."""
+        return jax.jacfwd(lambda z: self.residual(t, z))(z) * scale[None]
+
+    def onto_constraints(self, t, z, scale):
+        """The state near z that satisfies the constraints, nearest in units of `scale`; differentiable."""
+        if not self.rows:
+            return z
+        nearer = lambda z, _: (z - scale * _shortest(self.normals(t, z, scale), self.residual(t, z)), None)
+        return lax.scan(nearer, z, None, length=ONTO_CONSTRAINTS)[0]
+
+    def tangent_space(self, t, z, scale) -> Float[Array, "2n k"]:
+        """An orthonormal basis of the tangent space, in units of `scale`."""
+        if not self.rows:
+            return jnp.eye(z.size, dtype=z.dtype)
+        normals = self.normals(t, z, scale)
+        basis = jnp.linalg.svd(lax.stop_gradient(normals))[2][len(self.rows) :].T
+        # The derivative of a basis that turns as little as it can.
+        return basis - _shortest(normals, normals @ basis)
+
+    def passage(self, t0, z, span, frame, scale, volume=False, differentiable=False) -> Passage:
+        """The state and the frame after a time; errors, and the frame, count in units of `scale`, (2n,).
+
+        `volume`: whether to ask for its growth. In both modes derivatives flow through it where it is `differentiable`.
+        """
+        arrays, static = eqx.partition((self, t0, z, span, frame, lax.stop_gradient(scale)), eqx.is_array)
+        x, fixed = eqx.partition(arrays, eqx.is_inexact_array)
+
+        def solve(x, fixed, adjoint, _):
+            flow, *given = eqx.combine(x, fixed, static)
+            forward = isinstance(adjoint, diffrax.ForwardMode)
+            return _passage(flow, *given, volume, adjoint if forward else diffrax.RecursiveCheckpointAdjoint()), None
+
+        if not differentiable:
+            return solve(x, fixed, diffrax.ForwardMode(), False)[0]
+        return solve_in_both_modes(solve, x, fixed, recorded=False)
+
+    def path(self, t0, z, span, count) -> Float[Array, "count+1 2n"]:
+        """States at equal parts of a time, by short steps of Runge and Kutta: a sketch, that is compiled in no time."""
+        h = span / (count * SUBSTEPS)
+
+        def step(z, t):
+            def stage(rates, c_and_b):
+                c, b = c_and_b
+                rate, total = rates
+                rate = self.rate(t + c * h, z + c * h * rate)
+                return (rate, total + b * rate), None
+
+            nothing = jnp.zeros_like(z)
+            (_, total), _ = lax.scan(stage, (nothing, nothing), tuple(x.astype(z.dtype) for x in RUNGE_KUTTA))
+            return z + h * total, z
+
+        times = t0 + h * jnp.arange(count * SUBSTEPS, dtype=z.dtype)
+        last, path = lax.scan(step, z, times)
+        return jnp.concatenate([path[::SUBSTEPS], last[None]])
+
+
+def flow_of(system, t, q, v, params, rtol, rows=None, in_a_loop=True) -> Flow:
+    """The flow of a system, for states like this one; `rows` from `independent_rows_of`, by default all."""
+    x, unflatten = coordinates.flatten(q)
+    if rows is None:
+        rows = all_rows(system, t, q, v, params)
+    return Flow(system, params, jnp.asarray(rtol, x.dtype), unflatten, x.size, rows, in_a_loop)
+
+
+def scale_of(z, period):
+    """The size of each coordinate and velocity that a motion of this period shows at z; never zero.
+
+    Of what is zero, with its velocity, the largest of the others tells it; of a state that is all zero the user's unit.
+    """
+    rate = 2 * np.pi / period
+    x, u = jnp.split(jnp.abs(lax.stop_gradient(z)), 2)
+    own = jnp.maximum(x, u / rate)
+    largest = jnp.max(own)
+    own = jnp.where(own > 1e-6 * largest, own, jnp.where(largest > 0, largest, 1.0))
+    return lax.stop_gradient(jnp.concatenate([own, own * rate]))
+
+
+def independent_rows_of(system, t, q, v, params) -> tuple[int, ...] | None:
+    """Which constraint equations are independent near a state; None, for all, where JAX is tracing."""
+    if not system.constraints:
+        return ()
+    if not is_eager() or coordinates.is_traced((t, q, v, params)):
+        return None
+    rows, chosen = np.asarray(_normals(system, t, q, v, params)), []
+    for i, row in enumerate(rows):
+        rest = row
+        if chosen:
+            rest = row - rows[chosen].T @ np.linalg.lstsq(rows[chosen].T, row, rcond=None)[0]
+        if np.linalg.norm(rest) > DEPENDENT_BELOW * np.linalg.norm(row):
+            chosen.append(i)
+    return tuple(chosen)
+
+
+@compiled
+def _normals(system, t, q, v, params):
+    x, unflatten = coordinates.flatten(q)
+    z = jnp.concatenate([x, coordinates.flatten(v)[0]])
+    return jax.jacfwd(lambda z: _residual(system, t, z, params, unflatten))(z)
+
+
+def all_rows(system, t, q, v, params) -> tuple[int, ...]:
+    """All constraint equations, of positions and of velocities."""
+    holonomic = constraints.holonomic_equations(system, t, q, v, params)
+    return tuple(range(int(holonomic.sum()) + len(holonomic)))
+
+
+def _residual(system, t, z, params, unflatten):
+    x, u = jnp.split(z, 2)
+    position = constraints.position_residual(system, t, x, params, unflatten)
+    return jnp.concatenate([position, constraints.velocity_residual(system, t, x, u, params, unflatten)])
+
+
+def _shortest(rows, residual):
+    """The shortest δ with `rows @ δ = residual`."""
+    return rows.T @ jnp.linalg.solve(rows @ rows.T, residual)
+
+
+def _passage(flow, t0, z, span, frame, scale, volume, adjoint) -> Passage:
+
+    # Jitted, so that it is traced once: diffrax traces the body of its loop three times.
+    @eqx.filter_jit
+    def field(part, y, args):
+        flow, t0, span, scale = args
+        t = t0 + span * part
+        rate = lambda z: span * flow.rate(t, z * scale) / scale
+        if not frame.size:
+            return {"z": rate(y["z"]), "frame": jnp.zeros_like(frame), "growth": jnp.zeros_like(span)}
+        motion, push = jax.linearize(rate, y["z"])
+        if not volume:
+            return {"z": motion, "frame": jax.vmap(push, 1, 1)(y["frame"]), "growth": jnp.zeros_like(span)}
+        jacobian = jax.vmap(push, 1, 1)(jnp.eye(z.size, dtype=z.dtype))
+        growth = jnp.trace(jacobian)
+        if flow.rows:
+            normal = jnp.linalg.qr(flow.normals(t, y["z"] * scale, scale).T)[0]
+            growth = growth - jnp.sum(normal * (jacobian @ normal))
+        return {"z": motion, "frame": jacobian @ y["frame"], "growth": growth}
+
+    # As a function of the part of the span that has passed: the span is differentiated like a parameter.
+    y0 = {"z": z / scale, "frame": frame, "growth": jnp.zeros_like(span)}
+    zero, one, first = (jnp.asarray(x, z.dtype) for x in (0.0, 1.0, FIRST))
+    solution = diffrax.diffeqsolve(
+        diffrax.ODETerm(field),
+        Dopri8(in_a_loop=flow.in_a_loop),
+        zero,
+        one,
+        first,
+        y0,
+        (flow, t0, span, scale),
+        stepsize_controller=diffrax.PIDController(rtol=flow.rtol, atol=flow.rtol, dtmin=SHORTEST, force_dtmin=False),
+        adjoint=adjoint,
+        max_steps=MAX_STEPS,
+        throw=False,
+    )
+    y = jax.tree.map(lambda x: x[-1], solution.ys)
+    ended = solution.result == diffrax.RESULTS.successful
+    return Passage(y["z"] * scale, y["frame"], y["growth"], solution.stats["num_steps"], ended)

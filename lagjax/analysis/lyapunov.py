@@ -1,0 +1,239 @@
+"""Lyapunov exponents: how fast neighbouring motions part in the long run.
+
+A frame of tangents is carried along by the flow and made orthonormal again and again, Y = Q R. The logarithms of the
+diagonal of R, over the time they took, are the rates at which tangents, areas, volumes grow, and their means the
+exponents λ_1 ≥ λ_2 ≥ ...  On constraints the tangents are those of the manifold.
+
+All of them together sum to the mean of tr P J (`flow.py`): zero without damping, and in pairs ±λ; a damping force -c v
+of unit masses makes each pair sum to -c.
+
+A motion of finite length T does not have an exponent but an estimate of it. Its spread is that of the means over ten
+parts of the motion. And a growth that is no exponential one, as between regular motions of different periods, whose
+distance grows like t, cannot be told from an exponent of about log(t)/t: a factor of ten counts as uncertain.
+
+Source: Benettin, Galgani, Giorgilli & Strelcyn, *Meccanica* 15 (1980) 9 and 21; Eckmann & Ruelle, *Rev. Mod. Phys.* 57
+(1985) 617, §IV.
+"""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, ArrayLike, Bool, Float, PyTree
+
+from lagjax import plot
+from lagjax.analysis.flow import flow_of
+from lagjax.analysis.monodromy import problem_of, refuse_singular
+from lagjax.mechanics import coordinates
+from lagjax.mechanics.compiled import compiled
+from lagjax.mechanics.system import System
+
+# Less than for a cycle: what follows from a motion that forgets its start does not depend on all its digits.
+TOLERANCE = {np.dtype("float64"): 1e-9, np.dtype("float32"): 1e-5}
+# The part of a motion in which the frame finds its directions, and the parts of the rest by which the spread is known.
+SETTLING, BLOCKS, FEWEST = 0.25, 10, 24
+# Twice the standard deviation of the mean.
+SURE = 2.0
+# What may have grown once.
+ONCE = np.log(10.0)
+
+
+class LyapunovExponents(eqx.Module):
+    """The largest Lyapunov exponents of a motion, and how uncertain they are. It prints and plots itself.
+
+    - `exponents` (count,), `1/[t]`, in falling order but for their uncertainty.
+    - `uncertainty` (count,), likewise: twice the standard deviation of the mean, what the later half of it would
+      change alone, and what a growth by a factor of ten would make that comes once, together.
+    - `t` (T,): the times, `[t]`. `growth` (T-1, count): the logarithms of the growth from each to the next.
+    - `volume` (T-1,): those of the volume by Liouville's formula where all exponents were asked for; else 0.
+    - `settled`: from which time on growth counts.
+    - `ended`: whether the motion could be followed to its end; the exponents are NaN if not.
+
+    Under `vmap` every array has the batch's axes in front.
+    """
+
+    exponents: Float[Array, " count"]
+    uncertainty: Float[Array, " count"]
+    t: Float[Array, " T"]
+    growth: Float[Array, "T-1 count"]
+    volume: Float[Array, " T-1"]
+    settled: Float[Array, ""]
+    ended: Bool[Array, ""]
+    all_of_them: bool = eqx.field(static=True)
+
+    @property
+    def sensitive(self) -> Bool[Array, ""]:
+        """Whether neighbours part exponentially: the largest exponent is above zero by more than its uncertainty."""
+        return self.exponents[..., 0] > self.uncertainty[..., 0]
+
+    @property
+    def liouville(self) -> Float[Array, ""]:
+        """What all of them sum to by Liouville's formula; NaN where not all were asked for."""
+        first = _first(self.t.shape[-1])
+        mean = jnp.sum(self.volume[..., first:], axis=-1) / (self.t[..., -1] - self.t[..., first])
+        return mean if self.all_of_them else jnp.full_like(mean, jnp.nan)
+
+    def running(self) -> Float[Array, "T-1 count"]:
+        """The mean growth from the first time to each of the others, by which one sees whether it settles."""
+        return jnp.cumsum(self.growth, axis=-2) / (self.t[..., 1:] - self.t[..., :1])[..., None]
+
+    def plot(self):
+        """Plot the running means against time; returns a matplotlib `Figure`.
+
+        **Raises:** `ImportError` without matplotlib; `ValueError` for a batch.
+        """
+        if np.ndim(self.settled):
+            raise ValueError(
+                f"these are of a batch of shape {np.shape(self.settled)}: draw one lane of it.\n"
+                "Fix: jax.tree.map(lambda x: x[0], found).plot()"
+            )
+        curves = {f"λ{i + 1}": curve for i, curve in enumerate(np.asarray(self.running()).T)}
+        return plot.time_series(np.asarray(self.t)[1:], {"mean growth": curves})
+
+    def __repr__(self):
+        if coordinates.is_traced(self):
+            return f"LyapunovExponents(being traced, {self.exponents.shape[-1]} of them)"
+        if np.ndim(self.settled):
+            lanes, parting = " x ".join(map(str, np.shape(self.settled))), int(np.sum(np.asarray(self.sensitive)))
+            return f"Lyapunov exponents of {lanes} lanes; neighbours part in {parting} of them"
+        pairs = zip(np.asarray(self.exponents), np.asarray(self.uncertainty))
+        rows = [("exponents", ", ".join(f"{x:.4g} ± {u:.1g}" for x, u in pairs))]
+        rows.append(("of growth", f"from t = {float(self.settled):.6g} to {float(self.t[-1]):.6g}"))
+        if self.all_of_them:
+            total = float(jnp.sum(self.exponents))
+            rows.append(("sum", f"{total:.6g}; by Liouville's formula {float(self.liouville):.6g}"))
+        parts = "neighbours part exponentially; chaos, if the motion stays bounded"
+        verdict = parts if bool(self.sensitive) else "no exponential parting seen in this time"
+        rows.append(("verdict", verdict if bool(self.ended) else "not known: the motion could not be followed"))
+        return "\n".join(["Lyapunov exponents", *(f"  {label:<9}  {value}" for label, value in rows)])
+
+
+def lyapunov_exponents(
+    system: System,
+    q: PyTree[ArrayLike],
+    v: PyTree[ArrayLike],
+    params: PyTree = None,
+    *,
+    ts: ArrayLike,
+    count: int = 1,
+    rtol: ArrayLike | None = None,
+) -> LyapunovExponents:
+    """Return the largest Lyapunov exponents of a motion, with their uncertainty.
+
+    >>> import jax.numpy as jnp
+    >>> import lagjax as lj
+    >>> hill = lj.System(lambda t, q, v, params: 0.5 * v**2 + 0.5 * params["k"] * q**2)
+    >>> found = lyapunov_exponents(hill, 0.0, 0.0, {"k": 4.0}, ts=jnp.linspace(0.0, 40.0, 41), count=2)
+    >>> print(found.exponents.round(6), bool(found.sensitive))
+    [ 2. -2.] True
+
+    **Arguments:**
+
+    - `system`, `q`, `v`, `params`: as in `lj.integrate`. On constraints the nearest state that satisfies them is taken.
+    - `ts` (T,): increasing times, `[t]`, at which the tangents are made orthonormal again: often enough for them not to
+      grow beyond 1e6 or so in between. The first quarter of them serves for finding the directions.
+    - `count`: how many; at most twice the coordinates, less what constraints take away.
+    - `rtol`: the tolerance of the steps; 1e-9 by default in float64, 1e-5 in float32.
+
+    **Returns:** a `LyapunovExponents`.
+
+    **Raises:** `TypeError`, `ValueError` for a state of the wrong shape or dtype; `ValueError` for fewer than 24 times
+    or times out of order, and for more exponents than there are.
+
+    Source: Benettin et al., *Meccanica* 15 (1980) 21.
+    """
+    ts = coordinates.numpy_of(ts).asarray(ts)
+    _check(ts)
+    problem = problem_of(system, ts[0], q, v, params)
+    s = problem.state
+    flow = flow_of(problem.system, *coordinates.state(*s), 1.0, problem.rows)
+    most = 2 * flow.size - len(flow.rows)
+    if not (isinstance(count, int) and 1 <= count <= most):
+        raise ValueError(
+            f"count must be between 1 and {most}, not {count!r}: so many directions there are to part in.\n"
+            f"Fix: count={most} for all of them."
+        )
+    rtol = np.asarray(TOLERANCE.get(np.dtype(s.t.dtype), 1e-5) if rtol is None else rtol, s.t.dtype)
+    found = _grown(problem.system, *s, ts.astype(s.t.dtype), rtol, problem.rows, count)
+    exponents = LyapunovExponents(*found, count == most)
+    if not coordinates.is_traced(exponents) and not bool(exponents.ended):
+        refuse_singular(problem)
+    return exponents
+
+
+def _check(ts):
+    if ts.ndim != 1 or len(ts) < FEWEST:
+        raise ValueError(
+            f"ts must be a vector of at least {FEWEST} times, and has shape {ts.shape}.\n"
+            "Usual cause: the end alone; between two times tangents would grow until nothing is left of the others.\n"
+            "Fix: ts=jnp.linspace(0.0, 1000.0, 1001)."
+        )
+    if not coordinates.is_traced(ts) and not np.all(np.asarray(ts[1:] > ts[:-1])):
+        raise ValueError("ts must increase throughout.\nFix: ts=jnp.unique(ts).")
+
+
+@compiled
+def _grown(system, t, q, v, params, ts, rtol, rows, count):
+    flow = flow_of(system, t, q, v, params, rtol, rows)
+    z = flow.vector(q, v)
+    scale = _scale(flow, t, z)
+    z = flow.onto_constraints(t, z, scale)
+    basis = flow.tangent_space(t, z, scale)
+    # Of no special direction, and the same each time.
+    chosen = np.random.default_rng(0).normal(size=(basis.shape[1], count)).astype(basis.dtype)
+    frame, _ = _orthonormal(basis @ chosen)
+
+    def onward(state, times):
+        z, frame, ended = state
+        t, t1 = times
+        passed = flow.passage(t, z, t1 - t, frame, scale, volume=count == basis.shape[1])
+        z = flow.onto_constraints(t1, passed.z, scale)
+        frame = passed.frame
+        if flow.rows:
+            basis_there = flow.tangent_space(t1, z, scale)
+            frame = basis_there @ (basis_there.T @ frame)
+        frame, growth = _orthonormal(frame)
+        return (z, frame, ended & passed.ended), (growth, passed.growth)
+
+    (_, _, ended), (growth, volume) = lax.scan(onward, (z, frame, jnp.asarray(True)), (ts[:-1], ts[1:]))
+    exponents, uncertainty = _estimates(ts, growth)
+    ended = ended & jnp.all(jnp.isfinite(growth))
+    exponents, uncertainty = (jnp.where(ended, x, jnp.nan) for x in (exponents, uncertainty))
+    return exponents, uncertainty, ts, growth, volume, ts[_first(len(ts))], ended
+
+
+def _orthonormal(frame):
+    """Q of Y = Q R, and the logarithms of the diagonal of R."""
+    q, r = jnp.linalg.qr(frame)
+    return q, jnp.log(jnp.abs(jnp.diagonal(r)))
+
+
+def _first(times):
+    """From which of the times on growth counts."""
+    return int(SETTLING * (times - 1))
+
+
+def _estimates(ts, growth):
+    first = _first(len(ts))
+    mean = lambda a, b: jnp.sum(growth[a:b], axis=0) / (ts[b] - ts[a])
+    edges = np.linspace(first, len(ts) - 1, BLOCKS + 1).astype(int)
+    blocks = jnp.stack([mean(a, b) for a, b in zip(edges[:-1], edges[1:])])
+    spread = SURE * jnp.std(blocks, axis=0, ddof=1) / np.sqrt(BLOCKS)
+    middle, last = edges[BLOCKS // 2], len(ts) - 1
+    later = mean(middle, last) - mean(first, last)
+    once = ONCE / (ts[last] - ts[first])
+    return mean(first, last), jnp.sqrt(spread**2 + later**2 + once**2)
+
+
+def _scale(flow, t, z):
+    """Sizes of coordinates and velocities, by the state and how fast it changes; never zero."""
+    x, u = jnp.split(jnp.abs(lax.stop_gradient(z)), 2)
+    a = jnp.abs(lax.stop_gradient(flow.rate(t, z)))[flow.size :]
+    of_x, of_u, of_a = (jnp.max(y) for y in (x, u, a))
+    of_x = jnp.where(of_x > 0, of_x, 1.0)
+    rate = jnp.maximum(of_u / of_x, jnp.sqrt(of_a / of_x))
+    rate = jnp.where(rate > 0, rate, 1.0)
+    own = jnp.maximum(x, u / rate)
+    largest = jnp.max(own)
+    own = jnp.where(own > 1e-3 * largest, own, jnp.where(largest > 0, largest, 1.0))
+    return jnp.concatenate([own, own * rate])

@@ -1,0 +1,188 @@
+"""The monodromy matrix of a motion, and its eigenvalues with those taken out that are 1 for a reason.
+
+With an orthonormal basis B of the tangent space of the constraints, and the rows Q of what is trivial made orthonormal
+(`trivial.py`), the motion takes B w to B N w, and
+
+    (1 - QᵀQ) N (1 - QᵀQ) + QᵀQ
+
+has the multipliers that are not trivial, and 1 exactly for each row of Q. A motion in several parts, from node to node,
+has the product of their matrices.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Complex, Float
+
+from lagjax.analysis.flow import TOLERANCE, all_rows, flow_of, independent_rows_of, scale_of
+from lagjax.analysis.trivial import Reasons, directions, orthonormal, reasons_of
+from lagjax.jax_internals.tracing import WATCHED, is_eager
+from lagjax.mechanics import coordinates
+from lagjax.mechanics.closures import lift
+from lagjax.mechanics.compiled import compiled
+from lagjax.mechanics.coordinates import State
+from lagjax.mechanics.diagnosis import explain_failure
+from lagjax.mechanics.first_call import looked_at
+from lagjax.mechanics.hybrid import Hybrid
+from lagjax.mechanics.structure import angles
+from lagjax.mechanics.system import System
+
+# The second run's tolerance, by which the first is judged.
+LOOSER = 10.0
+TURN = 2 * np.pi
+
+
+class Period(NamedTuple):
+    """What a period of a motion says, before it is put in words.
+
+    `multipliers` are sorted, the `trivial` ones first; `reasons` (r,) are those of `trivial.py` that there are.
+    `apart`: how far the end is from the start, in units of the state.
+    """
+
+    multipliers: Complex[Array, " k"]
+    trivial: Bool[Array, " k"]
+    reasons: Bool[Array, " r"]
+    reduced: Float[Array, "k k"]
+    monodromy: Float[Array, "2n 2n"]
+    log_volume: Float[Array, ""]
+    apart: Float[Array, ""]
+    ended: Bool[Array, ""]
+
+
+class Problem(NamedTuple):
+    """A system that was looked at, and what its programs tell, all static but for the first two."""
+
+    system: object
+    state: State
+    reasons: Reasons
+    rows: tuple[int, ...] | None
+    is_angle: tuple[bool, ...]
+
+
+def problem_of(system, t, q, v, params) -> Problem:
+    """Look at a system at a state; where JAX traces nothing, dependent constraints are found and left out."""
+    if not isinstance(system, System | Hybrid):
+        raise TypeError(
+            f"the first argument must be a lj.System, not {type(system).__name__}.\n"
+            "Fix: system = lj.System(lagrangian)."
+        )
+    s = coordinates.prepared(t, *jax.tree.map(_as_float, (q, v)), params)
+    system = lift(looked_at(system, s), s)
+    state = coordinates.state(*s)
+    rows = independent_rows_of(system, *state)
+    _check_freedom(system, state, rows)
+    return Problem(system, s, reasons_of(system, *state), rows, angle_entries(system, *state))
+
+
+def refuse_singular(problem: Problem):
+    """Raise in the user's words where the equations fail at the state; for what could not be followed."""
+    words = explain_failure(problem.system, coordinates.state(*problem.state))
+    if words is not None:
+        raise ValueError(words)
+
+
+def _as_float(x):
+    """A whole number as another one."""
+    whole = isinstance(x, int) or isinstance(x, np.ndarray | np.generic) and np.issubdtype(x.dtype, np.integer)
+    return np.asarray(x, float) if whole else x
+
+
+def _check_freedom(system, state, rows):
+    n, known = coordinates.flatten(state.q)[0].size, rows is not None
+    rows = all_rows(system, *state) if rows is None else rows
+    if len(rows) < 2 * n:
+        return
+    cause = "constraints that fix every coordinate" if known else "constraints that depend on each other"
+    fix = "leave one out" + ("" if known else ", or call this outside of jit and vmap, where dependent ones are found")
+    raise ValueError(
+        f"there are {2 * n} coordinates and velocities, and {len(rows)} equations restrict them: nothing is left to "
+        f"move.\nUsual cause: {cause}.\nFix: {fix}."
+    )
+
+
+def angle_entries(system, t, q, v, params) -> tuple[bool, ...]:
+    """Which coordinates are angles, one by one."""
+    found = zip(*map(jax.tree.leaves, (angles(system, t, q, v, params), q)))
+    return tuple(bool(yes) for yes, x in found for _ in range(np.size(x)))
+
+
+def tolerance_of(rtol, dtype):
+    """The tolerance of the steps, by default the tightest that costs little."""
+    return np.asarray(TOLERANCE.get(np.dtype(dtype), 1e-5) if rtol is None else rtol, dtype)
+
+
+def period_of(problem: Problem, period, rtol, nodes=None) -> tuple[Period, Float[Array, ""]]:
+    """What a period says, and how far the entries of the matrix may be off; by a second run where nothing is traced."""
+    system, s, reasons, rows, is_angle = problem
+    eager = is_eager() and not coordinates.is_traced((s, period, nodes))
+    # Written out, the stages run in a third of the time and take three times as long to compile: for sweeps.
+    in_a_loop = not WATCHED.value or sum(np.size(x) for x in jax.tree.leaves(s.q)) > 1
+    rtol, period = tolerance_of(rtol, s.t.dtype), coordinates.numpy_of(period).asarray(period, s.t.dtype)
+    run = lambda rtol: _period(system, *s, nodes, period, rtol, reasons, rows, is_angle, in_a_loop, not eager)
+    found = run(rtol)
+    if eager:
+        looser = run(LOOSER * rtol)
+        error = np.max(np.abs(np.asarray(found.reduced) - np.asarray(looser.reduced)))
+        return found, jnp.asarray(error)
+    # Of the product alone, and no less than what the steps are asked for.
+    off = jnp.abs(jnp.linalg.det(lax.stop_gradient(found.reduced)) * jnp.exp(-lax.stop_gradient(found.log_volume)) - 1)
+    return found, jnp.maximum(off, LOOSER * rtol) * jnp.maximum(1.0, jnp.max(jnp.abs(lax.stop_gradient(found.reduced))))
+
+
+@compiled
+def _period(system, t, q, v, params, nodes, period, rtol, reasons, rows, is_angle, in_a_loop, differentiable) -> Period:
+    flow = flow_of(system, t, q, v, params, rtol, rows, in_a_loop)
+    first = flow.vector(q, v)
+    scale = scale_of(first, period)
+    first = flow.onto_constraints(t, first, scale)
+    nodes = first[None] if nodes is None else nodes.at[0].set(first)
+    count = len(nodes)
+    times = t + period * jnp.arange(count, dtype=t.dtype) / count
+    bases = [flow.tangent_space(t, z, scale) for t, z in zip(times, nodes)]
+    part = lambda t, z, basis: flow.passage(t, z, period / count, basis, scale, True, differentiable)
+    if count == 1:
+        passed = jax.tree.map(lambda x: x[None], part(times[0], nodes[0], bases[0]))
+    else:
+        passed = jax.vmap(part)(times, nodes, jnp.stack(bases))
+    whole, after = jnp.eye(bases[0].shape[1], dtype=t.dtype), [*bases[1:], bases[0]]
+    for basis, frame in zip(after, passed.frame):
+        whole = basis.T @ frame @ whole
+    rows_of, there = orthonormal(reasons, directions(flow, reasons, t, first, scale, bases[0]), TURN / period)
+    ended = jnp.all(passed.ended) & jnp.all(jnp.isfinite(whole))
+    multipliers, trivial = _sorted(_without(rows_of, whole), jnp.sum(there))
+    matrix = scale[:, None] * (bases[0] @ whole @ bases[0].T) / scale[None]
+    multipliers = jnp.where(ended, multipliers, jnp.nan)
+    apart = _apart(flow, reasons, is_angle, passed.z[-1] - first, scale)
+    return Period(multipliers, trivial, there, whole, matrix, jnp.sum(passed.growth), apart, ended)
+
+
+def _without(rows, matrix):
+    """The matrix with what is trivial taken out, and ones in its place."""
+    rest = jnp.eye(matrix.shape[0], dtype=matrix.dtype) - rows.T @ rows
+    return rest @ matrix @ rest + rows.T @ rows
+
+
+def _sorted(matrix, trivial):
+    """The eigenvalues: those nearest to 1, of which `trivial` are exactly that, and then by size."""
+    finite = jnp.all(jnp.isfinite(matrix))
+    # LAPACK need not return from what is not finite.
+    found = jnp.linalg.eigvals(jnp.where(finite, matrix, jnp.eye(len(matrix), dtype=matrix.dtype)))
+    found = jnp.where(finite, found, jnp.nan)
+    near = jnp.argsort(jnp.argsort(jnp.abs(lax.stop_gradient(found) - 1)))
+    first = near < trivial
+    size = jnp.abs(lax.stop_gradient(found))
+    # Of a conjugate pair, whose sizes round differently, the upper one comes first.
+    size = jnp.round(size / jnp.max(size), 9) + 1e-12 * jnp.sign(jnp.imag(lax.stop_gradient(found)))
+    order = jnp.argsort(jnp.where(first, -jnp.inf, -size))
+    return found[order], first[order]
+
+
+def _apart(flow, reasons, is_angle, difference, scale):
+    """How far a state is from where it began, but for whole turns and what nothing depends on."""
+    x, u = jnp.split(lax.stop_gradient(difference), 2)
+    x = jnp.where(np.array(is_angle), x - TURN * jnp.round(x / TURN), x)
+    x = jnp.where(np.array(reasons.ignorable), 0.0, x)
+    return jnp.max(jnp.abs(jnp.concatenate([x, u])) / scale)

@@ -1,0 +1,325 @@
+"""Periodic orbits: by elliptic integrals, Kepler's law, a cycloid, SciPy, and the motions that `lj.integrate` makes."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy import integrate, special
+
+import lagjax as lj
+from tests.systems import PARAMS, double_pendulum, pendulum, rod_pendulum
+
+G_OVER_L = PARAMS["g"] / PARAMS["l"]
+
+
+def closes(orbit, turned=0.0):
+    """How far the motion of `lj.integrate` is from its start after the period, less what it has turned or moved on."""
+    traj = orbit.trajectory
+    gone = jax.tree.map(lambda x: x[-1] - x[0], traj.q)
+    moved = jax.tree.map(lambda x, turns, shift: x - 2 * np.pi * turns - shift, gone, orbit.turns, orbit.shift)
+    back = jax.tree.map(lambda x: x[-1] - x[0], traj.v)
+    return max(float(np.max(np.abs(x))) for x in jax.tree.leaves((moved, back)))
+
+
+def swinging(amplitude, params=PARAMS):
+    """The pendulum's period, 4 √(l/g) K(sin²(amplitude/2))."""
+    return 4 * np.sqrt(params["l"] / params["g"]) * special.ellipk(np.sin(amplitude / 2) ** 2)
+
+
+# The pendulum.
+
+
+@pytest.mark.parametrize("hold", ["energy", *(pytest.param(x, marks=pytest.mark.slow) for x in ("period", ("q", "v")))])
+def test_pendulum(hold):
+    """What is held stays, and period and amplitude are those of the elliptic integral; twin: what is not held moves."""
+    guess = 0.9 * swinging(2.0) if hold != "period" else 1.02 * swinging(2.0)
+    orbit = lj.periodic_orbit(pendulum, (2.0, 0.0), guess, PARAMS, hold=hold)
+    assert bool(orbit.converged)
+    amplitude = np.arccos(np.cos(orbit.q) - orbit.v**2 / (2 * G_OVER_L))
+    np.testing.assert_allclose(orbit.period, swinging(amplitude), rtol=1e-11)
+    if hold == "period":
+        assert float(orbit.period) == guess and abs(amplitude - 2.0) > 1e-3
+    else:
+        np.testing.assert_allclose(amplitude, 2.0, rtol=1e-10)
+
+
+@pytest.mark.slow
+def test_pendulum_that_goes_around():
+    """It turns once in T = ∫ dφ / √(2 (E + cos φ)), counted by itself; twin: without a turn there is no such motion."""
+    rate = 2.5 * np.sqrt(G_OVER_L)
+    orbit = lj.periodic_orbit(pendulum, (0.0, rate), 1.0, PARAMS)
+    energy = rate**2 / 2 - G_OVER_L
+    exact = integrate.quad(lambda q: 1 / np.sqrt(2 * (energy + G_OVER_L * np.cos(q))), -np.pi, np.pi, epsabs=1e-13)[0]
+    assert float(orbit.turns) == 1.0 and "turns      q +1" in repr(orbit)
+    np.testing.assert_allclose(orbit.period, exact, rtol=1e-11)
+    assert closes(orbit) < 1e-8
+    with pytest.warns(lj.OrbitWarning, match="no periodic orbit was found near this start"):
+        none = lj.periodic_orbit(pendulum, (0.0, rate), 1.0, PARAMS, turns={"q": 0}, most=12)
+    assert not bool(none.converged) and "WARNING" in repr(none)
+
+
+@pytest.mark.slow
+def test_pendulum_on_a_rod():
+    """The same period on a constraint, which the orbit satisfies to round-off, from a start that is off it."""
+    amplitude, l = 2.0, PARAMS["l"]
+    start = {"x": l * np.sin(amplitude) + 0.01, "y": -l * np.cos(amplitude)}, {"x": 0.05, "y": 0.0}
+    orbit = lj.periodic_orbit(rod_pendulum, start, 0.8 * swinging(amplitude), PARAMS)
+    x, y, vx, vy = (float(z) for z in (orbit.q["x"], orbit.q["y"], orbit.v["x"], orbit.v["y"]))
+    np.testing.assert_allclose([np.hypot(x, y), x * vx + y * vy], [l, 0.0], atol=1e-13)
+    reached = np.arccos(-y / l - (vx**2 + vy**2) / (2 * PARAMS["g"] * l))
+    np.testing.assert_allclose(orbit.period, swinging(reached), rtol=1e-11)
+    found = lj.floquet(orbit)
+    assert found.trivial.all() and found.multipliers.shape == (2,)
+
+
+# Other families.
+
+
+def kepler_lagrangian(t, q, v, p):
+    """A unit mass attracted by -μ/r."""
+    return 0.5 * v @ v + p["mu"] / jnp.sqrt(q @ q)
+
+
+kepler = lj.System(kepler_lagrangian)
+
+
+@pytest.mark.slow
+def test_kepler():
+    """Every orbit of the energy has Kepler's period, from a guess of two thirds of it: all multipliers are 1."""
+    speed, mu = 1.25, 1.25
+    exact = 2 * np.pi / np.sqrt(mu) * (2 - speed**2 / mu) ** -1.5
+    orbit = lj.periodic_orbit(kepler, (np.array([1.0, 0.0]), np.array([0.0, speed])), 0.65 * exact, {"mu": mu})
+    np.testing.assert_allclose(orbit.period, exact, rtol=1e-11)
+
+
+def polar_lagrangian(t, q, v, p):
+    """A unit mass attracted by r^power, in polar coordinates."""
+    radius = q["r"]
+    return 0.5 * (v["r"] ** 2 + (radius * v["phi"]) ** 2) - radius ** p["power"] / p["power"]
+
+
+@pytest.mark.slow
+def test_relative_orbit():
+    """In a central force r comes back and φ has moved on, both as quadratures say; twin: as a whole it is not back."""
+    polar, power, speed = lj.System(polar_lagrangian), 1.0, 0.5
+    start = {"r": 1.0, "phi": 0.0}, {"r": 0.0, "phi": speed}
+    orbit = lj.periodic_orbit(polar, start, 1.8, {"power": power}, relative="phi")
+    r, w, vr = (float(x) for x in (orbit.q["r"], orbit.v["phi"], orbit.v["r"]))
+    h, energy = r**2 * w, 0.5 * vr**2 + 0.5 * (r * w) ** 2 + r
+    near, far = np.sort(np.roots([-1.0, energy, 0.0, -(h**2) / 2]).real)[-2:]
+    # r = m + d sin s takes the roots away from the ends.
+    middle, half = (near + far) / 2, (far - near) / 2
+    third = -(h**2) / 2 / (near * far)  # The cubic is -(r - near)(r - far)(r - third).
+
+    def quadrature(f):
+        radius = lambda s: middle + half * np.sin(s)
+        speed = lambda r: np.sqrt(2 * (r - third)) / r
+        return 2 * integrate.quad(lambda s: f(radius(s)) / speed(radius(s)), -np.pi / 2, np.pi / 2, epsabs=1e-13)[0]
+
+    np.testing.assert_allclose(orbit.period, quadrature(lambda r: 1.0), rtol=1e-10)
+    np.testing.assert_allclose(orbit.shift["phi"], quadrature(lambda r: h / r**2), rtol=1e-10)
+    assert orbit.shift["r"] == 0 and abs(orbit.shift["phi"] - np.pi) > 0.1
+    found = lj.floquet(orbit)
+    assert found.trivial.all() and "shift of phi" in repr(found) and "across momenta of phi" in repr(found)
+
+
+def duffing_lagrangian(t, q, v, p):
+    """A spring that hardens, and a force that drives."""
+    return 0.5 * v**2 - 0.5 * q**2 - p["b"] * q**4 / 4 + p["f"] * q * jnp.cos(p["omega"] * t)
+
+
+duffing = lj.System(duffing_lagrangian, dissipation=lambda t, q, v, p: 0.5 * p["c"] * v**2)
+DRIVEN = {"b": 0.75, "f": 0.3125, "omega": 1.25, "c": 0.125}
+
+
+@pytest.mark.slow
+def test_duffing():
+    """The driven orbit attracts, and is that of SciPy's motion after its transients; twin: off by a digit it is not."""
+    period = 2 * np.pi / DRIVEN["omega"]
+    orbit = lj.periodic_orbit(duffing, (1.0, 0.0), period, DRIVEN)
+    assert bool(orbit.converged) and float(orbit.period) == period
+    b, f, omega, c = DRIVEN.values()
+    rate = lambda t, y: [y[1], -y[0] - b * y[0] ** 3 - c * y[1] + f * np.cos(omega * t)]
+    settled = integrate.solve_ivp(rate, [0, 80 * period], [orbit.q + 0.01, orbit.v], rtol=1e-12, atol=1e-12).y[:, -1]
+    np.testing.assert_allclose([orbit.q, orbit.v], settled, atol=1e-9)
+    with pytest.raises(ValueError, match="the system is not the same after period = 6"):
+        lj.periodic_orbit(duffing, (1.0, 0.0), 6.0, DRIVEN)
+    found = lj.floquet(orbit)
+    assert bool(found.attracts) and not found.trivial.any()
+    np.testing.assert_allclose(found.product, np.exp(-c * period), rtol=1e-9)
+    assert abs(0.01 * np.abs(found.multipliers[0]) ** 80) < 1e-9
+
+
+@pytest.mark.slow
+def test_knife_edge_on_a_slope():
+    """A velocity constraint: the blade turns at ω and goes along a cycloid, to the side and not down the slope."""
+
+    def lagrangian(t, q, v, p):
+        return 0.5 * (v["x"] ** 2 + v["y"] ** 2 + p["I"] * v["turn"] ** 2) + p["slope"] * q["y"]
+
+    def along(t, q, v, p):
+        return v["y"] * jnp.cos(q["turn"]) - v["x"] * jnp.sin(q["turn"])
+
+    blade = lj.System(lagrangian, {"edge": lj.Nonholonomic(along)})
+    omega, slope = 1.25, 0.75
+    start = {"x": 0.0, "y": 0.0, "turn": 0.0}, {"x": 0.1, "y": 0.0, "turn": omega}
+    period = 2 * np.pi / omega
+    orbit = lj.periodic_orbit(blade, start, 0.95 * period, {"I": 0.5, "slope": slope}, relative="x", hold="v.turn")
+    np.testing.assert_allclose(orbit.period, period, rtol=1e-11)
+    # Along it d²s/dt² = g sin ωt, so that dx/dt = -(g/ω) cos² ωt + v cos ωt: Neimark & Fufaev, §II.1.
+    np.testing.assert_allclose(orbit.shift["x"], -slope * np.pi / omega**2, rtol=1e-10)
+    assert orbit.turns["turn"] == 1 and closes(orbit) < 1e-8
+    found = lj.floquet(orbit)
+    assert found.multipliers.shape == (5,) and "shift of x" in repr(found) and bool(found.stable)
+
+
+def inverted_lagrangian(t, q, v, p):
+    """A pendulum by its angle from the upward vertical, pushed to and fro."""
+    return 0.5 * v**2 - p["k"] * jnp.cos(q) + p["f"] * q * jnp.cos(t)
+
+
+@pytest.mark.slow
+def test_unstable_orbit_by_parts():
+    """A pendulum is pushed so as to stay up, for two periods of the push, in which neighbours leave it e^(4π)-fold.
+
+    Small pushes f make q = -f cos(t)/(1 + k) up to f³; a guess of zero leaves it at once.
+    """
+    inverted, f = lj.System(inverted_lagrangian), 0.01
+    orbit = lj.periodic_orbit(inverted, (0.0, 0.0), 4 * np.pi, {"k": 1.0, "f": f}, parts=8)
+    assert bool(orbit.converged) and orbit.nodes.shape == (8, 2)
+    np.testing.assert_allclose(orbit.q, -f / 2, atol=f**3)
+    np.testing.assert_allclose(orbit.nodes[:, 0], -f / 2 * np.cos(np.pi / 2 * np.arange(8)), atol=f**3)
+    found = lj.floquet(orbit)
+    np.testing.assert_allclose(found.multipliers[0], np.exp(4 * np.pi), rtol=1e-3)
+    np.testing.assert_allclose(found.product, 1.0, rtol=1e-5)
+    assert not bool(found.stable)
+
+
+@pytest.mark.exhaustive
+def test_nonlinear_mode_of_the_double_pendulum():
+    """The slow mode of equal rods: a small swing has the linear period, 2π/√((2 - √2) g/l), a large one takes longer.
+
+    The large one is compared with SciPy: released at rest, it is at rest again after half a period.
+    """
+    params = {"m1": 1.0, "m2": 1.0, "l1": 1.0, "l2": 1.0, "g": 9.8125}
+    linear = 2 * np.pi / np.sqrt((2 - np.sqrt(2)) * params["g"])
+    small = lj.periodic_orbit(double_pendulum, (1e-3 * np.array([1.0, 2**0.5]), np.zeros(2)), linear, params)
+    np.testing.assert_allclose(small.period, linear, rtol=1e-6)
+    large = lj.periodic_orbit(double_pendulum, (np.array([0.5, 0.5 * 2**0.5]), np.zeros(2)), linear, params)
+    assert closes(large) < 1e-7 and float(large.period) > 1.02 * linear
+    found = lj.floquet(large)
+    assert found.trivial.sum() == 2 and bool(found.stable) and abs(abs(found.multipliers[2]) - 1) < 1e-8
+
+    def rate(t, y):
+        (a, b), (u, w), g = y[:2], y[2:], params["g"]
+        c, s = np.cos(a - b), np.sin(a - b)
+        acceleration = np.linalg.solve(
+            [[2.0, c], [c, 1.0]], [-(w**2) * s - 2 * g * np.sin(a), u**2 * s - g * np.sin(b)]
+        )
+        return [u, w, *acceleration]
+
+    y = [*large.q, *large.v]
+    end = integrate.solve_ivp(rate, [0, float(large.period)], y, method="DOP853", rtol=1e-12, atol=1e-12).y[:, -1]
+    np.testing.assert_allclose(end, y, atol=1e-8)
+
+
+# Derivatives, lanes.
+
+
+def van_der_pol_orbit(mu):
+    """The limit cycle."""
+    system = lj.System(duffing_free, force=lambda t, q, v, p: p["mu"] * (1 - q**2) * v)
+    return lj.periodic_orbit(system, (2.0, 0.0), 6.5, {"mu": mu})
+
+
+def duffing_free(t, q, v, p):
+    """A unit mass on a unit spring."""
+    return 0.5 * v**2 - 0.5 * q**2
+
+
+@pytest.mark.slow
+def test_derivatives():
+    """Of the period by g and the amplitude, both modes, as of the elliptic integral; twin: of small swings one is 0."""
+
+    def period(x):
+        orbit = lj.periodic_orbit(pendulum, (x[1], 0.0 * x[1]), 3.0, {"g": x[0], "l": PARAMS["l"]}, hold=("q", "v"))
+        return orbit.period
+
+    g, amplitude = PARAMS["g"], 2.0
+    m = np.sin(amplitude / 2) ** 2
+    k, e = special.ellipk(m), special.ellipe(m)
+    of_m = (e - (1 - m) * k) / (2 * m * (1 - m))
+    exact = [-swinging(amplitude) / (2 * g), 4 / np.sqrt(G_OVER_L) * of_m * np.sin(amplitude) / 2]
+    x = jnp.array([g, amplitude])
+    for mode in (jax.jacfwd, jax.grad):
+        np.testing.assert_allclose(jax.jit(mode(period))(x), exact, rtol=1e-8)
+    assert abs(exact[1]) > 0.1
+
+
+@pytest.mark.slow
+def test_lanes_and_sweeps():
+    """A batch over μ is what a loop gives, and a sweep says which points did not converge."""
+    mu = jnp.array([0.5, 1.0, 2.0])
+    lanes = jax.jit(jax.vmap(van_der_pol_orbit))(mu)
+    # Andersen & Geer's and others' values.
+    np.testing.assert_allclose(lanes.period[1], 6.663286859323130, rtol=1e-11)
+    np.testing.assert_allclose(lanes.period[2], 7.629874479674862, rtol=1e-11)
+    assert "3 lanes, 3 converged" in repr(lanes)
+    alone = van_der_pol_orbit(0.5)
+    np.testing.assert_allclose([lanes.q[0], lanes.period[0]], [alone.q, alone.period], rtol=1e-9)
+
+    def run(point):
+        system = lj.System(duffing_free, force=lambda t, q, v, p: -p["mu"] * v)
+        return lj.periodic_orbit(system, (1.0, 0.0), 6.0, {"mu": point["mu"]}, most=6).period
+
+    damped = lj.sweep(run, {"mu": jnp.array([0.5, 0.75])}, progress=False)
+    (words,) = damped.counts()
+    assert "did not converge" in words
+
+
+# What is refused, or not found.
+
+SIMPLE = {"start": (2.0, 0.0), "period": 6.0}
+REFUSED = {
+    "no pair": (pendulum, {"start": 2.0}, TypeError, r"start must be a pair \(q, v\), not float"),
+    "a period below zero": (pendulum, {"period": -1.0}, ValueError, "period must be one positive number"),
+    "no such name": (
+        pendulum,
+        {"hold": "theta"},
+        ValueError,
+        "hold names 'theta', and there are 'energy', 'period', 'q' and 'v'",
+    ),
+    "seen": (pendulum, {"relative": "q"}, ValueError, "the system depends on it"),
+    "no angle of that name": (pendulum, {"turns": {"phi": 1}}, ValueError, "turns names 'phi'"),
+    "damped": (duffing, {"hold": "energy"}, ValueError, "so its period is that of the drive"),
+}
+
+
+@pytest.mark.parametrize("system, given, error, words", REFUSED.values(), ids=REFUSED)
+def test_refused_in_words(system, given, error, words):
+    """What makes no sense, with its fix."""
+    given = SIMPLE | given
+    with pytest.raises(error, match=words) as raised:
+        lj.periodic_orbit(system, given.pop("start"), given.pop("period"), PARAMS | DRIVEN, **given)
+    assert "Fix:" in str(raised.value)
+
+
+@pytest.mark.slow
+def test_no_cycle_of_a_damped_pendulum():
+    """There is none but rest, which is not taken for one; the best that was found is returned, and said to be that."""
+    damped = lj.System(pendulum.lagrangian, dissipation=lambda t, q, v, p: 0.5 * p["c"] * v**2)
+    with pytest.raises(ValueError, match="the Jacobi integral is not conserved here"):
+        lj.periodic_orbit(damped, (2.0, 0.0), 3.0, PARAMS | {"c": 0.5}, hold="energy")
+    with pytest.warns(lj.OrbitWarning, match="a state of rest"):
+        orbit = lj.periodic_orbit(damped, (2.0, 0.0), 3.0, PARAMS | {"c": 0.5})
+    assert not bool(orbit.converged) and np.isfinite(float(orbit.period)) and float(orbit.residual) > 1e-3
+
+
+@pytest.mark.slow
+def test_whole_numbers_and_pictures():
+    """A start and parameters in whole numbers; an orbit is drawn closed."""
+    orbit = lj.periodic_orbit(pendulum, (jnp.float64(1), jnp.float64(0)), 3, {"g": 10, "l": 1})
+    np.testing.assert_allclose(orbit.period, swinging(1.0, {"g": 10, "l": 1}), rtol=1e-10)
+    line = np.asarray(orbit.plot().axes[0].lines[0].get_xydata())
+    np.testing.assert_allclose(line[0], line[-1], atol=1e-7)
+    assert line[:, 0].max() == pytest.approx(1.0, abs=1e-9) and line[:, 0].min() == pytest.approx(-1.0, abs=1e-3)

@@ -1,0 +1,137 @@
+"""Lyapunov exponents: linear systems in closed form, sums by the damping, chaos by SciPy's variational equations."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy import integrate
+
+import lagjax as lj
+from tests.systems import PARAMS, pendulum, rod_pendulum
+
+G_OVER_L = PARAMS["g"] / PARAMS["l"]
+
+
+def hill_lagrangian(t, q, v, p):
+    """Two hills of different steepness, and coordinates that have both."""
+    return 0.5 * v @ v + 0.5 * p["k"] @ jnp.stack([q[0] + q[1], q[0] - q[1]]) ** 2 / 2
+
+
+@pytest.mark.parametrize("c", [0.0, 0.375])
+def test_linear(c):
+    """λ = -c/2 ± √(k + c²/4) for each; they sum to -c for each freedom; twin: without damping it is another sum."""
+    k = np.array([4.0, 0.5])
+    hill = lj.System(hill_lagrangian, dissipation=lambda t, q, v, p: 0.5 * p["c"] * v @ v)
+    start = np.zeros(2), np.zeros(2)
+    found = lj.lyapunov_exponents(hill, *start, {"k": k, "c": c}, ts=np.linspace(0.0, 60.0, 61), count=4)
+    exact = np.sort(np.concatenate([-c / 2 + s * np.sqrt(k + c**2 / 4) for s in (1, -1)]))[::-1]
+    np.testing.assert_allclose(found.exponents, exact, atol=1e-7)
+    np.testing.assert_array_less(np.abs(found.exponents - exact), found.uncertainty)
+    np.testing.assert_allclose(jnp.sum(found.exponents), -2 * c, atol=1e-8)
+    np.testing.assert_allclose(found.liouville, -2 * c, atol=1e-9)
+    assert bool(found.sensitive)
+
+
+@pytest.mark.slow
+def test_on_a_constraint():
+    """A pendulum that stands on its rod parts as e^(±√(g/l) t), two exponents; hanging it does not part."""
+    l, ts = PARAMS["l"], np.linspace(0.0, 10.0, 41)
+    at = lambda y: ({"x": 0.0, "y": y}, {"x": 0.0, "y": 0.0})
+    up = lj.lyapunov_exponents(rod_pendulum, *at(l), PARAMS, ts=ts, count=2)
+    np.testing.assert_allclose(up.exponents, np.sqrt(G_OVER_L) * np.array([1, -1]), atol=1e-7)
+    down = lj.lyapunov_exponents(rod_pendulum, *at(-l), PARAMS, ts=ts, count=2)
+    assert bool(up.sensitive) and not bool(down.sensitive)
+    with pytest.raises(ValueError, match="count must be between 1 and 2, not 3"):
+        lj.lyapunov_exponents(rod_pendulum, *at(l), PARAMS, ts=ts, count=3)
+
+
+def test_regular():
+    """A pendulum's neighbours part as t does: zero within the uncertainty, which shrinks; twin: not a fifth of it."""
+    run = lambda end: lj.lyapunov_exponents(pendulum, 2.0, 0.0, PARAMS, ts=np.linspace(0.0, end, 401), count=2)
+    short, long = run(200.0), run(1000.0)
+    for found in (short, long):
+        np.testing.assert_array_less(np.abs(found.exponents), found.uncertainty)
+        assert not bool(found.sensitive) and "no exponential parting" in repr(found)
+        np.testing.assert_allclose(jnp.sum(found.exponents), 0.0, atol=1e-8)
+    np.testing.assert_array_less(long.uncertainty, 0.3 * short.uncertainty)
+    assert (np.abs(short.exponents) > 0.2 * short.uncertainty).any()
+
+
+def henon_heiles_lagrangian(t, q, v, p):
+    """Hénon & Heiles, U = ½ (x² + y²) + x² y - y³/3."""
+    x, y = q[0], q[1]
+    return 0.5 * v @ v - 0.5 * (x**2 + y**2) - x**2 * y + y**3 / 3
+
+
+henon_heiles = lj.System(henon_heiles_lagrangian)
+
+
+def thrown(energy, y, vy):
+    """A start on x = 0 with an energy."""
+    return np.array([0.0, y]), np.array([np.sqrt(2 * energy - y**2 + 2 * y**3 / 3 - vy**2), vy])
+
+
+def by_scipy(start, times):
+    """The largest exponent over times, by the variational equations and renormalisation."""
+
+    def rate(t, w):
+        x, y, u, v, a, b, c, d = w
+        force = [-x - 2 * x * y, -y - x**2 + y**2]
+        return [u, v, *force, c, d, -(1 + 2 * y) * a - 2 * x * b, -2 * x * a - (1 - 2 * y) * b]
+
+    state, tangent, grown = np.concatenate(start), np.array([1.0, 0.5, -0.25, 0.75]), []
+    for a, b in zip(times[:-1], times[1:]):
+        end = integrate.solve_ivp(rate, [a, b], [*state, *tangent], method="DOP853", rtol=1e-9, atol=1e-10).y[:, -1]
+        state, size = end[:4], np.linalg.norm(end[4:])
+        tangent = end[4:] / size
+        grown.append(np.log(size))
+    quarter = len(grown) // 4
+    return np.sum(grown[quarter:]) / (times[-1] - times[quarter])
+
+
+@pytest.mark.slow
+def test_henon_heiles():
+    """At E = 1/6 most motions are chaotic, at 1/12 none is seen to be; SciPy's agree within what is uncertain."""
+    ts = np.linspace(0.0, 1500.0, 751)
+    for energy, y, vy, sensitive in ((1 / 6, -0.2, 0.1, True), (1 / 12, 0.1, 0.0, False)):
+        start = thrown(energy, y, vy)
+        found = lj.lyapunov_exponents(henon_heiles, *start, ts=ts, count=4)
+        assert bool(found.sensitive) == sensitive
+        independent = by_scipy(start, np.linspace(0.0, 1500.0, 151))
+        assert abs(float(found.exponents[0]) - independent) < 2 * float(found.uncertainty[0])
+        # In pairs, and two are zero: along the motion, and across energies.
+        pairs = found.exponents + found.exponents[::-1]
+        np.testing.assert_allclose(pairs, 0.0, atol=float(np.max(found.uncertainty)))
+        assert abs(found.exponents[1]) < found.uncertainty[1]
+        np.testing.assert_allclose(jnp.sum(found.exponents), 0.0, atol=1e-8)
+        # Benettin, Galgani & Strelcyn, Phys. Rev. A 14 (1976) 2338, fig. 5: about 0.13 at E = 1/6.
+        assert not sensitive or abs(found.exponents[0] - 0.13) < found.uncertainty[0]
+
+
+def duffing_lagrangian(t, q, v, p):
+    """A spring with two valleys, driven."""
+    return 0.5 * v**2 + 0.5 * q**2 - 0.25 * q**4 + p["f"] * q * jnp.cos(t)
+
+
+@pytest.mark.exhaustive
+def test_lanes_of_the_driven_duffing():
+    """Over the strength of the drive lanes are what a loop gives, chaotic or not; both sum to the damping."""
+    duffing = lj.System(duffing_lagrangian, dissipation=lambda t, q, v, p: 0.5 * p["c"] * v**2)
+    ts = np.linspace(0.0, 600.0, 301)
+    run = lambda f: lj.lyapunov_exponents(duffing, 1.0, 0.0, {"f": f, "c": 0.25}, ts=ts, count=2)
+    lanes = jax.jit(jax.vmap(run))(jnp.array([0.1, 0.4]))
+    np.testing.assert_allclose(jnp.sum(lanes.exponents, axis=1), -0.25, atol=1e-7)
+    assert list(lanes.sensitive) == [False, True] and "neighbours part in 1 of them" in repr(lanes)
+    alone = run(0.1)
+    np.testing.assert_allclose(lanes.exponents[0], alone.exponents, atol=1e-6)
+
+
+def test_what_is_printed_drawn_and_refused():
+    """Exponents with their uncertainty, the sum beside Liouville's; running means; too few times."""
+    found = lj.lyapunov_exponents(pendulum, 2.0, 0.0, PARAMS, ts=np.linspace(0.0, 200.0, 401), count=2)
+    assert "±" in repr(found) and "by Liouville's formula 0" in repr(found)
+    assert len(found.plot().axes[0].lines) == 2
+    np.testing.assert_allclose(found.running()[-1], jnp.sum(found.growth, axis=0) / 200.0, rtol=1e-12)
+    for ts, words in ((np.array([0.0, 100.0]), "at least 24 times"), (np.zeros(30), "must increase")):
+        with pytest.raises(ValueError, match=words):
+            lj.lyapunov_exponents(pendulum, 2.0, 0.0, PARAMS, ts=ts)
