@@ -51,7 +51,8 @@ class Symmetries(eqx.Module):
     - `scalings`: what multiplies L by a factor, and conserves nothing.
     - `basis`: the names of the motions that were looked among; `states`: at how many states.
     - `singular_values`: of the motions without t, and of all of them; `gap`: between what counts as zero and the
-      smallest that does not. Below 1000 it is left open where the line is, and the symmetries are to be doubted.
+      smallest that does not. Below 1000 it is left open where the line is, and the symmetries are to be doubted; 0
+      where too few states were found for so many motions.
     """
 
     details: dict[str, Found]

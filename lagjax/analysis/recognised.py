@@ -13,8 +13,8 @@ import numpy as np
 
 from lagjax.mechanics import coordinates
 
-# So many parameters are looked among.
-AT_MOST = 30
+# So many parameters are looked among, and so many terms are written.
+AT_MOST, LONG = 30, 8
 WHOLE = [Fraction(n) for n in (1, 2, 3, 4)] + [Fraction(1, 2)]
 FRACTIONS = [Fraction(n, d) for d in range(1, 13) for n in range(1, 13)]
 
@@ -78,7 +78,10 @@ def in_words(coefficients, names, params: dict[str, float], agrees: float, first
     factor = Number(Fraction(common), max(pi, 0), tuple((name, power) for name, power in below.items() if power > 0))
     size = _value(factor, params)
     text, used = "", []
-    for c, name, number in zip(coefficients, names, found):
+    for i, (c, name, number) in enumerate(zip(coefficients, names, found)):
+        if i == LONG and len(names) > LONG + 2:
+            text += f" ... ({len(names)} terms)"
+            break
         value = c / leading * size
         number = None if number is None else number.times(factor)
         word = f"{abs(value):.9g}" if number is None else str(number._replace(fraction=abs(number.fraction)))

@@ -23,6 +23,7 @@ from lagjax.mechanics.structure import angles
 WIDTHS = np.array([1.5, 1.0, 0.5, 0.1])
 OF_VELOCITIES = np.array([1.0, 0.3, 1.0, 0.0])
 ITERATIONS = 30
+NEARER, ENOUGH = (0.3, 0.3, 0.3), 0.75
 # Singular values of the constraints' rows up to this part of the largest belong to dependent ones.
 DEPENDENT_BELOW = 1e-6
 # A constraint holds where so many round-offs of its terms are left.
@@ -72,8 +73,17 @@ def around(system, s: coordinates.State, places) -> tuple[States, Scales]:
     us = xp.where(resting[:, None], xp.zeros_like(us), us)
     if not system.constraints:
         return States(t, xs, us, np.ones(len(places), bool)), scales
-    moved = _onto_constraints(system, s, scales, t, xs, us)
-    return States(t, *(xp.asarray(y) for y in moved)), scales
+    states = States(t, *(xp.asarray(y) for y in _onto_constraints(system, s, scales, t, xs, us)))
+    # Those that are lost are looked for nearer, where values are known.
+    for nearer in NEARER if xp is np else ():
+        if np.mean(states.found) > ENOUGH:
+            break
+        xs, us = x[None] + nearer * (xs - x[None]), u[None] + nearer * (us - u[None])
+        again = [np.asarray(y) for y in _onto_constraints(system, s, scales, t, xs, us)]
+        taken = (~states.found & again[2])[:, None]
+        found = states.found | again[2]
+        states = States(t, np.where(taken, again[0], states.x), np.where(taken, again[1], states.u), found)
+    return states, scales
 
 
 def sizes(system, s: coordinates.State, x, u) -> Scales:

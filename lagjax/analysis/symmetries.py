@@ -161,7 +161,7 @@ def _found(system, s, tried: Basis, own, gauge: Gauge, seen: Rates) -> Symmetrie
         details[words.text] = Found(NoetherCharge(system, generator), residual, timed, physical, is_cyclic)
     return Symmetries(
         details, scalings_of(system, s, tried, seen, precision), columns.names, len(seen.value),
-        spaces.singular_values, spaces.gap,
+        spaces.singular_values, spaces.gap if len(seen.value) > len(columns.names) + len(gauge.names) else 0.0,
         f"t = {float(s.t):.6g}, q = {describe(s.q)}, v = {describe(s.v)}", repr(system),
     )  # fmt: skip
 
@@ -171,9 +171,11 @@ def _columns(tried: Basis, own, gauge: Gauge, seen: Rates) -> _Columns:
     order = np.concatenate([np.arange(count, count + n_own), np.arange(count)]).astype(int)
     rows = lambda y: y.reshape(-1, y.shape[-1])[:, order] / np.sqrt(states)
     of_gauge = gauge.rates(*map(np.asarray, seen.states[:3])) / seen.energy[:, None]
-    unit = lambda y, axes: y / np.maximum(np.std(y, axis=axes), np.finfo(float).tiny)
+    unit = lambda y: y / np.maximum(np.std(y, axis=(0, 1)), np.finfo(float).tiny)
+    # A few states tell motions apart.
+    few = slice(0, 16 + 4 * (count + n_own) // seen.xi.shape[2])
     moves = np.concatenate(
-        [np.moveaxis(unit(seen.xi, (0, 1)), 1, 0).reshape(count + n_own, -1), unit(seen.tau, (0, 1)).T], axis=1
+        [np.moveaxis(unit(seen.xi[few]), 1, 0).reshape(count + n_own, -1), unit(seen.tau[few]).T], axis=1
     )
     return _Columns(
         (*(generator.name for generator in own), *tried.names), (*("own" for _ in own), *tried.kinds),
@@ -252,12 +254,12 @@ def _gauge_of(columns: _Columns, whole, gauge: Gauge, timed, pushed, precision: 
         return found, np.linalg.norm(scaled[:, chosen] @ found - rate)
 
     # On constraints some functions equal others: plain ones stay, of what is shifted, of low degree, without t.
-    plain = lambda k: (
-        pushed.issuperset(gauge.factors[k]),
-        -len(gauge.factors[k]) - gauge.powers[k],
-        not gauge.timed[k],
-    )
+    degree = lambda k: len(gauge.factors[k]) + gauge.powers[k]
+    plain = lambda k: (pushed.issuperset(gauge.factors[k]), -degree(k), not gauge.timed[k])
     kept = sorted(np.flatnonzero((size > 0) & (timed | ~gauge.timed)), key=plain)
+    few = [k for k in kept if pushed.issuperset(gauge.factors[k]) and degree(k) == 1]
+    if few and fitted(few)[1] <= 1e3 * precision.exact * np.linalg.norm(rate):
+        kept = few
     allowed = max(2 * fitted(kept)[1], 1e3 * precision.exact * np.linalg.norm(rate))
     for k in list(kept):
         without = [other for other in kept if other != k]
