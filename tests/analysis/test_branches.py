@@ -249,7 +249,8 @@ def test_folds_of_random_curves():
     assert counted > 20
 
 
-@pytest.mark.parametrize("e", [1e-6, pytest.param(1e-3, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("e", [1e-3, 1e-6])
 def test_nearly_a_pitchfork(e):
     """With a small push there is no crossing, and steps do not jump to the other side: the branch stays stable."""
     pushed = lj.System(lambda t, q, v, p: 0.5 * v**2 + 0.5 * p["mu"] * q**2 - 0.25 * q**4 + p["e"] * q)
