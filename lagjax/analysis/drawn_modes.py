@@ -15,11 +15,10 @@ from lagjax.motion.frames import drawn
 PERIODS, GROWTHS = 3.0, 3.0
 
 
-def drawn_roots(roots, growing, zero, labels):
+def drawn_roots(roots: np.ndarray, growing: np.ndarray, zero: np.ndarray):
     """Draw roots in the complex plane, numbered; returns a matplotlib `Figure`."""
     fig, axes = plot.figure(size=(5.6, 3.6))
     axis = axes[0, 0]
-    roots = np.asarray(roots)
     axis.axvline(0.0, color="black", linewidth=0.8)
     axis.axhline(0.0, color="black", linewidth=0.8)
     groups = (("grows", growing, 1, 6), ("zero", zero, 6, 2), ("does not grow", ~growing & ~zero, 0, 0))
@@ -56,7 +55,15 @@ def drawn_mode(mode):
     bars.set(xlabel="amplitude, the largest one", title=mode.label, xlim=(0.0, 1.25))
     for y, x in zip(place, shape):
         if abs(x) > 1e-6:
-            bars.text(abs(x) + 0.02, y, f"{np.degrees(np.angle(x)):.0f}°", va="center", fontsize=8)
+            bars.text(
+                abs(x) + 0.02,
+                y,
+                f"{abs(np.degrees(np.angle(x)).round()):.0f}°"
+                if x.imag == 0
+                else f"{np.degrees(np.angle(x)).round() + 0:.0f}°",
+                va="center",
+                fontsize=8,
+            )
     t = np.linspace(0.0, _span(root), 241)
     moving = np.exp(root * t)
     for i, x in enumerate(shape):

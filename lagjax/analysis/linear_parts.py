@@ -133,7 +133,12 @@ def parts_of(kind: Kind, system, t, q, v, params) -> Parts:
         by_position, by_velocity = jax.jacfwd(held, argnums=(0, 1))(x, u)
         velocity, position = velocity - by_velocity.astype(x.dtype), position - by_position.astype(x.dtype)
     if friction is not None:
-        rubbing = lambda x, u: response(system, t, x, u, params, unflatten) @ stacked
+
+        def rubbing(x, u):
+            found = response(system, t, x, u, params, unflatten)
+            assert found is not None
+            return found @ stacked
+
         by_position, by_velocity = jax.jacfwd(rubbing, argnums=(0, 1))(x, u)
         velocity, position = velocity - by_velocity.astype(x.dtype), position - by_position.astype(x.dtype)
     if kind.at_rest:

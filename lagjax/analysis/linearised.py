@@ -24,6 +24,9 @@ from lagjax.mechanics.structure import structure, unseen_coordinates
 from lagjax.numerics import dense
 from lagjax.numerics.rank import DEPENDENT_BELOW
 
+# Matrices of more freedoms are not printed.
+SHOWN = 6
+
 
 class Linearisation(eqx.Module):
     """The linear equations of small motions, `mass ẇ + (gyroscopic + damping) w + (stiffness + circulatory) η = 0`.
@@ -79,7 +82,25 @@ class Linearisation(eqx.Module):
         return jnp.concatenate([found, jnp.zeros(len(self.shifts), found.dtype)])
 
     def __repr__(self):
-        return f"Linearisation of {len(self.names)} coordinates, {self.mass.shape[-1]} freedoms"
+        n, p = self.mass.shape[-1], self.positions.shape[-1]
+        title = f"Linearisation of {len(self.names)} coordinates: {n} freedoms of velocity, {p} of position"
+        if coordinates.is_traced(self.mass) or self.mass.ndim > 2:
+            return title
+        rows = [title]
+        scale = max(float(np.max(np.abs(x), initial=0.0)) for x in (self.mass, self.stiffness, self.gyroscopic))
+        for name in ("mass", "gyroscopic", "damping", "circulatory", "stiffness"):
+            matrix = np.asarray(getattr(self, name))
+            if not np.any(np.abs(matrix) > 1e-14 * scale):
+                rows.append(f"  {name:<12}0")
+            elif n <= SHOWN:
+                lines = np.array2string(matrix + 0.0, precision=6, suppress_small=True).split("\n")
+                rows += [f"  {name:<12}{lines[0]}", *(f"  {'':<12}{line}" for line in lines[1:])]
+            else:
+                rows.append(f"  {name:<12}{n} x {n}, the largest entry {np.max(np.abs(matrix)):.6g}")
+        if self.shifts:
+            rows.append(f"  nothing depends on {', '.join(self.shifts)}")
+        rows.append(f"  steady to {float(self.residual):.1e}" + ("" if self.sound else ", but singular"))
+        return "\n".join(rows)
 
 
 def linearise(system, t, q, v, params) -> Linearisation:
@@ -118,6 +139,12 @@ def linearise(system, t, q, v, params) -> Linearisation:
     if m >= n:
         # Of so many equations some depend on others: which, only numbers tell.
         kind = kind._replace(independent=_chosen(kind, system, s, traced))
+    if sum(kind.independent) >= n:
+        raise ValueError(
+            f"{sum(kind.independent)} independent constraint equations on {n} coordinates leave no motion at all.\n"
+            "Usual cause: a constraint on every coordinate, or one given in two forms.\n"
+            "Fix: leave out the constraint of what is to move; print(lj.explain(system, t, q, v, params)) lists them."
+        )
     if traced:
         return _linearised(kind, system, *s)[0]
     found, steadiness = _linearised(kind, system, *s)

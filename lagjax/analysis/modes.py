@@ -12,7 +12,6 @@ from lagjax.analysis.drawn_modes import animated, drawn_mode, drawn_roots
 from lagjax.analysis.linearised import Linearisation, linearise, linearised
 from lagjax.analysis.motions import ASYMPTOTIC, GYROSCOPIC, STABLE, UNDECIDED, Motions, motions_of
 from lagjax.analysis.neutral import leads_to_others, with_neutral
-from lagjax.analysis.steadiness import STEADY_BELOW
 from lagjax.analysis.verdicts import VERDICTS, label_of, reason_of
 from lagjax.jax_internals.tracing import is_eager
 from lagjax.mechanics import coordinates
@@ -139,8 +138,7 @@ class NormalModes(eqx.Module):
 
         **Raises:** `ImportError` without matplotlib.
         """
-        growing, zero = np.asarray(self.growing), np.asarray(self.zero)
-        return drawn_roots(self.roots, growing, zero, None)
+        return drawn_roots(np.asarray(self.roots, complex), np.asarray(self.growing), np.asarray(self.zero))
 
     def __repr__(self):
         if coordinates.is_traced(self.roots) or np.ndim(self.code):
@@ -155,6 +153,9 @@ class NormalModes(eqx.Module):
             rows.append(f"  {i}  {values:<46}{label_of(i, self)}")
         if np.any(np.asarray(self.double) & ~np.asarray(self.zero)):
             rows.append("  double roots: their derivatives are those of the mean, or zero where they share a shape")
+        if self.roots.dtype == np.complex64 and len(self):
+            known = 1e2 * np.finfo(np.float32).eps * float(np.max(np.abs(self.roots)))
+            rows.append(f"  in float32: what is smaller than {known:.1e} is not told from zero")
         residual = float(self.linearisation.residual)
         if residual > 1e-10:
             rows.append(f"  the state is steady to {residual:.1e} of its size: roots are known to as much")
@@ -206,13 +207,11 @@ def normal_modes(system, t=None, q=None, v=None, params=None) -> NormalModes:
 
 def _with_symmetries(system, found, motions: Motions) -> Motions:
     """The motions, stable where what is zero leads to other equilibria."""
-    x, unflatten = coordinates.flatten(found.state.q)
-
-    def steady_at(displacement):
-        s = found.state._replace(q=unflatten(x + displacement.astype(x.dtype)))
-        return float(linearised(found.kind, system, s).residual) <= STEADY_BELOW[np.dtype(x.dtype)]
-
-    if not leads_to_others(motions.shapes, motions.zero, np.array(found.kind.unseen, bool), steady_at):
+    unseen = np.array(found.kind.unseen, bool)
+    explained = np.all(np.abs(motions.shapes[:, ~unseen]) <= 1e-6, axis=1)
+    _, unflatten = coordinates.flatten(found.state.q)
+    at = lambda x: linearised(found.kind, system, found.state._replace(q=unflatten(jnp.asarray(x, found.mass.dtype))))
+    if not leads_to_others(found, motions.shapes[motions.zero & ~explained], at):
         return motions
     lasting = ~motions.zero
     decays = not found.kind.conservative and bool(np.all(motions.roots.real[lasting] < 0))

@@ -22,7 +22,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Complex, Float, Int
 
 from lagjax.analysis.linearised import Linearisation
-from lagjax.analysis.roots import Roots, general_roots, symmetric_roots, zero_count
+from lagjax.analysis.roots import Roots, general_roots, roots_beside_zeros, symmetric_roots, zero_count
 from lagjax.numerics import dense, lapack
 
 STABLE, ASYMPTOTIC, GYROSCOPIC, DIVERGENCE, FLUTTER, UNDECIDED, UNSTEADY = range(7)
@@ -63,7 +63,7 @@ def motions_of(found: Linearisation, definite: bool = True) -> Motions:
     """The motions of a linearisation; `definite`: take the mass matrix for positive definite."""
     if not found.kind.conservative:
         return _judged(found, _of_first_order(found))
-    if definite and (found.kind.at_rest or found.parts.positions.shape[1] == 1):
+    if definite and (found.kind.at_rest or found.parts.positions.shape[1] < 2):
         return _judged(found, _at_rest(found))
     return _judged(found, _gyroscopic(found))
 
@@ -87,7 +87,11 @@ def _routh(found) -> _Reduced:
 def _at_rest(found) -> Motions:
     """No gyroscopic forces: squares of frequencies."""
     reduced = _routh(found)
-    roots = symmetric_roots(reduced.position, reduced.mass)
+    if reduced.mass.shape[0]:
+        roots = symmetric_roots(reduced.position, reduced.mass)
+    else:
+        none = jnp.zeros(0, found.mass.dtype)
+        roots = Roots(none, jnp.zeros((0, 0), found.mass.dtype), none, none > 0, none > 0)
     squares = roots.values
     # What is left of terms that cancel.
     x = lax.stop_gradient(jnp.abs(roots.vectors))
@@ -155,13 +159,12 @@ def _of_first_order(found) -> Motions:
     nil = jnp.zeros_like(transfer)
     A = jnp.block([[drift, transfer], [-K, -C]])
     E = jnp.block([[jnp.eye(count, dtype=M.dtype), nil], [nil.T, M]])
-    roots = general_roots(A, E)
-    zeros = zero_count(A, E, roots.values)
-    values, zero = _cleaned(roots, zeros)
+    roots, zero = roots_beside_zeros(A, E)
+    values = jnp.where(zero, 0.0, roots.values)
     # Other speeds of what nothing depends on: no position has a part in them.
     columns = lapack.singular_values(jnp.concatenate([transfer, C]))
     speeds = jnp.sum(columns <= 1e-12 * jnp.max(columns, initial=0.0))
-    unexplained = jnp.where(all(found.kind.holonomic), jnp.maximum(zeros - speeds, 0), 0)
+    unexplained = jnp.where(all(found.kind.holonomic), jnp.maximum(jnp.sum(zero) - speeds, 0), 0)
     rho, w = of_q[:, None] * roots.vectors[:count], of_w[:, None] * roots.vectors[count:] * rate
     moving = p.velocities @ w + p.turning @ rho
     still = p.positions @ rho
@@ -261,8 +264,10 @@ def _with_shifts(found, reduced, values, x, mirrored, energies, double, zero, gr
 
 
 def _conservative(values, energies, zero, growing, defective):
+    if not values.size:
+        return jnp.asarray(STABLE)
     growth = jnp.where(growing, values.real, -jnp.inf)
-    flutters = values.imag[jnp.argmax(growth)] != 0 if values.size else False
+    flutters = values.imag[jnp.argmax(growth)] != 0
     settled = jnp.where(jnp.any(energies < 0), GYROSCOPIC, STABLE)
     undecided = jnp.any(zero) if defective is None else jnp.any(zero | defective)
     settled = jnp.where(undecided, UNDECIDED, settled)

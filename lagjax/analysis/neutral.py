@@ -4,11 +4,13 @@ They are the vectors y = (positions, velocities) with A y = 0. LAPACK gives any 
 each has an entry that the others do not have, other speeds first.
 """
 
+import jax
 import numpy as np
 
 from lagjax.numerics.rank import null_space
 
 ZERO_BELOW = 1e-9
+NEWTON_STEPS, STEADY_AFTER = 8, 1e-9
 
 
 def with_neutral(found, shapes, zero):
@@ -47,13 +49,38 @@ def with_neutral(found, shapes, zero):
     return shapes, words
 
 
-def leads_to_others(shapes, zero, unseen, steady_at) -> bool:
-    """Whether all zero modes lead straight to further equilibria; `steady_at(displacement)` says so of one.
+def leads_to_others(found, shapes, linearised_at) -> bool:
+    """Whether further equilibria lie along each of the zero `shapes` (k, N): a symmetry, and no critical point.
 
-    It is the difference between a symmetry and a critical point, where terms of higher order decide.
+    Some way along one, Newton's method looks for an equilibrium across all of them. `linearised_at(x)`: the
+    `Linearisation` at other positions.
     """
-    displacements = [np.real(x) for x in shapes[zero] if np.any(np.abs(x[~unseen]) > 1e-6)]
-    return bool(displacements) and all(steady_at(size * x) for x in displacements for size in (0.37, -1.3))
+    start = np.concatenate([np.ravel(x) for x in jax.tree.leaves(found.state.q)])
+    P = np.asarray(found.parts.positions)
+    along = np.linalg.qr(np.linalg.pinv(P) @ np.real(shapes).T)[0]
+    across = null_space(along.T)
+    size = np.max(np.abs(start)) or 1.0
+    for shape in np.real(shapes):
+        for share in (0.2, -0.2):
+            x = start + share * size * shape
+            for _ in range(NEWTON_STEPS):
+                now = linearised_at(x)
+                if not now.sound:
+                    return False
+                x = x + _step(now, across)
+            if not linearised_at(x).residual <= STEADY_AFTER:
+                return False
+    return True
+
+
+def _step(now, across):
+    """To an equilibrium on the constraints, in as far as that is across what is to be kept."""
+    p, holonomic = now.parts, np.array(now.kind.holonomic, bool)
+    P, V, mass, K = (np.asarray(x) for x in (p.positions, p.velocities, p.mass, p.position))
+    force = mass @ np.linalg.pinv(V) @ np.asarray(p.a)
+    step = P @ across @ np.linalg.pinv(K @ across) @ force if across.shape[1] else np.zeros(len(P))
+    rows, off = np.asarray(p.raw.rows)[holonomic], np.asarray(p.off)[: int(holonomic.sum())]
+    return step - np.linalg.pinv(rows) @ off if len(rows) else step
 
 
 def _listed(names, shape):

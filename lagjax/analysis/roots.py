@@ -60,22 +60,36 @@ def general_roots(matrix, inertia) -> Roots:
     values, vectors, left = lapack.eigen(matrix, inertia)
     norm = lambda x, axis: jnp.sqrt(jnp.sum(jnp.abs(x) ** 2, axis=axis))
     condition = norm(vectors, 0) * norm(left, 1)
-    condition = jnp.where(jnp.isfinite(condition), condition, jnp.inf)
-    left = jnp.where(jnp.isfinite(left), left, 0.0)
+    return _followed(values, vectors, left, matrix, inertia, jnp.max(jnp.abs(values), initial=0.0), condition)
+
+
+def roots_beside_zeros(matrix, inertia) -> tuple[Roots, Bool[Array, " k"]]:
+    """The same, where A has directions that it takes to zero; and which roots are zero."""
+    eps = jnp.finfo(matrix.dtype).eps
+    values, beside, vectors, left, condition, null = lapack.eigen_without_null_space(matrix, inertia, eps)
     largest = jnp.max(jnp.abs(values), initial=0.0)
-    return _followed(values, vectors, left, matrix, inertia, largest, condition)
+    roots = _followed(values, vectors, left, matrix, inertia, largest, condition, beside, null)
+    return roots, null | (jnp.abs(roots.values) <= roots.round_off)
 
 
-def _followed(values, vectors, left, matrix, inertia, largest, condition) -> Roots:
+def _followed(values, vectors, left, matrix, inertia, largest, condition, beside=None, null=None) -> Roots:
     """The roots by their quotients, which follow the matrices; `left` (k, n) with `left @ inertia @ vectors` = 1."""
     real = jnp.zeros(0, values.dtype).real.dtype
+    condition = jnp.where(jnp.isfinite(condition), condition, jnp.inf)
+    vectors, left = (jnp.where(jnp.isfinite(x), x, 0.0) for x in (vectors, left))
     apart = jnp.abs(values[:, None] - values[None, :])
     alike = apart <= DOUBLE_BELOW[np.dtype(real)] * largest
+    if null is not None:
+        alike = alike & (null[:, None] == null[None, :])
     defective = condition > DEFECTIVE_ABOVE[np.dtype(real)]
     double = (jnp.sum(alike, axis=1) > 1) | defective
     follows = ~alike & ~defective[None, :] & ~defective[:, None]
+    if null is not None:
+        # What a mode shifts, of what may be shifted, is as 1/λ.
+        follows = follows & ~null[:, None] & ~null[None, :]
     start = values
-    # Twice: the first time for the digits of small roots.
+    # Twice: the first time for the digits of small roots, then for the derivatives alone. With an exact left vector any
+    # right one has the root: that without shifts, which are as 1/λ.
     for live in (False, True):
         A, E = (matrix, inertia) if live else lax.stop_gradient((matrix, inertia))
         left_of = left @ (A @ vectors - (E @ vectors) * start[None, :])
@@ -83,18 +97,19 @@ def _followed(values, vectors, left, matrix, inertia, largest, condition) -> Roo
         if live:
             new_vectors, new_left = vectors + vectors @ change, left - change @ left
         else:
-            new_vectors, new_left = vectors, left
+            new_vectors, new_left = vectors if beside is None else beside, left
         over = new_left.T * (A @ new_vectors - (E @ new_vectors) * start[None, :])
         under = jnp.sum(new_left.T * (E @ new_vectors), axis=0)
         correction = jnp.sum(over, axis=0) / jnp.where(under != 0, under, 1.0)
-        correction = jnp.where(defective, 0.0, correction)
+        correction = jnp.where(defective if null is None else defective | null, 0.0, correction)
         if jnp.iscomplexobj(values):
             # A real root stays one: the others come in pairs.
             correction = jnp.where(values.imag == 0, correction.real, correction)
         shared = jnp.where(alike & double[:, None], 1.0, jnp.eye(values.size, dtype=real))
         shared = jnp.where(defective[None, :] & ~jnp.eye(values.size, dtype=bool), 0.0, shared)
         correction = (shared / jnp.sum(shared, axis=1, keepdims=True)) @ correction
-        start = start + correction if live else lax.stop_gradient(start + correction)
+        still = lax.stop_gradient(correction)
+        start = start + correction - still if live else start + still
     round_off = 1e2 * jnp.finfo(real).eps * largest * jnp.where(defective, jnp.minimum(condition, 1e9), condition)
     return Roots(start, new_vectors, round_off, double, defective)
 

@@ -124,6 +124,31 @@ def test_a_free_chain_and_a_hard_one():
     np.testing.assert_allclose(modes.frequency, 2 * np.sin(np.arange(1, n + 1) * np.pi / (2 * (n + 1))), rtol=1e-10)
 
 
+@pytest.mark.slow
+def test_symmetries_are_told_from_critical_points():
+    """A molecule in the plane may move and turn: stable; q⁴, whose stiffness is as zero, is left undecided."""
+
+    def spring(t, q, v, params):
+        return 0.5 * jnp.sum(v**2) - 0.5 * params["k"] * (jnp.sqrt(jnp.sum((q[0] - q[1]) ** 2)) - 1.0) ** 2
+
+    ends = np.array([[0.0, 0.0], [1.0, 0.0]])
+    modes = lj.normal_modes(lj.System(spring), 0.0, ends, 0.0 * ends, {"k": 3.0})
+    assert modes.verdict == "stable" and list(modes.zero) == [True, True, True, False]
+    np.testing.assert_allclose(modes.frequency[3], np.sqrt(6.0), rtol=1e-12)
+    quartic = lj.System(lambda t, q, v, params: 0.5 * (v["x"] ** 2 + v["y"] ** 2) - q["x"] ** 4 - q["y"] ** 2)
+    assert lj.normal_modes(quartic, 0.0, STILL, STILL, None).verdict == "undecided"
+
+
+def test_what_is_free_and_what_is_held():
+    """A free mass at any speed has one zero mode; one that a constraint holds has no motion, and that is said."""
+    free = lj.System(lambda t, q, v, params: 0.5 * v**2)
+    modes = lj.normal_modes(free, 0.0, 1.0, 2.0, None)
+    assert modes.verdict == "stable" and "any q and any speed" in repr(modes)
+    held = lj.System(free.lagrangian, {"wall": lj.Holonomic(lambda t, q, params: q - 1.0)})
+    with pytest.raises(ValueError, match="leave no motion at all"):
+        lj.normal_modes(held, 0.0, 1.0, 0.0, None)
+
+
 # Gyroscopic forces.
 
 
