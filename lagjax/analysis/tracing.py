@@ -28,6 +28,8 @@ ITERATIONS = 10
 FIRST, LONGEST, LEAST = 0.005, 0.03, 1e-7
 # How far a tangent may turn in a step, in radians, and how far it should.
 MOST_TURN, TURN = 0.4, 0.12
+# The same of Newton's contraction, which is large where the branch is not what it seemed along the step.
+MOST_CONTRACTION, CONTRACTION = 0.3, 0.1
 # Positions so many times their unit are at infinity.
 INFINITY = 1e4
 CLOSED_WITHIN = 1e-3
@@ -76,6 +78,8 @@ class Tracer:
         self.unit = float(frame.unit)
         # The fastest root so far, beside which one is round-off.
         self.fastest = 0.0
+        # What Newton's second step was of its first, the last time.
+        self.contraction = 0.0
 
     def at(self, z):
         """E, J and the largest of all equations."""
@@ -90,7 +94,7 @@ class Tracer:
     def corrected(self, z, row, known=None):
         """Newton's method from z across a `row`, which keeps its value; None where it fails."""
         known = row @ z if known is None else known
-        z, last = z.copy(), np.inf
+        z, last, self.contraction = z.copy(), np.inf, 0.0
         for i in range(ITERATIONS):
             value, jacobian, _ = self.at(z)
             if not (np.all(np.isfinite(value)) and np.all(np.isfinite(jacobian))):
@@ -105,6 +109,8 @@ class Tracer:
             if not np.isfinite(length) or i > 1 and length > 0.7 * last and length > 1e3 * self.eps * self.size(z):
                 return None
             z = z - step
+            if i == 1 and last > 1e-6 * self.size(z):
+                self.contraction = length / last
             if length <= 50 * self.eps * self.size(z) or i > 2 and length >= last:
                 return z
             last = length
@@ -172,12 +178,14 @@ class Tracer:
             step = min(step, longest)
             row = self.weights * point.tangent
             z = self.corrected(point.z + step * point.tangent, row)
+            contraction = self.contraction
             found = self.point(z, point.tangent) if z is not None else None
             if isinstance(found, Point):
                 turn = np.arccos(np.clip((self.weights * found.tangent) @ point.tangent, -1, 1))
                 moved = np.sqrt(self.weights @ (found.z - point.z) ** 2)
-                if turn < MOST_TURN and moved < 2 * step:
-                    return found, step * float(np.clip(TURN / max(turn, 1e-3), 0.5, 2.0)), ""
+                if turn < MOST_TURN and moved < 1.2 * step and contraction < MOST_CONTRACTION:
+                    grow = min(TURN / max(turn, 1e-3), CONTRACTION / max(contraction, 1e-3))
+                    return found, step * float(np.clip(grow, 0.5, 2.0)), ""
                 why = "the branch turns more sharply than steps can follow: a corner of L, or a cusp"
             elif isinstance(found, str):
                 why = found
