@@ -26,6 +26,9 @@ from lagjax.analysis.unit_circle import unit_circle
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.system import System
 
+# Multipliers up to so many errors of M may be made of these.
+UNKNOWN = 100.0
+
 
 class Floquet(eqx.Module):
     """The multipliers of a cycle, and what they say of its stability. It prints and plots itself.
@@ -36,7 +39,7 @@ class Floquet(eqx.Module):
     - `monodromy` (2n, 2n): M on pushes (q, v) in the order of their names, zero on those off the constraints.
     - `log_volume`: the logarithm of Liouville's product, ∮ tr P J dt.
     - `error`: how far the entries of M may be off, in units in which the state has size 1; by a second run of less
-      accuracy where nothing is traced, else by Liouville's formula. What is smaller than this of the multipliers is
+      accuracy where nothing is traced, else by Liouville's formula. Multipliers that are not much larger than this are
       not known.
     - `period`; `ended`: whether the motion could be followed through it; `apart`: how far it then is from its start, in
       units of the state, but for whole turns and for what nothing depends on.
@@ -137,9 +140,10 @@ class Floquet(eqx.Module):
         rows.append(("product", f"{float(self.product):.9g}; by Liouville's formula {float(self.liouville):.9g}"
                      f" (apart by {off:.0e})"))  # fmt: skip
         rows.append(("error of M", f"{float(self.error):.0e} (estimated, in units of the state)"))
-        unknown = int(np.sum(np.abs(np.asarray(self.multipliers)) <= float(self.error)))
+        unknown = int(np.sum(np.abs(np.asarray(self.multipliers)) <= UNKNOWN * float(self.error)))
         if unknown:
-            rows.append(("WARNING", f"{unknown} multipliers are smaller than the error of M: they are not known"))
+            are = "is" if unknown == 1 else "are"
+            rows.append(("WARNING", f"of the multipliers {unknown} {are} not known: as small as what errors of M make"))
         return "\n".join(["Floquet multipliers", *(f"  {label:<11}  {value}" for label, value in rows)])
 
 

@@ -152,7 +152,7 @@ def kepler_lagrangian(t, q, v, p):
     return 0.5 * v @ v + p["mu"] / jnp.sqrt(q @ q)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_kepler():
     """All four multipliers are 1, two of them for a reason that is known, the others to 1e-5; and M is no identity."""
     mu, speed = 1.25, 1.25
@@ -251,7 +251,7 @@ def test_liouville_with_damping():
     np.testing.assert_allclose(on_rod.product, np.exp(-c * period), rtol=1e-10)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_derivatives():
     """Of the largest multiplier of Mathieu's equation in a, both modes, against the discriminant D: μ + 1/μ = D."""
     largest = lambda a: lj.floquet(mathieu, 0.0, 0.0, 0.0, {"a": a, "q": 0.25}, jnp.pi).largest
