@@ -38,7 +38,8 @@ SETTLING = 2
 # While only a part of a record counts, a change of a number by so much of it costs as much as an error of measurement;
 # without sigma that is so much of the data's spread.
 REACH, AN_ERROR = 0.3, 0.03
-# How much of a hold the whole record has: what only round-off sees keeps its guess.
+# How much of a hold the whole record has, for few numbers: what only round-off sees keeps its guess. Of many, as of a
+# network, no single one is determined.
 BARELY = 1e-7
 # Further starts where the end is doubtful, for no more numbers than this.
 AGAIN, AGAIN_UP_TO = 8, 20
@@ -243,7 +244,8 @@ def _course(problem: Problem, grow: bool, joined: bool, scattered, all_of_them: 
         done = xp.maximum(done, OF_RTOL * xp.max(xp.asarray(rtol)))
     last = np.arange(len(each)) == len(each) - 1
     xp = coordinates.numpy_of((ratio, done, scattered, problem.found.start))
-    held = np.where(partly, 1.0, BARELY) * (1.0 if problem.absolute else AN_ERROR) / REACH
+    barely = BARELY if problem.found.start.size <= AGAIN_UP_TO else 0.0
+    held = np.where(partly, 1.0, barely) * (1.0 if problem.absolute else AN_ERROR) / REACH
     stages = Stage(each, weights * ratio, np.ones(len(each)), held)
     # Round-off in the jumps between windows weighs as much as the jumps do.
     tolerances = xp.where(last, done * (JOINED[-1] if joined else 1.0), STAGE_DONE) * ratio

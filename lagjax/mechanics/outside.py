@@ -206,7 +206,12 @@ class _Look:
             if _is_library(value) and not isinstance(inner, types.ModuleType) and (callable(inner) or not self.whole):
                 return (value.__name__, attribute)
             value = inner
-        return ("missing", hasattr(builtins, name)) if value is MISSING else self.token(value)
+        if value is not MISSING:
+            return self.token(value)
+        # One that is not there yet may come, and one that was there has gone.
+        built_in = hasattr(builtins, name)
+        self.changing |= not built_in
+        return ("missing", built_in)
 
     def token(self, value, deep=True):
         """A value as something to compare."""

@@ -132,3 +132,21 @@ def test_a_look_calls_nothing():
     set_global("G", 2 * G)
     assert up_to_date(system) != system
     set_global("G", G / 2)
+
+
+def test_a_global_that_has_gone_is_a_change():
+    """Of two functions alike, the first without its module's names, as after `del jnp`: the second one counts."""
+
+    def made():
+        names = {"jnp": jnp}
+        exec("def swing(t, q, v, params): return 0.5 * v**2 + 41.0 * jnp.cos(q)", names)
+        return names, lj.System(names["swing"])
+
+    names, first = made()
+    np.testing.assert_allclose(lj.momentum(first, 0.0, 0.5, 2.0, None), 2.0)
+    del names["jnp"]
+    _, second = made()
+    np.testing.assert_allclose(lj.jacobi_integral(second, 0.0, 0.5, 0.0, None), -41.0 * np.cos(0.5))
+    # Twin: without it the first would stand for the second.
+    with pytest.raises(NameError):
+        lj.jacobi_integral(first, 0.0, 0.5, 0.0, None)
