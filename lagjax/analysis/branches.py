@@ -135,12 +135,11 @@ class Branches(eqx.Module):
                 f"plot({unknown[0]!r}) names no coordinate; there are {', '.join(self.names)}.\n"
                 f"Fix: plot({self.names[0]!r})."
             )
-        curves = [_columns(b.q, len(b)) for b in self.branches]
-        shown = list(names) or self._varying(curves)
+        shown = list(names) or self._varying(self._curves())
         columns = min(2, len(shown))
         fig, axes = plot.figure(-(-len(shown) // columns), columns, size=(4.8, 3.4))
         for axis, name in zip(axes.flat, shown):
-            self._draw(axis, name, curves)
+            self.draw(axis, name)
         for axis in axes.flat[len(shown) :]:
             axis.set_visible(False)
         handles = dict(zip(*reversed(_all_handles(axes))))
@@ -163,8 +162,12 @@ class Branches(eqx.Module):
         largest = np.max(spread, initial=0.0)
         return [name for name, x in zip(self.names, spread) if x > 1e-9 * largest][:6] or list(self.names[:1])
 
-    def _draw(self, axis, name, curves):
-        j = self.names.index(name)
+    def _curves(self):
+        return [_columns(b.q, len(b)) for b in self.branches]
+
+    def draw(self, axis, name: str | None = None):
+        """Draw one coordinate, by default the first, on axes of matplotlib, as `plot` does."""
+        j, curves = 0 if name is None else self.names.index(name), self._curves()
         inner = []
         for i, (branch, x) in enumerate(zip(self.branches, curves)):
             colour = plot.COLOURS[i % (len(plot.COLOURS) - 1)]
@@ -189,7 +192,7 @@ class Branches(eqx.Module):
             near = np.concatenate([x[self._not_far(b)] for b, x in zip(self.branches, inner)])
             middle, half = 0.5 * (near.min() + near.max()), 0.55 * np.ptp(near)
             axis.set_ylim(middle - max(half, 1e-12), middle + max(half, 1e-12))
-        axis.set(xlabel=self.along, ylabel=name)
+        axis.set(xlabel=self.along, ylabel=self.names[j])
 
 
 def _all_handles(axes):

@@ -32,6 +32,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax import plot
+from lagjax.analysis.continuation import continue_equilibria
 from lagjax.mechanics.constraints import Holonomic
 from lagjax.mechanics.multipliers import accelerations
 from lagjax.mechanics.system import System
@@ -152,9 +153,7 @@ class Squares(NamedTuple):
 def small_motion(params) -> Squares:
     """ω0² - ω² at the bottom, ω² sin²α = ω² - ω0⁴/ω² about α (meaningful above ω0), -(ω0² + ω²) at the top."""
     below, squared = params["g"] / params["a"], params["omega"] ** 2
-    return Squares(
-        bottom=below - squared, alpha=(squared - below) * (squared + below) / squared, top=-(below + squared)
-    )
+    return Squares(below - squared, (squared - below) * (squared + below) / squared, -(below + squared))
 
 
 def frequency(square):
@@ -239,11 +238,10 @@ def swing(params, psi, longest, tolerance=1e-10):
 
     Started on the side (+ψ or -ψ) from which it moves towards larger angles, and for `longest` at most.
     """
-    uphill = params["omega"] ** 2 * jnp.cos(psi) > params["g"] / params["a"]
-    start = jnp.where(uphill, psi, -psi)
+    start = jnp.where(params["omega"] ** 2 * jnp.cos(psi) > params["g"] / params["a"], psi, -psi)
     ts = jnp.stack([jnp.zeros_like(start), jnp.asarray(longest, start.dtype)])
-    tolerances = {"rtol": tolerance, "atol": tolerance}
-    return integrate(system, start, jnp.zeros_like(start), params, ts=ts, event=HALF_PERIOD, **tolerances)
+    how = {"ts": ts, "event": HALF_PERIOD, "rtol": tolerance, "atol": tolerance}
+    return integrate(system, start, jnp.zeros_like(start), params, **how)
 
 
 def settled(params, psi, time, tolerance=1e-9):
@@ -317,8 +315,7 @@ def cases():
     happened = f"alpha = {alpha:.6e}; arccos(1 / (1 + 1e-15)) is off by {100 * lost:.0f} %"
     rows.append(Case("(omega/omega0)² = 1 + 1e-15", happened, abs(alpha / exact - 1), 1e-15))
     rows.append(_reversed_case())
-    rows.append(_pitchfork_case())
-    return rows
+    return [*rows, _pitchfork_case(), _critical_case()]
 
 
 def _period_case(name, params, psi, tolerance, allowed):
@@ -348,6 +345,18 @@ def _pitchfork_case():
 
 
 @functools.cache
+def _branches():  # for the case and for the picture
+    return continue_equilibria(system, PARAMS | {"omega": 0.5}, 0.0, along="omega", to=9.0)
+
+
+def _critical_case():
+    """ω_c = √(g/a), and its derivative by a: -½ √(g/a³)."""
+    (found,), speed = _branches().critical, natural_rate(PARAMS)
+    error = abs(found.parameter / speed - 1), abs(found.derivative["a"] / (-0.5 * speed / PARAMS["a"]) - 1)
+    return Case(f"a {found.kind}, by continuation", "omega_c, and its derivative by a", float(max(error)), 1e-10)
+
+
+@functools.cache
 def _settling():  # for the case and for the picture; clear of ω0 itself, where friction needs for ever
     speeds = np.append(np.linspace(0.1, 0.92, 9), np.linspace(1.12, 2.45, 14))
     starts = np.where(np.arange(speeds.size) % 2, 0.5, -0.5)
@@ -363,15 +372,10 @@ def picture():
 
 
 def _draw_pitchfork(axis):
-    above = np.linspace(1.0, 2.5, 200)
-    branch = np.degrees(tilt(above**2 - 1))
-    axis.plot([0.0, 1.0], [0.0, 0.0], color=plot.COLOURS[0], label="stable")
-    axis.plot(np.append(above[::-1], above), np.append(-branch[::-1], branch), color=plot.COLOURS[0])
-    axis.plot([1.0, 2.5], [0.0, 0.0], color=plot.COLOURS[1], linestyle="--", label="unstable")
+    _branches().draw(axis)
     speeds, _, swept = _settling()
-    ends = np.degrees(swept.values)
-    axis.plot(speeds, ends, plot.MARKERS[0], color="black", markersize=4, label="settled, with friction")
-    axis.set(xlabel=r"$\omega/\omega_0$", ylabel=r"angle $\psi$ / degrees", title="The pitchfork")
+    axis.plot(natural_rate(PARAMS) * speeds, swept.values, "o", color="black", markersize=4, label="with friction")
+    axis.set(xlabel=r"$\omega$", ylabel=r"angle $\psi$", title="The pitchfork, by continuation")
     axis.legend(fontsize=8, frameon=False, loc="center left", bbox_to_anchor=(0.0, 0.72))
 
 
@@ -390,11 +394,7 @@ def _draw_periods(axis, unit):
 
 
 SCENE = Scene(
-    name="bead_on_hoop",
-    title="A bead on a rotating hoop",
+    name="bead_on_hoop", title="A bead on a rotating hoop",
     source="Goldstein, Classical Mechanics, Exercise 2-18; source document §3, Eq. (13)",
-    misprints=MISPRINTS,
-    runs=runs,
-    cases=cases,
-    picture=picture,
-)
+    misprints=MISPRINTS, runs=runs, cases=cases, picture=picture,
+)  # fmt: skip

@@ -35,6 +35,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax import plot
+from lagjax.analysis.modes import normal_modes
 from lagjax.mechanics.system import System
 from lagjax.motion.integrate import integrate
 from lagjax.report import Case, Run, Scene, relative_error
@@ -238,8 +239,7 @@ def _coefficients(j):
 
 def runs():
     """The same motion in both frames, and one above both critical speeds."""
-    ts = np.linspace(0.0, 100.0, 11)
-    above = PARAMS | {"omega": 8.0}
+    ts, above = np.linspace(0.0, 100.0, 11), PARAMS | {"omega": 8.0}
     return [
         _run("rotating frame, omega = 2.5", rotating_system, PARAMS, ts, by_hand.rails_rotating),
         _run("lab frame, omega = 2.5", lab_system, PARAMS, ts, by_hand.rails_in_the_lab),
@@ -260,18 +260,16 @@ def _run(name, system, params, ts, acceleration=None):
         state = trajectory.q, trajectory.v
         return balance(params, *(to_rotating(params, trajectory.t, *state) if in_lab else state)).h
 
-    measured = "coordinates and rates against the matrix exponential"
-    drawn = acceleration is not None
     return Run(
-        name, system, params, *start, ts, error, measured, 2e-8, invariant=invariant, by_hand=acceleration, drawn=drawn
-    )
+        name, system, params, *start, ts, error, "coordinates and rates against the matrix exponential", 2e-8,
+        invariant=invariant, by_hand=acceleration, drawn=acceleration is not None,
+    )  # fmt: skip
 
 
 def cases():
     """Speeds at and between the critical ones, stiff springs, late times."""
-    critical = float(np.sqrt(PARAMS["K"] / PARAMS["m"]))
     rows = [
-        _case("omega² = K/m: no equilibrium", {"omega": critical}, 20.0),
+        _case("omega² = K/m: no equilibrium", {"omega": float(np.sqrt(PARAMS["K"] / PARAMS["m"]))}, 20.0),
         _case("omega² = k/m: a line of equilibria", {"omega": 4.0}, 100.0),
         _case("omega = 5, between: divergence", {"omega": 5.0}, 10.0),
         _case("omega = 8, above both: 200 s", {"omega": 8.0}, 200.0),
@@ -283,18 +281,15 @@ def cases():
     # At t = 1e6 the clock itself resolves 1e-10 s, and the angle ω t as little.
     late = 1e6 + np.array([0.0, 5.0])
     end = integrate(lab_system, *to_lab(PARAMS, late[0], Q0, V0), PARAMS, ts=late, rtol=1e-12, atol=1e-12).end
-    got = to_rotating(PARAMS, late[1], end.q, end.v)
-    error = relative_error(got, exact_motion(PARAMS, Q0, V0, 5.0))
+    error = relative_error(to_rotating(PARAMS, late[1], end.q, end.v), exact_motion(PARAMS, Q0, V0, 5.0))
     rows.append(Case("lab frame from t = 1e6 s on", "cos(omega t) with ten digits left in t", error, 1e-7))
-    rows.append(_map_case())
-    return rows
+    return [*rows, _map_case(), _modes_case()]
 
 
 def _case(name, change, time):
     params = PARAMS | change
     trajectory = integrate(rotating_system, Q0, V0, params, ts=jnp.array([0.0, time]), rtol=1e-12, atol=1e-12)
-    end = trajectory.end
-    exact = exact_motion(params, Q0, V0, time)
+    end, exact = trajectory.end, exact_motion(params, Q0, V0, time)
     scale = max(abs(float(x)) for x in jax.tree.leaves(exact))
     error = max(float(abs(a - b)) for a, b in zip(jax.tree.leaves((end.q, end.v)), jax.tree.leaves(exact))) / scale
     happened = f"R({time:g} s) = {float(end.q['R']):.6g}, r = {float(end.q['r']):.6g}, {_verdict(params)}"
@@ -328,10 +323,26 @@ def _mapped():
     return *np.meshgrid(sides, sides, indexing="ij"), stability_map(sides, sides)
 
 
+@jax.jit
+@jnp.vectorize
+def is_held(over_K, over_k):
+    """Whether small motions stay small at (m ω²/K, m ω²/k), by their normal modes."""
+    squared = PARAMS["m"] * PARAMS["omega"] ** 2
+    params, zero = PARAMS | {"K": squared / over_K, "k": squared / over_k}, jnp.zeros_like(over_K)
+    rest, still = {"R": equilibrium_length(params), "r": zero}, {"R": zero, "r": zero}
+    return normal_modes(rotating_system, 0.0, rest, still, params).stable
+
+
+def _modes_case():
+    """The closed form at random points, as many as the picture has."""
+    over_K, over_k = np.exp(np.random.default_rng(0).uniform(np.log(0.05), np.log(20.0), (2, 60, 60)))
+    wrong = int(np.sum(is_held(over_K, over_k) != ((1 - over_K) * (1 - over_k) > 0)))
+    return Case("3,600 pairs of springs", "stability by normal modes", float(wrong), 0.0)
+
+
 def _map_case():
     """The whole plane, above both critical speeds too, where the rotation alone holds the carriage."""
-    over_K, over_k, swept = _mapped()
-    squared = PARAMS["m"] * PARAMS["omega"] ** 2
+    (over_K, over_k, swept), squared = _mapped(), PARAMS["m"] * PARAMS["omega"] ** 2
     stable = np.asarray(is_stable(PARAMS | {"K": squared / over_K, "k": squared / over_k}))
     # A motion that failed is NaN, and would pass for one that leaves.
     wrong = int(np.sum(((swept.values < LEAVES) != stable) | ~swept.ok))
@@ -357,24 +368,19 @@ def _draw_path(axis):
     axis.plot(path.q["x"], path.q["y"], label="integrated", **plot.style(0))
     axis.plot(exact["x"], exact["y"], plot.MARKERS[0], color=plot.COLOURS[1], markersize=4, label="exact")
     axis.set(xlabel="x", ylabel="y", title=r"Two turns in the laboratory, $\omega$ = 2.5", aspect="equal")
-    axis.set_xlim(-1.35, 1.35)
-    axis.set_ylim(-1.35, 1.75)
+    axis.set(xlim=(-1.35, 1.35), ylim=(-1.35, 1.75))
     axis.legend(fontsize=8, frameon=False, loc="upper center", ncols=3)
 
 
 def _draw_map(axis):
-    """Regions by the verdict, and what 144 pairs of springs do, integrated for 40 s."""
+    """Regions by the verdict of normal modes, and what 144 pairs of springs do, integrated for 40 s."""
     low, high = 0.05, 20.0
-    axis.fill_between([low, 1.0], low, 1.0, color=plot.COLOURS[2], alpha=0.25, linewidth=0)
-    axis.fill_between([1.0, high], 1.0, high, color=plot.COLOURS[5], alpha=0.25, linewidth=0)
+    x, y = np.meshgrid(*2 * [np.geomspace(low, high, 60)])
+    axis.contourf(x, y, is_held(x, y), [0.5, 1.5], colors=[plot.COLOURS[2]], alpha=0.25)
     axis.axvline(1.0, color="black", linewidth=1)
     axis.axhline(1.0, color="black", linewidth=1)
-    for x, y, words in (
-        (0.11, 0.5, "stable"),
-        (8.5, 11.0, "stable,\ngyroscopic"),
-        (0.11, 9.0, "grows"),
-        (9.0, 0.5, "grows"),
-    ):
+    words = "stable", "stable,\ngyroscopic", "grows", "grows"
+    for x, y, words in zip((0.11, 8.5, 0.11, 9.0), (0.5, 11.0, 9.0, 0.5), words):
         axis.text(x, y, words, ha="center", va="center", fontsize=9, bbox=plot.ON_MARKS)
     axis.text(1.0, 0.06, r"$\omega^2 = K/m$", fontsize=8, rotation=90, ha="center", va="bottom", bbox=plot.ON_MARKS)
     axis.text(0.052, 1.0, r"$\omega^2 = k/m$", fontsize=8, va="center", bbox=plot.ON_MARKS)
@@ -382,17 +388,13 @@ def _draw_map(axis):
     far = ~(swept.values < LEAVES)
     axis.loglog(p[~far], q[~far], plot.MARKERS[0], color=plot.COLOURS[0], markersize=3, label="integrated: stays")
     axis.loglog(p[far], q[far], plot.MARKERS[6], color=plot.COLOURS[1], markersize=4, label="integrated: leaves")
-    axis.set(xlabel=r"$m\omega^2/K$", ylabel=r"$m\omega^2/k$", title="Two critical speeds")
-    axis.set(xlim=(low, high), ylim=(low, high))
+    named = {"xlabel": r"$m\omega^2/K$", "ylabel": r"$m\omega^2/k$", "title": "Two critical speeds"}
+    axis.set(xlim=(low, high), ylim=(low, high), **named)
     axis.legend(fontsize=8, framealpha=0.9, edgecolor="none", loc="lower right")
 
 
 SCENE = Scene(
-    name="cross_rails",
-    title="A carriage on rotating cross-rails",
+    name="cross_rails", title="A carriage on rotating cross-rails",
     source="source document §6, Eq. (15); a problem of Goldstein, Classical Mechanics, chapter 2",
-    misprints=MISPRINTS,
-    runs=runs,
-    cases=cases,
-    picture=picture,
-)
+    misprints=MISPRINTS, runs=runs, cases=cases, picture=picture,
+)  # fmt: skip
