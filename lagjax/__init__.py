@@ -16,7 +16,9 @@ from typing import TYPE_CHECKING
 # isort: split
 # A system: its Lagrangian and its constraints.
 from lagjax.mechanics.constraints import Holonomic, Nonholonomic
+from lagjax.mechanics.generators import Generator
 from lagjax.mechanics.hybrid import Hybrid, Switch
+from lagjax.mechanics.noether import NoetherCharge, noether_charge
 from lagjax.mechanics.system import System
 
 # isort: split
@@ -43,28 +45,6 @@ from lagjax.numerics.radau import Radau5
 from lagjax.numerics.runge_kutta import Dopri8, Tsit5
 
 # isort: split
-# What a system is like.
-from lagjax.analysis.branches import Branch, Branches, Critical
-from lagjax.analysis.continuation import continue_equilibria
-from lagjax.analysis.cycles import OrbitWarning, periodic_orbit
-from lagjax.analysis.equilibria import equilibria
-from lagjax.analysis.floquet import Floquet, floquet
-from lagjax.analysis.found import Symmetries
-from lagjax.analysis.found_equilibria import Equilibria
-from lagjax.analysis.hamilton import Hamiltonian, hamiltonian
-from lagjax.analysis.least_action import action
-from lagjax.analysis.linearised import Linearisation, linearise
-from lagjax.analysis.lyapunov import LyapunovExponents, lyapunov_exponents
-from lagjax.analysis.modes import Mode, NormalModes, normal_modes
-from lagjax.analysis.orbit import PeriodicOrbit
-from lagjax.analysis.read_back import EquationsOfMotion, latex
-from lagjax.analysis.routh import Routhian, routhian
-from lagjax.analysis.symmetries import symmetries
-from lagjax.analysis.symmetry import SymmetryTest, is_symmetry
-from lagjax.mechanics.generators import Generator
-from lagjax.mechanics.noether import NoetherCharge, noether_charge
-
-# isort: split
 # Many motions.
 from lagjax.sweeps.engine import sweep
 from lagjax.sweeps.lanes import Status
@@ -87,12 +67,56 @@ from lagjax.comparison.work_precision import work_precision
 if TYPE_CHECKING:
     from lagjax import scenes
 
+    # What a system is like.
+    from lagjax.analysis.branches import Branch, Branches, Critical
+    from lagjax.analysis.continuation import continue_equilibria
+    from lagjax.analysis.cycles import OrbitWarning, periodic_orbit
+    from lagjax.analysis.equilibria import equilibria
+    from lagjax.analysis.floquet import Floquet, floquet
+    from lagjax.analysis.found import Symmetries
+    from lagjax.analysis.found_equilibria import Equilibria
+    from lagjax.analysis.hamilton import Hamiltonian, hamiltonian
+    from lagjax.analysis.least_action import action
+    from lagjax.analysis.linearised import Linearisation, linearise
+    from lagjax.analysis.lyapunov import LyapunovExponents, lyapunov_exponents
+    from lagjax.analysis.modes import Mode, NormalModes, normal_modes
+    from lagjax.analysis.orbit import PeriodicOrbit
+    from lagjax.analysis.read_back import EquationsOfMotion, latex
+    from lagjax.analysis.routh import Routhian, routhian
+    from lagjax.analysis.symmetries import symmetries
+    from lagjax.analysis.symmetry import SymmetryTest, is_symmetry
+
+
+# What is imported when it is first asked for, by its module.
+LATER = {
+    "lagjax.analysis.branches": "Branch Branches Critical",
+    "lagjax.analysis.continuation": "continue_equilibria",
+    "lagjax.analysis.cycles": "OrbitWarning periodic_orbit",
+    "lagjax.analysis.equilibria": "equilibria",
+    "lagjax.analysis.floquet": "Floquet floquet",
+    "lagjax.analysis.found": "Symmetries",
+    "lagjax.analysis.found_equilibria": "Equilibria",
+    "lagjax.analysis.hamilton": "Hamiltonian hamiltonian",
+    "lagjax.analysis.least_action": "action",
+    "lagjax.analysis.linearised": "Linearisation linearise",
+    "lagjax.analysis.lyapunov": "LyapunovExponents lyapunov_exponents",
+    "lagjax.analysis.modes": "Mode NormalModes normal_modes",
+    "lagjax.analysis.orbit": "PeriodicOrbit",
+    "lagjax.analysis.read_back": "EquationsOfMotion latex",
+    "lagjax.analysis.routh": "Routhian routhian",
+    "lagjax.analysis.symmetries": "symmetries",
+    "lagjax.analysis.symmetry": "SymmetryTest is_symmetry",
+}
+
 
 def __getattr__(name: str):
-    """The worked systems, imported when they are first asked for."""
-    if name != "scenes":
-        raise AttributeError(f"module 'lagjax' has no attribute '{name}'.")
-    return import_module("lagjax.scenes")
+    """The worked systems and what a system is like, imported when they are first asked for."""
+    if name == "scenes":
+        return import_module("lagjax.scenes")
+    for module, names in LATER.items():
+        if name in names.split():
+            return getattr(import_module(module), name)
+    raise AttributeError(f"module 'lagjax' has no attribute '{name}'.")
 
 
 def __dir__():

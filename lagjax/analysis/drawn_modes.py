@@ -25,9 +25,9 @@ def drawn_roots(roots: np.ndarray, growing: np.ndarray, zero: np.ndarray):
     for label, which, colour, marker in groups:
         x = roots[which]
         if x.size:
-            both = np.concatenate([x, x[x.imag > 0].conj()])
+            both = np.concatenate([x, np.conj(x[np.imag(x) > 0])])
             style = {"color": plot.COLOURS[colour], "marker": plot.MARKERS[marker], "markersize": 6}
-            axis.plot(both.real, both.imag, linestyle="", label=label, zorder=3, **style)
+            axis.plot(np.real(both), np.imag(both), linestyle="", label=label, zorder=3, **style)
     places: dict[tuple, list[str]] = {}
     size = max(float(np.max(np.abs(roots), initial=0.0)), 1e-300)
     for i, root in enumerate(roots):
@@ -36,7 +36,7 @@ def drawn_roots(roots: np.ndarray, growing: np.ndarray, zero: np.ndarray):
         axis.annotate(", ".join(names), (x * size, y * size), (6, 5), textcoords="offset points", fontsize=8)
     reach = 1.15 * size
     axis.set(xlabel="growth [1/t]", ylabel="frequency [rad/t]", ylim=(-reach, reach))
-    if np.all(np.abs(roots.real) < 0.05 * size):
+    if np.all(np.abs(np.real(roots)) < 0.05 * size):
         axis.set_xlim(-0.5 * reach, 0.5 * reach)
     axis.legend(fontsize=8, frameon=False, loc="center left", bbox_to_anchor=(1.0, 0.5))
     return fig
