@@ -12,8 +12,9 @@ from jaxtyping import Array, Bool, Float, PyTree
 
 from lagjax import plot
 from lagjax.animation import Animation
-from lagjax.mechanics import coordinates
+from lagjax.mechanics import coordinates, packed
 from lagjax.mechanics.compiled import compiled
+from lagjax.mechanics.packed import Packed
 from lagjax.mechanics.structure import angles, what_changes_jacobi_integral
 from lagjax.mechanics.system import System
 from lagjax.motion import account, frames
@@ -101,22 +102,12 @@ class Asked(NamedTuple):
 class Static(NamedTuple):
     """What of a trajectory is not an array: it must be hashable, so that JAX can carry it along."""
 
-    parts: tuple
-    structure: object
+    rest: Packed
     how: How
 
     @property
     def method(self) -> str:
         return self.how.method
-
-    def __reduce__(self):
-        # Equinox knows a marker in the structure by its identity, which a copy of the structure would lose.
-        return _static, (jax.tree.unflatten(self.structure, self.parts), self.how)
-
-
-def _static(tree, how):
-    parts, structure = jax.tree.flatten(tree)
-    return Static(tuple(parts), structure, how)
 
 
 class Trajectory(eqx.Module):
@@ -170,8 +161,7 @@ class Trajectory(eqx.Module):
         return self._problem()[2]
 
     def _problem(self):
-        static = jax.tree.unflatten(self.static.structure, self.static.parts)
-        return eqx.combine(self.arrays, static)
+        return self.static.rest.together(self.arrays)
 
     def rows(self) -> dict:
         """What there is of each output, by the names of the fields."""
@@ -295,8 +285,8 @@ def worst_drift(system, t, q, v, params):
 
 def pack(system, params, asked: Asked, how: How) -> tuple[PyTree, Static]:
     """Split (system, params, asked) into arrays and hashable rest."""
-    arrays, static = eqx.partition((system, params, asked), eqx.is_array)
-    return arrays, _static(static, how)
+    arrays, rest = packed.pack((system, params, asked))
+    return arrays, Static(rest, how)
 
 
 def ended_well(result) -> Bool[Array, "..."]:
