@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, PyTree
+from jaxtyping import Array, ArrayLike, Bool, Float, PyTree
 
 from lagjax import plot
 from lagjax.animation import Animation
@@ -79,13 +79,15 @@ class How(NamedTuple):
     """How a motion was stepped through.
 
     `order`: of the error that chooses steps; `evaluations`: of the equations in a step, None for an implicit method;
-    `steps`: chosen by the "tolerance" (in several "legs" of a motion), "fixed", or by the user's "controller".
+    `steps`: chosen by the "tolerance" (in several "legs" of a motion), "fixed", or by the user's "controller";
+    `backward`: in time.
     """
 
     method: str
     order: int
     evaluations: int | None
     steps: str
+    backward: bool = False
 
 
 class Asked(NamedTuple):
@@ -108,6 +110,10 @@ class Static(NamedTuple):
     @property
     def method(self) -> str:
         return self.how.method
+
+
+# What stands on the integrator, which makes trajectories, and so above this file: it is put here by `integrate.py`.
+BY_INTEGRATION: dict[str, Callable] = {}
 
 
 class Trajectory(eqx.Module):
@@ -180,6 +186,30 @@ class Trajectory(eqx.Module):
         if not self.system.constraints:
             return jnp.zeros_like(self.scaled_error)
         return _worst_residual(self.system, self.t, self.q, self.v, self.params)
+
+    def at(self, t: ArrayLike) -> Snapshot:
+        """Return the motion at any time, at the order of its method: continued from the output before by its own steps.
+
+        >>> import lagjax as lj
+        >>> fall = lj.System(lambda t, q, v, params: 0.5 * v**2 - params["g"] * q)
+        >>> traj = lj.integrate(fall, 0.0, 3.0, {"g": 10.0}, ts=[0.0, 0.5])
+        >>> now = traj.at([0.1, 0.2])
+        >>> print(now.q.round(9), now.v.round(9))
+        [0.25 0.4 ] [2. 1.]
+
+        **Arguments:** `t`: a time or an array of them, of any shape and in any order, `[t]`, between the first output
+        and the end of the motion.
+
+        **Returns:** a `Snapshot` (`t`, `q`, `v`, `multipliers`), each leaf with the shape of `t` in front; on the
+        constraints. At an output it is that output. Of a batch the axes of the batch come first. It is differentiable
+        in `t` and in all that the motion is. Under `jit` and in a batch it is NaN where there is no motion.
+
+        Each time costs a short solve from the output before it: with outputs as dense as steps, a step.
+
+        **Raises:** `ValueError` for a time outside of the motion, or after its end by an event or a failure; for
+        outputs off the constraints (`drift="none"`), and steps of a controller that has a plan for the whole motion.
+        """
+        return BY_INTEGRATION["at"](self, t)
 
     def plot(self, charges=False):
         """Plot coordinates, velocities and multipliers against time; returns a matplotlib `Figure`.
