@@ -11,6 +11,7 @@ import numpy as np
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.coordinates import State
 from lagjax.mechanics.hybrid import Hybrid, phases_of
+from lagjax.mechanics.signature import known_system
 from lagjax.mechanics.system import System
 from lagjax.motion.account import account_of, warning_of
 from lagjax.motion.consistency import departures
@@ -28,7 +29,7 @@ REFUSED = (RESULTS.start_not_finite, RESULTS.start_singular, RESULTS.contradicto
 
 def check_system(system: Any):
     """Raise where `system` is not a `System`."""
-    if not isinstance(system, System | Hybrid):
+    if not isinstance(known_system(system), System | Hybrid):
         raise TypeError(
             f"the first argument must be a lj.System, not {type(system).__name__}.\n"
             "Fix: system = lj.System(lagrangian)."
