@@ -12,6 +12,7 @@ from lagjax.mechanics.diagnosis import dependencies, describe, equation_names, e
 from lagjax.mechanics.equations import equations_of
 from lagjax.mechanics.first_call import looked_at
 from lagjax.mechanics.hybrid import Hybrid
+from lagjax.mechanics.refusals import check_system
 from lagjax.mechanics.saddle_point import examined
 from lagjax.mechanics.structure import Structure, is_free_of_velocities, structure
 from lagjax.mechanics.system import System
@@ -91,6 +92,7 @@ def explain(system, t, q, v, params=None):
 
     Source: García de Jalón & Bayo, *Kinematic and Dynamic Simulation of Multibody Systems*, §3.2 (rank and freedoms).
     """
+    check_system(system, t, q, v, params, phases=True)
     s = coordinates.state(t, q, v, params)
     if isinstance(system, Hybrid):
         return explained(system, {name: _explain(phase, s) for name, phase in zip(system.names, system.systems)}, s)
