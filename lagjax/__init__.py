@@ -31,6 +31,7 @@ from lagjax.motion.explanation import Explanation, explain
 # isort: split
 # Motion.
 from lagjax.animation import Animation
+from lagjax.mechanics.single_precision import PrecisionWarning
 from lagjax.motion.contacts import releases, slips, sticks, touches
 from lagjax.motion.crossings import Crossing, Crossings, EventWarning
 from lagjax.motion.hybrid_trajectory import HybridTrajectory, Switches
@@ -166,6 +167,7 @@ __all__ = [
     "Animation",
     "RESULTS",
     "AccuracyWarning",
+    "PrecisionWarning",
     "Generator",
     "noether_charge",
     "NoetherCharge",

@@ -35,7 +35,8 @@ class Routhian(eqx.Module):
 
     def __call__(self, t, q, v, params):
         """R at a state of the coordinates that are left, `[L]`."""
-        return self._at(t, *coordinates.as_floats((q, v)), params)[0]
+        q, v = jax.tree.map(jnp.asarray, coordinates.as_floats((q, v)))
+        return self._at(t, q, v, params)[0]
 
     def velocities(self, t, q, v, params) -> dict[str, Array]:
         """The velocities of the cyclic coordinates, by name, `[q]/[t]`: integrated, these give the coordinates."""

@@ -190,7 +190,7 @@ def _time(t):
 def _numbers(tree, which):
     """The coordinates as arrays, with whole numbers still as they are; an error where one is no real number."""
     try:
-        found = jtu.tree_map(_as_array, tree)
+        found = jtu.tree_map(lambda x: _as_array(float(x) if type(x) is int else x), tree)
     except TypeError:
         _check_real(tree, which)
         raise

@@ -71,7 +71,7 @@ class System(eqx.Module):
                 raise TypeError(
                     f"constraint '{name}' is a number.\n"
                     "Usual cause: params in the place of constraints.\n"
-                    "Fix: lj.System(lagrangian), and params with each call: lj.integrate(system, q0, v0, params, ts=ts)."
+                    "Fix: lj.System(lagrangian); each call takes them, lj.integrate(system, q0, v0, params, ts=ts)."
                 )
             if not isinstance(constraint, (Holonomic, Nonholonomic)):
                 raise TypeError(
