@@ -117,7 +117,7 @@ def _power(f: Failure) -> Words | None:
 
 def _attribute(f: Failure) -> Words | None:
     """A name asked for with a dot."""
-    missing = re.search(r"'(dict|list|tuple|\w*Tracer|ArrayImpl)' object has no attribute '(\w+)'", f.said)
+    missing = re.search(r"'?(dict|list|tuple|\w*Tracer|ArrayImpl)'?(?: object)? has no attribute '?(\w+)", f.said)
     if missing is None:
         return None
     of, name = missing.groups()
@@ -137,7 +137,7 @@ def _attribute(f: Failure) -> Words | None:
         )
     return (
         f"asks for .{name} of an array, which has none",
-        "a start that is a number or an array, and a function that is written for names",
+        "a function that is written for names, or a method that arrays do not have",
         f'q0 = {{"{name}": 0.1}} and {asked}["{name}"]',
     )
 
