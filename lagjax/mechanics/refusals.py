@@ -9,7 +9,8 @@ from lagjax.mechanics.constraints import Holonomic, Nonholonomic
 from lagjax.mechanics.hybrid import Hybrid
 from lagjax.mechanics.system import System
 
-P, R = ParamSpec("P"), TypeVar("R")
+P = ParamSpec("P")
+R = TypeVar("R")
 CONSTRAINTS = (Holonomic, Nonholonomic)
 
 
