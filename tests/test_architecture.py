@@ -24,6 +24,7 @@ LAYERS = (
         "animation",
         "meter",
         "motion",
+        "exchange",
         "analysis",
         "comparison",
         "sweeps",
