@@ -106,7 +106,7 @@ def result_codes() -> dict[int, str]:
 
 
 def plain(tree: PyTree) -> PyTree:
-    """Dictionaries, lists and tuples of arrays; what has named parts becomes a dictionary, a `RESULTS` item its code."""
+    """Dictionaries, lists and tuples: what has named parts becomes a dictionary, a `RESULTS` item its code."""
     if isinstance(tree, ITEM):
         return tree._value
     if isinstance(tree, Mapping):
