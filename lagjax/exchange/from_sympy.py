@@ -104,8 +104,9 @@ class _Names:
         for x in parameters:
             if not isinstance(x, sympy.Symbol):
                 raise TypeError(
-                    f"a parameter is a symbol, and {x} is a {type(x).__name__}.\n"
-                    f'Fix: m, g = symbols("m g"), and parameters=[m, g].'
+                    f"a parameter is a symbol, and {x} is none.\n"
+                    "Usual cause: a coordinate, a name or a number among them.\n"
+                    'Fix: m, g = symbols("m g"), and parameters=[m, g].'
                 )
         times = {x.args[0] for x in coordinates}
         if len(times) > 1:
@@ -116,9 +117,14 @@ class _Names:
             )
         (self.time,) = times or {sympy.physics.mechanics.dynamicsymbols._t}
         self.keys = {x: x.func.__name__ for x in coordinates} | {x: x.name for x in parameters}
+        if self.time in parameters:
+            raise ValueError(
+                f"'{self.time}' is among the parameters, and is the time.\n"
+                "Fix: leave it out: L may depend on it as it stands."
+            )
         for key in self.keys.values():
-            alike = [str(x) for x, other in self.keys.items() if other == key]
-            if len(alike) > 1 or list(parameters).count(self.time):
+            alike = [str(x) for x in (*coordinates, *parameters) if self.keys[x] == key]
+            if len(alike) > 1:
                 raise ValueError(
                     f"two of the coordinates and parameters have the name '{key}': {_commas(alike)}.\n"
                     "Usual cause: symbols(...) and dynamicsymbols(...) of one name, or symbols of one name with other "
@@ -195,7 +201,7 @@ class _Names:
         for x in given:
             if x not in self.coordinates:
                 raise ValueError(
-                    f"force has a part on '{x}', and the coordinates are {_commas(self.coordinates)}.\n"
+                    f"force has a part on {x!r}, and the coordinates are {_commas(self.coordinates)}.\n"
                     "Fix: the coordinates themselves as keys, force={x: -c * x.diff()}."
                 )
         return self.function("force", {self.keys[x]: given.get(x, 0) for x in self.coordinates})
@@ -216,7 +222,7 @@ class _Names:
                     f"{role} has {f} in it, a function of time that is no coordinate.\n"
                     "Usual cause: a coordinate left out, a generalized speed u in place of q.diff(), or a motion that "
                     "is given.\n"
-                    f"Fix: coordinates=[{_commas([*self.coordinates, f])}]; L.subs(u, q.diff()); "
+                    f"Fix: coordinates=[{_commas(x.func for x in (*self.coordinates, f))}]; L.subs(u, q.diff()); "
                     "L.subs(f, sin(Omega * t)).doit() for what is given."
                 )
         unknown = sorted(expression.free_symbols - {*self.parameters, self.time}, key=str)
@@ -259,8 +265,8 @@ def _several(given, role):
     """A sequence as a list."""
     if isinstance(given, Mapping | str) or not hasattr(given, "__iter__"):
         raise TypeError(
-            f"{role} must be a list, and is a {type(given).__name__}.\n"
-            f"Fix: {role}=[...]; numbers are given to lj.integrate, as a dictionary by their names."
+            f"{role} must be a list, and are given as {given!s:.60}.\n"
+            f"Fix: {role}=[...], of one too; numbers are given to lj.integrate, as a dictionary by their names."
         )
     return list(given)
 

@@ -131,7 +131,8 @@ def _guarded(expression, where):
     args = [_guarded(arg, where) for arg in expression.args]
     is_power = expression.is_Pow and not (expression.exp.is_Integer and expression.exp > 0)
     if where != sympy.true and (is_power or expression.func.__name__ in DELICATE) and args[0].free_symbols:
-        args[0] = sympy.Piecewise((args[0], where), (sympy.Rational(1, 2), True), evaluate=False)
+        # No `Piecewise`, which SymPy would draw out of a power.
+        args[0] = sympy.Function("harmless", real=True)(args[0], where)
     return expression.func(*args)
 
 
@@ -150,14 +151,15 @@ def _in_jax(expression):
     }
     for function, instead in others.items():
         expression = expression.replace(function, instead)
-    kinds = [sympy.Add, sympy.Mul, sympy.Pow, sympy.Symbol, sympy.Number, sympy.NumberSymbol, sympy.sinc]
+    kinds = [sympy.Add, sympy.Mul, sympy.Pow, sympy.Symbol, sympy.Number, sympy.NumberSymbol, sympy.sinc, sympy.frac]
     kinds += [sympy.Piecewise, sympy.functions.elementary.piecewise.ExprCondPair, sympy.ITE, sympy.Max, sympy.Min]
     kinds += [sympy.And, sympy.Or, sympy.Not, sympy.core.relational.Relational, sympy.logic.boolalg.BooleanAtom]
     for part in sympy.preorder_traversal(expression):
         # `nan` and `zoo` are numbers to SymPy.
         known = isinstance(part, tuple(kinds)) and part not in (sympy.nan, sympy.zoo)
-        if not known and type(part).__name__ not in FUNCTIONS:
-            raise NotInJax(str(part.func) if part.args else str(part))
+        undefined = isinstance(part, sympy.core.function.AppliedUndef)
+        if not known and (undefined or type(part).__name__ not in FUNCTIONS):
+            raise NotInJax(type(part).__name__ if part.args and not part.is_Atom else str(part))
     return expression
 
 
@@ -212,6 +214,10 @@ def _printer():
         _print_Infinity = lambda self, expr: "jnp.inf"
         _print_NegativeInfinity = lambda self, expr: "(-jnp.inf)"
         _print_sinc = lambda self, expr: f"jnp.sinc({self._print(expr.args[0] / sympy.pi)})"
+
+        # Nothing else is an undefined function any more: `harmless`.
+        _print_AppliedUndef = lambda self, expr: "jnp.where({1}, {0}, 0.5)".format(*map(self._print, expr.args))
+        _print_frac = lambda self, expr: f"jnp.mod({self._print(expr.args[0])}, 1)"
 
     for name in FUNCTIONS:
         setattr(Printer, f"_print_{name}", Printer._of_function)
