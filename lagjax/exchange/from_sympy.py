@@ -10,9 +10,10 @@ with the sign of λ that lagjax has.
 """
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from typing import Any
 
-from lagjax.exchange.sympy_source import NotInJax, SymPyFunction, function_of
+from lagjax.exchange.sympy_source import NotInJax, SymPyFunction, function_of, sympy_itself
 from lagjax.mechanics.arguments import OF_POSITION, OF_STATE
 from lagjax.mechanics.constraints import Holonomic, Nonholonomic
 from lagjax.mechanics.diagnosis import listed
@@ -69,7 +70,7 @@ def from_sympy(
 
     Source: Goldstein, *Classical Mechanics*, Eq. (1.53), (2.26); SymPy, `sympy.physics.mechanics.LagrangesMethod`.
     """
-    sympy = _sympy()
+    sympy = sympy_itself()
     if isinstance(lagrangian, sympy.physics.mechanics.LagrangesMethod):
         method, lagrangian = lagrangian, lagrangian._L[0]
         for word, value in (("coordinates", coordinates), ("constraints", constraints), ("force", force)):
@@ -136,13 +137,12 @@ class _Names:
         self.places |= {x: ("q", self.keys[x]) for x in coordinates} | {self.time: ("t", "")}
         self.places |= {x: ("params", self.keys[x]) for x in parameters}
 
-    def expression(self, given, role):
+    def expression(self, given, role) -> Any:
         """What was given, checked to be a number made of what is known."""
         sympy = self.sympy
-        try:
+        found: Any = None
+        with suppress(sympy.SympifyError):
             found = None if isinstance(given, str) else sympy.sympify(given)
-        except sympy.SympifyError:
-            found = None
         if isinstance(found, sympy.Equality) and role.startswith("constraint"):
             found = found.lhs - found.rhs
         if not isinstance(found, sympy.Expr) or getattr(found, "is_Matrix", False):
@@ -180,8 +180,9 @@ class _Names:
         """Holonomic where no velocity is in it."""
         several = isinstance(given, list | tuple) or getattr(given, "is_Matrix", False)
         given, role = [*given] if several else given, f"constraint '{name}'"
-        found = [self.expression(x, role) for x in given] if several else self.expression(given, role)
-        has = lambda parts: any(x.has(*parts) for x in (found if several else [found]))
+        equations = [self.expression(x, role) for x in (given if several else [given])]
+        found = equations if several else equations[0]
+        has = lambda parts: any(x.has(*parts) for x in equations)
         if self.coordinates and has([x.diff(self.time) for x in self.coordinates]):
             return Nonholonomic(self.function(role, found))
         if not has(self.coordinates):
@@ -309,12 +310,3 @@ def _without_time(written, coordinates):
 
 def _commas(items):
     return ", ".join(map(str, items))
-
-
-def _sympy():
-    try:
-        import sympy
-        import sympy.physics.mechanics
-    except ImportError as error:
-        raise ImportError("lj.from_sympy needs SymPy.\nFix: pip install 'lagjax[sympy]'.") from error
-    return sympy

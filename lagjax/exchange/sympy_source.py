@@ -36,6 +36,17 @@ WHOLE = 2**31 - 1
 RESERVED = {"t", "q", "v", "params", "jax", "jnp", "multipliers"}
 
 
+def sympy_itself() -> Any:
+    """The package."""
+    try:
+        import sympy
+        import sympy.physics.mechanics
+        import sympy.printing.pycode
+    except ImportError as error:
+        raise ImportError("lj.from_sympy needs SymPy.\nFix: pip install 'lagjax[sympy]'.") from error
+    return sympy
+
+
 class NotInJax(Exception):
     """Something of SymPy has no counterpart in JAX."""
 
@@ -77,8 +88,7 @@ def function_of(takes: Sequence[str], result: Any, written: str, names: Mapping[
 
     `names`: where to find what occurs in the expressions: ("params", "m") is params["m"], ("t", "") the time.
     """
-    import sympy
-
+    sympy = sympy_itself()
     taken, symbols = set(RESERVED), {}
     for part, (argument, key) in names.items():
         name = _identifier(key + "_dot" * (argument == "v"), taken) if key else argument
@@ -117,8 +127,7 @@ def _guarded(expression, where):
 
     `where`: the condition under which this part of it is taken.
     """
-    import sympy
-
+    sympy = sympy_itself()
     if isinstance(expression, sympy.Piecewise):
         before, branches = sympy.false, []
         for branch, condition in expression.args:
@@ -138,8 +147,7 @@ def _guarded(expression, where):
 
 def _in_jax(expression):
     """The expression in functions that JAX has; raises `NotInJax` for those that it has not."""
-    import sympy
-
+    sympy = sympy_itself()
     one = sympy.Integer(1)
     others = {
         sympy.sec: lambda x: one / sympy.cos(x),
@@ -166,10 +174,9 @@ def _in_jax(expression):
 @lru_cache(maxsize=1)
 def _printer():
     """Of SymPy's printer of Python the order of operations; what it writes is ours."""
-    import sympy
-    from sympy.printing.pycode import PythonCodePrinter
+    sympy = sympy_itself()
 
-    class Printer(PythonCodePrinter):
+    class Printer(sympy.printing.pycode.PythonCodePrinter):
         def _of_function(self, expr):
             return f"{FUNCTIONS[type(expr).__name__]}({', '.join(map(self._print, expr.args))})"
 
