@@ -14,7 +14,7 @@ import re
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from itertools import count
-from typing import Any
+from typing import Any, cast
 
 import equinox as eqx
 import jax
@@ -41,7 +41,6 @@ def sympy_itself() -> Any:
     try:
         import sympy
         import sympy.physics.mechanics
-        import sympy.printing.pycode
     except ImportError as error:
         raise ImportError("lj.from_sympy needs SymPy.\nFix: pip install 'lagjax[sympy]'.") from error
     return sympy
@@ -174,9 +173,11 @@ def _in_jax(expression):
 @lru_cache(maxsize=1)
 def _printer():
     """Of SymPy's printer of Python the order of operations; what it writes is ours."""
-    sympy = sympy_itself()
+    from sympy.printing.pycode import PythonCodePrinter
 
-    class Printer(sympy.printing.pycode.PythonCodePrinter):
+    sympy, of_python = sympy_itself(), cast(Any, PythonCodePrinter)
+
+    class Printer(of_python):
         def _of_function(self, expr):
             return f"{FUNCTIONS[type(expr).__name__]}({', '.join(map(self._print, expr.args))})"
 
