@@ -87,6 +87,10 @@ if TYPE_CHECKING:
     from lagjax.analysis.symmetries import symmetries
     from lagjax.analysis.symmetry import SymmetryTest, is_symmetry
 
+    # In and out.
+    from lagjax.exchange.exported import export, result_codes
+    from lagjax.exchange.from_sympy import from_sympy
+
 
 __version__ = "0.2.0"
 
@@ -109,6 +113,8 @@ LATER = {
     "lagjax.analysis.routh": "Routhian routhian",
     "lagjax.analysis.symmetries": "symmetries",
     "lagjax.analysis.symmetry": "SymmetryTest is_symmetry",
+    "lagjax.exchange.exported": "export result_codes",
+    "lagjax.exchange.from_sympy": "from_sympy",
 }
 
 
@@ -128,6 +134,7 @@ def __dir__():
 
 __all__ = [
     "System",
+    "from_sympy",
     "Holonomic",
     "Nonholonomic",
     "Hybrid",
@@ -215,5 +222,7 @@ __all__ = [
     "learned",
     "WorkPrecision",
     "work_precision",
+    "export",
+    "result_codes",
     "scenes",
 ]

@@ -24,6 +24,7 @@ LAYERS = (
         "animation",
         "meter",
         "motion",
+        "exchange",
         "analysis",
         "comparison",
         "sweeps",
@@ -33,7 +34,7 @@ LAYERS = (
 TOP = {"__init__", "__main__", "job"}
 FINDER = doctest.DocTestFinder()
 PRIVATE = ("jax._src", "jax.experimental", "jax.extend", "jax.interpreters", "jaxlib")
-OPTIONAL = {"google_crc32c", "matplotlib", "tqdm", "xarray", "zarr"}
+OPTIONAL = {"google_crc32c", "matplotlib", "sympy", "tqdm", "xarray", "zarr"}
 
 
 def layer(module):

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, PyTree
 
-from lagjax.jax_internals.tracing import WATCHED, is_eager
+from lagjax.jax_internals.tracing import SILENT, WATCHED, is_eager
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.closures import lift
 from lagjax.mechanics.first_call import looked_at, with_known_kinds
@@ -191,7 +191,7 @@ def _raise_or_warn(trajectory, start, settings):
     """Raise or warn in the user's words; while tracing, at run time with the result's own message."""
     if coordinates.is_traced(trajectory):
         # Who watches is told by the report.
-        return trajectory if WATCHED.value else raise_at_run_time(trajectory)
+        return trajectory if WATCHED.value or SILENT.value else raise_at_run_time(trajectory)
     result = trajectory.result
     if not is_among(result, ENDED_WELL):
         raise_failure(trajectory, start, settings)
