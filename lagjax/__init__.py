@@ -67,6 +67,9 @@ from lagjax.comparison.work_precision import work_precision
 if TYPE_CHECKING:
     from lagjax import scenes
 
+    # Many motions, in a notebook.
+    from lagjax.interactive.interact import Knobs, interact
+
     # What a system is like.
     from lagjax.analysis.branches import Branch, Branches, Critical
     from lagjax.analysis.continuation import continue_equilibria
@@ -106,6 +109,7 @@ LATER = {
     "lagjax.analysis.routh": "Routhian routhian",
     "lagjax.analysis.symmetries": "symmetries",
     "lagjax.analysis.symmetry": "SymmetryTest is_symmetry",
+    "lagjax.interactive.interact": "Knobs interact",
 }
 
 
@@ -202,6 +206,8 @@ __all__ = [
     "Sweep",
     "Status",
     "open_sweep",
+    "interact",
+    "Knobs",
     "fit",
     "Record",
     "Fit",
