@@ -7,10 +7,12 @@
 """
 
 import base64
+import fcntl
 import json
 import os
 import shutil
 import subprocess
+import sys
 import tempfile
 import time
 from pathlib import Path
@@ -20,6 +22,8 @@ FLAGS = (
     *("--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-sync"),
     *("--disable-background-networking", "--disable-component-update", "--remote-debugging-pipe", "--mute-audio"),
 )
+# The browser reads commands from its file number 3, and answers into number 4.
+AS_3_AND_4 = "import os, sys; _, a, b, *run = sys.argv; os.dup2(int(a), 3); os.dup2(int(b), 4); os.execv(run[0], run)"
 KEYS = {"ArrowRight": 39, "ArrowLeft": 37, "Home": 36, "End": 35, "Tab": 9, " ": 32}
 
 
@@ -34,17 +38,19 @@ class Browser:
     def __init__(self, flags=(), patience=60.0):
         self.patience, self.count, self.events = patience, 0, []
         self.profile = tempfile.TemporaryDirectory(ignore_cleanup_errors=True)
-        to_browser, self.out = os.pipe()
-        self.back, from_browser = os.pipe()
-        command = f'exec "$@" 3<&{to_browser} 4>&{from_browser}'
         path = installed()
         assert path, "no Chromium or Chrome is installed"
+        to_browser, self.out = os.pipe()
+        self.back, from_browser = os.pipe()
+        # Not among the numbers that the browser expects, which one would overwrite.
+        ends = [fcntl.fcntl(end, fcntl.F_DUPFD_CLOEXEC, 10) for end in (to_browser, from_browser)]
         self.process = subprocess.Popen(
-            ["sh", "-c", command, "sh", path, *FLAGS, *flags, f"--user-data-dir={self.profile.name}", "about:blank"],
-            pass_fds=(to_browser, from_browser), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+            [sys.executable, "-c", AS_3_AND_4, *map(str, ends), path, *FLAGS, *flags,
+             f"--user-data-dir={self.profile.name}", "about:blank"],
+            pass_fds=ends, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
         )  # fmt: skip
-        os.close(to_browser)
-        os.close(from_browser)
+        for end in (to_browser, from_browser, *ends):
+            os.close(end)
         self.rest = b""
         os.set_blocking(self.back, False)
 

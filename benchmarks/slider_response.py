@@ -44,6 +44,8 @@ run = lambda point: lj.integrate(bead, point["start"], 0.0, {"omega": point["ome
 knobs = lj.interact(run, {"omega": (0.0, 4.0, 0.02), "start": (0.1, 3.0)}, start={"omega": 0.6}, progress=False)
 """
 PRESSES, DRAGGED = 60, 100
+# Nothing of the user's own settings is read or written.
+OF_JUPYTER = ("JUPYTER_CONFIG_DIR", "JUPYTER_RUNTIME_DIR", "IPYTHONDIR", "JUPYTERLAB_SETTINGS_DIR")
 # From the key to the frame after the picture: an Image widget gets another source each time, a page draws in place.
 WATCH = """
 (() => {
@@ -104,10 +106,11 @@ def in_the_notebook():
         with socket.socket() as free:
             free.bind(("127.0.0.1", 0))
             port = free.getsockname()[1]
-        settings = ("--no-browser", f"--port={port}", "--IdentityProvider.token=", "--allow-root", "--ip=127.0.0.1")
-        own = {name: folder for name in ("JUPYTER_CONFIG_DIR", "JUPYTER_RUNTIME_DIR", "IPYTHONDIR", "JUPYTERLAB_SETTINGS_DIR")}
+        settings = ("--no-browser", f"--port={port}", "--IdentityProvider.token=", "--allow-root", "--ip=127.0.0.1",
+                    "--LabApp.expose_app_in_browser=True", f"--notebook-dir={folder}")  # fmt: skip
+        own = dict.fromkeys(OF_JUPYTER, folder)
         lab = subprocess.Popen(
-            [sys.executable, "-m", "jupyterlab", *settings, "--LabApp.expose_app_in_browser=True", f"--notebook-dir={folder}"],
+            [sys.executable, "-m", "jupyterlab", *settings],
             env=os.environ | own, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
         )  # fmt: skip
         try:
@@ -147,7 +150,7 @@ def in_the_page(run):
         axes = {"start": np.array([1.5]), "omega": np.arange(0.0, 4.01, 0.02)}
         lj.sweep(run, axes, progress=False).to_html(file)
         page = browser.open(file)
-        yield from measured(page, "page", "[data-views] svg", "#" + page.run("document.querySelectorAll('.lagjax input')[1].id"), 50)
+        yield from measured(page, "page", "[data-views] svg", ".lagjax .row:nth-child(2) input", 50)
 
 
 def measured(page, what, image, slider, target):

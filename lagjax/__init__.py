@@ -67,9 +67,6 @@ from lagjax.comparison.work_precision import work_precision
 if TYPE_CHECKING:
     from lagjax import scenes
 
-    # Many motions, in a notebook.
-    from lagjax.interactive.interact import Knobs, interact
-
     # What a system is like.
     from lagjax.analysis.branches import Branch, Branches, Critical
     from lagjax.analysis.continuation import continue_equilibria
@@ -88,6 +85,9 @@ if TYPE_CHECKING:
     from lagjax.analysis.routh import Routhian, routhian
     from lagjax.analysis.symmetries import symmetries
     from lagjax.analysis.symmetry import SymmetryTest, is_symmetry
+
+    # Many motions, in a notebook.
+    from lagjax.interactive.interact import Knobs, interact
 
 
 # What is imported when it is first asked for, by its module.

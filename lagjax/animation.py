@@ -1,8 +1,8 @@
 """A film of points in the plane that plays in a notebook or a browser: one SVG, its numbers, and a short script.
 
 It needs no network, no encoder and no other file. Where scripts are not run (an untrusted notebook, a preview) the
-first frame stands there. Coordinates are whole tenths of a pixel in two bytes each. A film may have several lanes of the
-same frames, of which the page shows one.
+first frame stands there. Coordinates are whole tenths of a pixel in two bytes each. A film may have several lanes, of
+which the page shows one.
 """
 
 import html
@@ -73,7 +73,8 @@ def film(t: np.ndarray, points: dict[str, np.ndarray], rate: float, trail: int) 
         f'<div data-film=""><div class="parts">{"".join(named)}</div>\n'
         f"{_picture(parts, low, size, scale, html.escape(f'{about}, {start}'))}\n"
         '<div class="row" style="max-width:520px"><button type="button" aria-label="play">&#9654;</button>'
-        f'<input type="range" aria-label="time" min="0" max="{len(t) - 1}" value="0"><output>{start}</output></div></div>'
+        f'<input type="range" aria-label="time" min="0" max="{len(t) - 1}" value="0"><output>{start}</output>'
+        "</div></div>"
     )
     return body, spec
 
@@ -117,7 +118,8 @@ def _picture(parts, low, size, scale, words):
     whole = (left + width + right, top + height + bottom)
     return (
         f'<svg xmlns="http://www.w3.org/2000/svg" role="img" aria-label="{words}" '
-        f'viewBox="0 0 {whole[0]} {whole[1]}" width="{whole[0] // 10}" font-family="sans-serif" style="max-width:100%;background:#fff">{"".join(drawn)}</svg>'
+        f'viewBox="0 0 {whole[0]} {whole[1]}" width="{whole[0] // 10}" font-family="sans-serif" '
+        f'style="max-width:100%;background:#fff">{"".join(drawn)}</svg>'
     )
 
 

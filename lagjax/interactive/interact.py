@@ -225,9 +225,9 @@ class Knobs:
             def with_choices(point):
                 return run({name: x for name, x in point.items() if name != NONE} | chosen)
 
-            axes = axes_of({name: x[None] for name, x in numbers.items()}, False)
+            axes, device = axes_of({name: x[None] for name, x in numbers.items()}, False), jax.local_devices()[:1]
             one = with_choices if chosen or NONE in numbers else run
-            self._programs[key], _ = program_for(one, axes, 1, jax.local_devices()[:1], LAYOUTS[1], progress=self._progress)
+            self._programs[key], _ = program_for(one, axes, 1, device, LAYOUTS[1], progress=self._progress)
         return self._programs[key]
 
     def _repr_mimebundle_(self, **options):
@@ -239,9 +239,8 @@ class Knobs:
         at = [f"{_in_words(item)} ({words(self._controls[item[0]])})" for item in self.point.items()]
         lines = [f"Knobs: {', '.join(at)}"] + ([] if self.ok else [f"  not ok: {self.status}"])
         how = ", ".join(f"{name}=..." for name in self._controls)
-        return "\n".join(
-            [*lines, f'  in a notebook these are sliders; here: knobs.set({how}), knobs.result, knobs.save("picture.png")']
-        )
+        here = f'here: knobs.set({how}), knobs.result, knobs.save("picture.png")'
+        return "\n".join([*lines, f"  in a notebook these are sliders; {here}"])
 
 
 def _in_words(item):

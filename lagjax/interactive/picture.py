@@ -48,7 +48,8 @@ class Picture:
                 )
                 axis.set(xlabel=panel.across, ylabel=panel.label)
                 if len(panel.curves) > 1:
-                    axis.legend(handles=self._lines[-1][:MOST_CURVES], fontsize=8, frameon=False, loc="center left", bbox_to_anchor=(1.0, 0.5))
+                    beside = {"loc": "center left", "bbox_to_anchor": (1.0, 0.5)}
+                    axis.legend(handles=self._lines[-1][:MOST_CURVES], fontsize=8, frameon=False, **beside)
             if not panels:
                 self.axes[0].set_axis_off()
         stays, anew = self._background is not None, self._fresh
@@ -103,10 +104,11 @@ class Picture:
     def _new(self, panels):
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
+        from matplotlib.layout_engine import ConstrainedLayoutEngine
 
         height = (PANEL + 0.8 if panels == 1 else PANEL * panels) + WORDS
-        self.figure = Figure(figsize=(WIDTH, height), dpi=DPI, layout="constrained")
-        self.figure.get_layout_engine().set(rect=(0, 0, 1, 1 - WORDS / height))
+        layout = ConstrainedLayoutEngine(rect=(0, 0, 1, 1 - WORDS / height))
+        self.figure = Figure(figsize=(WIDTH, height), dpi=DPI, layout=layout)
         self._canvas = FigureCanvasAgg(self.figure)
         self.axes = self.figure.subplots(panels, 1, squeeze=False)[:, 0]
         for axis in self.axes:

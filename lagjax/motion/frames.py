@@ -36,7 +36,7 @@ def film(
 def film_of_lanes(
     trajs: list, positions: Callable, seconds: float | None, rate: float, trail: float, by_event: Sequence[bool]
 ) -> tuple[np.ndarray, dict[str, np.ndarray], int]:
-    """The frames of several trajectories (None: of a lane without one) at the same times, as `animation.film` takes them.
+    """The frames of several trajectories (None: of a lane without one) at shared times, as `animation.film` takes them.
 
     A motion that ends before the others stays where it ended; one that does not come to three outputs is NaN.
     """

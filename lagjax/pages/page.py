@@ -1,15 +1,15 @@
 """A page that works by itself: HTML, the numbers that it shows, and the scripts that show them, in one file.
 
-Numbers travel as base64 of little-endian arrays in a JSON text, which the scripts (`*.js` beside this file) decode: four
-bytes become five and a third characters. No script asks for anything from outside.
+Numbers travel as base64 of little-endian arrays in a JSON text, which the scripts (`*.js` beside this file) decode:
+three bytes become four characters. No script asks for anything from outside.
 """
 
 import hashlib
 import html
 import json
 import math
-from importlib.resources import files
 from base64 import b64encode
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -51,7 +51,9 @@ class Page:
         return self.html
 
     def __repr__(self):
-        return f"{self.words}, {in_bytes(len(self.html))}: works in a notebook, and with .save(\"page.html\") in a browser"
+        return (
+            f'{self.words}, {in_bytes(len(self.html))}: works in a notebook, and with .save("page.html") in a browser'
+        )
 
 
 def whole(title: str, body: str) -> str:
@@ -62,8 +64,8 @@ def whole(title: str, body: str) -> str:
 def fragment(body: str, spec: dict[str, Any], scripts: tuple[str, ...], last: str = "") -> str:
     """HTML with its numbers and scripts, for a page or a notebook's cell.
 
-    **Arguments:** `body`: what is there before a script runs; `spec`: what the scripts are told, as JSON; `scripts`: the
-    names of files beside this one, in the order in which they build on each other; `last`: a line of script after them.
+    **Arguments:** `body`: what is there before a script runs; `spec`: what the scripts are told, as JSON; `scripts`: files
+    beside this one, in the order in which they build on each other; `last`: a line of script after them.
     """
     beside = files(__package__)
     data = json.dumps(spec, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")

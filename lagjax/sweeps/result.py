@@ -163,8 +163,8 @@ class Sweep:
         >>> import jax.numpy as jnp
         >>> import lagjax as lj
         >>> swept = lj.sweep(lambda point: {"height": point["v"] ** 2 / 20}, {"v": jnp.arange(3.0)}, progress=False)
-        >>> swept.to_html()
-        Page of 3 points, v (3), 20 kB: works in a notebook, and with .save("page.html") in a browser
+        >>> swept.to_html()  # doctest: +ELLIPSIS
+        Page of 3 points, v (3), ... kB: works in a notebook, and with .save("page.html") in a browser
 
         It shows how the chosen point went, in words; of values with one number a point the number, and a curve over the
         axis that was moved last; of a `Trajectory` its curves against time; of arrays their columns, against the array
@@ -180,7 +180,8 @@ class Sweep:
 
         **Raises:** `ValueError` where there is nothing to draw, or more than the page may hold.
         """
-        flat = jax.tree.map(lambda x: np.asarray(x).reshape(self.axes.size, *x.shape[len(self.axes.shape) :]), self.values)
+        in_front = lambda x: np.asarray(x).reshape(self.axes.size, *np.shape(x)[len(self.axes.shape) :])
+        flat = jax.tree.map(in_front, self.values)
         codes, of_film = self.status.result.reshape(-1), {"seconds": seconds, "rate": rate, "trail": trail}
         page = page_of(self.axes, flat, codes, _words, positions, megabytes, of_film)
         if path is not None:

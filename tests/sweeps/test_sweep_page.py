@@ -39,7 +39,7 @@ def array(text, dtype, *shape):
 
 
 def test_the_values_of_every_lane(swept):
-    """Numbers to all digits, curves in single precision, in the order of the sweep; times that differ with each lane."""
+    """Numbers to all digits, curves in single precision, in the order of the sweep; each lane with its own times."""
     page = told(swept.to_html().html)
     assert [axis["name"] for axis in page["axes"]] == ["a", "b"] and page["start"] == [1, 2]
     assert page["axes"][1]["labels"] == ["-1", "0", "4", "9"] and page["axes"][0]["at"] == [1.0, 2.0, 3.0]
@@ -72,12 +72,13 @@ def test_what_failed_and_what_is_left_out_in_words(swept):
 
 
 def test_paired_axes_and_slices_have_one_slider():
-    """Axes that move together are one slider, whose places say all; an axis of slices counts them; booleans are words."""
+    """Axes that move together are one slider, whose places say all; slices are counted; booleans are words."""
     axes = {"a": np.array([1.0, 2.5]), "w": np.eye(2)}
     together = lj.sweep(lambda p: p["a"] * p["w"][0], axes, paired=True, progress=False).to_html()
     (slider,) = told(together.html)["axes"]
     assert slider["labels"][1] == "a = 2.5, w of shape (2,)" and slider["name"] == "point"
-    grid = lj.sweep(lambda p: p["c"] * p["w"][0], {"w": np.eye(2), "c": np.array([False, True])}, progress=False).to_html()
+    axes = {"w": np.eye(2), "c": np.array([False, True])}
+    grid = lj.sweep(lambda p: p["c"] * p["w"][0], axes, progress=False).to_html()
     of_slices, of_switch = told(grid.html)["axes"]
     assert of_slices["labels"] == ["no. 0 of shape (2,)", "no. 1 of shape (2,)"]
     assert of_switch["labels"] == ["False", "True"] and of_switch["at"] == [0, 1]
@@ -114,7 +115,7 @@ def test_films_of_all_lanes():
     fall = lj.System(lambda t, q, v, params: 0.5 * v**2 / jnp.where(params["g"] > 0, 1.0, 0.0) - params["g"] * q)
     ground = {"ground": lj.Crossing(lambda t, q, v, params: q)}
     ts = np.linspace(0.0, 2.0, 41)
-    drop = lambda point: lj.integrate(fall, 2.0, 0.0, {"g": point["g"]}, ts=ts, events=ground, throw=False)
+    drop = lambda point: lj.integrate(fall, 2.0, 0.0, {"g": point["g"]}, ts=ts, events=ground, method=lj.Tsit5())
     swept = lj.sweep(drop, {"g": np.array([-1.0, 0.5, 4.0])}, progress=False)
     page = swept.to_html(positions=lambda t, q, params: (0.0, q), seconds=2.0, rate=10.0)
     spec = told(page.html)
