@@ -90,6 +90,8 @@ if TYPE_CHECKING:
     from lagjax.interactive.interact import Knobs, interact
 
 
+__version__ = "0.2.0"
+
 # What is imported when it is first asked for, by its module.
 LATER = {
     "lagjax.analysis.branches": "Branch Branches Critical",
