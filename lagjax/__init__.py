@@ -90,6 +90,8 @@ if TYPE_CHECKING:
     # In and out.
     from lagjax.exchange.exported import export, result_codes
     from lagjax.exchange.from_sympy import from_sympy
+    # Many motions, in a notebook.
+    from lagjax.interactive.interact import Knobs, interact
 
 
 __version__ = "0.2.0"
@@ -115,6 +117,7 @@ LATER = {
     "lagjax.analysis.symmetry": "SymmetryTest is_symmetry",
     "lagjax.exchange.exported": "export result_codes",
     "lagjax.exchange.from_sympy": "from_sympy",
+    "lagjax.interactive.interact": "Knobs interact",
 }
 
 
@@ -213,6 +216,8 @@ __all__ = [
     "Sweep",
     "Status",
     "open_sweep",
+    "interact",
+    "Knobs",
     "fit",
     "Record",
     "Fit",
