@@ -19,9 +19,10 @@ from lagjax.jax_internals.one_function import TOGETHER
 from lagjax.meter import meter
 from lagjax.motion.trajectory import RESULTS
 from lagjax.sweeps.axes import axes_of
-from lagjax.sweeps.blocks import block_of, compare_versions
-from lagjax.sweeps.fingerprint import check_file_names, named_leaves
-from lagjax.sweeps.lanes import LAYOUTS, NOT_RUN, STATUS_TYPES, Status
+from lagjax.sweeps.blocks import Filling, begun, compare_versions, together
+from lagjax.sweeps.fingerprint import check_file_names
+from lagjax.sweeps.labels import labels_of
+from lagjax.sweeps.lanes import LAYOUTS, not_run
 from lagjax.sweeps.memory import check_memory
 from lagjax.sweeps.remembered import program_for
 from lagjax.sweeps.result import Stored, Sweep
@@ -124,8 +125,9 @@ def sweep(
         chunk = _length(grid.size, workers, CHUNK.get(platform, CHUNK["gpu"]))
     engine = _Engine(run, grid, chunk, workers, sort, layout, devices, progress)
     if store is not None:
-        check_file_names("axis", list(grid.names))
-        check_file_names("value", [name for name, _ in named_leaves(engine.program.values)])
+        labels = labels_of(grid, engine.program.values)
+        check_file_names("axis", labels.axes)
+        check_file_names("value", [label.name for label in labels.values.values()])
     check_memory(grid, engine.program, workers, store, devices)
     if store is None:
         return _in_memory(engine, np.arange(grid.size), None)
@@ -264,7 +266,7 @@ def _replaced(found, places, others):
 
 def _in_memory(engine, indices, before):
     started, axes = time.perf_counter(), engine.axes
-    values, status = _not_run(engine.program, axes.size) if before is None else jax.tree.map(np.copy, before)
+    values, status = not_run(engine.program, axes.size) if before is None else jax.tree.map(np.copy, before)
     done = 0
     with _meter(len(indices), engine.progress) as shown:
         try:
@@ -295,34 +297,23 @@ def _in_memory(engine, indices, before):
     return Sweep(axes, values, status, engine.words, done, compiling, seconds, again)
 
 
-def _not_run(program, count):
-    """Room for the values and statuses of some points: NaN, or 0 in numbers that have none."""
-    nothing = lambda x: np.nan if np.issubdtype(x.dtype, np.inexact) else 0
-    values = jax.tree.map(lambda x: np.full((count, *x.shape), nothing(x), x.dtype), program.values)
-    fills = (NOT_RUN, 0, np.nan, np.nan)
-    return values, Status(*(np.full(count, fill, dtype) for fill, dtype in zip(fills, STATUS_TYPES)))
-
-
 def _in_store(engine, axes, path, part, accept_versions):
     started = time.perf_counter()
-    block = None if path.exists() else block_of(engine, axes, CHUNKS_EACH * part[1])
-    store = open_store(path, axes, engine.program, engine.layout, block, part, accept_versions)
+    of_new = lambda: begun(engine, axes, CHUNKS_EACH * part[1])
+    store = open_store(path, axes, engine.program, engine.layout, part, accept_versions, of_new)
     compare_versions(engine, store)
     k, n = part
     missing = [number for number in store.missing().tolist() if number % n == k]
-    length = lambda number: store.points(number).stop - store.points(number).start
+    length = lambda number: store.blocks.points(number).stop - store.blocks.points(number).start
     done = 0
     with _meter(sum(map(length, missing)), engine.progress) as shown:
         try:
-            for number in missing:
-                indices = np.r_[store.points(number)]
-                values, status = _not_run(engine.program, len(indices))
-                for places, found, how in engine.over(indices):
-                    for whole, some in zip(jax.tree.leaves((values, status)), jax.tree.leaves((found, how))):
-                        whole[places] = some
+            for numbers in together(engine, store, missing):
+                filling = Filling(engine, store, numbers)
+                for places, values, status in engine.over(filling.indices):
+                    filling.take(places, values, status)
                     shown.update(len(places))
-                store.write(number, values, status)
-                done += len(indices)
+                done += len(filling.indices)
         except KeyboardInterrupt:
             # A block that was written in this moment is there, too.
             done = sum(map(length, set(missing) - set(store.missing().tolist())))

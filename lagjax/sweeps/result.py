@@ -11,11 +11,13 @@ from jaxtyping import PyTree
 
 from lagjax import plot
 from lagjax.mechanics import coordinates
-from lagjax.motion.trajectory import Trajectory, in_words
+from lagjax.motion.trajectory import Trajectory
+from lagjax.sweeps import exported
 from lagjax.sweeps.axes import POINT, Axes
 from lagjax.sweeps.fingerprint import in_words as versions_in_words
 from lagjax.sweeps.fingerprint import named_leaves, versions
-from lagjax.sweeps.lanes import LOST, NOT_RUN, TRUSTED, Status
+from lagjax.sweeps.labels import words_of
+from lagjax.sweeps.lanes import LOST, TRUSTED, Status
 from lagjax.sweeps.metadata import restore
 from lagjax.sweeps.store import Store, nothing, tell
 
@@ -78,7 +80,7 @@ class Sweep:
     def counts(self) -> dict[str, int]:
         """How many points went which way, in words, the most frequent first."""
         codes, counts = np.unique(self.status.result, return_counts=True)
-        return {_words(codes[i]): int(counts[i]) for i in np.argsort(-counts)}
+        return {words_of(codes[i]): int(counts[i]) for i in np.argsort(-counts)}
 
     def resweep(self, run: Callable | None = None, where=None) -> "Sweep":
         """Run the points that are not `ok` again, with another `run` (other settings), and keep the rest.
@@ -94,28 +96,35 @@ class Sweep:
     def to_xarray(self):
         """Values, statuses and axes as an `xarray.Dataset`, with dimensions and coordinates by name.
 
-        The outputs of a `Trajectory` have the dimension `t`, where all points share their times.
+        The outputs of a `Trajectory` have the dimension `t`, where all points share their times. `result` says in its
+        attributes what its numbers mean (`flag_values`, `flag_meanings`). A value that is named like an axis has
+        `value_` in front. A store has the same names: `xarray.open_zarr(path)`.
 
         **Raises:** `ImportError` without xarray; `ValueError` for two values of one name.
         """
-        try:
-            import xarray
-        except ImportError as error:
-            raise ImportError('this needs xarray, an optional extra.\nFix: pip install "lagjax[data]"') from error
-        coords, variables = self._coordinates(), {}
-        for name, dims, x in self._labelled(coords):
-            # An axis of that name is a coordinate.
-            free = f"value_{name}" if name in coords else name
-            if free in variables:
-                raise ValueError(f"two of the values are named '{name}'.\nFix: another key in what run returns.")
-            variables[free] = ((*self.dims, *dims), x)
-        for name, x in zip(Status._fields, self.status):
-            variables[f"status_{name}" if name in variables else name] = (tuple(self.dims), x)
-        dataset = xarray.Dataset(variables, coords)
-        codes = np.unique(self.status.result)
-        dataset["result"].attrs = {"flag_values": codes.tolist(), "flag_meanings": [_words(code) for code in codes]}
-        dataset.attrs = {"how": self.how}
-        return dataset
+        return exported.dataset(self)
+
+    def to_pandas(self, values: Callable | None = None):
+        """A `pandas.DataFrame` with a row a point: the axes, what `run` returned, how the point went.
+
+        >>> import numpy as np
+        >>> import lagjax as lj
+        >>> run = lambda point: {"sum": point["a"] + point["b"], "both": point["a"] * np.array([1.0, 10.0])}
+        >>> swept = lj.sweep(run, {"a": np.array([1.0, 2.0]), "b": np.array([0.5])}, progress=False)
+        >>> print(swept.to_pandas().drop(columns=["steps", "scaled_error", "residual"]))
+             a    b  sum  both[0]  both[1]      result
+        0  1.0  0.5  1.5      1.0     10.0  successful
+        1  2.0  0.5  2.5      2.0     20.0  successful
+
+        Rows are in the order of the points, the last axis fastest. An array of a point has a column a number, up to
+        100; `result` is categorical, in words.
+
+        **Arguments:** `values`: a function of `swept.values` that returns what to show in their place, each with the
+        axes in front: `lambda values: {"end": values.q[..., -1]}`. Of trajectories that is asked for.
+
+        **Raises:** `ImportError` without pandas; `ValueError` where a point has more than a row has room for.
+        """
+        return exported.frame(self, values)
 
     def plot(self, value: str | Callable | None = None):
         """Draw values over the axes: lines over one, a map over two, a map for each value of the first over three.
@@ -172,34 +181,6 @@ class Sweep:
             )
         return numbers
 
-    def _coordinates(self):
-        if self.axes.paired:
-            return {name: ((POINT, *_inner(name, x)), x) for name, x in self.axes.values.items()}
-        flat = {name: x for name, x in self.axes.values.items() if x.ndim == 1}
-        slices = {f"{name}_values": ((name, *_inner(name, x)), x) for name, x in self.axes.values.items() if x.ndim > 1}
-        return flat | slices
-
-    def _labelled(self, coords):
-        """Every array as (name, dimensions behind the axes, values); shared times become a coordinate."""
-        found, values = [], self.values
-        lead = len(self.axes.shape)
-        for path, part in jax.tree_util.tree_leaves_with_path(values, is_leaf=lambda x: isinstance(x, Trajectory)):
-            key = jax.tree_util.keystr(path, simple=True, separator=".")
-            if not isinstance(part, Trajectory):
-                found.append((key or "value", tuple(_inner(key or "value", part, lead)), part))
-                continue
-            under = f"{key}." if key else ""
-            times = part.t[self.status.result != NOT_RUN]
-            t = f"{under}t"
-            if len(times) and np.all(times == times[0]):
-                coords[t] = times[0]
-            else:
-                found.append((f"{under}times", (t,), part.t))
-            for leaf_path, x in jax.tree_util.tree_leaves_with_path({"q": part.q, "v": part.v, **part.multipliers}):
-                name = under + jax.tree_util.keystr(leaf_path, simple=True, separator=".")
-                found.append((name, (t, *_inner(name, x, lead + 1)), x))
-        return found
-
     def __repr__(self):
         size, steps = self.axes.size, self.status.steps.reshape(-1)
         dims = " x ".join(f"{name} ({n})" for name, n in self.dims.items())
@@ -236,16 +217,8 @@ class Sweep:
         return shown
 
 
-def _inner(name, x, lead=1):
-    return [f"{name}_{i}" for i in range(np.ndim(x) - lead)]
-
-
 def _without_motion(part):
     return None if isinstance(part, Trajectory) else part
-
-
-def _words(code):
-    return {NOT_RUN: "not run", LOST: "lost from the store"}.get(int(code)) or in_words(code)
 
 
 def open_sweep(path: str | os.PathLike) -> Sweep:
@@ -294,7 +267,7 @@ class Stored:
         values, lost = self.store.values(self._like)
         where, new = known.copy(), []
         for number, wrong in lost.items():
-            here = self.store.points(number)
+            here = self.store.blocks.points(number)
             new += [] if known[here].all() else [wrong]
             where[here] = True
         if new:
