@@ -33,7 +33,7 @@ LAYERS = (
 TOP = {"__init__", "__main__", "job"}
 FINDER = doctest.DocTestFinder()
 PRIVATE = ("jax._src", "jax.experimental", "jax.extend", "jax.interpreters", "jaxlib")
-OPTIONAL = {"google_crc32c", "matplotlib", "tqdm", "xarray", "zarr"}
+OPTIONAL = {"google_crc32c", "matplotlib", "pandas", "tqdm", "xarray", "zarr"}
 
 
 def layer(module):

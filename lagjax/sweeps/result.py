@@ -54,10 +54,6 @@ class Sweep:
         self.how, self.ran, self.compiling, self.seconds = how, ran, compiling, seconds
         self._values, self._again = values, again
 
-    def __getstate__(self):
-        # What ran it is a compiled program, which stays where it was compiled.
-        return self.__dict__ | {"_again": _cannot}
-
     @property
     def dims(self) -> dict[str, int]:
         """The dimensions and their lengths."""
@@ -241,13 +237,22 @@ def open_sweep(path: str | os.PathLike) -> Sweep:
     how = f"from {path}" + (f", of which {len(missing)} blocks are missing" if missing else "")
     if (by := store.about["fingerprint"]["versions"]) != versions():
         how += f", written by {versions_in_words(by)}"
-    return Sweep(axes, Stored(store, None), status, how, 0, 0.0, 0.0, _cannot)
+    return Sweep(axes, Stored(store, None), status, how, 0, 0.0, 0.0, opened)
 
 
-def _cannot(swept, run, indices):
+def opened(swept, run, indices):
+    """What runs points of an opened sweep again: nothing."""
     raise ValueError(
-        "a sweep that was opened from its store, or copied, does not know what ran it.\n"
+        "a sweep that was opened from its store does not know what ran it.\n"
         "Fix: lj.sweep(run, axes, store=path), which computes what is missing; without a store lj.sweep(run, axes)."
+    )
+
+
+def of_store(swept, run, indices):
+    """What runs points of a sweep in a store again: nothing."""
+    raise ValueError(
+        "what is in a store belongs to the run that it was begun with.\n"
+        "Fix: lj.sweep(other, axes of what failed, paired=True), or a sweep without a store."
     )
 
 
