@@ -176,8 +176,6 @@ class Elsewhere(NamedTuple):
 
 
 def _again(swept, engine, which):
-    if len(which) == 0:
-        return swept
     lead = len(swept.axes.shape)
     flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[lead:]), (swept.values, swept.status))
     there, here = shapes_of(swept.values, lead), shapes_of(engine.program.values, 0)

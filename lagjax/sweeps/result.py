@@ -87,7 +87,8 @@ class Sweep:
         **Returns:** a new `Sweep`, in memory.
         """
         where = ~self.ok if where is None else np.broadcast_to(np.asarray(where, bool), self.axes.shape)
-        return self._again(self, run, np.flatnonzero(where.reshape(-1)))
+        which = np.flatnonzero(where.reshape(-1))
+        return self._again(self, run, which) if len(which) else self
 
     def to_xarray(self):
         """Values, statuses and axes as an `xarray.Dataset`, with dimensions and coordinates by name.
@@ -257,10 +258,20 @@ def of_store(swept, run, indices):
 
 
 class Stored:
-    """The values of a store, read when asked for; `like` has the shapes of one point."""
+    """The values of a store, read when asked for; `like` has the shapes of one point. In a pickle it is a path."""
 
-    def __init__(self, store: Store, like: PyTree):
-        self.store, self._like = store, like
+    def __init__(self, store: Store | Path, like: PyTree):
+        self._store, self._like = store, like
+
+    def __reduce__(self):
+        return Stored, (Path(os.path.abspath(self.store.path)), self._like)
+
+    @property
+    def store(self) -> Store:
+        """The store, opened when it is first needed."""
+        if isinstance(self._store, Path):
+            self._store = Store(self._store, "r")
+        return self._store
 
     @property
     def like(self) -> Any:
