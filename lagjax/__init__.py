@@ -87,6 +87,8 @@ if TYPE_CHECKING:
     from lagjax.analysis.symmetry import SymmetryTest, is_symmetry
 
 
+__version__ = "0.2.0"
+
 # What is imported when it is first asked for, by its module.
 LATER = {
     "lagjax.analysis.branches": "Branch Branches Critical",
