@@ -177,7 +177,7 @@ class Elsewhere(NamedTuple):
 
 def _again(swept, engine, which):
     lead = len(swept.axes.shape)
-    flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[lead:]), (swept.values, swept.status))
+    flat = jax.tree.map(lambda x: x.reshape(swept.axes.size, *x.shape[lead:]), (swept.values, swept.status))
     there, here = shapes_of(swept.values, lead), shapes_of(engine.program.values, 0)
     if there != here:
         raise ValueError(

@@ -8,7 +8,7 @@ import numpy as np
 from lagjax.motion.trajectory import Trajectory
 from lagjax.sweeps.fingerprint import named_leaves
 from lagjax.sweeps.labels import Labels, labels_of, shared_times, status_attributes, words_of
-from lagjax.sweeps.lanes import NOT_RUN, Status
+from lagjax.sweeps.lanes import Status
 
 # Columns of one array of a point.
 MOST_COLUMNS = 100
@@ -23,13 +23,12 @@ def dataset(swept: Any):
     values = swept.values
     labels, lead = _labels(swept, values), tuple(swept.dims)
     coords = {label.name: (label.dims, swept.axes.values[name]) for name, label in labels.axes.items()}
-    variables = {}
+    variables, there = {}, swept.status.result >= 0
     for key, x in named_leaves(values):
         label = labels.values.get(key)
         if label is None:
             continue
-        run = swept.status.result != NOT_RUN
-        shared = shared_times(x, len(lead), run) if label.times and len(label.dims) == 1 else None
+        shared = shared_times(x, there) if label.times and len(label.dims) == 1 else None
         if shared is None:
             variables[label.name] = ((*lead, *label.dims), x)
         else:
@@ -55,7 +54,7 @@ def frame(swept: Any, of_values):
     for key, x in named_leaves(values):
         label = labels.values.get(key)
         if label is not None:
-            columns |= _columns(label.name, np.asarray(x).reshape(-1, *np.shape(x)[len(shape) :]))
+            columns |= _columns(label.name, np.asarray(x).reshape(swept.axes.size, *np.shape(x)[len(shape) :]))
     for field, x in zip(Status._fields, swept.status):
         columns[labels.status[field].name] = x.reshape(-1)
     result = labels.status["result"].name

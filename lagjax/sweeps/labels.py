@@ -1,8 +1,9 @@
 """Names for what a sweep has, the same in xarray, in pandas and in a store: variables, dimensions, flags.
 
 An array that `run` returns is named by its path, `end.q`; "value" where it is alone. Its dimensions are those of the
-sweep, and behind them its own, `end.q_0`. Of a trajectory the coordinates, velocities and multipliers are shown, over
-the times `t`; what else it consists of has no name here. A name that is taken gets `value_` or `status_` in front.
+sweep, and behind them its own, `end.q_0`. Of a trajectory the outputs are shown, over the times `t`, their errors, its
+end, events and parameters, named as by `Trajectory.to_xarray`; what else it consists of has no name here. A name that
+is taken gets `value_` or `status_` in front.
 """
 
 from collections.abc import Iterable
@@ -18,8 +19,8 @@ from lagjax.sweeps.lanes import LOST, NOT_RUN, Status
 
 # What a store keeps beside them.
 KEPT_FREE = "lagjax"
-# What a trajectory shows, and the times of it all.
-SHOWN, TIMES = ("q", "v", "multipliers"), "t"
+# The times of a trajectory, and where among its arrays its parameters are.
+TIMES, PARAMS = "t", 1
 OF_STATUS = Status(
     "how each point went",
     "steps of all integrations of a point",
@@ -61,7 +62,7 @@ def labels_of(axes: Axes, like: PyTree) -> Labels:
         status[field] = Label(_free(field, "status", taken), ())
         taken.add(status[field].name)
     for part in shown:
-        dims = *part.dims, *inner_dims(names[part.key], part.inner)
+        dims = *part.dims, *inner_dims(part.of or names[part.key], part.inner)
         values[part.key] = Label(names[part.key], tuple(_apart(dim, taken) for dim in dims), part.times)
     return Labels(of_axes, values, status)
 
@@ -92,34 +93,61 @@ def _free(name, kind, taken):
 
 def _apart(dim, taken):
     while dim in taken:
-        dim = f"of_{dim}"
+        dim = f"value_{dim}"
     return dim
 
 
 class _Part(NamedTuple):
-    """An array among values: its leaf, its name before others are looked at, its dimensions with the last `inner`."""
+    """An array among values: its leaf; its name before others are looked at; its dimensions, the last `inner` of them
+    named after `of`, or after itself.
+    """
 
     key: str
     name: str
     dims: tuple[str, ...]
     inner: int
+    of: str = ""
     times: bool = False
 
 
 def _shown(like) -> Iterable[_Part]:
     for path, part in _with_path(like):
-        key = keyed(path)
-        if not isinstance(part, Trajectory):
-            yield _Part(key or "value", _flat(key or "value"), (), len(part.shape))
-            continue
-        under = f"{key}." if key else ""
-        lanes = len(part.t.shape) - 1
-        dims = tuple(_flat(dim) for dim in (*inner_dims(f"{under}lane", lanes), f"{under}{TIMES}"))
-        yield _Part(f"{under}{TIMES}", _flat(f"{under}times"), dims, 0, True)
-        for leaf, x in _with_path({name: getattr(part, name) for name in SHOWN}):
-            name = keyed(leaf)
-            shown = _flat(under + name.removeprefix("multipliers."))
-            yield _Part(under + name, shown, dims, len(x.shape) - lanes - 1)
+        key = keyed(path) or "value"
+        if isinstance(part, Trajectory):
+            yield from _of_motion(part, f"{key}." if keyed(path) else "")
+        else:
+            yield _Part(key, _flat(key), (), len(part.shape))
+
+
+def _of_motion(motion, under):
+    """What a trajectory shows, as its own `to_xarray` names it."""
+    batch = inner_dims(f"{under}lane", len(motion.t.shape) - 1)
+    dims = *batch, f"{under}{TIMES}"
+
+    def part(key, name, dims, x, of="", times=False):
+        inner, flat = len(x.shape) - len(dims), tuple(map(_flat, dims))
+        return _Part(under + key, _flat(under + name), flat, inner, _flat(under + of) if of else "", times)
+
+    yield part("t", "times", dims, motion.t, times=True)
+    errors = {} if motion.error is None else {f"error.{name}": getattr(motion.error, name) for name in ("q", "v")}
+    for which, tree in {"q": motion.q, "v": motion.v, **errors}.items():
+        for path, x in _with_path(tree):
+            inner = keyed(path)
+            yield part(_joined(which, inner), _joined(which, inner), dims, x, inner or "q")
+    for name, x in motion.multipliers.items():
+        yield part(f"multipliers.{name}", name, dims, x, name)
+    if hasattr(motion, "phase"):
+        yield part("phase", "phase", dims, motion.phase)
+    yield part("end.t", "end", batch, motion.end.t)
+    for name, found in motion.events.items():
+        yield part(f"events.{name}.t", f"events.{name}", (*batch, f"{under}crossing_of_{name}"), found.t)
+    for path, x in _with_path(motion.arrays[PARAMS]):
+        inner = keyed(path)
+        yield part(_joined(f"arrays.{PARAMS}", inner), _joined("params", inner), batch, x)
+
+
+def _joined(which, inner):
+    return f"{which}.{inner}" if inner else which
 
 
 def _flat(name):
@@ -154,7 +182,7 @@ def words_of(code) -> str:
     return {NOT_RUN: "not run", LOST: "lost from the store"}.get(int(code)) or in_words(code)
 
 
-def shared_times(x: np.ndarray, lead: int, run: np.ndarray):
-    """The times (..., T) that all points have that were run; None where they differ, or none was run."""
-    times = x.reshape(-1, *x.shape[lead:])[run.reshape(-1)]
+def shared_times(x: np.ndarray, there: np.ndarray):
+    """The times that all points have of which there are values; None where they differ, or there is none."""
+    times = x[there]
     return times[0] if len(times) and np.all(times == times[0]) else None

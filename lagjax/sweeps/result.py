@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Callable
+from copy import copy
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ from jaxtyping import PyTree
 from lagjax import plot
 from lagjax.mechanics import coordinates
 from lagjax.motion.trajectory import Trajectory
-from lagjax.sweeps import exported
+from lagjax.sweeps import exported, structures
 from lagjax.sweeps.axes import POINT, Axes
 from lagjax.sweeps.fingerprint import in_words as versions_in_words
 from lagjax.sweeps.fingerprint import named_leaves, versions
@@ -53,6 +54,26 @@ class Sweep:
         self.status = Status(*(x.reshape(axes.shape) for x in status))
         self.how, self.ran, self.compiling, self.seconds = how, ran, compiling, seconds
         self._values, self._again = values, again
+
+    def __copy__(self):
+        same = object.__new__(Sweep)
+        same.__dict__.update(self.__dict__)
+        return same
+
+    def __deepcopy__(self, memo):
+        # Of what is no array nothing changes: structures, systems, what ran it.
+        same, values = copy(self), self._values
+        same.axes, same.status = (jax.tree.map(np.copy, x) for x in (self.axes, self.status))
+        same._values = values if isinstance(values, Stored) else jax.tree.map(np.copy, values)
+        return same
+
+    def __getstate__(self):
+        values = self._values
+        return self.__dict__ | {"_values": values if isinstance(values, Stored) else structures.Travelling.of(values)}
+
+    def __setstate__(self, state):
+        values = state["_values"]
+        self.__dict__ = state | {"_values": values if isinstance(values, Stored) else values.unpacked()}
 
     @property
     def dims(self) -> dict[str, int]:
@@ -218,15 +239,21 @@ def _without_motion(part):
     return None if isinstance(part, Trajectory) else part
 
 
-def open_sweep(path: str | os.PathLike) -> Sweep:
-    """Open the sweep in a store, without what ran it: its values are a dictionary by name.
+def open_sweep(path: str | os.PathLike, *, run: Callable | None = None, system: Any = None) -> Sweep:
+    """Open the sweep in a store: its values have the structure of what `run` returned, trajectories included.
 
     Any version of lagjax, jax and diffrax may have written it. Statuses are read now, values when they are asked for.
     A file that is missing, cut off or of another block is seen now, without reading the values; one that has changed
     inside, when they are read. Either is told by name, and from then on its points are "lost from the store" in
     `status`, and not `ok`; `lj.sweep(run, axes, store=path)` computes them again.
 
-    **Raises:** `ValueError` where there is no store, or nothing can be told of it.
+    **Arguments:** functions are not stored, so that a trajectory does not know its system. It plots and plays all the
+    same; what else it needs one for (`print`, `drift()`) it has with `system`, the one that was integrated, or with
+    `run`, the function that was swept, which is traced for it and not run.
+
+    **Raises:** `ValueError` where there is no store, nothing can be told of it, or `run` returns something else than
+    it has. Of a store in an earlier format, and of values of classes that cannot be found, `values` is a dictionary by
+    name.
     """
     path = Path(path)
     if wrong := restore(path):
@@ -238,7 +265,8 @@ def open_sweep(path: str | os.PathLike) -> Sweep:
     how = f"from {path}" + (f", of which {len(missing)} blocks are missing" if missing else "")
     if (by := store.about["fingerprint"]["versions"]) != versions():
         how += f", written by {versions_in_words(by)}"
-    return Sweep(axes, Stored(store, None), status, how, 0, 0.0, 0.0, opened)
+    like = structures.as_run_returns(run, axes, store) if run is not None else structures.as_stored(store, system)
+    return Sweep(axes, Stored(store, like), status, how, 0, 0.0, 0.0, opened)
 
 
 def opened(swept, run, indices):
@@ -264,7 +292,8 @@ class Stored:
         self._store, self._like = store, like
 
     def __reduce__(self):
-        return Stored, (Path(os.path.abspath(self.store.path)), self._like)
+        like = None if self._like is None else structures.Travelling.of(self._like)
+        return _stored, (Path(os.path.abspath(self.store.path)), like)
 
     @property
     def store(self) -> Store:
@@ -291,3 +320,7 @@ class Stored:
         for x in jax.tree.leaves(values):
             x[where] = nothing(x.dtype)
         return values, where
+
+
+def _stored(path, like):
+    return Stored(path, None if like is None else like.unpacked())

@@ -125,7 +125,7 @@ class Store:
         """The values of a block, each (points, ...)."""
         here, lead = self.blocks.region(number), len(self.blocks.shape)
         found = [np.asarray(self.arrays[name][here]) for name in self._values.values()]
-        return [x.reshape(-1, *x.shape[lead:]) for x in found]
+        return [x.reshape(math.prod(x.shape[:lead]), *x.shape[lead:]) for x in found]
 
     def _damage(self, number, mark, read):
         for name, (length, checksum) in zip(self.arrays, mark.tolist()):
@@ -226,7 +226,7 @@ class Store:
     def _read(self, name):
         """(all of an array, each point in a row; the numbers of the blocks that cannot be read)."""
         found, unreadable = _read(self.arrays[name], self.blocks.region, len(self.blocks))
-        return found.reshape(-1, *found.shape[len(self.blocks.shape) :]), unreadable
+        return found.reshape(self.size, *found.shape[len(self.blocks.shape) :]), unreadable
 
     def one(self) -> dict[str, jax.ShapeDtypeStruct]:
         """The shapes of one point's values by name, without reading any."""

@@ -73,7 +73,7 @@ def test_a_function_without_a_name():
     found = WAYS["pickle"](lambdas)
     same(found, lambdas)
     with pytest.raises(
-        ValueError, match="what ran this sweep, <lambda>, could not be pickled(.|\n)*Fix: swept.resweep"
+        ValueError, match="what ran this sweep, <lambda>, could not be pickled(.|\n)*swept.resweep"
     ):
         found.resweep(where=True)
     assert found.resweep(product, where=True).ran == 12
