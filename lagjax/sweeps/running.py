@@ -30,7 +30,7 @@ MAX_STEPS = int(RESULTS.max_steps_reached._value)
 class Engine:
     """A compiled program and how it is called.
 
-    It takes motions for regular, which compiles in two thirds of the time: the careful program is compiled when a point
+    It takes motions for regular, which compiles in two thirds of the time: the robust program is compiled when a point
     turns out to need it.
     """
 
@@ -39,7 +39,7 @@ class Engine:
         self.workers, self.sort, self.layout, self.devices = workers, sort, layout, devices
         self.progress = progress
         self._patience = PATIENCE if layout == "vmap" else None
-        self.program, seconds = self._program(careful=False, progress=progress)
+        self.program, seconds = self._program(robust=False, progress=progress)
         # Before anything runs, and since then.
         self._compiling = [seconds, 0.0]
         self._lock, self._one, self._slow = threading.Lock(), None, None
@@ -63,9 +63,9 @@ class Engine:
         chunk = chunk_length(count, self.workers, self.chunk)
         return Engine(run, self.axes, chunk, self.workers, self.sort, self.layout, self.devices, self.progress)
 
-    def _program(self, careful, progress=False):
+    def _program(self, robust, progress=False):
         chunk, devices, layout = self.chunk, self.devices, self.layout
-        return program_for(self.run, self.axes, chunk, devices, layout, self._patience, careful, progress)
+        return program_for(self.run, self.axes, chunk, devices, layout, self._patience, robust, progress)
 
     def seconds_of(self, indices):
         """The seconds of computing at no more than `chunk` indices."""
@@ -76,16 +76,16 @@ class Engine:
     def first(self, indices):
         """(values, status) at no more than `chunk` indices, as the programs of many lanes have them."""
         if self.program.irregular.is_set():
-            return self._carefully(indices)
+            return self._robustly(indices)
         values, status, settled = self._called(self.program, indices)
         if settled is None or settled.all():
             return values, status
         if np.mean(~settled) > MOSTLY:
             self.program.irregular.set()
-        return _replaced((values, status), ~settled, self._carefully(indices[~settled]))
+        return _replaced((values, status), ~settled, self._robustly(indices[~settled]))
 
-    def _carefully(self, indices):
-        return self._called(self._careful, indices)[:2]
+    def _robustly(self, indices):
+        return self._called(self._robust, indices)[:2]
 
     def _called(self, program, indices):
         return program.call(self.axes.at(np.resize(indices, self.chunk)), len(indices))
@@ -109,10 +109,10 @@ class Engine:
         return self._one
 
     @property
-    def _careful(self):
+    def _robust(self):
         with self._lock:
             if self._slow is None:
-                self._slow, seconds = self._program(careful=True)
+                self._slow, seconds = self._program(robust=True)
                 self._compiling[1] += seconds
         return self._slow
 
