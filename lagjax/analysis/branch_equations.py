@@ -96,9 +96,7 @@ def place_of(steady: Steady, along: str) -> Place:
             return Place(along, None, of.index(along))
     found = numbers_in(steady.params)
     if along not in found:
-        more = (
-            'and "v.psi" for the velocity of a cyclic coordinate psi that is held (with hold="momentum": "p.psi")'
-        )
+        more = 'and "v.psi" for the velocity of a cyclic coordinate psi that is held (with hold="momentum": "p.psi")'
         raise no_such_number(along, steady.params, more)
     return Place(along, found[along])
 

@@ -112,7 +112,9 @@ class Branches(eqx.Module):
             low, high = np.min(b.parameter), np.max(b.parameter)
             ends = self._number(low, 6), self._number(high, 6)
             span = f"{self.along} {ends[0]} to {ends[1]}" if ends[0] != ends[1] else f"{self.along} {ends[0]}"
-            lines.append(f"  {f'branch {i + 1}':<{width}}  {span:<19}  {stability_in_words(_verdicts(b))}; ends at {b.status}")
+            lines.append(
+                f"  {f'branch {i + 1}':<{width}}  {span:<19}  {stability_in_words(_verdicts(b))}; ends at {b.status}"
+            )
         if self.status != "all followed":
             lines.append(f"  {self.status}")
         return "\n".join(lines)

@@ -6,13 +6,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from lagjax.analysis.flow import flow_of
 from lagjax.analysis.guessing import Asked, guessed
 from lagjax.analysis.monodromy import Problem, problem_of, tolerance_of
 from lagjax.analysis.numbers_in import no_such_number, numbers_in
-from lagjax.analysis.flow import flow_of
 from lagjax.analysis.orbit import PeriodicOrbit, packed
 from lagjax.analysis.orbit_branch import CriticalOrbit, OrbitBranch
-from lagjax.analysis.orbit_critical import FoundOrbit, between
+from lagjax.analysis.orbit_critical import FoundOrbit, between, dips
 from lagjax.analysis.orbit_equations import (
     ENERGY,
     ENTRY,
@@ -36,7 +36,7 @@ DEPENDENT = 1e-7
 # A change of the logarithm of a drive's period that is none.
 CONSTANT = 1e-9
 # The motion has shrunk to rest where so little of it is left; periods so many times the first one grow without end.
-AT_REST, ENDLESS = 1e-3, 1e3
+AT_REST, HALF, ENDLESS = 1e-3, 0.5, 1e3
 
 
 def continue_orbits(
@@ -50,7 +50,7 @@ def continue_orbits(
     >>> orbit = lj.periodic_orbit(pendulum, (1.0, 0.0), 6.7, {"g": 1.0})
     >>> branch = lj.continue_orbits(orbit, along="q", to=2.0)
     >>> print(branch.period[jnp.array([0, -1])].round(9))
-    [6.699977278 8.349752927]
+    [6.699975656 8.349752927]
 
     **Arguments:**
 
@@ -90,8 +90,8 @@ def _check(orbit):
     if not isinstance(orbit, PeriodicOrbit):
         raise TypeError(
             f"lj.continue_orbits needs a periodic orbit, not {type(orbit).__name__}.\n"
-            'Fix: orbit = lj.periodic_orbit(system, (q, v), period, params), and lj.continue_orbits(orbit, along="...", '
-            "to=...)."
+            "Fix: orbit = lj.periodic_orbit(system, (q, v), period, params), and lj.continue_orbits(orbit, "
+            'along="...", to=...).'
         )
     if not is_eager() or coordinates.is_traced(orbit):
         raise TypeError(
@@ -123,8 +123,8 @@ def _along(along, orbit: PeriodicOrbit, problem: Problem) -> tuple[Along, Asked]
         raise no_such_number(along, problem.state.params, more)
     if not reasons.autonomous:
         raise ValueError(
-            f"along={along!r}: the system depends on time, so its orbits come one by one, and its period is that of the "
-            f"drive.\nFix: a number in the parameters, along={next(iter(numbers), 'omega')!r}."
+            f"along={along!r}: the system depends on time, so its orbits come one by one, and its period is that of "
+            f"the drive.\nFix: a number in the parameters, along={next(iter(numbers), 'omega')!r}."
         )
     if along != PERIOD and not reasons.energy:
         raise ValueError(
@@ -240,28 +240,50 @@ class _Follower:
         """What lies between two points, put into the path; why it ends, where it does."""
         tracer, name = self.tracer, self.tracer.frame.along.name
         if tracer.frame.asked.moves:
-            turned = tracer.guide.rate @ tracer.evaluated(after.z).guide.rate
             largest = max(point.seen.moves for point in path.points)
-            if turned < 0 or after.seen.moves < AT_REST * largest:
-                return f"a state of rest, near {name} = {_at_rest(path.points):.6g}"
+            shrinks = after.seen.moves < AT_REST * largest
+            if shrinks or tracer.guide.rate @ tracer.evaluated(after.z).guide.rate < 0:
+                if before.seen.moves < HALF * largest:
+                    return f"a state of rest, near {name} = {self._at_rest(path.points):.6g}"
+                # It begins and ends where the system rests.
+                return f"a period that grows without end, near {name} = {before.seen.parameter:.6g}"
         if after.seen.period > ENDLESS * float(tracer.frame.period):
             return f"a period that grows without end, near {name} = {after.seen.parameter:.6g}"
-        for found in between(tracer, before, after):
-            point = found.point
-            point.critical = len(self.found)
-            # Multipliers are 1 in size there: what is beside it counts.
-            point.growing = None
-            self.found.append(found)
-            path.points.append(point)
+        all_found, earlier = between(tracer, before, after), path.points[-2:-1]
+        self._put(path, all_found, before, after)
+        if not all_found and earlier and earlier[0].critical is None and before.critical is None:
+            self._put(path, dips(tracer, earlier[0], before, after), before, after)
         return None
 
+    def _put(self, path, all_found, before, after):
+        """Points between the last ones into the path, each in its place."""
+        place = len(path.points) - 1
+        along = self.tracer.weights * (after.z - before.z)
+        for found in all_found:
+            point = found.point if isinstance(found, FoundOrbit) else found
+            if isinstance(found, FoundOrbit):
+                point.critical = len(self.found)
+                # Multipliers are 1 in size there: what is beside it counts.
+                point.growing = None
+                self.found.append(found)
+            if along @ (point.z - before.z) < 0:
+                path.points.insert(place, point)
+                place += 1
+            else:
+                path.points.append(point)
 
-def _at_rest(points):
-    """The parameter at which the motion has no size, in whose square it changes."""
-    if len(points) < 2:
-        return points[-1].seen.parameter
-    (a, b), (m, n) = ([p.seen.parameter for p in points[-2:]], [p.seen.moves**2 for p in points[-2:]])
-    return b + (b - a) * n / (m - n) if m > n else b
+    def _at_rest(self, points):
+        """The parameter at which the motion has no size, in whose square it changes; a coordinate with the size itself.
+
+        What is nothing beside the range is round-off.
+        """
+        frame, b = self.tracer.frame, points[-1].seen
+        found, power = b.parameter, 1 if frame.along.kind == ENTRY else 2
+        if len(points) > 1:
+            a = points[-2].seen
+            m, n = a.moves**power, b.moves**power
+            found = b.parameter + (b.parameter - a.parameter) * n / (m - n) if m > n else found
+        return 0.0 if abs(found) < 1e-9 * float(frame.unit) else found
 
 
 def _result(orbit, problem, place, tracer, path, found, along, first, last) -> OrbitBranch:
@@ -271,16 +293,19 @@ def _result(orbit, problem, place, tracer, path, found, along, first, last) -> O
     trees = lambda rows: jax.tree.map(lambda *x: np.stack(x), *[jax.tree.map(np.asarray, unflatten(r)) for r in rows])
     n = len(coordinates.names(orbit.q))
     known = [i for i, p in enumerate(path.points) if p.growing is not None]
-    growing = [path.points[min(known, key=lambda j: (abs(j - i), -j))].growing if known else 1 for i in range(len(seen))]
+    nearest = [min(known, key=lambda j: (abs(j - i), -j)) for i in range(len(seen)) if known]
+    stable = np.array([path.points[j].growing == 0 for j in nearest] or [False] * len(seen))
     critical = [
-        CriticalOrbit(p_kind.kind, np.asarray(p.seen.parameter), np.asarray(p_kind.accuracy), i, p.seen.multipliers)
-        for i, p in enumerate(path.points) if p.critical is not None for p_kind in [found[p.critical]]
+        CriticalOrbit(
+            found[p.critical].kind, np.asarray(p.seen.parameter), np.asarray(found[p.critical].accuracy), i,
+            p.seen.multipliers,
+        ) for i, p in enumerate(path.points) if p.critical is not None
     ]  # fmt: skip
     cast = lambda x: np.asarray(x, tracer.dtype)
     return OrbitBranch(
         cast([s.parameter for s in seen]), cast([s.period for s in seen]), trees([s.nodes[0][:n] for s in seen]),
         trees([s.nodes[0][n:] for s in seen]), trees([s.low for s in seen]), trees([s.high for s in seen]),
-        np.array([count == 0 for count in growing]), np.stack([s.multipliers for s in seen]),
+        stable, np.stack([s.multipliers for s in seen]),
         np.stack([cast(s.nodes) for s in seen]), critical, _with_floats(orbit, problem), place, along, first, last,
         path.status,
     )  # fmt: skip

@@ -64,7 +64,7 @@ class Passage(NamedTuple):
 
 
 class Changes(NamedTuple):
-    """By how much the parameters (a tree like their floats, None elsewhere), the start and the span change, (k, ...)."""
+    """By how much parameters (a tree like their floats, None elsewhere), the start and the span change, (k, ...)."""
 
     params: PyTree
     t0: Float[Array, " k"]

@@ -8,6 +8,8 @@ from lagjax.analysis.orbit_tracer import OrbitTracer
 from lagjax.analysis.tracing import Point
 
 HALVINGS = 40
+# A function that is this small in the middle of three points, beside its ends, may be zero twice between them.
+DIPS, VERTICES = 0.3, 8
 
 
 class FoundOrbit(NamedTuple):
@@ -33,6 +35,44 @@ def between(tracer: OrbitTracer, a: Point, b: Point) -> list[FoundOrbit]:
     if a.growing is not None and b.growing is not None and a.growing != b.growing and not found:
         found.append(_torus(tracer, a, b))
     return [one for one in found if one is not None]
+
+
+def dips(tracer: OrbitTracer, a: Point, b: Point, c: Point) -> list[FoundOrbit | Point]:
+    """What becomes critical and ceases to be within two steps: the sides of a narrow tongue, and a point in it."""
+    for kind, of in (("branch point", lambda p: p.seen.plus), ("period doubling", lambda p: p.seen.minus)):
+        left, middle, right = of(a), of(b), of(c)
+        same = left * middle > 0 and middle * right > 0
+        if not (same and abs(middle) < DIPS * min(abs(left), abs(right))):
+            continue
+        lowest = _beyond_zero(tracer, a, b, c, of)
+        if lowest is not None:
+            sides = [_zero(tracer, a, lowest, kind, of), _zero(tracer, lowest, c, kind, of)]
+            return [one for one in (sides[0], lowest, sides[1]) if one is not None]
+    return []
+
+
+def _beyond_zero(tracer, a, b, c, of):
+    """A point between a and c where a function has another sign, by parabolas; None where it only comes near zero."""
+    length = lambda p, q: float(np.sqrt(tracer.weights @ (q.z - p.z) ** 2))
+    whole = length(a, b) + length(b, c)
+    x, f = [0.0, length(a, b) / whole, 1.0], [of(a), of(b), of(c)]
+    sign, tried = np.sign(f[0]), set(x)
+    for _ in range(VERTICES):
+        near = np.argsort(np.abs(np.array(x) - x[int(np.argmin(np.abs(f)))]))[:3]
+        (x0, x1, x2), (f0, f1, f2) = np.array(x)[near], np.array(f)[near]
+        slope, bend = (f1 - f0) / (x1 - x0), ((f2 - f1) / (x2 - x1) - (f1 - f0) / (x1 - x0)) / (x2 - x0)
+        if not np.isfinite(bend) or bend * sign <= 0:
+            return None
+        vertex = 0.5 * (x0 + x1) - slope / (2 * bend)
+        point = tracer.between(a, c, vertex) if 0 < vertex < 1 and vertex not in tried else None
+        if point is None:
+            return None
+        if of(point) * sign < 0:
+            return point
+        tried.add(vertex)
+        x.append(vertex)
+        f.append(of(point))
+    return None
 
 
 def _zero(tracer, a, b, kind, of) -> FoundOrbit | None:

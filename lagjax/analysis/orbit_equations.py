@@ -12,7 +12,7 @@ parameter μ. With the flow Φ of `flow.py`,
 f and z_0' are those of the last point of the branch (Poincaré's condition). A drive sets the period: T is that after
 which the accelerations at some times and a state off the motion are what they were before,
 
-    Σ_i d_i·(a(t_i + T; μ) - a(t_i; μ)) = 0,       d_i = ∂a/∂t(t_i + T_0; μ_0)
+    Σ_i d_i·(a(t_i + T; μ) - a(t_i; μ)) = 0,       t_i = t_0 + c_i T,      d_i = ∂a/∂t at the start
 
 These are more equations than unknowns where a conserved quantity makes some follow from others. Tangents by μ and
 `log T` are carried along the motion beside those by the state.
@@ -35,7 +35,6 @@ from lagjax.analysis.flow import Changes, Flow
 from lagjax.analysis.guessing import TURN, Asked
 from lagjax.analysis.numbers_in import Number
 from lagjax.analysis.trivial import Reasons, directions, orthonormal
-from lagjax.mechanics import coordinates
 from lagjax.mechanics.compiled import compiled
 
 # Times, in periods, at which a drive is looked at.
@@ -55,9 +54,8 @@ class Along(eqx.Module):
 
 
 class Drive(eqx.Module):
-    """Where a drive is looked at: times (i,), a state (2n,), and the rates there change by `slopes` (i, n)."""
+    """Where a drive is looked at: at a state (2n,), where the rates change by `slopes` (i, n) at the start."""
 
-    times: Float[Array, " i"]
     z: Float[Array, " 2n"]
     slopes: Float[Array, "i n"]
 
@@ -102,7 +100,7 @@ class OrbitFrame(eqx.Module):
         flow, value = self.flow, z[-1] * self.unit
         if self.along.number is not None:
             flow = replace(flow, params=self.along.number.put(flow.params, value))
-        nodes = z[:-2].reshape(self.parts, -1) * self.scale
+        nodes = z[:-2].reshape(self.parts, -1) * self.scale[None]
         return flow, nodes, self.period * jnp.exp(z[-2])
 
 
@@ -111,8 +109,8 @@ class Evaluated(NamedTuple):
 
     - `whole` (k, k): the monodromy matrix in tangent coordinates; `trivial` (r, k): orthonormal, what is 1 in it for
       reasons, of which `there` (r,) are.
-    - `guide`: of the next point. `moves`: how far the state would go in a period at its rate. `amplified`: the largest
-      entry of a frame. `apart`: how much a driven system is another one after the period.
+    - `guide`: of the next point. `amplified`: the largest entry of a frame. `apart`: how much a driven system is
+      another one after the period.
     """
 
     value: Float[Array, " R"]
@@ -122,7 +120,6 @@ class Evaluated(NamedTuple):
     trivial: Float[Array, "r k"]
     there: Bool[Array, " r"]
     guide: Guide
-    moves: Float[Array, ""]
     amplified: Float[Array, ""]
     apart: Float[Array, ""]
 
@@ -153,7 +150,7 @@ def orbit_at(frame: OrbitFrame, z, guide: Guide) -> Evaluated:
     whole, trivial, there = _monodromy(frame, flow, times[0], nodes[0], passed.frame[:, :, :size], length)
     return Evaluated(
         jnp.where(good, value, jnp.nan), jacobian, jnp.max(jnp.abs(value)), whole, trivial, there,
-        Guide(nodes[0] / scale, rate / jnp.where(length > 0, length, 1.0)), jnp.max(jnp.abs(rate)),
+        Guide(nodes[0] / scale, rate / jnp.where(length > 0, length, 1.0)),
         jnp.max(jnp.abs(passed.frame)), _apart(frame, flow, period),
     )  # fmt: skip
 
@@ -180,7 +177,7 @@ def _closing(frame, nodes, passed):
     count, (size, n) = frame.parts, (frame.scale.size, frame.turns.size)
     comes_back = np.concatenate([1.0 - np.array(frame.asked.relative, float), np.ones(n)])
     first = nodes[0] + jnp.concatenate([TURN * frame.turns, jnp.zeros_like(frame.turns)])
-    values = (passed.z - jnp.concatenate([nodes[1:], first[None]])) / frame.scale
+    values = (passed.z - jnp.concatenate([nodes[1:], first[None]])) / frame.scale[None]
     rows = jnp.zeros((count, size, count * size + 2), values.dtype)
     for j in range(count):
         after = (j + 1) % count
@@ -199,7 +196,7 @@ def _others(frame: OrbitFrame, z, guide):
     found = []
     if flow.rows:
         off = jax.vmap(flow.residual)(_times(frame, period), nodes)
-        found.append((off / frame.sizes).reshape(-1))
+        found.append((off / frame.sizes[None]).reshape(-1))
     first = nodes[0] / frame.scale
     if asked.moves:
         found.append((guide.rate @ (first - guide.z))[None])
@@ -230,7 +227,9 @@ def _changed(frame, flow, period):
     """By how much accelerations differ after a period, at the times of the drive."""
     drive = frame.drive
     at = lambda t: flow.rate(t, drive.z)[flow.size :] / frame.scale[flow.size :]
-    return jax.vmap(at)(drive.times + period) - jax.vmap(at)(drive.times)
+    # At the same phases whatever the period is.
+    times = frame.t + period * jnp.asarray(WATCHED_AT, period.dtype)
+    return jax.vmap(at)(times + period) - jax.vmap(at)(times)
 
 
 def drive_of(flow: Flow, t, z, period, scale) -> Drive:
@@ -239,7 +238,7 @@ def drive_of(flow: Flow, t, z, period, scale) -> Drive:
     times = t + period * jnp.asarray(WATCHED_AT, t.dtype)
     at = lambda t: flow.rate(t, aside)[flow.size :] / scale[flow.size :]
     slopes = jax.vmap(lambda t: jax.jvp(at, (t,), (jnp.ones_like(t),))[1])(times + period)
-    return Drive(times, aside, slopes)
+    return Drive(aside, slopes)
 
 
 def _apart(frame, flow, period):

@@ -28,7 +28,8 @@ ON_CIRCLE = 3.0
 class OrbitSeen(NamedTuple):
     """What a user sees of a point, and what is watched: χ₊ and χ₋, and whether a pair is about to leave the circle.
 
-    `low`, `high` (n,): the smallest and largest of each coordinate. `multipliers` (k,): the trivial ones first.
+    - `multipliers` (k,): the trivial ones first.
+    - `low`, `high` (n,): the smallest and largest of each coordinate; `moves`: the largest distance between these.
     """
 
     parameter: float
@@ -64,7 +65,7 @@ class OrbitTracer(Tracer):
     def evaluated(self, z) -> Evaluated:
         """What the flow says at a point; of the last one it is remembered."""
         z = z.astype(self.dtype)
-        key = z.tobytes() + np.asarray(self.guide.z).tobytes()
+        key = b"".join(np.asarray(x).tobytes() for x in (z, *self.guide))
         if self.kept is None or self.kept[0] != key:
             self.kept = key, jax.tree.map(np.asarray, orbit_at(self.frame, z, self.guide))
         return self.kept[1]
@@ -94,7 +95,7 @@ class OrbitTracer(Tracer):
         nodes = z[:-2].reshape(self.frame.parts, -1) * np.asarray(self.frame.scale)
         seen = OrbitSeen(
             z[-1] * self.unit, period, nodes, multipliers, low, high, plus if self.crosses else 1.0, minus,
-            self._pairs(left), float(found.moves),
+            self._pairs(left), float(np.max((high - low) / np.asarray(self.frame.scale)[: len(low)])),
         )  # fmt: skip
         return Point(z, jacobian, tangent, float(np.sign(seen.plus)), seen, growing, below)
 
@@ -104,7 +105,9 @@ class OrbitTracer(Tracer):
         reduced = self._without(found, found.whole)
         left = np.linalg.eigvals(reduced)
         left = left[np.argsort(np.abs(left - 1), kind="stable")][count:]
-        left = left[np.lexsort((-left.imag, -np.round(np.abs(left) / max(np.max(np.abs(left), initial=0.0), 1e-300), 9)))]
+        left = left[
+            np.lexsort((-left.imag, -np.round(np.abs(left) / max(np.max(np.abs(left), initial=0.0), 1e-300), 9)))
+        ]
         return np.concatenate([np.ones(count, complex), left.astype(complex)]), left.astype(complex)
 
     def _without(self, found, matrix):

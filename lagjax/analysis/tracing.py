@@ -32,6 +32,8 @@ INFINITY = 1e4
 CLOSED_WITHIN = 1e-3
 # A crossing that is none shows that a step went from one branch to another; steps that short do not.
 AGAIN, SHORT = "again", 1e-6
+# Values between which a zero is interpolated.
+INTERPOLATED = 6
 LOST = "the equations that followed from others where the branch starts do so no longer"
 
 
@@ -138,7 +140,7 @@ class Tracer(abc.ABC):
         """All about a point of a branch; in words what is wrong with it."""
         _, jacobian, off = self.at(z)
         # Compared with what is left of equations that are solved: these are of the size of one.
-        if off > self.eps**0.5 * self.size(z):
+        if off > self.noise**0.5 * self.size(z):
             return LOST
         return self.described(z, jacobian, self.tangent(jacobian, along))
 
@@ -218,21 +220,31 @@ class Tracer(abc.ABC):
         best, off, last, side = b, np.inf, np.inf, 0
         if not left * right < 0:
             return None
+        tried = [(left, a.z), (right, b.z)]
         for _ in range(60):
             share = low + (high - low) * (left / (left - right))
             # Neither end may stay where it is: its value counts half (Illinois).
             point = self.between(a, b, share) if low < share < high else None
             if point is None:
-                break
+                return self._interpolated(a, tried) or (best, off)
             value = of(point)
             off, last, best = abs(float((point.z - best.z)[-1])), off, point
             if value == 0 or max(off, last) < 4 * self.noise * self.size(point.z):
                 break
+            tried.append((value, point.z))
             if value * left > 0:
                 low, left, right, side = share, value, right / 2 if side < 0 else right, -1
             else:
                 high, right, left, side = share, value, left / 2 if side > 0 else left, 1
         return best, off
+
+    def _interpolated(self, a: Point, tried: list[tuple[float, np.ndarray]]) -> tuple[Point, float] | None:
+        """The point where a function is zero, from its values beside it: very near a crossing Newton's method fails."""
+        tried = sorted(tried, key=lambda one: abs(one[0]))[:INTERPOLATED]
+        zs = [_at_zero(tried[:count]) for count in (len(tried) - 1, len(tried))]
+        point = self.point(zs[-1], a.tangent)
+        off = abs(float((zs[1] - zs[0])[-1]))
+        return (point, off) if isinstance(point, Point) else None
 
     def at_edge(self, a: Point, b: Point) -> Point | None:
         """The point of the branch where the parameter is at the end of its range."""
@@ -251,3 +263,14 @@ class Tracer(abc.ABC):
         first, last = path.points[0], path.points[-1]
         off = np.sqrt(self.weights @ (last.z - first.z) ** 2)
         return bool(off < max(step, CLOSED_WITHIN) and (self.weights * first.tangent) @ last.tangent > 0.9)
+
+
+def _at_zero(tried):
+    """Neville's interpolation of z by the value of a function, at the value zero."""
+    values, zs = [value for value, _ in tried], [z for _, z in tried]
+    for gap in range(1, len(zs)):
+        zs = [
+            (values[i] * zs[i + 1] - values[i + gap] * zs[i]) / (values[i] - values[i + gap])
+            for i in range(len(zs) - 1)
+        ]
+    return zs[0]
