@@ -143,7 +143,7 @@ def test_functions_that_pickle_cannot_find():
 @pytest.mark.slow
 @pytest.mark.parametrize("stored", [False, True])
 def test_sweeps(stored, tmp_path):
-    """Values, statuses and words stay; what ran it does not go along, and is told."""
+    """Values, statuses and words stay; what ran it goes along, too, or is told."""
     store = tmp_path / "store" if stored else None
     swept = lj.sweep(at, {"k": np.array([1.0, 2.0])}, store=store, progress=False)
     for way in ("copy", "deepcopy", "pickle"):
@@ -151,8 +151,11 @@ def test_sweeps(stored, tmp_path):
         assert repr(found) == repr(swept) and found.ok.all()
         lane = lambda swept: jax.tree.map(lambda x: jnp.asarray(x[1]), swept.values["motion"])
         same(lane(found), lane(swept))
-    with pytest.raises(ValueError, match="or copied, does not know what ran it"):
-        found.resweep(where=True)
+    if stored:
+        with pytest.raises(ValueError, match="what is in a store belongs to the run"):
+            found.resweep(where=True)
+    else:
+        assert found.resweep(where=[True, False]).ran == 1
 
 
 @pytest.mark.slow

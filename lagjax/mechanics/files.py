@@ -64,9 +64,9 @@ def read(path: str | os.PathLike, kind: str) -> tuple[dict[str, Any], dict[str, 
 
 def _read(path, kind):
     if not zipfile.is_zipfile(path):
-        whole = path.read_bytes()[:4]
-        if whole[:2] != b"PK":
-            _raise_foreign(path, kind)
+        with open(path, "rb") as file:
+            if file.read(2) != b"PK":
+                _raise_foreign(path, kind)
         raise_damaged(path, "its end is missing")
     try:
         with zipfile.ZipFile(path) as entries:

@@ -57,7 +57,8 @@ def message(result) -> str:
     """A result in words."""
     if is_among(result, [RESULTS.event_occurred]):
         return "ended by its event"
-    return RESULTS[result]
+    # `RESULTS[result]` does not look up a NumPy number, as a lane of a sweep has it.
+    return RESULTS._index_to_message[int(result._value)]
 
 
 def in_words(code) -> str:
