@@ -55,28 +55,32 @@ def load_trajectory(path: str | os.PathLike, system: System | Hybrid | None = No
       works in float32; and for objects of a class that has not been imported.
     """
     said, arrays = files.read(path, "trajectory")
-    reader = Reader(arrays)
     try:
-        found = {name: reader.up(node) for name, node in said["trajectory"].items()}
+        known, of, fields, problem, how = _taken_apart(Reader(arrays), said["trajectory"])
     except (KeyError, TypeError, IndexError, StopIteration) as error:
         files.raise_damaged(path, f"what it says of itself is not whole ({error})", error)
     except ValueError as error:
         raise ValueError(f"{path} cannot be read: {error}") from error
-    known = UnknownSystem(**found["system"])
     if system is not None:
         check_same(system, known, path)
+    kept = known if system is None else each_phase(system, lambda phase: first_alike(phase, up_to_date(phase)))
+    fields["arrays"], fields["static"] = pack(kept, *problem, how)
+    return of(**fields)
+
+
+def _taken_apart(reader, nodes):
+    """(what is known of the system, the class, its fields, the parameters and what was asked, how it went)."""
+    found = {name: reader.up(node) for name, node in nodes.items()}
     fields = {name: found[name] for name in PLAIN}
     fields |= {"end": Snapshot(**found["end"]), "result": result_of_names(found["result"])}
     fields["events"] = {name: Crossings(**x) for name, x in found["events"].items()}
-    error = found["error"]
+    error, of = found["error"], Trajectory
     fields["error"] = None if error is None else Errors(**error | {"result": result_of_names(error["result"])})
-    of: type[Trajectory] = Trajectory
     if "phase" in found:
-        of, more = HybridTrajectory, found["switches"]
-        fields |= {"phase": found["phase"], "switches": _made(Switches, more)}
-    kept = known if system is None else each_phase(system, lambda phase: first_alike(phase, up_to_date(phase)))
-    fields["arrays"], fields["static"] = pack(kept, found["params"], Asked(**found["asked"]), How(**found["how"]))
-    return of(**fields)
+        of = HybridTrajectory
+        fields |= {"phase": found["phase"], "switches": _made(Switches, found["switches"])}
+    problem = found["params"], Asked(**found["asked"])
+    return UnknownSystem(**found["system"]), of, fields, problem, How(**found["how"])
 
 
 def check_same(system, known: UnknownSystem, path) -> None:
