@@ -1,6 +1,6 @@
 """The compiled program of a sweep: the values that its axes have at some points, to values and statuses.
 
-Lanes run together, under `vmap`, each with its own steps; on a CPU `integrate` takes 256 of them at a time. `"in turn"`
+Lanes run together, under `vmap`, each with its own steps; on a CPU `integrate` takes 256 of them at a time. `"map"`
 takes one after the other, which measures slower nearly everywhere (`benchmarks/sweep.py`), and needs the least memory.
 """
 
@@ -22,20 +22,20 @@ from lagjax.sweeps.axes import POINT, Axes
 from lagjax.sweeps.digests import program_digest
 
 NOT_RUN, LOST = -1, -2
-LAYOUTS = ("together", "in turn")
+LAYOUTS = ("vmap", "map")
 
 
 class Status(NamedTuple):
     """How each point went, arrays in the shape of the sweep.
 
     `result` is the code of a `RESULTS` item, -1 where the point was not run, -2 where it is lost from its store;
-    `steps` those of all its integrations; `departure` and `residual` the worst (`Trajectory`), 0 where nothing was
+    `steps` those of all its integrations; `scaled_error` and `residual` the worst (`Trajectory`), 0 where nothing was
     integrated.
     """
 
     result: Any
     steps: Any
-    departure: Any
+    scaled_error: Any
     residual: Any
 
 
@@ -49,7 +49,7 @@ class Program(NamedTuple):
     """A compiled program for `chunk` points: one point's shapes, the bytes that it works with, a digest of its text.
 
     `call(point, count)`: (values, status, settled) of no more than `chunk` points, as NumPy arrays; `point` has the
-    values of so many by axis. Points that are not settled belong to the careful program; None where this one is that.
+    values of so many by axis. Points that are not settled belong to the robust program; None where this one is that.
     `irregular` is set when most points turn out to belong there.
     """
 
@@ -90,18 +90,18 @@ def point_of(run: Callable) -> Callable:
 
 
 def compiled(
-    run: Callable, axes: Axes, chunk: int, devices: Sequence, layout: str, patience=None, careful=True
+    run: Callable, axes: Axes, chunk: int, devices: Sequence, layout: str, patience=None, robust=True
 ) -> Program:
     """Compile a sweep's program for chunks of some length, split between the devices.
 
     Of the axes only names, shapes and dtypes matter. With `patience`, motions in it are given up after so many steps.
-    Where not `careful`, they are taken for regular.
+    Where not `robust`, they are taken for regular.
     """
     point = point_of(run)
 
     def lanes(values):
         at = lambda values: point(dict(zip(axes.names, values)))
-        return jax.lax.map(at, values) if layout == "in turn" else jax.vmap(at)(values)
+        return jax.lax.map(at, values) if layout == "map" else jax.vmap(at)(values)
 
     function, placed = lanes, SingleDeviceSharding(devices[0])
     if len(devices) > 1:
@@ -111,7 +111,7 @@ def compiled(
     shaped = tuple(jax.ShapeDtypeStruct((chunk, *x.shape[1:]), x.dtype, sharding=placed) for x in axes.arrays)
     of_user = Call("run", run, (POINT,))
     check_arguments(of_user, "the axes taken one by one; a point is one dictionary")
-    with PATIENCE(patience), REGULAR_FIRST(not careful), in_words(of_user, {POINT: axes.values}):
+    with PATIENCE(patience), REGULAR_FIRST(not robust), in_words(of_user, {POINT: axes.values}):
         traced = jax.jit(function).trace(shaped)
     shapes, *_ = traced.out_info
     program = traced.lower().compile()
