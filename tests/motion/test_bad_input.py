@@ -129,6 +129,7 @@ def test_a_constraint_may_have_any_name():
         lj.integrate(system, {"x": 1.25, "y": 0.0}, {"x": 0.4, "y": 0.0}, PARAMS, ts=TS)
 
 
+@pytest.mark.exhaustive
 def test_unreachable_constraint():
     """No consistent state exists: the error gives the residual by name."""
     system = lj.System(rod_pendulum.lagrangian, {"ghost": lj.Holonomic(lambda t, q, params: q["x"] ** 2 + 1.0)})

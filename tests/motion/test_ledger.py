@@ -83,6 +83,7 @@ def test_drag_takes_what_the_closed_form_says():
     assert [text.get_text() for text in axis.get_legend().get_texts()] == ["dissipation", "change of h"]
 
 
+@pytest.mark.slow
 def test_the_wedge_takes_what_the_mass_gives():
     """The normal force does -W on the mass and +W on the wedge, W = ½ M Ẋ²; twin: pushing the other way, +W and -W."""
     traj = lj.integrate(
@@ -99,6 +100,7 @@ def test_the_wedge_takes_what_the_mass_gives():
     assert "by X" in repr(ledger) and "constraint 'incline'          0" in repr(ledger)
 
 
+@pytest.mark.slow
 def test_the_motor_pays_for_the_hoop():
     """The motor's work is ω ΔL_z, so that E - ω L_z stays: the Jacobi integral of the bead alone."""
     params = bead_on_hoop.PARAMS
@@ -114,6 +116,7 @@ def test_the_motor_pays_for_the_hoop():
     assert ledger.closes and not lj.energy_ledger(traj, flipped(bead_on_hoop.driven_system)).closes
 
 
+@pytest.mark.slow
 def test_time_and_velocities_that_are_prescribed():
     """A charge in a field that grows, x = t³/6: -∂L/∂t does -∫ x dt; a belt that speeds up drags a box along."""
     growing = lj.System(lambda t, q, v, params: 0.5 * v**2 + t * q)

@@ -119,7 +119,7 @@ OTHERS = [
     (diffrax.ReversibleHeun(), 2, (200, 400, 800)),
     (diffrax.HalfSolver(diffrax.Heun()), 2, (100, 200, 400)),
 ]
-marked = lambda cases, *marks: [pytest.param(*case, marks=marks) for case in cases]
+marked = lambda cases, mark: [pytest.param(*case, marks=mark) for case in cases]
 name_of = lambda value: type(value).__name__ if isinstance(value, diffrax.AbstractSolver) else None
 
 

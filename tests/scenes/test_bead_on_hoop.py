@@ -15,6 +15,7 @@ from lagjax.report import relative_error
 from lagjax.scenes import bead_on_hoop as scene
 from lagjax.scenes.elliptic import agm, jacobi_elliptic
 from tests.references import keys, reference
+from tests.tiers import exhaustive_but
 
 SLOW, FAST, CRITICAL = scene.PARAMS | {"omega": 2.5}, scene.PARAMS, scene.CRITICAL
 STATE = (1.25, -2.0)
@@ -331,7 +332,7 @@ def test_reverse_gradient_of_state():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("derivative", [jax.jacfwd, jax.jacrev])
+@pytest.mark.parametrize("derivative", exhaustive_but((jax.jacrev,), (jax.jacfwd, jax.jacrev)))
 def test_gradient_of_torque(derivative):
     """So do the driven bead's state and the motor's torque, in both modes; the torque's explicit ω is in it."""
     exact = _check_gradient(derivative, _driven_final)

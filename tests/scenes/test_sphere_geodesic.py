@@ -166,7 +166,7 @@ def test_the_major_arc_is_a_saddle():
     assert float(geodesic.varied_length(np.pi, 0.1)) == pytest.approx(np.pi, abs=1e-4)
 
 
-@pytest.mark.parametrize("mode", [jax.jacrev, pytest.param(jax.jacfwd, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("mode", [jax.jacrev, pytest.param(jax.jacfwd, marks=pytest.mark.exhaustive)])
 def test_gradients_over_the_azimuth(mode):
     """∂ψ(1)/∂(ψ, ψ')(0) against the exact one to 1e-6."""
     ends = np.array([0.0, 1.0])
