@@ -32,6 +32,7 @@ def found():
     return compared()
 
 
+@pytest.mark.optimised
 def test_default_methods_and_their_orders(found):
     """The default of `integrate` comes first; each method shows its order; Tsit5's is not Dopri8's."""
     assert list(found.curves) == ["Nystrom12", "Dopri8", "Tsit5"]

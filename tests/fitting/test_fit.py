@@ -307,7 +307,7 @@ def test_outliers_priors_and_bounds(swinging):
     assert float(held.values[1]) == pytest.approx(1.3, abs=1e-5) and held.at_bounds() == ["l"]
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_outliers_from_far(swinging, monkeypatch):
     """With a wild value first, and others, a robust loss still gets from a bad guess to the truth."""
     rng = np.random.default_rng(2)

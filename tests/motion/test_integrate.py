@@ -210,7 +210,8 @@ def test_event_time_gradient():
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "method", [None, *(pytest.param(m, marks=pytest.mark.exhaustive) for m in (lj.Dopri8(), lj.Tsit5()))],
+    "method",
+    [None, *(pytest.param(m, marks=pytest.mark.exhaustive) for m in (lj.Dopri8(), lj.Tsit5()))],
     ids=["default", "8", "5"],
 )
 def test_float32_with_explicit_time(method):

@@ -221,7 +221,8 @@ def test_bad_input():
         lj.energy_ledger(3.0)
     with pytest.raises(TypeError, match="one that JAX is tracing"):
         jax.jit(lambda q0: lj.energy_ledger(of(q0)).closure)(1.0)
+    alone = of(1.0)
     with pytest.raises(ValueError, match="account for one lane"):
-        lj.energy_ledger(jax.vmap(of)(np.array([1.0, 2.0])))
+        lj.energy_ledger(jax.tree.map(lambda x: jnp.stack([x, x]), alone))
     with pytest.raises(TypeError, match="another one by a lj.System"):
-        lj.energy_ledger(of(1.0), lj.Hybrid({"falling": DRAGGED}))
+        lj.energy_ledger(alone, lj.Hybrid({"falling": DRAGGED}))

@@ -94,10 +94,13 @@ def bounced_by_formula(p):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("found, exact", [
+@pytest.mark.parametrize(
+    "found, exact",
+    [
         pytest.param(landed, landed_by_formula, marks=pytest.mark.exhaustive),
         (bounced, bounced_by_formula),
-    ])
+    ],
+)
 def test_at_a_crossing_that_moves(found, exact, monkeypatch):
     """Second derivatives of the time and state of a crossing, and through it; twin: of states at a time that stays."""
     p = jnp.array([4.0, 0.7])

@@ -273,7 +273,7 @@ def _driven(periods, tolerance):
     return integrate(scene.driven_system, *start, SLOW, ts=ts, rtol=tolerance, atol=tolerance)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_constraint_holds_for_twenty_periods():
     """The hoop's angle stays on ω t to 1e-12, and h = E - ω L_z is kept, where E itself is not."""
     trajectory = _driven(np.linspace(0.0, 20.3, 11), 1e-10)
@@ -325,7 +325,7 @@ def _check_gradient(derivative, function):
     return exact
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_reverse_gradient_of_state():
     """The final ψ and ψ̇, in reverse mode in m, a, g and ω, agree with the elliptic functions' gradient to 1e-6."""
     _check_gradient(jax.jacrev, _final)

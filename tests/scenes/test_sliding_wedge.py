@@ -193,7 +193,7 @@ def test_gradients(mode):
         np.testing.assert_allclose(got[name], exact[name], rtol=1e-6, err_msg=name)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_constraint_holds_for_a_thousand_drops():
     """Residuals stay below 1e-12, relative, while the particle slides for 1,000 times its first metre."""
     ts = np.linspace(0.0, 1000 * reference("s5.time to drop y=1"), 101)

@@ -145,7 +145,7 @@ def test_refused_cases():
     assert not geodesic._undetermined("", geodesic.ENDS).passed
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_thousand_turns():
     """1,000 turns leave the sphere by less than 1e-12, and the phase is off by no more than tolerances add up to."""
     case = geodesic._thousand_turns()

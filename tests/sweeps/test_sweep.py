@@ -90,6 +90,7 @@ def test_same_as_vmap_and_whoever_is_beside():
         assert_same(swept.values, other, 1e-10, 1e-12)
 
 
+@pytest.mark.slow
 def test_a_lane_that_fails_keeps_its_reason():
     """It is NaN, the others are what they are without it; run again with other settings it is filled in."""
     few = quiet(lambda point: swing(point, max_steps=22).q[-1])
