@@ -31,6 +31,7 @@ from lagjax.motion.explanation import Explanation, explain
 # isort: split
 # Motion.
 from lagjax.animation import Animation
+from lagjax.mechanics.single_precision import PrecisionWarning
 from lagjax.motion.contacts import releases, slips, sticks, touches
 from lagjax.motion.crossings import Crossing, Crossings, EventWarning
 from lagjax.motion.hybrid_trajectory import HybridTrajectory, Switches
@@ -90,6 +91,8 @@ if TYPE_CHECKING:
     from lagjax.exchange.exported import export, result_codes
     from lagjax.exchange.from_sympy import from_sympy
 
+
+__version__ = "0.2.0"
 
 # What is imported when it is first asked for, by its module.
 LATER = {
@@ -173,6 +176,7 @@ __all__ = [
     "Animation",
     "RESULTS",
     "AccuracyWarning",
+    "PrecisionWarning",
     "Generator",
     "noether_charge",
     "NoetherCharge",

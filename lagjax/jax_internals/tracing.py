@@ -18,7 +18,7 @@ with ThreadPoolExecutor(1) as _thread:
 WATCHED = jax.make_user_context(default_value=False)
 # Whether failures are told by their codes alone, in a program that has nobody to raise an error to.
 SILENT = jax.make_user_context(default_value=False)
-# Whether who watches runs again, with the careful way, what was taken for regular and is not.
+# Whether who watches runs again, with the robust way, what was taken for regular and is not.
 REGULAR_FIRST = jax.make_user_context(default_value=False)
 
 
