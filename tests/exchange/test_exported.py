@@ -154,6 +154,13 @@ REFUSED = {
     "a system": (lambda: lj.export(lambda system, x: x, pendulum, 1.0), "and not System"),
     "text": (lambda: lj.export(lambda x: x, {"a": "text"}), "and not str"),
     "text back": (lambda: lj.export(lambda x: {"a": "text"}, 1.0), "returned 'text', a str"),
+    "any number of times": (
+        lambda: lj.export(
+            lambda ts: lj.integrate(pendulum, 1.0, 0.0, PARAMS, ts=ts),
+            jax.ShapeDtypeStruct(export.symbolic_shape("n"), np.float64),
+        ),
+        "number of output times must be known .* is n",
+    ),
     "a print": (lambda: lj.export(prints, 1.0), "calls Python while it runs"),
     "a callback": (
         lambda: lj.export(lambda x: jax.pure_callback(np.sin, jax.ShapeDtypeStruct((), np.float64), x), 1.0),
