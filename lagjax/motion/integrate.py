@@ -24,6 +24,7 @@ from lagjax.motion import problem
 from lagjax.motion.arriving import WHOLE_STEPS
 from lagjax.motion.backward import in_either_direction, runs_backward
 from lagjax.motion.crossings import Crossing, crossings_of, guards_of, left_to_diffrax, warn_of_events
+from lagjax.motion.dense_output import at
 from lagjax.motion.failure import raise_failure
 from lagjax.motion.global_error import steps_to_repeat
 from lagjax.motion.no_lanes import raise_at_run_time
@@ -32,7 +33,9 @@ from lagjax.motion.reported import patient, report
 from lagjax.motion.slips import warn_of_odd_dissipation
 from lagjax.motion.solve import Settings
 from lagjax.motion.switching import each_phase, phases_in, refuse_beside_switches, starting
-from lagjax.motion.trajectory import ENDED_WELL, Trajectory, is_among
+from lagjax.motion.trajectory import BY_INTEGRATION, ENDED_WELL, Trajectory, is_among
+
+BY_INTEGRATION["at"] = at
 
 
 @by_name("lj.integrate(system, q0, v0, params, ts=ts)", "ts")
