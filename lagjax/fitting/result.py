@@ -1,5 +1,6 @@
 """The answer of a fit: estimates, how certain they are, and whether the residuals look like measurement errors."""
 
+import os
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
@@ -342,6 +343,16 @@ class Fit:
         size = np.maximum(np.abs(np.asarray(found.start)), 1e-300)
         near = (x - low < AT_BOUND * size) | (high - x < AT_BOUND * size)
         return [name for name, at in zip(self.names, near) if at]
+
+    def save(self, path: str | os.PathLike) -> None:
+        """Write the fit into a file, an npz; `lj.load_fit(path, system)` reads it, bit for bit.
+
+        Functions are not in it: the system, `observe`, and options that hold some. Whoever is stopped while it is
+        written leaves the file of before.
+
+        **Raises:** `TypeError` for what is no data in `params`, by name; `OSError` where there is no such folder.
+        """
+        save(self, path)
 
     def plot(self, record: int = 0):
         """Draw data, fit and residuals of a record, a row each channel; returns a matplotlib `Figure`."""
