@@ -62,8 +62,11 @@ def load_trajectory(path: str | os.PathLike, system: System | Hybrid | None = No
     except ValueError as error:
         raise ValueError(f"{path} cannot be read: {error}") from error
     known = UnknownSystem(**found["system"])
-    if system is not None:
-        check_same(system, known, path)
+    return trajectory_of(found, known if system is None else same_system(system, known, path))
+
+
+def trajectory_of(found: dict, kept: System | Hybrid | UnknownSystem) -> Trajectory:
+    """The trajectory that has these parts (`saving.parts`), and this system."""
     fields = {name: found[name] for name in PLAIN}
     fields |= {"end": Snapshot(**found["end"]), "result": result_of_names(found["result"])}
     fields["events"] = {name: Crossings(**x) for name, x in found["events"].items()}
@@ -73,9 +76,14 @@ def load_trajectory(path: str | os.PathLike, system: System | Hybrid | None = No
     if "phase" in found:
         of, more = HybridTrajectory, found["switches"]
         fields |= {"phase": found["phase"], "switches": _made(Switches, more)}
-    kept = known if system is None else each_phase(system, lambda phase: first_alike(phase, up_to_date(phase)))
     fields["arrays"], fields["static"] = pack(kept, found["params"], Asked(**found["asked"]), How(**found["how"]))
     return of(**fields)
+
+
+def same_system(system, known: UnknownSystem, path) -> System | Hybrid:
+    """The system that was integrated, which the user gives again; raise where it is another."""
+    check_same(system, known, path)
+    return each_phase(system, lambda phase: first_alike(phase, up_to_date(phase)))
 
 
 def check_same(system, known: UnknownSystem, path) -> None:
