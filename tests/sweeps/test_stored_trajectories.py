@@ -127,7 +127,7 @@ def test_labelled_with_the_axes_in_front(store):
     for name in ("q.x", "v.x", "end"):
         found = data[f"motion.{name}"].isel(k=2, x=0)
         np.testing.assert_array_equal(found, own[name])
-        assert tuple(dim.removeprefix("motion.") for dim in found.dims) == own[name].dims
+        assert tuple(str(dim).removeprefix("motion.") for dim in found.dims) == own[name].dims
 
 
 @pytest.mark.slow
