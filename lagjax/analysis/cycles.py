@@ -215,4 +215,5 @@ def _orbit(problem, found, asked) -> PeriodicOrbit:
     return PeriodicOrbit(
         jnp.asarray(s.t), unflatten(z[:n]), unflatten(z[n:]), found.place.period, unflatten(found.guess.turns),
         unflatten(shift), found.seen.size, found.converged, found.iterations, found.place.nodes, arrays, static,
+        asked,
     )  # fmt: skip

@@ -60,11 +60,24 @@ class System(eqx.Module):
                     f"Fix: pass the function itself, {role}=f, not its value f(...)."
                 )
         if constraints is not None and not isinstance(constraints, Mapping):
+            apart = callable(constraints) and not isinstance(constraints, Holonomic | Nonholonomic)
             raise TypeError(
                 f"constraints must be given by name, not as {type(constraints).__name__}.\n"
-                'Fix: constraints={"rod": lj.Holonomic(g)}.'
+                + ("Usual cause: kinetic and potential energy given apart.\n" if apart else "")
+                + 'Fix: constraints={"rod": lj.Holonomic(g)}'
+                + ("; L is one function, return kinetic - potential." if apart else ".")
             )
         for name, constraint in (constraints or {}).items():
+            if not isinstance(name, str):
+                raise TypeError(
+                    f'a constraint is named {name!r}, and its name must be text.\nFix: "{name}": lj.Holonomic(g).'
+                )
+            if isinstance(constraint, float | int):
+                raise TypeError(
+                    f"constraint '{name}' is a number.\n"
+                    "Usual cause: params in the place of constraints.\n"
+                    "Fix: lj.System(lagrangian); each call takes them, lj.integrate(system, q0, v0, params, ts=ts)."
+                )
             if not isinstance(constraint, (Holonomic, Nonholonomic)):
                 raise TypeError(
                     f"constraint '{name}' is {type(constraint).__name__}; its kind is missing.\n"

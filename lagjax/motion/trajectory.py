@@ -257,7 +257,7 @@ class Trajectory(eqx.Module):
         >>> start = {"x": 0.0, "y": 0.0}, {"x": 1.0, "y": 5.0}
         >>> traj = lj.integrate(stone, *start, {"g": 10.0}, ts=jnp.linspace(0.0, 1.0, 11))
         >>> traj.animate(lambda t, q, params: (q["x"], q["y"]))
-        Animation of 51 frames, 2 s, 5 kB: plays in a notebook, and with .save("motion.html") in a browser
+        Animation of 51 frames, 2 s, 8 kB: plays in a notebook, and with .save("motion.html") in a browser
 
         **Arguments:**
 

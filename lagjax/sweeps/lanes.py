@@ -15,7 +15,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec, SingleDeviceShardin
 from jaxtyping import PyTree
 
 from lagjax.jax_internals.tracing import REGULAR_FIRST
-from lagjax.mechanics.first_call import Call, check_arguments, in_words
+from lagjax.mechanics.in_words import Call, check_arguments, in_words
 from lagjax.motion.reported import PATIENCE, reporting
 from lagjax.motion.trajectory import ENDED_WELL, RESULTS, Trajectory
 from lagjax.sweeps.axes import POINT, Axes

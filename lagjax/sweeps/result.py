@@ -13,6 +13,7 @@ from jaxtyping import PyTree
 from lagjax import plot
 from lagjax.mechanics import coordinates
 from lagjax.motion.trajectory import Trajectory
+from lagjax.pages import Page
 from lagjax.sweeps import exported, structures
 from lagjax.sweeps.axes import POINT, Axes
 from lagjax.sweeps.fingerprint import in_words as versions_in_words
@@ -20,6 +21,7 @@ from lagjax.sweeps.fingerprint import named_leaves, versions
 from lagjax.sweeps.labels import words_of
 from lagjax.sweeps.lanes import LOST, TRUSTED, Status
 from lagjax.sweeps.metadata import restore
+from lagjax.sweeps.page import MOST_MEGABYTES, page_of
 from lagjax.sweeps.store import Store, nothing, tell
 
 COMPUTED_AGAIN = (
@@ -172,6 +174,46 @@ class Sweep:
                 "Fix: choose a part with swept.to_xarray().isel(...) and plot that."
             )
         return plot.maps(axes, panels)
+
+    def to_html(
+        self,
+        path: str | os.PathLike | None = None,
+        *,
+        positions: Callable | None = None,
+        seconds: float | None = None,
+        rate: float = 25.0,
+        trail: float = 2.0,
+        megabytes: float = MOST_MEGABYTES,
+    ) -> Page:
+        """Make a page with a slider for each axis, which works without Python and without a network.
+
+        >>> import jax.numpy as jnp
+        >>> import lagjax as lj
+        >>> swept = lj.sweep(lambda point: {"height": point["v"] ** 2 / 20}, {"v": jnp.arange(3.0)}, progress=False)
+        >>> swept.to_html()  # doctest: +ELLIPSIS
+        Page of 3 points, v (3), ... kB: works in a notebook, and with .save("page.html") in a browser
+
+        It shows how the chosen point went, in words; of values with one number a point the number, and a curve over the
+        axis that was moved last; of a `Trajectory` its curves against time; of arrays their columns, against the array
+        `t` beside them in a dictionary, or else their index.
+
+        **Arguments:**
+
+        - `path`: where to write the page; it can be written later, too: `page.save(path)`.
+        - `positions`, `seconds`, `rate`, `trail`: of a sweep of trajectories, a film as `Trajectory.animate` makes it.
+        - `megabytes`: how large the page may be.
+
+        **Returns:** a `Page`, which shows itself in a notebook.
+
+        **Raises:** `ValueError` where there is nothing to draw, or more than the page may hold.
+        """
+        in_front = lambda x: np.asarray(x).reshape(self.axes.size, *np.shape(x)[len(self.axes.shape) :])
+        flat = jax.tree.map(in_front, self.values)
+        codes, of_film = self.status.result.reshape(-1), {"seconds": seconds, "rate": rate, "trail": trail}
+        page = page_of(self.axes, flat, codes, _words, positions, megabytes, of_film)
+        if path is not None:
+            page.save(path)
+        return page
 
     def _plot_motions(self, motions):
         (name, x), *others = self.axes.values.items()
