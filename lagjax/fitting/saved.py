@@ -64,13 +64,12 @@ def load_fit(
             f"It has {', '.join(_short(role) for role in said['functions'])}."
         )
     try:
-        about = Reader(arrays).up(said["known"])
-        phase = about.pop("phase")
-        placeholder: Any = UnknownSystem(**about)
+        placeholder: Any = UnknownSystem(**Reader(arrays).up(said["known"]))
         if system is not None:
             check_same(system, placeholder, path)
-            alike = each_phase(system, lambda phase: first_alike(phase, up_to_date(phase)))
-            placeholder = replace_fields(alike, first=np.asarray(phase, np.int32)) if phase is not None else alike
+            alike = each_phase(system, lambda of: first_alike(of, up_to_date(of)))
+            phase = placeholder.phase
+            placeholder = alike if phase is None else replace_fields(alike, first=np.asarray(phase, np.int32))
         like = Reader(arrays).up(said["q"])
         known |= {"system": placeholder, "unflatten": unflatten_of(kinds(like))}
         known["first"] = placeholder if system is None else first_phase(placeholder)

@@ -18,7 +18,8 @@ def save(fit, path: str | os.PathLike) -> None:
     if coordinates.is_traced(fit):
         raise TypeError("this fit is being traced, and has no numbers yet.\nFix: save it outside of the program.")
     problem = fit.problem
-    roles = {id(problem.system): "system", id(problem.first): "first", id(problem.unflatten): "unflatten"}
+    # Of a motion without phases the first system is the system.
+    roles = {id(problem.first): "first", id(problem.system): "system", id(problem.unflatten): "unflatten"}
     if problem.observe is not None:
         roles[id(problem.observe)] = "observe"
     for name, value in problem.options.items():
@@ -42,11 +43,11 @@ def _is_data(value):
 def _described(fit) -> dict[str, Any]:
     system = fit.problem.system
     if isinstance(system, UnknownSystem):
-        return {name: getattr(system, name) for name in system.__dataclass_fields__} | {"phase": None}
+        return {name: getattr(system, name) for name in system.__dataclass_fields__}
     q, v = jax.tree.map(np.asarray, fit.starts()[0])
     params = jax.tree.map(np.asarray, fit.problem.params(fit.unknowns.shared, 0))
     t = np.asarray(np.asarray(fit.problem.windows.ts)[0, 0], jax.tree.leaves(q)[0].dtype)
     state = State(t, q, v, params)
     phase = int(system.first) if isinstance(system, Hybrid) else None
     about = {"words": repr(system), "angles": (), "signature": signature(system, state), "state": tuple(state)}
-    return about | {"phase": phase}
+    return about | {"starts": jax.tree.map(np.asarray, fit.known_starts()), "phase": phase}

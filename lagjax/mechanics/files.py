@@ -56,10 +56,17 @@ def read(path: str | os.PathLike, kind: str) -> tuple[dict[str, Any], dict[str, 
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"there is no file {path}.\nFix: the path that was given to .save(path).")
+    try:
+        return _read(path, kind)
+    except _Told as told:
+        raise ValueError(str(told)) from None
+
+
+def _read(path, kind):
     if not zipfile.is_zipfile(path):
-        whole = path.read_bytes()[:4]
-        if whole[:2] != b"PK":
-            _raise_foreign(path, kind)
+        with open(path, "rb") as file:
+            if file.read(2) != b"PK":
+                _raise_foreign(path, kind)
         raise_damaged(path, "its end is missing")
     try:
         with zipfile.ZipFile(path) as entries:

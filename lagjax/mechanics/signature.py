@@ -34,13 +34,16 @@ class UnknownSystem(eqx.Module):
     """In place of a system that was not given: what a file knows of it.
 
     - `words`: as it printed itself; `angles` (n,): which coordinates are angles.
-    - `signature`: what its functions said at `state`, by what they are.
+    - `signature`: what its functions said at `state`, by what they are. `starts`: where the motions of a fit start,
+    and `phase`: the number of the phase in which they do.
     """
 
     words: str = eqx.field(static=True)
     angles: tuple[bool, ...] = eqx.field(static=True)
     signature: dict[str, Array]
     state: PyTree
+    starts: PyTree = None
+    phase: int | None = eqx.field(static=True, default=None)
 
     def __repr__(self):
         return f"{self.words}, not given"

@@ -3,6 +3,7 @@
 import os
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -125,5 +126,5 @@ def result_of_names(said) -> RESULTS:
         if name not in RESULTS._name_to_item:
             raise ValueError(f"the result '{name}' is not known to this version of lagjax.")
         now[np.asarray(codes) == int(code)] = int(RESULTS._name_to_item[name]._value)
-    now = jnp.asarray(now) if eqx.is_array(codes) else now
+    now = jnp.asarray(now) if isinstance(codes, jax.Array) else now
     return eqx.tree_at(lambda r: r._value, item(RESULTS.successful, 0), now)
