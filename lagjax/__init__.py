@@ -39,6 +39,7 @@ from lagjax.motion.integrate import integrate
 from lagjax.motion.ledger import EnergyLedger, energy_ledger
 from lagjax.motion.phase_graph import HybridExplanation
 from lagjax.motion.replay import Replay
+from lagjax.motion.saved import load_trajectory
 from lagjax.motion.sections import PoincareSection, periods, poincare, turning_points
 from lagjax.motion.trajectory import RESULTS, AccuracyWarning, Snapshot, Trajectory
 from lagjax.numerics.nystrom import Nystrom8, Nystrom12
@@ -59,6 +60,7 @@ from lagjax.fitting.engine import fit
 from lagjax.fitting.identifiability import Identifiability
 from lagjax.fitting.records import Record
 from lagjax.fitting.result import Fit, FitWarning
+from lagjax.fitting.saved import load_fit
 
 # isort: split
 # Error against run time.
@@ -179,6 +181,7 @@ __all__ = [
     "HybridTrajectory",
     "Switches",
     "Snapshot",
+    "load_trajectory",
     "energy_ledger",
     "EnergyLedger",
     "Animation",
@@ -230,6 +233,7 @@ __all__ = [
     "Record",
     "Fit",
     "FitWarning",
+    "load_fit",
     "identifiability",
     "Identifiability",
     "learned",

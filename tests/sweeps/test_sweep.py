@@ -195,7 +195,9 @@ def test_whole_trajectories():
     data = swept.to_xarray()
     assert data["q"].dims == ("g", "angle", "t") and np.array_equal(data["t"], TS)
     np.testing.assert_array_equal(data["q"].sel(g=4.0).isel(angle=2, t=-1), swept.values.q[1, 2, -1])
-    assert data["result"].dims == ("g", "angle") and data["result"].attrs["flag_meanings"] == ["successful"]
+    flags = data["result"].attrs
+    assert data["result"].dims == ("g", "angle") and (data["result"] == OK).all()
+    assert dict(zip(flags["flag_values"], flags["flag_meanings"].split()))[OK] == "successful"
 
 
 def test_paired_and_labelled():
