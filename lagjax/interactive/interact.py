@@ -8,6 +8,7 @@ of a slider is drawn next: dragging leaves no queue.
 import html
 import threading
 import time
+from base64 import b64encode
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -233,7 +234,7 @@ class Knobs:
     def _repr_mimebundle_(self, **options):
         shown = dict(self.widget._repr_mimebundle_(**options) or {})
         # Where no widgets are shown (a hosted copy, a preview) the picture stands there.
-        return shown | {"text/plain": repr(self), "image/png": self.picture}
+        return shown | {"text/plain": repr(self), "image/png": b64encode(self.picture).decode()}
 
     def __repr__(self):
         at = [f"{_in_words(item)} ({words(self._controls[item[0]])})" for item in self.point.items()]

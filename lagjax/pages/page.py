@@ -64,8 +64,8 @@ def whole(title: str, body: str) -> str:
 def fragment(body: str, spec: dict[str, Any], scripts: tuple[str, ...], last: str = "") -> str:
     """HTML with its numbers and scripts, for a page or a notebook's cell.
 
-    **Arguments:** `body`: what is there before a script runs; `spec`: what the scripts are told, as JSON; `scripts`: files
-    beside this one, in the order in which they build on each other; `last`: a line of script after them.
+    **Arguments:** `body`: what is there before a script runs; `spec`: what the scripts are told, as JSON; `scripts`:
+    files beside this one, in the order in which they build on each other; `last`: a line of script after them.
     """
     beside = files(__package__)
     data = json.dumps(spec, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")

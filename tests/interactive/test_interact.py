@@ -6,6 +6,7 @@
 import builtins
 import re
 import threading
+from base64 import b64decode
 from collections.abc import Sized
 
 import jax
@@ -175,7 +176,7 @@ def test_several_at_once_are_one_picture(monkeypatch):
 def test_shows_itself(waves, tmp_path):
     """In a notebook the sliders, where there are none the picture, in a terminal what to do."""
     shown = waves.set(omega=3.0)._repr_mimebundle_()
-    assert "application/vnd.jupyter.widget-view+json" in shown and shown["image/png"] == waves.picture
+    assert "application/vnd.jupyter.widget-view+json" in shown and b64decode(shown["image/png"]) == waves.picture
     assert shown["text/plain"] == repr(waves)
     assert repr(waves).startswith("Knobs: omega = 3 (0 to 8)\n  in a notebook these are sliders; here: knobs.set(")
     waves.save(tmp_path / "picture.png")
