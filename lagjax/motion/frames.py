@@ -13,7 +13,7 @@ import jax
 import numpy as np
 
 from lagjax.animation import Animation
-from lagjax.mechanics.first_call import Call, check_arguments
+from lagjax.mechanics.in_words import Call, check_arguments
 
 # Without every other output the picture may be wrong by this share of its size: with all of them by a hundredth.
 MAY_MISS = 0.16
