@@ -92,6 +92,7 @@ if TYPE_CHECKING:
     # In and out.
     from lagjax.exchange.exported import export, result_codes
     from lagjax.exchange.from_sympy import from_sympy
+
     # Many motions, in a notebook.
     from lagjax.interactive.interact import Knobs, interact
 

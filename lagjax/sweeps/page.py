@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import PyTree
 
 from lagjax.animation import film
-from lagjax.mechanics.first_call import Call, check_arguments
+from lagjax.mechanics.in_words import Call, check_arguments
 from lagjax.motion.frames import film_of_lanes
 from lagjax.motion.trajectory import RESULTS, Trajectory
 from lagjax.pages import Page, encoded, fragment
@@ -16,6 +16,7 @@ from lagjax.pages.page import in_bytes
 from lagjax.plot import COLOURS
 from lagjax.sweeps.axes import POINT, Axes
 from lagjax.sweeps.drawn import Drawn, drawn
+from lagjax.sweeps.labels import words_of
 from lagjax.sweeps.lanes import NOT_RUN, TRUSTED
 
 # A number in base64: of one byte.
@@ -31,7 +32,6 @@ def page_of(
     axes: Axes,
     values: PyTree,
     codes: np.ndarray,
-    in_words: Callable[[int], str],
     positions: Callable | None,
     megabytes: float,
     of_film: dict[str, Any],
@@ -52,7 +52,7 @@ def page_of(
         "axes": _axes(axes),
         "start": [n // 2 for n in axes.shape],
         "status": encoded(codes, "i1"),
-        "words": {str(code): in_words(code) for code in np.unique(codes).tolist()},
+        "words": {str(code): words_of(code) for code in np.unique(codes).tolist()},
         "trusted": list(TRUSTED),
         "numbers": [{"name": name, "values": encoded(x, "f8")} for name, x in found.numbers.items()],
         "panels": [_panel(panel, codes) for panel in found.panels],
