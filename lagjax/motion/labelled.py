@@ -69,7 +69,7 @@ def dims_of(trajectory, dims: Sequence[str] | None = None) -> tuple[str, ...]:
     if len(dims) != count:
         raise ValueError(
             f"dims has {len(dims)} names, {', '.join(map(repr, dims))}, and this trajectory {count} axes in front of "
-            f'its outputs.\nFix: dims=({", ".join(f"{chr(34)}axis_{i}{chr(34)}" for i in range(count))}).'
+            f"its outputs.\nFix: dims=({', '.join(f'{chr(34)}axis_{i}{chr(34)}' for i in range(count))})."
         )
     return dims
 

@@ -72,9 +72,7 @@ def test_a_function_without_a_name():
     assert copy.deepcopy(lambdas).resweep(where=True).ran == 12
     found = WAYS["pickle"](lambdas)
     same(found, lambdas)
-    with pytest.raises(
-        ValueError, match="what ran this sweep, <lambda>, could not be pickled(.|\n)*swept.resweep"
-    ):
+    with pytest.raises(ValueError, match="what ran this sweep, <lambda>, could not be pickled(.|\n)*swept.resweep"):
         found.resweep(where=True)
     assert found.resweep(product, where=True).ran == 12
     assert found.resweep() is found, "there is nothing to run"
