@@ -7,7 +7,7 @@ const element = (parent, name, attributes = {}, text = null) => {
   return parent.appendChild(made);
 };
 const short = x => {
-  if (!Number.isFinite(x)) return "NaN";
+  if (!Number.isFinite(x)) return String(x);
   const size = Math.abs(x);
   return size !== 0 && (size < 1e-4 || size >= 1e6) ? x.toExponential(4) : String(+x.toPrecision(6));
 };

@@ -92,18 +92,28 @@ def _panel(panel, codes):
     ran = panel.x[codes != NOT_RUN]
     shared = len(ran) > 0 and np.array_equal(ran, np.broadcast_to(ran[0], ran.shape), equal_nan=True)
     x = ran[0] if shared else panel.x
-    curves = [{"name": name, "y": encoded(y, "f4")} for name, y in panel.curves.items()]
+    curves = [{"name": name, "y": encoded(y, _precision(y))} for name, y in panel.curves.items()]
     told = {"label": panel.label, "across": panel.across, "length": panel.x.shape[1]}
-    return told | {"x": encoded(x, "f4"), "curves": curves}
+    return told | {"x": encoded(x, _precision(x)), "curves": curves}
+
+
+def _precision(x):
+    """Single precision, where that shows what there is to see."""
+    there = x[np.isfinite(x)]
+    if there.size == 0:
+        return "f4"
+    largest, distance = np.max(np.abs(there)), np.max(there) - np.min(there)
+    return "f4" if (largest == 0 or 1e-30 < largest < 1e30) and not 0 < distance < 1e-3 * largest else "f8"
 
 
 def _check_size(axes, found: Drawn, megabytes):
-    curves = sum(y.size for panel in found.panels for y in panel.curves.values())
-    size = LONGER * (8 * axes.size * len(found.numbers) + 4 * curves)
+    curves = [y for panel in found.panels for y in panel.curves.values()]
+    numbers = len(found.numbers) + sum(y.size for y in curves) // axes.size
+    size = LONGER * (8 * axes.size * len(found.numbers) + sum(int(_precision(y)[1]) * y.size for y in curves))
     if size > 1e6 * megabytes:
         raise ValueError(
             f"the page would be larger than {in_bytes(size)}, and may have {megabytes:g} MB: {axes.size:,} points of "
-            f"{len(found.numbers) + curves // axes.size:,} numbers each.\n"
+            f"{numbers:,} numbers each.\n"
             "Fix: fewer points, or fewer times ts in run; or megabytes=..., for browsers with patience."
         )
 
