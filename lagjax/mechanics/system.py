@@ -6,6 +6,8 @@ from dataclasses import fields
 import equinox as eqx
 
 from lagjax.mechanics.constraints import Holonomic, Nonholonomic
+from lagjax.mechanics.memory import kinds, same
+from lagjax.mechanics.pickling import check_functions
 
 
 class System(eqx.Module):
@@ -28,6 +30,9 @@ class System(eqx.Module):
       `Q(t, q, v, multipliers, params)`, linear in these: it enters the equations that give them.
     - `dissipation`: Rayleigh's function `R(t, q, v, params)` -> scalar; its force is `-∂R/∂v`, so
       `R = ½ c v²` gives `-c v`.
+
+    Systems of the same functions are equal, and can be static arguments of `jax.jit`. They can be pickled where their
+    functions can: those that are defined with `def` in a module.
 
     **Raises:** `TypeError` where one of these is not a function or a constraint has no kind.
 
@@ -94,6 +99,26 @@ class System(eqx.Module):
         for field in fields(self):
             object.__setattr__(same, field.name, values if field.name == "read" else getattr(self, field.name))
         return same
+
+    def functions(self) -> dict[str, Callable | None]:
+        """The user's functions, each by what it is."""
+        of_constraints = {
+            f"{name} of constraint '{key}'": getattr(c, name)
+            for key, c in self.constraints.items()
+            for name in [field.name for field in fields(c)]
+        }
+        others = {"the force": self.force, "the dissipation": self.dissipation}
+        return {"the Lagrangian": self.lagrangian, **of_constraints, **others}
+
+    def __hash__(self):
+        return hash(kinds(self))
+
+    def __eq__(self, other):
+        return isinstance(other, System) and same(self, other)
+
+    def __reduce_ex__(self, protocol):
+        check_functions(self.functions())
+        return super().__reduce_ex__(protocol)
 
     def __repr__(self):
         parts = [_name(self.lagrangian)]

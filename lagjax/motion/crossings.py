@@ -27,6 +27,7 @@ from lagjax.mechanics.coordinates import State
 from lagjax.mechanics.in_words import Call, check_arguments, in_words
 from lagjax.mechanics.memory import is_array, kinds, remembered, shape_of
 from lagjax.mechanics.outside import first_guard_alike, read_by
+from lagjax.mechanics.pickling import check_functions
 from lagjax.mechanics.system import System
 from lagjax.mechanics.warned import warn
 
@@ -84,6 +85,10 @@ class Crossing(eqx.Module):
         self.direction = DIRECTIONS[direction]
         self.terminal = bool(terminal)
         self.most = 1 if terminal else most
+
+    def __reduce_ex__(self, protocol):
+        check_functions({"the guard of a crossing": self.guard})
+        return super().__reduce_ex__(protocol)
 
 
 class Crossings(eqx.Module):

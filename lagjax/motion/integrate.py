@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, PyTree
 
-from lagjax.jax_internals.tracing import WATCHED, is_eager
+from lagjax.jax_internals.tracing import SILENT, WATCHED, is_eager
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.closures import lift
 from lagjax.mechanics.first_call import looked_at, with_known_kinds
@@ -24,6 +24,7 @@ from lagjax.motion import problem
 from lagjax.motion.arriving import WHOLE_STEPS
 from lagjax.motion.backward import in_either_direction, runs_backward
 from lagjax.motion.crossings import Crossing, crossings_of, guards_of, left_to_diffrax, warn_of_events
+from lagjax.motion.dense_output import at
 from lagjax.motion.failure import raise_failure
 from lagjax.motion.global_error import steps_to_repeat
 from lagjax.motion.no_lanes import raise_at_run_time
@@ -32,7 +33,9 @@ from lagjax.motion.reported import patient, report
 from lagjax.motion.slips import warn_of_odd_dissipation
 from lagjax.motion.solve import Settings
 from lagjax.motion.switching import each_phase, phases_in, refuse_beside_switches, starting
-from lagjax.motion.trajectory import ENDED_WELL, Trajectory, is_among
+from lagjax.motion.trajectory import BY_INTEGRATION, ENDED_WELL, Trajectory, is_among
+
+BY_INTEGRATION["at"] = at
 
 
 @by_name("lj.integrate(system, q0, v0, params, ts=ts)", "ts")
@@ -191,7 +194,7 @@ def _raise_or_warn(trajectory, start, settings):
     """Raise or warn in the user's words; while tracing, at run time with the result's own message."""
     if coordinates.is_traced(trajectory):
         # Who watches is told by the report.
-        return trajectory if WATCHED.value else raise_at_run_time(trajectory)
+        return trajectory if WATCHED.value or SILENT.value else raise_at_run_time(trajectory)
     result = trajectory.result
     if not is_among(result, ENDED_WELL):
         raise_failure(trajectory, start, settings)
