@@ -349,8 +349,8 @@ def test_messages():
         lj.linearise(parametric, 0.0, 0.0, 0.0, None)
     with pytest.raises(ValueError, match="constraint 'rod'"):
         lj.linearise(rod_pendulum, 0.0, {"x": 0.0, "y": -1.0}, {"x": 0.0, "y": 0.0}, {"g": 9.8125, "l": 1.25})
-    with pytest.raises(TypeError, match="int"):
-        lj.linearise(small.bead, 0.0, 0, 0, BEAD)
+    with pytest.raises(TypeError, match="bool"):
+        lj.linearise(small.bead, 0.0, True, 0, BEAD)
     with pytest.raises(IndexError, match="there are 1 modes"):
         lj.normal_modes(small.bead, 0.0, 0.0, 0.0, BEAD)[1]
 
