@@ -1,4 +1,4 @@
-"""The site: `python -m sphinx -W -n docs docs/_build` builds it into `docs/_build`, without network; extra `docs`.
+"""The site: `python -m sphinx -W docs docs/_build/html` builds it there, without network; extra `docs`.
 
 What is generated (the pages of public names, errors, results, notebooks) is written into folders that git ignores.
 """

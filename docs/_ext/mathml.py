@@ -7,7 +7,7 @@ from sphinx.util import logging
 
 logger = logging.getLogger(__name__)
 # What docutils does not know, in what it knows.
-SPELT_OUT = {r"\tfrac": r"\frac", r"\dfrac": r"\frac", r"\lvert": "|", r"\rvert": "|"}
+SPELT_OUT = {r"\tfrac": r"\frac", r"\dfrac": r"\frac", r"\lvert": "|", r"\rvert": "|", "°": r"^{\circ}"}
 
 
 def mathml(translator, node, block: bool) -> str:

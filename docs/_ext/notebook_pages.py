@@ -54,7 +54,13 @@ def generate(app):
     clear(FOLDER, {"index.md"} | {f"{name}.ipynb" for name in names})
 
 
+def point_to_pages(app, docname, source):
+    """Links of a text to a notebook of the repository lead to its page."""
+    source[0] = source[0].replace("](../notebooks/", "](notebooks/")
+
+
 def setup(app):
     """Generate before the sources are read."""
+    app.connect("source-read", point_to_pages)
     app.connect("builder-inited", generate)
     return {"parallel_read_safe": True, "parallel_write_safe": True}
