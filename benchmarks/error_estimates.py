@@ -97,7 +97,7 @@ def judged(motion, tolerance):
     true, estimate, floor = np.concatenate(true), np.concatenate(estimate), np.maximum(motion.floor, known)[there]
     return Verdict(
         motion, tolerance, true, estimate, ratio(estimate, true, np.tile(floor, 2)), of_events(motion, traj),
-        float(np.max(known)), spoke and float(traj.departure) * SCALE["of estimates"] > 1,
+        float(np.max(known)), spoke and float(traj.scaled_error) * SCALE["of estimates"] > 1,
     )  # fmt: skip
 
 
@@ -164,7 +164,7 @@ def cost_of(motion):
             with compiles() as found:
                 traj = jax.block_until_ready(solve(motion, tolerance))
             # What a warning says of the motion is measured by programs of its own.
-            programs += 0 if traj.departure > 1 else len(found)
+            programs += 0 if traj.scaled_error > 1 else len(found)
         times = in_turn(lambda: solve(motion, tightest), lambda: solve(motion, tightest, False), repeats=REPEATS)
     return times.ratio()[0] - 1, 1e3 * times.medians[1], programs
 

@@ -3,8 +3,8 @@
 Some four hundred systems are broken at random, one family of breakages after the other: singular, contradictory, an
 inconsistent start, NaN, a tolerance out of reach, too few steps, and some that tempt an integrator to go on in
 silence. Each is integrated alone, where an exception or `lj.AccuracyWarning` reports it, and as a lane of a `vmap`,
-where its result must not be `successful`, or its `departure` above 1. Each has a healthy twin from the same generator,
-which must not be reported and must be right: within 100 tolerances of a closed form or a first integral.
+where its result must not be `successful`, or its `scaled_error` above 1. Each has a healthy twin from the same
+generator, which must not be reported and must be right: within 100 tolerances of a closed form or a first integral.
 
 What is called successful counts as unreported where nothing solves the broken equations (`error` is None), or where
 the answer is wrong: more than 10,000 tolerances (`WRONG`) from what is known of it. lagjax itself warns where a Jacobi
@@ -790,8 +790,8 @@ def side_by_side(program, cases) -> list[Verdict]:
     for i, case in enumerate(cases):
         lane = jax.tree.map(lambda x: np.asarray(x[i]), batch)
         report = None if lane.result == lj.RESULTS.successful else lj.RESULTS[lane.result]
-        if report is None and lane.departure > 1:
-            report = f"departure {float(lane.departure):.2g}"
+        if report is None and lane.scaled_error > 1:
+            report = f"scaled error {float(lane.scaled_error):.2g}"
         verdicts.append(Verdict(case, "lane", report, _error(case, lane) if report is None else np.nan, False, seconds))
     return verdicts
 

@@ -209,7 +209,7 @@ def rows(name, case, seeds, alone_too, restarts):
         return found.values, found.cost, found.converged, jnp.sum(jnp.isfinite(found.costs)), found.steps
 
     started = time.perf_counter()
-    swept = lj.sweep(run, {"data": data}, zipped=True, progress=False)
+    swept = lj.sweep(run, {"data": data}, paired=True, progress=False)
     seconds = time.perf_counter() - started
     values, cost, converged, tries, steps = swept.values
     right = cost <= costs * (1 + ROUND_OFF)

@@ -15,7 +15,7 @@ on `SAMPLE` of the lanes are within `ERROR`, motions in radians, gradients relat
     memory                  what the device reports as its peak over what the compiled program states beforehand
     operations on the host  in the compiled program (`host_operations.py`), and in one with a `jax.debug.callback`
     single precision        a tolerance that float32 cannot reach is refused; at the tightest one allowed: the error
-                            over it, and motions that are worse than a departure of 1 allows and do not say so
+                            over it, and motions that are worse than a scaled_error of 1 allows and do not say so
 
 Ready for a machine with one GPU; `--small` is for any other, and for the tests. Float64 is on throughout: float32 is
 asked for by the arrays.
@@ -278,7 +278,7 @@ def single_precision(name, small=False):
         found = jax.jit(lanes)(jnp.asarray(tolerance, "float32"), p, x)
     right = reference(case, "motions")
     worst = np.max(in_radians(case, jax.tree.map(lambda y: y[:, -1], (found.q, found.v)), right), axis=0)
-    said = np.asarray(found.departure) > 1
+    said = np.asarray(found.scaled_error) > 1
     return {
         "refused": refused, "tolerance": tolerance, "error": float(np.max(worst)),
         # Within a factor of ten, as an estimate may be off.

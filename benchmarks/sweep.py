@@ -150,9 +150,9 @@ def rate_rows(wanted):
             yield skipped(what, "only one core may be used")
         else:
             yield per_second(what, ours(workers=2, chunk=CHUNK // 2), ours(), 1.8)
-    what = "layout: lanes together / in turn"
+    what = "layout: lanes under vmap / under map"
     if wanted(what):
-        yield per_second(what, ours(), ours(layout="in turn"), None)
+        yield per_second(what, ours(), ours(layout="map"), None)
 
 
 def spread_rows(wanted):
@@ -223,7 +223,7 @@ def stored(path, log):
             return released(point["omega"] + 0.0 * number, ts, rtol=1e-10, atol=1e-10)
 
         axes = {"omega": omegas, "number": np.arange(STORED)}
-        return lj.sweep(run, axes, zipped=True, store=path, chunk=CHUNK, workers=1, progress=False)
+        return lj.sweep(run, axes, paired=True, store=path, chunk=CHUNK, workers=1, progress=False)
 
 
 def elsewhere(code):

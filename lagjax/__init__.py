@@ -39,7 +39,7 @@ from lagjax.motion.ledger import EnergyLedger, energy_ledger
 from lagjax.motion.phase_graph import HybridExplanation
 from lagjax.motion.replay import Replay
 from lagjax.motion.sections import PoincareSection, periods, poincare, turning_points
-from lagjax.motion.trajectory import RESULTS, AccuracyWarning, Moment, Trajectory
+from lagjax.motion.trajectory import RESULTS, AccuracyWarning, Snapshot, Trajectory
 from lagjax.numerics.nystrom import Nystrom8, Nystrom12
 from lagjax.numerics.radau import Radau5
 from lagjax.numerics.runge_kutta import Dopri8, Tsit5
@@ -86,6 +86,8 @@ if TYPE_CHECKING:
     from lagjax.analysis.symmetries import symmetries
     from lagjax.analysis.symmetry import SymmetryTest, is_symmetry
 
+
+__version__ = "0.2.0"
 
 # What is imported when it is first asked for, by its module.
 LATER = {
@@ -160,7 +162,7 @@ __all__ = [
     "Trajectory",
     "HybridTrajectory",
     "Switches",
-    "Moment",
+    "Snapshot",
     "energy_ledger",
     "EnergyLedger",
     "Animation",

@@ -168,7 +168,7 @@ starts = {
     "inertia": np.concatenate([[2.0], 2 + 0 * tilts, 1 + 0 * slips]),
     "c": np.concatenate([[0.0], 0 * tilts, friction]),
 }
-swept = lj.sweep(depart, starts, zipped=True, progress=False)
+swept = lj.sweep(depart, starts, paired=True, progress=False)
 parts = (0, slice(1, 21), slice(21, None))
 left, released, slid = ({name: x[part] for name, x in swept.values.items()} for part in parts)
 print(swept)

@@ -129,7 +129,7 @@ def free(point):
     return lj.integrate(bead, point["psi"], point["rate"], turning, ts=ts, rtol=1e-11, atol=1e-11)
 
 
-portrait = lj.sweep(free, starts | {"period": once}, zipped=True, progress=False).values
+portrait = lj.sweep(free, starts | {"period": once}, paired=True, progress=False).values
 h = np.asarray(exact.balance(params | {"omega": starts["omega"][:, None]}, portrait.q, portrait.v).h)
 grid_psi, grid_rate = np.meshgrid(np.linspace(-np.pi, np.pi, 241), np.linspace(-14.0, 14.0, 241))
 height = exact.balance(params, grid_psi, grid_rate).h / weight

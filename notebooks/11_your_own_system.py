@@ -49,7 +49,7 @@ params = {"m": 10.0, "l": 2.5, "g": 9.81}
 
 # %%
 q0, v0 = {"x": 0.9, "y": 2.3, "angle": 1.2}, {"x": 0.0, "y": 0.0, "angle": 0.0}
-explained = lj.explain(ladder, q0, v0, params)
+explained = lj.explain(ladder, 0.0, q0, v0, params)
 explained
 
 # %% [markdown]

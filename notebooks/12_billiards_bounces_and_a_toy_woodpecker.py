@@ -60,7 +60,7 @@ bounced = lj.integrate(ball, 1.0, 0.0, air, ts=jnp.linspace(0.0, 5.0, 401))
 bounced
 
 # %%
-lj.explain(ball, 1.0, 0.0, air)
+lj.explain(ball, 0.0, 1.0, 0.0, air)
 
 # %% [markdown]
 # The **energy ledger** says where the energy went: it integrates the power of every force, and compares with what the

@@ -168,7 +168,8 @@ MISTAKES = {
     "a film of q alone": (
         lambda: move(swing).animate(lambda q: (q["theta"], 0.0)), TYPE, r"positions\(t, q, params\)",
         r"def f\(t, q, params\)"),
-    "the state of the explanation": (lambda: lj.explain(lj.System(by_numpy), *START, PARAMS), TYPE, NUMPY, "jnp.cos"),
+    "the state of the explanation": (
+        lambda: lj.explain(lj.System(by_numpy), 0.0, *START, PARAMS), TYPE, NUMPY, "jnp.cos"),
     "one acceleration": (
         lambda: lj.accelerations(lj.System(needs_mass), 0.0, *START, PARAMS), VALUE, "'mass'", "'m'"),
     "the nearest state": (

@@ -207,7 +207,7 @@ def described(steady: Steady, y, root, y0, lasting) -> Row:
         by_name = constraints.split(*of_names)
     # Roots that coincide have no derivatives: those of `lj.normal_modes` say where.
     roots = equations.characteristic_roots(*stopped((steady, y, root.jacobian)))
-    status, departure, zero_modes = _verdict(steady, root, y0, lasting)
+    status, imbalance, zero_modes = _verdict(steady, root, y0, lasting)
     grows = GROWS_ABOVE[np.dtype(x.dtype)] * jnp.nanmax(jnp.abs(roots))
     stable = ~jnp.any(roots.real > grows) & jnp.any(jnp.isfinite(roots)) & (status == OK)
     momenta = steady.momenta(x, u) if steady.symmetries.count else jnp.zeros(0, x.dtype)
@@ -215,7 +215,7 @@ def described(steady: Steady, y, root, y0, lasting) -> Row:
     fill = lambda tree: jax.tree.map(lambda x: jnp.where(there, x, jnp.nan), tree)
     return Row(
         fill(steady.unflatten(x)), fill(steady.unflatten(u)), fill(by_name), fill(rates), fill(momenta),
-        stable, fill(roots), there, zero_modes, departure, status,
+        stable, fill(roots), there, zero_modes, imbalance, status,
         steady.unflatten(root.y[: steady.n]),
     )  # fmt: skip
 
@@ -230,7 +230,7 @@ def _verdict(steady: Steady, root, y0, lasting):
     size = jnp.concatenate([jnp.full(n, of_x), jnp.full(k, of_rates), jnp.full(steady.m, of_multipliers)])
     made = jnp.abs(root.jacobian) @ size
     off = jnp.abs(root.r) / jnp.where(made > 0, made, 1.0)
-    departure = jnp.max(off)
+    imbalance = jnp.max(off)
     at = slice(n, n + steady.m)
     status = jnp.asarray(OK)
     if not lasting:
@@ -239,13 +239,13 @@ def _verdict(steady: Steady, root, y0, lasting):
         status = jnp.where(jnp.all(lost <= limit * scale), OK, LASTS_NOT)
     # A force that fades is next to nothing far away.
     far = of_x > FAR * jnp.max(jnp.abs(y0[:n])) if steady.n else False
-    status = jnp.where((departure <= limit) & ~(far & (jnp.max(jnp.abs(y0[:n])) > 0)), status, NO_BALANCE)
+    status = jnp.where((imbalance <= limit) & ~(far & (jnp.max(jnp.abs(y0[:n])) > 0)), status, NO_BALANCE)
     if steady.m:
         violated = jnp.max(off[at])
         status = jnp.where((violated > limit) & (violated >= jnp.max(off[:n])), CONSTRAINED, status)
     status = jnp.where((status == NO_BALANCE) & (root.steps >= MOST), UNFINISHED, status)
-    status = jnp.where(jnp.isfinite(departure) & jnp.all(jnp.isfinite(root.y)), status, NOT_FINITE)
-    return lax.stop_gradient((status, departure, _zero_modes(steady, root)))
+    status = jnp.where(jnp.isfinite(imbalance) & jnp.all(jnp.isfinite(root.y)), status, NOT_FINITE)
+    return lax.stop_gradient((status, imbalance, _zero_modes(steady, root)))
 
 
 def _zero_modes(steady: Steady, root):

@@ -38,7 +38,7 @@ class Row(NamedTuple):
     eigenvalues: Complex[Array, " s"]
     found: Bool[Array, ""]
     zero_modes: Int[Array, ""]
-    departure: Float[Array, ""]
+    imbalance: Float[Array, ""]
     status: Int[Array, ""]
     last: PyTree[Float[Array, "..."]]
 
@@ -54,7 +54,7 @@ class Equilibria(eqx.Module):
     - `eigenvalues` (E, 2n): the roots s of departures e^(st), `1/[t]`, NaN beyond the last one; without derivatives.
     - `zero_modes` (E,): along how many directions, besides the cyclic ones, the balance is kept to first order: it is
       one of a family, the one nearest to its start, or a critical point where branches meet.
-    - `departure` (E,): the imbalance, relative to what a displacement as large as the coordinates makes.
+    - `imbalance` (E,): the imbalance, relative to what a displacement as large as the coordinates makes.
     - `found` (E,), `status` (S,): 0 where a start led to one; `describe(status)` says what another number means.
     - `of_start` (S,): to which row each start led, -1 for none. `starts`, `last`: leaves with a leading axis S, where
       each search began and ended, also of those that found nothing.
@@ -72,7 +72,7 @@ class Equilibria(eqx.Module):
     eigenvalues: Complex[Array, "E s"]
     found: Bool[Array, " E"]
     zero_modes: Int[Array, " E"]
-    departure: Float[Array, " E"]
+    imbalance: Float[Array, " E"]
     status: Int[Array, " S"]
     last: PyTree[Float[Array, "S ..."]]
     starts: PyTree[Float[Array, "S ..."]]

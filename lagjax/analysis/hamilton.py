@@ -127,7 +127,8 @@ def _no_velocity(s, mass, regular):
         f"L is degenerate in '{name}', {at}: the momenta do not tell its velocity, and there is no Hamiltonian.\n"
         "Usual cause: a coordinate whose velocity is missing from L, or stands in it linearly alone; a zero mass; a "
         "coordinate singularity (an azimuth at the pole).\n"
-        f"Fix: give '{name}' a kinetic energy, or leave it out of q; lj.explain(system, q, v, params) shows the masses."
+        f"Fix: give '{name}' a kinetic energy, or leave it out of q; lj.explain(system, t, q, v, params) shows the "
+        "masses."
     )
 
 

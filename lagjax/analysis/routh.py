@@ -78,8 +78,8 @@ class Routhian(eqx.Module):
             if reason is not None:
                 raise ValueError(
                     f"'{name}' is not cyclic: {reason}, and its momentum need not stay.\n"
-                    f"Fix: leave '{name}' out of cyclic; lj.explain(system, q, v, params).structure.cyclic lists those "
-                    "that L does not contain."
+                    f"Fix: leave '{name}' out of cyclic; lj.explain(system, t, q, v, params).structure.cyclic lists "
+                    "those that L does not contain."
                 )
         return True
 

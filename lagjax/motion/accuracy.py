@@ -1,7 +1,7 @@
 """What the estimated errors of a motion mean: how many digits are left, from when on they are lost, and to what.
 
 An error of up to ten thousand tolerances is as expected of many steps, as long as three digits are left. What exceeds
-that is in `departure`, in units of it.
+that is in `scaled_error`, in units of it.
 """
 
 from typing import Any, NamedTuple
@@ -75,7 +75,7 @@ def allowed(xp, size, span, tolerance):
     return xp.minimum(EXPECTED * tolerances, xp.where(nothing, np.inf, DIGITS_LEFT * size))
 
 
-def departure(xp, worst, seen, trajectory, ts, tolerance):
+def scaled_error(xp, worst, seen, trajectory, ts, tolerance):
     """The worst errors, (2, n), in units of what is allowed; what it was before where there is no estimate."""
     span, steps = abs(ts[-1] - ts[0]), xp.asarray(trajectory.stats["num_accepted_steps"])
 
@@ -84,7 +84,7 @@ def departure(xp, worst, seen, trajectory, ts, tolerance):
         # A number that is zero throughout has an error of zero.
         share = worst / xp.where(limit > 0, limit, 1.0)
         unknown = xp.isnan(share)
-        return xp.where(unknown.all(), trajectory.departure, xp.where(unknown, 0.0, share).max()).astype(ts.dtype)
+        return xp.where(unknown.all(), trajectory.scaled_error, xp.where(unknown, 0.0, share).max()).astype(ts.dtype)
 
     # Which coordinates are angles takes long to say, and counts only where much is lost.
     at_most = by(True) if xp is np else np.inf

@@ -30,7 +30,7 @@ from lagjax.mechanics.constraints import Holonomic, Nonholonomic
 from lagjax.mechanics.coordinates import is_traced
 from lagjax.mechanics.system import System
 from lagjax.motion.solve import trajectory_of
-from lagjax.motion.trajectory import Moment, Trajectory, pack
+from lagjax.motion.trajectory import Snapshot, Trajectory, pack
 
 
 class Reflected(eqx.Module):
@@ -75,7 +75,7 @@ def in_either_direction(system, q0, v0, params, ts, guards, settings, backward: 
     asked = reflected.asked._replace(stepsize_controller=settings.controller, jump_ts=settings.jump_ts)
     arrays, static = pack(system, params, asked, reflected.static.how)
     events = {name: replace(found, t=-found.t, v=_negative(found.v)) for name, found in reflected.events.items()}
-    v, end = _negative(reflected.v), reflect_moment(reflected.end)
+    v, end = _negative(reflected.v), reflect_snapshot(reflected.end)
     return replace(reflected, t=ts, v=v, end=end, events=events, arrays=arrays, static=static)
 
 
@@ -101,9 +101,9 @@ def reflect_system(system: System) -> System:
     return System(Reflected(system.lagrangian), constraints, force, dissipation)
 
 
-def reflect_moment(moment: Moment) -> Moment:
+def reflect_snapshot(snapshot: Snapshot) -> Snapshot:
     """An instant of the reflected motion, or several, as instants of the motion itself."""
-    return moment._replace(t=-moment.t, v=_negative(moment.v))
+    return snapshot._replace(t=-snapshot.t, v=_negative(snapshot.v))
 
 
 def _reflect_settings(settings):

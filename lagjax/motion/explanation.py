@@ -53,16 +53,16 @@ class Explanation:
 
 
 @overload
-def explain(system: System, q, v, params=None, *, t=0.0) -> Explanation:
+def explain(system: System, t, q, v, params=None) -> Explanation:
     """Of one system."""
 
 
 @overload
-def explain(system: Hybrid, q, v, params=None, *, t=0.0) -> HybridExplanation:
+def explain(system: Hybrid, t, q, v, params=None) -> HybridExplanation:
     """Of a motion in phases."""
 
 
-def explain(system, q, v, params=None, *, t=0.0):
+def explain(system, t, q, v, params=None):
     """Say what a system amounts to at a state: freedoms, dependent constraints, mass matrix, problems.
 
     >>> import lagjax as lj
@@ -70,7 +70,7 @@ def explain(system, q, v, params=None, *, t=0.0):
     >>> again = lj.Holonomic(lambda t, q, params: 2.0 * (q["x"] ** 2 + q["y"] ** 2) - 2.0)
     >>> free = lambda t, q, v, params: 0.5 * (v["x"] ** 2 + v["y"] ** 2)
     >>> twice = lj.System(free, constraints={"rod": rod, "again": again})
-    >>> explain(twice, {"x": 1.0, "y": 0.0}, {"x": 0.0, "y": 1.0})
+    >>> explain(twice, 0.0, {"x": 1.0, "y": 0.0}, {"x": 0.0, "y": 1.0})
     System
       at                  t = 0, q = (x = 1, y = 0), v = (x = 0, y = 1)
       coordinates         2: x, y
@@ -82,7 +82,7 @@ def explain(system, q, v, params=None, *, t=0.0):
       cyclic in L         x, y
       solved              2 accelerations and 2 multipliers by elimination without the zeros
 
-    **Arguments:** `q` and `v` alike, `params` as the system takes it, `t` scalar. A state off the constraints is moved
+    **Arguments:** `t` scalar, `q` and `v` alike, `params` as the system takes it. A state off the constraints is moved
     onto them first, and told where it was not near: dependent constraints agree only there.
 
     **Returns:** an `Explanation`; of a `Hybrid` a `HybridExplanation`: its phases, each explained, and its graph.

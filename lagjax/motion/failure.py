@@ -64,7 +64,7 @@ def _raise_in_phase(trajectory, start, settings) -> NoReturn:
     there = f"in phase '{hybrid.names[phase]}', entered at t = {float(entered.t):.9g}: "
     arrays, static = pack(hybrid.systems[phase], trajectory.params, trajectory.asked, trajectory.static.how)
     fields = {
-        name: getattr(trajectory, name) for name in ("q", "v", "end", "stats", "departure", "result", "tolerance")
+        name: getattr(trajectory, name) for name in ("q", "v", "end", "stats", "scaled_error", "result", "tolerance")
     }
     names = hybrid.systems[phase].constraints
     of_phase = lambda tree: {name: tree[name] for name in names}

@@ -21,7 +21,7 @@ import numpy as np
 from jax import lax
 
 from lagjax.jax_internals.tracing import is_eager
-from lagjax.motion.accuracy import Errors, columns, departure
+from lagjax.motion.accuracy import Errors, columns, scaled_error
 from lagjax.motion.consistency import stopped
 from lagjax.motion.trajectory import ENDED_WELL, RESULTS, Trajectory, ended_well, is_among
 
@@ -70,7 +70,7 @@ def with_errors_inside(run: Callable, first: Trajectory, settings, ts) -> Trajec
     known, settings, ts = stopped((first, settings, ts))
     second = stopped(run(_closer(jnp, settings, known.stats["num_accepted_steps"], known.end.t, ts)))
     found = _compared(jnp, known, second, ts)
-    return replace(first, error=found.error, departure=found.departure)
+    return replace(first, error=found.error, scaled_error=found.scaled_error)
 
 
 def _fixed(controller):
@@ -113,8 +113,8 @@ def _compared(xp, first, second, ts) -> Trajectory:
     found = Errors(*_in_their_places(errors, first), times, second.result, steps)
     of_motion = lambda row: row[: 2 * sum(np.size(x) for x in jax.tree.leaves(first.end.q))].reshape(2, -1)
     worst = of_motion(np.fmax.reduce(errors) if xp is np else jnp.nanmax(errors, axis=0))
-    excess = departure(xp, worst, of_motion(sizes[-1]), first, ts, tuple(map(xp.asarray, first.tolerance)))
-    return replace(first, error=found, departure=excess)
+    excess = scaled_error(xp, worst, of_motion(sizes[-1]), first, ts, tuple(map(xp.asarray, first.tolerance)))
+    return replace(first, error=found, scaled_error=excess)
 
 
 def _unknown(first, result=RESULTS.not_estimated) -> Trajectory:

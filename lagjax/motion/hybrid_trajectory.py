@@ -110,12 +110,12 @@ class HybridTrajectory(Trajectory):
 
     def drift(self) -> Float[Array, ""]:
         """Not known."""
-        return jnp.full_like(self.departure, jnp.nan)
+        return jnp.full_like(self.scaled_error, jnp.nan)
 
     def residual(self) -> Float[Array, ""]:
         """The worst constraint residual over all outputs, each in its own phase, relative."""
         worst = [_residual_in(system, i, self) for i, system in enumerate(self.system.systems) if system.constraints]
-        return jnp.max(jnp.stack([*worst, jnp.zeros_like(self.departure)]))
+        return jnp.max(jnp.stack([*worst, jnp.zeros_like(self.scaled_error)]))
 
     def plot(self, charges=False):
         """Plot coordinates, velocities and multipliers against time, with the switches; returns a matplotlib `Figure`.

@@ -53,7 +53,7 @@ def integrate(
     adjoint: diffrax.AbstractAdjoint | Replay | None = None,
     max_steps: int | None = 2**20,
     throw: bool = True,
-    progress: bool = False,
+    progress: bool | None = None,
     drift: str | None = None,
     estimate_error: bool | None = None,
     start: str | None = None,
@@ -108,7 +108,7 @@ def integrate(
     - `max_steps`: the largest number of steps, accepted and rejected, those that look for events among them.
     - `throw`: raise where the integration fails. With `throw=False` the trajectory carries the reason in
       `result` and NaN from there on.
-    - `progress`: show a progress meter.
+    - `progress`: True: show a progress meter. By default only the wait for the compiler, where somebody may look.
     - `estimate_error`: whether to integrate a second time, more precisely, to say in `traj.error` how wrong the motion
       may be. By default where nothing is traced, steps are chosen by lagjax or fixed, and there are at most 20,000. It
       compiles nothing there and costs 1.2 to 2 times the solve; inside `jit`, `vmap`, a sweep and derivatives it is one
@@ -126,7 +126,7 @@ def integrate(
       tolerance below the dtype's reach.
     - `ValueError` for a start off the constraints, or one where L or its equations are singular or not finite.
     - `RuntimeError` where the integration stops early: `max_steps` reached, or a step size that collapsed.
-    - Warns (`lj.AccuracyWarning`) where `departure` is above 1: where the estimated error is more than 10,000
+    - Warns (`lj.AccuracyWarning`) where `scaled_error` is above 1: where the estimated error is more than 10,000
       tolerances or leaves fewer than three digits; without an estimate, where the Jacobi integral must be constant
       and changed by 1000 tolerances, or by less over thousands of steps, or by 1e-5 with fixed steps. In lanes look at
       that.

@@ -37,7 +37,7 @@ from lagjax.motion.loop import resolution
 from lagjax.motion.one_solve import solved
 from lagjax.motion.recorded import nothing, with_those_of
 from lagjax.motion.sight import uneven
-from lagjax.motion.trajectory import RESULTS, Moment
+from lagjax.motion.trajectory import RESULTS, Snapshot
 
 # What a guard may be below zero where a motion starts, in tolerances of what it is made of.
 NOT_BELOW = 1e2
@@ -86,11 +86,11 @@ class Way(NamedTuple):
     rows: Rows
     switches: Switches
     events: dict[str, Crossings]
-    end: Moment
+    end: Snapshot
     stats: dict[str, Array]
     seen: Array
     least: Array
-    departure: Float[Array, ""]
+    scaled_error: Float[Array, ""]
     settled: Bool[Array, ""]
     result: Any
 
@@ -120,7 +120,7 @@ def solved_in_legs(hybrid: Hybrid, q0, v0, params, ts, phases, settings, adjoint
         "end": way.end,
         "stats": way.stats,
         "tolerance": (settings.rtol, way.least),
-        "departure": way.departure,
+        "scaled_error": way.scaled_error,
         "result": way.result,
         "settled": way.settled,
         "events": way.events | ({SWITCHES: way.switches.as_crossings()} if hybrid.switches else {}),
@@ -146,13 +146,13 @@ def _first_leg(hybrid, q0, v0, params, ts, phase, settings):
         impulse=record(v0), count=jnp.asarray(0), uncertain=jnp.asarray(False), names=hybrid.names,
         ways=tuple(s.phase for s in hybrid.switches),
     )  # fmt: skip
-    start = Moment(ts[0], q0, v0, {name: nan(shape) for name, shape in shapes.items()})
+    start = Snapshot(ts[0], q0, v0, {name: nan(shape) for name, shape in shapes.items()})
     zero, least = jnp.asarray(0), jnp.zeros((2, n), dtype) if settings.by_size else settings.atol
     stats = {name: zero for name in ("num_steps", "num_accepted_steps", "num_rejected_steps")}
     return Way(
         t=ts[0], q=q0, v=v0, phase=jnp.asarray(hybrid.first, jnp.int32), going=jnp.asarray(True), rows=rows,
         switches=switches, events=nothing(phase.guards, phase.events, q0, v0, start.multipliers), end=start,
-        stats=stats, seen=_sizes(q0, v0), least=least, departure=jnp.zeros((), dtype), settled=jnp.asarray(True),
+        stats=stats, seen=_sizes(q0, v0), least=least, scaled_error=jnp.zeros((), dtype), settled=jnp.asarray(True),
         result=RESULTS.successful,
     )  # fmt: skip
 
@@ -192,7 +192,8 @@ def _leg(hybrid, i, mine, way: Way, params, ts, phase: Phase, settings, adjoint)
         end=_where(onward, end._replace(q=after.q, v=after.v), end),
         stats={name: n + found["stats"][name] for name, n in way.stats.items()},
         seen=jnp.maximum(way.seen, _sizes(end.q, end.v)), least=least,
-        departure=jnp.maximum(way.departure, found["departure"]), settled=way.settled & found["settled"], result=result,
+        scaled_error=jnp.maximum(way.scaled_error, found["scaled_error"]),
+        settled=way.settled & found["settled"], result=result,
     )  # fmt: skip
     return _where(mine, further, way)
 
@@ -202,11 +203,11 @@ class Ending(NamedTuple):
 
     onward: Bool[Array, ""]
     first: Int[Array, ""]
-    end: Moment
+    end: Snapshot
     result: Any
 
 
-def _ending(phase: Phase, result, end: Moment, when, mine, way: Way, params, resolution, rtol) -> Ending:
+def _ending(phase: Phase, result, end: Snapshot, when, mine, way: Way, params, resolution, rtol) -> Ending:
     """What ends a leg; `when`: the times at which its guards cross, infinite of those that do not."""
     assert phase.guards is not None
     count, at_one_time, at_start = len(phase.switches), AT_ONCE * resolution, way.switches.count == 0
@@ -218,7 +219,7 @@ def _ending(phase: Phase, result, end: Moment, when, mine, way: Way, params, res
     at_once = switched & (end.t - way.t <= at_one_time)
     # What happens at once happens where the leg begins, and its time moves as that does.
     t, q, v = _where(at_once, (way.t, way.q, way.v), (end.t, end.q, end.v))
-    end = Moment(t, q, v, end.multipliers)
+    end = Snapshot(t, q, v, end.multipliers)
     is_below = _is_below(end, params, phase.guards, count, rtol)
     refused, full = at_once & at_start & is_below, way.switches.count >= way.switches.t.shape[0]
     onward = switched & ~refused & ~full
@@ -230,7 +231,7 @@ def _ending(phase: Phase, result, end: Moment, when, mine, way: Way, params, res
     return Ending(onward, first, end, result)
 
 
-def _is_below(end: Moment, params, guards: Guards, count: int, rtol):
+def _is_below(end: Snapshot, params, guards: Guards, count: int, rtol):
     """Whether one of the first guards is below zero, by more than errors make it."""
     state = stopped(tuple(end))
     value = lambda *state: jnp.stack(guards(*state, stopped(params))[:count])

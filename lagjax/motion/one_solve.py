@@ -21,7 +21,7 @@ from lagjax.motion.crossing_times import all_known, by_name, end_of
 from lagjax.motion.global_error import ROUND_OFFS
 from lagjax.motion.loop import Solution, solution_of
 from lagjax.motion.tolerances import Scales, rounding, scales_of, shared, span_of, tolerances_at
-from lagjax.motion.trajectory import RESULTS, Moment, ended_well, worst_drift
+from lagjax.motion.trajectory import RESULTS, Snapshot, ended_well, worst_drift
 from lagjax.numerics.nystrom import Nystrom
 from lagjax.numerics.runge_kutta import ExplicitRungeKutta
 
@@ -88,7 +88,7 @@ class Start(NamedTuple):
 class Outputs(NamedTuple):
     """The motion at the outputs and, last, at its end, where nothing is NaN; and which outputs were reached."""
 
-    motion: Moment
+    motion: Snapshot
     reached: Bool[Array, " T"]
 
 
@@ -139,7 +139,7 @@ def _outputs(equations, start, solution, ts, settings) -> Outputs:
         states = apart_from_jumps(equations, ts, settings.jump_ts, *states)
     # One compiled evaluation for the outputs and the end together.
     t, (q, v) = jax.tree.map(lambda x, last: jnp.concatenate([x, last]), (ts, states), solution.end)
-    return Outputs(Moment(t, q, v, jax.vmap(equations.multipliers)(t, q, v)), reached)
+    return Outputs(Snapshot(t, q, v, jax.vmap(equations.multipliers)(t, q, v)), reached)
 
 
 def _result(equations, start, solution, outputs, guards, settings):
@@ -167,7 +167,7 @@ def _result(equations, start, solution, outputs, guards, settings):
         "end": end,
         "stats": stats,
         "tolerance": (settings.rtol, _absolute(stopped((motion.q, motion.v)), start.scales, settings)),
-        "departure": _departure(stopped(equations), *stopped((motion.t, motion.q, motion.v)), stats, settings),
+        "scaled_error": _scaled_error(stopped(equations), *stopped((motion.t, motion.q, motion.v)), stats, settings),
         "result": result,
         "settled": ended_well(result) | _among(result, THE_SAME) if regular else jnp.asarray(True),
         "events": {} if located is None else by_name(guards, located, motion.t[-1:], ~start.refused),
@@ -182,7 +182,7 @@ def _absolute(states, scales, settings):
     return rounding(shared(scales, jnp.stack(sizes)))
 
 
-def _departure(equations, t, q, v, stats, settings):
+def _scaled_error(equations, t, q, v, stats, settings):
     """How far what must stay constant has changed at the outputs, in units of what the tolerance lets expect.
 
     An error of the Jacobi integral that grows steadily shifts the phase by about its size a radian, so that over very

@@ -228,7 +228,7 @@ def off_constraints(system: System, s: State, rtol, atol) -> str:
 
 def warn_of_inaccuracy(trajectory):
     """Warn where the error, or the change of something that must stay, is more than the tolerance lets expect."""
-    if float(trajectory.departure) <= 1:
+    if float(trajectory.scaled_error) <= 1:
         return
     estimated = trajectory.error is not None and account_of(trajectory) is not None
     words = warning_of(trajectory) if estimated else _of_drift(trajectory)

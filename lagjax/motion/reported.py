@@ -26,14 +26,14 @@ PATIENCE = jax.make_user_context(default_value=None)
 
 
 class Report(NamedTuple):
-    """How motions went: together the first result that was not good, all steps, the worst departure and residual.
+    """How motions went: together the first result that was not good, all steps, the worst scaled_error and residual.
 
-    `departure` is that of a `Trajectory`; `residual` the worst of the constraints at the outputs, relative.
+    `scaled_error` is that of a `Trajectory`; `residual` the worst of the constraints at the outputs, relative.
     """
 
     result: Int[Array, ""]
     steps: Int[Array, ""]
-    departure: Float[Array, ""]
+    scaled_error: Float[Array, ""]
     residual: Float[Array, ""]
 
 
@@ -48,7 +48,7 @@ def report(trajectory: Trajectory) -> Trajectory:
 
     def of(trajectory):
         t = stopped(trajectory)
-        return Report(t.result._value, t.stats["num_steps"], t.departure, t.residual())
+        return Report(t.result._value, t.stats["num_steps"], t.scaled_error, t.residual())
 
     return reported(trajectory, of)
 
@@ -145,11 +145,11 @@ def _together(reports):
         return None
     # A derivative inside has lanes of its own: the worst of them counts.
     flat = [Report(*(jnp.ravel(x) for x in told)) for told in reports]
-    results, steps, departures, residuals = (jnp.concatenate(parts) for parts in zip(*flat))
+    results, steps, scaled_errors, residuals = (jnp.concatenate(parts) for parts in zip(*flat))
     bad = (results != RESULTS.successful._value) & (results != RESULTS.event_occurred._value)
-    departure, worst = jnp.nanmax(departures), results[jnp.argmax(bad)]
-    result = jnp.where(jnp.any(bad) | ~(departure > 1), worst, RESULTS.drifted._value)
-    return Report(result, jnp.sum(steps), departure, jnp.nanmax(residuals))
+    scaled_error, worst = jnp.nanmax(scaled_errors), results[jnp.argmax(bad)]
+    result = jnp.where(jnp.any(bad) | ~(scaled_error > 1), worst, RESULTS.drifted._value)
+    return Report(result, jnp.sum(steps), scaled_error, jnp.nanmax(residuals))
 
 
 def _batched(operands, axes, kind):

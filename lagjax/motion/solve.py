@@ -22,6 +22,7 @@ from lagjax.mechanics.memory import filled_up, parted
 from lagjax.mechanics.memory_maps import share_used
 from lagjax.mechanics.structure import is_free_of_velocities
 from lagjax.mechanics.written_out import has_networks
+from lagjax.meter import waiting
 from lagjax.motion.both_modes import solve_in_both_modes
 from lagjax.motion.consistency import stopped
 from lagjax.motion.global_error import with_errors, with_errors_inside
@@ -68,7 +69,7 @@ class Settings:
     apart: bool = eqx.field(static=True)
     max_steps: int | None = eqx.field(static=True)
     drift: str = eqx.field(static=True)
-    progress: bool = eqx.field(static=True)
+    progress: bool | None = eqx.field(static=True)
     # Of the record for reverse mode, in bytes; None for the usual one.
     memory: float | None = eqx.field(static=True, default=None)
     # False where the equations are taken for regular, until that turns out to be wrong.
@@ -93,7 +94,7 @@ def trajectory_of(*problem) -> Trajectory:
     many = np.append(ts, np.full(filled_up(len(ts)) - len(ts), ts[-1]))
     of = lambda settings: parted((*motion, many, guards, settings))
     static, arrays = of(settings)
-    programs = kept((_Programs, static), lambda: _Programs(static, len(ts)))
+    programs = kept((_Programs, static), lambda: _Programs(static, len(ts), settings.progress))
     try:
         found = programs.run(arrays, len(ts))
         again = lambda closer: programs.run(of(closer)[1], len(ts), settled=True)
@@ -119,21 +120,30 @@ class _Programs:
     """The compiled programs of one kind of motion: of equations taken for regular (None where they are not), and with
     the careful way. JAX keeps them as long as this object lives."""
 
-    def __init__(self, static, count):
+    def __init__(self, static, count, progress):
         jit = partial(jax.jit, compiler_options=compiler_options())
         self.regular: Callable | None = jit(partial(_of_arrays, static, False, count))
         self.careful: Callable = jit(partial(_of_arrays, static, True, count))
-        self._count = count
+        self._count, self._progress, self._compiled = count, progress, set()
 
     def run(self, arrays, count, settled=False):
         """The trajectory with so many outputs; where it is not settled, by the careful way, but if `settled`."""
         if self.regular is not None:
-            found, rows, well = self.regular(arrays)
+            found, rows, well = self._called(self.regular, arrays)
             if settled or well:
                 return self._first_outputs(found, rows, count)
             self.regular = None
-        found, rows, _ = jax.block_until_ready(self.careful(arrays))
+        found, rows, _ = jax.block_until_ready(self._called(self.careful, arrays))
         return self._first_outputs(found, rows, count)
+
+    def _called(self, program, arrays):
+        """What a program returns; the first time somebody is told that it compiles."""
+        if program in self._compiled:
+            return program(arrays)
+        with waiting(self._progress, "compiling"):
+            found = program(arrays)
+        self._compiled.add(program)
+        return found
 
     def _first_outputs(self, found, rows, count):
         """The trajectory with so many outputs, of `rows` that were filled up."""

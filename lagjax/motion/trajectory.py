@@ -65,7 +65,7 @@ class AccuracyWarning(UserWarning):
     """A motion was computed, and shows by itself that it is less accurate than its tolerance suggests."""
 
 
-class Moment(NamedTuple):
+class Snapshot(NamedTuple):
     """One instant of a motion."""
 
     t: Float[Array, ""]
@@ -130,7 +130,7 @@ class Trajectory(eqx.Module):
     - `stats`: `num_steps`, `num_accepted_steps`, `num_rejected_steps`.
     - `error`: estimates of the errors of `q`, `v`, `multipliers` and of the times of `events` (`Errors`); None where
       they were not made.
-    - `departure`: the worst error in units of what is allowed (10,000 tolerances, and a thousandth of each number);
+    - `scaled_error`: the worst error in units of what is allowed (10,000 tolerances, and a thousandth of each number);
       above 1 the motion is less accurate than that, and `integrate` warns. Without `error` it is how far the Jacobi
       integral, where it must be constant, and the constraints changed, in units of what the tolerance lets expect; 0
       where nothing must stay.
@@ -147,9 +147,9 @@ class Trajectory(eqx.Module):
     q: PyTree[Float[Array, "T ..."]]
     v: PyTree[Float[Array, "T ..."]]
     multipliers: dict[str, Array]
-    end: Moment
+    end: Snapshot
     stats: dict[str, Array]
-    departure: Float[Array, ""]
+    scaled_error: Float[Array, ""]
     result: RESULTS
     events: dict[str, Crossings]
     tolerance: tuple[Array, Array]
@@ -188,7 +188,7 @@ class Trajectory(eqx.Module):
     def residual(self) -> Float[Array, ""]:
         """The worst constraint residual over all outputs, positions and velocities, relative; 0 without constraints."""
         if not self.system.constraints:
-            return jnp.zeros_like(self.departure)
+            return jnp.zeros_like(self.scaled_error)
         return _worst_residual(self.system, self.t, self.q, self.v, self.params)
 
     def plot(self, charges=False):
@@ -329,8 +329,8 @@ def _lines(traj):
         *(account.of_error(traj) or _not_estimated(traj)),
     ]
     rows += traj._of_system()
-    if float(traj.departure) > 1:
-        rows.append(("WARNING", f"the error is {float(traj.departure):.2g} times what the tolerance lets expect"))
+    if float(traj.scaled_error) > 1:
+        rows.append(("WARNING", f"the error is {float(traj.scaled_error):.2g} times what the tolerance lets expect"))
     rows += _shape_rows(traj)
     return ["Trajectory", *_aligned(rows)]
 
@@ -353,7 +353,7 @@ def _absolute(atol):
 def _batch_lines(traj, lanes):
     values, counts = np.unique(np.asarray(traj.result._value), return_counts=True)
     words = [f"{n} {message(_item(traj.result, v))}" for v, n in zip(values, counts)]
-    steps, drifted = np.asarray(traj.stats["num_steps"]), int(np.sum(np.asarray(traj.departure) > 1))
+    steps, drifted = np.asarray(traj.stats["num_steps"]), int(np.sum(np.asarray(traj.scaled_error) > 1))
     rows = [
         ("method", traj.static.method),
         ("lanes", " x ".join(map(str, lanes))),

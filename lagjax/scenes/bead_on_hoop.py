@@ -251,12 +251,12 @@ def settled(params, psi, time, tolerance=1e-9):
 
 
 def pitchfork(speeds, starts, **settings):
-    """Where beads with friction settle: a sweep over ω, each released at rest at its own ψ (zipped)."""
+    """Where beads with friction settle: a sweep over ω, each released at rest at its own ψ (paired)."""
 
     def settles(point):
         return settled(PARAMS | {"omega": point["omega"], "b": 2.0}, point["psi"], jnp.asarray(40.0), 1e-6)
 
-    return sweep(settles, {"omega": speeds, "psi": starts}, zipped=True, progress=False, **settings)
+    return sweep(settles, {"omega": speeds, "psi": starts}, paired=True, progress=False, **settings)
 
 
 def driven_start(params, psi):

@@ -1,4 +1,4 @@
-"""What varies in a sweep: named axes, as a grid or zipped, and the point at each flat index."""
+"""What varies in a sweep: named axes, as a grid or paired, and the point at each flat index."""
 
 import math
 from collections.abc import Mapping
@@ -9,19 +9,19 @@ import jax
 import numpy as np
 from jax.core import Tracer
 
-# The one dimension of zipped axes.
+# The one dimension of paired axes.
 POINT = "point"
 
 
 class Axes(eqx.Module):
     """Named axes: values (n, ...) by name, one slice of which is what a point gets.
 
-    The flat index runs over the last axis first; with `zipped` axes all of them move together.
+    The flat index runs over the last axis first; with `paired` axes all of them move together.
     """
 
     names: tuple[str, ...] = eqx.field(static=True)
     arrays: tuple[Any, ...]
-    zipped: bool = eqx.field(static=True)
+    paired: bool = eqx.field(static=True)
 
     @property
     def values(self) -> dict[str, Any]:
@@ -32,7 +32,7 @@ class Axes(eqx.Module):
     def dims(self) -> dict[str, int]:
         """The dimensions of the sweep and their lengths."""
         lengths = {name: len(x) for name, x in self.values.items()}
-        return {POINT: next(iter(lengths.values()))} if self.zipped else lengths
+        return {POINT: next(iter(lengths.values()))} if self.paired else lengths
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -46,7 +46,7 @@ class Axes(eqx.Module):
 
     def at(self, index) -> dict[str, Any]:
         """The point at a flat index, or of several indices (n,) their values (n, ...) by name."""
-        places = [index] * len(self.names) if self.zipped else np.unravel_index(index, self.shape)
+        places = [index] * len(self.names) if self.paired else np.unravel_index(index, self.shape)
         return {name: x[i] for name, x, i in zip(self.names, self.arrays, places)}
 
     def words(self, index: int) -> str:
@@ -57,7 +57,7 @@ class Axes(eqx.Module):
         )
 
 
-def axes_of(axes: Any, zipped: bool) -> Axes:
+def axes_of(axes: Any, paired: bool) -> Axes:
     """The axes that a user wrote, or an error."""
     example = 'Fix: axes={"omega": jnp.linspace(0.0, 3.0, 100)}.'
     if not isinstance(axes, Mapping) or not axes:
@@ -82,10 +82,10 @@ def axes_of(axes: Any, zipped: bool) -> Axes:
         # In the dtype that JAX would give it: float64 where that is enabled.
         values[str(name)] = x.astype(jax.dtypes.canonicalize_dtype(x.dtype))
     lengths = {name: len(x) for name, x in values.items()}
-    if zipped and len(set(lengths.values())) > 1:
+    if paired and len(set(lengths.values())) > 1:
         told = ", ".join(f"'{name}' has {n}" for name, n in lengths.items())
         raise ValueError(
-            f"zipped axes must be of one length: {told}.\n"
-            "Usual cause: a grid was meant.\nFix: leave zipped=True out, or cut the axes to one length."
+            f"paired axes must be of one length: {told}.\n"
+            "Usual cause: a grid was meant.\nFix: leave paired=True out, or cut the axes to one length."
         )
-    return Axes(tuple(values), tuple(values.values()), zipped)
+    return Axes(tuple(values), tuple(values.values()), paired)

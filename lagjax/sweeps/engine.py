@@ -46,12 +46,12 @@ def sweep(
     run: Callable[[dict[str, Any]], Any],
     axes: Mapping[str, ArrayLike],
     *,
-    zipped: bool = False,
+    paired: bool = False,
     store: str | os.PathLike | None = None,
     accept_versions: bool = False,
     part: tuple[int, int] | None = None,
     chunk: int | None = None,
-    layout: str = "together",
+    layout: str = "vmap",
     devices: list | None = None,
     sort: bool | None = None,
     workers: int | None = None,
@@ -74,7 +74,7 @@ def sweep(
     - `run(point)`: any JAX function; `point` is a dictionary with one scalar (or slice) an axis, and what it returns is
       any pytree of numbers and arrays: a final state, a period, a gradient, a whole `Trajectory`. `integrate` needs
       nothing special in it: it does not raise, and how it went is in `status`.
-    - `axes`: what varies, arrays (n, ...) by name. A grid of all combinations, the last axis fastest; with `zipped` all
+    - `axes`: what varies, arrays (n, ...) by name. A grid of all combinations, the last axis fastest; with `paired` all
       move together.
 
     **Long sweeps:**
@@ -90,8 +90,8 @@ def sweep(
     **How it runs,** which `print(swept)` says:
 
     - `chunk`: points for one call of the compiled program.
-    - `layout`: lanes `"together"` (`vmap`; those that take more than 32,768 steps are run again alone), or one after
-      the other, `"in turn"`.
+    - `layout`: lanes `"vmap"` (`vmap`; those that take more than 32,768 steps are run again alone), or one after
+      the other, `"map"`.
     - `sort`: first run a few points and then all in the order of their steps, so that a few long lanes do not hold the
       rest; by default for lanes together, from 16,000 points on.
     - `devices`: JAX devices to split each chunk between; by default all.
@@ -110,7 +110,7 @@ def sweep(
             f"run must be a function of a point, not {type(run).__name__}.\n"
             "Fix: lambda point: lj.integrate(system, q0, v0, params | point, ts=ts).q."
         )
-    grid = axes_of(axes, zipped)
+    grid = axes_of(axes, paired)
     devices = jax.local_devices() if devices is None else list(devices)
     part = (jax.process_index(), jax.process_count()) if part is None else part
     _check(layout, part, store)
@@ -143,7 +143,7 @@ class _Engine:
         self.run, self.axes, self.chunk = run, axes, math.ceil(chunk / len(devices)) * len(devices)
         self.workers, self.sort, self.layout, self.devices = workers, sort, layout, devices
         self.progress = progress
-        self._patience = PATIENCE if layout == "together" else None
+        self._patience = PATIENCE if layout == "vmap" else None
         self.program, seconds = self._program(careful=False, progress=progress)
         # Before anything runs, and since then.
         self._compiling = [seconds, 0.0]
@@ -198,7 +198,7 @@ class _Engine:
     def at(self, indices):
         """(values, status) at no more than `chunk` indices; lanes that were given up are run alone."""
         values, status = self.first(indices)
-        given_up = (status.result == MAX_STEPS) & (status.steps >= PATIENCE) & (self.layout == "together")
+        given_up = (status.result == MAX_STEPS) & (status.steps >= PATIENCE) & (self.layout == "vmap")
         if not given_up.any():
             return values, status
         alone = [self._alone.call(self.axes.at(indices[i : i + 1]), 1)[:2] for i in np.flatnonzero(given_up)]
@@ -209,7 +209,7 @@ class _Engine:
         # Compiled only where a lane needs it.
         with self._lock:
             if self._one is None:
-                self._one, seconds = program_for(self.run, self.axes, 1, self.devices[:1], "in turn")
+                self._one, seconds = program_for(self.run, self.axes, 1, self.devices[:1], "map")
                 self._compiling[1] += seconds
         return self._one
 
@@ -244,7 +244,7 @@ class _Engine:
     def _order(self, indices):
         """The places of some indices, sorted by the steps that a few of them took, where lanes wait for each other."""
         places = np.arange(len(indices))
-        worth = self.layout == "together" and len(indices) >= 64 * PILOTS if self.sort is None else self.sort
+        worth = self.layout == "vmap" and len(indices) >= 64 * PILOTS if self.sort is None else self.sort
         if not worth:
             return places
         few = places[:: max(1, len(indices) // min(self.chunk, PILOTS))][: self.chunk]
@@ -331,7 +331,7 @@ def _in_store(engine, axes, path, part, accept_versions):
     def again(swept, other, which):
         raise ValueError(
             "what is in a store belongs to the run that it was begun with.\n"
-            "Fix: lj.sweep(other, axes of what failed, zipped=True), or a sweep without a store."
+            "Fix: lj.sweep(other, axes of what failed, paired=True), or a sweep without a store."
         )
 
     here = f"{engine.words}, in {path}"

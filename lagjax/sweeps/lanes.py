@@ -1,6 +1,6 @@
 """The compiled program of a sweep: the values that its axes have at some points, to values and statuses.
 
-Lanes run together, under `vmap`, each with its own steps; on a CPU `integrate` takes 256 of them at a time. `"in turn"`
+Lanes run together, under `vmap`, each with its own steps; on a CPU `integrate` takes 256 of them at a time. `"map"`
 takes one after the other, which measures slower nearly everywhere (`benchmarks/sweep.py`), and needs the least memory.
 """
 
@@ -22,20 +22,20 @@ from lagjax.sweeps.axes import POINT, Axes
 from lagjax.sweeps.digests import program_digest
 
 NOT_RUN, LOST = -1, -2
-LAYOUTS = ("together", "in turn")
+LAYOUTS = ("vmap", "map")
 
 
 class Status(NamedTuple):
     """How each point went, arrays in the shape of the sweep.
 
     `result` is the code of a `RESULTS` item, -1 where the point was not run, -2 where it is lost from its store;
-    `steps` those of all its integrations; `departure` and `residual` the worst (`Trajectory`), 0 where nothing was
+    `steps` those of all its integrations; `scaled_error` and `residual` the worst (`Trajectory`), 0 where nothing was
     integrated.
     """
 
     result: Any
     steps: Any
-    departure: Any
+    scaled_error: Any
     residual: Any
 
 
@@ -101,7 +101,7 @@ def compiled(
 
     def lanes(values):
         at = lambda values: point(dict(zip(axes.names, values)))
-        return jax.lax.map(at, values) if layout == "in turn" else jax.vmap(at)(values)
+        return jax.lax.map(at, values) if layout == "map" else jax.vmap(at)(values)
 
     function, placed = lanes, SingleDeviceSharding(devices[0])
     if len(devices) > 1:

@@ -140,7 +140,7 @@ def create(path: Path, axes: Axes, program: Program, wanted: dict, block: int) -
         for metadata in arrays.values():
             metadata.pop("attributes", None)
         arrays = {name: metadata for name, metadata in arrays.items() if metadata["node_type"] == "array"}
-        said = {"fingerprint": wanted, "block": block, "names": list(axes.values), "zipped": axes.zipped}
+        said = {"fingerprint": wanted, "block": block, "names": list(axes.values), "paired": axes.paired}
         said = json.loads(json.dumps(said | {"arrays": arrays}))
         said["digest"] = _digest(said)
         for node in (group, group[DONE]):

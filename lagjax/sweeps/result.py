@@ -132,7 +132,7 @@ class Sweep:
         if value is None and isinstance(values, Trajectory) and len(self.axes.shape) == 1:
             return self._plot_motions(values)
         panels = self._panels(values, value)
-        if self.axes.zipped:
+        if self.axes.paired:
             name, x = next(iter(self.axes.values.items()))
             return plot.lines(name, x if x.ndim == 1 else np.arange(len(x)), panels, ~self.ok)
         axes = {name: x if x.ndim == 1 else np.arange(len(x)) for name, x in self.axes.values.items()}
@@ -173,7 +173,7 @@ class Sweep:
         return numbers
 
     def _coordinates(self):
-        if self.axes.zipped:
+        if self.axes.paired:
             return {name: ((POINT, *_inner(name, x)), x) for name, x in self.axes.values.items()}
         flat = {name: x for name, x in self.axes.values.items() if x.ndim == 1}
         slices = {f"{name}_values": ((name, *_inner(name, x)), x) for name, x in self.axes.values.items() if x.ndim > 1}

@@ -2,7 +2,7 @@
 
     axes/NAME     the values of the axes
     values/NAME   (points, ...) in blocks along the flat index, by name of what `run` returns
-    status/NAME   result, steps, departure, residual
+    status/NAME   result, steps, scaled_error, residual
     done          (blocks, arrays, 2): of each block the length and the checksum of its file in each array; written last
 
 A block that is not marked is computed again, whatever of it was written. To zarr a file that is not there is a block of
@@ -175,7 +175,7 @@ class Store:
         **Raises:** `ValueError` where their values are not.
         """
         names = tuple(self.about["names"])
-        return Axes(names, tuple(map(self._axis, names)), self.about["zipped"])
+        return Axes(names, tuple(map(self._axis, names)), self.about["paired"])
 
     def _axis(self, name):
         folder = self.path / "axes" / name

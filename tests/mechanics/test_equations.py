@@ -120,6 +120,6 @@ def test_what_is_written_does_not_outlive_a_value(change):
 @not_plain
 def test_explain_prints_the_choice(monkeypatch):
     """What is printed is the form that the equations have, not another judgement of it."""
-    assert "elimination without the zeros" in repr(lj.explain(rod_pendulum, *HORIZONTAL, PARAMS))
+    assert "elimination without the zeros" in repr(lj.explain(rod_pendulum, 0.0, *HORIZONTAL, PARAMS))
     monkeypatch.setattr(equations, "is_small", lambda *problem: False)
-    assert "3 equations by elimination" in repr(lj.explain(rod_pendulum, *HORIZONTAL, PARAMS))
+    assert "3 equations by elimination" in repr(lj.explain(rod_pendulum, 0.0, *HORIZONTAL, PARAMS))

@@ -96,10 +96,10 @@ def test_door_on_three_hinges():
 @pytest.mark.slow
 def test_report_names_dependent_constraints_and_counts_freedoms():
     """`explain`: a pendulum on two rods has one degree of freedom, and both rods are named."""
-    pair = lj.explain(twice(2.0), *STATE[1:])
+    pair = lj.explain(twice(2.0), *STATE)
     assert pair.degrees_of_freedom == 1
     assert set(pair.dependent[0]) == {"rod", "again"}
-    assert lj.explain(rod_pendulum, *STATE[1:]).dependent == ()
+    assert lj.explain(rod_pendulum, *STATE).dependent == ()
 
 
 @pytest.mark.exhaustive
@@ -108,12 +108,12 @@ def test_report_of_a_rounded_state():
 
     Such a state is moved onto the constraints first.
     """
-    report = lj.explain(door, *DOOR_STATE[1:])
+    report = lj.explain(door, *DOOR_STATE)
     assert report.degrees_of_freedom == report.position_freedoms == 1
     assert len(report.dependent) == 7
     assert "18, of which 11 independent" in repr(report)
     rounded = {"corner": np.round(DOOR_STATE[1]["corner"], 6)}
-    assert lj.explain(door, rounded, DOOR_STATE[2], DOOR_STATE[3]).degrees_of_freedom == 1
+    assert lj.explain(door, 0.0, rounded, DOOR_STATE[2], DOOR_STATE[3]).degrees_of_freedom == 1
 
 
 @pytest.mark.exhaustive
@@ -125,7 +125,7 @@ def test_report_of_a_state_with_other_velocities():
     length = lj.Holonomic(lambda t, q, params: jnp.sqrt(rod_square(q)) - params["l"])
     pair = lj.System(cartesian_lagrangian, {"rod": lj.Holonomic(rod), "length": length})
     along = {"x": STATE[2]["x"] + np.sin(2.0), "y": STATE[2]["y"] - np.cos(2.0)}
-    report = lj.explain(pair, STATE[1], along, PARAMS)
+    report = lj.explain(pair, 0.0, STATE[1], along, PARAMS)
     assert report.problem is None and report.degrees_of_freedom == 1
     labels = [label for label, _ in report.rows]
     assert labels[:2] == ["at", "off the constraints"]
@@ -134,12 +134,12 @@ def test_report_of_a_state_with_other_velocities():
         lj.accelerations(pair, 0.0, STATE[1], along, PARAMS)
     longer = lj.Holonomic(lambda t, q, params: rod_square(q) - 4.0 * params["l"] ** 2)
     torn = lj.System(cartesian_lagrangian, {"rod": lj.Holonomic(rod), "longer": longer})
-    report = lj.explain(torn, *STATE[1:])
+    report = lj.explain(torn, *STATE)
     assert "no state near it is on them" in repr(report) and "no consistent state" in str(report.problem)
     # On the velocities of both, with a path that only one of them follows: these do contradict each other.
     moved = lj.Holonomic(lambda t, q, params: rod_square(q) - (params["l"] + t**2) ** 2)
     against = lj.System(cartesian_lagrangian, {"rod": lj.Holonomic(rod), "moved": moved})
-    assert "contradict each other" in str(lj.explain(against, *STATE[1:]).problem)
+    assert "contradict each other" in str(lj.explain(against, *STATE).problem)
 
 
 @pytest.mark.slow

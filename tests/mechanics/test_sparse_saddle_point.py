@@ -222,8 +222,9 @@ def test_without_constraints():
 @pytest.mark.exhaustive
 def test_explain_says_so():
     """The row names band and size; a small system has none."""
-    assert "banded, half bandwidth 1, 9 equations" in repr(lj.explain(*chain(9)))
-    assert "banded" not in repr(lj.explain(*chain(4)))
+    explained = lambda system, *state: lj.explain(system, 0.0, *state)
+    assert "banded, half bandwidth 1, 9 equations" in repr(explained(*chain(9)))
+    assert "banded" not in repr(explained(*chain(4)))
 
 
 @pytest.mark.exhaustive

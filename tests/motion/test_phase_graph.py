@@ -32,7 +32,7 @@ def explanation():
         lj.Switch("sliding", to="flying", when=edge),
         lj.Switch("sliding", to="flying", when=lj.releases("table")),
     ]
-    return lj.explain(lj.Hybrid(PHASES, switches), {"x": 1.0, "y": 0.0}, {"x": 2.0, "y": 0.0})
+    return lj.explain(lj.Hybrid(PHASES, switches), 0.0, {"x": 1.0, "y": 0.0}, {"x": 2.0, "y": 0.0})
 
 
 def test_phases_and_guards(explanation):
@@ -51,7 +51,7 @@ def test_phases_and_guards(explanation):
 def test_elsewhere_guards_have_no_value():
     """Where the state is none of a phase, its guards are not evaluated."""
     hybrid = lj.Hybrid(PHASES, [lj.Switch("sliding", to="flying", when=lj.releases("table"))])
-    found = lj.explain(hybrid, {"x": 1.0, "y": 5.0}, {"x": 2.0, "y": 0.0})
+    found = lj.explain(hybrid, 0.0, {"x": 1.0, "y": 5.0}, {"x": 2.0, "y": 0.0})
     assert found.switches[0][3] is None and "now" not in repr(found)
 
 

@@ -51,9 +51,9 @@ def test_any_units():
         np.testing.assert_allclose(other.q / length, usual.q, rtol=0, atol=1e-12)
         np.testing.assert_allclose(other.v * time / length, usual.v, rtol=0, atol=1e-12)
         np.testing.assert_allclose(np.max(other.error.q) / length, np.max(usual.error.q), rtol=1e-3)
-        assert float(other.departure) < 1e-3
+        assert float(other.scaled_error) < 1e-3
     lost = on_rod(2.0**-30, atol=1e-9)
-    assert np.max(np.abs(lost.q / 2.0**-30 - usual.q)) > 1e-3 and float(lost.departure) > 1
+    assert np.max(np.abs(lost.q / 2.0**-30 - usual.q)) > 1e-3 and float(lost.scaled_error) > 1
 
 
 @pytest.mark.slow

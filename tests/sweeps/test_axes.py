@@ -12,7 +12,7 @@ GRID = {"a": np.array([1.0, 2.0]), "b": np.array([10.0, 20.0, 30.0]), "c": np.ar
 
 def test_the_last_axis_is_the_fastest():
     """As the loops run, one point and several; the slices of an axis of vectors."""
-    axes = axes_of(GRID, zipped=False)
+    axes = axes_of(GRID, paired=False)
     assert axes.shape == (2, 3, 4) and axes.size == 24
     points = [(a, b, c) for a in GRID["a"] for b in GRID["b"] for c in GRID["c"]]
     several = axes.at(np.array([0, 7, 23]))
@@ -22,9 +22,9 @@ def test_the_last_axis_is_the_fastest():
             assert np.array_equal(point["c"], points[index][2])
 
 
-def test_zipped_axes_move_together():
+def test_paired_axes_move_together():
     """One dimension, the point."""
-    axes = axes_of({"a": jnp.arange(3.0), "b": 2 * jnp.arange(3.0)}, zipped=True)
+    axes = axes_of({"a": jnp.arange(3.0), "b": 2 * jnp.arange(3.0)}, paired=True)
     assert axes.dims == {"point": 3}
     assert axes.at(2) == {"a": 2.0, "b": 4.0}
     assert axes.words(1) == "a = 1, b = 2"
@@ -32,12 +32,12 @@ def test_zipped_axes_move_together():
 
 def test_numbers_become_those_of_jax():
     """A list of integers stays one of integers, floats are in JAX's dtype."""
-    axes = axes_of({"n": [1, 2], "x": [0.5, 1.0]}, zipped=False)
+    axes = axes_of({"n": [1, 2], "x": [0.5, 1.0]}, paired=False)
     assert axes.values["n"].dtype == np.int64 and axes.values["x"].dtype == np.float64
 
 
 @pytest.mark.parametrize(
-    ("axes", "zipped", "error", "words"),
+    ("axes", "paired", "error", "words"),
     [
         ([1.0, 2.0], False, TypeError, "must be a dictionary of arrays by name"),
         ({}, False, TypeError, "must be a dictionary"),
@@ -48,10 +48,10 @@ def test_numbers_become_those_of_jax():
         ({"omega": [1.0, 2.0], "g": [1.0]}, True, ValueError, "'omega' has 2, 'g' has 1"),
     ],
 )
-def test_what_is_no_axis(axes, zipped, error, words):
+def test_what_is_no_axis(axes, paired, error, words):
     """By name, with the fix."""
     with pytest.raises(error, match=words) as refusal:
-        axes_of(axes, zipped)
+        axes_of(axes, paired)
     assert "Fix:" in str(refusal.value)
 
 

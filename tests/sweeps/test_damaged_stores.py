@@ -284,7 +284,7 @@ def test_other_versions(store):
 def as_format_1(path, to):
     """A store as it once was: one byte a block for a mark, no checksums, no copies, no files of fill values."""
     there = Store(path)
-    said = {key: there.about[key] for key in ("fingerprint", "block", "names", "zipped")}
+    said = {key: there.about[key] for key in ("fingerprint", "block", "names", "paired")}
     said["fingerprint"] |= {"format": 1}
     group = zarr.create_group(str(to))
     for name in said["names"]:

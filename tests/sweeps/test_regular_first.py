@@ -51,7 +51,7 @@ def quiet(run, axes=BOTH, **settings):
 def regular_alone(run, axes=BOTH):
     """(values, status, settled) of the program that takes motions for regular, and of nothing else."""
     grid = axes_of(axes, False)
-    program, _ = remembered.program_for(run, grid, grid.size, jax.local_devices()[:1], "together", careful=False)
+    program, _ = remembered.program_for(run, grid, grid.size, jax.local_devices()[:1], "vmap", careful=False)
     return program.call(grid.at(np.arange(grid.size)), grid.size)
 
 
@@ -179,7 +179,7 @@ def test_many_chunks_and_workers(compiled):
 @pytest.mark.exhaustive
 def test_in_turn_and_resweep(compiled):
     """One lane after the other, and run again."""
-    swept = quiet(first_coordinate, layout="in turn")
+    swept = quiet(first_coordinate, layout="map")
     np.testing.assert_allclose(swept.values, exact(BOTH["k"]), rtol=1e-7)
     again = swept.resweep(lambda point: 2 * first_coordinate(point), where=BOTH["k"] < 3)
     np.testing.assert_allclose(again.values, exact(BOTH["k"]) * np.where(BOTH["k"] < 3, 2, 1), rtol=1e-7)

@@ -49,7 +49,7 @@ def test_called_again_it_compiles_nothing():
         ({"x": np.arange(1000)}, {}),
         ({"x": np.ones((1000, 2))}, {}),
         (xs(1000), {"chunk": 100}),
-        (xs(1000), {"layout": "in turn"}),
+        (xs(1000), {"layout": "map"}),
     ]
     for axes, settings in others:
         with compiles() as found:
