@@ -14,10 +14,13 @@ project, author, copyright = "lagjax", "the authors of lagjax", "the authors of 
 release = version = installed("lagjax")
 language = "en"
 extensions = ["myst_nb", "sphinx_copybutton", "mathml", "api_pages", "api_links", "notebook_pages", "error_pages", "result_pages"]
-exclude_patterns = ["_build", "_ext"]
+exclude_patterns = ["_build", "_ext", "_static", "_templates"]
 nitpicky = True
 
 html_theme = "pydata_sphinx_theme"
+templates_path = ["_templates"]
+html_favicon = "_static/icon.svg"
+html_context = {"default_mode": "auto"}
 html_title = "lagjax"
 html_math_renderer = "mathml"
 html_static_path = ["_static"]

@@ -68,7 +68,6 @@ def draw_andrews(left, right):
     P = crank - p["d"] * unit(q.beta + q.theta)
     upper = a + p["zt"] * unit(q.delta)
     lower = a + p["u"] * unit(q.epsilon - np.pi / 2)
-    D = b + p["sc"] * unit(q.gamma - np.pi / 2) * -1 + p["sd"] * unit(q.gamma)
     D = np.asarray(b) + p["sd"] * unit(q.gamma) + p["sc"] * unit(q.gamma - np.pi / 2)
     chains = [path([0, 0], crank, P), path(b, P), path(a, upper, P), path(a, lower, P), path(b, D)]
     stills(left, chains, len(ts))

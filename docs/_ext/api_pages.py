@@ -142,7 +142,7 @@ def index(groups: dict[str, list[str]]) -> str:
         for name in names:
             first = (inspect.getdoc(getattr(lagjax, name)) or "").split("\n\n")[0].replace("\n", " ")
             parts.append(f"- [`lj.{name}`]({page_of(name)}.md): {first}")
-        parts.append("\n```{toctree}\n:hidden:\n\n" + "\n".join(map(page_of, names)) + "\n```\n")
+        parts.append(f"\n```{{toctree}}\n:hidden:\n:caption: {title}\n\n" + "\n".join(map(page_of, names)) + "\n```\n")
     return "\n".join(parts)
 
 
