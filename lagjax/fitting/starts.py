@@ -37,9 +37,10 @@ from lagjax.numerics.rank import null_space
 
 # Samples from whose parabola position and velocity are read.
 SAMPLES = 7
-# So many of them agree; what is off by so many times more than these, and by so much of the data's spread, is wild.
+# So many of them agree; what is off by so many times more than these, and by so much of the data's spread, is an
+# outlier.
 # (Samples far apart, along a curve that is no parabola, come to 30 times.)
-MOST, WILD, OF_SPREAD = 5, 100.0, 0.3
+MOST, FAR_OFF, OF_SPREAD = 5, 100.0, 0.3
 # Iterations for c, each with its own matrix; they end where the residual no longer falls.
 ITERATIONS = 12
 # Of a guess, what is left of the constraints after that, in displacements relative to the state.
@@ -230,7 +231,7 @@ def _parabola(t, x, samples):
     threes = _threes(count)
     values, slopes = [], []
     for column in x.reshape(len(x), -1).T:
-        wild, column = OF_SPREAD * spread(column), column[samples]
+        far_off, column = OF_SPREAD * spread(column), column[samples]
         first = xp.argsort(~xp.isfinite(column), stable=True)[:count]
         y, known = column[first], xp.isfinite(column[first])
         scale = xp.max(xp.where(known, t[first], 0.0))
@@ -243,7 +244,7 @@ def _parabola(t, x, samples):
             off = xp.abs(y - (powers @ through)[..., 0])
             typical = xp.sort(off, axis=1)[:, MOST - 1]
             best = xp.argmin(typical)
-            near = known & (~xp.all(known) | (off[best] <= xp.maximum(WILD * typical[best], wild)))
+            near = known & (~xp.all(known) | (off[best] <= xp.maximum(FAR_OFF * typical[best], far_off)))
         found = xp.linalg.lstsq(powers * near[:, None], xp.where(near, y, 0.0))[0]
         values.append(found[0])
         slopes.append(found[1] / scale)

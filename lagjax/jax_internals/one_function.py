@@ -92,7 +92,7 @@ def one_function(function: Callable, *args, checked: bool = False, in_blocks: bo
     return eqx.combine(jtu.tree_unflatten(jtu.tree_structure(shapes), found), rest[0])
 
 
-def called(results):
+def kept_as_call(results):
     """`results` of a jitted function that stays a call; else XLA computes it anew for each of those who need them."""
     if jax.default_backend() != "cpu" or is_plain():
         return results
@@ -107,7 +107,7 @@ def apart(function: Callable, *args):
     >>> print(apart(jnp.sin, jnp.asarray(0.0)))
     0.0
     """
-    return called(_jitted(function, args))
+    return kept_as_call(_jitted(function, args))
 
 
 @eqx.filter_jit

@@ -52,8 +52,8 @@ def accelerations(system, t, q, v, params) -> tuple[PyTree[Array], dict[str, Arr
     system = looked_at(system, s)
     # What a function closes over may be traced where nothing that is passed is.
     if not is_eager() or coordinates.is_traced((s, eqx.filter(system, eqx.is_array))):
-        equations = equations_of(lift(system, s), *s, quickly=True)
-        a, multipliers = equations.believed(s.t, equations.inside(s.q), equations.inside(s.v))
+        equations = equations_of(lift(system, s), *s, fast=True)
+        a, multipliers = equations.solution_or_nan(s.t, equations.inside(s.q), equations.inside(s.v))
         return equations.outside(a), multipliers
     equations = equations_of(system, *s)
     if isinstance(equations.form, Banded):

@@ -267,8 +267,8 @@ def guards_of(crossings: Mapping[str, Crossing], system: System, start: State, h
     functions, of_guards = [], []
     for name, crossing in crossings.items():
         guard, read = first_guard_alike(crossing.guard) if is_eager() else (crossing.guard, read_by(crossing.guard))
-        look = partial(_looked_at, name, guard, system, start)
-        takes, multipliers, long = remembered(system, (guards_of, guard, read, kinds(start)), look)
+        examine = partial(_looked_at, name, guard, system, start)
+        takes, multipliers, long = remembered(system, (guards_of, guard, read, kinds(start)), examine)
         given = dict(zip(OF_STATE, start)) | {"multipliers": multipliers}
         functions.append(lift_function(guard, tuple(given[name] for name in takes)))
         of_crossing = crossing.direction, crossing.terminal, crossing.most

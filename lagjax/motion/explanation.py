@@ -125,7 +125,7 @@ def _explain(system: System, s: coordinates.State) -> Explanation:
     if found_structure is not None:
         rows += _of_structure(found_structure)
     rows += [(name, "yes") for name in ("force", "dissipation") if getattr(system, name) is not None]
-    rows.append(("solved", _how_solved(equations_of(system, *s, quickly=True), found_structure)))
+    rows.append(("solved", _how_solved(equations_of(system, *s, fast=True), found_structure)))
     if is_free_of_velocities(system, *s):
         by = type(nystrom_for(system, s.params)).__name__
         rows.append(("velocities", f"accelerations do not depend on them: stepped by {by}"))

@@ -135,7 +135,7 @@ def sweep(
 class _Engine:
     """A compiled program and how it is called.
 
-    It takes motions for regular, which compiles in two thirds of the time: the careful program is compiled when a point
+    It takes motions for regular, which compiles in two thirds of the time: the robust program is compiled when a point
     turns out to need it.
     """
 
@@ -144,7 +144,7 @@ class _Engine:
         self.workers, self.sort, self.layout, self.devices = workers, sort, layout, devices
         self.progress = progress
         self._patience = PATIENCE if layout == "vmap" else None
-        self.program, seconds = self._program(careful=False, progress=progress)
+        self.program, seconds = self._program(robust=False, progress=progress)
         # Before anything runs, and since then.
         self._compiling = [seconds, 0.0]
         self._lock, self._one, self._slow = threading.Lock(), None, None
@@ -168,9 +168,9 @@ class _Engine:
         chunk = _length(count, self.workers, self.chunk)
         return _Engine(run, self.axes, chunk, self.workers, self.sort, self.layout, self.devices, self.progress)
 
-    def _program(self, careful, progress=False):
+    def _program(self, robust, progress=False):
         chunk, devices, layout = self.chunk, self.devices, self.layout
-        return program_for(self.run, self.axes, chunk, devices, layout, self._patience, careful, progress)
+        return program_for(self.run, self.axes, chunk, devices, layout, self._patience, robust, progress)
 
     def seconds_of(self, indices):
         """The seconds of computing at no more than `chunk` indices."""
@@ -217,7 +217,7 @@ class _Engine:
     def _careful(self):
         with self._lock:
             if self._slow is None:
-                self._slow, seconds = self._program(careful=True)
+                self._slow, seconds = self._program(robust=True)
                 self._compiling[1] += seconds
         return self._slow
 

@@ -113,8 +113,8 @@ class Store:
             if number in unreadable:
                 found[number] = f"{self._file(DONE, number)} is damaged"
             elif np.any(marks[number]):
-                look = self._damage_unchecked if self.format == 1 else self._damage
-                wrong = next(look(number, marks[number], read), None)
+                find_damage = self._damage_unchecked if self.format == 1 else self._damage
+                wrong = next(find_damage(number, marks[number], read), None)
                 if wrong is not None:
                     found[number] = wrong
         return found

@@ -240,7 +240,7 @@ def test_a_sphere_thrown_sliding():
 
 
 def test_forces_of_multipliers():
-    """Friction enters the equations: a block on an incline, written out, in arrays, and with the careful way."""
+    """Friction enters the equations: a block on an incline, written out, in arrays, and with the robust way."""
     incline = lj.Holonomic(lambda t, q, p: q["y"] - jnp.tan(p["angle"]) * q["x"])
 
     def drag(t, q, v, multipliers, p):

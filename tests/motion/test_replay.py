@@ -136,7 +136,7 @@ def test_differences_on_the_same_steps():
 @pytest.mark.slow
 @pytest.mark.parametrize("copies", exhaustive_but((2,), (1, 2)))
 def test_constraints_and_their_multipliers(copies):
-    """A rod, and two that say the same, whose steps are taken the careful way; in lanes, and from a turning point."""
+    """A rod, and two that say the same, whose steps are taken the robust way; in lanes, and from a turning point."""
     system, q0 = rod(copies), {"x": 2.0, "y": 0.0}
     one = lambda vy, p: end(system, q0, {"x": 0.0, "y": vy}, p)
     modes_agree(lambda x: jnp.sum(jax.vmap(one, (0, None))(*x)), (jnp.array([0.0, 0.5]), PARAMS))

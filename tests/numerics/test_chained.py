@@ -21,10 +21,10 @@ def chain(seed=0, windows=W):
     seams, begin, end = (draw(windows, J, n).at[-1].set(0.0) for n in (P, K, K))
 
     def product(d):
-        following = jnp.concatenate([d.own[1:], jnp.zeros_like(d.own[:1])])
+        following = jnp.concatenate([d.local[1:], jnp.zeros_like(d.local[:1])])
         return Equations(
-            rows @ d.shared + jnp.einsum("wij,wj->wi", own, d.own),
-            seams @ d.shared + jnp.einsum("wij,wj->wi", begin, d.own) + jnp.einsum("wij,wj->wi", end, following),
+            rows @ d.shared + jnp.einsum("wij,wj->wi", own, d.local),
+            seams @ d.shared + jnp.einsum("wij,wj->wi", begin, d.local) + jnp.einsum("wij,wj->wi", end, following),
             prior @ d.shared,
         )
 
@@ -50,8 +50,8 @@ def test_solution_and_covariance(windows):
     np.testing.assert_allclose(of.shared, whole[:P, :P], rtol=1e-9)
     for w in range(windows):
         part = slice(P + w * K, P + (w + 1) * K)
-        np.testing.assert_allclose(of.own[w], whole[part, part], rtol=1e-9)
-        np.testing.assert_allclose(of.own_shared[w], whole[part, :P], rtol=1e-8)
+        np.testing.assert_allclose(of.local[w], whole[part, part], rtol=1e-9)
+        np.testing.assert_allclose(of.local_shared[w], whole[part, :P], rtol=1e-8)
     if windows > 1:
         # Twin: without its seams a chain has another solution.
         loose = eliminate(slopes_of(product, u)._replace(seams_by_next=jnp.zeros((windows, J, K))), rhs, none)
