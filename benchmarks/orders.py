@@ -2,12 +2,12 @@
 
     python benchmarks/orders.py --json benchmarks/results/orders.json
 
-A double pendulum in its angles, and as two masses on rods, whose constraints every step returns to. For Nyström methods,
-which take no accelerations that see velocities, the ends of eight orbits of Hénon and Heiles: one alone scatters by 1.
-Constant steps; the order is the slope of the logarithm of the error (its mean over the orbits) over that of the step,
-against SciPy's DOP853 at a tolerance of 2.5e-14. Met where it is the claimed one within 0.35; within 1 for Nyström's,
-whose steps are a good part of a period. The slow tests measure the same with misprints as twins: `tests/motion/test_orders.py`,
-`tests/numerics/test_nystrom.py`, `tests/numerics/test_radau.py`.
+A double pendulum in its angles, and as two masses on rods, whose constraints every step returns to. For Nyström's
+methods, which take no accelerations that see velocities, the ends of eight orbits of Hénon and Heiles: one alone
+scatters by 1. Constant steps; the order is the slope of the logarithm of the error (its mean over the orbits) over
+that of the step, against SciPy's DOP853 at a tolerance of 2.5e-14. Met where it is the claimed one within 0.35; within
+1 for Nyström's, whose steps are a good part of a period. The slow tests measure the same with misprints as twins:
+`tests/motion/test_orders.py`, `tests/numerics/test_nystrom.py`, `tests/numerics/test_radau.py`.
 
 Source: Hairer, Nørsett & Wanner, *Solving ODEs I*, §II.3-II.5, II.14; Hénon & Heiles, *Astron. J.* 69 (1964) 73.
 """

@@ -13,7 +13,16 @@ sys.path[:0] = [str(HERE / "_ext"), str(HERE.parent)]
 project, author, copyright = "lagjax", "the authors of lagjax", "the authors of lagjax, Apache-2.0"
 release = version = installed("lagjax")
 language = "en"
-extensions = ["myst_nb", "sphinx_copybutton", "mathml", "api_pages", "api_links", "notebook_pages", "error_pages", "result_pages"]
+extensions = [
+    "myst_nb",
+    "sphinx_copybutton",
+    "mathml",
+    "api_pages",
+    "api_links",
+    "notebook_pages",
+    "error_pages",
+    "result_pages",
+]
 exclude_patterns = ["_build", "_ext", "_static", "_templates"]
 nitpicky = True
 

@@ -2,9 +2,10 @@
 
 import re
 
-import lagjax
 from api_pages import page_of
 from docutils import nodes
+
+import lagjax
 
 NAME = re.compile(r"lj\.(\w+)\b")
 

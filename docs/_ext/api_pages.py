@@ -8,14 +8,43 @@ import inspect
 import re
 import typing
 from pathlib import Path
+from statistics import median
+
+from written import clear, write
 
 import lagjax
-from written import clear, write
 
 FOLDER = Path(__file__).parent.parent / "api"
 INIT = Path(lagjax.__file__)
 # Whose example shows an object that no function is annotated to return.
-SHOWN_BY = {"Crossings": "Crossing", "Snapshot": "integrate", "Moment": "integrate"}
+SHOWN_BY = {
+    "Crossings": "Crossing", "Snapshot": "integrate", "Explanation": "explain", "Switches": "touches",
+    "Routhian": "routhian", "Branch": "continue_equilibria", "Critical": "continue_equilibria", "Mode": "normal_modes",
+    "Status": "sweep", "HybridTrajectory": "touches",
+}  # fmt: skip
+# Of names whose docstring has no room for one.
+EXAMPLES = {
+    "RESULTS": """
+>>> import lagjax as lj
+>>> print(lj.RESULTS[lj.RESULTS.event_occurred])
+Terminating differential equation solve because an event occurred.
+""",
+    "scenes": """
+>>> import lagjax as lj
+>>> hoop = lj.scenes.bead_on_hoop
+>>> print(f"{hoop.equilibrium_angle(hoop.PARAMS):.3f}")
+1.199
+""",
+}
+RAISE_IT = """
+>>> import warnings
+>>> import lagjax as lj
+>>> with warnings.catch_warnings():
+...     warnings.simplefilter("error", lj.{name})  # in here it is raised
+...     warnings.warn("for example", lj.{name})
+Traceback (most recent call last):
+{module}.{name}: for example
+"""
 
 
 def sections() -> dict[str, list[str]]:
@@ -31,7 +60,7 @@ def sections() -> dict[str, list[str]]:
     groups: dict[str, list[str]] = {}
     for name in lagjax.__all__:
         groups.setdefault(found.get(name, "More"), []).append(name)
-    return dict(sorted(groups.items(), key=lambda item: sum(place[name] for name in item[1]) / len(item[1])))
+    return dict(sorted(groups.items(), key=lambda item: median(place[name] for name in item[1])))
 
 
 def page_of(name: str) -> str:
@@ -70,8 +99,12 @@ def signature(thing, name: str, method: bool = False) -> str:
     if method and kept and kept[0].name in ("self", "cls"):
         kept = kept[1:]
     # The repr of an object has an address in it; a short one is a default that can be typed.
-    kept = [p if len(repr(p.default)) < 40 and " at 0x" not in repr(p.default) else p.replace(default=...) for p in kept]
-    return name + str(found.replace(parameters=kept, return_annotation=inspect.Signature.empty)).replace("Ellipsis", "...")
+    kept = [
+        p if len(repr(p.default)) < 40 and " at 0x" not in repr(p.default) else p.replace(default=...) for p in kept
+    ]
+    return name + str(found.replace(parameters=kept, return_annotation=inspect.Signature.empty)).replace(
+        "Ellipsis", "..."
+    )
 
 
 def makers(cls: type) -> list[str]:
@@ -104,16 +137,30 @@ def members(cls: type) -> list[str]:
     return parts
 
 
+def added_example(thing, name: str) -> str:
+    """An example that is not in a docstring; a test runs these."""
+    if inspect.isclass(thing) and issubclass(thing, Warning):
+        return RAISE_IT.format(name=name, module=thing.__module__)
+    return EXAMPLES.get(name, "")
+
+
+def borrowed(thing, name: str) -> str:
+    """The example of the function that makes such an object, or one added here."""
+    if added := added_example(thing, name):
+        return f"\n{markdown(added)}\n"
+    maker = SHOWN_BY.get(name) or next(iter(makers(thing)), None)
+    if maker is None:
+        return ""
+    return f"\nAn example, that of `lj.{maker}`:\n\n{example(inspect.getdoc(getattr(lagjax, maker)) or '')}\n"
+
+
 def described(thing, name: str) -> str:
     """The directive of a function or class."""
     doc = markdown(inspect.getdoc(thing) or "")
     if inspect.isclass(thing):
         kind = "exception" if issubclass(thing, BaseException) else "class"
         head = name if kind == "exception" or issubclass(thing, tuple) else signature(thing, name)
-        shown = ""
-        maker = next(iter(makers(thing)), None) or SHOWN_BY.get(name)
-        if "```pycon" not in doc and maker:
-            shown = f"\nAn example, that of `lj.{maker}`:\n\n{example(inspect.getdoc(getattr(lagjax, maker)))}\n"
+        shown = "" if "```pycon" in doc else borrowed(thing, name)
         inner = "\n".join(members(thing)) if kind == "class" else ""
         return f"::::{{py:{kind}}} {head}\n{doc}\n{shown}\n{inner}::::\n"
     if callable(thing):
@@ -126,7 +173,18 @@ def page(name: str) -> str:
     thing = getattr(lagjax, name)
     if not inspect.ismodule(thing):
         return f"# lj.{name}\n\n:::{{py:currentmodule}} lagjax\n:::\n\n{described(thing, name)}"
-    parts = [f"# lj.{name}\n", markdown(inspect.getdoc(thing) or ""), f"\n:::{{py:currentmodule}} lagjax.{name}\n:::\n"]
+    parts = [
+        f"# lj.{name}\n",
+        markdown(inspect.getdoc(thing) or ""),
+        markdown(EXAMPLES.get(name, "")),
+        f"\n:::{{py:currentmodule}} lagjax.{name}\n:::\n",
+    ]
+    if hasattr(thing, "__path__"):
+        inner = {key: value for key, value in vars(thing).items() if inspect.ismodule(value) and key in thing.__all__}
+        lines = [
+            f"- `lagjax.{name}.{key}`: {(inspect.getdoc(value) or '').splitlines()[0]}" for key, value in inner.items()
+        ]
+        parts += ["", *lines, "\nThe [gallery](../gallery.md) has a picture and a closed form of each.\n"]
     defined = ast.parse(Path(thing.__file__).read_text()).body
     for node in defined:
         if isinstance(node, (ast.FunctionDef, ast.ClassDef)) and not node.name.startswith("_"):

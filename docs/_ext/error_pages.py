@@ -1,15 +1,16 @@
 """What lagjax says when something is wrong, read off its code: every message, by theme, with a link to each.
 
-A message is text of three parts: what happened, the usual cause, the fix. Where numbers and names stand in one, the page
-has an ellipsis.
+A message is text of three parts: what happened, the usual cause, the fix. Where numbers and names stand in one, the
+page has an ellipsis.
 """
 
 import ast
 import re
 from pathlib import Path
 
-import lagjax
 from written import write
+
+import lagjax
 
 ROOT = Path(lagjax.__file__).parent
 PAGE = Path(__file__).parent.parent / "generated" / "errors.md"
@@ -46,9 +47,10 @@ ORDER = list(dict.fromkeys([*("A system and its Lagrangian", "States and constra
 ELSEWHERE = "Elsewhere"
 INTRO = """# What went wrong
 
-Every message that lagjax can give, as it stands in the code: what happened, the usual cause, the fix. Search this page (or
-the site) for words of yours; `…` stands for names and numbers of your system. Errors are raised where values are looked at,
-outside of `jit`; in a batch or a sweep a failed motion keeps its reason in `traj.result` or `swept.status` instead.
+Every message that lagjax can give, as it stands in the code: what happened, the usual cause, the fix. Search this page
+(or the site) for words of yours; `…` stands for names and numbers of your system. Errors are raised where values are
+looked at, outside of `jit`; in a batch or a sweep a failed motion keeps its reason in `traj.result` or `swept.status`
+instead.
 
 """
 
@@ -85,14 +87,16 @@ def messages(source: str) -> list[tuple[str, str]]:
     found, seen = [], set()
 
     def add(kind, text):
-        text = text and re.sub(r"…(?:\\s?…)+", "…", text).strip()
+        text = text and re.sub(r"…(?:\s?…)+", "…", text).strip()
         if text and re.search(r"[a-z]{3}", text) and text not in seen:
             seen.add(text)
             found.append((kind, text))
 
     tree = ast.parse(source)
     documented = (ast.Module, ast.ClassDef, ast.FunctionDef)
-    docstrings = {id(node.body[0].value) for node in ast.walk(tree) if isinstance(node, documented) and ast.get_docstring(node)}
+    docstrings = {
+        id(node.body[0].value) for node in ast.walk(tree) if isinstance(node, documented) and ast.get_docstring(node)
+    }
     inside: set[int] = set()
     for node in ast.walk(tree):
         call = node.exc if isinstance(node, ast.Raise) else node
@@ -102,7 +106,11 @@ def messages(source: str) -> list[tuple[str, str]]:
             add(kind_of(call), text_of(call.args[0]))
             inside |= {id(part) for part in ast.walk(call)}
     for node in ast.walk(tree):
-        if id(node) in inside or id(node) in docstrings or not isinstance(node, (ast.Constant, ast.JoinedStr, ast.BinOp)):
+        if (
+            id(node) in inside
+            or id(node) in docstrings
+            or not isinstance(node, (ast.Constant, ast.JoinedStr, ast.BinOp))
+        ):
             continue
         text = text_of(node)
         if text and "\nFix:" in text:
@@ -127,14 +135,20 @@ def anchor(text: str, taken: set[str]) -> str:
     return name
 
 
+def title(line: str) -> str:
+    """The first sentence of a message, or what fits on a line or two of it."""
+    short = re.split(r"(?<=[a-z)'…])[.:;] ", line)[0].rstrip(":.")
+    return short if len(short) <= 130 else short[:130].rsplit(" ", 1)[0] + " …"
+
+
 def entry(kind: str, text: str, taken: set[str]) -> str:
     """One message as Markdown: its first line is its heading."""
     first, *rest = text.split("\n")
     name = anchor(first, taken)
     # A heading is a line of text: what is code or a formula to Markdown must not become so.
-    heading = re.sub(r"([\\`*_{}\[\]<>#$|])", r"\\\1", first.rstrip(":."))
+    heading = re.sub(r"([\\`*_{}\[\]<>#$|])", r"\\\1", title(first))
     shown = f"```text\n{kind + ': ' if kind else ''}{text}\n```\n"
-    return f"({name})=\n### {heading[:160]}\n\n{shown}"
+    return f"({name})=\n### {heading}\n\n{shown}"
 
 
 def page() -> str:

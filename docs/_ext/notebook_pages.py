@@ -13,6 +13,15 @@ from written import clear, write
 
 FOLDER = Path(__file__).parent.parent / "notebooks"
 SOURCE = Path(__file__).parents[2] / "notebooks"
+INDEX = """# Notebooks
+
+One question each, with its Lagrangian in the first lines. They are shown with the outputs that are stored in them; the
+tests run them.
+
+```{toctree}
+:maxdepth: 1
+
+"""
 
 
 def words(code: str) -> str:
@@ -34,7 +43,8 @@ def with_alt_texts(notebook: dict, name: str) -> dict:
             headings = re.findall(r"^#+ (.*)", text, re.MULTILINE)
             heading = headings[-1] if headings else heading
         elif any("image/png" in output.get("data", {}) for output in cell["outputs"]):
-            alt = cell["metadata"].get("alt") or f"Figure, {heading}: {words(text)}".rstrip(": ")
+            said = words(text) or "drawn by " + text.strip().splitlines()[-1]
+            alt = cell["metadata"].get("alt") or f"Figure, {heading}: {said}"
             cell["metadata"]["mystnb"] = {"image": {"alt": alt.replace("$", "")}}
     return notebook
 
@@ -45,12 +55,7 @@ def generate(app):
     for name in names:
         text = (SOURCE / f"{name}.ipynb").read_text().replace("](../docs/", "](../")
         write(FOLDER / f"{name}.ipynb", json.dumps(with_alt_texts(json.loads(text), name), ensure_ascii=False))
-    listed = "\n".join(names)
-    write(
-        FOLDER / "index.md",
-        "# Notebooks\n\nOne question each, with its Lagrangian in the first lines. They are shown with the outputs that "
-        "are stored in\nthem; the tests run them.\n\n```{toctree}\n:maxdepth: 1\n\n" + listed + "\n```\n",
-    )
+    write(FOLDER / "index.md", INDEX + "\n".join(names) + "\n```\n")
     clear(FOLDER, {"index.md"} | {f"{name}.ipynb" for name in names})
 
 

@@ -11,8 +11,8 @@ ROOT = Path(__file__).parents[2]
 RESULTS, FOLDER = ROOT / "benchmarks" / "results", Path(__file__).parent.parent / "generated" / "measured"
 INTRO = """# Accuracy and speed
 
-All numbers come from `benchmarks/results/`, which the scripts in `benchmarks/` write; this page and those below it are made
-from these files. A target is what the project set itself before measuring. What is missed stands here too.
+All numbers come from `benchmarks/results/`, which the scripts in `benchmarks/` write; this page and those below it are
+made from these files. A target is what the project set itself before measuring. What is missed stands here too.
 
 ## Error against run time
 
@@ -80,7 +80,11 @@ def generate(app):
         write(FOLDER / f"{name}.md", one_file(name, found))
     missed = {name: [row for row in found["rows"] if row.get("met") is False] for name, found in files.items()}
     quoted = quote()
-    parts = [INTRO, quoted.accuracy(), "\n## Speed beside others\n\nRatios of run times (where the target is ≥: of rates) at"]
+    parts = [
+        INTRO,
+        quoted.accuracy(),
+        "\n## Speed beside others\n\nRatios of run times (where the target is ≥: of rates) at",
+    ]
     parts += [" equal error, one core, medians.\n\n", quoted.speed(), "\n## What is missed\n\n"]
     total = sum(len(found["rows"]) for found in files.values())
     parts.append(f"{sum(map(len, missed.values()))} of {total} rows miss their target.\n\n")

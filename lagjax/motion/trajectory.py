@@ -26,7 +26,7 @@ from lagjax.motion.curves import curves, finite
 
 # For checkers equinox's enumerations are Python's, of which none can have more items than its parent.
 class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
-    """How an integration or a fit ended: diffrax's results, and what they have no word for."""
+    """How an integration or a fit ended: diffrax's results, and more: `lj.RESULTS[traj.result]`."""
 
     start_off_constraints = "The initial state does not satisfy the constraints."
     contradictory = "Constraints that depend on each other ask for different accelerations at the initial state."

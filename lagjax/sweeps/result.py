@@ -256,6 +256,17 @@ def open_sweep(path: str | os.PathLike) -> Sweep:
     inside, when they are read. Either is told by name, and from then on its points are "lost from the store" in
     `status`, and not `ok`; `lj.sweep(run, axes, store=path)` computes them again.
 
+    >>> import tempfile
+    >>> import lagjax as lj
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     done = lj.sweep(lambda point: point["x"] ** 2, {"x": [1.0, 2.0]}, store=folder + "/squares", progress=False)
+    ...     print(open_sweep(folder + "/squares").values["value"])
+    [1. 4.]
+
+    **Arguments:** `path`: the folder that `lj.sweep` was given as `store`.
+
+    **Returns:** a `Sweep`.
+
     **Raises:** `ValueError` where there is no store, or nothing can be told of it.
     """
     path = Path(path)
