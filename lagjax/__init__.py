@@ -31,6 +31,7 @@ from lagjax.motion.explanation import Explanation, explain
 # isort: split
 # Motion.
 from lagjax.animation import Animation
+from lagjax.mechanics.single_precision import PrecisionWarning
 from lagjax.motion.contacts import releases, slips, sticks, touches
 from lagjax.motion.crossings import Crossing, Crossings, EventWarning
 from lagjax.motion.hybrid_trajectory import HybridTrajectory, Switches
@@ -70,6 +71,7 @@ if TYPE_CHECKING:
     # What a system is like.
     from lagjax.analysis.branches import Branch, Branches, Critical
     from lagjax.analysis.continuation import continue_equilibria
+    from lagjax.analysis.continued_orbits import continue_orbits
     from lagjax.analysis.cycles import OrbitWarning, periodic_orbit
     from lagjax.analysis.equilibria import equilibria
     from lagjax.analysis.floquet import Floquet, floquet
@@ -81,10 +83,18 @@ if TYPE_CHECKING:
     from lagjax.analysis.lyapunov import LyapunovExponents, lyapunov_exponents
     from lagjax.analysis.modes import Mode, NormalModes, normal_modes
     from lagjax.analysis.orbit import PeriodicOrbit
+    from lagjax.analysis.orbit_branch import CriticalOrbit, OrbitBranch
     from lagjax.analysis.read_back import EquationsOfMotion, latex
     from lagjax.analysis.routh import Routhian, routhian
     from lagjax.analysis.symmetries import symmetries
     from lagjax.analysis.symmetry import SymmetryTest, is_symmetry
+
+    # In and out.
+    from lagjax.exchange.exported import export, result_codes
+    from lagjax.exchange.from_sympy import from_sympy
+
+    # Many motions, in a notebook.
+    from lagjax.interactive.interact import Knobs, interact
 
 
 __version__ = "0.2.0"
@@ -93,6 +103,7 @@ __version__ = "0.2.0"
 LATER = {
     "lagjax.analysis.branches": "Branch Branches Critical",
     "lagjax.analysis.continuation": "continue_equilibria",
+    "lagjax.analysis.continued_orbits": "continue_orbits",
     "lagjax.analysis.cycles": "OrbitWarning periodic_orbit",
     "lagjax.analysis.equilibria": "equilibria",
     "lagjax.analysis.floquet": "Floquet floquet",
@@ -104,10 +115,14 @@ LATER = {
     "lagjax.analysis.lyapunov": "LyapunovExponents lyapunov_exponents",
     "lagjax.analysis.modes": "Mode NormalModes normal_modes",
     "lagjax.analysis.orbit": "PeriodicOrbit",
+    "lagjax.analysis.orbit_branch": "CriticalOrbit OrbitBranch",
     "lagjax.analysis.read_back": "EquationsOfMotion latex",
     "lagjax.analysis.routh": "Routhian routhian",
     "lagjax.analysis.symmetries": "symmetries",
     "lagjax.analysis.symmetry": "SymmetryTest is_symmetry",
+    "lagjax.exchange.exported": "export result_codes",
+    "lagjax.exchange.from_sympy": "from_sympy",
+    "lagjax.interactive.interact": "Knobs interact",
 }
 
 
@@ -127,6 +142,7 @@ def __dir__():
 
 __all__ = [
     "System",
+    "from_sympy",
     "Holonomic",
     "Nonholonomic",
     "Hybrid",
@@ -168,6 +184,7 @@ __all__ = [
     "Animation",
     "RESULTS",
     "AccuracyWarning",
+    "PrecisionWarning",
     "Generator",
     "noether_charge",
     "NoetherCharge",
@@ -196,6 +213,9 @@ __all__ = [
     "periodic_orbit",
     "PeriodicOrbit",
     "OrbitWarning",
+    "continue_orbits",
+    "OrbitBranch",
+    "CriticalOrbit",
     "floquet",
     "Floquet",
     "lyapunov_exponents",
@@ -204,6 +224,8 @@ __all__ = [
     "Sweep",
     "Status",
     "open_sweep",
+    "interact",
+    "Knobs",
     "fit",
     "Record",
     "Fit",
@@ -213,5 +235,7 @@ __all__ = [
     "learned",
     "WorkPrecision",
     "work_precision",
+    "export",
+    "result_codes",
     "scenes",
 ]

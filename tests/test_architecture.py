@@ -21,19 +21,22 @@ LAYERS = (
         "mechanics",
         "learned",
         "plot",
+        "pages",
         "animation",
         "meter",
         "motion",
+        "exchange",
         "analysis",
         "comparison",
         "sweeps",
+        "interactive",
     ),
     *("fitting", "report", "mechanisms", "scenes", "stability"),
 )
 TOP = {"__init__", "__main__", "job"}
 FINDER = doctest.DocTestFinder()
 PRIVATE = ("jax._src", "jax.experimental", "jax.extend", "jax.interpreters", "jaxlib")
-OPTIONAL = {"google_crc32c", "matplotlib", "tqdm", "xarray", "zarr"}
+OPTIONAL = {"PIL", "google_crc32c", "ipywidgets", "matplotlib", "pandas", "sympy", "tqdm", "xarray", "zarr"}
 
 
 def layer(module):

@@ -19,16 +19,11 @@ INIT = Path(lagjax.__file__)
 # Whose example shows an object that no function is annotated to return.
 SHOWN_BY = {
     "Crossings": "Crossing", "Snapshot": "integrate", "Explanation": "explain", "Switches": "touches",
-    "Routhian": "routhian", "Branch": "continue_equilibria", "Critical": "continue_equilibria", "Mode": "normal_modes",
-    "Status": "sweep", "HybridTrajectory": "touches",
+    "Routhian": "routhian", "Branch": "continue_equilibria", "Critical": "continue_equilibria", "Mode": "normal_modes", "CriticalOrbit": "continue_orbits",
+    "Status": "sweep", "Knobs": "interact", "HybridTrajectory": "touches",
 }  # fmt: skip
 # Of names whose docstring has no room for one.
 EXAMPLES = {
-    "RESULTS": """
->>> import lagjax as lj
->>> print(lj.RESULTS[lj.RESULTS.event_occurred])
-Terminating differential equation solve because an event occurred.
-""",
     "scenes": """
 >>> import lagjax as lj
 >>> hoop = lj.scenes.bead_on_hoop

@@ -28,42 +28,35 @@ from dataclasses import replace
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import jax.tree_util as jtu
-import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
 from lagjax.analysis import balance as equations
 from lagjax.analysis.balance import Steady
+from lagjax.analysis.numbers_in import Number, no_such_number, numbers_in
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.compiled import compiled
-from lagjax.mechanics.diagnosis import listed
 from lagjax.numerics.rank import independent_rows
 
 FOLD, BRANCH, MULTIPLE, FLUTTER, COLLISION, ESCAPE = "fold", "branch", "multiple", "flutter", "collision", "escape"
 
 
 class Place(eqx.Module):
-    """Where the parameter of a branch is: an entry of a leaf of `params`, or of what is held of the symmetries."""
+    """Where the parameter of a branch is: a number in `params`, or (`of_params` is None) what is held of a symmetry."""
 
     name: str = eqx.field(static=True)
-    leaf: int | None = eqx.field(static=True)
-    entry: int = eqx.field(static=True)
+    of_params: Number | None
+    entry: int = eqx.field(static=True, default=0)
 
     def put(self, s: Steady, value) -> Steady:
         """The problem at this value of the parameter."""
-        if self.leaf is None:
+        if self.of_params is None:
             return replace(s, held=s.held.at[self.entry].set(value))
-        leaves, structure = jtu.tree_flatten(s.params)
-        leaf = jnp.asarray(leaves[self.leaf])
-        leaves[self.leaf] = leaf.reshape(-1).at[self.entry].set(value).reshape(leaf.shape).astype(leaf.dtype)
-        return replace(s, params=jtu.tree_unflatten(structure, leaves))
+        return replace(s, params=self.of_params.put(s.params, value))
 
     def get(self, s: Steady):
         """Its value in the problem."""
-        if self.leaf is None:
-            return s.held[self.entry]
-        return jnp.ravel(jtu.tree_leaves(s.params)[self.leaf])[self.entry]
+        return s.held[self.entry] if self.of_params is None else self.of_params.get(s.params)
 
 
 class Frame(eqx.Module):
@@ -101,25 +94,11 @@ def place_of(steady: Steady, along: str) -> Place:
         of = of or [f"{kind}[{i}]" for i in range(steady.symmetries.count)]
         if along in of and steady.symmetries.hold == hold:
             return Place(along, None, of.index(along))
-    found = []
-    for i, (path, leaf) in enumerate(jtu.tree_flatten_with_path(steady.params)[0]):
-        name = jtu.keystr(path, simple=True, separator=".") or "params"
-        if not eqx.is_array_like(leaf) or not jnp.issubdtype(jnp.result_type(leaf), jnp.floating):
-            continue
-        for entry, index in enumerate(np.ndindex(jnp.shape(leaf))):
-            suffix = "[" + ", ".join(map(str, index)) + "]" if index else ""
-            found.append(Place(name + suffix, i, entry))
-    for place in found:
-        if place.name == along:
-            return place
-    known = [place.name for place in found]
-    there = f"there {'are' if len(known) != 1 else 'is'} {listed(known) or 'none'}"
-    there = f"there {'are' if len(known) != 1 else 'is'} {listed(known) or 'none'}"
-    raise ValueError(
-        f"along={along!r} is no number in params; {there}.\n"
-        'Fix: one of these; "spring.k" for params["spring"]["k"], and "v.psi" for the velocity of a cyclic coordinate '
-        'psi that is held (with hold="momentum": "p.psi").'
-    )
+    found = numbers_in(steady.params)
+    if along not in found:
+        more = 'and "v.psi" for the velocity of a cyclic coordinate psi that is held (with hold="momentum": "p.psi")'
+        raise no_such_number(along, steady.params, more)
+    return Place(along, found[along])
 
 
 @compiled

@@ -64,7 +64,7 @@ class Branch(eqx.Module):
         return len(self.parameter)
 
     def __repr__(self):
-        return f"Branch of {len(self)} points, {_stability(self)}; ends at {self.status}"
+        return f"Branch of {len(self)} points, {stability_in_words(_verdicts(self))}; ends at {self.status}"
 
 
 class Branches(eqx.Module):
@@ -112,7 +112,9 @@ class Branches(eqx.Module):
             low, high = np.min(b.parameter), np.max(b.parameter)
             ends = self._number(low, 6), self._number(high, 6)
             span = f"{self.along} {ends[0]} to {ends[1]}" if ends[0] != ends[1] else f"{self.along} {ends[0]}"
-            lines.append(f"  {f'branch {i + 1}':<{width}}  {span:<19}  {_stability(b)}; ends at {b.status}")
+            lines.append(
+                f"  {f'branch {i + 1}':<{width}}  {span:<19}  {stability_in_words(_verdicts(b))}; ends at {b.status}"
+            )
         if self.status != "all followed":
             lines.append(f"  {self.status}")
         return "\n".join(lines)
@@ -171,13 +173,9 @@ class Branches(eqx.Module):
         inner = []
         for i, (branch, x) in enumerate(zip(self.branches, curves)):
             colour = plot.COLOURS[i % (len(plot.COLOURS) - 1)]
-            for where, verdict in _runs(branch):
-                _, dash, width = LOOKS[verdict]
-                axis.plot(branch.parameter[where], x[where, j], dash, color=colour, linewidth=width, zorder=2)
+            draw_by_stability(axis, branch.parameter, x[:, j], _verdicts(branch), colour)
             inner.append(x[:, j])
-        for verdict, (label, dash, _) in LOOKS.items():
-            if any(np.any(_verdicts(b) == verdict) for b in self.branches):
-                axis.plot([], [], dash, color="0.2", label=label)
+        name_stability(axis, [_verdicts(branch) for branch in self.branches])
         for c in self.critical:
             y = coordinates.flatten(c.q)[0][j]
             if c.kind == "escape":
@@ -220,16 +218,30 @@ def _verdicts(branch):
     return np.where(known, np.asarray(branch.stable).astype(int), UNKNOWN)
 
 
-def _runs(branch):
+def runs(verdicts):
     """Runs of points alike, each with the first of the next: (slice, verdict)."""
-    verdicts = _verdicts(branch)
     edges = [0, *(np.flatnonzero(np.diff(verdicts)) + 1), len(verdicts)]
     for start, end in zip(edges, edges[1:]):
         yield slice(start, min(end + 1, len(verdicts))), int(verdicts[start])
 
 
-def _stability(branch):
-    kinds = [LOOKS[verdict][0] for _, verdict in _runs(branch)]
+def draw_by_stability(axis, x, y, verdicts, colour):
+    """Draw a curve whose stable parts are solid and whose unstable ones are dashed."""
+    for where, verdict in runs(verdicts):
+        _, dash, width = LOOKS[verdict]
+        axis.plot(x[where], y[where], dash, color=colour, linewidth=width, zorder=2)
+
+
+def name_stability(axis, verdicts):
+    """Put what these lines mean into the legend, those that there are."""
+    for verdict, (label, dash, _) in LOOKS.items():
+        if any(np.any(of_one == verdict) for of_one in verdicts):
+            axis.plot([], [], dash, color="0.2", label=label)
+
+
+def stability_in_words(verdicts):
+    """Stability along a branch, from its first point to its last."""
+    kinds = [LOOKS[verdict][0] for _, verdict in runs(verdicts)]
     if len(kinds) > 4:
         return f"stable and unstable in turn ({len(kinds)} times)"
     return ", then ".join(kinds)

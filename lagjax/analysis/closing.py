@@ -118,7 +118,7 @@ def closed(system, t, q, v, params, period, rtol, asked: Asked, rows, parts, tur
     """Search for an orbit near a state; `turns` (n,) of the angles, or None for those of the guess."""
     flow = flow_of(system, t, q, v, params, rtol, rows)
     guess = guessed(flow, t, flow.vector(q, v), period, asked, parts, turns)
-    goal = Goal(_integral(flow, t, guess.z), guess.z)
+    goal = Goal(integral_at(flow, t, guess.z), guess.z)
     zero, size = jnp.zeros((), t.dtype), 2 * flow.size - len(flow.rows)
     rows_of = parts * 2 * flow.size + asked.moves + asked.energy + len(asked.held)
     matrix, bases = jnp.zeros((rows_of, parts * size + 1), t.dtype), jnp.zeros((parts, 2 * flow.size, size), t.dtype)
@@ -157,7 +157,7 @@ def implicit(system, t, q, v, params, rtol, asked: Asked, rows, found: Found) ->
     found = lax.stop_gradient(found)
     seen, scale = found.seen, found.guess.scale
     goal_z = flow.onto_constraints(t, flow.vector(q, v), scale)
-    goal = Goal(_integral(flow, t, goal_z), goal_z)
+    goal = Goal(integral_at(flow, t, goal_z), goal_z)
     nodes = jax.vmap(lambda z: flow.onto_constraints(t, z, scale))(found.place.nodes)
     place = Place(nodes, found.place.period)
     none = jnp.zeros((flow.size * 2, 0), nodes.dtype)
@@ -243,9 +243,9 @@ def _residual(flow, t, place, ends, asked, goal, guess):
     if asked.moves:
         parts.append(jnp.zeros(1, left.dtype))
     if asked.energy:
-        slope = jax.grad(lambda z: _integral(flow, t, z))(lax.stop_gradient(place.nodes[0])) * scale
+        slope = jax.grad(lambda z: integral_at(flow, t, z))(lax.stop_gradient(place.nodes[0])) * scale
         size = lax.stop_gradient(jnp.linalg.norm(slope))
-        off = _integral(flow, t, place.nodes[0]) - goal.integral
+        off = integral_at(flow, t, place.nodes[0]) - goal.integral
         # Less than the round-off of its terms is nothing, but for its derivative.
         terms = jnp.abs(goal.integral) + jnp.abs(flow.system.lagrangian(t, *flow.state(goal.z), flow.params))
         noise = lax.stop_gradient(jnp.abs(off) <= ROUND_OFFS * jnp.finfo(off.dtype).eps * terms)
@@ -263,7 +263,7 @@ def _comes_back(asked, dtype):
 def _held_slopes(flow, t, place, scale, asked):
     """The gradients of what is held, of size one, in units of `scale`."""
     if asked.energy:
-        slope = jax.grad(lambda z: _integral(flow, t, z))(place.nodes[0]) * scale
+        slope = jax.grad(lambda z: integral_at(flow, t, z))(place.nodes[0]) * scale
         size = jnp.linalg.norm(slope)
         yield slope / jnp.where(size > 0, size, 1.0)
     for i in asked.held:
@@ -284,7 +284,7 @@ def _step(matrix, residual, bases, asked, rtol, damping):
     return Step(moves, solved[-1] if asked.free else jnp.zeros_like(rtol), matrix[last] @ solved)
 
 
-def _integral(flow, t, z):
+def integral_at(flow, t, z):
     """The Jacobi integral v·p - L."""
     q, v = flow.state(z)
     value, p = jax.value_and_grad(flow.system.lagrangian, argnums=2)(t, q, v, flow.params)

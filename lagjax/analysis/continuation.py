@@ -19,12 +19,14 @@ from lagjax.analysis.critical_points import Found, between, escape
 from lagjax.analysis.equilibria import conserves_balance, held_at, searched
 from lagjax.analysis.found_equilibria import OK, WORDS
 from lagjax.analysis.starts import checked, stacked, stacked_one, symmetries_of
-from lagjax.analysis.tracing import AGAIN, FIRST, Path, Point, Tracer
+from lagjax.analysis.steady_tracer import SteadyTracer
+from lagjax.analysis.tracing import AGAIN, FIRST, Path, Point
 from lagjax.jax_internals.tracing import is_eager
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.compiled import compiled
 from lagjax.mechanics.coordinates import State
 from lagjax.mechanics.diagnosis import describe
+from lagjax.mechanics.refusals import by_name, check_system
 from lagjax.mechanics.structure import angles
 
 # Points at which a branch begins and critical points are the same within so much.
@@ -39,6 +41,7 @@ UNITS, NOTHING = (1.0, 1e3, 1e6, 1e9, 1e12), 1e-2
 LINE, LINE_WITHIN = 40, 1e-9
 
 
+@by_name('lj.continue_equilibria(system, params, start, along="omega", to=5.0)', "along", "to")
 def continue_equilibria(
     system,
     params: PyTree,
@@ -86,6 +89,7 @@ def continue_equilibria(
     Source: Keller, in *Applications of Bifurcation Theory* (1977) 359; Govaerts, *Numerical Methods for Bifurcations of
     Dynamical Equilibria*, ch. 2-4.
     """
+    check_system(system, params, start)
     q, v = stacked_one(start)
     if velocity is not None:
         v = jax.tree.map(lambda x: x[0], stacked([velocity], "velocity"))
@@ -113,7 +117,7 @@ def continue_equilibria(
         frame, z = _frame(steady, place, first, last, s.v, units)
         # Where the start is a critical point, the branch begins a little before it.
         low, high = sorted((float(z[-1]), last / abs(last - first)))
-        runs.append(_Run(Tracer(frame, low, high), most_points, crossings))
+        runs.append(_Run(SteadyTracer(frame, low, high), most_points, crossings))
         runs[-1].main(z, np.sign(last - first))
         if "infinity" not in runs[-1].paths[0].status:
             return runs[-1].result(along, first, last, s)
@@ -217,7 +221,7 @@ class _Launch(NamedTuple):
 class _Run:
     """The branches and critical points found so far, and those that are to be traced."""
 
-    def __init__(self, tracer: Tracer, most: int, crossings: bool):
+    def __init__(self, tracer: SteadyTracer, most: int, crossings: bool):
         self.tracer, self.most, self.crossings = tracer, most, crossings
         self.paths: list[Path] = []
         self.found: list[Found] = []
@@ -372,7 +376,7 @@ def _joined(halves: list[Path]) -> Path:
     return Path(points, status)
 
 
-def _branch(path: Path, tracer: Tracer) -> Branch:
+def _branch(path: Path, tracer: SteadyTracer) -> Branch:
     seen = [p.seen for p in path.points]
     parameter, q, v, multipliers, roots = jax.tree.map(lambda *x: np.stack(x), *seen)
     stable = np.array([p.growing for p in path.points], object)

@@ -30,7 +30,8 @@ from lagjax.analysis.branch_equations import (
     extended_at,
     extended_by_params,
 )  # fmt: skip
-from lagjax.analysis.tracing import Point, Tracer
+from lagjax.analysis.steady_tracer import SteadyTracer
+from lagjax.analysis.tracing import Point
 
 NEWTON = 12
 # Directions whose share of the parameter is less run across it.
@@ -54,7 +55,7 @@ class Found:
     used: list[np.ndarray]
 
 
-def between(tracer: Tracer, a: Point, b: Point) -> list[Found]:
+def between(tracer: SteadyTracer, a: Point, b: Point) -> list[Found]:
     """All that is critical between two neighbouring points of a branch."""
     found = []
     if max(abs(b.z[-1] - a.z[-1]), abs(a.tangent[-1]), abs(b.tangent[-1])) < CONSTANT:
@@ -166,7 +167,7 @@ def _fold(tracer, a, b):
     return Found("fold", big[: z.size], [], 0.0, _derivative(tracer, FOLD, big, np.zeros(1)), accuracy, [])
 
 
-def escape(tracer: Tracer, point: Point) -> Found | None:
+def escape(tracer: SteadyTracer, point: Point) -> Found | None:
     """The parameter at which the solution of linear equations is at infinity, from a point far out."""
     n = tracer.frame.columns.size
     half, here = point.z.copy(), tracer.at(point.z)[1][:, :-1]
@@ -230,28 +231,17 @@ def _divergence(tracer, a, b, few, many):
         known = roots[np.isfinite(roots)]
         return float(np.poly(known / fastest)[known.size - zeros].real)
 
-    low, high, left, right = 0.0, 1.0, product(a.seen[-1]), product(b.seen[-1])
-    best, off, last = many, float(np.max(np.abs(few.z - many.z))), np.inf
-    for i in range(60 if left * right < 0 else 0):
-        # A chord, and every third time the middle, so that neither end stays where it is.
-        share = low + (high - low) * (left / (left - right) if i % 3 < 2 else 0.5)
-        point = tracer.between(a, b, share)
-        if point is None or not 0 < high - low or share in (low, high):
-            break
-        value = product(point.seen[-1])
-        off, last, best = abs(float((point.z - best.z)[-1])), off, point
-        if value == 0 or max(off, last) < 4 * tracer.eps * tracer.size(point.z):
-            break
-        low, high, left, right = (share, high, value, right) if value * left > 0 else (low, share, left, value)
-    if left * right >= 0 or off > tracer.eps**0.6 * tracer.size(best.z):
-        return Found("divergence", best.z, [], 0.0, None, max(off, float(np.max(np.abs(few.z - many.z)))), [])
+    of = lambda point: product(point.seen[-1])
+    best, off = tracer.zero_between(a, b, of) or (many, np.inf)
+    if off > tracer.eps**0.6 * tracer.size(best.z):
+        return Found("divergence", many.z, [], 0.0, None, float(np.max(np.abs(few.z - many.z))), [])
     derivative = _slopes(tracer, best, lambda z, other: product(other.point(z, best.tangent).seen[-1]))
     return Found("divergence", best.z, [], 0.0, derivative, off, [])
 
 
 def _slopes(tracer, point, value):
     """Derivatives of the parameter at which `value(z, tracer)` is zero along a branch, by central differences."""
-    place, steady = tracer.frame.place, tracer.frame.steady
+    number, steady = tracer.frame.place.of_params, tracer.frame.steady
     row = np.zeros_like(point.z)
     row[-1] = 1.0
     h = tracer.eps ** (1 / 3)
@@ -273,12 +263,12 @@ def _slopes(tracer, point, value):
             leaf.reshape(-1)[entry] += sign * step
             params = eqx.combine(structure.unflatten([*leaves[:i], jnp.asarray(leaf), *leaves[i + 1 :]]), rest)
             frame = replace(tracer.frame, steady=replace(steady, params=params))
-            return at(Tracer(frame, tracer.low, tracer.high), point.z, here)
+            return at(SteadyTracer(frame, tracer.low, tracer.high), point.z, here)
 
         return -tracer.unit * (moved(1) - moved(-1)) / (2 * step) / by_parameter
 
     own = lambda i, entry: (
-        place.leaf is not None and leaves[i] is jax.tree.leaves(steady.params)[place.leaf] and (entry == place.entry)
+        number is not None and leaves[i] is jax.tree.leaves(steady.params)[number.leaf] and entry == number.entry
     )
     found = [np.reshape([0.0 if own(i, j) else by(i, j) for j in range(np.size(x))], np.shape(x))
              for i, x in enumerate(leaves)]  # fmt: skip

@@ -17,6 +17,7 @@ Source: Hairer, Nørsett & Wanner, *Solving ODEs I*, §I.14; Coddington & Levins
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import NamedTuple
 
 import diffrax
@@ -60,6 +61,14 @@ class Passage(NamedTuple):
     growth: Float[Array, ""]
     steps: Int[Array, ""]
     ended: Bool[Array, ""]
+
+
+class Changes(NamedTuple):
+    """By how much parameters (a tree like their floats, None elsewhere), the start and the span change, (k, ...)."""
+
+    params: PyTree
+    t0: Float[Array, " k"]
+    span: Float[Array, " k"]
 
 
 class Flow(eqx.Module):
@@ -111,12 +120,15 @@ class Flow(eqx.Module):
         # The derivative of a basis that turns as little as it can.
         return basis - _shortest(normals, normals @ basis)
 
-    def passage(self, t0, z, span, frame, scale, volume=False, differentiable=False) -> Passage:
+    def passage(
+        self, t0, z, span, frame, scale, volume=False, differentiable=False, changes: Changes | None = None
+    ) -> Passage:
         """The state and the frame after a time; errors, and the frame, count in units of `scale`, (2n,).
 
         `volume`: whether to ask for its growth. In both modes derivatives flow through it where it is `differentiable`.
+        `changes`: what else changes with each column of the frame.
         """
-        arrays, static = eqx.partition((self, t0, z, span, frame, lax.stop_gradient(scale)), eqx.is_array)
+        arrays, static = eqx.partition((self, t0, z, span, frame, lax.stop_gradient(scale), changes), eqx.is_array)
         x, fixed = eqx.partition(arrays, eqx.is_inexact_array)
 
         def solve(x, fixed, adjoint, _):
@@ -128,9 +140,9 @@ class Flow(eqx.Module):
             return solve(x, fixed, diffrax.ForwardMode(), False)[0]
         return solve_in_both_modes(solve, x, fixed, recorded=False)
 
-    def path(self, t0, z, span, count) -> Float[Array, "count+1 2n"]:
+    def path(self, t0, z, span, count, substeps=SUBSTEPS) -> Float[Array, "count+1 2n"]:
         """States at equal parts of a time, by short steps of Runge and Kutta: a sketch, that is compiled in no time."""
-        h = span / (count * SUBSTEPS)
+        h = span / (count * substeps)
 
         def step(z, t):
             def stage(rates, c_and_b):
@@ -143,9 +155,9 @@ class Flow(eqx.Module):
             (_, total), _ = lax.scan(stage, (nothing, nothing), tuple(x.astype(z.dtype) for x in RUNGE_KUTTA))
             return z + h * total, z
 
-        times = t0 + h * jnp.arange(count * SUBSTEPS, dtype=z.dtype)
+        times = t0 + h * jnp.arange(count * substeps, dtype=z.dtype)
         last, path = lax.scan(step, z, times)
-        return jnp.concatenate([path[::SUBSTEPS], last[None]])
+        return jnp.concatenate([path[::substeps], last[None]])
 
 
 def flow_of(system, t, q, v, params, rtol, rows=None, in_a_loop=True) -> Flow:
@@ -209,14 +221,16 @@ def _shortest(rows, residual):
     return rows.T @ jnp.linalg.solve(rows @ rows.T, residual)
 
 
-def _passage(flow, t0, z, span, frame, scale, volume, adjoint) -> Passage:
+def _passage(flow, t0, z, span, frame, scale, changes, volume, adjoint) -> Passage:
 
     # Jitted, so that it is traced once: diffrax traces the body of its loop three times.
     @eqx.filter_jit
     def field(part, y, args):
-        flow, t0, span, scale = args
-        t = t0 + span * part
-        rate = lambda z: span * flow.rate(t, z * scale) / scale
+        flow, t0, span, scale, changes = args
+        rate = lambda z: span * flow.rate(t0 + span * part, z * scale) / scale
+        if changes is not None:
+            motion, frame_motion = _with_changes(flow, part, y, t0, span, scale, changes)
+            return {"z": motion, "frame": frame_motion, "growth": jnp.zeros_like(span)}
         if not frame.size:
             return {"z": rate(y["z"]), "frame": jnp.zeros_like(frame), "growth": jnp.zeros_like(span)}
         motion, push = jax.linearize(rate, y["z"])
@@ -239,7 +253,7 @@ def _passage(flow, t0, z, span, frame, scale, volume, adjoint) -> Passage:
         one,
         first,
         y0,
-        (flow, t0, span, scale),
+        (flow, t0, span, scale, changes),
         stepsize_controller=diffrax.PIDController(rtol=flow.rtol, atol=flow.rtol, dtmin=SHORTEST, force_dtmin=False),
         adjoint=adjoint,
         max_steps=MAX_STEPS,
@@ -248,3 +262,15 @@ def _passage(flow, t0, z, span, frame, scale, volume, adjoint) -> Passage:
     y = jax.tree.map(lambda x: x[-1], solution.ys)
     ended = solution.result == diffrax.RESULTS.successful
     return Passage(y["z"] * scale, y["frame"], y["growth"], solution.stats["num_steps"], ended)
+
+
+def _with_changes(flow, part, y, t0, span, scale, changes):
+    """The rates of the state and of its frame, where parameters and times change with its columns."""
+    floats, rest = eqx.partition(flow.params, eqx.is_inexact_array)
+
+    def rate(z, floats, t0, span):
+        now = replace(flow, params=eqx.combine(floats, rest))
+        return span * now.rate(t0 + span * part, z * scale) / scale
+
+    motion, push = jax.linearize(rate, y["z"], floats, t0, span)
+    return motion, jax.vmap(push, (1, 0, 0, 0), 1)(y["frame"], *changes)

@@ -1,27 +1,24 @@
-"""A branch of steady motions, point by point: pseudo-arclength continuation, which passes folds.
+"""A branch of solutions, point by point: pseudo-arclength continuation, which passes folds.
 
-The next point is looked for one step along the tangent and, from there, across it. In units of `branch_equations.py`,
-with the Jacobian `J = (E_y, E_μ)` and the tangent τ, `J τ = 0`,
+The solutions are steady motions (`steady_tracer.py`) or cycles (`orbit_tracer.py`), of equations E(z) = 0 of
+z = (y, μ), with the Jacobian `J = (E_y, E_μ)`. The next point is looked for one step along the tangent τ, `J τ = 0`,
+and, from there, across it,
 
     E(z) = 0,      τ·(z - z_i - h τ) = 0
 
-Lengths are those of positions and of the parameter. What is watched from point to point: the sign of `det (J; τ)`,
-which changes where another branch crosses (also where this one only touches the critical parameter, as the side branch
-of a pitchfork does); that of τ_μ, which changes at a fold; the number of roots that grow; and that of
-negative eigenvalues of E_y, which changes by two where two are zero together.
+There may be more equations than unknowns, of which some follow from the others: what solves them is a least-squares
+solution. Lengths are those of positions and of the parameter.
 
 Source: Keller, in *Applications of Bifurcation Theory* (1977) 359; Allgower & Georg, *Introduction to Numerical
-Continuation Methods*, §8.1 (the determinant) and ch. 6 (steps).
+Continuation Methods*, ch. 6 (steps).
 """
 
+import abc
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Any
 
-import jax
 import numpy as np
-
-from lagjax.analysis.branch_equations import Frame, evaluated, seen_at
-from lagjax.analysis.equilibria import GROWS_ABOVE
 
 ITERATIONS = 10
 # Steps by length: the first, the longest (relative to how far it is from the origin) and the least.
@@ -35,6 +32,8 @@ INFINITY = 1e4
 CLOSED_WITHIN = 1e-3
 # A crossing that is none shows that a step went from one branch to another; steps that short do not.
 AGAIN, SHORT = "again", 1e-6
+# Values between which a zero is interpolated.
+INTERPOLATED = 6
 LOST = "the equations that followed from others where the branch starts do so no longer"
 
 
@@ -42,14 +41,15 @@ LOST = "the equations that followed from others where the branch starts do so no
 class Point:
     """A point of a branch: z, the Jacobian and the tangent there, and what a user sees.
 
-    `sign` of the determinant, how many roots are `growing`, and how many eigenvalues of E_y are `negative`.
+    `sign` of a function that changes it where another branch crosses; how many small departures are `growing`, None
+    where that is not known; and how many of the numbers of which `sign` is a product are `negative`.
     """
 
     z: np.ndarray
     jacobian: np.ndarray
     tangent: np.ndarray
     sign: float
-    seen: tuple
+    seen: Any
     growing: int | None
     negative: int
     critical: int | None = None
@@ -64,26 +64,42 @@ class Path:
     others: list[str] = field(default_factory=list)
 
 
-class Tracer:
-    """What is common to all branches of a run: the frame, what lengths are, and the tolerance of Newton's method."""
+class Tracer(abc.ABC):
+    """What is common to all branches of a run: the equations, what lengths are, the range of the parameter.
 
-    def __init__(self, frame: Frame, low: float, high: float):
-        self.frame, self.low, self.high = frame, low, high
-        size, positions = frame.columns.size, frame.steady.n
-        self.weights = np.zeros(size + 1)
-        self.weights[:positions] = 1.0
-        self.weights[-1] = 1.0
-        self.dtype = np.dtype(frame.columns.dtype)
-        self.eps = float(np.finfo(self.dtype).eps)
-        self.unit = float(frame.unit)
-        # The fastest root so far, beside which one is round-off.
-        self.fastest = 0.0
+    Abstract: `at` and `described` say what is solved. `weights` (N + 1,) of z in lengths; the first `positions` entries
+    of z are at infinity where they are large; `unit` of the parameter.
+    """
+
+    weights: np.ndarray
+    positions: int
+    dtype: np.dtype
+    unit: float
+
+    def __init__(self, low: float, high: float):
+        self.low, self.high = low, high
         # What Newton's second step was of its first, the last time.
         self.contraction = 0.0
 
+    @property
+    def eps(self) -> float:
+        return float(np.finfo(self.dtype).eps)
+
+    @property
+    def noise(self) -> float:
+        """The round-off of a step of Newton's method, relative to z."""
+        return self.eps
+
+    @abc.abstractmethod
     def at(self, z):
         """E, J and the largest of all equations."""
-        return jax.tree.map(np.asarray, evaluated(self.frame, z.astype(self.dtype)))
+
+    @abc.abstractmethod
+    def described(self, z, jacobian, tangent) -> Point | str:
+        """A point with all that is to be known of it; in words what is wrong with it."""
+
+    def moved_to(self, point: Point):
+        """The branch has come to a point: equations may refer to it from now on."""
 
     def tangent(self, jacobian, along):
         """The unit tangent that leads on from `along`."""
@@ -102,16 +118,17 @@ class Tracer:
             matrix = np.concatenate([jacobian, row[None]])
             left = np.append(value, row @ z - known)
             try:
-                step = np.linalg.solve(matrix, left)
+                square = matrix.shape[0] == matrix.shape[1]
+                step = np.linalg.solve(matrix, left) if square else np.linalg.lstsq(matrix, left, rcond=None)[0]
             except np.linalg.LinAlgError:
                 return None
             length = float(np.max(np.abs(step)))
-            if not np.isfinite(length) or i > 1 and length > 0.7 * last and length > 1e3 * self.eps * self.size(z):
+            if not np.isfinite(length) or i > 1 and length > 0.7 * last and length > 1e3 * self.noise * self.size(z):
                 return None
             z = z - step
             if i == 1 and last > 1e-6 * self.size(z):
                 self.contraction = length / last
-            if length <= 50 * self.eps * self.size(z) or i > 2 and length >= last:
+            if length <= 50 * self.noise * self.size(z) or i > 2 and length >= last:
                 return z
             last = length
         return None
@@ -123,13 +140,9 @@ class Tracer:
         """All about a point of a branch; in words what is wrong with it."""
         _, jacobian, off = self.at(z)
         # Compared with what is left of equations that are solved: these are of the size of one.
-        if off > self.eps**0.5 * self.size(z):
+        if off > self.noise**0.5 * self.size(z):
             return LOST
-        tangent = self.tangent(jacobian, along)
-        seen = jax.tree.map(np.asarray, seen_at(self.frame, z.astype(self.dtype)))
-        sign = np.linalg.slogdet(np.concatenate([jacobian, (self.weights * tangent)[None]]))[0]
-        negative = int(np.sum(np.linalg.eigvals(jacobian[:, :-1]).real < 0))
-        return Point(z, jacobian, tangent, float(sign), seen, self.growing(seen[-1]), negative)
+        return self.described(z, jacobian, self.tangent(jacobian, along))
 
     def trace(self, start: Point, most: int, on_step: Callable, first: float = FIRST) -> Path:
         """Follow a branch until it leaves the range of the parameter, ends or closes.
@@ -160,19 +173,20 @@ class Tracer:
             if outside:
                 path.status = "the end of the range"
                 return path
-            if np.max(np.abs(after.z[: self.frame.steady.n])) > INFINITY:
+            if np.max(np.abs(after.z[: self.positions])) > INFINITY:
                 path.status = "infinity"
                 return path
             if self.closes(path, step):
                 path.status = "closed"
                 return path
             point = after
+            self.moved_to(point)
         path.status = f"the limit of {most} points"
         return path
 
     def next_point(self, point: Point, step: float):
         """The next point, the step after it, and why there is none."""
-        longest = LONGEST * max(1.0, float(np.max(np.abs(point.z[: self.frame.steady.n]))))
+        longest = LONGEST * max(1.0, float(np.max(np.abs(point.z[: self.positions]))))
         why = "Newton's method does not converge, however short the step"
         while step > LEAST * self.size(point.z):
             step = min(step, longest)
@@ -200,6 +214,38 @@ class Tracer:
         found = self.point(z, a.tangent) if z is not None else None
         return found if isinstance(found, Point) else None
 
+    def zero_between(self, a: Point, b: Point, of: Callable[[Point], float]) -> tuple[Point, float] | None:
+        """The point between two others at which a function of points changes its sign, and how far off it may be."""
+        low, high, left, right = 0.0, 1.0, of(a), of(b)
+        best, off, last, side = b, np.inf, np.inf, 0
+        if not left * right < 0:
+            return None
+        tried = [(left, a.z), (right, b.z)]
+        for _ in range(60):
+            share = low + (high - low) * (left / (left - right))
+            # Neither end may stay where it is: its value counts half (Illinois).
+            point = self.between(a, b, share) if low < share < high else None
+            if point is None:
+                return self._interpolated(a, tried) or (best, off)
+            value = of(point)
+            off, last, best = abs(float((point.z - best.z)[-1])), off, point
+            if value == 0 or max(off, last) < 4 * self.noise * self.size(point.z):
+                break
+            tried.append((value, point.z))
+            if value * left > 0:
+                low, left, right, side = share, value, right / 2 if side < 0 else right, -1
+            else:
+                high, right, left, side = share, value, left / 2 if side > 0 else left, 1
+        return best, off
+
+    def _interpolated(self, a: Point, tried: list[tuple[float, np.ndarray]]) -> tuple[Point, float] | None:
+        """The point where a function is zero, from its values beside it: very near a crossing Newton's method fails."""
+        tried = sorted(tried, key=lambda one: abs(one[0]))[:INTERPOLATED]
+        zs = [_at_zero(tried[:count]) for count in (len(tried) - 1, len(tried))]
+        point = self.point(zs[-1], a.tangent)
+        off = abs(float((zs[1] - zs[0])[-1]))
+        return (point, off) if isinstance(point, Point) else None
+
     def at_edge(self, a: Point, b: Point) -> Point | None:
         """The point of the branch where the parameter is at the end of its range."""
         edge = self.low if b.z[-1] < self.low else self.high
@@ -218,10 +264,13 @@ class Tracer:
         off = np.sqrt(self.weights @ (last.z - first.z) ** 2)
         return bool(off < max(step, CLOSED_WITHIN) and (self.weights * first.tangent) @ last.tangent > 0.9)
 
-    def growing(self, roots) -> int | None:
-        """How many roots grow; None where they are not known."""
-        known = roots[np.isfinite(roots)]
-        if not known.size:
-            return None
-        self.fastest = max(self.fastest, float(np.max(np.abs(known))))
-        return int(np.sum(known.real > GROWS_ABOVE[self.dtype] * self.fastest))
+
+def _at_zero(tried):
+    """Neville's interpolation of z by the value of a function, at the value zero."""
+    values, zs = [value for value, _ in tried], [z for _, z in tried]
+    for gap in range(1, len(zs)):
+        zs = [
+            (values[i] * zs[i + 1] - values[i + gap] * zs[i]) / (values[i] - values[i + gap])
+            for i in range(len(zs) - 1)
+        ]
+    return zs[0]

@@ -1,18 +1,24 @@
-"""What a store asks of the engine that fills it: points to write together, and whether it is as other versions were."""
+"""How an engine fills a store: points to write together, and whether it is as other versions were."""
 
 import warnings
+from collections.abc import Iterator
 from typing import Any
 
+import jax
 import numpy as np
 
 from lagjax.sweeps.axes import Axes
 from lagjax.sweeps.fingerprint import in_words, named_leaves, versions
-from lagjax.sweeps.lanes import GOOD
+from lagjax.sweeps.grids import Blocks, divided
+from lagjax.sweeps.labels import labels_of
+from lagjax.sweeps.lanes import GOOD, Status, not_run
 from lagjax.sweeps.memory import bytes_of
 from lagjax.sweeps.store import Store
 
 # A block of a store is written about so often, and holds no more than this.
 BLOCK_SECONDS, BLOCK_BYTES = 2.0, 256e6
+# The last call of the program for some blocks is filled up with points of which nobody asks: one of so many.
+FULL_CHUNKS = 16
 # Two versions may differ by so much, relative to the largest value, before it is told.
 ALIKE_VERSIONS = 1e-6
 
@@ -28,15 +34,78 @@ def block_of(engine: Any, axes: Axes, shares: int) -> int:
     return min(wanted, fair, fits)
 
 
+def begun(engine: Any, axes: Axes, shares: int) -> tuple[Blocks, dict[str, np.ndarray]]:
+    """Of a new store the blocks, and the times of its trajectories that do not depend on the point, by leaf."""
+    return divided(axes.shape, block_of(engine, axes, shares)), _times(engine, axes)
+
+
+def _times(engine, axes):
+    labels = labels_of(axes, engine.program.values).values
+    found = {}
+    for key, x in named_leaves(engine.program.values):
+        if key in labels and labels[key].times and len(x.shape) == 1 and _is_fixed(engine, axes, key):
+            found[key] = dict(named_leaves(engine.first(np.arange(1))[0]))[key][0]
+    return found
+
+
+def _is_fixed(engine, axes, key):
+    """Whether a leaf of what `run` returns is the same at all points, whatever they are: vmap knows."""
+    leaf = lambda point: dict(named_leaves(engine.run(point)))[key]
+    try:
+        jax.eval_shape(jax.vmap(leaf, out_axes=None), axes.at(np.zeros(1, int)))
+    except ValueError as error:
+        if "out_axes" not in str(error):
+            raise
+        return False
+    return True
+
+
+class Filling:
+    """Blocks that are being computed together: each is written as soon as all of its points are there."""
+
+    def __init__(self, engine: Any, store: Store, numbers: list[int]):
+        self.store, self.numbers = store, numbers
+        points = [store.blocks.points(number) for number in numbers]
+        self.indices = np.concatenate([np.arange(x.start, x.stop) for x in points])
+        lengths = np.array([x.stop - x.start for x in points])
+        self._ends, self._left = np.cumsum(lengths), lengths
+        self._found = not_run(engine.program, len(self.indices))
+
+    def take(self, places: np.ndarray, values: Any, status: Status):
+        """What was computed at some places among the indices."""
+        for whole, some in zip(jax.tree.leaves(self._found), jax.tree.leaves((values, status))):
+            whole[places] = some
+        touched = np.searchsorted(self._ends, places, side="right")
+        self._left = self._left - np.bincount(touched, minlength=len(self._left))
+        for i in np.unique(touched)[self._left[np.unique(touched)] == 0].tolist():
+            start = 0 if i == 0 else self._ends[i - 1]
+            self.store.write(self.numbers[i], *jax.tree.map(lambda x: x[start : self._ends[i]], self._found))
+
+
+def together(engine: Any, store: Store, numbers: list[int]) -> Iterator[list[int]]:
+    """Blocks to compute together: so that their points fill the chunks of the program, and fit into memory."""
+    points = min(FULL_CHUNKS * engine.program.chunk, int(BLOCK_BYTES / bytes_of(engine.program)))
+    some, count = [], 0
+    for number in numbers:
+        here = store.blocks.points(number)
+        if some and count + here.stop - here.start > points:
+            yield some
+            some, count = [], 0
+        some.append(number)
+        count += here.stop - here.start
+    if some:
+        yield some
+
+
 def compare_versions(engine: Any, store: Store) -> None:
     """Where other versions have begun a store, compute some of its points again and tell how they differ."""
     there, number = store.about["fingerprint"], store.first()
     if there["program"] == engine.program.digest or number is None:
         return
-    indices = np.r_[store.points(number)][: engine.program.chunk]
+    indices = np.r_[store.blocks.points(number)][: engine.program.chunk]
     found, status = engine.first(indices)
     worst, name = 0.0, None
-    for (leaf, x), before in zip(named_leaves(found), store.read(indices)):
+    for (leaf, x), before in zip(named_leaves(found), (x[: len(indices)] for x in store.read(number))):
         good = np.isin(status.result, GOOD)
         x, before = x[good].astype(complex), before[good].astype(complex)
         largest = np.max(np.abs(before), initial=0.0)

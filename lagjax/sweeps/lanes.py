@@ -15,7 +15,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec, SingleDeviceShardin
 from jaxtyping import PyTree
 
 from lagjax.jax_internals.tracing import REGULAR_FIRST
-from lagjax.mechanics.first_call import Call, check_arguments, in_words
+from lagjax.mechanics.in_words import Call, check_arguments, in_words
 from lagjax.motion.reported import PATIENCE, reporting
 from lagjax.motion.trajectory import ENDED_WELL, RESULTS, Trajectory
 from lagjax.sweeps.axes import POINT, Axes
@@ -123,3 +123,11 @@ def compiled(
 
     one = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), shapes)
     return Program(call, chunk, one, working, program_digest(traced.jaxpr), threading.Event())
+
+
+def not_run(program: Program, count: int) -> tuple[PyTree, Status]:
+    """Room for the values and statuses of some points: NaN, or 0 in numbers that have none."""
+    nothing = lambda x: np.nan if np.issubdtype(x.dtype, np.inexact) else 0
+    values = jax.tree.map(lambda x: np.full((count, *x.shape), nothing(x), x.dtype), program.values)
+    fills = (NOT_RUN, 0, np.nan, np.nan)
+    return values, Status(*(np.full(count, fill, dtype) for fill, dtype in zip(fills, STATUS_TYPES)))

@@ -10,7 +10,7 @@ import pytest
 import lagjax as lj
 from lagjax.meter import Silent
 from lagjax.motion.reported import reporting
-from lagjax.sweeps import engine
+from lagjax.sweeps import engine, running
 
 pendulum = lj.System(lambda t, q, v, params: 0.5 * v**2 + params["g"] * jnp.cos(q))
 rod = lj.System(
@@ -109,7 +109,7 @@ def test_a_lane_that_fails_keeps_its_reason():
 @pytest.mark.slow
 def test_long_lanes_are_run_alone(monkeypatch):
     """The others do not wait for them; steps that run out by the user's own word are not taken again."""
-    monkeypatch.setattr(engine, "PATIENCE", 30)
+    monkeypatch.setattr(running, "PATIENCE", 30)
     run = lambda limit: jax.jit(lambda point: swing(point, max_steps=limit).q[-1])
     alone = run(2**16)
     swept = quiet(alone)

@@ -1,0 +1,318 @@
+"""How a cycle changes with a parameter: a branch of cycles, its folds, and where it becomes unstable."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lagjax.analysis.flow import flow_of
+from lagjax.analysis.guessing import Asked, guessed
+from lagjax.analysis.monodromy import Problem, problem_of, tolerance_of
+from lagjax.analysis.numbers_in import no_such_number, numbers_in
+from lagjax.analysis.orbit import PeriodicOrbit
+from lagjax.analysis.orbit_branch import CriticalOrbit, OrbitBranch
+from lagjax.analysis.orbit_critical import FoundOrbit, between, dips
+from lagjax.analysis.orbit_equations import (
+    ENERGY,
+    ENTRY,
+    NUMBER,
+    PERIOD,
+    Along,
+    Guide,
+    OrbitFrame,
+    drive_by_parameter,
+    sizes_at,
+)  # fmt: skip
+from lagjax.analysis.orbit_tracer import OrbitTracer
+from lagjax.analysis.starts import checked
+from lagjax.analysis.tracing import Path, Point
+from lagjax.jax_internals.tracing import is_eager
+from lagjax.mechanics import coordinates
+from lagjax.mechanics.compiled import compiled
+from lagjax.mechanics.packed import pack
+
+# Singular values of the equations below this part of the largest do not count.
+DEPENDENT = 1e-7
+# A change of the logarithm of a drive's period that is none.
+CONSTANT = 1e-9
+# The motion has shrunk to rest where so little of it is left; periods so many times the first one grow without end.
+AT_REST, HALF, ENDLESS = 1e-3, 0.5, 1e3
+
+
+def continue_orbits(
+    orbit: PeriodicOrbit, *, along: str, to: float, rtol: float | None = None, most_points: int = 1000
+) -> OrbitBranch:
+    """Follow a periodic orbit as a parameter changes, through folds, with its stability.
+
+    >>> import jax.numpy as jnp
+    >>> import lagjax as lj
+    >>> pendulum = lj.System(lambda t, q, v, params: 0.5 * v**2 + params["g"] * jnp.cos(q))
+    >>> orbit = lj.periodic_orbit(pendulum, (1.0, 0.0), 6.7, {"g": 1.0})
+    >>> branch = lj.continue_orbits(orbit, along="q", to=2.0)
+    >>> print(branch.period[jnp.array([0, -1])].round(9))
+    [6.699975656 8.349752927]
+
+    **Arguments:**
+
+    - `orbit`: what `lj.periodic_orbit` returned: where the branch begins.
+    - `along`: what changes, by its name in the orbit's parameters: `"omega"`, `"spring.k"`, `"k[1]"`. Of a system that
+      does not depend on time also `"period"`, and a coordinate or velocity of the start, `"theta"`, `"v.theta"`; where
+      it is conserved, `"energy"` (the Jacobi integral). With a number in the parameters the orbit holds what it was
+      found with. The period of a drive follows its parameters.
+    - `to`: its last value; the first is that of the orbit. The branch is followed within this range.
+    - `rtol`: as in `lj.periodic_orbit`. `most_points`: of the branch.
+
+    **Returns:** an `OrbitBranch`. What was found before a branch ends is there, and its `status` says why it does.
+
+    **Raises:**
+
+    - `TypeError` for what is no periodic orbit, and inside of `jax.jit`, `vmap` or `grad`: how many points there are
+      depends on values.
+    - `ValueError` for an orbit that did not converge, and an `along` that names nothing, or what is held.
+
+    Source: Seydel, *Practical Bifurcation and Stability Analysis*, ch. 7; Doedel, Keller & Kernévez, Int. J.
+    Bifurcation Chaos 1 (1991) 745.
+    """
+    _check(orbit)
+    # A whole number in the parameters may be followed like any other.
+    system, s = checked(orbit.system, orbit.t, orbit.q, orbit.v, orbit.params)
+    problem = problem_of(system, *s)
+    place, asked = _along(along, orbit, problem)
+    rtol = tolerance_of(rtol, s.t.dtype)
+    frame, z = _frame(orbit, problem, place, asked, rtol, to)
+    first, last = float(z[-1] * frame.unit), float(to)
+    low, high = sorted((float(z[-1]), last / float(frame.unit)))
+    tracer, path, found = _traced(frame, z, low, high, np.sign(last - first), most_points)
+    return _result(orbit, problem, place, tracer, path, found, along, first, last)
+
+
+def _check(orbit):
+    if not isinstance(orbit, PeriodicOrbit):
+        raise TypeError(
+            f"lj.continue_orbits needs a periodic orbit, not {type(orbit).__name__}.\n"
+            "Fix: orbit = lj.periodic_orbit(system, (q, v), period, params), and lj.continue_orbits(orbit, "
+            'along="...", to=...).'
+        )
+    if not is_eager() or coordinates.is_traced(orbit):
+        raise TypeError(
+            "lj.continue_orbits decides by values how it goes on, and JAX is tracing.\n"
+            "Fix: call it outside of jit, vmap and grad; lj.periodic_orbit works inside."
+        )
+    if np.ndim(orbit.period):
+        raise ValueError(
+            f"these are orbits, a batch of shape {np.shape(orbit.period)}: a branch begins at one of them.\n"
+            "Fix: orbit = jax.tree.map(lambda x: x[0], orbit)."
+        )
+    if not bool(orbit.converged):
+        raise ValueError(
+            f"this orbit is none yet: its end is {float(orbit.residual):.2g} of its size from its start.\n"
+            "Usual cause: lj.periodic_orbit did not converge, as it said.\n"
+            "Fix: another start or period, until orbit.converged."
+        )
+
+
+def _along(along, orbit: PeriodicOrbit, problem: Problem) -> tuple[Along, Asked]:
+    """What changes, and what is still held of the orbit then."""
+    asked, reasons, names = orbit.asked, problem.reasons, coordinates.names(orbit.q)
+    numbers = numbers_in(problem.state.params)
+    if along in numbers:
+        return Along(along, NUMBER, numbers[along]), asked
+    entries = [*names, *(f"v{name[1:]}" if name == "q" or name.startswith("q[") else f"v.{name}" for name in names)]
+    if along not in (ENERGY, PERIOD, *entries):
+        more = '"period", "energy", or a coordinate or velocity of the start, such as "' + names[0] + '"'
+        raise no_such_number(along, problem.state.params, more)
+    if not reasons.autonomous:
+        raise ValueError(
+            f"along={along!r}: the system depends on time, so its orbits come one by one, and its period is that of "
+            f"the drive.\nFix: a number in the parameters, along={next(iter(numbers), 'omega')!r}."
+        )
+    if along != PERIOD and not reasons.energy:
+        raise ValueError(
+            f"along={along!r}: the Jacobi integral is not conserved here, so orbits of the same parameters come one by "
+            "one.\nUsual cause: a force or dissipation.\n"
+            f"Fix: a number in the parameters, along={next(iter(numbers), 'omega')!r}."
+        )
+    free = asked._replace(free=True, energy=False, held=())
+    if along == ENERGY:
+        return Along(along, ENERGY), free
+    if along == PERIOD:
+        if not reasons.energy:
+            raise ValueError(
+                "along='period': a cycle of this system has a period of its own.\n"
+                f"Fix: a number in the parameters, along={next(iter(numbers), 'mu')!r}."
+            )
+        return Along(along, PERIOD), free._replace(free=False)
+    return Along(along, ENTRY, None, entries.index(along)), free
+
+
+@compiled
+def _guess(flow, t, z, period, asked):
+    return guessed(flow, t, z, period, asked, 1, None).scale
+
+
+def _frame(orbit, problem, place: Along, asked, rtol, to) -> tuple[OrbitFrame, np.ndarray]:
+    """Units, what is held, and the point at which the branch begins."""
+    s, system = problem.state, problem.system
+    flow = flow_of(system, *s, rtol, problem.rows)
+    flow = replace(flow, params=jax.tree.map(lambda x: jnp.asarray(x) if isinstance(x, np.ndarray) else x, s.params))
+    nodes, period = np.asarray(orbit.nodes, s.t.dtype), np.asarray(orbit.period, s.t.dtype)
+    flat = lambda tree: np.concatenate([np.ravel(x) for x in jax.tree.leaves(tree)])
+    nodes = np.concatenate([np.concatenate([flat(s.q), flat(s.v)])[None], nodes[1:]])
+    scale = _guess(flow, s.t, nodes[0], period, asked._replace(free=False))
+    integral, slope, sizes, drive = sizes_at(flow, s.t, nodes[0], period, scale)
+    first = {
+        NUMBER: lambda: place.number.get(s.params), ENERGY: lambda: integral, PERIOD: lambda: period,
+        ENTRY: lambda: nodes[0][place.entry],
+    }[place.kind]()  # fmt: skip
+    first, last = float(first), float(to)
+    if not np.isfinite(last) or first == last:
+        raise ValueError(
+            f"to={to} gives the parameter {place.name!r} no way to go from {first:.6g}.\n"
+            f"Fix: to={2 * first or 1.0:.6g}, and the first value in that of the orbit."
+        )
+    unit = np.asarray(abs(last - first), s.t.dtype)
+    y = np.append((nodes / np.asarray(scale)).reshape(-1), 0.0)
+    none = jnp.zeros((0, y.size), s.t.dtype)
+    frame = OrbitFrame(
+        flow, jnp.asarray(s.t), scale, period, unit, jnp.asarray(flat(orbit.turns), s.t.dtype), integral, nodes[0],
+        slope, sizes, None, none, y, place, asked, problem.reasons, len(nodes),
+    )  # fmt: skip
+    z = np.append(y, first / unit)
+    if not problem.reasons.autonomous and place.kind == NUMBER:
+        with_drive = replace(frame, drive=drive)
+        moved = float(drive_by_parameter(with_drive, z))
+        frame = with_drive if abs(moved) > CONSTANT else frame
+    return frame, z
+
+
+def _traced(frame, z, low, high, towards, most) -> tuple[OrbitTracer, Path, list[FoundOrbit]]:
+    """The branch from its start."""
+    size = frame.scale.size
+    guide = Guide(z[:size], np.zeros(size, z.dtype))
+    tracer = OrbitTracer(frame, low, high, guide, True)
+    tracer.guide = tracer.evaluated(z).guide
+    free = _left_free(tracer, z)
+    if len(free):
+        # What is free where the branch begins leads to other orbits of the same parameter: one of them is followed.
+        frame = replace(frame, free=jnp.asarray(free, frame.t.dtype))
+        tracer = OrbitTracer(frame, low, high, tracer.guide, _explained(frame, len(free)))
+    row = np.eye(z.size)[-1]
+    corrected = tracer.corrected(z, row)
+    begin = tracer.point(z if corrected is None else corrected, towards * row)
+    if isinstance(begin, str):
+        raise ValueError(f"the orbit is no start of a branch: {begin}.\nFix: find it again with a smaller rtol.")
+    tracer.moved_to(begin)
+    follower = _Follower(tracer)
+    path = tracer.trace(begin, most, follower.step)
+    if path.status == "infinity":
+        path.status = f"infinity, near {frame.along.name} = {path.points[-1].seen.parameter:.6g}"
+    return tracer, path, follower.found
+
+
+def _left_free(tracer, z):
+    """Directions in which orbits of the same parameter lie beside the start, (d, N)."""
+    _, jacobian, _ = tracer.at(z)
+    _, sizes, right = np.linalg.svd(jacobian)
+    rank = int(np.sum(sizes > DEPENDENT * sizes[0]))
+    kernel = right[rank:]
+    if len(kernel) < 2:
+        return np.zeros((0, z.size - 1))
+    # One direction of the kernel leads on along the parameter, the others across it.
+    lead = kernel[:, -1] / max(np.linalg.norm(kernel[:, -1]), 1e-300)
+    across = np.linalg.svd(lead[None])[2][1:] @ kernel
+    return across[:, :-1]
+
+
+def _explained(frame, count):
+    """Whether all that is free belongs to multipliers that are known to be trivial."""
+    shifts = sum(frame.reasons.ignorable)
+    known = frame.reasons.energy + shifts * (1 + frame.reasons.momenta)
+    return count <= known
+
+
+class _Follower:
+    """What is found from point to point."""
+
+    def __init__(self, tracer: OrbitTracer):
+        self.tracer, self.found = tracer, []
+
+    def step(self, before: Point, after: Point, path: Path) -> str | None:
+        """What lies between two points, put into the path; why it ends, where it does."""
+        tracer, name = self.tracer, self.tracer.frame.along.name
+        if tracer.frame.asked.moves:
+            largest = max(point.seen.moves for point in path.points)
+            shrinks = after.seen.moves < AT_REST * largest
+            if shrinks or tracer.guide.rate @ tracer.evaluated(after.z).guide.rate < 0:
+                if before.seen.moves < HALF * largest:
+                    return f"a state of rest, near {name} = {self._at_rest(path.points):.6g}"
+                # It begins and ends where the system rests.
+                return f"a period that grows without end, near {name} = {before.seen.parameter:.6g}"
+        if after.seen.period > ENDLESS * float(tracer.frame.period):
+            return f"a period that grows without end, near {name} = {after.seen.parameter:.6g}"
+        all_found, earlier = between(tracer, before, after), path.points[-2:-1]
+        self._put(path, all_found, before, after)
+        if not all_found and earlier and earlier[0].critical is None and before.critical is None:
+            self._put(path, dips(tracer, earlier[0], before, after), before, after)
+        return None
+
+    def _put(self, path, all_found, before, after):
+        """Points between the last ones into the path, each in its place."""
+        place = len(path.points) - 1
+        along = self.tracer.weights * (after.z - before.z)
+        for found in all_found:
+            point = found.point if isinstance(found, FoundOrbit) else found
+            if isinstance(found, FoundOrbit):
+                point.critical = len(self.found)
+                # Multipliers are 1 in size there: what is beside it counts.
+                point.growing = None
+                self.found.append(found)
+            if along @ (point.z - before.z) < 0:
+                path.points.insert(place, point)
+                place += 1
+            else:
+                path.points.append(point)
+
+    def _at_rest(self, points):
+        """The parameter at which the motion has no size, in whose square it changes; a coordinate with the size itself.
+
+        What is nothing beside the range is round-off.
+        """
+        frame, b = self.tracer.frame, points[-1].seen
+        found, power = b.parameter, 1 if frame.along.kind == ENTRY else 2
+        if len(points) > 1:
+            a = points[-2].seen
+            m, n = a.moves**power, b.moves**power
+            found = b.parameter + (b.parameter - a.parameter) * n / (m - n) if m > n else found
+        return 0.0 if abs(found) < 1e-9 * float(frame.unit) else found
+
+
+def _result(orbit, problem, place, tracer, path, found, along, first, last) -> OrbitBranch:
+    """All of it in the user's structure."""
+    seen = [p.seen for p in path.points]
+    _, unflatten = coordinates.flatten(orbit.q)
+    trees = lambda rows: jax.tree.map(lambda *x: np.stack(x), *[jax.tree.map(np.asarray, unflatten(r)) for r in rows])
+    n = len(coordinates.names(orbit.q))
+    known = [i for i, p in enumerate(path.points) if p.growing is not None]
+    nearest = [min(known, key=lambda j: (abs(j - i), -j)) for i in range(len(seen)) if known]
+    stable = np.array([path.points[j].growing == 0 for j in nearest] or [False] * len(seen))
+    critical = [
+        CriticalOrbit(
+            found[p.critical].kind, np.asarray(p.seen.parameter), np.asarray(found[p.critical].accuracy), i,
+            p.seen.multipliers,
+        ) for i, p in enumerate(path.points) if p.critical is not None
+    ]  # fmt: skip
+    cast = lambda x: np.asarray(x, tracer.dtype)
+    return OrbitBranch(
+        cast([s.parameter for s in seen]), cast([s.period for s in seen]), trees([s.nodes[0][:n] for s in seen]),
+        trees([s.nodes[0][n:] for s in seen]), trees([s.low for s in seen]), trees([s.high for s in seen]),
+        stable, np.stack([s.multipliers for s in seen]),
+        np.stack([cast(s.nodes) for s in seen]), critical, _with_floats(orbit, problem), place, along, first, last,
+        path.status,
+    )  # fmt: skip
+
+
+def _with_floats(orbit, problem) -> PeriodicOrbit:
+    """The orbit with the parameters as the branch has them."""
+    arrays, static = pack((problem.system, coordinates.state(*problem.state).params))
+    return replace(orbit, arrays=arrays, static=static)

@@ -1,0 +1,303 @@
+"""Branches of cycles: against elliptic integrals, Mathieu's boundaries, SciPy's shooting and averaging."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy import integrate, optimize, special
+
+import lagjax as lj
+from tests.systems import PARAMS, pendulum, rod_pendulum
+
+UNIT = {"g": 1.0, "l": 1.0}
+
+
+def swinging(amplitude, length=1.0):
+    """The pendulum's period for g = 1, 4 √l K(sin²(amplitude/2))."""
+    return 4 * np.sqrt(length) * special.ellipk(np.sin(amplitude / 2) ** 2)
+
+
+def gone(rate, period, z):
+    """Where SciPy's motion is after a period."""
+    return integrate.solve_ivp(rate, [0, period], z, method="DOP853", rtol=1e-13, atol=1e-13).y[:, -1]
+
+
+def monodromy(rate, period, z, step=1e-5):
+    """How that changes with the start, by central differences."""
+    return np.stack([(gone(rate, period, z + e) - gone(rate, period, z - e)) / (2 * step)
+                     for e in step * np.eye(len(z))], axis=1)  # fmt: skip
+
+
+def shot(rate, period, z):
+    """A periodic state near another, by SciPy's motions alone, and its multipliers."""
+    z = optimize.fsolve(lambda z: gone(rate, period, z) - z, z, xtol=1e-9)
+    matrix = monodromy(rate, period, z)
+    return z - np.linalg.solve(matrix - np.eye(len(z)), gone(rate, period, z) - z), np.linalg.eigvals(matrix)
+
+
+# Families of a conservative system.
+
+
+@pytest.mark.slow
+def test_pendulum_by_its_amplitude():
+    """The period is 4 K(k) √(l/g) at every point, also off the closed form's grid; twin: of small swings it is not."""
+    orbit = lj.periodic_orbit(pendulum, (1.0, 0.0), 6.7, UNIT)
+    branch = lj.continue_orbits(orbit, along="q", to=3.0)
+    np.testing.assert_allclose(branch.period, swinging(branch.q), rtol=1e-11)
+    assert len(branch) > 20 and float(branch.q[-1]) == pytest.approx(3.0, abs=1e-13) and branch.stable.all()
+    assert np.max(np.abs(branch.period / (2 * np.pi) - 1)) > 1
+    np.testing.assert_allclose(branch.high, branch.q, atol=1e-6)
+    np.testing.assert_allclose(branch.low, -branch.q, atol=1e-6)
+    # A point of it is an orbit, of which the motion closes.
+    middle = branch[len(branch) // 2]
+    end = middle.trajectory.q[-1]
+    np.testing.assert_allclose(end, middle.q, atol=1e-9)
+    assert lj.floquet(middle).trivial.all()
+    smaller = lj.continue_orbits(orbit, along="q", to=-1.0)
+    assert smaller.status.startswith("a state of rest, near q = ") and abs(smaller.q[-1]) < 0.05
+    by_energy = lj.continue_orbits(orbit, along="energy", to=2.0)
+    assert by_energy.status.startswith("a period that grows without end, near energy = 1")
+    by_period = lj.continue_orbits(orbit, along="period", to=9.0)
+    np.testing.assert_allclose(by_period.period, by_period.parameter, rtol=1e-12)
+    np.testing.assert_allclose(by_period.period, swinging(by_period.q), rtol=1e-11)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("along, to", [("energy", 0.9), ("l", 3.0)])
+def test_pendulum_on_a_rod(along, to):
+    """On a constraint: by energy, and by the rod's length with the energy held; the rod keeps its length."""
+    start = {"x": np.sin(1.0), "y": -np.cos(1.0)}, {"x": 0.0, "y": 0.0}
+    orbit = lj.periodic_orbit(rod_pendulum, start, 6.7, UNIT | {"m": 1.0})
+    branch = lj.continue_orbits(orbit, along=along, to=to)
+    energy, length = (branch.parameter, 1.0) if along == "energy" else (-np.cos(1.0), branch.parameter)
+    np.testing.assert_allclose(branch.period, swinging(np.arccos(-energy / length), length), rtol=1e-10)
+    np.testing.assert_allclose(np.hypot(branch.q["x"], branch.q["y"]), length, rtol=1e-12)
+    assert branch.status == "the end of the range" and branch.stable.all()
+
+
+@pytest.mark.exhaustive
+def test_relative_orbits():
+    """In a central force, by the law of the force: at r² it is a harmonic oscillator, whose r has the period π."""
+
+    def lagrangian(t, q, v, p):
+        return 0.5 * (v["r"] ** 2 + (q["r"] * v["phi"]) ** 2) - q["r"] ** p["power"] / p["power"]
+
+    start = {"r": 1.0, "phi": 0.0}, {"r": 0.0, "phi": 0.5}
+    orbit = lj.periodic_orbit(lj.System(lagrangian), start, 1.8, {"power": 1.0}, relative="phi")
+    branch = lj.continue_orbits(orbit, along="power", to=2.0)
+    np.testing.assert_allclose(branch.period[-1], np.pi, rtol=1e-11)
+    assert abs(branch.period[0] - np.pi) > 0.03
+
+
+# Driven systems.
+
+
+def duffing_lagrangian(t, q, v, p):
+    """A spring that hardens, and a force that drives."""
+    return 0.5 * v**2 - 0.5 * q**2 - p["b"] * q**4 / 4 + p["f"] * q * jnp.cos(p["omega"] * t)
+
+
+duffing = lj.System(duffing_lagrangian, dissipation=lambda t, q, v, p: 0.5 * p["c"] * v**2)
+DRIVEN = {"b": 0.75, "f": 0.3125, "omega": 0.5, "c": 0.125}
+
+
+def duffing_rate(omega):
+    """The same for SciPy."""
+    b, f, _, c = DRIVEN.values()
+    return lambda t, y: [y[1], -y[0] - b * y[0] ** 3 - c * y[1] + f * np.cos(omega * t)]
+
+
+@pytest.mark.slow
+def test_resonance_curve():
+    """Both folds, every orbit, stability: by SciPy's shooting; amplitudes about those of harmonic balance.
+
+    Twin: off by a millionth an orbit is not SciPy's, and beyond the folds there is only one.
+    """
+    orbit = lj.periodic_orbit(duffing, (0.4, 0.0), 2 * np.pi / DRIVEN["omega"], DRIVEN)
+    branch = lj.continue_orbits(orbit, along="omega", to=3.0)
+    assert [c.kind for c in branch.critical] == ["fold", "fold"] and branch.status == "the end of the range"
+    np.testing.assert_allclose(branch.period * branch.parameter, 2 * np.pi, rtol=1e-12)
+    upper, lower = branch.critical
+    for i in [*range(5, len(branch), 37), upper.index - 6, lower.index + 6]:
+        omega = float(branch.parameter[i])
+        rate, period = duffing_rate(omega), 2 * np.pi / omega
+        z = np.array([branch.q[i], branch.v[i]])
+        exact, found = shot(rate, period, z + 1e-4)
+        np.testing.assert_allclose(z, exact, atol=1e-8)
+        assert np.abs(z + 1e-6 - exact).max() > 1e-8
+        assert bool(branch.stable[i]) == bool(np.abs(found).max() < 1)
+        np.testing.assert_allclose(np.sort(np.abs(found)), np.sort(np.abs(branch.multipliers[i])), rtol=1e-6)
+    # One harmonic: (1 - ω² + 3/4 b A²)² A² + (c ω A)² = f².
+    near = np.arange(0, upper.index)[branch.parameter[: upper.index] > 1.0]
+    amplitude, omega = branch.high[near], branch.parameter[near]
+    b, f, _, c = DRIVEN.values()
+    force = np.sqrt((1 - omega**2 + 0.75 * b * amplitude**2) ** 2 + (c * omega) ** 2) * amplitude
+    assert np.mean(np.abs(force / f - 1)) < 0.5
+
+    def one_harmonic(omega):
+        """A² of the balance."""
+        roots = np.roots([(0.75 * b) ** 2, 1.5 * b * (1 - omega**2), (1 - omega**2) ** 2 + (c * omega) ** 2, -(f**2)])
+        return np.sqrt(np.sort(roots[np.abs(roots.imag) < 1e-9].real))
+
+    grid = np.linspace(1.0, 2.0, 4001)
+    several = grid[[len(one_harmonic(w)) == 3 for w in grid]]
+    np.testing.assert_allclose([lower.parameter, upper.parameter], [several[0], several[-1]], rtol=0.01)
+    # SciPy's orbits at the folds have the multiplier 1, which is a double root: off by the root of what they are off.
+    for fold in branch.critical:
+        omega = float(fold.parameter)
+        z = np.array([branch.q[fold.index], branch.v[fold.index]])
+        found = np.linalg.eigvals(monodromy(duffing_rate(omega), 2 * np.pi / omega, z))
+        assert np.abs(found - 1).min() < 1e-6 and np.abs(found - 1).max() > 0.1
+
+
+def mathieu_lagrangian(t, q, v, p):
+    """x'' + (a - 2 q cos 2t) x = 0, a pendulum on a moving pivot near rest; and as it swings far."""
+    return 0.5 * v**2 + (p["a"] - 2 * p["q"] * jnp.cos(2 * t)) * jnp.cos(q)
+
+
+@pytest.mark.slow
+def test_tongues_of_a_parametric_pendulum():
+    """At rest its multiplier passes -1 and 1 where Mathieu's characteristic values are, a tongue of 5e-4 too.
+
+    Twin: those of another q are others.
+    """
+    system, q = lj.System(mathieu_lagrangian), 0.25
+    orbit = lj.periodic_orbit(system, (0.0, 0.0), np.pi, {"a": 0.1, "q": q})
+    branch = lj.continue_orbits(orbit, along="a", to=10.0)
+    edges = lambda q: np.array([edge(n, q) for n in (1, 2, 3) for edge in (special.mathieu_b, special.mathieu_a)])
+    found = np.array([c.parameter for c in branch.critical])
+    assert [c.kind for c in branch.critical] == ["period doubling"] * 2 + ["branch point"] * 2 + ["period doubling"] * 2
+    np.testing.assert_allclose(found, edges(q), atol=1e-10)
+    assert np.abs(found - edges(q + 1e-3)).max() > 1e-6
+    assert all(float(c.accuracy) < 1e-10 for c in branch.critical)
+    inside = np.sum(branch.parameter[:, None] > edges(q)[None], axis=1) % 2 == 1
+    off = np.min(np.abs(branch.parameter[:, None] - edges(q)[None]), axis=1) > 1e-9
+    np.testing.assert_array_equal(branch.stable[off], ~inside[off])
+
+
+@pytest.mark.slow
+def test_combination_resonance():
+    """Two oscillators coupled by a drive near the sum of their frequencies: two pairs meet, by SciPy's multipliers."""
+
+    def lagrangian(t, q, v, p):
+        springs = 0.5 * (q[0] ** 2 + p["k"] * q[1] ** 2)
+        return 0.5 * v @ v - springs - p["e"] * jnp.cos(p["omega"] * t) * q[0] * q[1]
+
+    params = {"k": 2.0, "e": 0.25, "omega": 2.1}
+    orbit = lj.periodic_orbit(lj.System(lagrangian), (np.zeros(2), np.zeros(2)), 2 * np.pi / 2.1, params)
+    branch = lj.continue_orbits(orbit, along="omega", to=2.7)
+    assert [c.kind for c in branch.critical] == ["torus", "torus"]
+
+    def growth(omega):
+        coupling = lambda t: params["e"] * np.cos(omega * t)
+        rate = lambda t, y: [y[2], y[3], -y[0] - coupling(t) * y[1], -params["k"] * y[1] - coupling(t) * y[0]]
+        columns = [integrate.solve_ivp(rate, [0, 2 * np.pi / omega], e, rtol=1e-12, atol=1e-13).y[:, -1]
+                   for e in np.eye(4)]  # fmt: skip
+        return np.abs(np.linalg.eigvals(np.stack(columns, axis=1))).max() - 1
+
+    first, second = (float(c.parameter) for c in branch.critical)
+    assert first < 1 + np.sqrt(2.0) < second
+    for edge, out in ((first, -1), (second, 1)):
+        assert growth(edge + out * 1e-6) < 1e-5 < growth(edge - out * 1e-6) < 1e-2
+    assert "a pair at ±" in repr(branch)
+
+
+# Cycles of autonomous systems.
+
+
+def oscillator(t, q, v, p):
+    """A unit mass on a unit spring."""
+    return 0.5 * v**2 - 0.5 * q**2
+
+
+@pytest.mark.slow
+def test_van_der_pol_family():
+    """Periods are those in the literature; where all circles close, at μ = 0, the multiplier passes 1.
+
+    Urabe, *IRE Trans. Circuit Theory* 7 (1960) 382; 6.663286859323130 and 7.629874479674862: Andersen & Geer (1982).
+    """
+    system = lj.System(oscillator, force=lambda t, q, v, p: p["mu"] * (1 - q**2) * v)
+    orbit = lj.periodic_orbit(system, (2.0, 0.0), 6.5, {"mu": 1})
+    branch = lj.continue_orbits(orbit, along="mu", to=10.0)
+    np.testing.assert_allclose(branch.period[[0, -1]], [6.663286859323130, 19.07836957], atol=2e-8)
+    assert branch.stable.all() and not branch.critical
+    back = lj.continue_orbits(orbit, along="mu", to=-1.0)
+    (critical,) = back.critical
+    assert critical.kind == "branch point" and abs(float(critical.parameter)) < 1e-9
+    off = np.abs(back.parameter) > 1e-6
+    np.testing.assert_array_equal(back.stable[off], back.parameter[off] > 0)
+    np.testing.assert_allclose(back.period[-1], back.period[0], rtol=1e-11)
+
+
+@pytest.mark.slow
+def test_a_cycle_that_shrinks_and_one_that_folds():
+    """x'' + x = (μ + a² - a⁴) x' on average: it folds at μ = -1/4, and shrinks to rest at μ = 0 (Hopf), or 2 √μ."""
+    small = lj.System(oscillator, force=lambda t, q, v, p: (p["mu"] - q**2) * v)
+    branch = lj.continue_orbits(lj.periodic_orbit(small, (1.0, 0.0), 6.5, {"mu": 0.25}), along="mu", to=-0.5)
+    assert branch.status == "a state of rest, near mu = 0" and not branch.critical
+    # By energy: r' = ε r (μ + 2 r² - r⁴) has circles r² = 1 ± √(1 + μ).
+    push = lambda t, q, v, p: 0.01 * (p["mu"] + 2 * (q**2 + v**2) - (q**2 + v**2) ** 2) * v
+    folds = lj.System(oscillator, force=push)
+    orbit = lj.periodic_orbit(folds, (np.sqrt(2.0), 0.0), 6.3, {"mu": 0.0})
+    branch = lj.continue_orbits(orbit, along="mu", to=-2.0)
+    (fold,) = branch.critical
+    assert fold.kind == "fold"
+    np.testing.assert_allclose(fold.parameter, -1.0, atol=1e-10)
+    circles = branch.q**2 + branch.v**2
+    np.testing.assert_allclose((circles - 1) ** 2, 1 + branch.parameter, atol=1e-9)
+    np.testing.assert_array_equal(branch.stable[: fold.index], True)
+    assert not branch.stable[fold.index + 1 :].any() and branch.status.startswith("a state of rest, near mu = ")
+
+
+@pytest.mark.slow
+def test_torus_of_a_driven_van_der_pol():
+    """With less drive it loses the entrainment: a pair passes the circle, as SciPy's multipliers do."""
+    lagrangian = lambda t, q, v, p: 0.5 * v**2 - 0.5 * q**2 + p["f"] * q * jnp.cos(2 * t)
+    system = lj.System(lagrangian, force=lambda t, q, v, p: 0.5 * (1 - q**2) * v)
+    orbit = lj.periodic_orbit(system, (-2.0, 0.0), np.pi, {"f": 6.0})
+    branch = lj.continue_orbits(orbit, along="f", to=0.5)
+    (torus,) = branch.critical
+    assert torus.kind == "torus" and branch.stable[0] and not branch.stable[-1]
+    f = float(torus.parameter)
+    rate = lambda t, y: [y[1], -y[0] + 0.5 * (1 - y[0] ** 2) * y[1] + f * np.cos(2 * t)]
+    _, found = shot(rate, np.pi, np.array([branch.q[torus.index], branch.v[torus.index]]) + 1e-4)
+    np.testing.assert_allclose(np.abs(found), 1.0, atol=1e-8)
+    # By Liouville the size is known: ∮ (1 - q²)/2 dt = 0 there; twin: not elsewhere.
+    of = lambda i: np.prod(np.abs(branch.multipliers[i]))
+    assert abs(of(torus.index) - 1) < 1e-11 < abs(of(torus.index + 2) - 1)
+
+
+# What is drawn and said.
+
+
+@pytest.mark.slow
+def test_what_is_drawn_and_refused():
+    """Stable solid and unstable dashed, folds marked; names of nothing and a range that leads nowhere are refused."""
+    orbit = lj.periodic_orbit(duffing, (0.4, 0.0), 2 * np.pi / DRIVEN["omega"], DRIVEN)
+    branch = lj.continue_orbits(orbit, along="omega", to=1.7, most_points=400)
+    (axis,) = branch.plot().axes
+    dashes = {line.get_linestyle() for line in axis.get_lines() if len(line.get_xdata()) > 2}
+    assert dashes == {"-", "--"} and axis.get_ylabel() == "largest q" and axis.get_xlabel() == "omega"
+    assert {"stable", "unstable", "fold"} <= set(axis.get_legend_handles_labels()[1])
+    assert branch.plot("period").axes[0].get_ylabel() == "period" and "fold" in repr(branch)
+    short = lj.continue_orbits(orbit, along="omega", to=1.7, most_points=5)
+    assert short.status == "the limit of 5 points" and len(short) == 5
+    with pytest.raises(ValueError, match="names no coordinate; there are q, and 'period'"):
+        branch.plot("theta")
+    with pytest.raises(ValueError, match="along='speed' is no number in params; there are 'b', 'c', 'f' and 'omega'"):
+        lj.continue_orbits(orbit, along="speed", to=1.0)
+    with pytest.raises(ValueError, match="along='period': the system depends on time"):
+        lj.continue_orbits(orbit, along="period", to=1.0)
+    with pytest.raises(ValueError, match="no way to go from 0.5"):
+        lj.continue_orbits(orbit, along="omega", to=0.5)
+    with pytest.raises(TypeError, match="JAX is tracing"):
+        jax.jit(lambda orbit: lj.continue_orbits(orbit, along="omega", to=1.0).period)(orbit)
+    with pytest.raises(IndexError, match="branch\\[0\\] to branch"):
+        branch[len(branch)]
+
+
+def test_no_orbit_to_begin_with():
+    """A system, and a state, are no orbit."""
+    with pytest.raises(TypeError, match="needs a periodic orbit, not System") as raised:
+        lj.continue_orbits(pendulum, along="g", to=2.0)  # type: ignore
+    assert "Fix: orbit = lj.periodic_orbit" in str(raised.value) and PARAMS["g"] > 0
