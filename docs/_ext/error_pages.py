@@ -40,8 +40,11 @@ THEMES = {
     "fitting": "Fits",
     "learned": "Learned models",
     "comparison": "Error against run time",
+    "exchange": "In and out",
+    "interactive": "Knobs",
     "plot": "Pictures",
     "animation": "Pictures",
+    "pages": "Pictures",
 }
 ORDER = list(dict.fromkeys([*("A system and its Lagrangian", "States and constraints", "Motion"), *THEMES.values()]))
 ELSEWHERE = "Elsewhere"

@@ -293,8 +293,8 @@ def open_sweep(path: str | os.PathLike, *, run: Callable | None = None, system: 
     >>> import lagjax as lj
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     done = lj.sweep(lambda point: point["x"] ** 2, {"x": [1.0, 2.0]}, store=folder + "/squares", progress=False)
-    ...     print(open_sweep(folder + "/squares").values)
-    [1. 4.]
+    ...     print(open_sweep(folder + "/squares").counts())
+    {'successful': 2}
 
     **Arguments:** `path`: the folder that `lj.sweep` was given as `store`. Functions are not stored, so that a
     trajectory does not know its system. It plots and plays all the same; what else it needs one for (`print`,
