@@ -30,7 +30,7 @@ const server = createServer((request, response) => {
 }).listen(0);
 const origin = `http://127.0.0.1:${server.address().port}`;
 const pages = fs.readdirSync(root, { recursive: true })
-    .filter((name) => name.endsWith(".html") && (!wanted.length || wanted.some((part) => name.includes(part))))
+    .filter((name) => name.endsWith(".html") && !name.startsWith("_static") && (!wanted.length || wanted.some((part) => name.includes(part))))
     .sort();
 
 const browser = await chromium.launch({

@@ -36,8 +36,11 @@ html_static_path = ["_static"]
 html_css_files = ["site.css"]
 html_copy_source = False
 html_show_sourcelink = False
+# Pages without others beside them; and one whose list would fold with a toggle that has no name for those who hear it.
+html_sidebars = {name: [] for name in ("index", "first-ten-minutes", "gallery", "generated/measured/*")}
 html_theme_options = {
     "navigation_with_keys": False,
+    "collapse_navigation": True,
     "show_nav_level": 1,
     "navbar_align": "left",
     "header_links_before_dropdown": 8,

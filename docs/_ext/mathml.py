@@ -39,7 +39,7 @@ def inline(translator, node):
 
 def displayed(translator, node):
     """A formula on lines of its own, which scroll by themselves where the page is narrow."""
-    translator.body.append('<div class="math" tabindex="0" role="region" aria-label="Formula">')
+    translator.body.append('<div class="formula" tabindex="0" role="region" aria-label="Formula">')
     translator.body.append(mathml(translator, node, block=True) + "</div>\n")
     raise nodes.SkipNode
 
