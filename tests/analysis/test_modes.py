@@ -270,6 +270,7 @@ def disk_critical(params):
     return np.sqrt(A * m * g * r / (C * (C + m * r**2)))
 
 
+@pytest.mark.slow
 def test_a_rolling_disk():
     """Its leaning has that root at each speed; g/(3r) of a thin disk; from there on it stays upright."""
     m, r, g = 1.5, 0.4, 9.81
@@ -311,6 +312,7 @@ def test_damping_and_circulation():
 # Derivatives where there is none, and programs.
 
 
+@pytest.mark.slow
 def test_a_double_root_is_reported():
     """Of an isotropic oscillator: finite derivatives, of the mean, and it is said."""
     at = lambda k1: lj.normal_modes(small.circulating, 0.0, STILL, STILL, {"k1": k1, "k2": 4.0, "n": 0.0, "c": 0.0})

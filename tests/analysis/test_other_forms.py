@@ -48,7 +48,7 @@ def exact_charge(q, p, t, params):
 
 @pytest.mark.parametrize(
     "system, exact, params",
-    [pytest.param(FAST, exact_fast, OF_FAST, marks=pytest.mark.slow), (CHARGE, exact_charge, OF_CHARGE)],
+    [pytest.param(FAST, exact_fast, OF_FAST, marks=pytest.mark.exhaustive), (CHARGE, exact_charge, OF_CHARGE)],
     ids=["fast", "charge"],
 )
 def test_hamiltonians_in_closed_form(system, exact, params):
