@@ -48,6 +48,7 @@ from lagjax.numerics.runge_kutta import Dopri8, Tsit5
 
 # isort: split
 # Many motions.
+from lagjax.pages.page import Page
 from lagjax.sweeps.engine import sweep
 from lagjax.sweeps.lanes import Status
 from lagjax.sweeps.result import Sweep, open_sweep
@@ -227,6 +228,7 @@ __all__ = [
     "Sweep",
     "Status",
     "open_sweep",
+    "Page",
     "interact",
     "Knobs",
     "fit",

@@ -132,5 +132,5 @@ def known_system(system: Any) -> Any:
 def _raise_unknown(system) -> NoReturn:
     raise ValueError(
         f"this needs the functions of the system ({system.words}), which are not in a file.\n"
-        "Fix: lj.load_trajectory(path, system=system), or lj.load_fit, with the system that was integrated."
+        "Fix: lj.load_trajectory(path, system=system), or load_fit or open_sweep, with the system that was integrated."
     )

@@ -55,32 +55,35 @@ def load_trajectory(path: str | os.PathLike, system: System | Hybrid | None = No
       works in float32; and for objects of a class that has not been imported.
     """
     said, arrays = files.read(path, "trajectory")
+    reader = Reader(arrays)
     try:
-        known, of, fields, problem, how = _taken_apart(Reader(arrays), said["trajectory"])
+        found = {name: reader.up(node) for name, node in said["trajectory"].items()}
+        known = UnknownSystem(**found["system"])
+        trajectory = trajectory_of(found, known)
     except (KeyError, TypeError, IndexError, StopIteration) as error:
         files.raise_damaged(path, f"what it says of itself is not whole ({error})", error)
     except ValueError as error:
         raise ValueError(f"{path} cannot be read: {error}") from error
-    if system is not None:
-        check_same(system, known, path)
-    kept = known if system is None else each_phase(system, lambda phase: first_alike(phase, up_to_date(phase)))
-    fields["arrays"], fields["static"] = pack(kept, *problem, how)
-    return of(**fields)
+    return trajectory if system is None else trajectory_of(found, same_system(system, known, path))
 
 
-def _taken_apart(reader, nodes):
-    """(what is known of the system, the class, its fields, the parameters and what was asked, how it went)."""
-    found = {name: reader.up(node) for name, node in nodes.items()}
+def trajectory_of(found: dict, kept: System | Hybrid | UnknownSystem) -> Trajectory:
+    """The trajectory that has these parts (`saving.parts`), and this system."""
     fields = {name: found[name] for name in PLAIN}
     fields |= {"end": Snapshot(**found["end"]), "result": result_of_names(found["result"])}
     fields["events"] = {name: Crossings(**x) for name, x in found["events"].items()}
-    error, of = found["error"], Trajectory
+    error = found["error"]
     fields["error"] = None if error is None else Errors(**error | {"result": result_of_names(error["result"])})
-    if "phase" in found:
-        of = HybridTrajectory
-        fields |= {"phase": found["phase"], "switches": _made(Switches, found["switches"])}
-    problem = found["params"], Asked(**found["asked"])
-    return UnknownSystem(**found["system"]), of, fields, problem, How(**found["how"])
+    fields["arrays"], fields["static"] = pack(kept, found["params"], Asked(**found["asked"]), How(**found["how"]))
+    if "phase" not in found:
+        return Trajectory(**fields)
+    return HybridTrajectory(**fields, phase=found["phase"], switches=_made(Switches, found["switches"]))
+
+
+def same_system(system, known: UnknownSystem, path) -> System | Hybrid:
+    """The system that was integrated, which the user gives again; raise where it is another."""
+    check_same(system, known, path)
+    return each_phase(system, lambda phase: first_alike(phase, up_to_date(phase)))
 
 
 def check_same(system, known: UnknownSystem, path) -> None:

@@ -1,6 +1,7 @@
 """Trajectories written into files: all but the functions of their system, of which a signature is kept."""
 
 import os
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -21,17 +22,22 @@ def save(trajectory, path: str | os.PathLike) -> None:
     """Write a trajectory into a file: see `Trajectory.save`."""
     _check_known(trajectory)
     writer, known = Writer(), described(trajectory)
+    nodes = {name: writer.down(x, name) for name, x in parts(trajectory, result_in_names).items()}
+    nodes["system"] = writer.down(_fields(known), "system")
+    files.write(path, "trajectory", {"trajectory": nodes}, writer.arrays)
+
+
+def parts(trajectory, of_result: Callable) -> dict[str, Any]:
+    """All that a trajectory is but its system, by name; `of_result(result)` is what stands for a result."""
     tree: dict[str, Any] = {name: getattr(trajectory, name) for name in PLAIN}
     tree |= {"end": trajectory.end._asdict(), "events": {n: _fields(x) for n, x in trajectory.events.items()}}
     tree |= {"params": trajectory.params, "asked": trajectory.asked._asdict()}
-    tree |= {"how": trajectory.static.how._asdict(), "result": result_in_names(trajectory.result)}
+    tree |= {"how": trajectory.static.how._asdict(), "result": of_result(trajectory.result)}
     error = trajectory.error
-    tree["error"] = None if error is None else error._asdict() | {"result": result_in_names(error.result)}
+    tree["error"] = None if error is None else error._asdict() | {"result": of_result(error.result)}
     if hasattr(trajectory, "phase"):
         tree |= {"phase": trajectory.phase, "switches": _fields(trajectory.switches)}
-    nodes = {name: writer.down(x, name) for name, x in tree.items()}
-    nodes["system"] = writer.down(_fields(known), "system")
-    files.write(path, "trajectory", {"trajectory": nodes}, writer.arrays)
+    return tree
 
 
 def described(trajectory) -> UnknownSystem:
