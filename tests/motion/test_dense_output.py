@@ -7,11 +7,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from counting import compiles
 from scipy.special import ellipj, ellipk
 
 import lagjax as lj
 from lagjax.motion.frames import hermite
+from tests.counting import compiles
 
 TS = np.linspace(0.0, 4.0, 9)
 AMPLITUDE = 2.0
