@@ -103,6 +103,8 @@ class Steady(eqx.Module):
         return self.fields(x) @ jax.grad(of)(u)
 
 
+# Jitted, so that a Lagrangian is traced once wherever its balance is asked for.
+@eqx.filter_jit
 def imbalance(s: Steady, t, x, u, a, multipliers):
     """`M a - F - Aᵀ λ - B λ`, for any velocity and acceleration."""
     state = s.system, t, x, u, s.params, s.unflatten
@@ -113,6 +115,7 @@ def imbalance(s: Steady, t, x, u, a, multipliers):
     return left.astype(x.dtype)
 
 
+@eqx.filter_jit
 def forces(s: Steady, t, x, u) -> Float[Array, "m n"]:
     """The force of each multiplier: the rows of A, and what a force makes of it."""
     state = s.system, t, x, u, s.params, s.unflatten
@@ -120,6 +123,7 @@ def forces(s: Steady, t, x, u) -> Float[Array, "m n"]:
     return rows if reaction is None else rows + reaction.T
 
 
+@eqx.filter_jit
 def restrictions(s: Steady, t, x, u):
     """`g` or `phi` of each constraint, stacked in the order of their names."""
     q, v = s.unflatten(x), s.unflatten(u)

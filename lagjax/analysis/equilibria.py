@@ -9,6 +9,7 @@ so that a minimum of |r| which is no root, and a flight to where forces only fad
 """
 
 from collections.abc import Callable, Iterable
+from functools import partial
 from typing import Any
 
 import jax
@@ -102,7 +103,8 @@ def equilibria(
     """
     q = stacked(starts)
     count = jax.tree.leaves(q)[0].shape[0]
-    v = jax.tree.map(jnp.zeros_like, q) if velocities is None else _velocities(velocities, q, count)
+    zeros = lambda x: coordinates.numpy_of(x).zeros_like(x)
+    v = jax.tree.map(zeros, q) if velocities is None else _velocities(velocities, q, count)
     first = jax.tree.map(lambda x: x[0], (q, v))
     try:
         system, s = checked(system, t, *first, params)
@@ -118,7 +120,7 @@ def equilibria(
         )
     symmetries = symmetries_of(system, s, cyclic, hold, moving)
     # What a function closes over may be traced where nothing that is passed is.
-    steady = Steady(lift(system, s), s.t, s.params, jnp.zeros(symmetries.count, s.t.dtype), s.q, symmetries)
+    steady = Steady(lift(system, s), s.t, s.params, np.zeros(symmetries.count, s.t.dtype), s.q, symmetries)
     q, v = jax.tree.map(lambda x: x.astype(s.t.dtype), (q, v))
     lasting = not symmetries.count and conserves_balance(system, s)
     plain = is_eager() and not coordinates.is_traced((steady, q, v))
@@ -154,7 +156,7 @@ def _velocities(velocities, q, count):
     v = stacked([velocities] if _is_one(velocities, q) else velocities, "velocities")
     if jax.tree.structure(v) != jax.tree.structure(q):
         coordinates.state(0.0, jax.tree.map(lambda x: x[0], q), jax.tree.map(lambda x: x[0], v), None)
-    return jax.tree.map(lambda x, of: jnp.broadcast_to(x, (count, *of.shape[1:])), v, q)
+    return jax.tree.map(lambda x, of: coordinates.numpy_of(x).broadcast_to(x, (count, *of.shape[1:])), v, q)
 
 
 def _is_one(velocities, q):
@@ -167,7 +169,7 @@ def _moving(v, count):
     return np.any(np.concatenate([np.asarray(x).reshape(count, -1) for x in jax.tree.leaves(v)], axis=1) != 0, axis=0)
 
 
-@compiled
+@partial(compiled, in_numpy=True)
 def searched(steady: Steady, q, v, lasting, plain) -> Row:
     """What each start leads to, one row each."""
     return jax.vmap(lambda q, v: _settled(steady, q, v, lasting, plain))(q, v)

@@ -5,7 +5,6 @@ from typing import NamedTuple
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int, PyTree
 
@@ -128,7 +127,7 @@ def merged(rows: Equilibria, is_angle: PyTree[bool]) -> Equilibria:
             kept.append(i)
     pick = lambda tree: jax.tree.map(lambda x: x[np.array(kept, int)], tree)
     of_rows = [name for name in Row._fields if name not in ("status", "last")]
-    return replace(rows, **{name: pick(getattr(rows, name)) for name in of_rows}, of_start=jnp.asarray(of_start))
+    return replace(rows, **{name: pick(getattr(rows, name)) for name in of_rows}, of_start=of_start)
 
 
 def _close(off, size, angle):

@@ -26,11 +26,13 @@ def stacked(starts, what="starts") -> PyTree:
         structures = {jtu.tree_structure(start) for start in starts}
         if len(structures) > 1:
             raise ValueError(f"the {what} differ in structure: each must be like q.\nFix: {AS_STARTS}.")
-        return jtu.tree_map(lambda *x: jnp.stack([jnp.asarray(_float(y)) for y in x]), *starts)
+        # Known values stay with NumPy, which compiles nothing.
+        xp = coordinates.numpy_of(starts)
+        return jtu.tree_map(lambda *x: xp.stack([xp.asarray(_float(y)) for y in x]), *starts)
     leaves = jtu.tree_leaves(starts)
     if not leaves:
         raise ValueError(f"{what} has no coordinates.\nFix: {AS_STARTS}.")
-    starts = jtu.tree_map(lambda x: jnp.asarray(_float(x)), starts)
+    starts = jtu.tree_map(lambda x: coordinates.numpy_of(x).asarray(_float(x)), starts)
     leaves = jtu.tree_leaves(starts)
     if all(x.ndim == 0 for x in leaves):
         return jtu.tree_map(lambda x: x[None], starts)
@@ -50,7 +52,7 @@ def stacked(starts, what="starts") -> PyTree:
 def stacked_one(q):
     """A state of rest at q."""
     q = jax.tree.map(lambda x: x[0], stacked([q]))
-    return q, jax.tree.map(jnp.zeros_like, q)
+    return q, jax.tree.map(lambda x: coordinates.numpy_of(x).zeros_like(x), q)
 
 
 def _float(x):
