@@ -156,7 +156,7 @@ def _frame(orbit, problem, place: Along, asked, rtol, to) -> tuple[OrbitFrame, n
     flow = flow_of(system, *s, rtol, problem.rows)
     flow = replace(flow, params=jax.tree.map(lambda x: jnp.asarray(x) if isinstance(x, np.ndarray) else x, s.params))
     nodes, period = np.asarray(orbit.nodes, s.t.dtype), np.asarray(orbit.period, s.t.dtype)
-    flat = lambda tree: np.concatenate([np.ravel(x) for x in jax.tree.leaves(tree)])
+    flat = coordinates.vector
     nodes = np.concatenate([np.concatenate([flat(s.q), flat(s.v)])[None], nodes[1:]])
     scale = _guess(flow, s.t, nodes[0], period, asked._replace(free=False))
     integral, slope, sizes, drive = sizes_at(flow, s.t, nodes[0], period, scale)
@@ -289,8 +289,7 @@ class _Follower:
 def _result(orbit, problem, place, tracer, path, found, along, first, last) -> OrbitBranch:
     """All of it in the user's structure."""
     seen = [p.seen for p in path.points]
-    _, unflatten = coordinates.flatten(orbit.q)
-    trees = lambda rows: jax.tree.map(lambda *x: np.stack(x), *[jax.tree.map(np.asarray, unflatten(r)) for r in rows])
+    trees = lambda rows: coordinates.like(orbit.q, np.asarray(np.stack(rows), tracer.dtype))
     n = len(coordinates.names(orbit.q))
     known = [i for i, p in enumerate(path.points) if p.growing is not None]
     nearest = [min(known, key=lambda j: (abs(j - i), -j)) for i in range(len(seen)) if known]

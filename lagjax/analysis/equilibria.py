@@ -36,8 +36,7 @@ from lagjax.jax_internals.tracing import is_eager
 from lagjax.mechanics import constraints, coordinates
 from lagjax.mechanics.closures import lift
 from lagjax.mechanics.compiled import compiled
-from lagjax.mechanics.reactions import force_with_ones
-from lagjax.mechanics.structure import angles, sees_time
+from lagjax.mechanics.structure import angles, is_autonomous
 from lagjax.motion.consistency import stopped
 from lagjax.numerics import lapack
 from lagjax.numerics.roots import MOST, differentiable, least_squares_root, zero_below
@@ -122,7 +121,7 @@ def equilibria(
     # What a function closes over may be traced where nothing that is passed is.
     steady = Steady(lift(system, s), s.t, s.params, np.zeros(symmetries.count, s.t.dtype), s.q, symmetries)
     q, v = jax.tree.map(lambda x: x.astype(s.t.dtype), (q, v))
-    lasting = not symmetries.count and conserves_balance(system, s)
+    lasting = not symmetries.count and is_autonomous(system, *s)
     plain = is_eager() and not coordinates.is_traced((steady, q, v))
     rows = searched(steady, q, v, lasting, plain)
     found = Equilibria(t=s.t, params=s.params, symmetries=symmetries, starts=q, **rows._asdict())
@@ -138,17 +137,6 @@ def _is_a_state(system, t, q, params) -> bool:
     except (TypeError, ValueError, IndexError):
         return False
     return True
-
-
-def conserves_balance(system, s) -> bool:
-    """Whether a balance at rest lasts because nothing depends on t."""
-    holonomic = [lambda t, q, v, params, g=c.g: g(t, q, params) for c in system.constraints.values()
-                 if isinstance(c, constraints.Holonomic)]  # fmt: skip
-    others = [c.phi for c in system.constraints.values() if not isinstance(c, constraints.Holonomic)]
-    functions = [system.lagrangian, *holonomic, *others]
-    functions += [force_with_ones(system)] if system.force is not None else []
-    functions += [system.dissipation] if system.dissipation is not None else []
-    return not any(sees_time(function, *s) for function in functions)
 
 
 def _velocities(velocities, q, count):

@@ -87,7 +87,7 @@ def _structure(args, names):
     nonzero = np.array([not is_zero(x) for x in mass.program.jaxpr.outvars]).reshape(n, n)
     lagrangian = _numbers(lambda system, *state: system.lagrangian(*state), args)
     linear = _numbers(_momentum_at_rest, args)
-    seen = [_numbers(lambda _, *state, f=f: f(*state), args) for f in _seen(system)]
+    seen = [_numbers(lambda _, *state, f=f: f(*state), args) for f in functions_of(system)]
     return Structure(
         mass_depends_on=_depends_on(mass, names),
         blocks=tuple(tuple(names[i] for i in block) for block in banded.blocks(nonzero)),
@@ -109,7 +109,7 @@ def unseen_coordinates(system, t, q, v, params) -> np.ndarray:
     written = in_numbers(system, unflatten), t, coordinates.numbers(q), coordinates.numbers(v), params
     seen = np.zeros(x.size, bool)
     try:
-        for f in _seen(written[0]):
+        for f in functions_of(written[0]):
             numbers = _numbers(lambda _, *state, f=f: f(*state), written)
             _, *state = numbers.state_variables
             seen |= np.array([depends(numbers.program.jaxpr, [y]) for y in state[: x.size]])
@@ -123,7 +123,7 @@ def _unseen_leaves(system, t, q, v, params):
     unseen = []
     for i, leaf in enumerate(jtu.tree_leaves(q)):
         at = lambda args, i=i: jtu.tree_leaves(args[1])[i]
-        kinds = {_dependence(f, (t, q, v, params), at) for f in _seen(system)}
+        kinds = {_dependence(f, (t, q, v, params), at) for f in functions_of(system)}
         unseen += [kinds == {Depends.NOT}] * int(np.size(leaf))
     return np.array(unseen)
 
@@ -204,7 +204,8 @@ def angles(system, t, q, v, params) -> PyTree[bool]:
     found = []
     for i in range(len(leaves)):
         kinds = {
-            _dependence(f, (t, q, v, params), lambda args, i=i: jtu.tree_leaves(args[1])[i]) for f in _seen(system)
+            _dependence(f, (t, q, v, params), lambda args, i=i: jtu.tree_leaves(args[1])[i])
+            for f in functions_of(system)
         }
         found.append(kinds - {Depends.NOT} == {Depends.PERIODICALLY})
     return jtu.tree_unflatten(structure, found)
@@ -220,7 +221,7 @@ def conserved_momenta(system, t, q, v, params) -> list[str]:
     system = in_numbers(system, unflatten)
     args = (system, t, coordinates.numbers(q), coordinates.numbers(v), params)
     try:
-        seen = [_depends_on(_numbers(lambda _, *state, f=f: f(*state), args), names) for f in _seen(system)]
+        seen = [_depends_on(_numbers(lambda _, *state, f=f: f(*state), args), names) for f in functions_of(system)]
     except TooLong:
         return []
     return [name for name in names if not any(name in found for found in seen)]
@@ -293,7 +294,12 @@ def _of_state(constraint):
     return lambda t, q, v, params: constraint.g(t, q, params)
 
 
-def _seen(system):
+def is_autonomous(system, t, q, v, params) -> bool:
+    """Whether nothing that the motion depends on depends on t."""
+    return not any(sees_time(f, t, q, v, params) for f in functions_of(system))
+
+
+def functions_of(system):
     """All functions that the motion depends on, of (t, q, v, params)."""
     functions = []
     for phase in phases_of(system):
