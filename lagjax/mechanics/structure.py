@@ -231,10 +231,10 @@ def what_changes_momentum(system, name, t, q, v, params) -> Iterator[str]:
     """What may change the momentum of a coordinate, in words."""
     if not _contains(system.lagrangian, name, t, q, v, params, argument=2):
         yield "L does not contain its velocity"
-    if system.force is not None:
-        yield "there is a force"
-    if system.dissipation is not None:
-        yield "there is dissipation"
+    if system.force is not None and _pushes(system, name, t, q, v, params):
+        yield "a force acts on it"
+    if system.dissipation is not None and _contains(system.dissipation, name, t, q, v, params, argument=2):
+        yield "dissipation acts on it"
     functions = {"L contains it": system.lagrangian}
     for other, c in system.constraints.items():
         if isinstance(c, Holonomic):
@@ -244,6 +244,25 @@ def what_changes_momentum(system, name, t, q, v, params) -> Iterator[str]:
     for words, function in functions.items():
         if _contains(function, name, t, q, v, params):
             yield words
+
+
+def forced_by(system, name, t, q, v, params) -> Iterator[str]:
+    """Which forces on others depend on a coordinate, in words."""
+    if system.force is not None and _contains(force_with_ones(system), name, t, q, v, params):
+        yield "the force contains it"
+    if system.dissipation is not None and _contains(system.dissipation, name, t, q, v, params):
+        yield "dissipation contains it"
+
+
+def _pushes(system, name, t, q, v, params) -> bool:
+    """Whether the force has an entry for a coordinate that is not written as zero; also where that is not known."""
+    _, unflatten = coordinates.flatten(q)
+    args = in_numbers(system, unflatten), t, coordinates.numbers(q), coordinates.numbers(v), params
+    try:
+        force = _numbers(lambda system, *state: force_with_ones(system)(*state), args)
+    except TooLong:
+        return True
+    return not is_zero(force.program.jaxpr.outvars[coordinates.names(q).index(name)])
 
 
 def _contains(function, name, t, q, v, params, argument=1) -> bool:
@@ -257,7 +276,8 @@ def _contains(function, name, t, q, v, params, argument=1) -> bool:
     alone, known = in_numbers(System(function), unflatten), coordinates.names(q)
     args = alone, t, coordinates.numbers(q), coordinates.numbers(v), params
     try:
-        numbers = _numbers(lambda system, *state: system.lagrangian(*state), args)
+        # Of a force all entries count.
+        numbers = _numbers(lambda system, *state: coordinates.flatten(system.lagrangian(*state))[0], args)
     except TooLong:
         return True
     place = 1 + (argument - 1) * len(known) + known.index(name)
