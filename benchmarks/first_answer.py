@@ -246,7 +246,7 @@ QUESTIONS = {
         PENDULUM, "orbit = lj.periodic_orbit(system, start, 2.0, params)\n"
         "answer = lambda x: lj.continue_orbits(orbit, along='q', to=2.0 * x).period", None, 2.0,
     ),
-    "Floquet multipliers at rest on the rod": Question(
+    "Floquet multipliers on the rod": Question(
         ROD + BEAD, "answer = lambda x: lj.floquet(system, 0.0, *at_rest, params | {'m': x}, 2.0).multipliers", None, 2.0,
     ),
     "Lyapunov exponent of a double pendulum": Question(

@@ -181,10 +181,10 @@ def _settled(steady: Steady, q, v, lasting, plain) -> Row:
     fixed, linear = stopped(steady), np.arange(y0.size) >= steady.n + steady.symmetries.count
     root = least_squares_root(lambda y: equations.balance(fixed, y), lax.stop_gradient(y0), linear)
     y = root.y if plain else differentiable(lambda y: equations.balance(steady, y), root)
-    return described(steady, y, root, y0, lasting)
+    return described(steady, y, root, y0, lasting, plain)
 
 
-def described(steady: Steady, y, root, y0, lasting) -> Row:
+def described(steady: Steady, y, root, y0, lasting, plain) -> Row:
     """A root in the user's structure, with what is to be known of it."""
     x, rates, multipliers = steady.parts(y)
     u, a = steady.velocity_and_acceleration(x, rates)
@@ -195,8 +195,8 @@ def described(steady: Steady, y, root, y0, lasting) -> Row:
     if steady.m:
         of_names = steady.system, multipliers, steady.t, steady.like, steady.like, steady.params
         by_name = constraints.split(*of_names)
-    # Roots that coincide have no derivatives: those of `lj.normal_modes` say where.
-    roots = equations.characteristic_roots(*stopped((steady, y, root.jacobian)))
+    jacobian = root.jacobian if plain else jax.jacfwd(lambda y: equations.balance(steady, y))(y)
+    roots = equations.characteristic_roots(steady, y, jacobian, derivatives=not plain)
     status, imbalance, zero_modes = _verdict(steady, root, y0, lasting)
     grows = GROWS_ABOVE[np.dtype(x.dtype)] * jnp.nanmax(jnp.abs(roots))
     stable = ~jnp.any(roots.real > grows) & jnp.any(jnp.isfinite(roots)) & (status == OK)
