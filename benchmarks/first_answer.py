@@ -247,7 +247,8 @@ QUESTIONS = {
         "answer = lambda x: lj.continue_orbits(orbit, along='q', to=2.0 * x).period", None, 2.0,
     ),
     "Floquet multipliers on the rod": Question(
-        ROD + BEAD, "answer = lambda x: lj.floquet(system, 0.0, *at_rest, params | {'m': x}, 2.0).multipliers", None, 2.0,
+        ROD + BEAD, "answer = lambda x: lj.floquet(system, 0.0, *at_rest, params | {'m': x}, 2.0).multipliers", None,
+        2.0,
     ),
     "Lyapunov exponent of a double pendulum": Question(
         DOUBLE, "answer = lambda x: lj.lyapunov_exponents(system, *start, {'g': 9.81 * x}, ts=np.linspace(0, 20, 201))"

@@ -78,8 +78,7 @@ def continue_orbits(
     system, s = checked(orbit.system, orbit.t, orbit.q, orbit.v, orbit.params)
     problem = problem_of(system, *s)
     place, asked = _along(along, orbit, problem)
-    rtol = tolerance_of(rtol, s.t.dtype)
-    frame, z = _frame(orbit, problem, place, asked, rtol, to)
+    frame, z = _frame(orbit, problem, place, asked, tolerance_of(rtol, s.t.dtype), to)
     first, last = float(z[-1] * frame.unit), float(to)
     low, high = sorted((float(z[-1]), last / float(frame.unit)))
     tracer, path, found = _traced(frame, z, low, high, np.sign(last - first), most_points)
@@ -161,7 +160,7 @@ def _frame(orbit, problem, place: Along, asked, rtol, to) -> tuple[OrbitFrame, n
     scale = _guess(flow, s.t, nodes[0], period, asked._replace(free=False))
     integral, slope, sizes, drive = sizes_at(flow, s.t, nodes[0], period, scale)
     first = {
-        NUMBER: lambda: place.number.get(s.params), ENERGY: lambda: integral, PERIOD: lambda: period,
+        NUMBER: lambda: place.number.get(s.params) if place.number else 0.0, ENERGY: lambda: integral, PERIOD: lambda: period,
         ENTRY: lambda: nodes[0][place.entry],
     }[place.kind]()  # fmt: skip
     first, last = float(first), float(to)

@@ -49,7 +49,9 @@ class Routhian(eqx.Module):
 
     def force(self, t, q, v, params):
         """The generalized forces on the coordinates that are left, like these."""
-        found = self.system.force(t, *self._state(t, q, v, params), self._parted(params)[0])
+        force = self.system.force
+        assert force is not None
+        found = force(t, *self._state(t, q, v, params), self._parted(params)[0])
         if isinstance(found, Mapping):
             return {name: found[name] for name in q}
         places = [_place(name) for name in self.cyclic]
@@ -57,7 +59,9 @@ class Routhian(eqx.Module):
 
     def dissipation(self, t, q, v, params):
         """Rayleigh's function of the coordinates that are left."""
-        return self.system.dissipation(t, *self._state(t, q, v, params), self._parted(params)[0])
+        dissipation = self.system.dissipation
+        assert dissipation is not None
+        return dissipation(t, *self._state(t, q, v, params), self._parted(params)[0])
 
     def _state(self, t, q, v, params):
         """Positions, cyclic ones zero, and velocities of all coordinates."""
