@@ -1,7 +1,7 @@
 """What does the right-hand side from L cost beside the one derived by hand?
 
 Every system of the six scenes, alone and in 1,000 lanes: `lj.accelerations` and the accelerations and multipliers as a
-careful person writes them in `jax.numpy`, in the same coordinates and as the same function of the state, the
+robust person writes them in `jax.numpy`, in the same coordinates and as the same function of the state, the
 multipliers eliminated by hand (`by_hand.py`). And the double pendulum beside numba.
 
 Both run in a compiled loop in which every acceleration changes the next state a little, so that nothing can be left out

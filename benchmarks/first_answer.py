@@ -1,7 +1,7 @@
 """What a person waits for: the first answer of a fresh process, and the next call, beside bare diffrax.
 
 Each figure is of a new process, with everything that a person waits for after `import`: tracing, compiling, running. A
-bare program is what a careful person writes for the same problem: accelerations derived by hand, diffrax's Dopri8 in
+bare program is what a robust person writes for the same problem: accelerations derived by hand, diffrax's Dopri8 in
 `jax.jit`, the same tolerance and outputs. Both are measured in the same run, one after the other, medians of three.
 
     first answer / bare     of the same problem, wall clock; of a sweep: of one of its motions, by us

@@ -31,6 +31,7 @@ from lagjax.motion.explanation import Explanation, explain
 # isort: split
 # Motion.
 from lagjax.animation import Animation
+from lagjax.mechanics.single_precision import PrecisionWarning
 from lagjax.motion.contacts import releases, slips, sticks, touches
 from lagjax.motion.crossings import Crossing, Crossings, EventWarning
 from lagjax.motion.hybrid_trajectory import HybridTrajectory, Switches
@@ -38,6 +39,7 @@ from lagjax.motion.integrate import integrate
 from lagjax.motion.ledger import EnergyLedger, energy_ledger
 from lagjax.motion.phase_graph import HybridExplanation
 from lagjax.motion.replay import Replay
+from lagjax.motion.saved import load_trajectory
 from lagjax.motion.sections import PoincareSection, periods, poincare, turning_points
 from lagjax.motion.trajectory import RESULTS, AccuracyWarning, Snapshot, Trajectory
 from lagjax.numerics.nystrom import Nystrom8, Nystrom12
@@ -46,6 +48,7 @@ from lagjax.numerics.runge_kutta import Dopri8, Tsit5
 
 # isort: split
 # Many motions.
+from lagjax.pages.page import Page
 from lagjax.sweeps.engine import sweep
 from lagjax.sweeps.lanes import Status
 from lagjax.sweeps.result import Sweep, open_sweep
@@ -58,6 +61,7 @@ from lagjax.fitting.engine import fit
 from lagjax.fitting.identifiability import Identifiability
 from lagjax.fitting.records import Record
 from lagjax.fitting.result import Fit, FitWarning
+from lagjax.fitting.saved import load_fit
 
 # isort: split
 # Error against run time.
@@ -88,6 +92,15 @@ if TYPE_CHECKING:
     from lagjax.analysis.symmetries import symmetries
     from lagjax.analysis.symmetry import SymmetryTest, is_symmetry
 
+    # In and out.
+    from lagjax.exchange.exported import export, result_codes
+    from lagjax.exchange.from_sympy import from_sympy
+
+    # Many motions, in a notebook.
+    from lagjax.interactive.interact import Knobs, interact
+
+
+__version__ = "0.2.0"
 
 # What is imported when it is first asked for, by its module.
 LATER = {
@@ -110,6 +123,9 @@ LATER = {
     "lagjax.analysis.routh": "Routhian routhian",
     "lagjax.analysis.symmetries": "symmetries",
     "lagjax.analysis.symmetry": "SymmetryTest is_symmetry",
+    "lagjax.exchange.exported": "export result_codes",
+    "lagjax.exchange.from_sympy": "from_sympy",
+    "lagjax.interactive.interact": "Knobs interact",
 }
 
 
@@ -129,6 +145,7 @@ def __dir__():
 
 __all__ = [
     "System",
+    "from_sympy",
     "Holonomic",
     "Nonholonomic",
     "Hybrid",
@@ -165,11 +182,13 @@ __all__ = [
     "HybridTrajectory",
     "Switches",
     "Snapshot",
+    "load_trajectory",
     "energy_ledger",
     "EnergyLedger",
     "Animation",
     "RESULTS",
     "AccuracyWarning",
+    "PrecisionWarning",
     "Generator",
     "noether_charge",
     "NoetherCharge",
@@ -209,14 +228,20 @@ __all__ = [
     "Sweep",
     "Status",
     "open_sweep",
+    "Page",
+    "interact",
+    "Knobs",
     "fit",
     "Record",
     "Fit",
     "FitWarning",
+    "load_fit",
     "identifiability",
     "Identifiability",
     "learned",
     "WorkPrecision",
     "work_precision",
+    "export",
+    "result_codes",
     "scenes",
 ]

@@ -1,17 +1,19 @@
-"""A film of points in the plane that plays in a notebook or a browser: one SVG, its numbers, and forty lines of script.
+"""A film of points in the plane that plays in a notebook or a browser: one SVG, its numbers, and a short script.
 
 It needs no network, no encoder and no other file. Where scripts are not run (an untrusted notebook, a preview) the
-first frame stands there. Coordinates are whole tenths of a pixel, so that ten seconds of a pendulum are about 10 kB.
+first frame stands there. Coordinates are whole tenths of a pixel in two bytes each. A film may have several lanes, of
+which the page shows one.
 """
 
-import hashlib
 import html
-import json
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from lagjax.pages import encoded, fragment, whole
+from lagjax.pages.page import in_bytes
 from lagjax.plot import COLOURS
 
 # The largest field of the picture in tenths of a pixel, and what stands around it: left, top, right, bottom.
@@ -21,41 +23,8 @@ MARGINS = (520, 80, 160, 440)
 NARROWEST = 0.3
 # Points of longer lines are not marked: these are outlines.
 MARKED_UP_TO = 8
-
-# The page may hold a film twice: the script takes the first that no script has taken.
-PLAYER = """
-(() => {
-  const root = document.querySelector("#ID:not([data-live])");
-  root.dataset.live = "";
-  const film = DATA, count = film.parts[0].length, groups = root.querySelectorAll("g[data-part]");
-  const [button, slider, clock] = ["button", "input", "output"].map(name => root.querySelector(name));
-  let began = null;
-  const draw = i => {
-    film.parts.forEach((frames, k) => {
-      const [trail, line, dots] = groups[k].children, from = Math.max(0, i - film.trail);
-      trail.setAttribute("points", frames.slice(from, i + 1).map(frame => frame.slice(-2)).join(" "));
-      line.setAttribute("points", frames[i].join(" "));
-      if (dots) dots.setAttribute("d", frames[i].map((x, j) => j % 2 ? x + "h0" : "M" + x + " ").join(""));
-    });
-    clock.textContent = "t = " + (film.start + i * film.step).toFixed(film.digits);
-  };
-  const pause = () => { began = null; button.textContent = "\\u25b6"; button.ariaLabel = "play"; };
-  const advance = now => {
-    if (began === null || !root.isConnected) return;
-    slider.value = Math.floor(Math.max(0, now - began) / 1000 * film.rate) % count;
-    draw(+slider.value);
-    requestAnimationFrame(advance);
-  };
-  button.onclick = () => {
-    if (began !== null) return pause();
-    began = performance.now() - slider.value / film.rate * 1000;
-    button.textContent = "\\u275a\\u275a";
-    button.ariaLabel = "pause";
-    requestAnimationFrame(advance);
-  };
-  slider.oninput = () => { pause(); draw(+slider.value); };
-})();
-"""
+# A lane without a motion: what the script knows by this number.
+NOWHERE = -32768
 
 
 class Animation:
@@ -63,49 +32,63 @@ class Animation:
 
     - `t` (F,): the time of each frame; `points`: by name, (F, k, 2), what is drawn.
     - `rate`: frames a second; `trail`: how many frames behind a trail reaches.
+
+    >>> import numpy as np
+    >>> t = np.linspace(0.0, 1.0, 5)
+    >>> points = {"ball": np.stack([t, t * (1.0 - t)], axis=1)[:, None]}
+    >>> print(Animation(t, points, rate=25.0, trail=3).t[-1])
+    1.0
     """
 
     def __init__(self, t: np.ndarray, points: dict[str, np.ndarray], rate: float, trail: int):
         self.t, self.points, self.rate, self.trail = t, points, rate, trail
 
     def save(self, path) -> None:
-        """Write a page that plays in any browser, without a network."""
-        page = f'<!DOCTYPE html><meta charset="utf-8"><title>Motion</title>\n{self._repr_html_()}\n'
-        Path(path).write_text(page, encoding="utf-8")
+        """Write a page that plays in any browser, without Python and without a network."""
+        Path(path).write_text(whole("Motion", self._repr_html_()), encoding="utf-8")
 
     def _repr_html_(self):
-        low, size, scale = _field(self.points)
-        parts = {name: _in_tenths_of_pixels(x, low, size, scale) for name, x in self.points.items()}
-        step = float(self.t[1] - self.t[0])
-        digits = max(0, math.ceil(-math.log10(step)))
-        flat = [x.reshape(len(x), -1).tolist() for x in parts.values()]
-        film = {"rate": self.rate, "trail": self.trail, "start": float(self.t[0]), "step": step, "digits": digits}
-        data = json.dumps(film | {"parts": flat}, separators=(",", ":"))
-        name = "lagjax-" + hashlib.sha256((data + repr(list(parts))).encode()).hexdigest()[:12]
-        dot = '<span style="margin-right:1em"><span style="color:{}">&#9679;</span> {}</span>'
-        named = [dot.format(_colour(i), html.escape(str(part))) for i, part in enumerate(parts) if len(parts) > 1]
-        script = PLAYER.replace("ID", name).replace("DATA", data)
-        return (
-            f'<div id="{name}" style="max-width:520px;font:13px sans-serif"><div>{"".join(named)}</div>\n'
-            f"{_picture(parts, low, size, scale)}\n"
-            '<div style="display:flex;gap:8px;align-items:center">'
-            '<button aria-label="play" style="width:3em">&#9654;</button>'
-            f'<input type="range" aria-label="time" min="0" max="{len(self.t) - 1}" value="0" style="flex:1">'
-            f'<output style="min-width:6em">t = {float(self.t[0]):.{digits}f}</output></div>\n'
-            f"<script>{script}</script></div>"
-        )
+        body, spec = film(self.t, {name: x[None] for name, x in self.points.items()}, self.rate, self.trail)
+        return fragment(body, spec, ("decode.js", "film.js"), "film(root, spec);")
 
     def __repr__(self):
-        seconds, size = (len(self.t) - 1) / self.rate, len(self._repr_html_()) / 1000
+        seconds = (len(self.t) - 1) / self.rate
         return (
-            f"Animation of {len(self.t)} frames, {seconds:.3g} s, {math.ceil(size)} kB: "
+            f"Animation of {len(self.t)} frames, {seconds:.3g} s, {in_bytes(len(self._repr_html_()))}: "
             'plays in a notebook, and with .save("motion.html") in a browser'
         )
+
+
+def film(t: np.ndarray, points: dict[str, np.ndarray], rate: float, trail: int) -> tuple[str, dict[str, Any]]:
+    """A film as HTML with its first frame, and what `film.js` plays it from.
+
+    **Arguments:** `t` (F,); `points` by name, (N, F, k, 2) for N lanes, NaN in a lane without a motion; `rate`, `trail`
+    as in `Animation`.
+    """
+    low, size, scale = _field(points)
+    parts = {name: _in_tenths_of_pixels(x, low, size, scale) for name, x in points.items()}
+    step = float(t[1] - t[0])
+    digits = max(0, math.ceil(-math.log10(abs(step))))
+    about = "Motion" + "".join(f" of {name}" for name in [", ".join(filter(None, parts))] if name)
+    spec = {"rate": rate, "trail": trail, "start": float(t[0]), "step": step, "digits": digits, "frames": len(t)}
+    spec |= {"about": about, "parts": [{"points": x.shape[2], "xy": encoded(x, "i2")} for x in parts.values()]}
+    dot = '<span><span style="color:{}" aria-hidden="true">&#9679;</span> {}</span>'
+    named = [dot.format(_colour(i), html.escape(str(part))) for i, part in enumerate(parts) if len(parts) > 1]
+    start = f"t = {float(t[0]):.{digits}f}"
+    body = (
+        f'<div data-film=""><div class="parts">{"".join(named)}</div>\n'
+        f"{_picture(parts, low, size, scale, html.escape(f'{about}, {start}'))}\n"
+        '<div class="row" style="max-width:520px"><button type="button" aria-label="play">&#9654;</button>'
+        f'<input type="range" aria-label="time" min="0" max="{len(t) - 1}" value="0"><output>{start}</output>'
+        "</div></div>"
+    )
+    return body, spec
 
 
 def _field(points):
     """The lower left corner and the size of what is shown, and tenths of a pixel to a unit, the same both ways."""
     every = np.concatenate([x.reshape(-1, 2) for x in points.values()])
+    every = every[np.isfinite(every).all(axis=1)]
     low, high = every.min(axis=0), every.max(axis=0)
     size = high - low
     size = np.maximum(size, NARROWEST * size.max())
@@ -116,17 +99,18 @@ def _field(points):
 def _in_tenths_of_pixels(x, low, size, scale):
     left, top, *_ = MARGINS
     across, up = np.moveaxis((x - low) * scale, -1, 0)
-    return np.rint(np.stack([left + across, top + size[1] * scale - up], axis=-1)).astype(int)
+    drawn = np.rint(np.stack([left + across, top + size[1] * scale - up], axis=-1))
+    return np.where(np.isfinite(drawn), drawn, NOWHERE).astype(np.int16)
 
 
-def _picture(parts, low, size, scale):
+def _picture(parts, low, size, scale, words):
     """The SVG: frame, ticks, and the first frame's points."""
     left, top, right, bottom = MARGINS
     width, height = np.rint(size * scale).astype(int)
     drawn = [
         f'<rect x="{left}" y="{top}" width="{width}" height="{height}" fill="none" stroke="#999" stroke-width="8"/>'
     ]
-    text = '<text x="{}" y="{}" text-anchor="{}" font-size="110" font-family="sans-serif">{}</text>'
+    text = '<text x="{}" y="{}" text-anchor="{}" style="font-size:125px" fill="#222">{}</text>'
     grid = '<path d="{}" stroke="#ddd" stroke-width="5"/>'
     for value, label in _ticks(low[0], low[0] + size[0]):
         x = round(left + (value - low[0]) * scale)
@@ -136,10 +120,11 @@ def _picture(parts, low, size, scale):
         drawn += [grid.format(f"M{left} {y}h{width}"), text.format(left - 50, y + 40, "end", label)]
     drawn.append(text.format(left + width // 2, top + height + 330, "middle", "x"))
     drawn.append(text.format(70, top + height // 2, "middle", "y"))
-    drawn += [_part(i, x[0]) for i, x in enumerate(parts.values())]
+    drawn += [_part(i, x[0, 0]) for i, x in enumerate(parts.values())]
     whole = (left + width + right, top + height + bottom)
     return (
-        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {whole[0]} {whole[1]}" width="{whole[0] // 10}" '
+        f'<svg xmlns="http://www.w3.org/2000/svg" role="img" aria-label="{words}" '
+        f'viewBox="0 0 {whole[0]} {whole[1]}" width="{whole[0] // 10}" font-family="sans-serif" '
         f'style="max-width:100%;background:#fff">{"".join(drawn)}</svg>'
     )
 
@@ -147,8 +132,9 @@ def _picture(parts, low, size, scale):
 def _part(i, points):
     """A trail, a line and its dots, which the script moves."""
     colour = _colour(i)
-    line = " ".join(f"{x} {y}" for x, y in points)
-    dots = "".join(f"M{x} {y}h0" for x, y in points)
+    there = [(x, y) for x, y in points.tolist() if x != NOWHERE]
+    line = " ".join(f"{x} {y}" for x, y in there)
+    dots = "".join(f"M{x} {y}h0" for x, y in there)
     marks = f'<path d="{dots}" stroke="{colour}" stroke-width="110" stroke-linecap="round"/>'
     return (
         f'<g data-part="" fill="none" stroke="{colour}" stroke-linejoin="round">'

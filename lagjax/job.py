@@ -25,7 +25,7 @@ import jax
 from lagjax import plot, report, stability
 from lagjax.numerics.runge_kutta import Dopri8
 from lagjax.scenes import SCENES
-from lagjax.sweeps.engine import usable_cores
+from lagjax.sweeps.running import usable_cores
 
 STABILITY = "stability"
 

@@ -1,6 +1,6 @@
 """A film is one piece of HTML that holds its numbers and needs nothing else."""
 
-import json
+import base64
 import re
 import xml.etree.ElementTree as ET
 
@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from lagjax.animation import FIELD, MARKED_UP_TO, Animation
+from tests.pages.test_page import told
 
 T = np.linspace(0.0, 2.0, 51)
 CIRCLE = np.stack([3 * np.cos(T), 3 * np.sin(T)], axis=1)[:, None]
@@ -21,8 +22,12 @@ def page():
 
 
 def numbers(page):
-    """What the script draws from."""
-    return json.loads(re.search(r"film = (\{.*?\}), count", page)[1])
+    """What the script draws from, each part (F, k, 2)."""
+    film = told(page)
+    decoded = lambda part: np.frombuffer(base64.b64decode(part["xy"][1]), "<i2").reshape(
+        film["frames"], part["points"], 2
+    )
+    return [decoded(part) for part in film["parts"]]
 
 
 def picture(page):
@@ -31,7 +36,7 @@ def picture(page):
 
 
 def test_needs_nothing_from_outside(page):
-    """No address but the name of SVG, no import, no file; small."""
+    """No address but the name of SVG, no file; small."""
     assert re.findall(r"(?:src|href|url|import|fetch)\b", page) == []
     assert set(re.findall(r"https?://[^\"]*", page)) == {"http://www.w3.org/2000/svg"}
     assert len(page) < 15_000
@@ -39,8 +44,7 @@ def test_needs_nothing_from_outside(page):
 
 def test_numbers_are_the_points(page):
     """Undoing the scale gives the points back to a twentieth of a pixel, with one scale for x and y, y upwards."""
-    film = numbers(page)
-    drawn = [np.array(part, float).reshape(len(T), -1, 2) for part in film["parts"]]
+    drawn = [part.astype(float) for part in numbers(page)]
     pixels, points = (np.concatenate([x.reshape(-1, 2) for x in all_]) for all_ in (drawn, POINTS.values()))
     scale = np.ptp(pixels[:, 0]) / np.ptp(points[:, 0])
     np.testing.assert_allclose(pixels[:, 0] - pixels[0, 0], scale * (points[:, 0] - points[0, 0]), atol=2)
@@ -53,11 +57,11 @@ def test_numbers_are_the_points(page):
 def test_first_frame_stands_without_a_script(page):
     """The SVG shows the first frame, with ticks and axis labels; a name is escaped."""
     groups = [g for g in picture(page).iter() if "data-part" in g.attrib]
-    for group, frames in zip(groups, numbers(page)["parts"], strict=True):
+    for group, frames in zip(groups, numbers(page), strict=True):
         trail, line, dots = group
         assert trail.attrib["points"] == ""
-        assert [int(x) for x in line.attrib["points"].split()] == frames[0]
-        assert [int(x) for x in re.findall(r"-?\d+(?= |h0)", dots.attrib["d"])] == frames[0]
+        assert [int(x) for x in line.attrib["points"].split()] == frames[0].reshape(-1).tolist()
+        assert [int(x) for x in re.findall(r"-?\d+(?= |h0)", dots.attrib["d"])] == frames[0].reshape(-1).tolist()
     words = [e.text for e in picture(page).iter() if e.tag.endswith("text")]
     assert {"x", "y", "-1", "0", "3"} <= set(words)
     assert "rod &amp; bob" in page
@@ -76,7 +80,7 @@ def test_the_same_film_is_the_same_text(page):
     """Run again, a notebook does not change; another film on the same page has another name."""
     assert Animation(T, POINTS, 25.0, 10)._repr_html_() == page
     other = Animation(T, {"tip": POINTS["tip"]}, 25.0, 10)._repr_html_()
-    assert other[:30] != page[:30]
+    assert other[:50] != page[:50]
 
 
 def test_saves_a_page(tmp_path, page):

@@ -39,6 +39,11 @@ def at(point):
     return {"motion": swing(point["k"]), "k": point["k"]}
 
 
+def rod(t, q, params):
+    """A constraint, as one that can be pickled."""
+    return q["x"] - params["k"]
+
+
 def in_float64():
     """As `conftest.py` sets it for the tests' own process."""
     jax.config.update("jax_enable_x64", True)
@@ -65,9 +70,80 @@ def test_trajectories(way):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("way", WAYS)
+def test_methods(way):
+    """A method that takes its tolerances from the step-size controller still does: equal ones, the same motion."""
+    found = WAYS[way](lj.Radau5())
+    motion = lambda method: lj.integrate(
+        system, {"x": 1.0}, {"x": 0.0}, {"k": 2.0, "power": 2}, ts=TS, method=method, rtol=1e-6
+    )
+    assert jax.tree.leaves(found) == jax.tree.leaves(lj.Radau5())
+    np.testing.assert_array_equal(motion(found).q["x"], motion(lj.Radau5()).q["x"])
+    assert motion(found).asked.method == lj.Radau5()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("way", WAYS)
+def test_orbits(way):
+    """A periodic orbit knows its system: its motion is that of before."""
+    orbit = lj.periodic_orbit(system, ({"x": 1.0}, {"x": 0.0}), np.pi, {"k": 2.0, "power": 2})
+    found = WAYS[way](orbit)
+    assert repr(found) == repr(orbit) and found.system == system
+    np.testing.assert_array_equal(found.trajectory.q["x"], orbit.trajectory.q["x"])
+
+
+def test_systems_are_static_arguments():
+    """A program of `jax.jit` takes a system as a static argument: one trace for equal ones, another for another one."""
+    traces = []
+
+    def force(system, x):
+        traces.append(system)
+        return lj.accelerations(system, 0.0, {"x": x}, {"x": 0.0}, {"k": 2.0, "power": 2})[0]["x"]
+
+    program = jax.jit(force, static_argnums=0)
+    for equal in (system, lj.System(spring), copy.deepcopy(system), pickle.loads(pickle.dumps(system))):
+        assert program(equal, 1.0) == -4.0 and hash(equal) == hash(system) and equal == system
+    assert len(traces) == 1
+    other = lj.System(lambda t, q, v, params: spring(t, q, v, params) - q["x"])
+    assert program(other, 1.0) == -5.0 and len(traces) == 2 and other != system
+
+
+def test_equal_systems():
+    """Constraints by name, and arrays that functions carry, count by value; twins: another name, another number."""
+    of = lambda name: lj.System(spring, {name: lj.Holonomic(rod)})
+    assert of("rod") == of("rod") != of("bar") and hash(of("rod")) == hash(of("rod"))
+    carried = lambda x: lj.System(jax.tree_util.Partial(lambda x, *state: x * spring(*state), jnp.asarray(x)))
+    one = carried(1.0)
+    assert one == jax.tree.map(jnp.array, one) and one != jax.tree.map(lambda x: 2 * x, one)
+    phases = lambda: lj.Hybrid({"flying": system}, [lj.Switch("flying", to="flying", when=rod, reset=spring)])
+    assert phases() == phases() and hash(phases()) == hash(phases())
+
+
+def test_functions_that_pickle_cannot_find():
+    """Pickle is told about by the function's role, place and the fix; copies keep any function. Twin: `spring` goes."""
+
+    def nameless(t, q, params):
+        return q["x"]
+
+    here = lambda t, q, v, params: q["x"]
+    for thing, words in (
+        (lj.System(here), "the Lagrangian cannot be pickled: it is a lambda (test_copies.py, line "),
+        (lj.System(spring, {"rod": lj.Holonomic(nameless)}), "g of constraint 'rod' .*nameless is defined inside of"),
+        (lj.System(spring, force=here), "the force cannot be pickled"),
+        (lj.Crossing(here), "the guard of a crossing cannot"),
+        (lj.Switch("a", to="b", when=here), "when of the switch 'a' -> 'b' cannot"),
+    ):
+        with pytest.raises(pickle.PicklingError, match=words.replace("(", r"\(")) as raised:
+            pickle.dumps(thing)
+        assert "Fix: define it with def" in str(raised.value)
+        assert copy.deepcopy(thing) == thing
+    assert pickle.loads(pickle.dumps(lj.System(spring, {"rod": lj.Holonomic(rod)}))).constraints["rod"].g is rod
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("stored", [False, True])
 def test_sweeps(stored, tmp_path):
-    """Values, statuses and words stay; what ran it does not go along, and is told."""
+    """Values, statuses and words stay; what ran it goes along, too, or is told."""
     store = tmp_path / "store" if stored else None
     swept = lj.sweep(at, {"k": np.array([1.0, 2.0])}, store=store, progress=False)
     for way in ("copy", "deepcopy", "pickle"):
@@ -75,8 +151,11 @@ def test_sweeps(stored, tmp_path):
         assert repr(found) == repr(swept) and found.ok.all()
         lane = lambda swept: jax.tree.map(lambda x: jnp.asarray(x[1]), swept.values["motion"])
         same(lane(found), lane(swept))
-    with pytest.raises(ValueError, match="or copied, does not know what ran it"):
-        found.resweep(where=True)
+    if stored:
+        with pytest.raises(ValueError, match="what is in a store belongs to the run"):
+            found.resweep(where=True)
+    else:
+        assert found.resweep(where=[True, False]).ran == 1
 
 
 @pytest.mark.slow

@@ -5,12 +5,15 @@ All of these but the film fail before anything is compiled.
 
 import math
 import re
+import traceback
 
 import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.special
+import sympy
 
 import lagjax as lj
 
@@ -96,6 +99,34 @@ def needs_mass(t, q, v, params):
     return 0.5 * params["mass"] * v["theta"] ** 2
 
 
+def counts(t, q, v, params):
+    """A sum of so many terms."""
+    return 0.5 * v["theta"] ** 2 - sum(q["theta"] ** i for i in range(params["n"]))
+
+
+def taken_apart(t, q, v, params):
+    """A dict unpacked into its names."""
+    (rate,) = v
+    return 0.5 * rate**2
+
+
+def unpacked(t, q, v, params):
+    """A vector of two by its entries."""
+    x, y = v
+    return 0.5 * (x**2 + y**2)
+
+
+def changed(t, q, v, params):
+    """An array written into."""
+    v[0] = 0.0
+    return 0.5 * v @ v
+
+
+def by_sympy(t, q, v, params):
+    """A function for symbols."""
+    return 0.5 * v["theta"] ** 2 + sympy.cos(q["theta"])
+
+
 with_length = lj.System(point, {"rod": lj.Holonomic(lambda t, q, p: q["x"] - p["l"])})
 VALUE, TYPE = ValueError, TypeError
 NUMPY = r"NumPy cannot be differentiated"
@@ -103,7 +134,26 @@ MISTAKES = {
     "another name in v": (lambda: move(swing, ({"theta": 1.0}, {"thta": 0.0})), VALUE, "structure of q", "v: thta"),
     "v a number": (lambda: move(swing, ({"theta": 1.0}, 0.0)), VALUE, "q: theta", "v: no names", "zeros_like"),
     "v of another shape": (lambda: move(swing, ({"theta": 1.0}, {"theta": np.zeros(1)})), VALUE, r"\(1,\) in v"),
-    "whole numbers": (lambda: move(swing, ({"theta": 1}, {"theta": 0})), TYPE, "'theta' of q is int", "1.0"),
+    "a condition": (lambda: move(swing, ({"theta": True}, {"theta": 0})), TYPE, "'theta' of q is bool", "1.0"),
+    "text": (lambda: move(swing, ({"theta": "1"}, {"theta": 0})), TYPE, "'theta' of q is '1'", "from a file"),
+    "params before v": (
+        lambda: move(swing, (START[0], PARAMS), START[1]), VALUE, "structure of q", "another order", "q0, v0, params"),
+    "q and v before t": (
+        lambda: lj.accelerations(pendulum, *START, 0.0, PARAMS), TYPE, "one number, and is a dict", "t, q, v"),
+    "the system last": (
+        lambda: lj.integrate(*START, PARAMS, pendulum, ts=TS), TYPE, "is a dict", "number 4 here", "system, q0, v0"),
+    "times by place": (
+        lambda: lj.integrate(pendulum, *START, PARAMS, TS), TYPE, "without ts=", "by place", r"params, ts=ts\)"),
+    "times left out": (lambda: lj.integrate(pendulum, *START, PARAMS), TYPE, "without ts=", r"params, ts=ts\)"),
+    "times as params": (lambda: move(swing, params=TS), TYPE, "'m' of params", r"shape \(5,\)", "another order"),
+    "L in another order": (
+        lambda: move(lambda q, v, t, params: 0.5 * v["theta"] ** 2), TYPE, r"f\(q, v, t, params\)", r"def f\(t, q, v"),
+    "numbers in another order": (
+        lambda: move(lambda q, v, t, params: 0.5 * v**2 - q, (1.0, 0.0)), TYPE, r"f\(q, v, t, params\)"),
+    "a constraint in another order": (
+        lambda: constrained(lambda q, t, params: q["x"]), TYPE, "'rod'", r"f\(q, t, params\)", r"def f\(t, q, params"),
+    "another order by other names": (
+        lambda: move(lambda x, u, s, p: 0.5 * u["theta"] ** 2 - x["theta"]), TYPE, "'theta' of t", r"def f\(t, q, v"),
     "no params": (lambda: move(swing, params=None), TYPE, "none were given", r"ts=ts\)"),
     "a parameter left out": (
         lambda: move(swing, params={"m": 1.0}), VALUE, "'g', and there is none: params has 'm'", '"g": 1.0'),
@@ -113,6 +163,33 @@ MISTAKES = {
         lambda: move(swing, ({"thteta": 1.0}, {"thteta": 0.0})), VALUE, "has 'thteta'", 'q0 = {"theta": 0.1}'),
     "a start without names": (lambda: move(swing, (1.0, 0.0)), TYPE, "'theta' of an array", 'q0 = {"theta": 0.1}'),
     "a list": (lambda: move(of_a_vector, ([1.0], [0.0])), TYPE, "with a list", r"q0 = jnp.array\("),
+    "a product of lists": (
+        lambda: move(lambda t, q, v, p: 0.5 * v @ v, ([1.0, 2.0], [0.0, 0.0])), TYPE, "with a list", r"jnp.array\("),
+    "an array beside a list": (
+        lambda: move(of_a_vector, (np.ones(2), [0.0, 0.0])), VALUE, "an array beside a list", r"jnp.array\("),
+    "entries of a number": (
+        lambda: move(lambda t, q, v, p: 0.5 * v[0] ** 2, (1.0, 0.0)), TYPE, "of a single number", "q in place of q"),
+    "too few entries": (
+        lambda: move(lambda t, q, v, p: 0.5 * v[2] ** 2, ([1.0, 1.0], [0.0, 0.0])), TYPE, "a list of 2", "one entry"),
+    "too many to unpack": (
+        lambda: move(unpacked, (np.ones(3), np.ones(3))), TYPE, r"q is an array of shape \(3,\)", r"x, y = v"),
+    "an entry of a dict": (
+        lambda: move(lambda t, q, v, p: 0.5 * v[0] ** 2), VALUE, "asks for 0", "for an array", r"v\['theta'\]"),
+    "a dict taken apart": (lambda: move(taken_apart), TYPE, "with text", "gives the names", r"q\['theta'\]"),
+    "an entry changed": (lambda: move(changed, (np.ones(2), np.zeros(2))), TYPE, r"v\[0\] = 0.0", r"x.at\[i\].set"),
+    "shapes that differ": (
+        lambda: move(lambda t, q, v, p: v @ jnp.ones(3), (np.ones(2), np.zeros(2))), TYPE,
+        r"shapes \(2,\) and \(3,\)", r"q is an array of shape \(2,\)"),
+    "attributes of an array": (lambda: move(attributes, (1.0, 0.0)), TYPE, ".theta of an array", r'v\["theta"\]'),
+    "a power": (lambda: move(lambda t, q, v, p: 0.5 * v["theta"] ^ 2), TYPE, "no power", r"v\*\*2"),
+    "a count as a float": (lambda: move(counts, params={"n": 3.0}), TYPE, "no whole number", '"n": 3'),
+    "a count in an array": (lambda: move(counts, params={"n": jnp.array(3)}), TYPE, "not known while JAX", '"n": 3'),
+    "entries by a condition": (
+        lambda: move(lambda t, q, v, p: jnp.sum(v[v > 0] ** 2), (np.ones(2), np.ones(2))), TYPE, "how many", "where"),
+    "params as a list": (lambda: move(swing, params=[1.5, 9.81]), TYPE, "params, which is a list", '"m": 1.0'),
+    "SciPy": (
+        lambda: move(lambda t, q, v, p: 0.5 * scipy.special.j0(q["theta"])), TYPE, NUMPY, "jax.scipy.special.j0"),
+    "SymPy": (lambda: move(by_sympy), TYPE, "SymPy", "jnp.cos"),
     "a vector of one": (
         lambda: move(of_a_vector, (np.ones(1), np.zeros(1))), VALUE, r"shape \(1,\)", "jnp.sum", "q0 = 0.1"),
     "float32": (
@@ -141,6 +218,13 @@ MISTAKES = {
     "math": (lambda: move(by_math), TYPE, "Python number", "jnp.cos in place of math.cos"),
     "float": (lambda: move(by_float), TYPE, "Python number", "leave out float"),
     "if": (lambda: move(with_if), TYPE, "decides", r'if q\["theta"\] > 0', "jnp.where"),
+    "a pair of energies": (lambda: move(lambda t, q, v, p: (0.5, 1.0)), VALUE, "a tuple", "one by one", "kinetic -"),
+    "energies by name": (lambda: move(lambda t, q, v, p: {"T": 0.5}), VALUE, "a dict", "one by one", "kinetic -"),
+    "a whole number": (lambda: move(lambda t, q, v, p: 1), VALUE, "returned 1, ", "in place of an energy"),
+    "a comparison": (lambda: move(lambda t, q, v, p: v["theta"] > 0), VALUE, "bool", "in place of an energy"),
+    "a complex energy": (lambda: move(lambda t, q, v, p: v["theta"] * 1j), VALUE, "complex", "jnp.real"),
+    "a force without return": (
+        lambda: move(lj.System(swing, force=lambda t, q, v, p: None)), VALUE, "force", "returned None"),
     "no return": (lambda: move(without_return), VALUE, "returned None", "return kinetic - potential"),
     "attributes": (lambda: move(attributes), TYPE, ".theta of a dict", r'v\["theta"\]'),
     "no time": (lambda: move(without_time), TYPE, "4 arguments", r"without_time\(q, v, params\)", "def without_time"),
@@ -200,6 +284,31 @@ def test_the_check_can_fail():
     lj.momentum(pendulum, 0.0, *START, PARAMS)
 
 
+def test_the_users_error_is_kept():
+    """The error in words is raised from the user's own, whose traceback ends at the user's line."""
+    for lagrangian, kind in ((by_numpy, jax.errors.TracerArrayConversionError), (needs_mass, KeyError)):
+        with pytest.raises((TypeError, ValueError)) as caught:
+            move(lagrangian)
+        cause = caught.value.__cause__
+        assert isinstance(cause, kind)
+        frames = [frame.name for frame in traceback.extract_tb(cause.__traceback__)]
+        assert lagrangian.__name__ in frames
+    # Twin: what is not put in words has no cause.
+    with pytest.raises(NameError) as caught:
+        move(lambda t, q, v, params: 0.5 * mass * v["theta"] ** 2)  # noqa: F821  # pyright: ignore[reportUndefinedVariable]
+    assert caught.value.__cause__ is None
+
+
+def test_other_names_are_no_other_order():
+    """Twin: names are the user's choice; one of the usual ones in another place says nothing."""
+    for lagrangian in (
+        lambda s, x, u, p: 0.5 * u["theta"] ** 2,
+        lambda t, v, w, p: 0.5 * w["theta"] ** 2,
+        lambda *state: 0.5 * state[2]["theta"] ** 2,
+    ):
+        assert float(lj.momentum(lj.System(lagrangian), 0, {"theta": 0}, {"theta": 2}, None)["theta"]) == 2.0
+
+
 def test_an_unknown_error_is_the_users_own():
     """What is not recognized comes as it was raised."""
 
@@ -235,3 +344,11 @@ def test_callables_of_any_kind():
         assert float(lj.momentum(lj.System(lagrangian), 0.0, *START, PARAMS)["theta"]) == 0.0
     with pytest.raises(ValueError, match="'mass'"):
         lj.momentum(lj.System(functools.partial(needs_mass)), 0.0, *START, PARAMS)
+
+
+def test_degrees():
+    """`explain` tells angles of more than a turn; twin: a length of as much, and smaller angles, are no matter."""
+    system = lj.System(lambda t, q, v, params: 0.5 * (v["a"] ** 2 + v["x"] ** 2) + jnp.cos(q["a"]) - q["x"] ** 2)
+    said = lambda a, x: str(lj.explain(system, 0, {"a": a, "x": x}, {"a": 0, "x": 0}))
+    assert re.search(r"angles +in radians: a = 90 is 14.3 turns; of degrees jnp.radians\(...\)", said(90, 90))
+    assert "radians" not in said(1, 90)

@@ -25,6 +25,7 @@ from lagjax.mechanics import coordinates
 from lagjax.mechanics.compiled import compiled
 from lagjax.mechanics.coordinates import State
 from lagjax.mechanics.diagnosis import describe
+from lagjax.mechanics.refusals import by_name, check_system
 from lagjax.mechanics.structure import angles, is_autonomous
 
 # Points at which a branch begins and critical points are the same within so much.
@@ -39,6 +40,7 @@ UNITS, NOTHING = (1.0, 1e3, 1e6, 1e9, 1e12), 1e-2
 LINE, LINE_WITHIN = 40, 1e-9
 
 
+@by_name('lj.continue_equilibria(system, params, start, along="omega", to=5.0)', "along", "to")
 def continue_equilibria(
     system,
     params: PyTree,
@@ -86,6 +88,7 @@ def continue_equilibria(
     Source: Keller, in *Applications of Bifurcation Theory* (1977) 359; Govaerts, *Numerical Methods for Bifurcations of
     Dynamical Equilibria*, ch. 2-4.
     """
+    check_system(system, params, start)
     q, v = stacked_one(start)
     if velocity is not None:
         v = jax.tree.map(lambda x: x[0], stacked([velocity], "velocity"))

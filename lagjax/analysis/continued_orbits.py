@@ -10,7 +10,7 @@ from lagjax.analysis.flow import flow_of
 from lagjax.analysis.guessing import Asked, guessed
 from lagjax.analysis.monodromy import Problem, problem_of, tolerance_of
 from lagjax.analysis.numbers_in import no_such_number, numbers_in
-from lagjax.analysis.orbit import PeriodicOrbit, packed
+from lagjax.analysis.orbit import PeriodicOrbit
 from lagjax.analysis.orbit_branch import CriticalOrbit, OrbitBranch
 from lagjax.analysis.orbit_critical import FoundOrbit, between, dips
 from lagjax.analysis.orbit_equations import (
@@ -30,6 +30,7 @@ from lagjax.analysis.tracing import Path, Point
 from lagjax.jax_internals.tracing import is_eager
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.compiled import compiled
+from lagjax.mechanics.packed import pack
 
 # Singular values of the equations below this part of the largest do not count.
 DEPENDENT = 1e-7
@@ -159,10 +160,8 @@ def _frame(orbit, problem, place: Along, asked, rtol, to) -> tuple[OrbitFrame, n
     nodes = np.concatenate([np.concatenate([flat(s.q), flat(s.v)])[None], nodes[1:]])
     scale = _guess(flow, s.t, nodes[0], period, asked._replace(free=False))
     integral, slope, sizes, drive = sizes_at(flow, s.t, nodes[0], period, scale)
-    first = {
-        NUMBER: lambda: place.number.get(s.params) if place.number else 0.0, ENERGY: lambda: integral, PERIOD: lambda: period,
-        ENTRY: lambda: nodes[0][place.entry],
-    }[place.kind]()  # fmt: skip
+    first = {ENERGY: integral, PERIOD: period, ENTRY: nodes[0][place.entry]}.get(place.kind)
+    first = place.number.get(s.params) if place.number is not None else first
     first, last = float(first), float(to)
     if not np.isfinite(last) or first == last:
         raise ValueError(
@@ -311,5 +310,5 @@ def _result(orbit, problem, place, tracer, path, found, along, first, last) -> O
 
 def _with_floats(orbit, problem) -> PeriodicOrbit:
     """The orbit with the parameters as the branch has them."""
-    arrays, static = packed(problem.system, coordinates.state(*problem.state).params)
+    arrays, static = pack((problem.system, coordinates.state(*problem.state).params))
     return replace(orbit, arrays=arrays, static=static)

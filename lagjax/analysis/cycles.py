@@ -15,10 +15,11 @@ from jaxtyping import ArrayLike, PyTree
 from lagjax.analysis import closing
 from lagjax.analysis.guessing import Asked
 from lagjax.analysis.monodromy import problem_of, refuse_singular, tolerance_of
-from lagjax.analysis.orbit import PeriodicOrbit, packed
+from lagjax.analysis.orbit import PeriodicOrbit
 from lagjax.jax_internals.tracing import is_eager
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.diagnosis import listed
+from lagjax.mechanics.packed import pack
 from lagjax.mechanics.system import System
 from lagjax.motion.consistency import stopped
 from lagjax.motion.reported import Report, reported
@@ -213,7 +214,7 @@ def _orbit(problem, found, asked) -> PeriodicOrbit:
     like = lambda x: coordinates.like(s.q, x)
     z, n = found.place.nodes[0], found.guess.turns.shape[0]
     shift = xp.where(np.array(asked.relative), found.seen.gone[:n], xp.zeros_like(z[:n]))
-    arrays, static = packed(problem.system, coordinates.state(*s).params)
+    arrays, static = pack((problem.system, coordinates.state(*s).params))
     return PeriodicOrbit(
         xp.asarray(s.t), like(z[:n]), like(z[n:]), found.place.period, like(found.guess.turns),
         like(shift), found.seen.size, found.converged, found.iterations, found.place.nodes, arrays, static,

@@ -8,7 +8,7 @@ import numpy as np
 from lagjax import plot
 from lagjax.animation import Animation
 from lagjax.mechanics import coordinates
-from lagjax.mechanics.first_call import Call, check_arguments
+from lagjax.mechanics.in_words import Call, check_arguments
 from lagjax.motion.frames import drawn
 
 # How many periods, or times in which it grows by e, a film shows.

@@ -36,6 +36,7 @@ from lagjax.jax_internals.tracing import is_eager
 from lagjax.mechanics import constraints, coordinates
 from lagjax.mechanics.closures import lift
 from lagjax.mechanics.compiled import compiled
+from lagjax.mechanics.refusals import by_name, check_system
 from lagjax.mechanics.structure import angles, is_autonomous
 from lagjax.motion.consistency import stopped
 from lagjax.numerics import lapack
@@ -49,6 +50,7 @@ FAR = 1e9
 GROWS_ABOVE = {np.dtype("float64"): 1e-7, np.dtype("float32"): 2e-3}
 
 
+@by_name("lj.equilibria(system, params, starts=[q])", "starts")
 def equilibria(
     system,
     params: PyTree = None,
@@ -100,6 +102,7 @@ def equilibria(
     Source: Marsden & Ratiu, *Introduction to Mechanics and Symmetry*, §8.9; Goldstein, Eq. (6.1); Nocedal & Wright,
     *Numerical Optimization*, §10.3.
     """
+    check_system(system, params, starts)
     q = stacked(starts)
     count = jax.tree.leaves(q)[0].shape[0]
     zeros = lambda x: coordinates.numpy_of(x).zeros_like(x)

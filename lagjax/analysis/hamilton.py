@@ -21,6 +21,7 @@ from lagjax.mechanics.diagnosis import describe
 from lagjax.mechanics.first_call import looked_at
 from lagjax.mechanics.noether import applied_force
 from lagjax.mechanics.reactions import reacts
+from lagjax.mechanics.refusals import check_system
 from lagjax.mechanics.system import System
 
 
@@ -91,11 +92,7 @@ def hamiltonian(system: System) -> Hamiltonian:
 
     Source: Goldstein, Eq. (8.15), (8.18).
     """
-    if not isinstance(system, System):
-        raise TypeError(
-            f"a Hamiltonian is made of a lj.System, not of {type(system).__name__}.\n"
-            "Fix: lj.hamiltonian(lj.System(lagrangian))."
-        )
+    check_system(system)
     return Hamiltonian(system)
 
 

@@ -16,6 +16,7 @@ from jaxtyping import Array, Float
 
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.first_call import looked_at
+from lagjax.mechanics.refusals import check_system
 from lagjax.motion.trajectory import Trajectory
 
 # Gauss's rule on each piece, exact up to degree 15.
@@ -48,6 +49,7 @@ def action(
 
     Source: Goldstein, Eq. (2.1).
     """
+    check_system(system, path, params)
     if isinstance(path, Trajectory):
         return _of_trajectory(system, path, params, t0, t1)
     if not callable(path):
@@ -113,7 +115,7 @@ def _cubic(s, h, x_a, x_b, u_a, u_b):
 
 def _rise(path, t):
     """A path's position and velocity."""
-    q, v = jax.jvp(path, (t,), (jnp.ones_like(t),))
+    q, v = jax.jvp(lambda t: coordinates.as_floats(path(t)), (t,), (jnp.ones_like(t),))
     as_array = lambda x: jnp.asarray(x, jnp.result_type(t))
     return jax.tree.map(as_array, q), jax.tree.map(as_array, v)
 

@@ -20,6 +20,7 @@ from lagjax.mechanics.compiled import compiled
 from lagjax.mechanics.coordinates import State
 from lagjax.mechanics.first_call import looked_at
 from lagjax.mechanics.memory import kinds, remembered
+from lagjax.mechanics.refusals import check_system
 from lagjax.mechanics.structure import structure, unseen_coordinates
 from lagjax.numerics import dense
 from lagjax.numerics.rank import DEPENDENT_BELOW
@@ -129,6 +130,7 @@ def linearise(system, t, q, v, params) -> Linearisation:
 
     Source: Goldstein, *Classical Mechanics*, §6.1-6.2; Meijaard et al., *Proc. R. Soc. A* 463 (2007) 1955, Appendix B.
     """
+    check_system(system, t, q, v, params)
     s = coordinates.state(t, q, v, params)
     system = looked_at(system, s)
     traced = not is_eager() or coordinates.is_traced((s, eqx.filter(system, eqx.is_array)))

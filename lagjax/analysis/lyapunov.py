@@ -26,6 +26,7 @@ from lagjax.analysis.flow import flow_of
 from lagjax.analysis.monodromy import problem_of, refuse_singular
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.compiled import compiled
+from lagjax.mechanics.refusals import by_name
 from lagjax.mechanics.system import System
 
 # Less than for a cycle: what follows from a motion that forgets its start does not depend on all its digits.
@@ -108,6 +109,7 @@ class LyapunovExponents(eqx.Module):
         return "\n".join(["Lyapunov exponents", *(f"  {label:<9}  {value}" for label, value in rows)])
 
 
+@by_name("lj.lyapunov_exponents(system, q, v, params, ts=ts)", "ts")
 def lyapunov_exponents(
     system: System,
     q: PyTree[ArrayLike],

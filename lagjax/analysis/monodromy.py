@@ -26,9 +26,8 @@ from lagjax.mechanics.compiled import compiled
 from lagjax.mechanics.coordinates import State
 from lagjax.mechanics.diagnosis import explain_failure
 from lagjax.mechanics.first_call import looked_at
-from lagjax.mechanics.hybrid import Hybrid
+from lagjax.mechanics.refusals import check_system
 from lagjax.mechanics.structure import angles
-from lagjax.mechanics.system import System
 
 # The second run's tolerance, by which the first is judged.
 LOOSER = 10.0
@@ -64,12 +63,8 @@ class Problem(NamedTuple):
 
 def problem_of(system, t, q, v, params) -> Problem:
     """Look at a system at a state; where JAX traces nothing, dependent constraints are found and left out."""
-    if not isinstance(system, System | Hybrid):
-        raise TypeError(
-            f"the first argument must be a lj.System, not {type(system).__name__}.\n"
-            "Fix: system = lj.System(lagrangian)."
-        )
-    s = coordinates.prepared(t, *jax.tree.map(_as_float, (q, v)), params)
+    check_system(system, q, v, params)
+    s = coordinates.prepared(t, q, v, params)
     system = lift(looked_at(system, s), s)
     state = coordinates.state(*s)
     rows = independent_rows_of(system, *state)
@@ -82,12 +77,6 @@ def refuse_singular(problem: Problem):
     words = explain_failure(problem.system, coordinates.state(*problem.state))
     if words is not None:
         raise ValueError(words)
-
-
-def _as_float(x):
-    """A whole number as another one."""
-    whole = isinstance(x, int) or isinstance(x, np.ndarray | np.generic) and np.issubdtype(x.dtype, np.integer)
-    return np.asarray(x, float) if whole else x
 
 
 def _check_freedom(system, state, rows):

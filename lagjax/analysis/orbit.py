@@ -1,13 +1,13 @@
 """A periodic orbit: the answer of `lj.periodic_orbit`."""
 
 import equinox as eqx
-import jax
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from lagjax.analysis.guessing import Asked
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.diagnosis import describe
+from lagjax.mechanics.packed import Packed
 from lagjax.mechanics.system import System
 from lagjax.motion.integrate import integrate
 from lagjax.motion.trajectory import Trajectory
@@ -40,7 +40,7 @@ class PeriodicOrbit(eqx.Module):
     iterations: Int[Array, ""]
     nodes: Float[Array, "K 2n"]
     arrays: PyTree
-    static: tuple = eqx.field(static=True)
+    static: Packed = eqx.field(static=True)
     asked: Asked = eqx.field(static=True)
 
     @property
@@ -52,8 +52,7 @@ class PeriodicOrbit(eqx.Module):
         return self._problem()[1]
 
     def _problem(self):
-        parts, structure = self.static
-        return eqx.combine(self.arrays, jax.tree.unflatten(structure, parts))
+        return self.static.together(self.arrays)
 
     @property
     def trajectory(self) -> Trajectory:
@@ -92,13 +91,6 @@ class PeriodicOrbit(eqx.Module):
         if not bool(self.converged):
             rows.append(("WARNING", "not converged: the best that was found"))
         return "\n".join(["Periodic orbit", *(f"  {label:<9}  {value}" for label, value in rows)])
-
-
-def packed(system, params) -> tuple[PyTree, tuple]:
-    """Split (system, params) into arrays and a hashable rest."""
-    arrays, static = eqx.partition((system, params), eqx.is_array)
-    parts, structure = jax.tree.flatten(static)
-    return arrays, (tuple(parts), structure)
 
 
 def _moved(tree):

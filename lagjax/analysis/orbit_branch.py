@@ -17,9 +17,10 @@ from lagjax.analysis.branches import (
     name_stability,
     stability_in_words,
 )  # fmt: skip
-from lagjax.analysis.orbit import PeriodicOrbit, packed
+from lagjax.analysis.orbit import PeriodicOrbit
 from lagjax.analysis.orbit_equations import NUMBER, Along
 from lagjax.mechanics import coordinates
+from lagjax.mechanics.packed import pack
 
 MARKS = {"fold": ("s", 1), "branch point": ("o", 2), "period doubling": ("D", 3), "torus": ("^", 4)}
 
@@ -81,7 +82,7 @@ class OrbitBranch(eqx.Module):
         system, params = self.orbit.system, self.orbit.params
         if self.place.kind == NUMBER and self.place.number is not None:
             params = self.place.number.put(params, self.parameter[i])
-        arrays, static = packed(system, params)
+        arrays, static = pack((system, coordinates.as_arrays(params, self.orbit.t.dtype)))
         return replace(
             self.orbit, q=pick(self.q), v=pick(self.v), period=self.period[i], nodes=self.nodes[i], arrays=arrays,
             static=static,

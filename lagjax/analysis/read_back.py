@@ -24,6 +24,7 @@ from lagjax.mechanics.diagnosis import equation_names
 from lagjax.mechanics.first_call import looked_at
 from lagjax.mechanics.in_numbers import Numbers, in_numbers
 from lagjax.mechanics.lagrangian import mass_and_forcing
+from lagjax.mechanics.refusals import check_system
 from lagjax.numerics import scalars
 
 # Operations of a program, and coordinates, beyond which nobody reads the equations.
@@ -77,6 +78,7 @@ def latex(system, q, v, params=None, *, t=0.0) -> EquationsOfMotion:
 
     Source: Goldstein, *Classical Mechanics*, Eq. (1.57), (2.26).
     """
+    check_system(system, q, v, params)
     s = coordinates.state(t, q, v, jax.tree.map(lambda x: float(x) if type(x) is int else x, params))
     try:
         system = looked_at(system, s)

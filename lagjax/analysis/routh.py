@@ -24,6 +24,7 @@ from lagjax.mechanics.constraints import Holonomic
 from lagjax.mechanics.diagnosis import listed
 from lagjax.mechanics.memory import kinds, remembered
 from lagjax.mechanics.reactions import reacts
+from lagjax.mechanics.refusals import check_system
 from lagjax.mechanics.structure import forced_by, what_changes_momentum
 from lagjax.mechanics.system import System
 
@@ -36,6 +37,7 @@ class Routhian(eqx.Module):
 
     def __call__(self, t, q, v, params):
         """R at a state of the coordinates that are left, `[L]`."""
+        q, v = jax.tree.map(jnp.asarray, coordinates.as_floats((q, v)))
         return self._at(t, q, v, params)[0]
 
     def velocities(self, t, q, v, params) -> dict[str, Array]:
@@ -141,6 +143,7 @@ def routhian(system: System, cyclic: str | Iterable[str]) -> System:
 
     Source: Goldstein, §8.3, with the other sign; Landau & Lifshitz, *Mechanics*, §41.
     """
+    check_system(system, cyclic)
     names = (cyclic,) if isinstance(cyclic, str) else tuple(cyclic)
     if not names or len(set(names)) < len(names):
         raise ValueError('cyclic names each coordinate to eliminate once.\nFix: cyclic=["phi", "psi"].')

@@ -27,12 +27,13 @@ def stacked(starts, what="starts") -> PyTree:
         if len(structures) > 1:
             raise ValueError(f"the {what} differ in structure: each must be like q.\nFix: {AS_STARTS}.")
         # Known values stay with NumPy, which compiles nothing.
+        starts = coordinates.as_floats(starts)
         xp = coordinates.numpy_of(starts)
-        return jtu.tree_map(lambda *x: xp.stack([xp.asarray(_float(y)) for y in x]), *starts)
+        return jtu.tree_map(lambda *x: xp.stack([xp.asarray(y) for y in x]), *starts)
     leaves = jtu.tree_leaves(starts)
     if not leaves:
         raise ValueError(f"{what} has no coordinates.\nFix: {AS_STARTS}.")
-    starts = jtu.tree_map(lambda x: coordinates.numpy_of(x).asarray(_float(x)), starts)
+    starts = jtu.tree_map(lambda x: coordinates.numpy_of(x).asarray(x), coordinates.as_floats(starts))
     leaves = jtu.tree_leaves(starts)
     if all(x.ndim == 0 for x in leaves):
         return jtu.tree_map(lambda x: x[None], starts)
@@ -53,17 +54,6 @@ def stacked_one(q):
     """A state of rest at q."""
     q = jax.tree.map(lambda x: x[0], stacked([q]))
     return q, jax.tree.map(lambda x: coordinates.numpy_of(x).zeros_like(x), q)
-
-
-def _float(x):
-    """Whole numbers as floats of the default size."""
-    if isinstance(x, bool | int) or isinstance(x, np.ndarray) and np.issubdtype(x.dtype, np.integer):
-        return np.asarray(x, jax.dtypes.canonicalize_dtype(np.float64))
-    if isinstance(x, jax.Array) and jnp.issubdtype(x.dtype, jnp.integer):
-        return x.astype(jax.dtypes.canonicalize_dtype(np.float64))
-    if isinstance(x, list):
-        return np.asarray(x, jax.dtypes.canonicalize_dtype(np.float64))
-    return x
 
 
 def checked(system, t, q, v, params):

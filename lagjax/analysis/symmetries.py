@@ -31,6 +31,7 @@ from lagjax.mechanics.first_call import looked_at
 from lagjax.mechanics.generators import Generator, as_generator
 from lagjax.mechanics.memory import filled_up, kinds, remembered
 from lagjax.mechanics.noether import NoetherCharge
+from lagjax.mechanics.refusals import check_system
 from lagjax.mechanics.structure import conserved_momenta
 
 
@@ -63,6 +64,7 @@ def symmetries(system, q, v, params=None, *, basis: Iterable | Mapping | None = 
 
     Source: Olver, *Applications of Lie Groups to Differential Equations*, §4.4.
     """
+    check_system(system, q, v, params)
     s = coordinates.state(t, q, v, params)
     if coordinates.is_traced(s):
         raise TypeError(

@@ -20,6 +20,7 @@ from lagjax.mechanics.diagnosis import describe
 from lagjax.mechanics.first_call import looked_at
 from lagjax.mechanics.generators import as_generator
 from lagjax.mechanics.multipliers import accelerations
+from lagjax.mechanics.refusals import check_system
 
 STATES, AT_LEAST = 64, 8
 
@@ -120,6 +121,7 @@ def is_symmetry(system, generator, q, v, params=None, *, t=0.0) -> SymmetryTest:
 
     Source: Goldstein, *Classical Mechanics*, §13.7; Neĭmark & Fufaev, *Dynamics of Nonholonomic Systems*, §III.6.
     """
+    check_system(system, generator, q, v, params)
     generator = as_generator(generator)
     s = coordinates.state(t, q, v, params)
     system = looked_at(system, s)

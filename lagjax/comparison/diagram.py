@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from lagjax import plot
+from lagjax.comparison import exported
 from lagjax.comparison.methods import as_code
 from lagjax.comparison.points import Curve, Point
 from lagjax.comparison.references import Reference
@@ -94,6 +95,22 @@ class WorkPrecision:
                 f"{nearest.error:.1e}.\nFix: ask for more, or tighter tolerances=."
             )
         return Choices(sorted(found, key=lambda choice: choice.seconds))
+
+    def to_pandas(self):
+        """A `pandas.DataFrame` with a row a point: method, tolerance, error, seconds, steps, evaluations, how it ended.
+
+        `order` and `compile_seconds` are those of the method. Steps and evaluations that are not known are `<NA>`.
+
+        **Raises:** `ImportError` without pandas.
+        """
+        return exported.frame(self)
+
+    def to_xarray(self):
+        """An `xarray.Dataset` over `solver`, the methods by name, and `tolerance`, loose to tight; NaN where not tried.
+
+        **Raises:** `ImportError` without xarray.
+        """
+        return exported.dataset(self)
 
     def plot(self, title: str = ""):
         """Draw error against run time, and against evaluations of the accelerations; returns a matplotlib `Figure`.

@@ -43,20 +43,20 @@ class Program:
     """The trajectory of a motion by one method, of (tolerance, ts, q, v); as many times as were given.
 
     `compile_seconds` are those of tracing and compiling. Equations are first taken for regular, as `integrate` does;
-    where that turns out wrong, the careful program is compiled too, and kept to.
+    where that turns out wrong, the robust program is compiled too, and kept to.
     """
 
     def __init__(self, motion: Motion, method: Any):
         self._motion, self._method = motion, method
         self.compile_seconds = 0.0
-        self._compiled = self._compile(careful=False)
+        self._compiled = self._compile(robust=False)
 
     def __call__(self, tolerance, ts=None, q=None, v=None) -> Trajectory:
         """Solve; by default from the start, with outputs at its own times."""
         args = self._arguments(tolerance, ts, q, v)
         found, settled = self._compiled(args)
         if settled is not None and not bool(settled):
-            self._compiled = self._compile(careful=True)
+            self._compiled = self._compile(robust=True)
             found, _ = self._compiled(args)
         return jax.block_until_ready(found)
 
@@ -78,7 +78,7 @@ class Program:
         given = (np.asarray(tolerance, ts.dtype), ts, start.q if q is None else q, start.v if v is None else v)
         return [jnp.asarray(x) for x in parted((*given, start.params))[1]]
 
-    def _compile(self, careful):
+    def _compile(self, robust):
         motion, given = self._motion, (np.asarray(0.0, self._motion.ts.dtype), self._motion.ts, *self._motion.start[1:])
         static, _ = parted(given)
 
@@ -95,7 +95,7 @@ class Program:
             return found, settled
 
         started = time.perf_counter()
-        with REGULAR_FIRST(not careful):
+        with REGULAR_FIRST(not robust):
             lowered = jax.jit(program, compiler_options=compiler_options()).lower(self._arguments(1e-3))
         compiled = lowered.compile()
         self.compile_seconds += time.perf_counter() - started

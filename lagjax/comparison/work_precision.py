@@ -18,6 +18,7 @@ from lagjax.comparison.programs import Motion, Program, Times, in_turn, less_the
 from lagjax.comparison.references import Known, Reference
 from lagjax.jax_internals.tracing import is_eager
 from lagjax.mechanics import coordinates
+from lagjax.mechanics.refusals import by_name, check_system
 from lagjax.mechanics.system import System
 from lagjax.motion import problem
 from lagjax.motion.crossings import Crossing
@@ -32,6 +33,7 @@ KNOWN_BY = 2
 UNTIMED = Times(float("nan"), float("nan"))
 
 
+@by_name("lj.work_precision(system, q0, v0, params, ts=ts)", "ts")
 def work_precision(
     system: System,
     q0: PyTree[ArrayLike],
@@ -156,7 +158,7 @@ class Solve(NamedTuple):
 
 def _motion(system, q0, v0, params, ts, events, options):
     """The motion, with its start in arrays; raise where there is none."""
-    problem.check_system(system)
+    check_system(system, q0, v0, params)
     unknown = [name for name in options if name not in OPTIONS]
     if unknown:
         raise TypeError(
@@ -165,8 +167,8 @@ def _motion(system, q0, v0, params, ts, events, options):
         )
     if not is_eager() or coordinates.is_traced((q0, v0, params, ts)):
         raise TypeError("work_precision measures times, and what is being traced has none.\nFix: call it outside jit.")
-    ts = np.asarray(ts)
-    start = coordinates.state(ts[0] if ts.ndim == 1 and ts.size else 0.0, q0, v0, params)
+    ts = np.asarray(problem.vector_of_times(ts))
+    start = coordinates.state(ts[0], q0, v0, params)
     return Motion(system, start, problem.times(ts, start.t.dtype), {**options, "events": events})
 
 

@@ -11,7 +11,7 @@ from lagjax.fitting.identifiability import Identifiability
 from lagjax.fitting.predicted import check_motion
 from lagjax.fitting.problem import problem_of
 from lagjax.fitting.records import Record
-from lagjax.fitting.search import look
+from lagjax.fitting.search import evaluate
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.hybrid import Hybrid
 from lagjax.mechanics.system import System
@@ -70,13 +70,13 @@ def identifiability(
     if shrink is None and candidates is not None:
         raise ValueError('candidates= are judged by what they shrink.\nFix: shrink="g", the number to know better.')
     at = None if shrink is None else surveyed(problem, problem.start)
-    seen = look(problem, problem.start, WHOLE) if at is None else at.seen
-    if coordinates.is_traced(seen):
+    evaluation = evaluate(problem, problem.start, WHOLE) if at is None else at.evaluation
+    if coordinates.is_traced(evaluation):
         raise TypeError(
             "identifiability looks at numbers, and here it is traced.\n"
             "Fix: call it in a Python loop, not in jit, vmap or lj.sweep: it is compiled once."
         )
-    check_motion(problem, seen.well, problem.start)
+    check_motion(problem, evaluation.well, problem.start)
     following = None
     if at is not None:
         # `observe` belongs to those that are measured by it.
@@ -86,5 +86,5 @@ def identifiability(
         following = next_measurements(problem, runs, at, shrink, candidates, of)
     noise = np.asarray(1.0) if problem.absolute else None
     return Identifiability(
-        problem.found.names, problem.found.start, seen.singular_values, seen.combinations, noise, following
+        problem.found.names, problem.found.start, evaluation.singular_values, evaluation.combinations, noise, following
     )

@@ -20,7 +20,7 @@ from lagjax.fitting.candidates import Candidate, NextMeasurements, judged, sd_of
 from lagjax.fitting.equations import WHOLE, Problem
 from lagjax.fitting.predicted import check_predicted
 from lagjax.fitting.records import PADDING, Record, Windows, channel_name, padded
-from lagjax.fitting.search import UNSEEN, Linear, Seen, linearised, seen_from
+from lagjax.fitting.search import UNSEEN, Evaluation, Linear, evaluation_from, linearised
 from lagjax.mechanics.compiled import compiled
 from lagjax.mechanics.diagnosis import listed
 from lagjax.mechanics.memory import filled_up
@@ -32,15 +32,15 @@ class Surveyed(NamedTuple):
     """What the data say at one point, with the slopes of all equations there."""
 
     linear: Linear
-    seen: Seen
+    evaluation: Evaluation
 
 
 @partial(compiled, in_numpy=True)
 def surveyed(problem: Problem, u: Unknowns) -> Surveyed:
-    """What `look` sees, and the slopes that it sees it by. One program serves all runs of one form."""
+    """What `evaluate` sees, and the slopes that it sees it by. One program serves all runs of one form."""
     check_predicted(problem)
     linear = linearised(problem, u, WHOLE, "squares")
-    return Surveyed(linear, seen_from(problem, u, linear, WHOLE))
+    return Surveyed(linear, evaluation_from(problem, u, linear, WHOLE))
 
 
 class Known(NamedTuple):
@@ -69,10 +69,10 @@ def next_measurements(
     """How certain a number would be after each candidate; `problem_for(records)` makes arrays of runs of one form."""
     name, direction = _direction(problem, shrink)
     slopes = at.linear.slopes
-    each = [without(*blocks) for blocks in zip(slopes.rows_by_shared, slopes.rows_by_own)]
+    each = [without(*blocks) for blocks in zip(slopes.rows_by_shared, slopes.rows_by_local)]
     prior = np.asarray(slopes.shared)
     known = Known(np.concatenate([prior, *each]), each, prior)
-    # As `seen_from` decides what the data determine.
+    # As `evaluation_from` decides what the data determine.
     least = float(np.sqrt(np.finfo(problem.windows.ts.dtype).eps) / UNSEEN)
     units = units_of(known.shared, np.asarray(problem.found.start), least)
     # Without sigmas the rows are in units of a common size: what they tell is a multiple of the error.
@@ -164,12 +164,12 @@ def _run(name, record, parts, known, direction, least):
         if not at.linear.well[0]:
             raise ValueError(f"the motion of candidate '{name}' fails: {_why(part)}")
         slopes.append(at.linear.slopes)
-    p, k, times = len(direction), slopes[0].rows_by_own.shape[-1], len(record.t)
+    p, k, times = len(direction), slopes[0].rows_by_local.shape[-1], len(record.t)
     n = p + k * len(parts)
     rows: list[list] = [[] for _ in range(times)]
     for i, (part, of) in enumerate(zip(parts, slopes)):
         both = np.zeros((of.rows_by_shared.shape[1], n))
-        both[:, :p], both[:, p + k * i : p + k * (i + 1)] = of.rows_by_shared[0], of.rows_by_own[0]
+        both[:, :p], both[:, p + k * i : p + k * (i + 1)] = of.rows_by_shared[0], of.rows_by_local[0]
         for at_time, block in zip(*_by_time(part, both)):
             rows[at_time].append(block)
     held = np.concatenate([known.shared, np.zeros((len(known.shared), n - p))], axis=1)
@@ -209,7 +209,7 @@ def _errors(parts):
 
 def _why(part):
     """In the words of the integration, why a motion fails."""
-    ts, params, (q, v), options = part.setting(part.start.shared, part.start.own[0], 0, WHOLE)
+    ts, params, (q, v), options = part.setting(part.start.shared, part.start.local[0], 0, WHOLE)
     try:
         integrate(part.system, q, v, params, ts=ts, **(options | {"throw": True}))
     except (ValueError, RuntimeError) as error:
@@ -221,16 +221,16 @@ def _further(problem, records, at, known, direction, least) -> list[Candidate]:
     """Further measurements in the runs that there are: of each quantity, at the one time that is best."""
     longer = _longer(problem, records)
     further, slopes = surveyed(longer, problem.start).linear.slopes, at.linear.slopes
-    k = slopes.rows_by_own.shape[-1]
+    k = slopes.rows_by_local.shape[-1]
     along = np.concatenate([direction, np.zeros(k)])
     # A start at zero is as good as any: of these no relative change is asked.
     values = np.concatenate([problem.found.start, np.zeros(k)])
     best: dict[str, Candidate] = {}
     for w, r in enumerate(longer.windows.record):
         others = known.but(w)
-        of_window = np.concatenate([slopes.rows_by_shared[w], slopes.rows_by_own[w]], axis=1)
+        of_window = np.concatenate([slopes.rows_by_shared[w], slopes.rows_by_local[w]], axis=1)
         here = np.concatenate([np.concatenate([others, np.zeros((len(others), k))], axis=1), of_window])
-        both = np.concatenate([further.rows_by_shared[w], further.rows_by_own[w]], axis=1)
+        both = np.concatenate([further.rows_by_shared[w], further.rows_by_local[w]], axis=1)
         part = _one_window(longer, w)
         _, rows = _by_time(part, both)
         ts = part.windows.ts[0][part.windows.real[0]]

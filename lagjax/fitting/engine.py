@@ -1,4 +1,4 @@
-"""The front door of fits: check, look, search, say what was found and how well."""
+"""The front door of fits: check, evaluate, search, say what was found and how well."""
 
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -12,14 +12,14 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import PyTree
 
-from lagjax.fitting.doubts import doubts
+from lagjax.fitting.caveats import caveats
 from lagjax.fitting.equations import Problem, Stage
 from lagjax.fitting.optimisers import is_of_optax
 from lagjax.fitting.predicted import check_motion
 from lagjax.fitting.problem import problem_of
 from lagjax.fitting.records import Record
 from lagjax.fitting.result import Fit, FitWarning
-from lagjax.fitting.search import Course, listening, look, search
+from lagjax.fitting.search import Course, evaluate, listening, search
 from lagjax.fitting.trained import held_problem, parted_records, train
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.diagnosis import listed
@@ -155,7 +155,7 @@ def fit(
         check = lambda: check_motion(problem, np.zeros(problem.windows.count, bool), problem.start)
         held = held_problem(problem, apart, system, params, observe, loss, window, options)
         trained = train(problem, held, optimiser, batch, iterations, patience, seed, progress, check)
-        return _told(Fit(problem, *trained.searched, trained.seen, _sorted(units), trained.course))
+        return _told(Fit(problem, *trained.searched, trained.evaluation, _sorted(units), trained.course))
     further = restarts
     if restarts is None:
         further = AGAIN if optimiser is None and 0 < problem.found.start.size <= AGAIN_UP_TO else 0
@@ -163,25 +163,25 @@ def fit(
     course = _course(problem, grow, joined and window is not None, scattered, bool(restarts))
     last = jax.tree.map(lambda x: x[-1], course.stages)
     with _shown(problem, course, progress) as tell:
-        searched, seen = search(problem, course, optimiser, 100 if iterations is None else iterations, tell)
+        searched, evaluation = search(problem, course, optimiser, 100 if iterations is None else iterations, tell)
     costs = coordinates.numpy_of(searched.costs).asarray(searched.costs)[: int(course.count)]
     searched = searched._replace(costs=costs)
-    if seen is None and problem.found.start.size <= COVARIANCE_UP_TO:
-        seen = look(problem, searched.unknowns, last)
-    if seen is not None and not coordinates.is_traced(seen) and not np.any(np.asarray(seen.well)):
-        check_motion(problem, seen.well, problem.start)
-    found = Fit(problem, *searched, seen, _sorted(units))
-    if seen is not None and not coordinates.is_traced(found.cost) and found.at_bounds():
+    if evaluation is None and problem.found.start.size <= COVARIANCE_UP_TO:
+        evaluation = evaluate(problem, searched.unknowns, last)
+    if evaluation is not None and not coordinates.is_traced(evaluation) and not np.any(np.asarray(evaluation.well)):
+        check_motion(problem, evaluation.well, problem.start)
+    found = Fit(problem, *searched, evaluation, _sorted(units))
+    if evaluation is not None and not coordinates.is_traced(found.cost) and found.at_bounds():
         # There the search's own slopes vanish.
-        found = eqx.tree_at(lambda f: f.seen, found, look(problem, searched.unknowns, last))
+        found = eqx.tree_at(lambda f: f.evaluation, found, evaluate(problem, searched.unknowns, last))
     return _told(found)
 
 
 def _told(found: Fit) -> Fit:
-    """The fit, after it was reported to who runs it, and its doubts to who called."""
+    """The fit, after it was reported to who runs it, and its caveats to who called."""
     found = reported(found, Fit.report)
     if not coordinates.is_traced(found.cost):
-        for words in doubts(found):
+        for words in caveats(found):
             warnings.warn(words, FitWarning, stacklevel=3)
     return found
 

@@ -153,7 +153,7 @@ def starts_at(problem: Problem, u: Unknowns, windows: Int[Array, " R"]):
 
     def at(w):
         state = lambda both: problem.state(both[:p], both[p:], w)
-        both = jnp.concatenate([u.shared, u.own[w]])
+        both = jnp.concatenate([u.shared, u.local[w]])
         return state(both), jax.jacfwd(state)(both)
 
     return jax.vmap(at)(windows)
@@ -194,16 +194,16 @@ def together(problem: Problem, u: Unknowns, parts: OfWindow, stage: Stage) -> Eq
     return Equations(parts.rows, _seamed(problem, stage) * gap, weight * (u.shared - known))
 
 
-def slopes_together(problem: Problem, by_shared: OfWindow, by_own: OfWindow, stage: Stage) -> Slopes:
+def slopes_together(problem: Problem, by_shared: OfWindow, by_local: OfWindow, stage: Stage) -> Slopes:
     """The slopes of all equations from those of the windows' contributions, (W, ..., p) and (W, ..., k)."""
     seamed = _seamed(problem, stage)[:, :, None]
     following = lambda x: jnp.roll(x, -1, axis=0)
     return Slopes(
         by_shared.rows,
-        by_own.rows,
+        by_local.rows,
         seamed * (by_shared.end - following(by_shared.begin)),
-        seamed * by_own.end,
-        -seamed * following(by_own.begin),
+        seamed * by_local.end,
+        -seamed * following(by_local.begin),
         jnp.diag(known_before(problem, stage)[1]),
     )
 
@@ -246,8 +246,8 @@ def equations(problem: Problem, u: Unknowns, stage: Stage) -> Equations:
 def over_windows(function: Callable, problem: Problem, u: Unknowns):
     """`function(w, s)` of every window."""
     if problem.windows.count == 1:
-        return jax.tree.map(lambda x: x[None], function(0, u.own[0]))
-    return one_by_one(lambda x: function(*x), (jnp.arange(problem.windows.count), u.own))
+        return jax.tree.map(lambda x: x[None], function(0, u.local[0]))
+    return one_by_one(lambda x: function(*x), (jnp.arange(problem.windows.count), u.local))
 
 
 def one_by_one(function: Callable, xs):

@@ -86,7 +86,7 @@ class Laplace:
     - `eigenvalues` (r,): of the Hessian in units of Gauss and Newton's, the smallest first; `directions` (r, n) of
       them, in standard deviations of Gauss and Newton. `unseen` (n - r, n): directions that the data do not see.
     - `off`: how many standard deviations the peak of the parabola is away from the estimate.
-    - `doubts`: what is to be known of it, in words.
+    - `caveats`: what is to be known of it, in words.
     """
 
     names: tuple[str, ...]
@@ -98,7 +98,7 @@ class Laplace:
     directions: Float[np.ndarray, "r n"]
     unseen: Float[np.ndarray, "u n"]
     off: float
-    doubts: tuple[str, ...]
+    caveats: tuple[str, ...]
     _at: dict[str, np.ndarray]
     # Of the unknowns by z, and their places in a row of all numbers that `starts` has room for.
     _by_z: Float[np.ndarray, "n n"]
@@ -142,7 +142,7 @@ class Laplace:
     def _check(self):
         if not self.positive_definite:
             raise ValueError(
-                f"there is no normal distribution here: {self.doubts[0]}\n"
+                f"there is no normal distribution here: {self.caveats[0]}\n"
                 "Fix: priors={...} for it, fewer numbers in free=, or a fit that has converged."
             )
 
@@ -153,7 +153,7 @@ class Laplace:
         gauss_newton = np.sqrt(np.diag(self.gauss_newton))
         for name, mean, sd, other in list(zip(self.names, self.mean, self.sd, gauss_newton))[:40]:
             lines.append(f"  {name:<{width}}  {mean:.6g} ± {sd:.3g}, by Gauss and Newton ± {other:.3g}")
-        return "\n".join([*lines, *(f"  {words}" for words in self.doubts)])
+        return "\n".join([*lines, *(f"  {words}" for words in self.caveats)])
 
 
 def laplace(problem: Problem, u: Unknowns, variance: float) -> Laplace:
@@ -169,7 +169,7 @@ def laplace(problem: Problem, u: Unknowns, variance: float) -> Laplace:
     labels, starts_at = _labels(problem)
     places = np.append(np.arange(p), p + np.flatnonzero(labels != "")).astype(int)
     names = (*found.names, *labels[labels != ""])
-    mean = np.concatenate([np.asarray(u.shared), (starts_at + np.asarray(u.own)).ravel()])[places]
+    mean = np.concatenate([np.asarray(u.shared), (starts_at + np.asarray(u.local)).ravel()])[places]
     slopes, gradient, term = _together(problem, u, at, places)
     least = float(np.sqrt(np.finfo(problem.windows.ts.dtype).eps) / UNSEEN)
     units = units_of(slopes, np.append(np.asarray(u.shared), np.zeros(len(names) - p)), least)
@@ -205,8 +205,8 @@ def laplace(problem: Problem, u: Unknowns, variance: float) -> Laplace:
         directions,
         right[~seen],
         off,
-        tuple(_doubts(names, eigenvalues, directions, right[~seen], off)),
-        {name: np.asarray(x) for name, x in zip(found.names, u.shared)} | {"starts": np.asarray(u.own)},
+        tuple(_caveats(names, eigenvalues, directions, right[~seen], off)),
+        {name: np.asarray(x) for name, x in zip(found.names, u.shared)} | {"starts": np.asarray(u.local)},
         by_z,
         places,
     )
@@ -273,7 +273,7 @@ def _labels(problem):
     return labels.ravel(), values
 
 
-def _doubts(names, eigenvalues, directions, unseen, off):
+def _caveats(names, eigenvalues, directions, unseen, off):
     """What there is to know, in words, the gravest first."""
     words = [f"the data do not see {_direction(names, row)}: no peak there." for row in unseen[:3]]
     for value, row in list(zip(eigenvalues, directions))[:3]:

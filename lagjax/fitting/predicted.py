@@ -64,7 +64,7 @@ def check_motion(problem, well, u):
     if not failed.size:
         return
     w = int(failed[0])
-    ts, params, (q, v), options = problem.setting(u.shared, u.own[w], w, WHOLE)
+    ts, params, (q, v), options = problem.setting(u.shared, u.local[w], w, WHOLE)
     reason = "it stops early"
     try:
         integrate(problem.system, q, v, params, ts=ts, **(options | {"throw": True}))

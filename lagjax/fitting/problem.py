@@ -17,7 +17,7 @@ from lagjax.mechanics import coordinates
 from lagjax.mechanics.diagnosis import listed
 from lagjax.mechanics.hybrid import Hybrid, first_phase
 from lagjax.mechanics.outside import up_to_date
-from lagjax.motion.problem import check_system
+from lagjax.mechanics.refusals import check_system
 from lagjax.motion.switching import each_phase, starting
 
 # What `integrate` takes and a fit sets itself.
@@ -26,7 +26,7 @@ OURS = {"ts", "throw", "adjoint"}
 
 def problem_of(system, records, params, free, observe, bounds, priors, loss, window, options) -> Problem:
     """Check everything and make arrays of it."""
-    check_system(system)
+    check_system(system, records, params, phases=True)
     system = _starting(system, window, options)
     first = first_phase(system)
     records = [records] if isinstance(records, Record) else list(records)

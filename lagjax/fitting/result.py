@@ -1,5 +1,6 @@
 """The answer of a fit: estimates, how certain they are, and whether the residuals look like measurement errors."""
 
+import os
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
@@ -19,11 +20,13 @@ from lagjax.fitting.identifiability import Identifiability
 from lagjax.fitting.laplace import Laplace, laplace
 from lagjax.fitting.misfit import Misfit
 from lagjax.fitting.records import channel_name
-from lagjax.fitting.search import Seen
+from lagjax.fitting.saving import save
+from lagjax.fitting.search import Evaluation
 from lagjax.fitting.table import lines_of
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.compiled import compiled
 from lagjax.mechanics.diagnosis import listed
+from lagjax.mechanics.signature import UnknownSystem
 from lagjax.motion.integrate import integrate
 from lagjax.motion.reported import Report
 from lagjax.motion.trajectory import RESULTS, Trajectory
@@ -76,7 +79,7 @@ class Fit:
     rested: Bool[Array, ""]
     misfit: Misfit
     costs: Float[Array, " starts"]
-    seen: Seen | None
+    evaluation: Evaluation | None
     units: tuple[tuple[str, str], ...] = eqx.field(static=True)
     training: Any = None
 
@@ -128,21 +131,21 @@ class Fit:
 
     @property
     def determined(self) -> Bool[Array, " p"]:
-        return self._seen().determined.shared
+        return self._evaluated().determined.shared
 
     @property
     def identifiability(self) -> Identifiability:
-        seen = self._seen()
+        evaluation = self._evaluated()
         noise = self._xp.sqrt(self.variance)
-        return Identifiability(self.names, self.values, seen.singular_values, seen.combinations, noise)
+        return Identifiability(self.names, self.values, evaluation.singular_values, evaluation.combinations, noise)
 
     @property
     def chi2(self) -> Float[Array, ""]:
-        return 2 * self.cost if self.seen is None else self.seen.chi2
+        return 2 * self.cost if self.evaluation is None else self.evaluation.chi2
 
     @property
     def freedom(self) -> Float[Array, ""]:
-        return self._seen().freedom
+        return self._evaluated().freedom
 
     @property
     def variance(self) -> Float[Array, ""]:
@@ -163,7 +166,7 @@ class Fit:
     @property
     def covariance(self) -> Float[Array, "p p"]:
         known = self.determined[:, None] & self.determined[None, :]
-        return self._xp.where(known, self._of_errors() * self._seen().covariance.shared, np.nan)
+        return self._xp.where(known, self._of_errors() * self._evaluated().covariance.shared, np.nan)
 
     @property
     def sd(self) -> Float[Array, " p"]:
@@ -178,13 +181,13 @@ class Fit:
     @property
     def start_sd(self) -> tuple[list[PyTree], list[PyTree]]:
         # On constraints a start depends on the parameters too: that of a rod of unknown length, for example.
-        xp, seen, windows = self._xp, self._seen(), self.problem.windows.first
-        of, determined, of_errors = seen.covariance, seen.determined, self._of_errors()
-        _, slopes = starts_at(self.problem, self.unknowns, windows)
+        xp, evaluation, windows = self._xp, self._evaluated(), self.problem.windows.first
+        of, determined, of_errors = evaluation.covariance, evaluation.determined, self._of_errors()
+        _, slopes = self.known_starts()
         found = []
         for r, w in enumerate(windows):
-            joint = of_errors * xp.block([[of.shared, of.own_shared[w].T], [of.own_shared[w], of.own[w]]])
-            known = xp.concatenate([determined.shared, determined.own[w]])
+            joint = of_errors * xp.block([[of.shared, of.local_shared[w].T], [of.local_shared[w], of.local[w]]])
+            known = xp.concatenate([determined.shared, determined.local[w]])
 
             def sd(slopes, r=r, joint=joint, known=known):
                 with np.errstate(invalid="ignore"):
@@ -196,22 +199,22 @@ class Fit:
         of_q, of_v = zip(*found)
         return list(of_q), list(of_v)
 
-    def _seen(self) -> Seen:
-        if self.seen is None:
+    def _evaluated(self) -> Evaluation:
+        if self.evaluation is None:
             raise ValueError(
                 f"uncertainties of {len(self.names)} numbers are not computed.\n"
                 "Fix: fit fewer of them: freeze a network with free=[...]."
             )
-        return self.seen
+        return self.evaluation
 
     def _of_errors(self):
         """The variance of an M-estimate of many measurements, in units of that of least squares with these sigmas."""
         if self.problem.loss == "squares":
             return self.variance
-        return _of_forgiven_errors(self._seen().rows.reshape(-1), self.known(), self.problem.loss)
+        return _of_forgiven_errors(self._evaluated().rows.reshape(-1), self.known(), self.problem.loss)
 
     def known(self) -> Bool[Array, " windows*m"]:
-        """Which of the residuals `seen.rows`, in a row, belong to a measurement."""
+        """Which of the residuals `evaluation.rows`, in a row, belong to a measurement."""
         parts = []
         for kind, tree in self.problem.measured.items():
             for x, s in zip(jax.tree.leaves(tree), jax.tree.leaves(self.problem.sigma[kind])):
@@ -223,9 +226,15 @@ class Fit:
 
     def starts(self) -> list[tuple[PyTree, PyTree]]:
         """(q, v) at the start of each record."""
-        windows = self.problem.windows.first
-        states, _ = starts_at(self.problem, self.unknowns, windows)
-        return [jax.tree.map(lambda x, r=r: x[r], states) for r in range(len(windows))]
+        states, _ = self.known_starts()
+        return [jax.tree.map(lambda x, r=r: x[r], states) for r in range(len(self.problem.windows.first))]
+
+    def known_starts(self) -> tuple[PyTree, PyTree]:
+        """The starts of all records together, and their slopes by the unknowns."""
+        system = self.problem.system
+        if isinstance(system, UnknownSystem):
+            return system.starts
+        return starts_at(self.problem, self.unknowns, self.problem.windows.first)
 
     def motion(self, record: int = 0, ts=None) -> Trajectory:
         """The fitted motion of a record from its start, at its times or at others from the same start."""
@@ -260,7 +269,7 @@ class Fit:
         windows, at = self.problem.windows, 0
         chosen = np.asarray(windows.record) == (np.asarray(windows.record) if record is None else record)
         real = np.asarray(windows.real)[chosen]
-        rows = _rows(self.problem, self.unknowns) if self.seen is None else self.seen.rows
+        rows = _rows(self.problem, self.unknowns) if self.evaluation is None else self.evaluation.rows
         for kind, tree in self.problem.measured.items():
             sigmas = jax.tree.leaves(self.problem.sigma[kind])
             for (path, x), sigma in zip(jax.tree_util.tree_leaves_with_path(tree), sigmas):
@@ -279,7 +288,7 @@ class Fit:
         """The unknowns as `log_likelihood` takes them: parameters by name, and the starts' deviations, (W, k)."""
         # JAX's arrays, for a sampler.
         of_names = {name: jnp.asarray(self.unknowns.shared[i]) for i, name in enumerate(self.names)}
-        return of_names | {"starts": jnp.asarray(self.unknowns.own)}
+        return of_names | {"starts": jnp.asarray(self.unknowns.local)}
 
     @property
     def log_likelihood(self) -> Callable[[Mapping[str, Array]], Float[Array, ""]]:
@@ -321,9 +330,9 @@ class Fit:
         """
         if self._traced:
             raise TypeError("laplace() looks at numbers, and this fit is traced.\nFix: call it outside of the program.")
-        seen = self._seen()
+        evaluation = self._evaluated()
         priors = np.isfinite(self.problem.found.sd).sum()
-        apart = self.known().sum() + priors - sum(np.sum(d) for d in seen.determined)
+        apart = self.known().sum() + priors - sum(np.sum(d) for d in evaluation.determined)
         # A seam takes away an unknown: it shows in the freedom.
         if self.freedom > apart + 0.5:
             raise ValueError(
@@ -332,7 +341,7 @@ class Fit:
             )
         found = laplace(self.problem, self.unknowns, float(self.variance))
         if not found.positive_definite:
-            warnings.warn(f"Laplace: {found.doubts[0]}", FitWarning, stacklevel=2)
+            warnings.warn(f"Laplace: {found.caveats[0]}", FitWarning, stacklevel=2)
         return found
 
     def at_bounds(self) -> list[str]:
@@ -342,6 +351,16 @@ class Fit:
         size = np.maximum(np.abs(np.asarray(found.start)), 1e-300)
         near = (x - low < AT_BOUND * size) | (high - x < AT_BOUND * size)
         return [name for name, at in zip(self.names, near) if at]
+
+    def save(self, path: str | os.PathLike) -> None:
+        """Write the fit into a file, an npz; `lj.load_fit(path, system)` reads it, bit for bit.
+
+        Functions are not in it: the system, `observe`, and options that hold some. Whoever is stopped while it is
+        written leaves the file of before.
+
+        **Raises:** `TypeError` for what is no data in `params`, by name; `OSError` where there is no such folder.
+        """
+        save(self, path)
 
     def plot(self, record: int = 0):
         """Draw data, fit and residuals of a record, a row each channel; returns a matplotlib `Figure`."""

@@ -105,7 +105,7 @@ class Linear(NamedTuple):
     well: Bool[Array, " W"]
 
 
-class Seen(NamedTuple):
+class Evaluation(NamedTuple):
     """What the data say at one point, where errors are of size one.
 
     - `rows` (W, m): residuals in sigmas. `well` (W,): which motions ended well.
@@ -138,11 +138,11 @@ def linearised(problem: Problem, u: Unknowns, stage: Stage, loss: str) -> Linear
         return jax.tree.map(lambda x: x[0], (values, well)), jax.tree.map(lambda x: x.T, pushed)
 
     (values, well), pushed = over_windows(at, problem, u)
-    by_shared, by_own = (jax.tree.map(lambda x: x[..., part], pushed) for part in (slice(p), slice(p, None)))
-    return Linear(together(problem, u, values, stage), slopes_together(problem, by_shared, by_own, stage), well)
+    by_shared, by_local = (jax.tree.map(lambda x: x[..., part], pushed) for part in (slice(p), slice(p, None)))
+    return Linear(together(problem, u, values, stage), slopes_together(problem, by_shared, by_local, stage), well)
 
 
-def seen_from(problem: Problem, u: Unknowns, linear: Linear, stage: Stage) -> Seen:
+def evaluation_from(problem: Problem, u: Unknowns, linear: Linear, stage: Stage) -> Evaluation:
     """What the data say at `u`, from the plain residuals and their slopes."""
     sizes = linear.slopes.sizes()
     # What the equations do not determine is held by next to nothing.
@@ -157,8 +157,8 @@ def seen_from(problem: Problem, u: Unknowns, linear: Linear, stage: Stage) -> Se
     inverse = (right.T / size[:, None]) @ (jnp.where(seen, 1 / jnp.where(seen, singular, 1.0), 0.0)[:, None] * left.T)
     of = covariance(triangular, inverse)
     known_alone = jnp.sum(jnp.where(seen[:, None], 0.0, right) ** 2, axis=0) < NO_PART
-    own = jnp.sqrt(jax.vmap(jnp.diag)(of.own))
-    determined = Unknowns(known_alone, (sizes.own > 0) & (sizes.own * own < unseen))
+    own = jnp.sqrt(jax.vmap(jnp.diag)(of.local))
+    determined = Unknowns(known_alone, (sizes.local > 0) & (sizes.local * own < unseen))
     relative = jnp.where(u.shared != 0, jnp.abs(u.shared), 1.0)
     _, singular_values, combinations = jnp.linalg.svd(triangular.shared * relative[None])
     chi2 = jnp.sum(linear.values.rows**2)
@@ -167,22 +167,22 @@ def seen_from(problem: Problem, u: Unknowns, linear: Linear, stage: Stage) -> Se
     joined = jnp.where(stage.joined > 0, jnp.sum(problem.windows.seam) * problem.unit.size, 0)
     unknowns = sum(jnp.sum(d) for d in determined) - joined
     freedom = sum(known) + jnp.sum(jnp.isfinite(problem.found.sd)) - unknowns
-    return Seen(
+    return Evaluation(
         linear.values.rows, linear.well, of, determined, singular_values, combinations, chi2,
         freedom.astype(chi2.dtype),
     )  # fmt: skip
 
 
 @partial(compiled, in_numpy=True)
-def look(problem: Problem, u: Unknowns, stage: Stage) -> Seen:
+def evaluate(problem: Problem, u: Unknowns, stage: Stage) -> Evaluation:
     """What the data say at `u`."""
     check_predicted(problem)
-    at = lambda problem, u, stage: seen_from(problem, u, linearised(problem, u, stage, "squares"), stage)
+    at = lambda problem, u, stage: evaluation_from(problem, u, linearised(problem, u, stage, "squares"), stage)
     return in_turn(at, problem, u, stage)
 
 
 def _natural(problem, y: Unknowns) -> Unknowns:
-    return Unknowns(problem.found.natural(y.shared), y.own)
+    return Unknowns(problem.found.natural(y.shared), y.local)
 
 
 @eqx.filter_custom_jvp
@@ -300,7 +300,7 @@ class _Best(NamedTuple):
 def _search(problem, course, optimiser, limit, tell):
     last = len(course.tolerances) - 1
     tries = course.count
-    own = jnp.asarray(problem.start.own)
+    own = jnp.asarray(problem.start.local)
 
     def one_stage(y, stage, tolerance, number):
         told = partial(jax.debug.callback, _heard, number) if tell else lambda cost: None
@@ -352,7 +352,7 @@ def _search(problem, course, optimiser, limit, tell):
     nothing = _nothing(problem, y, _keeps_slopes(problem, optimiser))
     start = jnp.asarray(0), number, y, jnp.asarray(0), jnp.full(len(course.starts), jnp.nan, y.shared.dtype), nothing
     *_, steps, costs, best = lax.while_loop(go_on, step, start)
-    u, seen = _natural(problem, best.y), None
+    u, evaluation = _natural(problem, best.y), None
     if best.slopes is not None:
         _, rate = jax.jvp(problem.found.natural, (best.y.shared,), (jnp.ones_like(best.y.shared),))
         slopes = best.slopes.scaled(jnp.where(rate != 0, 1 / rate, 0.0))
@@ -360,8 +360,8 @@ def _search(problem, course, optimiser, limit, tell):
         mean, weight = known_before(problem, WHOLE)
         values = best.values._replace(shared=weight * (u.shared - mean))
         linear = Linear(values, slopes._replace(shared=jnp.diag(weight)), best.well)
-        seen = seen_from(problem, u, linear, jax.tree.map(lambda x: x[-1], course.stages))
-    return Searched(u, best.cost, steps, best.rested, best.misfit, costs), seen
+        evaluation = evaluation_from(problem, u, linear, jax.tree.map(lambda x: x[-1], course.stages))
+    return Searched(u, best.cost, steps, best.rested, best.misfit, costs), evaluation
 
 
 def _keeps_slopes(problem, optimiser):
@@ -370,7 +370,7 @@ def _keeps_slopes(problem, optimiser):
 
 def _nothing(problem, y, with_slopes):
     """What stands for the best end before there is one."""
-    (p,), (windows, k), dtype = y.shared.shape, y.own.shape, y.shared.dtype
+    (p,), (windows, k), dtype = y.shared.shape, y.local.shape, y.shared.dtype
     m = sum(int(np.prod(x.shape[1:])) for x in jax.tree.leaves(problem.measured))
     j = 0 if windows == 1 else problem.unit.size
     of = lambda *shape: jnp.zeros(shape, dtype)

@@ -37,9 +37,10 @@ from lagjax.numerics.rank import null_space
 
 # Samples from whose parabola position and velocity are read.
 SAMPLES = 7
-# So many of them agree; what is off by so many times more than these, and by so much of the data's spread, is wild.
+# So many of them agree; what is off by so many times more than these, and by so much of the data's spread, is an
+# outlier.
 # (Samples far apart, along a curve that is no parabola, come to 30 times.)
-MOST, WILD, OF_SPREAD = 5, 100.0, 0.3
+MOST, FAR_OFF, OF_SPREAD = 5, 100.0, 0.3
 # Iterations for c, each with its own matrix; they end where the residual no longer falls.
 ITERATIONS = 12
 # Of a guess, what is left of the constraints after that, in displacements relative to the state.
@@ -133,7 +134,7 @@ def starts(
         charts.append(_charts(system, guess, *(_free(guess.q, hold) for hold in held), r))
     q, v = zip(*charts)
     k = max(chart.along.shape[1] for chart in q), max(chart.along.shape[1] for chart in v)
-    return Starts(_stacked(q, 0, sum(k)), _stacked(v, k[0], sum(k))), _unflatten(kinds(guesses[0].q))
+    return Starts(_stacked(q, 0, sum(k)), _stacked(v, k[0], sum(k))), unflatten_of(kinds(guesses[0].q))
 
 
 def _stacked(charts: Sequence[Chart], before: int, k: int) -> Chart:
@@ -163,7 +164,7 @@ def _vector(tree):
 
 
 @lru_cache
-def _unflatten(of_kinds) -> Callable:
+def unflatten_of(of_kinds) -> Callable:
     """The function that makes coordinates of these `kinds` of a vector."""
     structure, *arrays = of_kinds
     with jax.ensure_compile_time_eval():
@@ -230,7 +231,7 @@ def _parabola(t, x, samples):
     threes = _threes(count)
     values, slopes = [], []
     for column in x.reshape(len(x), -1).T:
-        wild, column = OF_SPREAD * spread(column), column[samples]
+        far_off, column = OF_SPREAD * spread(column), column[samples]
         first = xp.argsort(~xp.isfinite(column), stable=True)[:count]
         y, known = column[first], xp.isfinite(column[first])
         scale = xp.max(xp.where(known, t[first], 0.0))
@@ -243,7 +244,7 @@ def _parabola(t, x, samples):
             off = xp.abs(y - (powers @ through)[..., 0])
             typical = xp.sort(off, axis=1)[:, MOST - 1]
             best = xp.argmin(typical)
-            near = known & (~xp.all(known) | (off[best] <= xp.maximum(WILD * typical[best], wild)))
+            near = known & (~xp.all(known) | (off[best] <= xp.maximum(FAR_OFF * typical[best], far_off)))
         found = xp.linalg.lstsq(powers * near[:, None], xp.where(near, y, 0.0))[0]
         values.append(found[0])
         slopes.append(found[1] / scale)
@@ -279,7 +280,7 @@ def _charts(system, s: State, free_q, free_v, r) -> Starts:
         nothing = np.zeros((len(free_q), 0))
         return Starts(*(Chart(y, np.eye(len(f))[:, f], nothing) for y, f in ((x, free_q), (u, free_v))))
     with jax.ensure_compile_time_eval():
-        unflatten = _unflatten(kinds(s.q))
+        unflatten = unflatten_of(kinds(s.q))
 
         def charts(x, u, of_q, of_v):
             return Starts(_chart(x, of_q, free_q), _chart(u, of_v, free_v))

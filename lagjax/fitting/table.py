@@ -17,7 +17,7 @@ def lines_of(fit) -> list[str]:
     if tried > 1:
         near = int(np.sum(np.asarray(fit.costs) <= 1.01 * float(fit.cost) + 1e-300))
         lines[0] += f"; {near} of {tried} starts ended here"
-    if fit.seen is None:
+    if fit.evaluation is None:
         lines.append(f"  {len(fit.names)} numbers, uncertainties not computed; cost {float(fit.cost):.6g}")
         return lines
     units, rows = dict(fit.units), []

@@ -17,7 +17,7 @@ from lagjax.fitting.optimisers import Optimiser
 from lagjax.fitting.problem import problem_of
 from lagjax.fitting.records import Record
 from lagjax.fitting.result import Fit
-from lagjax.fitting.search import Searched, Seen, look
+from lagjax.fitting.search import Evaluation, Searched, evaluate
 from lagjax.fitting.training import Ended, State, Task, all_rounds, begun, ended, goes_on, round_of, with_params
 from lagjax.mechanics import coordinates
 from lagjax.meter import meter, waiting
@@ -104,7 +104,7 @@ class Trained(NamedTuple):
     """The end of a training as of a search, what the data say there (None of many numbers), and its course."""
 
     searched: Searched
-    seen: Seen | None
+    evaluation: Evaluation | None
     course: Training
 
 
@@ -188,10 +188,10 @@ def train(
         xp.minimum(each * state.best.round, steps), state.step, stopped, state.failed, state.skipped, held_back,
         batch, windows,
     )  # fmt: skip
-    numbers = problem.found.start.size + end.unknowns.own.size // windows
-    seen = look(problem, end.unknowns, WHOLE) if 0 < numbers <= SLOPES_UP_TO else None
+    numbers = problem.found.start.size + end.unknowns.local.size // windows
+    evaluation = evaluate(problem, end.unknowns, WHOLE) if 0 < numbers <= SLOPES_UP_TO else None
     searched = Searched(end.unknowns, end.cost, state.step, course.rested, end.misfit, end.cost[None])
-    return Trained(searched, seen, course)
+    return Trained(searched, evaluation, course)
 
 
 def _in_rounds(task: Task, progress, check) -> tuple[State, np.ndarray, np.ndarray]:
@@ -221,6 +221,6 @@ def _held_back(task: Task, state: State, end: Ended, end_held: Ended) -> Fit:
     held: Any = task.held
     problem = with_params(held, task.problem, end.unknowns.shared)
     # Of starts that are known nothing is to be said.
-    seen = look(problem, end_held.unknowns, WHOLE) if end_held.unknowns.own.size else None
+    evaluation = evaluate(problem, end_held.unknowns, WHOLE) if end_held.unknowns.local.size else None
     rested = jnp.ones((), bool) if coordinates.is_traced(end_held) else np.asarray(True)
-    return Fit(problem, *end_held[:2], state.step, rested, end_held.misfit, end_held.cost[None], seen, ())
+    return Fit(problem, *end_held[:2], state.step, rested, end_held.misfit, end_held.cost[None], evaluation, ())

@@ -48,7 +48,7 @@ class Best(NamedTuple):
     score: Float[Array, ""]
     round: Int[Array, ""]
     y: Float[Array, " p"]
-    own: Float[Array, "W k"]
+    local: Float[Array, "W k"]
     held: Float[Array, "H k"]
 
 
@@ -62,7 +62,7 @@ class State(NamedTuple):
     """
 
     y: Float[Array, " p"]
-    own: Float[Array, "W k"]
+    local: Float[Array, "W k"]
     held: Float[Array, "H k"]
     optimiser: Any
     inverses: Float[Array, "W k k"]
@@ -118,13 +118,13 @@ def begun(task: Task) -> State:
 
     def begin(task):
         check_predicted(task.problem)
-        problem, own = task.problem, jnp.asarray(task.problem.start.own)
+        problem, own = task.problem, jnp.asarray(task.problem.start.local)
         y, (windows, k), zero = problem.found.free(problem.found.start), own.shape, jnp.zeros((), int)
         # From starts that are off, slopes are so large that optimisers that remember them, as Adam does, hardly move.
         own, at = settled(problem, problem.found.natural(y), own, JUDGING)
         held, score = jnp.zeros((0, k), own.dtype), jnp.sum(at.sums) / jnp.maximum(jnp.sum(task.known), 1)
         if task.held is not None:
-            held, score = _judged(task, y, jnp.asarray(task.held.start.own), ENDING)
+            held, score = _judged(task, y, jnp.asarray(task.held.start.local), ENDING)
         return State(
             y, own, held, task.optimiser.init(problem.found, y), _inverses(at),
             jnp.arange(windows), jnp.full((), windows), zero, zero, zero, zero, Best(score, zero, y, own, held),
@@ -165,7 +165,7 @@ def ended(task: Task, state: State) -> tuple[Ended, Ended | None]:
     def end(task, state):
         problem, best = task.problem, state.best
         x = problem.found.natural(best.y)
-        found = _ended(problem, x, best.own)
+        found = _ended(problem, x, best.local)
         return found, None if task.held is None else _ended(with_params(task.held, problem, x), x[:0], best.held)
 
     return in_turn(end, task, state)
@@ -186,13 +186,13 @@ def _round(task: Task, state: State):
     stays = lambda state: (state, jnp.asarray(jnp.nan, state.y.dtype))
     one = lambda state, _: lax.cond(state.step < task.limit, partial(_step, task), stays, state)
     state, losses = lax.scan(one, state, length=task.steps)
-    at = squares(task.problem, task.problem.found.natural(state.y), state.own)
+    at = squares(task.problem, task.problem.found.natural(state.y), state.local)
     state, score = state._replace(inverses=_inverses(at)), jnp.sum(at.sums) / jnp.maximum(jnp.sum(task.known), 1)
     if task.held is not None:
         held, score = _judged(task, state.y, state.held, JUDGING)
         state = state._replace(held=held)
     number = state.round + 1
-    new = Best(score, number, state.y, state.own, state.held)
+    new = Best(score, number, state.y, state.local, state.held)
     best = jax.tree.map(lambda a, b: jnp.where(score < state.best.score, a, b), new, state.best)
     return state._replace(round=number, best=best), Round(losses, score)
 
@@ -227,18 +227,18 @@ def _step(task: Task, state: State):
         before = jnp.sum((weight * (x - mean)) ** 2)
         return 0.5 * (count / task.batch * jnp.sum(sums) + before) / total, (jnp.sum(sums), well)
 
-    own = state.own[chosen]
-    (value, (squared, well)), (by_y, by_own) = jax.value_and_grad(cost, (0, 1), has_aux=True)(state.y, own)
+    own = state.local[chosen]
+    (value, (squared, well)), (by_y, by_local) = jax.value_and_grad(cost, (0, 1), has_aux=True)(state.y, own)
     y, optimiser = task.optimiser.step(
         found, state.y, by_y, state.optimiser, value, lambda y: cost(y, own)[0]
     )  # fmt: skip
     finite = jnp.all(jnp.isfinite(by_y)) & jnp.all(jnp.isfinite(y))
     kept = lambda new, old: jax.tree.map(lambda a, b: jnp.where(finite, a, b), new, old)
     y, optimiser = kept((y, optimiser), (state.y, state.optimiser))
-    slopes = by_own * (total * task.batch / count)
+    slopes = by_local * (total * task.batch / count)
     own = own + _towards(problem, chosen, state.inverses[chosen], slopes)
     state = state._replace(
-        y=y, optimiser=optimiser, own=state.own.at[chosen].set(own), order=order, at=at + task.batch,
+        y=y, optimiser=optimiser, local=state.local.at[chosen].set(own), order=order, at=at + task.batch,
         step=state.step + 1, failed=state.failed + jnp.sum(~well), skipped=state.skipped + ~finite,
     )  # fmt: skip
     return state, squared / jnp.maximum(jnp.sum(known[chosen]), 1)

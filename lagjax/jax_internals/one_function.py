@@ -92,7 +92,7 @@ def one_function(function: Callable, *args, checked: bool = False, in_blocks: bo
     return eqx.combine(jtu.tree_unflatten(jtu.tree_structure(shapes), found), rest[0])
 
 
-def called(results):
+def kept_as_call(results):
     """`results` of a jitted function that stays a call; else XLA computes it anew for each of those who need them."""
     if jax.default_backend() != "cpu" or is_plain():
         return results
@@ -107,7 +107,7 @@ def apart(function: Callable, *args):
     >>> print(apart(jnp.sin, jnp.asarray(0.0)))
     0.0
     """
-    return called(_jitted(function, args))
+    return kept_as_call(_jitted(function, args))
 
 
 @eqx.filter_jit
@@ -315,7 +315,7 @@ def _batched(operands, axes, *, jaxpr, in_blocks, points, values, checked):
 
 
 def _lanes_together(*operands, jaxpr, batched, lanes=None, **params):
-    if lanes == 0:
+    if isinstance(lanes, int) and lanes == 0:
         # A loop that waits for the slowest of no lanes has none to ask.
         return [jnp.zeros((0, *aval.shape), aval.dtype) for aval in jaxpr.out_avals]
     return jax.vmap(jaxpr_as_fun(jaxpr), [0 if b else None for b in batched])(*operands)
@@ -324,6 +324,9 @@ def _lanes_together(*operands, jaxpr, batched, lanes=None, **params):
 def _lanes_in_blocks(*operands, jaxpr, batched, lanes, **params):
     """A loop over blocks of lanes, as few as fit and all of one length: the last lane fills the last block."""
     together = partial(_lanes_together, jaxpr=jaxpr, batched=batched)
+    if not isinstance(lanes, int):
+        # An exported program of any number of lanes does not know how many blocks there are.
+        return together(*operands, lanes=lanes)
     blocks = -(-lanes // TOGETHER)
     if blocks <= 1:
         return together(*operands, lanes=lanes)

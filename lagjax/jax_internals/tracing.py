@@ -16,7 +16,9 @@ with ThreadPoolExecutor(1) as _thread:
 # Whether somebody watches how motions go, lane by lane. A context of JAX's: under it what the user has jitted is traced
 # again.
 WATCHED = jax.make_user_context(default_value=False)
-# Whether who watches runs again, with the careful way, what was taken for regular and is not.
+# Whether failures are told by their codes alone, in a program that has nobody to raise an error to.
+SILENT = jax.make_user_context(default_value=False)
+# Whether who watches runs again, with the robust way, what was taken for regular and is not.
 REGULAR_FIRST = jax.make_user_context(default_value=False)
 
 

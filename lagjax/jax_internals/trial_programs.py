@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from lagjax.jax_internals.one_function import called, one_function
+from lagjax.jax_internals.one_function import kept_as_call, one_function
 
 
 def main():
@@ -18,7 +18,7 @@ def main():
         def body(state):
             x, y = state
             x = lax.cond(y > 0, lambda: 1.5 * x, lambda: 1.25 * x)
-            return x, called(jax.jit(lambda x, y: (jnp.sin(x) + y, x))(x, y))[0]
+            return x, kept_as_call(jax.jit(lambda x, y: (jnp.sin(x) + y, x))(x, y))[0]
 
         return lax.while_loop(lambda state: state[0] < 100.0, body, (x, y))
 

@@ -19,8 +19,14 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PyTree
 
 from lagjax.jax_internals.tracing import is_eager
+from lagjax.mechanics.single_precision import warn_of_float32
 
 FLOAT64 = np.dtype("float64")
+# Tuples that are made once: a call takes 20 microseconds, and to make a union of types takes one.
+ARRAYS = (np.ndarray, np.generic, jax.Array)
+NUMBERS = (float, int, *ARRAYS)
+OF_NUMPY = (bool, int, float, complex, np.ndarray, np.generic)
+MADE_OF_FLOAT64 = (np.ndarray, np.float64)
 
 
 class State(NamedTuple):
@@ -85,34 +91,41 @@ def _key_name(key, first):
 def state(t, q, v, params) -> State:
     """Check a state's shapes and dtypes and make arrays of it.
 
-    Python floats become arrays of the state's dtype, in `params` too: a float that stayed a Python
-    number would be compiled in, and each new value would compile again.
+    Whole numbers among the coordinates become floats. Python floats become arrays of the state's dtype, in `params`
+    too: a float that stayed a Python number would be compiled in, and each new value would compile again.
 
-    **Raises:** `TypeError` for an integer or complex coordinate; `ValueError` where `v` does not have the
-    structure and shapes of `q`, or `q` is empty.
+    **Raises:** `TypeError` for a coordinate that is no real number, and a time that is none; `ValueError` where `v`
+    does not have the structure and shapes of `q`, or `q` is empty.
     """
     return _of_jax(given_state(t, q, v, params))
 
 
 def given_state(t, q, v, params) -> State:
     """The same, but for NumPy's arrays, which stay: a compiled program takes them in a tenth of the time."""
-    given = jtu.tree_leaves((q, v))
-    q, v = jtu.tree_map(_as_array, q), jtu.tree_map(_as_array, v)
-    _check_floating(q, "q")
-    _check_floating(v, "v")
-    _check_alike(q, v)
-    if not given:
-        raise ValueError("q has no coordinates: give at least one, such as q = {'theta': 0.1}.")
+    t, given = _time(t), jtu.tree_leaves((q, v))
+    of_q, of_v = _numbers(q, "q"), _numbers(v, "v")
+    _check_alike(of_q, of_v, params)
+    if not any(getattr(x, "size", 1) for x in given):
+        raise ValueError(
+            "q has no coordinates.\n"
+            "Usual cause: None, an empty list, or a dict that is filled later.\n"
+            "Fix: give at least one, such as q0 = {'theta': 0.1}."
+        )
     # A Python float has the dtype of those beside it.
     dtype = _dtype_of(given)
-    q, v = (jtu.tree_map(lambda x: _of_dtype(x, dtype), tree) for tree in (q, v))
-    return State(_of_dtype(_as_array(t), dtype), q, v, given_params(params, dtype))
+    if dtype != FLOAT64:
+        warn_of_float32(dtype, given)
+    q, v = (jtu.tree_map(lambda x: _of_dtype(x, dtype), tree) for tree in (of_q, of_v))
+    return State(_of_dtype(t, dtype), q, v, given_params(params, dtype))
 
 
 def _dtype_of(given):
     """The dtype of numbers beside each other: JAX's own answer, which takes a tenth of a short call."""
-    plain = all(isinstance(x, float) or isinstance(x, np.ndarray | np.float64) and x.dtype == FLOAT64 for x in given)
-    return FLOAT64 if plain and jax.config.read("jax_enable_x64") else jnp.result_type(*given)
+    if all(isinstance(x, float) or isinstance(x, MADE_OF_FLOAT64) and x.dtype == FLOAT64 for x in given):
+        return FLOAT64 if jax.config.read("jax_enable_x64") else jnp.result_type(*given)
+    # Whole numbers take part as floats.
+    floats = [x for x in given if not jnp.issubdtype(jnp.result_type(x), jnp.integer)]
+    return jnp.result_type(*floats) if floats else jax.dtypes.canonicalize_dtype(FLOAT64)
 
 
 def prepared(t, q, v, params) -> State:
@@ -148,7 +161,7 @@ def _as_array(x):
     """An array in one of JAX's dtypes, of NumPy where it is none yet."""
     if isinstance(x, jax.Array):
         return x
-    if not isinstance(x, (bool, int, float, complex, np.ndarray, np.generic)):
+    if not isinstance(x, OF_NUMPY):
         return jnp.asarray(x)
     x = np.asarray(x)
     return x.astype(jax.dtypes.canonicalize_dtype(x.dtype), copy=False)
@@ -157,6 +170,18 @@ def _as_array(x):
 def _of_dtype(x, dtype):
     as_it_is = x.dtype == dtype and not getattr(x, "weak_type", False)
     return x if as_it_is else x.astype(dtype)
+
+
+def as_floats(tree):
+    """The whole numbers in `tree` as floats of the default size; the rest as it is."""
+
+    def convert(x):
+        if not isinstance(x, NUMBERS) or isinstance(x, bool | float):
+            return x
+        whole = isinstance(x, int) or jnp.issubdtype(x.dtype, jnp.integer)
+        return _of_dtype(_as_array(x), jax.dtypes.canonicalize_dtype(FLOAT64)) if whole else x
+
+    return jtu.tree_map(convert, tree)
 
 
 def numpy_of(tree):
@@ -169,33 +194,79 @@ def is_traced(tree) -> bool:
     return any(isinstance(leaf, Tracer) for leaf in jtu.tree_leaves(tree))
 
 
-def _check_floating(tree, which):
-    for path, leaf in jtu.tree_flatten_with_path(tree)[0]:
-        if jnp.issubdtype(leaf.dtype, jnp.floating):
+def _time(t):
+    """A time as an array of one number."""
+    if type(t) is float:
+        return np.asarray(t)
+    if isinstance(t, NUMBERS) and not isinstance(t, bool) and np.ndim(t) == 0:
+        return _as_array(t)
+    of = f"an array of shape {np.shape(t)}" if isinstance(t, ARRAYS) else f"a {type(t).__name__}"
+    raise TypeError(
+        f"t must be one number, and is {of}.\n"
+        "Usual cause: arguments in another order.\n"
+        "Fix: (system, t, q, v, params), as t=0.0."
+    )
+
+
+def _numbers(tree, which):
+    """The coordinates as arrays, with whole numbers still as they are; an error where one is no real number."""
+    try:
+        found = jtu.tree_map(_as_number, tree)
+    except TypeError:
+        _check_real(tree, which)
+        raise
+    if not all(x.dtype == FLOAT64 or _is_real(x.dtype) for x in jtu.tree_leaves(found)):
+        _check_real(tree, which)
+    return found
+
+
+def _as_number(x):
+    # Also a whole number that is beyond those of arrays.
+    return _as_array(float(x) if type(x) is int else x)
+
+
+def _is_real(dtype):
+    return jnp.issubdtype(dtype, jnp.floating) or jnp.issubdtype(dtype, jnp.integer)
+
+
+def _check_real(tree, which):
+    for path, leaf in jtu.tree_leaves_with_path(tree):
+        dtype = leaf.dtype if hasattr(leaf, "dtype") else np.asarray(leaf).dtype
+        if _is_real(dtype):
             continue
-        cause, fix = (
-            "a whole number written without its decimal point",
-            "1.0 instead of 1, or jnp.asarray(..., dtype=float)",
-        )
-        if jnp.issubdtype(leaf.dtype, jnp.complexfloating):
+        of, cause, fix = str(dtype), "a condition in place of a number", "0.0 or 1.0"
+        if jnp.issubdtype(dtype, jnp.complexfloating):
             cause, fix = "the root of a negative number, or an amplitude", "its real part, jnp.real(...)"
+        elif callable(leaf):
+            of, cause, fix = "a function", "a function in place of what it returns", "f() in place of f"
+        elif hasattr(leaf, "magnitude"):
+            of, cause = f"{leaf!r:.60}", "a number with its unit"
+            fix = "the number, x.magnitude, all in one system of units"
+        elif not jnp.issubdtype(dtype, np.bool_):
+            of, cause = f"{leaf!r:.60}", "text from a file, or a number that was left to be filled in"
+            fix = "a number, as q0 = 0.1, or names, as q0 = {'x': 0.1}"
         raise TypeError(
-            f"coordinate '{_path_name(path)}' of {which} is {leaf.dtype}, and the equations of motion need floats.\n"
+            f"coordinate '{_path_name(path)}' of {which} is {of}, and the equations of motion need real numbers.\n"
             f"Usual cause: {cause}.\n"
-            f"Fix: write {fix}."
+            f"Fix: {fix}."
         )
 
 
-def _check_alike(q, v):
+def _check_alike(q, v, params):
     q_structure, v_structure = jtu.tree_structure(q), jtu.tree_structure(v)
     if q_structure != v_structure:
         has = ["no names" if jtu.treedef_is_leaf(jtu.tree_structure(x)) else ", ".join(names(x)) for x in (q, v)]
         if has[0] == has[1]:
             has = [str(q_structure), str(v_structure)]
+        cause = "a coordinate missing from v, or a name written in two ways"
+        fix = "start from v = jax.tree.map(jnp.zeros_like, q)"
+        if params is not None and jtu.tree_structure(params) in (q_structure, v_structure):
+            cause = "arguments in another order, params before q or v; or a start with names and without"
+            fix = "lj.integrate(system, q0, v0, params, ts=ts); and (system, t, q, v, params) at one state"
+        elif isinstance(q, list | tuple) != isinstance(v, list | tuple) and "no names" in has:
+            cause, fix = "an array beside a list of numbers", "arrays, q0 = jnp.array([0.1, 0.2])"
         raise ValueError(
-            f"v must have the structure of q.\n  q: {has[0]}\n  v: {has[1]}\n"
-            "Usual cause: a coordinate missing from v, or a name written in two ways.\n"
-            "Fix: start from v = jax.tree.map(jnp.zeros_like, q)."
+            f"v must have the structure of q.\n  q: {has[0]}\n  v: {has[1]}\nUsual cause: {cause}.\nFix: {fix}."
         )
     for (path, a), b in zip(jtu.tree_flatten_with_path(q)[0], jtu.tree_leaves(v)):
         if a.shape != b.shape:

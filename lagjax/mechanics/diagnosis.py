@@ -146,6 +146,8 @@ def dependencies(jacobian, independent, names) -> list[tuple[str, ...]]:
 def listed(names) -> str:
     """Names in quotes, the last after "and"."""
     quoted = [f"'{name}'" for name in names]
+    if not quoted:
+        return "none"
     return quoted[0] if len(quoted) == 1 else ", ".join(quoted[:-1]) + f" and {quoted[-1]}"
 
 

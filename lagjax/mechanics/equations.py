@@ -1,7 +1,7 @@
 """The equations of a system: all that is asked of them at a state, and the one place that knows how they are solved.
 
 There are three ways. In arrays the equations are one matrix (`saddle_point.py`), or a band where the system is large
-and its parts touch few others (`sparse_saddle_point.py`): the careful way, which exchanges rows, leaves dependent
+and its parts touch few others (`sparse_saddle_point.py`): the robust way, which exchanges rows, leaves dependent
 constraints out and says what is wrong. Those of a small system are written out number by number besides
 (`written_out.py`), which is many times as fast, and NaN where that does not do.
 
@@ -19,7 +19,7 @@ import jax.tree_util as jtu
 from jax import lax
 from jaxtyping import Array, Bool, Float, PyTree
 
-from lagjax.jax_internals.one_function import called
+from lagjax.jax_internals.one_function import kept_as_call
 from lagjax.jax_internals.tracing import WATCHED
 from lagjax.mechanics import constraints, coordinates
 from lagjax.mechanics.compiled import compiled
@@ -37,7 +37,7 @@ class Equations(eqx.Module):
     """The equations of a system with its parameters, for states of one shape.
 
     `form` solves them in arrays. `written` are the same number by number, with what does not depend on the state
-    `prepared`; None of a system that is not small. `fallback`: whether programs contain the careful way for where these
+    `prepared`; None of a system that is not small. `fallback`: whether programs contain the robust way for where these
     fail. `unflatten` puts the coordinates, one by one in a small system, back into the user's structure.
     """
 
@@ -51,13 +51,13 @@ class Equations(eqx.Module):
 
     @property
     def are_written(self) -> bool:
-        """Whether the quick way exists."""
+        """Whether the fast way exists."""
         return self.written is not None
 
     @property
     def are_taken_for_regular(self) -> bool:
-        """Whether what fails the quick way gives NaN, and nothing says why."""
-        return self.written is not None and self.written.careful and not self.fallback
+        """Whether what fails the fast way gives NaN, and nothing says why."""
+        return self.written is not None and self.written.may_fail and not self.fallback
 
     def inside(self, y):
         """A position or velocity of the user's as these equations take it."""
@@ -71,12 +71,12 @@ class Equations(eqx.Module):
         """The accelerations, and the multipliers by name."""
         if self.written is None:
             return self.accelerations(t, q, v)
-        a, stacked = self.quickly(t, q, v)
-        quickly = a, constraints.split(self.system, stacked, t, q, v, self.params)
+        a, stacked = self.fast(t, q, v)
+        fast = a, constraints.split(self.system, stacked, t, q, v, self.params)
         if not self.fallback:
-            return quickly
+            return fast
         # A branch also in a batch, where it is taken for all lanes or none.
-        return lax.cond(eqxi.unvmap_all(all_finite(quickly)), lambda: quickly, lambda: self.accelerations(t, q, v))
+        return lax.cond(eqxi.unvmap_all(all_finite(fast)), lambda: fast, lambda: self.accelerations(t, q, v))
 
     def multipliers(self, t, q, v) -> dict[str, Array]:
         """The multipliers by name, one way for all states of a batch: derivatives flow through them."""
@@ -84,19 +84,19 @@ class Equations(eqx.Module):
             return {}
         return self.rates(t, q, v)[1] if self.are_taken_for_regular else self.accelerations(t, q, v)[1]
 
-    def believed(self, t, q, v) -> tuple[PyTree[Array], dict[str, Array]]:
-        """Accelerations and multipliers, NaN where they are not to be believed."""
+    def solution_or_nan(self, t, q, v) -> tuple[PyTree[Array], dict[str, Array]]:
+        """Accelerations and multipliers, NaN where they are not valid."""
         if self.written is None:
-            return _believed(self.form, self.system, t, q, v, self.params)
-        a, stacked = self.quickly(t, q, v)
-        quickly = a, constraints.split(self.system, stacked, t, q, v, self.params)
-        if not self.written.careful:
-            return quickly
-        carefully = lambda: _believed(self.form, self.system, t, q, v, self.params)
-        return lax.cond(eqxi.unvmap_all(all_finite(a)), lambda: quickly, carefully)
+            return _solution_or_nan(self.form, self.system, t, q, v, self.params)
+        a, stacked = self.fast(t, q, v)
+        fast = a, constraints.split(self.system, stacked, t, q, v, self.params)
+        if not self.written.may_fail:
+            return fast
+        robustly = lambda: _solution_or_nan(self.form, self.system, t, q, v, self.params)
+        return lax.cond(eqxi.unvmap_all(all_finite(a)), lambda: fast, robustly)
 
     def verdict(self, t, q, v) -> Verdict:
-        """Solve the equations at one state, and say whether the solution is to be believed."""
+        """Solve the equations at one state, and say whether the solution is valid."""
         if not self.are_taken_for_regular:
             return _verdict(self.form, self.system, t, q, v, self.params)
         # What speaks against one that is not regular is not told apart.
@@ -107,18 +107,18 @@ class Equations(eqx.Module):
         regular, mass = is_regular(*state)
         return Verdict(a, multipliers, finite, ~regular, jnp.asarray(False), mass)
 
-    def quickly(self, t, q, v):
+    def fast(self, t, q, v):
         """The accelerations, and the multipliers in one vector, as they are written out."""
         assert self.written is not None
-        return called(self.written.equations.at(self.prepared[0], t, q, v))
+        return kept_as_call(self.written.equations.at(self.prepared[0], t, q, v))
 
     def projected(self, t, q, v):
         """The state returned to the constraints, as it is written out; NaN where it is not near them."""
         assert self.written is not None and self.written.project is not None
-        return called(self.written.project.at(self.prepared[1], t, q, v))
+        return kept_as_call(self.written.project.at(self.prepared[1], t, q, v))
 
     def accelerations(self, t, q, v, baumgarte_rate=None, independent=None):
-        """The accelerations, and the multipliers by name, the careful way.
+        """The accelerations, and the multipliers by name, the robust way.
 
         `independent` (m,) says which constraint equations to solve with; chosen at this state if None.
         """
@@ -139,19 +139,19 @@ class Equations(eqx.Module):
         return self.form.row_sizes(*_vectors(self.system, t, q, v, self.params))
 
 
-def equations_of(system, t, q, v, params, *, quickly=False, fallback=True) -> Equations:
+def equations_of(system, t, q, v, params, *, fast=False, fallback=True) -> Equations:
     """The equations of a system, for states like this one, of which only shapes and dtypes count.
 
-    With `quickly` those of a small system are written out, too, and take states number by number (`Equations.inside`).
+    With `fast` those of a small system are written out, too, and take states number by number (`Equations.inside`).
     Without `fallback` they are taken for regular; that is settled by who asks.
     """
     written, unflatten = None, None
-    if quickly and is_small(system, t, q, v, params):
+    if fast and is_small(system, t, q, v, params):
         _, unflatten = coordinates.flatten(q)
         system, q, v = in_numbers(system, unflatten), coordinates.numbers(q), coordinates.numbers(v)
         written = _written_for(system, t, q, v, params)
     prepared = (None, None) if written is None else written.prepare(system, params)
-    fallback = fallback and written is not None and written.careful
+    fallback = fallback and written is not None and written.may_fail
     return Equations(system, params, prepared, _form(system, t, q, v, params), written, fallback, unflatten)
 
 
@@ -177,7 +177,7 @@ def _written_for(*problem) -> WrittenOut | None:
     return _written(*kind)
 
 
-# A motion is traced with and without the careful way, for its derivatives, in lanes: the equations are the same.
+# A motion is traced with and without the robust way, for its derivatives, in lanes: the equations are the same.
 @lru_cache(maxsize=64)
 def _written(structure, leaves, watched) -> WrittenOut | None:
     found = []
@@ -211,9 +211,9 @@ def _verdict(form, system, t, q, v, params) -> Verdict:
     return found._replace(a=state[-1](found.a), multipliers=by_name)
 
 
-def _believed(form, system, t, q, v, params):
+def _solution_or_nan(form, system, t, q, v, params):
     state = _vectors(system, t, q, v, params)
-    a, multipliers = form.believed(*state)
+    a, multipliers = form.solution_or_nan(*state)
     return state[-1](a), constraints.split(system, multipliers, t, q, v, params)
 
 

@@ -15,7 +15,7 @@ from lagjax.mechanics import coordinates
 from lagjax.mechanics.arguments import OF_POSITION
 from lagjax.mechanics.cartesian import AXES, leaf_names, points
 from lagjax.mechanics.diagnosis import listed
-from lagjax.mechanics.first_call import Call, check_arguments, in_words
+from lagjax.mechanics.in_words import Call, check_arguments, in_words
 from lagjax.mechanics.memory import shape_of
 
 

@@ -16,6 +16,8 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Int
 
 from lagjax.mechanics.arguments import takes_of
+from lagjax.mechanics.memory import kinds, same
+from lagjax.mechanics.pickling import check_functions
 from lagjax.mechanics.system import System
 
 MOST_SWITCHES = 16
@@ -83,6 +85,17 @@ class Switch(eqx.Module):
 
     def __repr__(self):
         return f"Switch({self.in_words()})"
+
+    def __hash__(self):
+        return hash(kinds(self))
+
+    def __eq__(self, other):
+        return isinstance(other, Switch) and same(self, other)
+
+    def __reduce_ex__(self, protocol):
+        functions = {"when": self.when, "reset": self.reset}
+        check_functions({f"{role} of the switch {self.in_words()}": f for role, f in functions.items()})
+        return super().__reduce_ex__(protocol)
 
     def value(self, t, q, v, multipliers, params):
         """The guard at one state."""
@@ -179,6 +192,12 @@ class Hybrid(eqx.Module):
                 "is the start by default."
             )
         return replace_fields(self, first=np.asarray(self.names.index(start), np.int32))
+
+    def __hash__(self):
+        return hash(kinds(self))
+
+    def __eq__(self, other):
+        return isinstance(other, Hybrid) and same(self, other)
 
     def leaving(self, phase: int) -> list[int]:
         """The numbers of the switches that end a phase."""

@@ -21,6 +21,7 @@ from lagjax.mechanics import constraints, coordinates
 from lagjax.mechanics.compiled import compiled
 from lagjax.mechanics.first_call import looked_at
 from lagjax.mechanics.reactions import force_at, response
+from lagjax.mechanics.refusals import check_system
 
 
 class Linear(NamedTuple):
@@ -131,6 +132,7 @@ def jacobi_integral(system, t, q, v, params) -> Float[Array, ""]:
 
 
 def _checked(system, t, q, v, params):
+    check_system(system, t, q, v, params)
     s = coordinates.state(t, q, v, params)
     return looked_at(system, s), s
 

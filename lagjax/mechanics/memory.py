@@ -9,6 +9,7 @@ import equinox as eqx
 import jax
 import jax.tree_util as jtu
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import PyTree
 
 T = TypeVar("T")
@@ -39,6 +40,16 @@ def kinds(tree: PyTree):
     """Structure, shapes and dtypes of a tree, and what in it is no array: what a program is compiled for."""
     leaves, structure = jtu.tree_flatten(tree)
     return structure, *((x.shape, x.dtype) if is_array(x) else (type(x), x) for x in leaves)
+
+
+def same(a: PyTree, b: PyTree) -> bool:
+    """Whether two trees are the same, their arrays by value; those that JAX is tracing by identity."""
+    if kinds(a) != kinds(b):
+        return False
+    pairs = [(x, y) for x, y in zip(jtu.tree_leaves(a), jtu.tree_leaves(b)) if x is not y and is_array(x)]
+    if any(isinstance(part, Tracer) for pair in pairs for part in pair):
+        return False
+    return all(np.array_equal(x, y, equal_nan=np.issubdtype(x.dtype, np.inexact)) for x, y in pairs)
 
 
 class Parted(NamedTuple):

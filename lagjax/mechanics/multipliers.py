@@ -17,6 +17,7 @@ from lagjax.mechanics.diagnosis import explain_failure, explain_singular, where
 from lagjax.mechanics.equations import equations_of
 from lagjax.mechanics.first_call import looked_at
 from lagjax.mechanics.outside import up_to_date
+from lagjax.mechanics.refusals import check_system
 from lagjax.mechanics.saddle_point import examined
 from lagjax.mechanics.sparse_saddle_point import Banded
 
@@ -48,12 +49,13 @@ def accelerations(system, t, q, v, params) -> tuple[PyTree[Array], dict[str, Arr
 
     Source: Goldstein, Eq. (2.24)-(2.27).
     """
+    check_system(system, t, q, v, params)
     s = coordinates.prepared(t, q, v, params)
     system = looked_at(system, s)
     # What a function closes over may be traced where nothing that is passed is.
     if not is_eager() or coordinates.is_traced((s, eqx.filter(system, eqx.is_array))):
-        equations = equations_of(lift(system, s), *s, quickly=True)
-        a, multipliers = equations.believed(s.t, equations.inside(s.q), equations.inside(s.v))
+        equations = equations_of(lift(system, s), *s, fast=True)
+        a, multipliers = equations.solution_or_nan(s.t, equations.inside(s.q), equations.inside(s.v))
         return equations.outside(a), multipliers
     equations = equations_of(system, *s)
     if isinstance(equations.form, Banded):
@@ -88,6 +90,7 @@ def constraint_force(system, t, q, v, params) -> dict[str, PyTree[Array]]:
 
     Source: Goldstein, Eq. (2.26).
     """
+    check_system(system, t, q, v, params)
     s = coordinates.state(t, q, v, params)
     _, multipliers = accelerations(system, *s)
     system = up_to_date(system)
@@ -111,7 +114,10 @@ def constraint_residual(system, t, q, v, params, level: str = "constraint") -> d
     **Raises:** `ValueError` for another level, or a constraint that returns neither scalar nor vector.
     """
     if level not in ("constraint", "velocity"):
-        raise ValueError(f'level must be "constraint" or "velocity", not {level!r}.')
+        raise ValueError(
+            f'level must be "constraint" or "velocity", not {level!r}.\nFix: leave it out, or level="velocity".'
+        )
+    check_system(system, t, q, v, params)
     s = coordinates.state(t, q, v, params)
     system = looked_at(system, s)
     return _constraint_residual(system, *s, level)

@@ -30,6 +30,7 @@ from lagjax.mechanics.first_call import looked_at
 from lagjax.mechanics.generators import Generator, as_generator
 from lagjax.mechanics.multipliers import accelerations
 from lagjax.mechanics.reactions import force_at
+from lagjax.mechanics.refusals import check_system
 from lagjax.mechanics.system import System
 
 
@@ -95,6 +96,7 @@ def noether_charge(system: System, generator) -> NoetherCharge:
 
     Source: Goldstein, §13.7; the gauge term as in Derivation 8 of its chapter 1.
     """
+    check_system(system, generator)
     return NoetherCharge(system, as_generator(generator))
 
 

@@ -4,7 +4,7 @@ A compiled program holds the values that these had when it was traced. So each p
 makes another `System`, which is traced anew. Functions are followed into those that they call, but not into installed
 packages, whose globals are constants; a class into its methods. Values that JAX is tracing are left to `closures.py`.
 
-There are two looks. `read_by` is quick, as it comes with every call: arrays beyond `WHOLE` bytes are compared by
+There are two looks. `read_by` is fast, as it comes with every call: arrays beyond `WHOLE` bytes are compared by
 identity and a sample, what has attributes by those one level deep. `meaning_of` compares everything by its content, so
 that two functions that mean the same have the same meaning, or says that it cannot.
 """
@@ -73,8 +73,8 @@ def first_alike(system: System, now: System) -> System:
 def first_guard_alike(guard: Callable) -> tuple[Callable, Hashable]:
     """The first function, or module that can be called, that means the same as `guard`, and what it reads."""
     read = read_by(guard)
-    look = lambda: meaning_of(guard) if isinstance(guard, types.FunctionType | eqx.Module) else None
-    meaning = remembered(guard, (first_guard_alike, read), look)
+    reading = lambda: meaning_of(guard) if isinstance(guard, types.FunctionType | eqx.Module) else None
+    meaning = remembered(guard, (first_guard_alike, read), reading)
     return _first_of(_guards, meaning, (guard, read), lambda first: read_by(first[0]) == first[1])
 
 
@@ -111,14 +111,14 @@ def _first_of(known, meaning, mine, is_still):
 
 def read_by(function: Callable | None) -> Hashable:
     """The values that a function reads from outside, as something to compare; () where there are none."""
-    look = _Look(whole=False)
+    reading = _Reading(whole=False)
     if isinstance(function, eqx.Module):
-        # The arrays of a module are arguments of each program, and need no look.
+        # The arrays of a module are arguments of each program, and need no reading.
         inside = [x for x in jax.tree.leaves(function) if callable(x)]
-        found = tuple(look.function(f) for f in (inspect.unwrap(type(function).__call__), *inside))
+        found = tuple(reading.function(f) for f in (inspect.unwrap(type(function).__call__), *inside))
     else:
-        found = look.function(function)
-    return found if look.changing else ()
+        found = reading.function(function)
+    return found if reading.changing else ()
 
 
 def meaning_of(function: Callable) -> Hashable | None:
@@ -127,16 +127,16 @@ def meaning_of(function: Callable) -> Hashable | None:
     None where that cannot be told: of what is traced, random generators, open files, very large or foreign objects.
     What a function returns once and another time not, by the clock or by a file, is no meaning either.
     """
-    look = _Look(whole=True)
+    reading = _Reading(whole=True)
     try:
-        found = look.function(function)
+        found = reading.function(function)
     except RecursionError:
         return None
-    return found if look.complete else None
+    return found if reading.complete else None
 
 
-class _Look:
-    """One look. Afterwards: whether anything of it can change, and whether it is complete."""
+class _Reading:
+    """One reading. Afterwards: whether anything of it can change, and whether it is complete."""
 
     def __init__(self, whole: bool):
         self.whole, self.changing, self.complete = whole, False, True

@@ -96,11 +96,11 @@ class Dense(NamedTuple):
         singular = singular | ~found.unique
         return Verdict(found.a, found.multipliers, finite, singular, against, _of_rows(found.linear.mass))
 
-    def believed(self, *state):
+    def solution_or_nan(self, *state):
         """The solution as vectors, NaN where constraints contradict each other."""
         found = _examined(*state)
-        believed = found.unique & ~jnp.any(found.contradictory)
-        return tuple(jnp.where(believed, x, jnp.nan) for x in (found.a, found.multipliers))
+        valid = found.unique & ~jnp.any(found.contradictory)
+        return tuple(jnp.where(valid, x, jnp.nan) for x in (found.a, found.multipliers))
 
     def __str__(self):
         by = "division" if self.diagonal else "elimination" if self.unknowns <= dense.ELIMINATE_UP_TO else "LAPACK"

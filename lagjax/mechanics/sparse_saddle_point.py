@@ -131,11 +131,11 @@ class Banded(NamedTuple):
         mass = _largest_inertia(plan, inertia, x)
         return Verdict(a, multipliers, finite, finite & (singular | ~solved), contradictory, mass)
 
-    def believed(self, *state):
-        """The solution as vectors, NaN where it is not to be believed."""
+    def solution_or_nan(self, *state):
+        """The solution as vectors, NaN where it is not valid."""
         found = self.verdict(*state)
-        believed = ~(found.singular | found.contradictory)
-        return tuple(jnp.where(believed, x, jnp.nan) for x in (found.a, found.multipliers))
+        valid = ~(found.singular | found.contradictory)
+        return tuple(jnp.where(valid, x, jnp.nan) for x in (found.a, found.multipliers))
 
     def __str__(self):
         return str(self.plan)

@@ -6,6 +6,8 @@ from dataclasses import fields
 import equinox as eqx
 
 from lagjax.mechanics.constraints import Holonomic, Nonholonomic
+from lagjax.mechanics.memory import kinds, same
+from lagjax.mechanics.pickling import check_functions
 
 
 class System(eqx.Module):
@@ -29,6 +31,9 @@ class System(eqx.Module):
     - `dissipation`: Rayleigh's function `R(t, q, v, params)` -> scalar; its force is `-∂R/∂v`, so
       `R = ½ c v²` gives `-c v`.
 
+    Systems of the same functions are equal, and can be static arguments of `jax.jit`. They can be pickled where their
+    functions can: those that are defined with `def` in a module.
+
     **Raises:** `TypeError` where one of these is not a function or a constraint has no kind.
 
     Source: Goldstein, *Classical Mechanics*, §1.5 (Lagrange's equations with R, Eq. 1.70) and §2.4.
@@ -48,6 +53,8 @@ class System(eqx.Module):
         force: Callable | None = None,
         dissipation: Callable | None = None,
     ):
+        if isinstance(lagrangian, System):
+            raise TypeError("this is a lj.System already.\nFix: system, in place of lj.System(system).")
         for role, function in (("lagrangian", lagrangian), ("force", force), ("dissipation", dissipation)):
             if function is not None and not callable(function):
                 raise TypeError(
@@ -55,11 +62,24 @@ class System(eqx.Module):
                     f"Fix: pass the function itself, {role}=f, not its value f(...)."
                 )
         if constraints is not None and not isinstance(constraints, Mapping):
+            apart = callable(constraints) and not isinstance(constraints, Holonomic | Nonholonomic)
             raise TypeError(
                 f"constraints must be given by name, not as {type(constraints).__name__}.\n"
-                'Fix: constraints={"rod": lj.Holonomic(g)}.'
+                + ("Usual cause: kinetic and potential energy given apart.\n" if apart else "")
+                + 'Fix: constraints={"rod": lj.Holonomic(g)}'
+                + ("; L is one function, return kinetic - potential." if apart else ".")
             )
         for name, constraint in (constraints or {}).items():
+            if not isinstance(name, str):
+                raise TypeError(
+                    f'a constraint is named {name!r}, and its name must be text.\nFix: "{name}": lj.Holonomic(g).'
+                )
+            if isinstance(constraint, float | int):
+                raise TypeError(
+                    f"constraint '{name}' is a number.\n"
+                    "Usual cause: params in the place of constraints.\n"
+                    "Fix: lj.System(lagrangian); each call takes them, lj.integrate(system, q0, v0, params, ts=ts)."
+                )
             if not isinstance(constraint, (Holonomic, Nonholonomic)):
                 raise TypeError(
                     f"constraint '{name}' is {type(constraint).__name__}; its kind is missing.\n"
@@ -79,6 +99,26 @@ class System(eqx.Module):
         for field in fields(self):
             object.__setattr__(same, field.name, values if field.name == "read" else getattr(self, field.name))
         return same
+
+    def functions(self) -> dict[str, Callable | None]:
+        """The user's functions, each by what it is."""
+        of_constraints = {
+            f"{name} of constraint '{key}'": getattr(c, name)
+            for key, c in self.constraints.items()
+            for name in [field.name for field in fields(c)]
+        }
+        others = {"the force": self.force, "the dissipation": self.dissipation}
+        return {"the Lagrangian": self.lagrangian, **of_constraints, **others}
+
+    def __hash__(self):
+        return hash(kinds(self))
+
+    def __eq__(self, other):
+        return isinstance(other, System) and same(self, other)
+
+    def __reduce_ex__(self, protocol):
+        check_functions(self.functions())
+        return super().__reduce_ex__(protocol)
 
     def __repr__(self):
         parts = [_name(self.lagrangian)]

@@ -11,7 +11,7 @@ VANISHES_BELOW = {np.dtype("float64"): 1e-10, np.dtype("float32"): 1e-4}
 
 
 class Verdict(NamedTuple):
-    """A solution of the equations at one state, as vectors or by name, and whether it is to be believed.
+    """A solution of the equations at one state, as vectors or by name, and whether it is valid.
 
     `mass`: the largest of each row of M.
     """

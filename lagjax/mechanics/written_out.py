@@ -9,7 +9,7 @@ few coordinates, as straight code on single numbers. The matrix
 is eliminated in the order in which it is written, coordinates before constraints, so that its zeros, which are known
 before anything runs, cost nothing. That is as accurate as pivoting where M is definite; where it is not, where
 constraints depend on each other, and where a state is too far from the constraints to be returned in two iterations,
-the results are NaN: a caller then does it the careful way.
+the results are NaN: a caller then does it the robust way.
 
 Source: Golub & Van Loan, *Matrix Computations*, §4.1.2 (L D Lᵀ), §4.2.7 (without pivoting where definite).
 """
@@ -47,12 +47,12 @@ SMALL_CORRECTION = 1e-7
 class WrittenOut(NamedTuple):
     """`equations(system, t, q, v, params)` -> (a, multipliers stacked); `project(same)` -> (q, v).
 
-    `careful` says whether either may give NaN where the careful way does not.
+    `may_fail` says whether either may give NaN where the robust way does not.
     """
 
     equations: Numbers
     project: Numbers | None
-    careful: bool
+    may_fail: bool
 
     def prepare(self, system, params) -> tuple[tuple | None, tuple | None]:
         """What does not depend on the state: of the equations, and of the return to the constraints."""
@@ -86,7 +86,7 @@ def write_out(system, t, q, v, params) -> WrittenOut | None:
         return None
     if equations.length > LONG:
         return None
-    return WrittenOut(equations, Numbers(_projected, args) if count else None, careful=not diagonal)
+    return WrittenOut(equations, Numbers(_projected, args) if count else None, may_fail=not diagonal)
 
 
 def _equations(diagonal, system, t, q, v, params):
@@ -98,8 +98,8 @@ def _equations(diagonal, system, t, q, v, params):
     rows = constraints.acceleration_rows(system, t, x, u, params, unflatten)
     solver = dense.Saddle(linear.mass, rows.jacobian, diagonal)
     a, multipliers, unique = with_reactions(solver.solve, linear.forcing, rows.gamma, linear.response)
-    believed = solver.believed if linear.response is None else solver.believed & unique
-    return unflatten(a if diagonal else jnp.where(believed, a, jnp.nan)), multipliers
+    valid = solver.valid if linear.response is None else solver.valid & unique
+    return unflatten(a if diagonal else jnp.where(valid, a, jnp.nan)), multipliers
 
 
 def _projected(system, t, q, v, params):
@@ -123,7 +123,7 @@ def _projected(system, t, q, v, params):
             still, -constraints.velocity_residual(system, t, x, u, params, unflatten), refine=False
         )
         u = u + last_u
-    near = solver.believed & _tiny(last_x, x) & _tiny(last_u, u)
+    near = solver.valid & _tiny(last_x, x) & _tiny(last_u, u)
     return unflatten(jnp.where(near, x, jnp.nan)), unflatten(u)
 
 

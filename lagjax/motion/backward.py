@@ -73,7 +73,7 @@ def in_either_direction(system, q0, v0, params, ts, guards, settings, backward: 
         reflect_system(system), q0, _negative(v0), params, -ts, guards, _reflect_settings(settings)
     )
     asked = reflected.asked._replace(stepsize_controller=settings.controller, jump_ts=settings.jump_ts)
-    arrays, static = pack(system, params, asked, reflected.static.how)
+    arrays, static = pack(system, params, asked, reflected.static.how._replace(backward=True))
     events = {name: replace(found, t=-found.t, v=_negative(found.v)) for name, found in reflected.events.items()}
     v, end = _negative(reflected.v), reflect_snapshot(reflected.end)
     return replace(reflected, t=ts, v=v, end=end, events=events, arrays=arrays, static=static)

@@ -28,6 +28,7 @@ from lagjax.mechanics.diagnosis import describe, listed
 from lagjax.mechanics.equations import equations_of
 from lagjax.mechanics.first_call import looked_at
 from lagjax.mechanics.lagrangian import mass_and_forcing
+from lagjax.mechanics.refusals import check_system
 from lagjax.mechanics.saddle_point import displacement_map
 from lagjax.motion.consistency import departures, stopped, within
 from lagjax.numerics import dense
@@ -71,6 +72,7 @@ def consistent_state(system, t, q, v, params, hold: str | Iterable[str] = ()):
 
     Source: Hairer, Lubich & Wanner, *Geometric Numerical Integration*, Eq. (IV.4.3).
     """
+    check_system(system, t, q, v, params)
     s = coordinates.state(t, q, v, params)
     system = looked_at(system, s)
     free = free_coordinates(s.q, hold)

@@ -5,7 +5,6 @@ space, a contact that lets go (its multiplier). `watching.py` follows its sign a
 """
 
 import inspect
-import warnings
 from collections.abc import Callable, Hashable, Mapping
 from functools import partial
 from typing import Any, NamedTuple
@@ -25,10 +24,12 @@ from lagjax.mechanics.arguments import OF_STATE, WITH_MULTIPLIERS, takes_of
 from lagjax.mechanics.closures import lift_function
 from lagjax.mechanics.constraints import zero_multipliers
 from lagjax.mechanics.coordinates import State
-from lagjax.mechanics.first_call import Call, check_arguments, in_words
+from lagjax.mechanics.in_words import Call, check_arguments, in_words
 from lagjax.mechanics.memory import is_array, kinds, remembered, shape_of
 from lagjax.mechanics.outside import first_guard_alike, read_by
+from lagjax.mechanics.pickling import check_functions
 from lagjax.mechanics.system import System
+from lagjax.mechanics.warned import warn
 
 # The operations of a guard that is compiled once for all places where it is looked at.
 LONG = 100
@@ -84,6 +85,10 @@ class Crossing(eqx.Module):
         self.direction = DIRECTIONS[direction]
         self.terminal = bool(terminal)
         self.most = 1 if terminal else most
+
+    def __reduce_ex__(self, protocol):
+        check_functions({"the guard of a crossing": self.guard})
+        return super().__reduce_ex__(protocol)
 
 
 class Crossings(eqx.Module):
@@ -267,8 +272,8 @@ def guards_of(crossings: Mapping[str, Crossing], system: System, start: State, h
     functions, of_guards = [], []
     for name, crossing in crossings.items():
         guard, read = first_guard_alike(crossing.guard) if is_eager() else (crossing.guard, read_by(crossing.guard))
-        look = partial(_looked_at, name, guard, system, start)
-        takes, multipliers, long = remembered(system, (guards_of, guard, read, kinds(start)), look)
+        examine = partial(_looked_at, name, guard, system, start)
+        takes, multipliers, long = remembered(system, (guards_of, guard, read, kinds(start)), examine)
         given = dict(zip(OF_STATE, start)) | {"multipliers": multipliers}
         functions.append(lift_function(guard, tuple(given[name] for name in takes)))
         of_crossing = crossing.direction, crossing.terminal, crossing.most
@@ -313,19 +318,17 @@ def warn_of_events(events: Mapping[str, Crossings]):
     """Warn where crossings may be missing, and where there were more than are kept."""
     for name, found in events.items():
         if bool(found.uncertain):
-            warnings.warn(
+            warn(
                 f"crossings of event '{name}' may be missing: its guard touches zero within round-off, or changes too "
                 "fast between steps to be followed.\n"
                 "Usual cause: a guard that is zero all along (a conserved quantity), grazes its surface, or oscillates "
                 "far faster than the motion.\n"
                 "Fix: shift the level of the guard a little; or let the motion take shorter steps, max_step=.",
                 EventWarning,
-                stacklevel=4,
             )
         elif int(found.count) > found.t.shape[-1] > 1:
-            warnings.warn(
+            warn(
                 f"event '{name}' happened {int(found.count)} times, and the first {found.t.shape[-1]} are kept.\n"
                 f"Fix: lj.Crossing(..., most={int(found.count)}), or terminal=True to end at the first.",
                 EventWarning,
-                stacklevel=4,
             )

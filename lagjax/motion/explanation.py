@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from typing import NamedTuple, overload
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -12,8 +13,9 @@ from lagjax.mechanics.diagnosis import dependencies, describe, equation_names, e
 from lagjax.mechanics.equations import equations_of
 from lagjax.mechanics.first_call import looked_at
 from lagjax.mechanics.hybrid import Hybrid
+from lagjax.mechanics.refusals import check_system
 from lagjax.mechanics.saddle_point import examined
-from lagjax.mechanics.structure import Structure, is_free_of_velocities, structure
+from lagjax.mechanics.structure import Structure, angles, is_free_of_velocities, structure
 from lagjax.mechanics.system import System
 from lagjax.motion.consistency import departures, to_manifold, within
 from lagjax.motion.consistent_state import consistent_state
@@ -91,6 +93,7 @@ def explain(system, t, q, v, params=None):
 
     Source: García de Jalón & Bayo, *Kinematic and Dynamic Simulation of Multibody Systems*, §3.2 (rank and freedoms).
     """
+    check_system(system, t, q, v, params, phases=True)
     s = coordinates.state(t, q, v, params)
     if isinstance(system, Hybrid):
         return explained(system, {name: _explain(phase, s) for name, phase in zip(system.names, system.systems)}, s)
@@ -114,6 +117,8 @@ def _explain(system: System, s: coordinates.State) -> Explanation:
     if place.off:
         rows.append(("off the constraints", place.off))
     rows.append(("coordinates", f"{len(names)}: {', '.join(names)}"))
+    if turned := _in_turns(system, s, names):
+        rows.append(("angles", f"in radians: {turned}; of degrees jnp.radians(...)"))
     if equations:
         kinds = {name: "position" if isinstance(c, Holonomic) else "velocity" for name, c in system.constraints.items()}
         rows.append(("constraints", ", ".join(f"'{name}' ({kind})" for name, kind in kinds.items())))
@@ -125,7 +130,7 @@ def _explain(system: System, s: coordinates.State) -> Explanation:
     if found_structure is not None:
         rows += _of_structure(found_structure)
     rows += [(name, "yes") for name in ("force", "dissipation") if getattr(system, name) is not None]
-    rows.append(("solved", _how_solved(equations_of(system, *s, quickly=True), found_structure)))
+    rows.append(("solved", _how_solved(equations_of(system, *s, fast=True), found_structure)))
     if is_free_of_velocities(system, *s):
         by = type(nystrom_for(system, s.params)).__name__
         rows.append(("velocities", f"accelerations do not depend on them: stepped by {by}"))
@@ -165,6 +170,18 @@ def _on_the_constraints(system, s) -> _Place:
     except ValueError as error:
         return _Place(s, f"by {off}, and no state near it is on them", str(error))
     return _Place(s._replace(q=q, v=v), f"by {off} as given; all that is said here is of the nearest state on them")
+
+
+def _in_turns(system, s, names):
+    """Angles of more than a turn, which may have been meant in degrees, in words."""
+    x, _ = coordinates.flatten(s.q)
+    large = np.abs(np.asarray(x)) > 2 * np.pi
+    if not large.any():
+        return ""
+    leaves = zip(jax.tree.leaves(angles(system, *s)), jax.tree.leaves(s.q))
+    is_angle = np.concatenate([np.full(np.size(leaf), angle) for angle, leaf in leaves])
+    found = [(name, float(y)) for name, y, told in zip(names, x, large & is_angle) if told]
+    return ", ".join(f"{name} = {y:.6g} is {y / (2 * np.pi):.3g} turns" for name, y in found)
 
 
 def _in_words(group):

@@ -7,13 +7,13 @@ for pictures where outputs are dense. Whether they are is seen by leaving every 
 of it is wrong by about sixteen times the error.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 
 import jax
 import numpy as np
 
 from lagjax.animation import Animation
-from lagjax.mechanics.first_call import Call, check_arguments
+from lagjax.mechanics.in_words import Call, check_arguments
 
 # Without every other output the picture may be wrong by this share of its size: with all of them by a hundredth.
 MAY_MISS = 0.16
@@ -25,19 +25,69 @@ def film(
     traj, positions: Callable, seconds: float | None, rate: float, trail: float, ended_by_event: bool
 ) -> Animation:
     """The frames of one trajectory, as they are drawn."""
-    check_arguments(Call("positions", positions, ("t", "q", "params")), "an argument left out that is not needed")
+    _check_positions(positions)
     t, q, v = _reached(traj, ended_by_event)
-    seconds = float(np.clip(abs(t[-1] - t[0]), SHORTEST, LONGEST)) if seconds is None else seconds
+    at, kept = _frames(t[0], t[-1], seconds, rate, trail)
+    points = drawn(positions, at, hermite(t, q, v, at), traj.params)
+    _check_dense(positions, t, q, v, traj.params, points)
+    return Animation(at, points, rate, kept)
+
+
+def film_of_lanes(
+    trajs: list, positions: Callable, seconds: float | None, rate: float, trail: float, by_event: Sequence[bool]
+) -> tuple[np.ndarray, dict[str, np.ndarray], int]:
+    """The frames of several trajectories (None: of a lane without one) at shared times, as `animation.film` takes them.
+
+    A motion that ends before the others stays where it ended; one that does not come to three outputs is NaN.
+    """
+    _check_positions(positions)
+    lanes = []
+    for traj, ended in zip(trajs, by_event):
+        try:
+            lanes.append(None if traj is None else _reached(traj, ended))
+        except ValueError:
+            lanes.append(None)
+    ends = [(lane[0][0], lane[0][-1]) for lane in lanes if lane is not None]
+    if not ends:
+        raise ValueError("no point has a motion to draw.\nUsual cause: all failed at their start; see swept.counts().")
+    backward = ends[0][1] < ends[0][0]
+    first, last = (max, min) if backward else (min, max)
+    at, kept = _frames(first(start for start, _ in ends), last(end for _, end in ends), seconds, rate, trail)
+    found = []
+    for traj, lane in zip(trajs, lanes):
+        if traj is None or lane is None:
+            found.append(None)
+            continue
+        t, q, v = lane
+        here = np.clip(at, min(t[0], t[-1]), max(t[0], t[-1]))
+        found.append(drawn(positions, here, hermite(t, q, v, here), traj.params))
+        _check_dense(positions, t, q, v, traj.params, found[-1])
+    like = next(points for points in found if points is not None)
+    nothing = {name: np.full_like(x, np.nan) for name, x in like.items()}
+    found = [nothing if points is None else points for points in found]
+    shapes = {tuple((name, x.shape) for name, x in points.items()) for points in found}
+    if len(shapes) != 1:
+        raise ValueError(
+            "positions(t, q, params) must return the same points for all motions.\n"
+            "Fix: return points of one shape for each name, without if."
+        )
+    return at, {name: np.stack([points[name] for points in found]) for name in like}, kept
+
+
+def _check_positions(positions):
+    check_arguments(Call("positions", positions, ("t", "q", "params")), "an argument left out that is not needed")
+
+
+def _frames(start, end, seconds, rate, trail):
+    """The times of the frames, and how many the trail keeps."""
+    seconds = float(np.clip(abs(end - start), SHORTEST, LONGEST)) if seconds is None else seconds
     count = round(seconds * rate) + 1 if np.isfinite(seconds * rate) else 0
     if count < 2 or not trail >= 0:
         raise ValueError(
             f"seconds = {seconds:g} at rate = {rate:g} frames a second, with a trail of {trail:g} s, is no film.\n"
             "Fix: traj.animate(positions, seconds=10.0), and a trail of zero or more seconds."
         )
-    at = np.linspace(t[0], t[-1], count)
-    points = drawn(positions, at, hermite(t, q, v, at), traj.params)
-    _check_dense(positions, t, q, v, traj.params, points)
-    return Animation(at, points, rate, int(min(trail * rate, count)))
+    return np.linspace(start, end, count), int(min(trail * rate, count))
 
 
 def hermite(t, q, v, at):

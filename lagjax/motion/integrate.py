@@ -13,27 +13,32 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, PyTree
 
-from lagjax.jax_internals.tracing import WATCHED, is_eager
+from lagjax.jax_internals.tracing import SILENT, WATCHED, is_eager
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.closures import lift
 from lagjax.mechanics.first_call import looked_at, with_known_kinds
 from lagjax.mechanics.hybrid import Hybrid, phases_of
+from lagjax.mechanics.refusals import by_name, check_system
 from lagjax.mechanics.system import System
 from lagjax.motion import problem
 from lagjax.motion.arriving import WHOLE_STEPS
 from lagjax.motion.backward import in_either_direction, runs_backward
 from lagjax.motion.crossings import Crossing, crossings_of, guards_of, left_to_diffrax, warn_of_events
+from lagjax.motion.dense_output import at
 from lagjax.motion.failure import raise_failure
 from lagjax.motion.global_error import steps_to_repeat
 from lagjax.motion.no_lanes import raise_at_run_time
 from lagjax.motion.replay import Replay
 from lagjax.motion.reported import patient, report
-from lagjax.motion.slips import warn_of_float32, warn_of_odd_dissipation
+from lagjax.motion.slips import warn_of_odd_dissipation
 from lagjax.motion.solve import Settings
 from lagjax.motion.switching import each_phase, phases_in, refuse_beside_switches, starting
-from lagjax.motion.trajectory import ENDED_WELL, Trajectory, is_among
+from lagjax.motion.trajectory import BY_INTEGRATION, ENDED_WELL, Trajectory, is_among
+
+BY_INTEGRATION["at"] = at
 
 
+@by_name("lj.integrate(system, q0, v0, params, ts=ts)", "ts")
 def integrate(
     system: System | Hybrid,
     q0: PyTree[ArrayLike],
@@ -70,8 +75,9 @@ def integrate(
     **Main arguments:**
 
     - `system`: the `System`; or a `Hybrid`, a motion in phases.
-    - `q0`, `v0`: initial coordinates and velocities, any pytree of float arrays, alike; `[q]`, `[q]/[t]`. A start
-      that is off the constraints by no more than about the tolerance is moved onto them.
+    - `q0`, `v0`: initial coordinates and velocities, any pytree of numbers and arrays, alike; `[q]`, `[q]/[t]`. Whole
+      numbers become floats. A list is a pytree, not a vector; angles are in radians. A start that is off the
+      constraints by no more than about the tolerance is moved onto them.
     - `params`: what the Lagrangian takes; gradients flow to its floating arrays.
     - `ts` (T,): output times, `[t]`, increasing or, to run backward, decreasing. Each is the end of a step of the
       method, not an interpolation. (Decreasing times have to be known while JAX is tracing: a NumPy array.)
@@ -130,23 +136,23 @@ def integrate(
       tolerances or leaves fewer than three digits; without an estimate, where the Jacobi integral must be constant
       and changed by 1000 tolerances, or by less over thousands of steps, or by 1e-5 with fixed steps. In lanes look at
       that.
-    - Warns of what is hardly ever meant: a `dissipation` that is odd in v, as a force is; once, float32 by default.
+    - Warns of what is hardly ever meant: a `dissipation` that is odd in v, as a force is; once in a process
+      (`lj.PrecisionWarning`), float32 because nothing else was asked for.
 
     Order and accuracy: those of `method`; `tests/motion/test_orders.py` measures them.
 
     Source: Hairer & Wanner, *Solving ODEs II*, §VII.2 (projection); Kidger, arXiv:2202.02435 (diffrax).
     """
-    problem.check_system(system)
+    check_system(system, q0, v0, params, phases=True)
     problem.check_method(method)
     problem.check_controller(stepsize_controller, max_step, jump_ts)
-    ts = coordinates.numpy_of(ts).asarray(ts)
-    t0 = ts[0] if ts.ndim == 1 and ts.size else 0.0
-    state = coordinates.prepared(t0, q0, v0, params)
+    problem.check_max_steps(max_steps)
+    ts = problem.vector_of_times(ts)
+    state = coordinates.prepared(ts[0], q0, v0, params)
     dtype = state.t.dtype
     system = each_phase(starting(system, start), lambda phase: looked_at(phase, state))
     if is_eager():
         state = with_known_kinds(phases_of(system)[0], state)
-    warn_of_float32(dtype, q0, v0)
     for phase in phases_of(system):
         warn_of_odd_dissipation(phase.dissipation, state)
     if isinstance(system, Hybrid):
@@ -188,7 +194,7 @@ def _raise_or_warn(trajectory, start, settings):
     """Raise or warn in the user's words; while tracing, at run time with the result's own message."""
     if coordinates.is_traced(trajectory):
         # Who watches is told by the report.
-        return trajectory if WATCHED.value else raise_at_run_time(trajectory)
+        return trajectory if WATCHED.value or SILENT.value else raise_at_run_time(trajectory)
     result = trajectory.result
     if not is_among(result, ENDED_WELL):
         raise_failure(trajectory, start, settings)

@@ -88,7 +88,7 @@ class Way(NamedTuple):
     events: dict[str, Crossings]
     end: Snapshot
     stats: dict[str, Array]
-    seen: Array
+    sizes_so_far: Array
     least: Array
     scaled_error: Float[Array, ""]
     settled: Bool[Array, ""]
@@ -152,8 +152,8 @@ def _first_leg(hybrid, q0, v0, params, ts, phase, settings):
     return Way(
         t=ts[0], q=q0, v=v0, phase=jnp.asarray(hybrid.first, jnp.int32), going=jnp.asarray(True), rows=rows,
         switches=switches, events=nothing(phase.guards, phase.events, q0, v0, start.multipliers), end=start,
-        stats=stats, seen=_sizes(q0, v0), least=least, scaled_error=jnp.zeros((), dtype), settled=jnp.asarray(True),
-        result=RESULTS.successful,
+        stats=stats, sizes_so_far=_sizes(q0, v0), least=least, scaled_error=jnp.zeros((), dtype),
+        settled=jnp.asarray(True), result=RESULTS.successful,
     )  # fmt: skip
 
 
@@ -166,7 +166,7 @@ def _leg(hybrid, i, mine, way: Way, params, ts, phase: Phase, settings, adjoint)
     ahead = jnp.where(place == 0, way.t, ts[jnp.minimum(place + past - 1, ts.shape[0] - 1)])
     times = jnp.where(mine, ahead, way.t)
     settings = settings if system.constraints else replace(settings, drift="none")
-    found = apart(solved, system, way.q, way.v, params, times, phase.guards, settings, adjoint, way.seen)
+    found = apart(solved, system, way.q, way.v, params, times, phase.guards, settings, adjoint, way.sizes_so_far)
     result, end, onward = found["result"], found["end"], jnp.asarray(False)
     after, target, switches = After(way.q, way.v, jnp.asarray(False)), way.phase, way.switches
     if phase.guards is not None and phase.switches:
@@ -191,7 +191,7 @@ def _leg(hybrid, i, mine, way: Way, params, ts, phase: Phase, settings, adjoint)
         events=with_those_of(found["events"], way.events),
         end=_where(onward, end._replace(q=after.q, v=after.v), end),
         stats={name: n + found["stats"][name] for name, n in way.stats.items()},
-        seen=jnp.maximum(way.seen, _sizes(end.q, end.v)), least=least,
+        sizes_so_far=jnp.maximum(way.sizes_so_far, _sizes(end.q, end.v)), least=least,
         scaled_error=jnp.maximum(way.scaled_error, found["scaled_error"]),
         settled=way.settled & found["settled"], result=result,
     )  # fmt: skip

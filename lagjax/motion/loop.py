@@ -24,7 +24,7 @@ from lagjax.motion.crossing_times import Located, at_known_times, first_end, loc
 from lagjax.motion.recording import Problem, Recorded, with_room
 from lagjax.motion.replay import Replay, replayed
 from lagjax.motion.sight import Sight
-from lagjax.motion.stepping import Field, OnManifold, QuickField, forward_differentiable
+from lagjax.motion.stepping import FastField, Field, OnManifold, forward_differentiable
 from lagjax.motion.tolerances import Scales, Tolerances, Weighing, as_nothing
 from lagjax.motion.watching import Watching
 from lagjax.numerics.nystrom import Nystrom
@@ -89,19 +89,19 @@ def _followed(adjoint, settings):
 def _loop(equations, start, y0, refused, scales, settings, ts, adjoint, guards=None, repeated=False):
     adjoint = _followed(adjoint, settings)
     feedback = BAUMGARTE_DECAYS / (ts[-1] - ts[0]) if settings.drift == "baumgarte" else None
-    quick, written = None, equations.written
+    fast, written = None, equations.written
     if written is not None and feedback is None:
         unrolled = written.equations.length <= settings.unroll_up_to
-        quick = settings.method if unrolled else _in_a_loop(settings.method, adjoint)
+        fast = settings.method if unrolled else _in_a_loop(settings.method, adjoint)
     # BacksolveAdjoint integrates a larger state backwards: it takes the bare method, and no end beside the outputs.
     bare = isinstance(adjoint, diffrax.BacksolveAdjoint)
     settings = eqx.tree_at(lambda s: s.method, settings, _with_root_finder(settings, scales))
     controller = _controller(equations, start, ts, settings, scales, bare, repeated)
-    terms = diffrax.ODETerm(Field(equations, feedback) if quick is None else QuickField(equations))
+    terms = diffrax.ODETerm(Field(equations, feedback) if fast is None else FastField(equations))
     if bare:
         solver, saveat = settings.method, diffrax.SaveAt(ts=ts)
     else:
-        solver = _solver(equations, quick, feedback, refused, settings, adjoint)
+        solver = _solver(equations, fast, feedback, refused, settings, adjoint)
         subs = diffrax.SubSaveAt(ts=ts), diffrax.SubSaveAt(t1=True)
         saveat = diffrax.SaveAt(subs=subs, controller_state=guards is not None)
     if guards is not None:
@@ -189,11 +189,11 @@ def _with_root_finder(settings, scales):
     return with_tolerances(method, *tolerances)
 
 
-def _solver(equations, quick, feedback, refused, settings, adjoint):
+def _solver(equations, fast, feedback, refused, settings, adjoint):
     return OnManifold(
         solver=_in_a_loop(settings.method, adjoint),
         equations=equations,
-        quick=quick,
+        fast=fast,
         feedback=feedback,
         refused=refused,
         tolerances=Tolerances(settings.rtol, settings.atol),

@@ -33,7 +33,7 @@ DRIFT_TOLERANCES = 1e3
 PHASE_STEPS = 0.2
 # With fixed steps no tolerance says how much is expected.
 FIXED_STEPS_ALLOW = 1e-5
-# What the careful way would say, too.
+# What the robust way would say, too.
 THE_SAME = RESULTS.max_steps_reached, RESULTS.start_off_constraints, RESULTS.tolerance_too_small, RESULTS.unordered
 # What diffrax reports, in the words of a motion.
 TRANSLATED = {
@@ -43,21 +43,21 @@ TRANSLATED = {
 }
 
 
-def solved(system, q0, v0, params, ts, guards, settings, adjoint, seen=None):
+def solved(system, q0, v0, params, ts, guards, settings, adjoint, sizes_so_far=None):
     """The fields of the trajectory of one system, by name, and whether it is settled.
 
     `seen` (2, n): how large coordinates and velocities have been before, where this is not the first leg of a motion.
     """
     ours = isinstance(settings.method, (ExplicitRungeKutta, Nystrom))
     # A condition that asks diffrax evaluates the vector field at the state that it gets, the user's.
-    quickly = ours and settings.event is None
-    equations = equations_of(system, ts[0], q0, v0, params, quickly=quickly, fallback=settings.careful)
+    fast = ours and settings.event is None
+    equations = equations_of(system, ts[0], q0, v0, params, fast=fast, fallback=settings.robust)
     if guards is not None and equations.unflatten is not None:
         guards = guards.in_numbers(equations.unflatten)
     q, v = equations.inside(q0), equations.inside(v0)
-    _, atol = tolerances_at(State(ts[0], q, v, params), ts, settings, seen)
+    _, atol = tolerances_at(State(ts[0], q, v, params), ts, settings, sizes_so_far)
     settings = replace(settings, atol=atol)
-    start = _start(equations, q, v, ts, settings, seen)
+    start = _start(equations, q, v, ts, settings, sizes_so_far)
     solution = _stepped(equations, start, ts, guards, settings, adjoint)
     outputs = _outputs(equations, start, solution, ts, settings)
     fields = _result(equations, start, solution, outputs, guards, settings)
@@ -92,7 +92,7 @@ class Outputs(NamedTuple):
     reached: Bool[Array, " T"]
 
 
-def _start(equations: Equations, q, v, ts, settings, seen) -> Start:
+def _start(equations: Equations, q, v, ts, settings, sizes_so_far) -> Start:
     """What speaks against a start comes in rising order: the last of what holds is the result."""
     t, off_constraints, holds = ts[0], jnp.asarray(False), jnp.asarray(True)
     if equations.system.constraints:
@@ -102,8 +102,8 @@ def _start(equations: Equations, q, v, ts, settings, seen) -> Start:
         q, v, holds = returned(equations, t, q, v, settings.rtol, settings.atol)
     a, _, finite, singular, contradictory, mass = stopped(equations.verdict(t, q, v))
     scales = scales_of(mass, *stopped((q, v)), a, stopped(span_of(ts))) if settings.by_size else None
-    if scales is not None and seen is not None:
-        scales = scales._replace(first=jnp.maximum(scales.first, seen))
+    if scales is not None and sizes_so_far is not None:
+        scales = scales._replace(first=jnp.maximum(scales.first, sizes_so_far))
     too_small = settings.controller is None and settings.rtol[0] < ROUND_OFFS * jnp.finfo(ts.dtype).eps
     lengths = [settings.max_step, *([] if settings.dt0 is None else [settings.dt0])]
     against = {

@@ -238,7 +238,7 @@ def last_known(sign, signs):
 class Next(NamedTuple):
     """Where to look next, see `Search`; or which guards are found to turn at an end that is known."""
 
-    look: Bool[Array, ""]
+    needed: Bool[Array, ""]
     at: Float[Array, ""]
     asked: Int[Array, ""]
     curvature: Float[Array, ""]
@@ -246,7 +246,7 @@ class Next(NamedTuple):
     turns_right: tuple[Bool[Array, ""], ...]
 
 
-def next_look(left_end: Node, right_end: Node, times, of_guards, resolution) -> Next:
+def next_node(left_end: Node, right_end: Node, times, of_guards, resolution) -> Next:
     """Where to look for the first guard in doubt, in its first piece in doubt: at the extremum, or halfway."""
     none, halfway = jnp.asarray(False), left_end.t + 0.5 * (right_end.t - left_end.t)
     found = Next(jnp.asarray(True), halfway, jnp.asarray(-1), jnp.ones_like(halfway), (), ())
@@ -264,7 +264,7 @@ def next_look(left_end: Node, right_end: Node, times, of_guards, resolution) -> 
             turns_left[i], turns_right[i] = turns_left[i] | at_left, turns_right[i] | at_right
             inside = turning & ~(at_left | at_right)
             found = found._replace(
-                look=found.look & ~(at_left | at_right),
+                needed=found.needed & ~(at_left | at_right),
                 at=jnp.where(inside, at, found.at),
                 asked=jnp.where(inside, i, found.asked),
                 curvature=jnp.where(inside, (right - left) / length, found.curvature),

@@ -1,10 +1,10 @@
 """The questions that `integrate` asks of its arguments before it starts, in the user's words."""
 
-import warnings
 from functools import lru_cache
 from typing import Any
 
 import diffrax
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -12,6 +12,7 @@ from lagjax.mechanics import coordinates
 from lagjax.mechanics.coordinates import State
 from lagjax.mechanics.hybrid import Hybrid, phases_of
 from lagjax.mechanics.system import System
+from lagjax.mechanics.warned import warn
 from lagjax.motion.account import account_of, warning_of
 from lagjax.motion.consistency import departures
 from lagjax.motion.global_error import ROUND_OFFS
@@ -24,15 +25,6 @@ DEFAULT_TOLERANCE = {np.dtype("float64"): 1e-9, np.dtype("float32"): 1e-5}
 PACKAGES = {"diffrax": "diffrax.", "lagjax": "lj."}
 # Starts that cannot be integrated, whose reason is in the equations.
 REFUSED = (RESULTS.start_not_finite, RESULTS.start_singular, RESULTS.contradictory)
-
-
-def check_system(system: Any):
-    """Raise where `system` is not a `System`."""
-    if not isinstance(system, System | Hybrid):
-        raise TypeError(
-            f"the first argument must be a lj.System, not {type(system).__name__}.\n"
-            "Fix: system = lj.System(lagrangian)."
-        )
 
 
 def check_method(method: Any):
@@ -60,6 +52,12 @@ def check_method(method: Any):
 
 def check_adjoint(adjoint: Any, drift: str, jump_ts: Any, recorded: bool):
     """Raise where an adjoint cannot follow the motion; `recorded`: whether its steps can be, by lagjax."""
+    if adjoint is not None and not isinstance(adjoint, diffrax.AbstractAdjoint | Replay):
+        raise TypeError(
+            f"adjoint must be lj.Replay() or an adjoint of diffrax, not {_kind(adjoint)}.\n"
+            "Usual cause: the brackets left out, or an adjoint by its name.\n"
+            "Fix: leave adjoint out (both modes then work), or adjoint=diffrax.RecursiveCheckpointAdjoint()."
+        )
     if isinstance(adjoint, Replay) and adjoint.memory is not None and not recorded:
         raise ValueError(
             "the memory of lj.Replay is for a record of steps, which is not kept with a stepsize_controller, a "
@@ -78,13 +76,30 @@ def check_adjoint(adjoint: Any, drift: str, jump_ts: Any, recorded: bool):
         )
 
 
+def check_max_steps(max_steps: Any):
+    """Raise where the largest number of steps is none."""
+    if max_steps is None or isinstance(max_steps, int | np.integer) and max_steps > 0:
+        return
+    raise ValueError(
+        f"max_steps must be a whole number above zero, not {max_steps!r}.\n"
+        "Usual cause: 1e6, which is a float.\n"
+        "Fix: max_steps=10**6, or leave it out."
+    )
+
+
+def _kind(thing):
+    return f"the class {thing.__name__}" if isinstance(thing, type) else type(thing).__name__
+
+
 def check_drift(drift: Any, system: System | Hybrid) -> str:
     """The drift control to use; raise where it is unknown."""
     constrained = any(phase.constraints for phase in phases_of(system))
     if drift is None:
         return "project" if constrained else "none"
     if drift not in ("project", "baumgarte", "none"):
-        raise ValueError(f'drift must be "project", "baumgarte" or "none", not {drift!r}.')
+        raise ValueError(
+            f'drift must be "project", "baumgarte" or "none", not {drift!r}.\nFix: leave it out, or drift="project".'
+        )
     return drift if constrained else "none"
 
 
@@ -92,6 +107,12 @@ def check_controller(controller: Any, max_step: Any, jump_ts: Any):
     """Raise where steps are to be limited that a controller of the user's chooses."""
     if controller is None:
         return
+    if not isinstance(controller, diffrax.AbstractStepSizeController):
+        raise TypeError(
+            f"stepsize_controller must be a controller of diffrax, not {_kind(controller)}.\n"
+            "Usual cause: the brackets left out, or a controller by its name.\n"
+            "Fix: leave it out, or stepsize_controller=diffrax.PIDController(rtol=1e-9, atol=1e-9)."
+        )
     for name, given, fix in (
         ("max_step", max_step, "stepsize_controller=diffrax.PIDController(rtol=1e-9, atol=1e-9, dtmax=0.1)"),
         ("jump_ts", jump_ts, "stepsize_controller=diffrax.ClipStepSizeController(controller, jump_ts=jump_ts)"),
@@ -103,15 +124,27 @@ def check_controller(controller: Any, max_step: Any, jump_ts: Any):
             )
 
 
-def times(ts: Any, dtype):
-    """`ts` as an increasing or decreasing vector of `dtype`, or an error."""
-    ts = coordinates.numpy_of(ts).asarray(ts)
-    if np.ndim(ts) != 1 or np.shape(ts)[0] < 2:
+def vector_of_times(ts: Any):
+    """`ts` as an array of two or more numbers, or an error."""
+    given, ts = ts, coordinates.numpy_of(ts).asarray(ts)
+    real = jnp.issubdtype(ts.dtype, jnp.floating) or jnp.issubdtype(ts.dtype, jnp.integer)
+    if real and ts.ndim == 1 and not isinstance(ts.shape[0], int):
         raise ValueError(
-            f"ts must be a vector of at least two times, and has shape {np.shape(ts)}.\n"
+            f"the number of output times must be known when a motion is exported, and is {ts.shape[0]}.\n"
+            "Fix: as many times as are ever needed, jax.ShapeDtypeStruct((1000,), float)."
+        )
+    if not real or ts.ndim != 1 or len(ts) < 2:
+        of = f"has shape {ts.shape}" if real else f"is {given!r:.60}"
+        raise ValueError(
+            f"ts must be a vector of at least two times, and {of}.\n"
             "Usual cause: the last time alone; the motion starts at ts[0] with (q0, v0).\n"
             "Fix: ts=jnp.linspace(0.0, 10.0, 101)."
         )
+    return ts
+
+
+def times(ts: Any, dtype):
+    """A vector of times as an increasing or decreasing one of `dtype`, or an error."""
     ts = ts.astype(dtype)
     if not coordinates.is_traced(ts):
         if not np.all(np.isfinite(ts)):
@@ -134,10 +167,10 @@ def step_length(value: Any, name: str, dtype):
     """`dt0` or `max_step` as a number of `dtype`, or an error where it is not positive; None where it is not given."""
     if value is None:
         return None
-    if not coordinates.is_traced(value) and not (np.ndim(value) == 0 and float(value) > 0):
+    if not coordinates.is_traced(value) and not (_is_number(value) and float(value) > 0):
         fixed = ", or with fixed steps dt0=1e-3 for example" if name == "dt0" else ", or max_step=0.1 for example"
         raise ValueError(
-            f"{name} must be one positive number, not {value}.\n"
+            f"{name} must be one positive number, not {value!r}.\n"
             "Usual cause: a step against the time; it is a length also where ts decreases.\n"
             f"Fix: leave {name} out{fixed}."
         )
@@ -160,6 +193,10 @@ def jumps(jump_ts: Any, dtype):
     return jnp.atleast_1d(jnp.asarray(jump_ts, dtype)) if np.prod(shape) else None
 
 
+def _is_number(value):
+    return isinstance(value, int | float | np.ndarray | np.generic | jax.Array) and np.ndim(value) == 0
+
+
 def _holds_traced(times):
     return isinstance(times, (list, tuple)) and coordinates.is_traced(times)
 
@@ -170,9 +207,11 @@ def tolerance(value: Any, name: str, dtype):
     value = DEFAULT_TOLERANCE.get(dtype, 1e-2) if value is None else value
     if isinstance(value, (tuple, list)) and coordinates.is_traced(value):
         value = jnp.stack([jnp.asarray(x, dtype) for x in value])
-    if np.ndim(value) and np.shape(value) != (2,):
+    is_text = isinstance(value, str) or not isinstance(value, jax.Array) and np.asarray(value).dtype.kind not in "fiu"
+    if is_text or np.ndim(value) and np.shape(value) != (2,):
+        of = f"is {value!r:.40}" if is_text else f"has shape {np.shape(value)}"
         raise ValueError(
-            f"{name} must be one number, or two: for coordinates and for velocities. Its shape is {np.shape(value)}.\n"
+            f"{name} must be one number, or two: for coordinates and for velocities. It {of}.\n"
             f"Fix: {name}=1e-9, or {name}=(1e-9, 1e-6)."
         )
     if coordinates.is_traced(value):
@@ -188,7 +227,7 @@ def _tolerance(value, name, dtype):
 
 def _check_tolerance(value, name, dtype):
     if not value >= 0:
-        raise ValueError(f"{name} must be a number >= 0, not {value}.")
+        raise ValueError(f"{name} must be a number >= 0, not {value}.\nFix: {name}=1e-9, or leave it out.")
     floor = ROUND_OFFS * float(jnp.finfo(dtype).eps)
     if name == "rtol" and value < floor:
         single = dtype == np.dtype("float32")
@@ -206,7 +245,11 @@ def check_finite(s: State):
         values = np.asarray(coordinates.flatten(tree)[0])
         for name, value in zip(coordinates.names(tree), values):
             if not np.isfinite(value):
-                raise ValueError(f"coordinate '{name}' of {which} is {value}.\nFix: start from finite numbers.")
+                raise ValueError(
+                    f"coordinate '{name}' of {which} is {value}.\n"
+                    "Usual cause: a division by zero, or a measurement that is missing.\n"
+                    "Fix: start from finite numbers."
+                )
 
 
 def off_constraints(system: System, s: State, rtol, atol) -> str:
@@ -232,7 +275,7 @@ def warn_of_inaccuracy(trajectory):
         return
     estimated = trajectory.error is not None and account_of(trajectory) is not None
     words = warning_of(trajectory) if estimated else _of_drift(trajectory)
-    warnings.warn(words, AccuracyWarning, stacklevel=4)
+    warn(words, AccuracyWarning)
 
 
 def _of_drift(trajectory):

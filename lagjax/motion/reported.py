@@ -38,7 +38,7 @@ class Report(NamedTuple):
 
 
 class Settled(NamedTuple):
-    """Whether a motion that was taken for regular would be the same with the careful way."""
+    """Whether a motion that was taken for regular would be the same with the robust way."""
 
     settled: Bool[Array, ""]
 

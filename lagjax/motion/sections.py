@@ -24,6 +24,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 from lagjax import plot
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.hybrid import Hybrid
+from lagjax.mechanics.refusals import by_name
 from lagjax.mechanics.system import System
 from lagjax.motion.accuracy import angle_mask
 from lagjax.motion.crossings import Crossing, Crossings, crossings_of
@@ -155,6 +156,7 @@ class PoincareSection(eqx.Module):
         return "\n".join(["Poincaré section", *(f"  {label:<10}  {value}" for label, value in rows)])
 
 
+@by_name("lj.poincare(system, q0, v0, params, section=section, ts=ts)", "section", "ts")
 def poincare(
     system: System | Hybrid,
     q0: PyTree[ArrayLike],

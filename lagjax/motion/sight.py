@@ -34,7 +34,7 @@ class Sight(eqx.Module):
         multipliers = self.motion.rates(t, y)[1] if self.guards.take_multipliers else {}
         return self.guards(t, *y, multipliers, args)
 
-    def seen(self, left: Node, right: Node, args):
+    def sample(self, left: Node, right: Node, args):
         """The guards at `right`; the ends of the pieces between the two nodes; and each guard at the inner ones, by the
         quintic and by the cubics."""
         h = right.t - left.t

@@ -4,30 +4,26 @@ A force given in place of Rayleigh's function R is odd in the velocities, R(-v) 
 takes, v·∂R/∂v, then changes its sign with v, so that it gives to one motion what it takes of the reversed one, which no
 dissipation does. That R is not even is not enough: in a medium that moves with w it is ½ c (v - w)², which has a part
 of each kind, and is right.
-
-In single precision, which is JAX's default, a motion has seven digits at most.
 """
 
-import warnings
 import weakref
 from types import FunctionType
 
 import jax
 import jax.numpy as jnp
-import jax.tree_util as jtu
 import numpy as np
 
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.coordinates import State
+from lagjax.mechanics.warned import warn
 
 # Round-off of an R of some terms, in units of the last place.
 ROUND_OFFS = 100
 # Functions that were looked at and found in order: 1 ms a call is saved.
 _in_order = weakref.WeakSet()
-_told_of_float32 = []
 
 
-def warn_of_odd_dissipation(dissipation, state: State, stacklevel: int = 2) -> None:
+def warn_of_odd_dissipation(dissipation, state: State) -> None:
     """Warn where R changes its sign with the velocities. Nothing is looked at while JAX traces."""
     known = isinstance(dissipation, FunctionType) and dissipation in _in_order
     if dissipation is None or known or coordinates.is_traced(state):
@@ -43,13 +39,13 @@ def warn_of_odd_dissipation(dissipation, state: State, stacklevel: int = 2) -> N
     if there != 0 and abs(there + back) <= ROUND_OFFS * float(jnp.finfo(t.dtype).eps) * abs(there):
         name = getattr(dissipation, "__name__", "f")
         name = "f" if name == "<lambda>" else name
-        warnings.warn(
+        warn(
             "dissipation R(t, q, v, params) changes its sign with v, R(-v) = -R(v): it gives as much energy to one "
             "motion as it takes of the reversed one.\n"
             "Usual cause: a force given in place of Rayleigh's function R, whose force is -∂R/∂v.\n"
             f"Fix: force={name}, if -c v is meant as a force; or R = 0.5 c v², whose force is -c v. Friction of "
             "constant size has R = c |v|.",
-            stacklevel=stacklevel + 1,
+            UserWarning,
         )
     elif isinstance(dissipation, FunctionType):
         _in_order.add(dissipation)
@@ -61,20 +57,3 @@ def _moving(v):
     usual = np.max(np.abs(flat)) or 1.0
     irregular = usual * (0.5 + np.modf(0.6180339887 * np.arange(1, len(flat) + 1))[0])
     return unflatten(jnp.asarray(np.where(np.asarray(flat) == 0, irregular, flat), flat.dtype))
-
-
-def warn_of_float32(dtype, q0, v0, stacklevel: int = 2) -> None:
-    """Warn once a process where JAX is left in single precision, and no start of NumPy's float32 asks for it."""
-    left_off = jax.dtypes.canonicalize_dtype(np.float64) == np.float32
-    if _told_of_float32 or jnp.finfo(dtype).bits > 32 or not left_off:
-        return
-    if any(isinstance(x, (np.ndarray, np.generic)) and x.dtype == np.float32 for x in jtu.tree_leaves((q0, v0))):
-        return
-    _told_of_float32.append(True)
-    warnings.warn(
-        "JAX computes in float32, as it does unless told otherwise: seven digits at most, tolerances of 1e-5 in place "
-        "of 1e-9, and derivatives and fits with fewer digits yet.\n"
-        'Fix: jax.config.update("jax_enable_x64", True) before the first array. Where float32 is meant, on a GPU for '
-        "example, start from np.float32 arrays. This is told once.",
-        stacklevel=stacklevel + 1,
-    )

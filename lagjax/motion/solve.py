@@ -73,7 +73,7 @@ class Settings:
     # Of the record for reverse mode, in bytes; None for the usual one.
     memory: float | None = eqx.field(static=True, default=None)
     # False where the equations are taken for regular, until that turns out to be wrong.
-    careful: bool = eqx.field(static=True, default=True)
+    robust: bool = eqx.field(static=True, default=True)
     # The operations of a right-hand side that is copied to each of a method's stages.
     unroll_up_to: int = eqx.field(static=True, default=UNROLL_UP_TO)
 
@@ -82,7 +82,7 @@ def trajectory_of(*problem) -> Trajectory:
     """The trajectory of a system, q0, v0, params, ts, guards, and settings; what went wrong is recorded in its result.
 
     Where nothing is traced, the equations are first taken for regular, which compiles in two thirds of the time and is
-    all that most systems need; where that fails, the careful way is compiled too, and kept to. Equinox's wrapper of
+    all that most systems need; where that fails, the robust way is compiled too, and kept to. Equinox's wrapper of
     `jit` takes longer than a short motion; it has better words for the checks that it puts into a program.
     """
     if not is_eager():
@@ -108,7 +108,7 @@ def _inside(*problem):
     *motion, settings = problem
     # An adjoint that was asked for is there to be differentiated through.
     regular = takes_for_regular() and settings.adjoint is None
-    settings = replace(settings, careful=not regular)
+    settings = replace(settings, robust=not regular)
     found, settled = _trajectory_of(*motion, settings)
     if settings.repeated_up_to:
         again = lambda closer: _trajectory_of(*stopped(motion), closer)[0]
@@ -118,22 +118,22 @@ def _inside(*problem):
 
 class _Programs:
     """The compiled programs of one kind of motion: of equations taken for regular (None where they are not), and with
-    the careful way. JAX keeps them as long as this object lives."""
+    the robust way. JAX keeps them as long as this object lives."""
 
     def __init__(self, static, count, progress):
         jit = partial(jax.jit, compiler_options=compiler_options())
         self.regular: Callable | None = jit(partial(_of_arrays, static, False, count))
-        self.careful: Callable = jit(partial(_of_arrays, static, True, count))
+        self.robust: Callable = jit(partial(_of_arrays, static, True, count))
         self._count, self._progress, self._compiled = count, progress, set()
 
     def run(self, arrays, count, settled=False):
-        """The trajectory with so many outputs; where it is not settled, by the careful way, but if `settled`."""
+        """The trajectory with so many outputs; where it is not settled, by the robust way, but if `settled`."""
         if self.regular is not None:
             found, rows, well = self._called(self.regular, arrays)
             if settled or well:
                 return self._first_outputs(found, rows, count)
             self.regular = None
-        found, rows, _ = jax.block_until_ready(self._called(self.careful, arrays))
+        found, rows, _ = jax.block_until_ready(self._called(self.robust, arrays))
         return self._first_outputs(found, rows, count)
 
     def _called(self, program, arrays):
@@ -153,10 +153,10 @@ class _Programs:
         return replace(found, **jax.device_put(jtu.tree_map(lambda x: np.asarray(x)[:count], rows)))
 
 
-def _of_arrays(static, careful, count, arrays):
+def _of_arrays(static, robust, count, arrays):
     """The trajectory with the number of outputs that was asked for first, all outputs, and whether it is settled."""
     *motion, settings = static.together(arrays)
-    found, settled = _trajectory(*motion, replace(settings, careful=careful, unroll_up_to=UNROLL_AT_ONCE_UP_TO))
+    found, settled = _trajectory(*motion, replace(settings, robust=robust, unroll_up_to=UNROLL_AT_ONCE_UP_TO))
     rows = found.rows()
     return replace(found, **jtu.tree_map(lambda x: x[:count], rows)), rows, settled
 
@@ -182,8 +182,8 @@ def _trajectory(system, q0, v0, params, ts, guards, settings):
         rest, settings = eqx.combine(fixed, static)
         *motion, jump_ts = eqx.combine(x, rest)
         unroll_up_to = 0 if differentiated else settings.unroll_up_to
-        careful = settings.careful or differentiated and settings.adjoint is None
-        settings = replace(settings, jump_ts=jump_ts, unroll_up_to=unroll_up_to, careful=careful)
+        robust = settings.robust or differentiated and settings.adjoint is None
+        settings = replace(settings, jump_ts=jump_ts, unroll_up_to=unroll_up_to, robust=robust)
         fields = solve(*motion, settings, adjoint)
         return fields, fields.pop("record", None)
 

@@ -18,7 +18,7 @@ from jax import lax
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, PyTree
 
-from lagjax.jax_internals.one_function import called
+from lagjax.jax_internals.one_function import kept_as_call
 from lagjax.mechanics.equations import Equations, all_finite
 from lagjax.motion.arriving import between_jumps
 from lagjax.motion.consistency import to_manifold
@@ -42,23 +42,23 @@ class Stages(NamedTuple):
 
 
 class Field(eqx.Module):
-    """d(q, v)/dt = (v, a), the careful way; with Baumgarte's feedback, if there is a rate of it."""
+    """d(q, v)/dt = (v, a), the robust way; with Baumgarte's feedback, if there is a rate of it."""
 
     equations: Equations
     feedback: Float[Array, ""] | None = None
 
     def __call__(self, t, y, args):
         independent = args.independent if isinstance(args, Stages) else None
-        return y[1], called(self.equations.accelerations(t, *y, self.feedback, independent))[0]
+        return y[1], kept_as_call(self.equations.accelerations(t, *y, self.feedback, independent))[0]
 
 
-class QuickField(eqx.Module):
-    """The same from the equations written out, which may give NaN where the careful way does not."""
+class FastField(eqx.Module):
+    """The same from the equations written out, which may give NaN where the robust way does not."""
 
     equations: Equations
 
     def __call__(self, t, y, args):
-        return y[1], self.equations.quickly(t, *y)[0]
+        return y[1], self.equations.fast(t, *y)[0]
 
 
 class OnManifold(diffrax.AbstractWrappedSolver):
@@ -68,7 +68,7 @@ class OnManifold(diffrax.AbstractWrappedSolver):
     says that steps are chosen by the tolerances. `arriving` says that outputs are wanted at the ends of steps only.
     `jump_ts` become ends of steps by the controller; here each step stays on its side of them.
 
-    The equations belong to the solver, since diffrax hands an interpolation only times and states; by `quick`, the same
+    The equations belong to the solver, since diffrax hands an interpolation only times and states; by `fast`, the same
     method, it steps on those that are written out. `feedback` is the rate of Baumgarte's. Where `refused`, and where a
     step is not finite, its error is infinite: an adaptive solve ends within a few steps at the smallest step size, one
     with fixed steps at once.
@@ -76,7 +76,7 @@ class OnManifold(diffrax.AbstractWrappedSolver):
 
     solver: diffrax.AbstractSolver
     equations: Equations
-    quick: diffrax.AbstractSolver | None
+    fast: diffrax.AbstractSolver | None
     feedback: Float[Array, ""] | None
     refused: Bool[Array, ""]
     tolerances: Tolerances
@@ -112,13 +112,13 @@ class OnManifold(diffrax.AbstractWrappedSolver):
 
     @property
     def terms(self) -> diffrax.AbstractTerm:
-        """The vector field the careful way."""
+        """The vector field the robust way."""
         return diffrax.ODETerm(Field(self.equations, self.feedback))
 
     @property
-    def quick_terms(self) -> diffrax.AbstractTerm:
+    def fast_terms(self) -> diffrax.AbstractTerm:
         """The vector field as it is written out."""
-        return diffrax.ODETerm(QuickField(self.equations))
+        return diffrax.ODETerm(FastField(self.equations))
 
     def _between(self, *, t0, t1, y0, y1=None, state=None):
         if self.arriving:
@@ -135,14 +135,14 @@ class OnManifold(diffrax.AbstractWrappedSolver):
         return self.solver.error_order(terms)
 
     def init(self, terms, t0, t1, y0, args):
-        if self.quick is not None:
-            return self.quick.init(self.quick_terms, t0, t1, y0, args)
+        if self.fast is not None:
+            return self.fast.init(self.fast_terms, t0, t1, y0, args)
         return self.solver.init(self.terms, t0, t1, y0, self._stages(t0, y0))
 
     def func(self, terms, t0, y0, args):
         # Only used to choose the first step, which has to be finite even where the motion is refused.
-        if self.quick is not None:
-            rate = self.quick_terms.vf(t0, y0, args)
+        if self.fast is not None:
+            rate = self.fast_terms.vf(t0, y0, args)
         else:
             rate = self.solver.func(self.terms, t0, y0, self._stages(t0, y0))
         return jtu.tree_map(lambda f: jnp.where(self.refused | ~jnp.isfinite(f), 0.0, f), rate)
@@ -150,7 +150,7 @@ class OnManifold(diffrax.AbstractWrappedSolver):
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         if self.jump_ts is not None:
             t0, t1, made_jump = between_jumps(t0, t1, self.jump_ts, made_jump)
-        if self.quick is None:
+        if self.fast is None:
             y1, error, solver_state, result = self._careful_step(t0, t1, y0, solver_state, made_jump)
         else:
             y1, error, solver_state, result = self._quick_step(t0, t1, y0, solver_state, made_jump)
@@ -168,22 +168,22 @@ class OnManifold(diffrax.AbstractWrappedSolver):
     # Jitted, so that it is traced once: diffrax traces the body of its loop three times.
     @eqx.filter_jit
     def _quick_step(self, t0, t1, y0, solver_state, made_jump):
-        quick, terms = self.quick, self.quick_terms
-        assert quick is not None
+        fast, terms = self.fast, self.fast_terms
+        assert fast is not None
         jumped = True if self.project else made_jump
-        y1, error, _, solver_state, result = quick.step(terms, t0, t1, y0, None, solver_state, jumped)
+        y1, error, _, solver_state, result = fast.step(terms, t0, t1, y0, None, solver_state, jumped)
         if self.project:
             y1 = self.equations.projected(t1, *y1)
         if not self.equations.fallback:
             return y1, error, solver_state, result
-        believed = all_finite((y1, error))
+        valid = all_finite((y1, error))
 
         def again():
             y1, error, _, result = self._careful_step(t0, t1, y0, None, True)
-            return y1, error, quick.init(terms, t1, t1, y1, None), result
+            return y1, error, fast.init(terms, t1, t1, y1, None), result
 
         # A branch also in a batch, where it is taken for all lanes or none.
-        return lax.cond(eqxi.unvmap_all(believed), lambda: (y1, error, solver_state, result), again)
+        return lax.cond(eqxi.unvmap_all(valid), lambda: (y1, error, solver_state, result), again)
 
     def _careful_step(self, t0, t1, y0, solver_state, made_jump):
         # The projection moves the state, so a derivative kept from the last step's end is stale.
@@ -200,17 +200,17 @@ class OnManifold(diffrax.AbstractWrappedSolver):
         return y1, error, solver_state, result
 
     def again(self, t0, t1, y0):
-        """The end of an accepted step by what is known at its start, and whether it was taken so, or carefully."""
-        if self.quick is None:
-            return self.again_carefully(t0, t1, y0), jnp.asarray(True)
+        """The end of an accepted step by what is known at its start, and whether it was taken so, or robustly."""
+        if self.fast is None:
+            return self.again_robustly(t0, t1, y0), jnp.asarray(True)
         if self.jump_ts is not None:
             t0, t1, _ = between_jumps(t0, t1, self.jump_ts, True)
-        y1, error, *_ = self.quick.step(self.quick_terms, t0, t1, y0, None, None, True)
+        y1, error, *_ = self.fast.step(self.fast_terms, t0, t1, y0, None, None, True)
         y1 = self.equations.projected(t1, *y1) if self.project else y1
         return y1, all_finite((y1, error))
 
-    def again_carefully(self, t0, t1, y0):
-        """The end of an accepted step the careful way."""
+    def again_robustly(self, t0, t1, y0):
+        """The end of an accepted step the robust way."""
         if self.jump_ts is not None:
             t0, t1, _ = between_jumps(t0, t1, self.jump_ts, True)
         return self._careful_step(t0, t1, y0, None, True)[0]
@@ -263,14 +263,14 @@ class SteppedTo(Interpolation):
 
     def at(self, t):
         s = self.solver
-        # Three places of diffrax's program ask, and each is compiled: the careful step alone takes a third of the time
+        # Three places of diffrax's program ask, and each is compiled: the robust step alone takes a third of the time
         # of both, and costs little at run time, since most outputs are ends of steps.
         t0, made_jump = self.t0, False
         if s.jump_ts is not None:
             t0, t, made_jump = between_jumps(t0, t, s.jump_ts, made_jump)
         y, error, _, result = s._careful_step(t0, t, self.y0, self.state, made_jump)
-        believed = (result == diffrax.RESULTS.successful) & s.acceptable(self.y0, y, error)
-        return jtu.tree_map(lambda x: jnp.where(believed, x, jnp.nan), y)
+        valid = (result == diffrax.RESULTS.successful) & s.acceptable(self.y0, y, error)
+        return jtu.tree_map(lambda x: jnp.where(valid, x, jnp.nan), y)
 
 
 def forward_differentiable(method):

@@ -114,7 +114,7 @@ def stopped_early(trajectory, settings) -> str:
         "throw=False",
     )
     if settings.controller is None:
-        steps, path = look(trajectory, settings), _Path(trajectory)
+        steps, path = last_steps(trajectory, settings), _Path(trajectory)
         cause, fix = _jump(path, steps) or _singularity(path, steps) or (cause, fix)
     return (
         f"{what}: {RESULTS[trajectory.result]} The last state is {describe(end.q)}{_fastest(trajectory)}.\n"
@@ -131,7 +131,7 @@ def _used_up(trajectory, settings):
         missing = abs(float(trajectory.t[-1] - end.t)) / rate if rate > 0 else np.inf
         cause, fix = "steps that are short for the span", "longer steps"
     else:
-        steps, path = look(trajectory, settings), _Path(trajectory)
+        steps, path = last_steps(trajectory, settings), _Path(trajectory)
         rate, missing = steps.rate, steps.missing
         cause, fix = _jump(path, steps) or _singularity(path, steps) or _fast(path, steps) or SPAN
     if not missing < TOO_MANY:
@@ -150,7 +150,7 @@ def _rounded_up(count):
     return int(-(-count // unit) * unit)
 
 
-def look(trajectory, settings) -> Steps:
+def last_steps(trajectory, settings) -> Steps:
     """Take up the motion where it ended, and put down each step."""
     system, params, end = trajectory.system, trajectory.params, trajectory.end
     state = (end.t, end.q, end.v, params)

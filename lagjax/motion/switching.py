@@ -17,8 +17,8 @@ from lagjax.mechanics.arguments import OF_STATE, takes_of
 from lagjax.mechanics.closures import lift_function
 from lagjax.mechanics.constraints import zero_multipliers
 from lagjax.mechanics.coordinates import State
-from lagjax.mechanics.first_call import Call, check_arguments, in_words
 from lagjax.mechanics.hybrid import Hybrid, Switch, replace_fields
+from lagjax.mechanics.in_words import Call, check_arguments, in_words
 from lagjax.mechanics.memory import shape_of
 from lagjax.mechanics.outside import first_guard_alike, read_by
 from lagjax.mechanics.system import System

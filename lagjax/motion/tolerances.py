@@ -61,7 +61,7 @@ class Scales(NamedTuple):
     first: Float[Array, "2 n"]
 
 
-def tolerances_at(start, ts, settings, seen=None) -> Tolerances:
+def tolerances_at(start, ts, settings, sizes_so_far=None) -> Tolerances:
     """The tolerances of a whole state, for constraints, which see coordinates together: as given, or by the start.
 
     `seen` (2, n): how large coordinates and velocities have been before it.
@@ -69,7 +69,10 @@ def tolerances_at(start, ts, settings, seen=None) -> Tolerances:
     if not settings.by_size:
         return Tolerances(settings.rtol, settings.atol)
     sizes = jnp.abs(_rows(start.q, start.v))
-    span, (of_q, of_v) = span_of(ts), jnp.max(sizes if seen is None else jnp.maximum(sizes, seen), axis=1)
+    span, (of_q, of_v) = (
+        span_of(ts),
+        jnp.max(sizes if sizes_so_far is None else jnp.maximum(sizes, sizes_so_far), axis=1),
+    )
     of_q = jnp.where(of_q > 0, of_q, jnp.where(of_v > 0, of_v * span, 1.0))
     return Tolerances(settings.rtol, stopped(settings.rtol * jnp.stack([of_q, jnp.maximum(of_v, of_q / span)])))
 

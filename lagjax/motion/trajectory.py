@@ -1,6 +1,7 @@
 """The answer of an integration: times, states, multipliers, and how it went."""
 
-from collections.abc import Callable
+import os
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import diffrax
@@ -8,57 +9,30 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, PyTree
+from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from lagjax import plot
 from lagjax.animation import Animation
-from lagjax.mechanics import coordinates
+from lagjax.mechanics import coordinates, packed
 from lagjax.mechanics.compiled import compiled
-from lagjax.mechanics.structure import angles, what_changes_jacobi_integral
+from lagjax.mechanics.packed import Packed
+from lagjax.mechanics.signature import UnknownSystem, known_system
+from lagjax.mechanics.structure import what_changes_jacobi_integral
 from lagjax.mechanics.system import System
-from lagjax.motion import account, frames
-from lagjax.motion.accuracy import Errors
+from lagjax.motion import frames, printed
+from lagjax.motion.accuracy import Errors, angle_mask
 from lagjax.motion.charges import panels
 from lagjax.motion.consistency import worst_residual
 from lagjax.motion.crossings import Crossings
 from lagjax.motion.curves import curves, finite
-
-
-# For checkers equinox's enumerations are Python's, of which none can have more items than its parent.
-class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
-    """How an integration or a fit ended: diffrax's results, and what they have no word for."""
-
-    start_off_constraints = "The initial state does not satisfy the constraints."
-    contradictory = "Constraints that depend on each other ask for different accelerations at the initial state."
-    start_not_finite = "L, the accelerations or the multipliers are not finite at the initial state."
-    start_singular = "The accelerations are not determined at the initial state: the equations are singular there."
-    not_finite = "The state became NaN or infinite."
-    unsolved_step = (
-        "A step could not be solved, could not be returned to the constraints, or lost the state in its error."
-    )
-    tolerance_too_small = "The tolerance is below the round-off of the state's dtype."
-    unordered = (
-        "The times do not increase throughout, or dt0 or max_step is not positive. (Times that decrease are taken "
-        "where they are known while JAX is tracing: a NumPy array.)"
-    )
-    drifted = (
-        "The motion was computed, but its error, or the change of what must stay constant, is above what is allowed."
-    )
-    not_converged = "The search of a fit, or of a periodic orbit, did not converge."
-    not_estimated = (
-        "The error was not estimated: it was not asked for, and the motion takes more than 20,000 steps; or how to "
-        "shorten the steps of its controller is not known."
-    )
-    misfit = "The residuals of a fit are no errors of measurement: they contradict sigma, or follow a curve."
-    too_many_switches = "There were more switches than most_switches."
-    guard_not_seen = "A guard is below zero, and was not seen to cross it: its phase began on it, and hardly left it."
-    guard_below_zero = "A guard of the first phase is below zero at the start."
-    reset_not_finite = "The state after a switch is NaN or infinite."
-
-
-# Diffrax has no words for a success, and equinox no other place for them.
-RESULTS._index_to_message[int(RESULTS.successful._value)] = "successful"
-ENDED_WELL = RESULTS.successful, RESULTS.event_occurred
+from lagjax.motion.labelled import dataset
+from lagjax.motion.results import ENDED_WELL as ENDED_WELL
+from lagjax.motion.results import RESULTS as RESULTS
+from lagjax.motion.results import ended_well as ended_well
+from lagjax.motion.results import in_words as in_words
+from lagjax.motion.results import is_among as is_among
+from lagjax.motion.results import message as message
+from lagjax.motion.saving import save
 
 
 class AccuracyWarning(UserWarning):
@@ -78,13 +52,15 @@ class How(NamedTuple):
     """How a motion was stepped through.
 
     `order`: of the error that chooses steps; `evaluations`: of the equations in a step, None for an implicit method;
-    `steps`: chosen by the "tolerance" (in several "legs" of a motion), "fixed", or by the user's "controller".
+    `steps`: chosen by the "tolerance" (in several "legs" of a motion), "fixed", or by the user's "controller";
+    `backward`: in time.
     """
 
     method: str
     order: int
     evaluations: int | None
     steps: str
+    backward: bool = False
 
 
 class Asked(NamedTuple):
@@ -101,22 +77,16 @@ class Asked(NamedTuple):
 class Static(NamedTuple):
     """What of a trajectory is not an array: it must be hashable, so that JAX can carry it along."""
 
-    parts: tuple
-    structure: object
+    rest: Packed
     how: How
 
     @property
     def method(self) -> str:
         return self.how.method
 
-    def __reduce__(self):
-        # Equinox knows a marker in the structure by its identity, which a copy of the structure would lose.
-        return _static, (jax.tree.unflatten(self.structure, self.parts), self.how)
 
-
-def _static(tree, how):
-    parts, structure = jax.tree.flatten(tree)
-    return Static(tuple(parts), structure, how)
+# What stands on the integrator, which makes trajectories, and so above this file: it is put here by `integrate.py`.
+BY_INTEGRATION: dict[str, Callable] = {}
 
 
 class Trajectory(eqx.Module):
@@ -159,6 +129,11 @@ class Trajectory(eqx.Module):
 
     @property
     def system(self) -> System:
+        return known_system(self.any_system)
+
+    @property
+    def any_system(self) -> System | UnknownSystem:
+        """The system; of a trajectory from a file that was read without it what the file says of it."""
         return self._problem()[0]
 
     @property
@@ -170,8 +145,7 @@ class Trajectory(eqx.Module):
         return self._problem()[2]
 
     def _problem(self):
-        static = jax.tree.unflatten(self.static.structure, self.static.parts)
-        return eqx.combine(self.arrays, static)
+        return self.static.rest.together(self.arrays)
 
     def rows(self) -> dict:
         """What there is of each output, by the names of the fields."""
@@ -190,6 +164,61 @@ class Trajectory(eqx.Module):
         if not self.system.constraints:
             return jnp.zeros_like(self.scaled_error)
         return _worst_residual(self.system, self.t, self.q, self.v, self.params)
+
+    def at(self, t: ArrayLike) -> Snapshot:
+        """Return the motion at any time, at the order of its method: continued from the output before by its own steps.
+
+        >>> import lagjax as lj
+        >>> fall = lj.System(lambda t, q, v, params: 0.5 * v**2 - params["g"] * q)
+        >>> traj = lj.integrate(fall, 0.0, 3.0, {"g": 10.0}, ts=[0.0, 0.5])
+        >>> now = traj.at([0.1, 0.2])
+        >>> print(now.q.round(9), now.v.round(9))
+        [0.25 0.4 ] [2. 1.]
+
+        **Arguments:** `t`: a time or an array of them, of any shape and in any order, `[t]`, between the first output
+        and the end of the motion.
+
+        **Returns:** a `Snapshot` (`t`, `q`, `v`, `multipliers`), each leaf with the shape of `t` in front; on the
+        constraints. At an output it is that output. Of a batch the axes of the batch come first. It is differentiable
+        in `t` and in all that the motion is. Under `jit` and in a batch it is NaN where there is no motion.
+
+        Each time costs a short solve from the output before it: with outputs as dense as steps, a step.
+
+        **Raises:** `ValueError` for a time outside of the motion, or after its end by an event or a failure; for
+        outputs off the constraints (`drift="none"`), and steps of a controller that has a plan for the whole motion.
+        """
+        return BY_INTEGRATION["at"](self, t)
+
+    def save(self, path: str | os.PathLike) -> None:
+        """Write the motion into a file, an npz; `lj.load_trajectory(path, system)` reads it, bit for bit.
+
+        The functions of the system are not in it. Whoever is stopped while it is written leaves the file of before.
+
+        **Raises:** `TypeError` for what is no data in `params` or in the structure of q, by name; `OSError` where there
+        is no such folder.
+        """
+        save(self, path)
+
+    def to_xarray(self, dims: Sequence[str] | None = None):
+        """Return the motion as an `xarray.Dataset`.
+
+        >>> import lagjax as lj
+        >>> fall = lj.System(lambda t, q, v, params: 0.5 * v["y"] ** 2 - params["g"] * q["y"])
+        >>> traj = lj.integrate(fall, {"y": 0.0}, {"y": 3.0}, {"g": 10.0}, ts=[0.0, 0.2, 0.5])
+        >>> data = traj.to_xarray()
+        >>> print(data["q.y"].dims, data["q.y"].sel(t=0.2).item(), data.attrs["params.g"])
+        ('t',) 0.4 10.0
+
+        Variables are named as here: `q.y`, `v.y`, with their estimated errors as `error.q.y`, and multipliers as their
+        constraints. Their dimensions are `t` and, of a coordinate that is an array, `y_0` and so on. `result`, `end`
+        and the numbers of steps come with them; the method, tolerances and parameters are attributes.
+
+        **Arguments:** `dims`: the names of a batch's axes, which come first; by default "batch", or "batch_0" and so
+        on. The parameters of a batch are variables.
+
+        **Raises:** `ImportError` without xarray; `ValueError` for another number of names than of axes.
+        """
+        return dataset(self, dims)
 
     def plot(self, charges=False):
         """Plot coordinates, velocities and multipliers against time; returns a matplotlib `Figure`.
@@ -212,9 +241,7 @@ class Trajectory(eqx.Module):
         """
         lanes = jax.tree.map(lambda x: np.asarray(x).reshape(-1, *x.shape[self.t.ndim - 1 :]), self)
         lanes = [jax.tree.map(lambda x: x[i], lanes) for i in range(len(lanes.t))]
-        first = jax.tree.map(lambda x: x[0], (lanes[0].t, lanes[0].q, lanes[0].v))
-        of_leaves = angles(lanes[0].system, *first, lanes[0].params)
-        is_angle = coordinates.flatten(jax.tree.map(lambda yes, x: np.full(x.shape, yes), of_leaves, first[1]))[0]
+        is_angle = angle_mask(lanes[0])
         pairs = [(curves(lane.q), curves(lane.v)) for lane in lanes]
         drawn = {name: [finite(q[name], v[name]) for q, v in pairs] for name in pairs[0][0]}
         return plot.phase_portrait({name: (drawn[name], bool(yes)) for name, yes in zip(drawn, is_angle)})
@@ -230,7 +257,7 @@ class Trajectory(eqx.Module):
         >>> start = {"x": 0.0, "y": 0.0}, {"x": 1.0, "y": 5.0}
         >>> traj = lj.integrate(stone, *start, {"g": 10.0}, ts=jnp.linspace(0.0, 1.0, 11))
         >>> traj.animate(lambda t, q, params: (q["x"], q["y"]))
-        Animation of 51 frames, 2 s, 5 kB: plays in a notebook, and with .save("motion.html") in a browser
+        Animation of 51 frames, 2 s, 8 kB: plays in a notebook, and with .save("motion.html") in a browser
 
         **Arguments:**
 
@@ -251,6 +278,9 @@ class Trajectory(eqx.Module):
 
     def _of_system(self):
         """What a line each says of the system and its events."""
+        of_events = [(f"event '{name}'", crossings.in_words()) for name, crossings in self.events.items()]
+        if isinstance(self.any_system, UnknownSystem):
+            return [("system", repr(self.any_system)), *of_events]
         found = []
         if self.system.constraints:
             found.append(("worst constraint residual", f"{float(self.residual()):.1e} (relative)"))
@@ -258,7 +288,7 @@ class Trajectory(eqx.Module):
         changed_by = next(what_changes_jacobi_integral(self.system, *first, self.params), None)
         as_it_may = "" if changed_by is None else f"; need not be conserved: {changed_by}"
         found.append(("change of the Jacobi integral", f"{float(self.drift()):.1e} (relative){as_it_may}"))
-        return found + [(f"event '{name}'", crossings.in_words()) for name, crossings in self.events.items()]
+        return found + of_events
 
     def _check_alone(self, call):
         if self.t.ndim != 1:
@@ -271,7 +301,7 @@ class Trajectory(eqx.Module):
         if coordinates.is_traced(self):
             return f"Trajectory({self.static.method}, being traced, t: {self.t.shape})"
         lanes = self.t.shape[:-1]
-        return "\n".join(_batch_lines(self, lanes) if lanes else _lines(self))
+        return "\n".join(printed.batch_lines(self, lanes) if lanes else printed.lines(self))
 
 
 @eqx.filter_jit
@@ -295,98 +325,8 @@ def worst_drift(system, t, q, v, params):
 
 def pack(system, params, asked: Asked, how: How) -> tuple[PyTree, Static]:
     """Split (system, params, asked) into arrays and hashable rest."""
-    arrays, static = eqx.partition((system, params, asked), eqx.is_array)
-    return arrays, _static(static, how)
-
-
-def ended_well(result) -> Bool[Array, "..."]:
-    """Whether a motion was computed to its end or its event."""
-    return (result == RESULTS.successful) | (result == RESULTS.event_occurred)
-
-
-def is_among(result, others) -> bool:
-    """Whether a result that is known is one of some others; without JAX, which takes ten times as long."""
-    return int(result._value) in [int(other._value) for other in others]
-
-
-def message(result) -> str:
-    """A result in words."""
-    if is_among(result, [RESULTS.event_occurred]):
-        return "ended by its event"
-    return RESULTS[result]
-
-
-def in_words(code) -> str:
-    """A result's number in words."""
-    return message(_item(RESULTS.successful, code))
-
-
-def _lines(traj):
-    rows = [
-        ("method", f"{traj.static.method}, rtol {_pair(traj.tolerance[0])}, atol {_absolute(traj.tolerance[1])}"),
-        ("result", message(traj.result) + _ended(traj)),
-        *account.of_cost(traj),
-        *(account.of_error(traj) or _not_estimated(traj)),
-    ]
-    rows += traj._of_system()
-    if float(traj.scaled_error) > 1:
-        rows.append(("WARNING", f"the error is {float(traj.scaled_error):.2g} times what the tolerance lets expect"))
-    rows += _shape_rows(traj)
-    return ["Trajectory", *_aligned(rows)]
-
-
-def _not_estimated(traj):
-    if traj.error is None or is_among(traj.error.result, ENDED_WELL):
-        return []
-    return [("error", message(traj.error.result))]
-
-
-def _pair(tolerance):
-    of_q, of_v = (f"{float(value):.3g}" for value in np.asarray(tolerance))
-    return of_q if of_q == of_v else f"{of_q} (q), {of_v} (v)"
-
-
-def _absolute(atol):
-    return _pair(atol) if np.ndim(atol) == 1 else "by size"
-
-
-def _batch_lines(traj, lanes):
-    values, counts = np.unique(np.asarray(traj.result._value), return_counts=True)
-    words = [f"{n} {message(_item(traj.result, v))}" for v, n in zip(values, counts)]
-    steps, drifted = np.asarray(traj.stats["num_steps"]), int(np.sum(np.asarray(traj.scaled_error) > 1))
-    rows = [
-        ("method", traj.static.method),
-        ("lanes", " x ".join(map(str, lanes))),
-        ("results", "; ".join(words)),
-        *([("WARNING", f"{drifted} lanes are less accurate than the tolerance lets expect")] if drifted else []),
-        ("steps a lane", f"{steps.min()} to {steps.max()}, {int(steps.sum())} in all" if steps.size else "no lanes"),
-        *_shape_rows(traj),
-    ]
-    return ["Trajectory, a batch", *_aligned(rows)]
-
-
-def _item(result, value):
-    return eqx.tree_at(lambda r: r._value, result, jnp.asarray(value))
-
-
-def _ended(traj):
-    first, last, end = *np.asarray(traj.t)[[0, -1]], float(traj.end.t)
-    return "" if abs(end - first) >= abs(last - first) else f" (at t = {end:.9g} of {last:.6g})"
-
-
-def _shape_rows(traj):
-    rows = [("outputs", f"{traj.t.shape[-1]} times, {traj.t.dtype}")]
-    for label, tree in (("q, v", traj.q), ("multipliers", traj.multipliers)):
-        leaves = jax.tree_util.tree_leaves_with_path(tree)
-        if leaves:
-            shown = [f"{jax.tree_util.keystr(p, simple=True, separator='.')} {x.shape}".strip() for p, x in leaves]
-            rows.append((label, ", ".join(shown)))
-    return rows
-
-
-def _aligned(rows):
-    width = max(len(label) for label, _ in rows)
-    return [f"  {label:<{width}}  {value}" for label, value in rows]
+    arrays, rest = packed.pack((system, params, asked))
+    return arrays, Static(rest, how)
 
 
 @compiled

@@ -52,7 +52,7 @@ from lagjax.motion.pieces import (
     changes,
     first_root,
     last_known,
-    next_look,
+    next_node,
 )
 from lagjax.motion.sight import Sight
 
@@ -86,7 +86,7 @@ class Move(NamedTuple):
     turns_left: tuple[Bool[Array, ""], ...]
 
 
-class Seen(NamedTuple):
+class Segment(NamedTuple):
     """The guards between the last part's end and this one's: see `Pieces`; the signs that are believed, and the first
     root that is wanted."""
 
@@ -215,7 +215,7 @@ class Watching(diffrax.AbstractStepSizeController):
         right = self.sight.unseen(t)._replace(y=y, a=a)
         turns = [x & (t == part.turns_at) for x in part.turns]
         right = right._replace(values=tuple(v._replace(turns=x) for v, x in zip(right.values, turns)))
-        values, times, inner = apart(self.sight.seen, left, right, args)
+        values, times, inner = apart(self.sight.sample, left, right, args)
         right = right._replace(values=values)
         of_guards = apart(self.sight.judged, left, right, inner)
         doubts = [_any(p.doubt) for p in of_guards]
@@ -235,45 +235,45 @@ class Watching(diffrax.AbstractStepSizeController):
             # Where a root is sought, those of other guards on the way there.
             others = [[c & (part.root.guard != i) for c in mine] for i, mine in enumerate(crosses)]
             root = apart(partial(first_root, kinds), times, of_guards, signs, others)
-            seen = Seen(left, right, times, of_guards, doubts, signs, root)
+            segment = Segment(left, right, times, of_guards, doubts, signs, root)
             of_guards_now = zip(watched.followed, values, kinds)
             first = tuple(f._replace(sign=self.sight.first_sign(value, kind)) for f, value, kind in of_guards_now)
-            ways = (apart(way, seen, watched, until) for way in (self._toward_root, self._looked))
+            ways = (apart(way, segment, watched, until) for way in (self._toward_root, self._looked))
             move = _where(part.root.guard >= 0, *ways)
             return _where(begins, Move(nothing[0], until, part, first, nothing, nothing, nothing), move)
 
         return lax.cond(eqxi.unvmap_all(calm | ~keep), lambda: onward, closer), a, values
 
-    def _looked(self, seen: Seen, watched: Watched, until) -> Move:
+    def _looked(self, segment: Segment, watched: Watched, until) -> Move:
         """Settle what is between two nodes, or say where to look next; where a guard crosses, go to the root."""
-        part, left, right, no = watched.part, seen.left, seen.right, (jnp.asarray(False),) * len(self.kinds)
+        part, left, right, no = watched.part, segment.left, segment.right, (jnp.asarray(False),) * len(self.kinds)
         again, at_extremum, turns, followed = apart(self._at_extremum, right, left, part, watched.followed, until)
         right = right._replace(values=tuple(v._replace(turns=v.turns | x) for v, x in zip(right.values, turns)))
         given_up = part.looks >= LOOKS
         # By halves down to the resolution of time: a jump, whose place is then known.
         narrow = right.t - left.t <= NARROW * self.resolution
-        root, following = seen.root, apart(next_look, left, right, seen.times, seen.of_guards, self.resolution)
-        settled, takes, crosses = apart(self._settled, seen.in_doubt, again, narrow | given_up, root)
+        root, following = segment.root, apart(next_node, left, right, segment.times, segment.of_guards, self.resolution)
+        settled, takes, crosses = apart(self._settled, segment.in_doubt, again, narrow | given_up, root)
         looking = ~again & ~settled
         # A start beyond the guard is as near to it as a root can be.
         sign = _chosen(root.guard, [v.g for v in left.values]) * root.after
         begin = jnp.where((sign >= 0) & (root.low <= left.t), left.t + self.resolution, root.guess)
-        at = jnp.where(again, at_extremum, jnp.where(following.look, following.at, right.t))
+        at = jnp.where(again, at_extremum, jnp.where(following.needed, following.at, right.t))
         at = jnp.where(takes, until, jnp.where(crosses, self._inside(root, begin), at))
         none = jnp.asarray(-1)
         later = part._replace(
             looks=jnp.where(takes & (right.t >= until), 0, part.looks + 1),
-            asked=jnp.where(again, part.asked, jnp.where(looking & following.look, following.asked, none)),
+            asked=jnp.where(again, part.asked, jnp.where(looking & following.needed, following.asked, none)),
             curvature=jnp.where(again, part.curvature, following.curvature),
             tries=jnp.where(again, part.tries + 1, 0),
-            turns=tuple(looking & ~following.look & x for x in following.turns_right),
+            turns=tuple(looking & ~following.needed & x for x in following.turns_right),
             turns_at=right.t,
             root=root._replace(guard=jnp.where(crosses, root.guard, none)),
             moved=jnp.where(again, at - right.t, jnp.inf),
         )
         followed = tuple(
             Followed(jnp.where(takes, last_known(f.sign, s), f.sign), f.count, f.uncertain | (settled & x & given_up))
-            for f, s, x in zip(followed, seen.signs, seen.in_doubt)
+            for f, s, x in zip(followed, segment.signs, segment.in_doubt)
         )
         return Move(takes, at, later, followed, no, turns, tuple(looking & x for x in following.turns_left))
 
@@ -282,13 +282,13 @@ class Watching(diffrax.AbstractStepSizeController):
         settled = ~again & (~_any(in_doubt) | anyway)
         return settled, settled & (root.guard < 0), settled & (root.guard >= 0)
 
-    def _toward_root(self, seen: Seen, watched: Watched, until) -> Move:
+    def _toward_root(self, segment: Segment, watched: Watched, until) -> Move:
         """One step of Newton's formula, or of halves where that does not get on; the part is taken at the root."""
-        part, t, none = watched.part, seen.right.t, jnp.asarray(-1)
+        part, t, none = watched.part, segment.right.t, jnp.asarray(-1)
         no = (jnp.asarray(False),) * len(self.kinds)
-        found, sooner, takes, onward, at = apart(self._nearer, seen, part)
+        found, sooner, takes, onward, at = apart(self._nearer, segment, part)
         root, at_one_time, followed, crossing = part.root, AT_ONCE * self.resolution, [], []
-        for i, (kind, f, v) in enumerate(zip(self.kinds, watched.followed, seen.right.values)):
+        for i, (kind, f, v) in enumerate(zip(self.kinds, watched.followed, segment.right.values)):
             known = jnp.where(jnp.abs(v.g) > v.noise, jnp.sign(v.g), 0.0)
             wanted = (f.sign != 0) & (True if kind.direction == 0 else kind.direction == -f.sign)
             close = jnp.abs(v.g) <= jnp.maximum(v.noise, at_one_time * jnp.abs(v.rate))
@@ -307,11 +307,11 @@ class Watching(diffrax.AbstractStepSizeController):
         )
         return Move(takes, jnp.where(found, until, at), later, tuple(followed), tuple(crossing), no, no)
 
-    def _nearer(self, seen: Seen, part: Part):
+    def _nearer(self, segment: Segment, part: Part):
         """Whether the root is found, whether another one is `sooner`, and whether the part is taken; the root that is
         sought then, and where."""
-        root, t = part.root, seen.right.t
-        g, rate = (_chosen(root.guard, [getattr(v, name) for v in seen.right.values]) for name in ("g", "rate"))
+        root, t = part.root, segment.right.t
+        g, rate = (_chosen(root.guard, [getattr(v, name) for v in segment.right.values]) for name in ("g", "rate"))
         crossed = g * root.after >= 0
         low, high = jnp.where(crossed, root.low, jnp.maximum(root.low, t)), jnp.where(crossed, t, root.high)
         step = -g / jnp.where(rate != 0, rate, jnp.nan)
@@ -325,7 +325,7 @@ class Watching(diffrax.AbstractStepSizeController):
         at = jnp.where(narrow, high, jnp.where(nearer, t + step, low + 0.5 * (high - low)))
         # Another guard may be crossed on the way: the one that was sought is not the first. Of two that jump at one
         # time neither is, whatever an interpolant says.
-        earlier = seen.root
+        earlier = segment.root
         before, limit = (x - AT_ONCE * self.resolution for x in (t, root.before))
         sooner = found & (earlier.guard >= 0) & (earlier.guess < before) & (t < limit)
         found = found & ~sooner

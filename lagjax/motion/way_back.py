@@ -73,10 +73,10 @@ class Motion:
         return max(self.places) + 1
 
     @property
-    def careful(self) -> bool:
-        """Whether some steps may have been taken the careful way, and not as they are written out."""
+    def robust(self) -> bool:
+        """Whether some steps may have been taken the robust way, and not as they are written out."""
         solver = self.static.solver
-        return solver.quick is not None and solver.equations.fallback
+        return solver.fast is not None and solver.equations.fallback
 
     @property
     def where(self) -> Problem:
@@ -215,18 +215,18 @@ class _Way:
             step = lambda problem, *start: by(self.copied(problem.solver, *start), *start)
             return self.each(step, 3)(*filled(leaves, self.moved, chosen), *start)
 
-        _, pull, believed = jax.vjp(partial(end, OnManifold.again), *start, has_aux=True)
-        if self.motion.careful:
-            # Not a choice between two ends: what is not to be believed has no derivative, and zero times that is NaN.
-            carefully = lambda ct: jax.vjp(partial(end, OnManifold.again_carefully), *start)[1](ct)
-            pull = partial(lax.cond, eqxi.unvmap_all(believed), pull, carefully)
+        _, pull, valid = jax.vjp(partial(end, OnManifold.again), *start, has_aux=True)
+        if self.motion.robust:
+            # Not a choice between two ends: what is not valid has no derivative, and zero times that is NaN.
+            robustly = lambda ct: jax.vjp(partial(end, OnManifold.again_robustly), *start)[1](ct)
+            pull = partial(lax.cond, eqxi.unvmap_all(valid), pull, robustly)
         of_arrays, *of_start = pull(ct)
         return (of_arrays, *of_start) if self.of_times else (of_arrays, None, None, *of_start)
 
     def copied(self, solver: OnManifold, t0, t1, y) -> OnManifold:
         """The solver with its right-hand side copied to each stage, where that is worth while."""
         method = solver.solver
-        if solver.quick is not None or not isinstance(method, Nystrom | ExplicitRungeKutta):
+        if solver.fast is not None or not isinstance(method, Nystrom | ExplicitRungeKutta):
             return solver
         if self.lanes is None and all(x.size <= PRODUCT for x in self.leaves):
             return solver

@@ -25,7 +25,7 @@ class Unknowns(NamedTuple):
     """What all windows share, and what each has of its own."""
 
     shared: Float[Array, " p"]
-    own: Float[Array, "windows k"]
+    local: Float[Array, "windows k"]
 
 
 class Equations(NamedTuple):
@@ -40,18 +40,20 @@ class Slopes(NamedTuple):
     """The derivatives of `Equations` that are not zero by structure."""
 
     rows_by_shared: Float[Array, "windows m p"]
-    rows_by_own: Float[Array, "windows m k"]
+    rows_by_local: Float[Array, "windows m k"]
     seams_by_shared: Float[Array, "windows j p"]
-    seams_by_own: Float[Array, "windows j k"]
+    seams_by_local: Float[Array, "windows j k"]
     seams_by_next: Float[Array, "windows j k"]
     shared: Float[Array, "h p"]
 
     def along(self, d: Unknowns) -> Equations:
         """The change of the equations along a change of the unknowns."""
-        following = jnp.concatenate([d.own[1:], jnp.zeros_like(d.own[:1])])
+        following = jnp.concatenate([d.local[1:], jnp.zeros_like(d.local[:1])])
         return Equations(
-            self.rows_by_shared @ d.shared + _each(self.rows_by_own, d.own),
-            self.seams_by_shared @ d.shared + _each(self.seams_by_own, d.own) + _each(self.seams_by_next, following),
+            self.rows_by_shared @ d.shared + _each(self.rows_by_local, d.local),
+            self.seams_by_shared @ d.shared
+            + _each(self.seams_by_local, d.local)
+            + _each(self.seams_by_next, following),
             self.shared @ d.shared,
         )
 
@@ -61,8 +63,12 @@ class Slopes(NamedTuple):
         shared = jnp.sum(squares(self.rows_by_shared) + squares(self.seams_by_shared), axis=0)
         shared = shared + jnp.sum(self.shared**2, axis=0)
         # A window's start is also where the seam before it ends.
-        own = squares(self.rows_by_own) + squares(self.seams_by_own) + jnp.roll(squares(self.seams_by_next), 1, axis=0)
-        return Unknowns(jnp.sqrt(shared), jnp.sqrt(own))
+        local = (
+            squares(self.rows_by_local)
+            + squares(self.seams_by_local)
+            + jnp.roll(squares(self.seams_by_next), 1, axis=0)
+        )
+        return Unknowns(jnp.sqrt(shared), jnp.sqrt(local))
 
     def scaled(self, by_shared: Float[Array, " p"]) -> "Slopes":
         """The slopes by shared unknowns that are measured in other units."""
@@ -85,23 +91,23 @@ def _each(blocks, vectors):
 
 def _directions(u: Unknowns) -> Unknowns:
     """Directions whose derivatives hold all slopes: every other window at a time, since seams see two."""
-    (p,), (windows, k) = u.shared.shape, u.own.shape
+    (p,), (windows, k) = u.shared.shape, u.local.shape
     parities = min(windows, 2)
-    alternating = (jnp.arange(windows)[None, :] % 2 == jnp.arange(parities)[:, None]).astype(u.own.dtype)
-    own = alternating[:, None, :, None] * jnp.eye(k, dtype=u.own.dtype)[None, :, None, :]
-    own = own.reshape(parities * k, windows, k)
-    zeros = jnp.zeros((p, windows, k), u.own.dtype), jnp.zeros((parities * k, p), u.shared.dtype)
-    return Unknowns(jnp.concatenate([jnp.eye(p, dtype=u.shared.dtype), zeros[1]]), jnp.concatenate([zeros[0], own]))
+    alternating = (jnp.arange(windows)[None, :] % 2 == jnp.arange(parities)[:, None]).astype(u.local.dtype)
+    local = alternating[:, None, :, None] * jnp.eye(k, dtype=u.local.dtype)[None, :, None, :]
+    local = local.reshape(parities * k, windows, k)
+    zeros = jnp.zeros((p, windows, k), u.local.dtype), jnp.zeros((parities * k, p), u.shared.dtype)
+    return Unknowns(jnp.concatenate([jnp.eye(p, dtype=u.shared.dtype), zeros[1]]), jnp.concatenate([zeros[0], local]))
 
 
 def _slopes(along: Equations, u: Unknowns) -> Slopes:
     """The slopes from the derivatives along `_directions(u)`, which are the leading axis."""
-    (p,), (windows, k) = u.shared.shape, u.own.shape
-    by_shared, by_own = (jax.tree.map(lambda x: x[part], along) for part in (slice(None, p), slice(p, None)))
+    (p,), (windows, k) = u.shared.shape, u.local.shape
+    by_shared, by_local = (jax.tree.map(lambda x: x[part], along) for part in (slice(None, p), slice(p, None)))
     last = lambda x: jnp.moveaxis(x, 0, -1)
     w, parities = jnp.arange(windows), min(windows, 2)
     # Axes: parity, k, windows, equations.
-    rows, seams = (x.reshape(parities, k, *x.shape[1:]) for x in (by_own.rows, by_own.seams))
+    rows, seams = (x.reshape(parities, k, *x.shape[1:]) for x in (by_local.rows, by_local.seams))
     chosen = lambda x, parity: jnp.moveaxis(x, 1, -1)[parity % parities, w]
     return Slopes(
         last(by_shared.rows),
@@ -116,17 +122,17 @@ def _slopes(along: Equations, u: Unknowns) -> Slopes:
 class Factors(NamedTuple):
     """What is left of the equations, triangular: `R s_w + next s_{w+1} + P p = rhs`, and `S p = rhs`."""
 
-    own: Float[Array, "windows k k"]
+    local: Float[Array, "windows k k"]
     following: Float[Array, "windows k k"]
-    own_by_shared: Float[Array, "windows k p"]
-    own_rhs: Float[Array, "windows k"]
+    local_by_shared: Float[Array, "windows k p"]
+    local_rhs: Float[Array, "windows k"]
     shared: Float[Array, "p p"]
     shared_rhs: Float[Array, " p"]
 
 
 def eliminate(a: Slopes, rhs: Equations, damping: Unknowns) -> Factors:
     """Factorise the equations together with `damping * unknown = 0`."""
-    windows, _, k = a.rows_by_own.shape
+    windows, _, k = a.rows_by_local.shape
     p = a.shared.shape[1]
     width = k + p + 1
 
@@ -134,16 +140,16 @@ def eliminate(a: Slopes, rhs: Equations, damping: Unknowns) -> Factors:
         a, r, seam, damped = x
         blocks = [
             [carried[:, :k], jnp.zeros((width, k)), carried[:, k:]],
-            [a.rows_by_own, jnp.zeros_like(a.rows_by_own), a.rows_by_shared, r[:, None]],
-            [a.seams_by_own, a.seams_by_next, a.seams_by_shared, seam[:, None]],
+            [a.rows_by_local, jnp.zeros_like(a.rows_by_local), a.rows_by_shared, r[:, None]],
+            [a.seams_by_local, a.seams_by_next, a.seams_by_shared, seam[:, None]],
             [jnp.diag(damped), jnp.zeros((k, k)), jnp.zeros((k, p + 1))],
         ]
         triangle = _triangle(jnp.concatenate([jnp.concatenate(row, axis=1) for row in blocks]))
         return triangle[k:, k:], triangle[:k]
 
     each = a._replace(shared=jnp.zeros((windows, 0)))
-    start = jnp.zeros((width, width), a.rows_by_own.dtype)
-    left, found = lax.scan(one_window, start, (each, rhs.rows, rhs.seams, damping.own))
+    start = jnp.zeros((width, width), a.rows_by_local.dtype)
+    left, found = lax.scan(one_window, start, (each, rhs.rows, rhs.seams, damping.local))
     on_shared = [
         left[:, k:],
         jnp.concatenate([a.shared, rhs.shared[:, None]], axis=1),
@@ -172,21 +178,21 @@ def solution(f: Factors) -> Unknowns:
     shared = _upper(f.shared, f.shared_rhs)
 
     def back(following, x):
-        own, by_next, by_shared, rhs = x
-        found = _upper(own, rhs - by_next @ following - by_shared @ shared)
+        local, by_next, by_shared, rhs = x
+        found = _upper(local, rhs - by_next @ following - by_shared @ shared)
         return found, found
 
-    each = f.own, f.following, f.own_by_shared, f.own_rhs
-    _, own = lax.scan(back, jnp.zeros_like(f.own_rhs[0]), each, reverse=True)
-    return Unknowns(shared, own)
+    each = f.local, f.following, f.local_by_shared, f.local_rhs
+    _, local = lax.scan(back, jnp.zeros_like(f.local_rhs[0]), each, reverse=True)
+    return Unknowns(shared, local)
 
 
 class Covariance(NamedTuple):
     """Of what is shared, of each window's own, and between the two."""
 
     shared: Float[Array, "p p"]
-    own: Float[Array, "windows k k"]
-    own_shared: Float[Array, "windows k p"]
+    local: Float[Array, "windows k k"]
+    local_shared: Float[Array, "windows k p"]
 
 
 def covariance(f: Factors, inverse: Float[Array, "p p"]) -> Covariance:
@@ -194,21 +200,21 @@ def covariance(f: Factors, inverse: Float[Array, "p p"]) -> Covariance:
 
     `inverse` of the shared factor: a generalised one leaves out what is not determined.
     """
-    k, of_shared = f.own.shape[-1], inverse @ inverse.T
+    k, of_shared = f.local.shape[-1], inverse @ inverse.T
 
     def back(joint, x):
-        own, by_next, by_shared = x
-        inverse = _upper(own, jnp.eye(k, dtype=own.dtype))
+        local, by_next, by_shared = x
+        inverse = _upper(local, jnp.eye(k, dtype=local.dtype))
         # s_w = R⁻¹ (noise - [next, P] (s_{w+1}, p)).
         gain = -inverse @ jnp.concatenate([by_next, by_shared], axis=1)
         with_rest = gain @ joint
-        of_own, own_shared = inverse @ inverse.T + with_rest @ gain.T, with_rest[:, k:]
-        joint = jnp.block([[of_own, own_shared], [own_shared.T, of_shared]])
-        return joint, (of_own, own_shared)
+        of_local, local_shared = inverse @ inverse.T + with_rest @ gain.T, with_rest[:, k:]
+        joint = jnp.block([[of_local, local_shared], [local_shared.T, of_shared]])
+        return joint, (of_local, local_shared)
 
     last = jnp.zeros((k + len(inverse),) * 2, f.shared.dtype).at[k:, k:].set(of_shared)
-    _, (own, own_shared) = lax.scan(back, last, (f.own, f.following, f.own_by_shared), reverse=True)
-    return Covariance(of_shared, own, own_shared)
+    _, (local, local_shared) = lax.scan(back, last, (f.local, f.following, f.local_by_shared), reverse=True)
+    return Covariance(of_shared, local, local_shared)
 
 
 def _upper(triangle, rhs):

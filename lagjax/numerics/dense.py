@@ -7,7 +7,7 @@ by component*: after it the computed x solves `(K + dK) x = b + db` with `|dK| <
 of 10 keeps its digits where the entries of K and b carry them.
 
 The elimination acts on whole rows, one column a time, in a loop: written out it ran a fifth faster, and made up
-half of what there is to compile in a constrained system, where it is the way out of the quick one (`Saddle`). Against
+half of what there is to compile in a constrained system, where it is the way out of the fast one (`Saddle`). Against
 LAPACK, whose call costs 1-1.6 microseconds, it is faster up to n = 6.
 
 Differentiation never passes through the pivoting: `dx = K^-1 (db - dK x)`, transposed by JAX.
@@ -150,7 +150,7 @@ def reciprocal_condition(matrix: Float[Array, "n n"]) -> Float[Array, ""]:
 class Saddle:
     """`[[M, Aᵀ], [A, 0]]` eliminated in the order in which it is written, one number at a time.
 
-    For programs that are written out (`scalars.py`), where the zeros of M and A cost nothing. `believed` says whether
+    For programs that are written out (`scalars.py`), where the zeros of M and A cost nothing. `valid` says whether
     the answers are as accurate as with pivoting: M is definite (or every pivot the largest of its column), and no row
     of A depends on those before it. A `diagonal` M without A is divided by: what is singular gives NaN or infinity.
 
@@ -169,7 +169,7 @@ class Saddle:
             if k == n:
                 schur = [work[i][i] for i in range(n, n + m)]
             pivot = work[k][k]
-            # What is not believed is computed too, and must not put NaN into the derivatives of what is taken instead.
+            # What is not valid is computed too, and must not put NaN into the derivatives of what is taken instead.
             nonzero = nonzero & (pivot != 0)
             pivot = pivot if diagonal else jnp.where(pivot != 0, pivot, 1.0)
             self.pivots.append(pivot)
@@ -187,7 +187,7 @@ class Saddle:
                 for j in range(k + 1, i + 1):
                     work[i][j] = work[i][j] - factor * column[j - k - 1]
         definite = positive | negative
-        self.believed = diagonal or nonzero & ((definite & independent) if m else (definite | largest))
+        self.valid = diagonal or nonzero & ((definite & independent) if m else (definite | largest))
 
     def solve(self, forcing: Float[Array, " n"], gamma: Float[Array, " m"], refine: bool = True):
         """a and λ of `M a - Aᵀ λ = F`, `A a = gamma`; with constraints, refined once."""

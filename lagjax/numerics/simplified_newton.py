@@ -14,6 +14,7 @@ step: rejecting such steps ties h to (k omega)^(-1/3).
 Source: Hairer & Wanner, *Solving ODEs II*, §IV.8, (8.9)-(8.11).
 """
 
+import copyreg
 from collections.abc import Callable
 from typing import Any
 
@@ -172,6 +173,15 @@ def _inverse_at(fn, y, args, options):
     return Inverse(dense.inverse(jax.jacfwd(lambda vector: ravel_pytree(fn(unravel(vector), args)[0])[0])(vector)))
 
 
+def tolerance_of_the_controller():
+    """What diffrax puts in place of tolerances that are those of the step-size controller."""
+    return diffrax.with_stepsize_controller_tols(SimplifiedNewton)().rtol
+
+
+# It is known by identity, which a copy of a method, or one that was pickled, would not have.
+copyreg.pickle(type(tolerance_of_the_controller()), lambda _: (tolerance_of_the_controller, ()))
+
+
 def with_tolerances(solver: diffrax.AbstractSolver, rtol, atol, norm=optx.max_norm) -> diffrax.AbstractSolver:
     """Give a solver's root finder tolerances, where it was to take them from an adaptive step-size controller.
 
@@ -183,7 +193,7 @@ def with_tolerances(solver: diffrax.AbstractSolver, rtol, atol, norm=optx.max_no
     """
     if not isinstance(solver, diffrax.AbstractImplicitSolver):
         return solver
-    from_controller = diffrax.with_stepsize_controller_tols(SimplifiedNewton)().rtol
+    from_controller = tolerance_of_the_controller()
     wanted = {"rtol": rtol, "atol": atol, "norm": norm}
     missing = [name for name in wanted if getattr(solver.root_finder, name, None) is from_controller]
     if not missing:

@@ -1,5 +1,6 @@
 """What a store belongs to: the axes, the values' names and kinds, the program, the versions that wrote it."""
 
+from collections.abc import Iterable
 from importlib.metadata import version
 from typing import Any
 
@@ -10,11 +11,11 @@ from lagjax.sweeps.axes import Axes
 from lagjax.sweeps.digests import digest
 from lagjax.sweeps.lanes import Program
 
-# 1 had no checksums. It is read, and continued as it is.
-FORMAT = 2
+# The earlier ones are read, and continued as they are: `earlier`.
+FORMAT = 3
 ANOTHER_FUNCTION = "run is another function"
-# Names that zarr keeps for itself.
-RESERVED = ("", ".", "..", "zarr.json")
+# Names that zarr, or a store, keeps for itself.
+RESERVED = ("", ".", "..", "zarr.json", "lagjax")
 
 
 def fingerprint(axes: Axes, program: Program, layout: str) -> dict[str, Any]:
@@ -65,20 +66,13 @@ def named_leaves(tree) -> list[tuple[str, Any]]:
     return [(name, leaf) for name, _, leaf in found]
 
 
-def check_file_names(kind: str, names: list[str]) -> None:
-    """Raise `ValueError` for names that cannot be folders beside each other."""
+def check_file_names(kind: str, names: Iterable[str]) -> None:
+    """Raise `ValueError` for names that cannot be those of folders."""
     for name in names:
-        parts = name.split("/")
-        if any(part in RESERVED or part.startswith("__") for part in parts) or "\\" in name:
+        if name in RESERVED or name.startswith("__") or "/" in name or "\\" in name:
             raise ValueError(
-                f"{kind} '{name}' cannot be kept in a store: zarr has no place for such a name.\n"
+                f"{kind} '{name}' cannot be kept in a store: there is no place in it for such a name.\n"
                 "Fix: another key, of letters, digits and underscores."
-            )
-        inside = next((other for other in names if other.startswith(f"{name}/")), None)
-        if inside is not None:
-            raise ValueError(
-                f"{kind}s '{name}' and '{inside}' cannot be kept in one store: one would lie inside of the other.\n"
-                f"Fix: another key, as '{inside.replace('/', '_')}'."
             )
 
 

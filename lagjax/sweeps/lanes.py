@@ -15,7 +15,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec, SingleDeviceShardin
 from jaxtyping import PyTree
 
 from lagjax.jax_internals.tracing import REGULAR_FIRST
-from lagjax.mechanics.first_call import Call, check_arguments, in_words
+from lagjax.mechanics.in_words import Call, check_arguments, in_words
 from lagjax.motion.reported import PATIENCE, reporting
 from lagjax.motion.trajectory import ENDED_WELL, RESULTS, Trajectory
 from lagjax.sweeps.axes import POINT, Axes
@@ -49,7 +49,7 @@ class Program(NamedTuple):
     """A compiled program for `chunk` points: one point's shapes, the bytes that it works with, a digest of its text.
 
     `call(point, count)`: (values, status, settled) of no more than `chunk` points, as NumPy arrays; `point` has the
-    values of so many by axis. Points that are not settled belong to the careful program; None where this one is that.
+    values of so many by axis. Points that are not settled belong to the robust program; None where this one is that.
     `irregular` is set when most points turn out to belong there.
     """
 
@@ -90,12 +90,12 @@ def point_of(run: Callable) -> Callable:
 
 
 def compiled(
-    run: Callable, axes: Axes, chunk: int, devices: Sequence, layout: str, patience=None, careful=True
+    run: Callable, axes: Axes, chunk: int, devices: Sequence, layout: str, patience=None, robust=True
 ) -> Program:
     """Compile a sweep's program for chunks of some length, split between the devices.
 
     Of the axes only names, shapes and dtypes matter. With `patience`, motions in it are given up after so many steps.
-    Where not `careful`, they are taken for regular.
+    Where not `robust`, they are taken for regular.
     """
     point = point_of(run)
 
@@ -111,7 +111,7 @@ def compiled(
     shaped = tuple(jax.ShapeDtypeStruct((chunk, *x.shape[1:]), x.dtype, sharding=placed) for x in axes.arrays)
     of_user = Call("run", run, (POINT,))
     check_arguments(of_user, "the axes taken one by one; a point is one dictionary")
-    with PATIENCE(patience), REGULAR_FIRST(not careful), in_words(of_user, {POINT: axes.values}):
+    with PATIENCE(patience), REGULAR_FIRST(not robust), in_words(of_user, {POINT: axes.values}):
         traced = jax.jit(function).trace(shaped)
     shapes, *_ = traced.out_info
     program = traced.lower().compile()
@@ -123,3 +123,11 @@ def compiled(
 
     one = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), shapes)
     return Program(call, chunk, one, working, program_digest(traced.jaxpr), threading.Event())
+
+
+def not_run(program: Program, count: int) -> tuple[PyTree, Status]:
+    """Room for the values and statuses of some points: NaN, or 0 in numbers that have none."""
+    nothing = lambda x: np.nan if np.issubdtype(x.dtype, np.inexact) else 0
+    values = jax.tree.map(lambda x: np.full((count, *x.shape), nothing(x), x.dtype), program.values)
+    fills = (NOT_RUN, 0, np.nan, np.nan)
+    return values, Status(*(np.full(count, fill, dtype) for fill, dtype in zip(fills, STATUS_TYPES)))

@@ -35,18 +35,18 @@ def program_for(
     devices: Sequence,
     layout: str,
     patience: int | None = None,
-    careful: bool = True,
+    robust: bool = True,
     progress: bool | None = False,
 ) -> tuple[Program, float]:
     """The program, and the seconds that compiling it took; 0 where there was one."""
-    key, code = _key(run, axes, chunk, devices, layout, patience, careful), _code(run)
+    key, code = _key(run, axes, chunk, devices, layout, patience, robust), _code(run)
     with _LOCK:
         _, program = _PROGRAMS.get(key, (None, None))
     seconds = 0.0
     if program is None:
         started = time.perf_counter()
         with waiting(progress, "compiling"):
-            program = compiled(run, axes, chunk, devices, layout, patience, careful)
+            program = compiled(run, axes, chunk, devices, layout, patience, robust)
         seconds = time.perf_counter() - started
     if key is not None and code is not None:
         with _LOCK:
@@ -64,14 +64,14 @@ def _drop(key, gone):
         _PROGRAMS.pop(key, None)
 
 
-def _key(run, axes, chunk, devices, layout, patience, careful):
+def _key(run, axes, chunk, devices, layout, patience, robust):
     """What a program is compiled for; None where that cannot be told."""
     meaning = meaning_of(run)
     if meaning is None:
         return None
     kinds = tuple((name, x.shape[1:], str(x.dtype)) for name, x in axes.values.items())
     settings = (tuple(jax.config.values.items()), jax.sharding.get_abstract_mesh())
-    return meaning, kinds, chunk, tuple(devices), layout, patience, careful, settings
+    return meaning, kinds, chunk, tuple(devices), layout, patience, robust, settings
 
 
 def _code(run):

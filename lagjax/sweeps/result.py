@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Callable
+from copy import copy
 from pathlib import Path
 from typing import Any
 
@@ -11,12 +12,16 @@ from jaxtyping import PyTree
 
 from lagjax import plot
 from lagjax.mechanics import coordinates
-from lagjax.motion.trajectory import Trajectory, in_words
+from lagjax.motion.trajectory import Trajectory
+from lagjax.pages import Page
+from lagjax.sweeps import exported, structures
 from lagjax.sweeps.axes import POINT, Axes
 from lagjax.sweeps.fingerprint import in_words as versions_in_words
 from lagjax.sweeps.fingerprint import named_leaves, versions
-from lagjax.sweeps.lanes import LOST, NOT_RUN, TRUSTED, Status
+from lagjax.sweeps.labels import words_of
+from lagjax.sweeps.lanes import LOST, TRUSTED, Status
 from lagjax.sweeps.metadata import restore
+from lagjax.sweeps.page import MOST_MEGABYTES, page_of
 from lagjax.sweeps.store import Store, nothing, tell
 
 COMPUTED_AGAIN = (
@@ -52,9 +57,25 @@ class Sweep:
         self.how, self.ran, self.compiling, self.seconds = how, ran, compiling, seconds
         self._values, self._again = values, again
 
+    def __copy__(self):
+        same = object.__new__(Sweep)
+        same.__dict__.update(self.__dict__)
+        return same
+
+    def __deepcopy__(self, memo):
+        # Of what is no array nothing changes: structures, systems, what ran it.
+        same, values = copy(self), self._values
+        same.axes, same.status = (jax.tree.map(np.copy, x) for x in (self.axes, self.status))
+        same._values = values if isinstance(values, Stored) else jax.tree.map(np.copy, values)
+        return same
+
     def __getstate__(self):
-        # What ran it is a compiled program, which stays where it was compiled.
-        return self.__dict__ | {"_again": _cannot}
+        values = self._values
+        return self.__dict__ | {"_values": values if isinstance(values, Stored) else structures.Travelling.of(values)}
+
+    def __setstate__(self, state):
+        values = state["_values"]
+        self.__dict__ = state | {"_values": values if isinstance(values, Stored) else values.unpacked()}
 
     @property
     def dims(self) -> dict[str, int]:
@@ -78,7 +99,7 @@ class Sweep:
     def counts(self) -> dict[str, int]:
         """How many points went which way, in words, the most frequent first."""
         codes, counts = np.unique(self.status.result, return_counts=True)
-        return {_words(codes[i]): int(counts[i]) for i in np.argsort(-counts)}
+        return {words_of(codes[i]): int(counts[i]) for i in np.argsort(-counts)}
 
     def resweep(self, run: Callable | None = None, where=None) -> "Sweep":
         """Run the points that are not `ok` again, with another `run` (other settings), and keep the rest.
@@ -89,33 +110,41 @@ class Sweep:
         **Returns:** a new `Sweep`, in memory.
         """
         where = ~self.ok if where is None else np.broadcast_to(np.asarray(where, bool), self.axes.shape)
-        return self._again(self, run, np.flatnonzero(where.reshape(-1)))
+        which = np.flatnonzero(where.reshape(-1))
+        return self._again(self, run, which) if len(which) else self
 
     def to_xarray(self):
         """Values, statuses and axes as an `xarray.Dataset`, with dimensions and coordinates by name.
 
-        The outputs of a `Trajectory` have the dimension `t`, where all points share their times.
+        The outputs of a `Trajectory` have the dimension `t`, where all points share their times. `result` says in its
+        attributes what its numbers mean (`flag_values`, `flag_meanings`). A value that is named like an axis has
+        `value_` in front. A store has the same names: `xarray.open_zarr(path)`.
 
         **Raises:** `ImportError` without xarray; `ValueError` for two values of one name.
         """
-        try:
-            import xarray
-        except ImportError as error:
-            raise ImportError('this needs xarray, an optional extra.\nFix: pip install "lagjax[data]"') from error
-        coords, variables = self._coordinates(), {}
-        for name, dims, x in self._labelled(coords):
-            # An axis of that name is a coordinate.
-            free = f"value_{name}" if name in coords else name
-            if free in variables:
-                raise ValueError(f"two of the values are named '{name}'.\nFix: another key in what run returns.")
-            variables[free] = ((*self.dims, *dims), x)
-        for name, x in zip(Status._fields, self.status):
-            variables[f"status_{name}" if name in variables else name] = (tuple(self.dims), x)
-        dataset = xarray.Dataset(variables, coords)
-        codes = np.unique(self.status.result)
-        dataset["result"].attrs = {"flag_values": codes.tolist(), "flag_meanings": [_words(code) for code in codes]}
-        dataset.attrs = {"how": self.how}
-        return dataset
+        return exported.dataset(self)
+
+    def to_pandas(self, values: Callable | None = None):
+        """A `pandas.DataFrame` with a row a point: the axes, what `run` returned, how the point went.
+
+        >>> import numpy as np
+        >>> import lagjax as lj
+        >>> run = lambda point: {"sum": point["a"] + point["b"], "both": point["a"] * np.array([1.0, 10.0])}
+        >>> swept = lj.sweep(run, {"a": np.array([1.0, 2.0]), "b": np.array([0.5])}, progress=False)
+        >>> print(swept.to_pandas().drop(columns=["steps", "scaled_error", "residual"]))
+             a    b  sum  both[0]  both[1]      result
+        0  1.0  0.5  1.5      1.0     10.0  successful
+        1  2.0  0.5  2.5      2.0     20.0  successful
+
+        Rows are in the order of the points, the last axis fastest. An array of a point has a column a number, up to
+        100; `result` is categorical, in words.
+
+        **Arguments:** `values`: a function of `swept.values` that returns what to show in their place, each with the
+        axes in front: `lambda values: {"end": values.q[..., -1]}`. Of trajectories that is asked for.
+
+        **Raises:** `ImportError` without pandas; `ValueError` where a point has more than a row has room for.
+        """
+        return exported.frame(self, values)
 
     def plot(self, value: str | Callable | None = None):
         """Draw values over the axes: lines over one, a map over two, a map for each value of the first over three.
@@ -146,6 +175,46 @@ class Sweep:
             )
         return plot.maps(axes, panels)
 
+    def to_html(
+        self,
+        path: str | os.PathLike | None = None,
+        *,
+        positions: Callable | None = None,
+        seconds: float | None = None,
+        rate: float = 25.0,
+        trail: float = 2.0,
+        megabytes: float = MOST_MEGABYTES,
+    ) -> Page:
+        """Make a page with a slider for each axis, which works without Python and without a network.
+
+        >>> import jax.numpy as jnp
+        >>> import lagjax as lj
+        >>> swept = lj.sweep(lambda point: {"height": point["v"] ** 2 / 20}, {"v": jnp.arange(3.0)}, progress=False)
+        >>> swept.to_html()  # doctest: +ELLIPSIS
+        Page of 3 points, v (3), ... kB: works in a notebook, and with .save("page.html") in a browser
+
+        It shows how the chosen point went, in words; of values with one number a point the number, and a curve over the
+        axis that was moved last; of a `Trajectory` its curves against time; of arrays their columns, against the array
+        `t` beside them in a dictionary, or else their index.
+
+        **Arguments:**
+
+        - `path`: where to write the page; it can be written later, too: `page.save(path)`.
+        - `positions`, `seconds`, `rate`, `trail`: of a sweep of trajectories, a film as `Trajectory.animate` makes it.
+        - `megabytes`: how large the page may be.
+
+        **Returns:** a `Page`, which shows itself in a notebook.
+
+        **Raises:** `ValueError` where there is nothing to draw, or more than the page may hold.
+        """
+        in_front = lambda x: np.asarray(x).reshape(self.axes.size, *np.shape(x)[len(self.axes.shape) :])
+        flat = jax.tree.map(in_front, self.values)
+        codes, of_film = self.status.result.reshape(-1), {"seconds": seconds, "rate": rate, "trail": trail}
+        page = page_of(self.axes, flat, codes, positions, megabytes, of_film)
+        if path is not None:
+            page.save(path)
+        return page
+
     def _plot_motions(self, motions):
         (name, x), *others = self.axes.values.items()
         if others or x.ndim > 1:
@@ -171,34 +240,6 @@ class Sweep:
                 "Fix: choose one, as swept.plot(lambda values: values.q[..., -1])."
             )
         return numbers
-
-    def _coordinates(self):
-        if self.axes.paired:
-            return {name: ((POINT, *_inner(name, x)), x) for name, x in self.axes.values.items()}
-        flat = {name: x for name, x in self.axes.values.items() if x.ndim == 1}
-        slices = {f"{name}_values": ((name, *_inner(name, x)), x) for name, x in self.axes.values.items() if x.ndim > 1}
-        return flat | slices
-
-    def _labelled(self, coords):
-        """Every array as (name, dimensions behind the axes, values); shared times become a coordinate."""
-        found, values = [], self.values
-        lead = len(self.axes.shape)
-        for path, part in jax.tree_util.tree_leaves_with_path(values, is_leaf=lambda x: isinstance(x, Trajectory)):
-            key = jax.tree_util.keystr(path, simple=True, separator=".")
-            if not isinstance(part, Trajectory):
-                found.append((key or "value", tuple(_inner(key or "value", part, lead)), part))
-                continue
-            under = f"{key}." if key else ""
-            times = part.t[self.status.result != NOT_RUN]
-            t = f"{under}t"
-            if len(times) and np.all(times == times[0]):
-                coords[t] = times[0]
-            else:
-                found.append((f"{under}times", (t,), part.t))
-            for leaf_path, x in jax.tree_util.tree_leaves_with_path({"q": part.q, "v": part.v, **part.multipliers}):
-                name = under + jax.tree_util.keystr(leaf_path, simple=True, separator=".")
-                found.append((name, (t, *_inner(name, x, lead + 1)), x))
-        return found
 
     def __repr__(self):
         size, steps = self.axes.size, self.status.steps.reshape(-1)
@@ -236,27 +277,35 @@ class Sweep:
         return shown
 
 
-def _inner(name, x, lead=1):
-    return [f"{name}_{i}" for i in range(np.ndim(x) - lead)]
-
-
 def _without_motion(part):
     return None if isinstance(part, Trajectory) else part
 
 
-def _words(code):
-    return {NOT_RUN: "not run", LOST: "lost from the store"}.get(int(code)) or in_words(code)
-
-
-def open_sweep(path: str | os.PathLike) -> Sweep:
-    """Open the sweep in a store, without what ran it: its values are a dictionary by name.
+def open_sweep(path: str | os.PathLike, *, run: Callable | None = None, system: Any = None) -> Sweep:
+    """Open the sweep in a store: its values have the structure of what `run` returned, trajectories included.
 
     Any version of lagjax, jax and diffrax may have written it. Statuses are read now, values when they are asked for.
     A file that is missing, cut off or of another block is seen now, without reading the values; one that has changed
     inside, when they are read. Either is told by name, and from then on its points are "lost from the store" in
     `status`, and not `ok`; `lj.sweep(run, axes, store=path)` computes them again.
 
-    **Raises:** `ValueError` where there is no store, or nothing can be told of it.
+    >>> import tempfile
+    >>> import lagjax as lj
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     done = lj.sweep(lambda point: point["x"] ** 2, {"x": [1.0, 2.0]}, store=folder + "/squares", progress=False)
+    ...     print(open_sweep(folder + "/squares").counts())
+    {'successful': 2}
+
+    **Arguments:** `path`: the folder that `lj.sweep` was given as `store`. Functions are not stored, so that a
+    trajectory does not know its system. It plots and plays all the same; what else it needs one for (`print`,
+    `drift()`) it has with `system`, the one that was integrated, or with `run`, the function that was swept, which is
+    traced for it and not run.
+
+    **Returns:** a `Sweep`.
+
+    **Raises:** `ValueError` where there is no store, nothing can be told of it, or `run` returns something else than
+    it has. Of a store in an earlier format, and of values of classes that cannot be found, `values` is a dictionary by
+    name.
     """
     path = Path(path)
     if wrong := restore(path):
@@ -268,21 +317,42 @@ def open_sweep(path: str | os.PathLike) -> Sweep:
     how = f"from {path}" + (f", of which {len(missing)} blocks are missing" if missing else "")
     if (by := store.about["fingerprint"]["versions"]) != versions():
         how += f", written by {versions_in_words(by)}"
-    return Sweep(axes, Stored(store, None), status, how, 0, 0.0, 0.0, _cannot)
+    like = structures.as_run_returns(run, axes, store) if run is not None else structures.as_stored(store, system)
+    return Sweep(axes, Stored(store, like), status, how, 0, 0.0, 0.0, opened)
 
 
-def _cannot(swept, run, indices):
+def opened(swept, run, indices):
+    """What runs points of an opened sweep again: nothing."""
     raise ValueError(
-        "a sweep that was opened from its store, or copied, does not know what ran it.\n"
+        "a sweep that was opened from its store does not know what ran it.\n"
         "Fix: lj.sweep(run, axes, store=path), which computes what is missing; without a store lj.sweep(run, axes)."
     )
 
 
-class Stored:
-    """The values of a store, read when asked for; `like` has the shapes of one point."""
+def of_store(swept, run, indices):
+    """What runs points of a sweep in a store again: nothing."""
+    raise ValueError(
+        "what is in a store belongs to the run that it was begun with.\n"
+        "Fix: lj.sweep(other, axes of what failed, paired=True), or a sweep without a store."
+    )
 
-    def __init__(self, store: Store, like: PyTree):
-        self.store, self._like = store, like
+
+class Stored:
+    """The values of a store, read when asked for; `like` has the shapes of one point. In a pickle it is a path."""
+
+    def __init__(self, store: Store | Path, like: PyTree):
+        self._store, self._like = store, like
+
+    def __reduce__(self):
+        like = None if self._like is None else structures.Travelling.of(self._like)
+        return _stored, (Path(os.path.abspath(self.store.path)), like)
+
+    @property
+    def store(self) -> Store:
+        """The store, opened when it is first needed."""
+        if isinstance(self._store, Path):
+            self._store = Store(self._store, "r")
+        return self._store
 
     @property
     def like(self) -> Any:
@@ -294,7 +364,7 @@ class Stored:
         values, lost = self.store.values(self._like)
         where, new = known.copy(), []
         for number, wrong in lost.items():
-            here = self.store.points(number)
+            here = self.store.blocks.points(number)
             new += [] if known[here].all() else [wrong]
             where[here] = True
         if new:
@@ -302,3 +372,7 @@ class Stored:
         for x in jax.tree.leaves(values):
             x[where] = nothing(x.dtype)
         return values, where
+
+
+def _stored(path, like):
+    return Stored(path, None if like is None else like.unpacked())

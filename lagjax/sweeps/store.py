@@ -1,19 +1,20 @@
-"""A sweep on disk: a zarr group, written block by block, each of them marked when all of it is there.
+"""A sweep on disk: a zarr group that xarray reads as it lies, written block by block, each marked when it is all there.
 
-    axes/NAME     the values of the axes
-    values/NAME   (points, ...) in blocks along the flat index, by name of what `run` returns
-    status/NAME   result, steps, scaled_error, residual
-    done          (blocks, arrays, 2): of each block the length and the checksum of its file in each array; written last
+    NAME                (*axes,) + what a point has: values by `labels`, result, steps, scaled_error, residual; the axes
+    lagjax              what the store says about itself, and
+    lagjax/values/NAME  what of trajectories has no label: their ends, statistics, parameters
+    lagjax/marks        (blocks, arrays, 2): of each block the length and checksum of its files; written last
 
-A block that is not marked is computed again, whatever of it was written. To zarr a file that is not there is a block of
-fill values, so that the marks must tell what belongs there. They are looked at in two ways:
+A block is a box of the grid, and a run of flat indices (`grids`). One that is not marked is computed again, whatever of
+it was written. To zarr a file that is not there is a block of fill values, so that the marks must tell what belongs
+there. They are looked at in two ways:
 
 - a glance, whenever a store is opened: each file is there, is as long as it was and ends as it did. It reads 4 bytes a
   file, and sees what is missing, cut off, or of another block;
 - a full check, of its own part, when a sweep goes on: each file is read and has its checksum (crc32c).
 
-What neither has seen yet, zarr sees when values are read. Format 1 had one byte a block for a mark and no checksums: in
-it a file that is not there is lost if there should be numbers in it, and one of fill values looks alike.
+What neither has seen yet, zarr sees when values are read. In format 1, without checksums, a file that is not there is
+lost if there should be numbers in it, and one of fill values looks alike (`earlier`).
 
 Needs zarr (`pip install "lagjax[data]"`). A transactional store made for object stores (icechunk 1.1) was tried: of 64
 blocks that 8 processes had committed on a file system 16 were gone, as it warns.
@@ -22,7 +23,7 @@ blocks that 8 processes had committed on a file system 16 were gone, as it warns
 import math
 import os
 import warnings
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -31,8 +32,9 @@ import numpy as np
 
 from lagjax.sweeps.axes import Axes
 from lagjax.sweeps.fingerprint import ANOTHER_FUNCTION, differences, fingerprint, named_leaves, of_axis
+from lagjax.sweeps.grids import Blocks
 from lagjax.sweeps.lanes import GOOD, LOST, NOT_RUN, Program, Status
-from lagjax.sweeps.metadata import DONE, about, create, import_zarr, remove_leftovers, restore
+from lagjax.sweeps.metadata import about, create, import_zarr, remove_leftovers, restore
 
 # What zarr and its codecs raise for files that are not what they were.
 UNREADABLE = (ValueError, RuntimeError, TypeError, OSError)
@@ -49,34 +51,27 @@ class Store:
         self.path = Path(path)
         self.about: dict[str, Any] = about(self.path)
         self.format: int = self.about["fingerprint"]["format"]
-        self._values = [f"values/{name}" for name in self.about["fingerprint"]["values"]]
-        self._status = [f"status/{name}" for name in Status._fields]
+        places = self.about["places"]
+        # By the name of a leaf, or of a field.
+        self._values: dict[str, str] = {name: places["values"][name] for name in self.about["fingerprint"]["values"]}
+        self._status: dict[str, str] = {name: places["status"][name] for name in Status._fields}
         zarr = import_zarr()
         # A block of nothing but fill values has a file like any other.
         with zarr.config.set({"array.write_empty_chunks": True}):
-            group: Any = zarr.open_group(str(path), mode=mode)
+            group: Any = zarr.open_group(str(path), mode=mode, use_consolidated=False)
             self.group = group
-            self.arrays: dict[str, Any] = {name: group[name] for name in (*self._values, *self._status)}
-            self._done = group[DONE]
-
-    @property
-    def block(self) -> int:
-        """How many points are written together."""
-        return self.about["block"]
-
-    @property
-    def blocks(self) -> int:
-        """How many blocks there are, written or not."""
-        return self._done.shape[0]
+            names = (*self._values.values(), *self._status.values())
+            self.arrays: dict[str, Any] = {name: group[name] for name in names}
+            self._marks_name: str = places["marks"]
+            self._marks_array = group[self._marks_name]
+        shape = self.arrays[self._status["result"]].shape
+        # In earlier formats the grid is a row of all points.
+        self.blocks = Blocks(shape, tuple(self.about["block"]))
 
     @property
     def size(self) -> int:
         """How many points there are."""
-        return self.arrays[self._status[0]].shape[0]
-
-    def points(self, number: int) -> slice:
-        """The flat indices of a block."""
-        return slice(number * self.block, min((number + 1) * self.block, self.size))
+        return math.prod(self.blocks.shape)
 
     def missing(self) -> np.ndarray:
         """The numbers of the blocks that are not marked."""
@@ -84,23 +79,25 @@ class Store:
 
     def _marks(self):
         """(the marks of all blocks, 0 where there is none; the numbers of the blocks whose mark is damaged)."""
-        return _read(self._done, lambda number: slice(number, number + 1), self.blocks)
+        return _read(self._marks_array, lambda number: slice(number, number + 1), len(self.blocks))
 
     def _missing(self, marks):
-        return np.flatnonzero(marks.reshape(self.blocks, -1).max(axis=1) == 0)
+        return np.flatnonzero(marks.reshape(len(self.blocks), -1).max(axis=1) == 0)
 
     def write(self, number: int, values, status: Status):
         """Write a block, and then mark it."""
-        here = self.points(number)
+        here = self.blocks.region(number)
+        shape = tuple(x.stop - x.start for x in here)
         flat = [x for _, x in named_leaves(values)] + list(status)
         for array, x in zip(self.arrays.values(), flat):
-            array[here] = x
-        self._done[number] = 1 if self.format == 1 else [_mark(self._file(name, number)) for name in self.arrays]
+            array[here] = x.reshape(shape + x.shape[1:])
+        marks = 1 if self.format == 1 else [_mark(self._file(name, number)) for name in self.arrays]
+        self._marks_array[number] = marks
 
     def unmark(self, numbers: Iterable[int]):
         """Forget that some blocks were written."""
         for number in numbers:
-            self._done[number] = 0
+            self._marks_array[number] = 0
 
     def damage(self, numbers: Iterable[int], read: bool, marks=None) -> dict[int, str]:
         """What of some blocks is not whole: by the block's number the file, and what is wrong with it.
@@ -111,10 +108,10 @@ class Store:
         found = {}
         for number in numbers:
             if number in unreadable:
-                found[number] = f"{self._file(DONE, number)} is damaged"
+                found[number] = f"{self._file(self.about['places']['marks'], number)} is damaged"
             elif np.any(marks[number]):
-                look = self._damage_unchecked if self.format == 1 else self._damage
-                wrong = next(look(number, marks[number], read), None)
+                find_damage = self._damage_unchecked if self.format == 1 else self._damage
+                wrong = next(find_damage(number, marks[number], read), None)
                 if wrong is not None:
                     found[number] = wrong
         return found
@@ -122,11 +119,13 @@ class Store:
     def first(self) -> int | None:
         """The number of the first block that is there."""
         missing = set(self.missing().tolist())
-        return next((number for number in range(self.blocks) if number not in missing), None)
+        return next((number for number in range(len(self.blocks)) if number not in missing), None)
 
-    def read(self, indices: np.ndarray) -> list[np.ndarray]:
-        """The values at some neighbouring points, in order."""
-        return [np.asarray(self.arrays[name][indices[0] : indices[-1] + 1]) for name in self._values]
+    def read(self, number: int) -> list[np.ndarray]:
+        """The values of a block, each (points, ...)."""
+        here, lead = self.blocks.region(number), len(self.blocks.shape)
+        found = [np.asarray(self.arrays[name][here]) for name in self._values.values()]
+        return [x.reshape(math.prod(x.shape[:lead]), *x.shape[lead:]) for x in found]
 
     def _damage(self, number, mark, read):
         for name, (length, checksum) in zip(self.arrays, mark.tolist()):
@@ -151,12 +150,12 @@ class Store:
                     yield f"{file} is not as it was written"
 
     def _damage_unchecked(self, number, mark, read):
-        result, here = self.arrays[self._status[0]], self.points(number)
+        result, here = self.arrays[self._status["result"]], self.blocks.region(number)
         for name, array in self.arrays.items():
             file = self._file(name, number)
             if file is not None and not file.exists():
                 # Steps and the like that are all 0 had no file; results never were like what fills them.
-                if array is result or name in self._values and np.isin(result[here], GOOD).any():
+                if array is result or name in self._values.values() and np.isin(result[here], GOOD).any():
                     yield f"{file} is missing"
             elif read:
                 try:
@@ -166,8 +165,11 @@ class Store:
 
     def _file(self, name, number):
         """The file of a block; None where an array has no numbers."""
-        shape = self._done.shape if name == DONE else self.arrays[name].shape
-        return None if math.prod(shape) == 0 else self.path.joinpath(name, "c", str(number), *"0" * (len(shape) - 1))
+        if name == self._marks_name:
+            return self.path.joinpath(name, "c", str(number), *"0" * (len(self._marks_array.shape) - 1))
+        shape, place = self.arrays[name].shape, self.blocks.place(number)
+        inner = "0" * (len(shape) - len(place))
+        return None if math.prod(shape) == 0 else self.path.joinpath(name, "c", *map(str, place), *inner)
 
     def axes(self) -> Axes:
         """The axes as they were written.
@@ -178,9 +180,10 @@ class Store:
         return Axes(names, tuple(map(self._axis, names)), self.about["paired"])
 
     def _axis(self, name):
-        folder = self.path / "axes" / name
+        place = self.about["places"]["axes"][name]
+        folder = self.path / place
         try:
-            x = np.asarray(self.group[f"axes/{name}"][...])
+            x = np.asarray(self.group[place][...])
         except UNREADABLE:
             x = None
         if x is None or of_axis(x) != self.about["fingerprint"]["axes"][name]:
@@ -198,8 +201,9 @@ class Store:
             try:
                 self._axis(name)
             except ValueError:
-                self.group[f"axes/{name}"][...] = x
-                damaged.append(f"{self.path / 'axes' / name} was damaged")
+                place = self.about["places"]["axes"][name]
+                self.group[place][...] = x
+                damaged.append(f"{self.path / place} was damaged")
         return damaged
 
     def values(self, like=None) -> tuple[Any, dict[int, str]]:
@@ -207,42 +211,46 @@ class Store:
 
         Each is (points, ...), in the structure of `like` or in a dictionary by name; NaN or 0 where there is no block.
         """
-        found, (missing, lost) = {}, self._glance()
-        for name in self._values:
-            found[name], unreadable = _read(self.arrays[name], self.points, self.blocks)
-            lost.update({number: f"{self._file(name, number)} is damaged" for number in unreadable})
+        named, (missing, lost) = {}, self._glance()
+        for name, place in self._values.items():
+            named[name], unreadable = self._read(place)
+            lost.update({number: f"{self._file(place, number)} is damaged" for number in unreadable})
         lost = {number: wrong for number, wrong in lost.items() if number not in missing}
         for number in missing:
-            for x in found.values():
-                x[self.points(number)] = nothing(x.dtype)
-        named = {name.removeprefix("values/"): x for name, x in found.items()}
+            for x in named.values():
+                x[self.blocks.points(number)] = nothing(x.dtype)
         if like is not None:
             named = jax.tree.unflatten(jax.tree.structure(like), [named[name] for name, _ in named_leaves(like)])
         return named, lost
 
+    def _read(self, name):
+        """(all of an array, each point in a row; the numbers of the blocks that cannot be read)."""
+        found, unreadable = _read(self.arrays[name], self.blocks.region, len(self.blocks))
+        return found.reshape(self.size, *found.shape[len(self.blocks.shape) :]), unreadable
+
     def one(self) -> dict[str, jax.ShapeDtypeStruct]:
         """The shapes of one point's values by name, without reading any."""
-        arrays = {name.removeprefix("values/"): self.arrays[name] for name in self._values}
-        return {name: jax.ShapeDtypeStruct(x.shape[1:], x.dtype) for name, x in arrays.items()}
+        arrays, lead = {name: self.arrays[place] for name, place in self._values.items()}, len(self.blocks.shape)
+        return {name: jax.ShapeDtypeStruct(x.shape[lead:], x.dtype) for name, x in arrays.items()}
 
     def status(self) -> tuple[Status, set[int], dict[int, str]]:
         """(the statuses of all points, the blocks that are not marked, what is lost of the others)."""
         status, (missing, lost) = [], self._glance()
-        for name in self._status:
-            x, unreadable = _read(self.arrays[name], self.points, self.blocks)
+        for place in self._status.values():
+            x, unreadable = self._read(place)
             status.append(x)
-            lost.update({number: f"{self._file(name, number)} is damaged" for number in unreadable})
+            lost.update({number: f"{self._file(place, number)} is damaged" for number in unreadable})
         lost = {number: wrong for number, wrong in lost.items() if number not in missing}
         for numbers, code in ((missing, NOT_RUN), (lost, LOST)):
             for number in numbers:
                 for x, fill in zip(status, (code, 0, np.nan, np.nan)):
-                    x[self.points(number)] = fill
+                    x[self.blocks.points(number)] = fill
         return Status(*status), missing, lost
 
     def _glance(self):
         """(the blocks that are not marked, what is lost of the others)."""
         marks, unreadable = self._marks()
-        lost = self.damage(range(self.blocks), False, (marks, unreadable))
+        lost = self.damage(range(len(self.blocks)), False, (marks, unreadable))
         return set(self._missing(marks).tolist()) - set(unreadable), lost
 
 
@@ -258,7 +266,7 @@ def tell(path: Path, wrong: Iterable[str], then: str, stacklevel: int):
     )
 
 
-def _read(array, points, blocks):
+def _read(array, region, blocks):
     """(all of an array, the numbers of the blocks that cannot be read)."""
     try:
         return np.asarray(array[...]), []
@@ -266,7 +274,7 @@ def _read(array, points, blocks):
         found, unreadable = np.full(array.shape, nothing(array.dtype), array.dtype), []
         for number in range(blocks):
             try:
-                found[points(number)] = array[points(number)]
+                found[region(number)] = array[region(number)]
             except UNREADABLE:
                 unreadable.append(number)
         return found, unreadable
@@ -304,23 +312,30 @@ def chunk_of(path: str | os.PathLike) -> int:
 
 
 def open_store(
-    path: Path, axes: Axes, program: Program, layout: str, block: int | None, part: tuple[int, int], accept: bool
+    path: Path,
+    axes: Axes,
+    program: Program,
+    layout: str,
+    part: tuple[int, int],
+    accept: bool,
+    begun: Callable[[], tuple[Blocks, dict, dict | None]],
 ) -> Store:
     """Open the store of a sweep, made where there is none; refuse one that belongs to another sweep.
 
-    What of it is not whole is told, put back or, of this part, marked as missing.
+    `begun()`: the blocks of a new one, the times of its trajectories that all points share, the structure of values.
+    What of a store is not whole is told, put back or, of this part, marked as missing.
     """
     wanted = fingerprint(axes, program, layout)
     if not path.exists():
-        create(path, axes, program, wanted, block)
+        create(path, axes, program, wanted, *begun())
     _check_belongs(path, about(path)["fingerprint"], wanted, accept)
     remove_leftovers(path)
     wrong = restore(path)
     store = Store(path)
     wrong += store.write_axes(axes)
-    lost = store.damage(range(part[0], store.blocks, part[1]), read=True)
+    lost = store.damage(range(part[0], len(store.blocks), part[1]), read=True)
     if wrong or lost:
-        again = f"Blocks that are computed again: {len(lost):,} of {store.blocks:,}" if lost else "It is put back"
+        again = f"Blocks that are computed again: {len(lost):,} of {len(store.blocks):,}" if lost else "It is put back"
         tell(path, [*wrong, *lost.values()], f"{again}; nothing needs to be done.", stacklevel=4)
     store.unmark(lost)
     return store

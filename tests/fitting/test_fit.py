@@ -15,7 +15,7 @@ from scipy.optimize import least_squares
 
 import lagjax as lj
 from lagjax.fitting import search
-from lagjax.fitting.doubts import doubts
+from lagjax.fitting.caveats import caveats
 from lagjax.fitting.equations import WHOLE, _counts, equations
 from lagjax.fitting.problem import problem_of
 from lagjax.fitting.search import linearised
@@ -46,7 +46,7 @@ def noisy(x, sigma=0.01, seed=0):
 def test_finds_parameters_and_start(swinging, capsys):
     """Without errors: parameters, start and their names, to 1e-8; without a guess of the start. It shows its steps."""
     record = lj.Record(TS, q=swinging[0])
-    found = lj.fit(pendulum, record, GUESS, free=FREE, bounds={"l": (0.0, None)}, progress=True)
+    found = lj.fit(pendulum, record, GUESS, free=FREE, progress=True)
     shown = capsys.readouterr().err
     assert f"{int(found.steps)} steps" in shown and "stage 3 of 3, cost" in shown
     assert bool(found.converged) and found.names == ("c", "l")
@@ -156,8 +156,8 @@ def test_a_start_on_constraints_is_as_uncertain_as_they_are():
     angle = lj.fit(lj.System(swing), swung, {"m": 1.5, "g": 9.81, "l": 2.1}, free=["g", "l"], observe=x)
     np.testing.assert_allclose(found.values, angle.values, rtol=1e-6)
     np.testing.assert_allclose(found.covariance, angle.covariance, rtol=1e-3, atol=1e-9)
-    of = angle.seen.covariance
-    joint = np.block([[of.shared, of.own_shared[0].T], [of.own_shared[0], of.own[0]]])
+    of = angle.evaluation.covariance
+    joint = np.block([[of.shared, of.local_shared[0].T], [of.local_shared[0], of.local[0]]])
     state = lambda l, q, v: jnp.stack([l * jnp.sin(q), -l * jnp.cos(q), l * jnp.cos(q) * v, l * jnp.sin(q) * v])
     slope = jnp.stack(jax.jacfwd(state, (0, 1, 2))(angle.values[1], angle.q0[0], angle.v0[0]), axis=1)
     slope = np.concatenate([np.zeros((4, 1)), slope], axis=1)
@@ -293,7 +293,7 @@ def test_outliers_priors_and_bounds(swinging):
     assert off(plain) > 10 and off(robust) < 2
     assert np.all(robust.sd > clean.sd) and np.all(robust.sd < 2 * clean.sd)
     astray = eqx.tree_at(lambda found: found.unknowns.shared, clean, jnp.array([0.05, 1e9]))
-    assert "'l' was guessed to be 1.4, and came to 1e+09" in doubts(astray)[0] and not doubts(clean)
+    assert "'l' was guessed to be 1.4, and came to 1e+09" in caveats(astray)[0] and not caveats(clean)
 
     known = fit(data, priors={"l": (1.248, 0.0005)})
     weights = np.array([1 / clean.sd[1] ** 2, 1 / 0.0005**2])
@@ -307,7 +307,7 @@ def test_outliers_priors_and_bounds(swinging):
     assert float(held.values[1]) == pytest.approx(1.3, abs=1e-5) and held.at_bounds() == ["l"]
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_outliers_from_far(swinging, monkeypatch):
     """With a wild value first, and others, a robust loss still gets from a bad guess to the truth."""
     rng = np.random.default_rng(2)
@@ -366,7 +366,7 @@ def test_slopes_three_ways(name):
     u = p.start
     flat, back = ravel_pytree(u)
     slopes = linearised(p, u, WHOLE, "squares").slopes
-    forward = np.concatenate([slopes.rows_by_shared[0], slopes.rows_by_own[0]], axis=1)
+    forward = np.concatenate([slopes.rows_by_shared[0], slopes.rows_by_local[0]], axis=1)
     rows = lambda x: equations(p, back(x), WHOLE).rows[0]
     direction = np.random.default_rng(0).normal(size=forward.shape[0])
     pulled = jax.jit(jax.grad(lambda x: direction @ rows(x)))(flat)
@@ -491,8 +491,8 @@ def test_unknowns_of_a_start_keep_to_the_constraints():
     """Whatever its unknowns, a start satisfies the constraints, for other parameters too."""
     case = CASES["pendulum on a rod"]
     p = problem(case, {"q": case.truth().q})
-    assert p.start.own.shape == (1, 2)
-    state = jax.jit(lambda u: p.setting(u.shared, u.own[0], 0, WHOLE)[2])
+    assert p.start.local.shape == (1, 2)
+    state = jax.jit(lambda u: p.setting(u.shared, u.local[0], 0, WHOLE)[2])
     for own in ([0.3, -0.5], [-0.5, 1.0]):
         u = Unknowns(jnp.array([2.4, 1.0]), jnp.array([own]))
         q, v = state(u)

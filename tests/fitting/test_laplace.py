@@ -33,6 +33,7 @@ def exact(y, prior):
     return mean, inverse, evidence + 1.5 * np.log(2 * np.pi) + 0.5 * np.linalg.slogdet(inverse)[1]
 
 
+@pytest.mark.slow
 def test_a_linear_motion_has_this_posterior():
     """Mean, covariance and evidence of a fall with a prior; no word is left, and nothing is compiled twice."""
     y = measured()
@@ -40,7 +41,7 @@ def test_a_linear_motion_has_this_posterior():
     found = fit((9.81, 0.1))
     told = found.laplace()
     mean, covariance, evidence = exact(y, (9.81, 0.1))
-    assert told.names == ("g", "q(0)", "v.q(0)") and told.positive_definite and told.doubts == ()
+    assert told.names == ("g", "q(0)", "v.q(0)") and told.positive_definite and told.caveats == ()
     np.testing.assert_allclose(told.mean, mean, rtol=1e-7)
     np.testing.assert_allclose(told.covariance, covariance, rtol=1e-6)
     np.testing.assert_allclose(told.gauss_newton, covariance, rtol=1e-6)
@@ -150,9 +151,9 @@ def test_no_peak(rough):
         with pytest.raises(ValueError, match="(?s)no normal distribution here: no peak.*priors="):
             draw()
     aside = moved(found.values[0] + 0.2 * found.sd[0]).laplace()
-    assert aside.positive_definite and aside.off > 0.1 and "the estimate is no peak" in aside.doubts[0]
+    assert aside.positive_definite and aside.off > 0.1 and "the estimate is no peak" in aside.caveats[0]
     # Twin: at the peak none of it.
-    assert found.laplace().off < 1e-3 and all("no peak" not in words for words in found.laplace().doubts)
+    assert found.laplace().off < 1e-3 and all("no peak" not in words for words in found.laplace().caveats)
 
     with pytest.warns(lj.FitWarning):
         unseen = lj.fit(pendulum, lj.Record(T, q=np.cos(T), sigma=0.3), PENDULUM, free=["c", "g", "l"], restarts=0)

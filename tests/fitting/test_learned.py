@@ -100,7 +100,7 @@ def test_slopes_of_a_network_in_reverse():
     u = problem.start
 
     def cost(x):
-        return 0.5 * sum(jnp.sum(part**2) for part in equations(problem, Unknowns(x, u.own), WHOLE))
+        return 0.5 * sum(jnp.sum(part**2) for part in equations(problem, Unknowns(x, u.local), WHOLE))
 
     pulled = jax.jit(jax.grad(cost))(u.shared)
     values, slopes, _ = linearised(problem, u, WHOLE, "squares")

@@ -93,13 +93,14 @@ def problem_with(records, **options):
     return problem_of(spring, records, {"k": 3.0}, None, None, None, None, "squares", options.get("window"), settings)
 
 
+@pytest.mark.slow
 def test_starts_of_their_own():
     """Each window's start, for a k that is wrong, is that of SciPy's least squares with cos and sin."""
     records = [record(i, known=False, amplitude=a) for i, a in enumerate((1.0, 0.5))]
     problem = problem_with(records)
     problem = jax.tree.map(lambda x: jnp.asarray(x) if isinstance(x, np.ndarray) else x, problem)
     own, at = jax.jit(lambda x, own: settled(problem, x, own, 20, 1e-14))(
-        jnp.array([3.0]), jnp.asarray(problem.start.own)
+        jnp.array([3.0]), jnp.asarray(problem.start.local)
     )
     w = np.sqrt(3.0)
     for i, r in enumerate(records):
@@ -132,11 +133,11 @@ def test_only_what_is_in_a_batch_moves():
     task = Task(problem, None, Optimiser(optax.adam(0.1)), 1, 1, *numbers)
     # Starts that are off, so that there is somewhere to go.
     state = begun(task)
-    state = state._replace(own=np.asarray(state.own) + 0.01)
+    state = state._replace(local=np.asarray(state.local) + 0.01)
     seen = []
     for _ in range(4):
         after, told = round_of(task, state)
-        moved = np.flatnonzero(np.any(after.own != state.own, axis=1))
+        moved = np.flatnonzero(np.any(after.local != state.local, axis=1))
         assert len(moved) == 1 and after.y != state.y and np.isfinite(told.losses).all()
         seen.append(int(moved[0]))
         state = after

@@ -8,10 +8,11 @@ from jax import lax
 
 from lagjax.jax_internals import one_function as one_function_module
 from lagjax.jax_internals.marks import ONE_KERNEL, marked
-from lagjax.jax_internals.one_function import called, one_function
+from lagjax.jax_internals.one_function import kept_as_call, one_function
 from lagjax.jax_internals.plain import is_plain
 
 pytestmark = [
+    pytest.mark.optimised,
     pytest.mark.skipif(is_plain(), reason="LAGJAX_PLAIN: nothing is marked"),
     pytest.mark.skipif(jax.default_backend() != "cpu", reason="the marks are for CPUs"),
 ]
@@ -55,7 +56,7 @@ def test_a_call_stays_one():
         return lambda x: branches(mark(part(x))[0]) + mark(part(x + 1))[0]
 
     calls = lambda mark: jax.jit(twice(mark)).lower(jnp.asarray(2.0)).compile().as_text().count(" call(")
-    assert calls(called) == 2 and calls(lambda results: results) == 0
+    assert calls(kept_as_call) == 2 and calls(lambda results: results) == 0
 
 
 def test_marks_reach_the_program():

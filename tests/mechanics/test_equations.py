@@ -21,7 +21,7 @@ SYSTEM, Q, V, OF_CHAIN = chain(2)
 def in_three_ways(monkeypatch):
     """The equations of the chain in one matrix, as a band, and number by number; and its state."""
     s = coordinates.state(0.0, Q, V, OF_CHAIN)
-    dense, written = equations_of(SYSTEM, *s), equations_of(SYSTEM, *s, quickly=True, fallback=False)
+    dense, written = equations_of(SYSTEM, *s), equations_of(SYSTEM, *s, fast=True, fallback=False)
     monkeypatch.setattr(sparse_plan, "UNKNOWNS_AT_LEAST", 2)
     monkeypatch.setattr(sparse_plan, "BAND_AT_MOST", 1.0)
     banded = equations_of(SYSTEM, *s)
@@ -49,29 +49,29 @@ def test_the_three_ways_say_the_same(monkeypatch):
     def everything(t, q, v):
         numbers = t, written.inside(q), written.inside(v)
         a, multipliers = written.rates(*numbers)
-        quickly = (written.outside(a), multipliers), written.verdict(*numbers)[2:5]
-        return said(dense, t, q, v), said(banded, t, q, v), quickly
+        fast = (written.outside(a), multipliers), written.verdict(*numbers)[2:5]
+        return said(dense, t, q, v), said(banded, t, q, v), fast
 
-    expected, found, quickly = everything(*s[:3])
+    expected, found, fast = everything(*s[:3])
     for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(expected)):
         np.testing.assert_allclose(one, other, rtol=1e-11, atol=1e-11)
-    np.testing.assert_allclose(flat(quickly[0]), flat(expected[0]), rtol=1e-11, atol=1e-11)
-    assert list(map(bool, quickly[1])) == list(map(bool, expected[-1])) == [True, False, False]
+    np.testing.assert_allclose(flat(fast[0]), flat(expected[0]), rtol=1e-11, atol=1e-11)
+    assert list(map(bool, fast[1])) == list(map(bool, expected[-1])) == [True, False, False]
     elsewhere, *_ = everything(s.t, jax.tree.map(lambda x: 1.001 * x, s.q), s.v)
     assert np.max(np.abs(flat(elsewhere[0]) - flat(expected[0]))) > 1e-4
     assert np.max(np.abs(elsewhere[2] - expected[2])) > 1e-9
 
 
 @not_plain
-def test_the_careful_way_is_there_unless_they_are_taken_for_regular():
+def test_the_robust_way_is_there_unless_they_are_taken_for_regular():
     """Where what is written out gives NaN the fallback finds out why; without it NaN stays, and a verdict says so."""
     same = lambda t, q, params: jnp.stack([q["x"] ** 2 + q["y"] ** 2 - params["l"] ** 2] * 2)
     twice = lj.System(rod_pendulum.lagrangian, {"rod": lj.Holonomic(same)})
     s = coordinates.state(0.0, *HORIZONTAL, PARAMS)
-    careful, regular = (equations_of(twice, *s, quickly=True, fallback=fallback) for fallback in (True, False))
-    numbers = s.t, careful.inside(s.q), careful.inside(s.v)
+    robust, regular = (equations_of(twice, *s, fast=True, fallback=fallback) for fallback in (True, False))
+    numbers = s.t, robust.inside(s.q), robust.inside(s.v)
     of = lambda one: jax.jit(lambda t, q, v: (one.rates(t, q, v), one.verdict(t, q, v).finite))(*numbers)
-    ((a, multipliers), finite), ((unknown, _), nowhere) = of(careful), of(regular)
+    ((a, multipliers), finite), ((unknown, _), nowhere) = of(robust), of(regular)
     assert np.all(np.isfinite(flat(a))) and np.all(np.isnan(flat(unknown)))
     assert bool(finite) and not bool(nowhere)
     # Dependent equations share their force.
@@ -86,7 +86,7 @@ def test_equations_are_written_out_once_for_all_traces():
 
     def put_down(x):
         q = {"x": x, "y": s.q["y"]}
-        written.append(equations_of(rod_pendulum, s.t, q, s.v, s.params, quickly=True).written)
+        written.append(equations_of(rod_pendulum, s.t, q, s.v, s.params, fast=True).written)
         return x
 
     x = s.q["x"]
@@ -95,7 +95,7 @@ def test_equations_are_written_out_once_for_all_traces():
     jax.make_jaxpr(jax.vmap(put_down))(x[None])
     assert len({id(found) for found in written}) == 1 and written[0] is not None
     another = lj.System(lambda *state: 2.0 * rod_pendulum.lagrangian(*state), rod_pendulum.constraints)
-    assert equations_of(another, *s, quickly=True).written is not written[0]
+    assert equations_of(another, *s, fast=True).written is not written[0]
 
 
 @pytest.mark.parametrize("change", ["closed over", "given"])

@@ -63,7 +63,7 @@ def test_the_same_accelerations(name):
 
 
 def test_the_same_projection():
-    """From 1e-5 off, the nearest state of the careful way; from far off, NaN."""
+    """From 1e-5 off, the nearest state of the robust way; from far off, NaN."""
     q, v = {"x": 1.25 + 1e-5, "y": 2e-5}, {"x": 1e-5, "y": 3.0}
     s = coordinates.state(0.0, q, v, PARAMS)
     project = write_out(rod_pendulum, *s).project

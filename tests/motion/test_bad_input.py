@@ -43,10 +43,14 @@ def test_force_of_another_structure():
         lj.integrate(system, 0.0, 1.0, ts=TS)
 
 
-def test_integer_state():
-    """A whole number written without its decimal point, by name."""
-    with refusal(TypeError, "'psi' of q is int", "1.0 instead of 1"):
-        lj.integrate(sphere, {"psi": 1, "theta": 0.0}, {"psi": 0.0, "theta": 1.0}, ts=TS)
+def test_no_numbers_in_the_start():
+    """A condition, text, a function: by name, with what may have been meant."""
+    for start, words in ((True, "'psi' of q is bool"), ("1.0", "'1.0'"), (lambda: 1.0, "a function"), ({1.0}, "{1.0}")):
+        with refusal(TypeError, words, "Usual cause"):
+            lj.integrate(sphere, {"psi": start, "theta": 0.0}, {"psi": 0.0, "theta": 1.0}, ts=TS)
+    for start in (None, {}, [], np.zeros(0)):
+        with refusal(ValueError, "q has no coordinates"):
+            lj.integrate(pendulum, start, start, PARAMS, ts=TS)
 
 
 def test_float32_out_of_reach():
@@ -113,10 +117,16 @@ def test_constraint_without_a_derivative():
 
 
 def test_start_off_the_constraint():
-    """An inconsistent start: positions and velocities, with the remedy; `consistent_state` cures it."""
+    """An inconsistent start: positions and velocities, with the remedy."""
     q0, v0 = {"x": 1.3, "y": 0.1}, {"x": 0.2, "y": -1.0}
     with refusal(ValueError, "off the constraints", "'rod' = 0.138", "d/dt 'rod'", "consistent_state"):
         lj.integrate(rod_pendulum, q0, v0, PARAMS, ts=TS)
+
+
+@pytest.mark.slow
+def test_the_remedy_for_a_start_off_the_constraint():
+    """What the message advises cures it; twin: without it the same start is refused, above."""
+    q0, v0 = {"x": 1.3, "y": 0.1}, {"x": 0.2, "y": -1.0}
     traj = lj.integrate(rod_pendulum, *lj.consistent_state(rod_pendulum, 0.0, q0, v0, PARAMS), PARAMS, ts=TS)
     assert float(traj.residual()) < 1e-14
 
@@ -129,6 +139,7 @@ def test_a_constraint_may_have_any_name():
         lj.integrate(system, {"x": 1.25, "y": 0.0}, {"x": 0.4, "y": 0.0}, PARAMS, ts=TS)
 
 
+@pytest.mark.exhaustive
 def test_unreachable_constraint():
     """No consistent state exists: the error gives the residual by name."""
     system = lj.System(rod_pendulum.lagrangian, {"ghost": lj.Holonomic(lambda t, q, params: q["x"] ** 2 + 1.0)})
@@ -144,12 +155,35 @@ def test_unreachable_constraint():
         ([0.0, 1.0, 1.0], "must increase"),
         ([0.0], "at least two times"),
         (3.0, "at least two times"),
+        (None, "two times, and is None"),
+        ("0..1", "two times, and is '0..1'"),
+        (["0", "1"], r"two times, and is \['0', '1'\]"),
+        ([0j, 1j], "two times, and is"),
+        (np.ones((2, 2)), r"has shape \(2, 2\)"),
     ],
 )
 def test_times(ts, words):
     """ts that goes to and fro, or is no vector."""
     with refusal(ValueError, words):
         lj.integrate(pendulum, 1.0, 0.0, PARAMS, ts=ts)
+
+
+OPTIONS = {
+    "dt0": ("small", ValueError, "one positive number, not 'small'"),
+    "rtol": ("1e-9", ValueError, "It is '1e-9'"),
+    "atol": (1j, ValueError, "one number, or two"),
+    "max_steps": (1e6, ValueError, r"not 1000000.0.*10\*\*6"),
+    "adjoint": ("backsolve", TypeError, "an adjoint of diffrax, not str"),
+    "stepsize_controller": (diffrax.PIDController, TypeError, "the class PIDController"),
+}
+
+
+@pytest.mark.parametrize("name", OPTIONS)
+def test_options_of_another_kind(name):
+    """Text for a number, a float for a count, a class for an instance: by the option's name, before anything runs."""
+    given, kind, words = OPTIONS[name]
+    with refusal(kind, name, words):
+        lj.integrate(pendulum, 1.0, 0.0, PARAMS, ts=TS, **{name: given})
 
 
 @pytest.mark.parametrize("name", ("dt0", "max_step"))
@@ -223,6 +257,12 @@ def test_called_lagrangian_and_bare_constraint():
         lj.System(3.0)
     with refusal(TypeError, "'rod'", "lj.Holonomic"):
         lj.System(pendulum.lagrangian, {"rod": lambda t, q, params: q})
+    with refusal(TypeError, "kinetic and potential energy given apart", "return kinetic - potential"):
+        lj.System(pendulum.lagrangian, pendulum.lagrangian)
+    with refusal(TypeError, "params in the place of constraints", "each call takes them"):
+        lj.System(pendulum.lagrangian, PARAMS)
+    with refusal(TypeError, "named 3, and its name must be text"):
+        lj.System(pendulum.lagrangian, {3: lj.Holonomic(lambda t, q, params: q)})
 
 
 def test_unknown_drift():

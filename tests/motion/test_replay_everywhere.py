@@ -65,7 +65,7 @@ def test_scenes(name):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", exhaustive_but(("double_pendulum",), tuple(MECHANISMS)))
 def test_mechanisms(name):
-    """Over a short time: redundant ones are stepped the careful way."""
+    """Over a short time: redundant ones are stepped the robust way."""
     m = MECHANISMS[name]
     modes_agree(m.system, m.q0, m.v0, m.params, np.linspace(0.0, min(m.end, 0.02), OUTPUTS))
 

@@ -1,8 +1,4 @@
-"""What is hardly ever meant is told: a force in place of R, and single precision that nobody asked for."""
-
-import subprocess
-import sys
-from pathlib import Path
+"""What is hardly ever meant is told: a force in place of R."""
 
 import jax
 import jax.numpy as jnp
@@ -67,24 +63,3 @@ def test_integrate_tells_and_goes_on():
         return of_start.q["x"] + lj.integrate(closed, *start, None, ts=ts).q["x"]
 
     assert jax.eval_shape(traced, 0.5, 0.5).shape == (2,)
-
-
-@pytest.mark.exhaustive
-def test_single_precision_is_told_once():
-    """Without x64: by the first start that is none of NumPy's float32; with it never."""
-    code = """
-import sys, warnings, numpy as np, jax, jax.numpy as jnp, lagjax as lj
-jax.config.update("jax_enable_x64", sys.argv[1] == "64")
-free = lj.System(lambda t, q, v, params: 0.5 * v**2)
-for one in (np.float32(1.0), 1.0, jnp.asarray(1.0)):
-    with warnings.catch_warnings(record=True) as told:
-        warnings.simplefilter("always")
-        motion = lj.integrate(free, one, one, None, ts=np.linspace(0.0, 1.0, 2))
-    print(motion.t.dtype, len(told), "jax_enable_x64" in str([x.message for x in told]), [x.filename for x in told])
-"""
-    root = Path(lj.__file__).parents[1]
-    for bits, counts in (("32", [0, 1, 0]), ("64", [0, 0, 0])):
-        command = [sys.executable, "-c", code, bits]
-        found = subprocess.run(command, cwd=root, capture_output=True, text=True, check=True).stdout.splitlines()
-        assert [line.split()[1:3] for line in found] == [[str(n), str(n == 1)] for n in counts], found
-        assert "<string>" in found[1] or bits == "64", "the warning shows the user's line"

@@ -11,7 +11,7 @@ from lagjax.numerics.dense import Saddle
 def eliminated(mass, jacobian, forcing, gamma):
     """a, multipliers, and whether they are believed."""
     saddle = Saddle(mass, jacobian)
-    return *saddle.solve(forcing, gamma), saddle.believed
+    return *saddle.solve(forcing, gamma), saddle.valid
 
 
 def error_of(solution, matrix, known):

@@ -35,5 +35,5 @@ def test_two_devices(tmp_path):
     # Split, the program is compiled otherwise, and where an error is no more than round-off the next step differs.
     np.testing.assert_allclose(two["steps"], one.status.steps, rtol=0.2)
     np.testing.assert_allclose(two["values"], one.values, atol=1e-7)
-    # Half of the lanes belong to the careful program.
+    # Half of the lanes belong to the robust program.
     np.testing.assert_allclose(two["irregular"], exact(BOTH["k"]), rtol=1e-7)

@@ -1,4 +1,4 @@
-"""Sweeps take motions for regular first: what is not settled is computed with the careful program, all of it."""
+"""Sweeps take motions for regular first: what is not settled is computed with the robust program, all of it."""
 
 import contextlib
 from collections import Counter
@@ -51,7 +51,7 @@ def quiet(run, axes=BOTH, **settings):
 def regular_alone(run, axes=BOTH):
     """(values, status, settled) of the program that takes motions for regular, and of nothing else."""
     grid = axes_of(axes, False)
-    program, _ = remembered.program_for(run, grid, grid.size, jax.local_devices()[:1], "vmap", careful=False)
+    program, _ = remembered.program_for(run, grid, grid.size, jax.local_devices()[:1], "vmap", robust=False)
     return program.call(grid.at(np.arange(grid.size)), grid.size)
 
 
@@ -61,7 +61,7 @@ def compiled(monkeypatch):
     count, compiled = Counter(), remembered.compiled
 
     def counted(*args):
-        count["careful" if args[-1] else "regular"] += 1
+        count["robust" if args[-1] else "regular"] += 1
         return compiled(*args)
 
     monkeypatch.setattr(remembered, "compiled", counted)
@@ -70,7 +70,7 @@ def compiled(monkeypatch):
 
 
 @contextlib.contextmanager
-def all_careful(monkeypatch):
+def all_robust(monkeypatch):
     """Sweeps as they would be without."""
     with monkeypatch.context() as changed:
         changed.setattr(lanes, "REGULAR_FIRST", lambda _: REGULAR_FIRST(False))
@@ -79,11 +79,12 @@ def all_careful(monkeypatch):
     remembered._PROGRAMS.clear()
 
 
+@pytest.mark.slow
 @not_plain
 def test_lanes_that_are_not_regular(compiled):
     """They have their exact values, and the others those that they had. Twin: without the second program they fail."""
     swept = quiet(first_coordinate)
-    assert swept.ok.all() and compiled == {"regular": 1, "careful": 1}
+    assert swept.ok.all() and compiled == {"regular": 1, "robust": 1}
     np.testing.assert_allclose(swept.values, exact(BOTH["k"]), rtol=1e-7)
     values, status, settled = regular_alone(first_coordinate)
     np.testing.assert_array_equal(settled, BOTH["k"] > 1)
@@ -92,12 +93,13 @@ def test_lanes_that_are_not_regular(compiled):
 
 
 def test_where_all_are_regular(compiled):
-    """Nothing careful is compiled."""
+    """Nothing robust is compiled."""
     swept = quiet(first_coordinate, DEFINITE)
     np.testing.assert_allclose(swept.values, exact(DEFINITE["k"]), rtol=1e-7)
     assert swept.ok.all() and compiled == {"regular": 1}
 
 
+@pytest.mark.slow
 @not_plain
 def test_what_run_makes_of_a_failure():
     """A run that catches NaN, and looks at `result`: the whole lane is computed anew. Twin: the first program alone."""
@@ -129,7 +131,7 @@ def test_motions_that_nobody_is_told_of(what, compiled, monkeypatch):
     """In a loop or a branch nothing is taken for regular. Twin: it would go unnoticed."""
     run = lambda point: HIDDEN[what](point["k"])
     np.testing.assert_allclose(quiet(run).values, exact(BOTH["k"]), rtol=1e-7)
-    assert regular_alone(run)[2] is None and compiled["careful"] == 0
+    assert regular_alone(run)[2] is None and compiled["robust"] == 0
     monkeypatch.setattr(reported, "_hides", lambda jaxpr: False)
     remembered._PROGRAMS.clear()
     np.testing.assert_array_equal(np.isnan(quiet(run).values), BOTH["k"] < 1)
@@ -150,17 +152,17 @@ def test_derivatives(derivative, compiled):
     step = 1e-5
     slopes = (exact(BOTH["k"] + step) - exact(BOTH["k"] - step)) / (2 * step)
     np.testing.assert_allclose(quiet(run).values, slopes, rtol=1e-5)
-    assert compiled == {"regular": 1, "careful": 1}
+    assert compiled == {"regular": 1, "robust": 1}
     np.testing.assert_array_equal(np.isnan(regular_alone(run)[0]), BOTH["k"] < 1)
 
 
 @pytest.mark.exhaustive
 def test_many_chunks_and_workers(compiled):
-    """One careful program for all of them; after a chunk that is mostly irregular the other is not called again."""
+    """One robust program for all of them; after a chunk that is mostly irregular the other is not called again."""
     many = {"k": np.tile(BOTH["k"][:2], 40)}
     swept = quiet(first_coordinate, many, chunk=4, workers=4)
     np.testing.assert_allclose(swept.values, exact(many["k"]), rtol=1e-7)
-    assert compiled == {"regular": 1, "careful": 1} and swept.compiling > 0
+    assert compiled == {"regular": 1, "robust": 1} and swept.compiling > 0
     (program,) = [program for _, program in remembered._PROGRAMS.values() if program.irregular.is_set()]
     calls = Counter()
     remembered_program = program._replace(call=lambda *args: calls.update(["regular"]) or program.call(*args))
@@ -219,7 +221,7 @@ def test_a_constraint_written_twice(monkeypatch):
 
     axes = {"twice": np.array([True, False]), "x": np.array([1.0, 1.2, np.nan])}
     swept = quiet(values, axes)
-    with all_careful(monkeypatch):
+    with all_robust(monkeypatch):
         expected = quiet(values, axes)
     np.testing.assert_array_equal(swept.status.result, expected.status.result)
     assert swept.ok[:, 0].all()

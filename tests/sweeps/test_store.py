@@ -50,10 +50,10 @@ def test_written_resumed_and_read(tmp_path):
     same(second, whole)
     alone = lj.open_sweep(path)
     assert alone.dims == whole.dims and alone.counts() == whole.counts()
-    np.testing.assert_array_equal(alone.values["value"], whole.values)
+    np.testing.assert_array_equal(alone.values, whole.values)
     assert alone.to_xarray()["value"].dims == ("g", "angle")
     with pytest.raises(ValueError, match="does not know what ran it"):
-        alone.resweep()
+        alone.resweep(where=True)
 
 
 def test_only_what_is_missing(tmp_path):
@@ -61,10 +61,10 @@ def test_only_what_is_missing(tmp_path):
     path, whole = tmp_path / "sweep", swept(worker.quick)
     swept(worker.quick, path)
     store = Store(path)
-    store.group["done"][1] = 0
-    store.group["values/value"][store.block : 2 * store.block] = -1.0
+    store.unmark([1])
+    store.group["value"][store.blocks.region(1)] = -1.0
     again = swept(worker.quick, path)
-    assert again.ran == store.block
+    assert again.ran == len(np.r_[store.blocks.points(1)])
     same(again, whole)
 
 
@@ -92,7 +92,14 @@ def test_another_sweep_is_refused(tmp_path):
 
 def blocks_there(path):
     """How many blocks are marked, 0 before there is a store."""
-    return 0 if not path.exists() else Store(path).blocks - len(Store(path).missing())
+    return 0 if not path.exists() else len(Store(path).blocks) - len(Store(path).missing())
+
+
+def points_there(path):
+    """How many points these blocks have."""
+    store = Store(path)
+    there = set(range(len(store.blocks))) - set(store.missing().tolist())
+    return sum(len(np.r_[store.blocks.points(number)]) for number in there)
 
 
 def wait_for(process, path, count):
@@ -117,7 +124,7 @@ def test_killed_and_resumed(tmp_path):
     path = tmp_path / "sweep"
     kill_when(started(path), path, 1)
     kill_when(started(path), path, 2)
-    there = blocks_there(path) * Store(path).block
+    there = points_there(path)
     rest = started(path)
     computed = int(rest.communicate()[0])
     assert 0 < computed <= POINTS - there
@@ -136,7 +143,7 @@ def test_interrupted_from_the_keyboard(tmp_path):
         process.send_signal(signal.SIGINT)
         computed = int(process.communicate()[0])
         assert process.returncode == 0 and computed > 0
-    assert blocks_there(path) * Store(path).block == computed
+    assert points_there(path) == computed
     same(swept(worker.run, path), swept(worker.run))
 
 
@@ -160,8 +167,8 @@ def test_two_processes_one_killed(tmp_path):
     first, second = started(path, 0, 2), started(path, 1, 2)
     kill_when(second, path, 1)
     computed = int(first.communicate()[0])
-    missing = len(Store(path).missing())
+    missing = POINTS - points_there(path)
     again = int(started(path, 1, 2).communicate()[0])
-    assert 0 < computed < POINTS and missing > 0 and again <= missing * Store(path).block
+    assert 0 < computed < POINTS and missing > 0 and again <= missing
     assert len(Store(path).missing()) == 0
     same(swept(worker.run, path), swept(worker.run))

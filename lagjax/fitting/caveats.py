@@ -12,10 +12,10 @@ from lagjax.mechanics.diagnosis import listed
 ASTRAY = 1e6
 
 
-def doubts(fit: Fit) -> list[str]:
+def caveats(fit: Fit) -> list[str]:
     """What a user has to know of a fit, the gravest first."""
     words = [_of_search(fit), _of_training(fit), _astray(fit), _against_sigma(fit) or _on_a_curve(fit)]
-    if fit.seen is not None:
+    if fit.evaluation is not None:
         words += [_of_parameters(fit), _of_motion(fit)]
         words += [] if fit.problem.absolute else [_without_freedom(fit)]
     if at := fit.at_bounds():
@@ -65,7 +65,7 @@ def _astray(fit):
 
 
 def _of_parameters(fit):
-    if rank_of(np.asarray(fit.seen.singular_values)) == len(fit.names):
+    if rank_of(np.asarray(fit.evaluation.singular_values)) == len(fit.names):
         return ""
     return (
         f"the data do not determine all parameters.\n{fit.identifiability}\n"
@@ -75,7 +75,7 @@ def _of_parameters(fit):
 
 
 def _of_motion(fit):
-    failed = np.flatnonzero(~np.asarray(fit.seen.well))
+    failed = np.flatnonzero(~np.asarray(fit.evaluation.well))
     if not failed.size:
         return ""
     record = int(fit.problem.windows.record[failed[0]])

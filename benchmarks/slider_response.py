@@ -1,0 +1,209 @@
+"""How soon does the picture follow a slider? `lj.interact` in JupyterLab, and the page of a sweep, in a real browser.
+
+A bead on a turning hoop, 30 units of time, 601 outputs, drawn as a curve. In a browser without a window the slider has
+the focus, and a key is pressed as a person presses it. What is measured, in wall time inside the browser, begins with
+the key and ends with the frame after the new picture is loaded: the notebook's messages to the kernel and back, the
+solve, the drawing and the PNG are all in it. "whole": the part of the presses after which also axes and ticks had to be
+drawn again. Then 100 presses come in one go, as from a hand that drags: no queue may form, and the last value must be
+the one that stays.
+
+In this process: the processor time of one value, and of its parts. In the browser runs also the processor time of all
+processes a press; that of the browser is spent on several cores, also after the picture is there.
+
+    python benchmarks/slider_response.py [--json FILE] [--only TEXT]
+
+Needs Chromium or Chrome, and the extra `notebook`. On a machine that others use, wall times say how busy it is: the
+load is written beside them.
+"""
+
+import json
+import os
+import socket
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import jax
+import numpy as np
+from browser import Browser, installed
+from measure import main, row, skipped
+
+import lagjax as lj
+
+jax.config.update("jax_enable_x64", True)
+
+CELL = """
+import jax, jax.numpy as jnp
+jax.config.update("jax_enable_x64", True)
+import lagjax as lj
+bead = lj.System(lambda t, q, v, params: 0.5 * v**2 + 0.5 * (params["omega"] * jnp.sin(q)) ** 2 + jnp.cos(q))
+ts = jnp.linspace(0.0, 30.0, 601)
+run = lambda point: lj.integrate(bead, point["start"], 0.0, {"omega": point["omega"]}, ts=ts)
+knobs = lj.interact(run, {"omega": (0.0, 4.0, 0.02), "start": (0.1, 3.0)}, start={"omega": 0.6}, progress=False)
+"""
+PRESSES, DRAGGED = 60, 100
+# Nothing of the user's own settings is read or written.
+OF_JUPYTER = ("JUPYTER_CONFIG_DIR", "JUPYTER_RUNTIME_DIR", "IPYTHONDIR", "JUPYTERLAB_SETTINGS_DIR")
+# From the key to the frame after the picture: an Image widget gets another source each time, a page draws in place.
+WATCH = """
+(() => {
+  window.times = []; window.pressed = 0; window.told = () => {};
+  document.addEventListener("keydown", () => { window.pressed = performance.now(); }, true);
+  const seen = () => requestAnimationFrame(() => {
+    window.times.push([window.pressed, performance.now()]);
+    window.told(true);
+  });
+  const image = document.querySelector("IMAGE");
+  if (image.tagName === "IMG") image.addEventListener("load", seen);
+  else new MutationObserver(seen).observe(image, {childList: true, subtree: true, attributes: true});
+})()
+"""
+
+
+def rows(wanted):
+    """The kernel's part, the browser's whole, and the page's."""
+    space = {}
+    exec(CELL, space)
+    if wanted("kernel"):
+        yield from in_this_process(space["knobs"])
+    for what, measured in (("notebook", in_the_notebook), ("page", lambda: in_the_page(space["run"]))):
+        if wanted(what):
+            if installed() is None:
+                yield skipped(what, "no Chromium or Chrome is installed")
+            else:
+                yield from measured()
+
+
+def in_this_process(knobs):
+    """Processor time a value."""
+    values = np.linspace(0.6, 1.8, 61)
+    wholes, times = [], []
+    for omega in values:
+        before, began = knobs._picture.drawn_whole, time.process_time()
+        knobs.set(omega=omega)
+        times.append(1e3 * (time.process_time() - began))
+        wholes.append(knobs._picture.drawn_whole > before)
+    solve, png = (milliseconds(f) for f in (lambda: knobs._values(knobs.point), knobs._picture._png))
+    whole = statistics.median([x for x, is_whole in zip(times, wholes) if is_whole] or [0.0])
+    more = {"solve": solve, "png": png, "with axes": whole, "whole": np.mean(wholes), "bytes": len(knobs.picture)}
+    yield row("kernel: ms of processor time a value, median", statistics.median(times), 20, **more)
+
+
+def milliseconds(function, repeats=30):
+    """Processor time of one call."""
+    began = time.process_time()
+    for _ in range(repeats):
+        function()
+    return 1e3 * (time.process_time() - began) / repeats
+
+
+def in_the_notebook():
+    """JupyterLab with one notebook of one cell."""
+    with tempfile.TemporaryDirectory() as folder:
+        cell = {"cell_type": "code", "source": CELL + "knobs", "metadata": {}, "outputs": [], "execution_count": None}
+        kernel = {"kernelspec": {"name": "python3", "display_name": "Python 3", "language": "python"}}
+        notebook = {"cells": [cell], "metadata": kernel, "nbformat": 4, "nbformat_minor": 4}
+        Path(folder, "knobs.ipynb").write_text(json.dumps(notebook))
+        with socket.socket() as free:
+            free.bind(("127.0.0.1", 0))
+            port = free.getsockname()[1]
+        settings = ("--no-browser", f"--port={port}", "--IdentityProvider.token=", "--allow-root", "--ip=127.0.0.1",
+                    "--LabApp.expose_app_in_browser=True", f"--notebook-dir={folder}")  # fmt: skip
+        own = dict.fromkeys(OF_JUPYTER, folder)
+        lab = subprocess.Popen(
+            [sys.executable, "-m", "jupyterlab", *settings],
+            env=os.environ | own, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+        )  # fmt: skip
+        try:
+            wait_for(port)
+            with Browser(patience=120.0) as browser:
+                page = browser.open(f"http://127.0.0.1:{port}/lab/tree/knobs.ipynb", width=1100, height=900)
+                page.wait("window.jupyterapp && document.querySelector('.jp-Notebook .jp-CodeCell')", 120)
+                page.wait("document.querySelector('.jp-NotebookPanel-toolbar')", 60)
+                time.sleep(2.0)
+                page.run("jupyterapp.commands.execute('notebook:run-all-cells').then(() => null)")
+                page.wait("document.querySelector('img.widget-image')", 240)
+                roots = browser.process.pid, lab.pid
+                yield from measured(page, "notebook", "img.widget-image", ".widget-slider .noUi-handle", 50, roots)
+                if os.environ.get("LAGJAX_PICTURE"):
+                    page.picture(os.environ["LAGJAX_PICTURE"])
+        finally:
+            lab.terminate()
+            lab.wait()
+
+
+def wait_for(port, seconds=120.0):
+    """Wait until somebody listens."""
+    until = time.monotonic() + seconds
+    while True:
+        try:
+            socket.create_connection(("127.0.0.1", port), 1.0).close()
+            return
+        except OSError:
+            if time.monotonic() > until:
+                raise
+            time.sleep(0.2)
+
+
+def in_the_page(run):
+    """The page of a sweep over as many values."""
+    with tempfile.TemporaryDirectory() as folder, Browser() as browser:
+        file = Path(folder, "sweep.html")
+        axes = {"start": np.array([1.5]), "omega": np.arange(0.0, 4.01, 0.02)}
+        lj.sweep(run, axes, progress=False).to_html(file)
+        page = browser.open(file)
+        yield from measured(
+            page, "page", "[data-views] svg", ".lagjax .row:nth-child(2) input", 50, [browser.process.pid]
+        )
+
+
+def processor_time(*roots):
+    """Milliseconds of processor time of some processes and all that they started, as Linux tells it."""
+    parents, spent = {}, {}
+    for file in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            after_name = file.read_text().rpartition(")")[2].split()
+        except OSError:
+            continue
+        number = int(file.parent.name)
+        parents[number], spent[number] = int(after_name[1]), sum(map(int, after_name[11:13]))
+    family = lambda number: number in roots or (number in parents and family(parents[number]))
+    return 1e3 * sum(spent[number] for number in spent if family(number)) / os.sysconf("SC_CLK_TCK")
+
+
+def measured(page, what, image, slider, target, roots):
+    """Rows: one press after another, and many in one go."""
+    page.run(WATCH.replace("IMAGE", image))
+    page.run(f"document.querySelector({json.dumps(slider)}).focus()")
+    page.press("ArrowRight")
+    page.wait("times.length >= 1")
+    page.run("times.length = 0")
+    spent = [processor_time(root) for root in roots]
+    for _ in range(PRESSES):
+        page.press("ArrowRight")
+        # Nobody asks meanwhile, which would take the browser's time.
+        page.run("times.some(([key]) => key === pressed) || new Promise(done => { window.told = done; })")
+        time.sleep(0.05)
+    spent = [(processor_time(root) - before) / PRESSES for root, before in zip(roots, spent)]
+    more = dict(zip(("browser", "server and kernel"), spent))
+    yield row(f"{what}: ms of processor time a press, all processes", sum(spent), **more)
+    # A page may draw several times for one key: the last counts.
+    last = {pressed: seen - pressed for pressed, seen in page.run("times")}
+    times = sorted(last.values())
+    load = {"load": os.getloadavg()[0]}
+    more = {"least": times[0], "of 95 %": times[int(0.95 * len(times))], "presses": len(times)} | load
+    yield row(f"{what}: ms from the key to the picture, median", statistics.median(times), target, **more)
+    page.run("times.length = 0")
+    for _ in range(DRAGGED):
+        page.press("ArrowLeft")
+    page.wait("times.length && performance.now() - times[times.length - 1][1] > 500")
+    pressed, seen = page.run("[window.pressed, times[times.length - 1][1]]")
+    more = {"pictures": len({seen for _, seen in page.run("times")}), "presses": DRAGGED} | load
+    yield row(f"{what}: ms from the last key of a drag to the last picture", max(0.0, seen - pressed), 150, **more)
+
+
+if __name__ == "__main__":
+    main(rows, __doc__)

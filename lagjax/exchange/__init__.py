@@ -1,0 +1,1 @@
+"""Ways in and out: models from SymPy, compiled programs for processes without lagjax."""

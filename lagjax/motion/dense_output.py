@@ -1,0 +1,299 @@
+"""The motion between outputs: the method's own steps from the output before.
+
+A trajectory keeps what was asked for, and outputs are ends of steps. A polynomial through them would have an order of
+its own, and be wrong where the motion turned between two of them. So the motion is continued from the last output
+before the time that is asked for, by the method, the tolerances and the longest step that it was integrated with: what
+comes out has the order of the method and satisfies the constraints. It costs one short solve for each time, which is
+compiled once for a system and then serves all times and all of its trajectories.
+
+At an output it is that output. There a solve would have nothing to do and no derivative by the time: one step of the
+classical Runge-Kutta method of length zero has the first four of them.
+"""
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, ArrayLike, Int
+
+from lagjax.jax_internals.tracing import is_eager
+from lagjax.mechanics import coordinates
+from lagjax.mechanics.compiled import compiled
+from lagjax.mechanics.hybrid import Hybrid
+from lagjax.mechanics.memory import filled_up
+from lagjax.mechanics.multipliers import accelerations
+from lagjax.motion.arriving import WHOLE_STEPS
+from lagjax.motion.backward import in_either_direction
+from lagjax.motion.hybrid_trajectory import NO_PHASE, HybridTrajectory
+from lagjax.motion.reported import patient
+from lagjax.motion.solve import Settings
+from lagjax.motion.trajectory import Snapshot, Trajectory, ended_well, in_words
+
+# Controllers that can begin anywhere. Others have a plan of their own for the whole motion.
+BEGIN_ANYWHERE = type(None), diffrax.PIDController, diffrax.ConstantStepSize, diffrax.ClipStepSizeController
+# Times are the same where they are so near to each other, in round-offs: a user computes the end of a motion anew.
+SAME = 4
+# An output is continued by this part of the motion where nothing is asked of that.
+ASIDE = 1e-6
+MAX_STEPS = 2**20
+# Times that are solved for side by side: 7 microseconds each, and 20 one after the other, where a step is enough.
+LANES = 256
+
+
+class Known(NamedTuple):
+    """Where a motion can be continued from, in the order of its run: outputs, and the states after switches.
+
+    `phase`: the number of the phase that begins or goes on there; None of a motion without phases.
+    """
+
+    at: Snapshot
+    is_output: np.ndarray | None
+    phase: Int[Array, " N"] | None
+
+
+def at(trajectory: Trajectory, t: ArrayLike) -> Snapshot:
+    """The motion at times of any shape: see `Trajectory.at`."""
+    _check_can_be_continued(trajectory)
+    dtype = trajectory.t.dtype
+    t = coordinates.numpy_of(t).asarray(t, dtype)
+    if not is_eager() or coordinates.is_traced((trajectory, t)):
+        return _traced(trajectory, t)
+    if trajectory.t.ndim > 1:
+        _check_inside(t, np.asarray(trajectory.t)[..., 0], np.asarray(trajectory.t)[..., -1])
+        return _of_batch(trajectory, t)
+    _check_ended(trajectory, t)
+    times = t.ravel()
+    known = _known_of(trajectory)
+    index = _before(known, times, trajectory.static.how.backward)
+    nodes = jax.tree.map(lambda x: np.asarray(x)[index], known.at)
+    found = jax.tree.map(np.array, nodes._replace(t=times))
+    between = np.flatnonzero(nodes.t != times)
+    for phase in [None] if known.phase is None else np.unique(np.asarray(known.phase)[index[between]]):
+        mine = between if phase is None else between[np.asarray(known.phase)[index[between]] == phase]
+        if mine.size:
+            _fill(found, mine, trajectory, phase, jax.tree.map(lambda x, mine=mine: x[mine], nodes), times[mine])
+    return jax.tree.map(lambda x: jnp.asarray(x.reshape(t.shape + x.shape[1:])), found)
+
+
+def _fill(found, mine, trajectory, phase, nodes, times):
+    """Write what the motion is at some times, all in one phase, beside what is known already."""
+    system = trajectory.system if phase is None else trajectory.system.systems[phase]
+    multipliers = {name: x for name, x in nodes.multipliers.items() if name in system.constraints}
+    # Of few sizes, for each of which a program is compiled.
+    count = filled_up(len(times)) if len(times) <= LANES else LANES * filled_up(-(-len(times) // LANES))
+    fill = np.minimum(np.arange(count), len(times) - 1)
+    nodes, times = jax.tree.map(lambda x: x[fill], (nodes._replace(multipliers=multipliers), times))
+    of_system = system, trajectory.params, trajectory.asked, trajectory.tolerance
+    new, result = _continue_all(*of_system, nodes, times, trajectory.static.how.backward)
+    new, result = jax.tree.map(lambda x: np.asarray(x)[: mine.size], (new, result))
+    if not np.all(ended_well(result)):
+        _raise_not_continued(nodes.t, times, result)
+    for name, x in found.multipliers.items():
+        x[mine] = new.multipliers[name] if name in multipliers else np.nan
+    for old, x in zip(jax.tree.leaves((found.q, found.v)), jax.tree.leaves((new.q, new.v))):
+        old[mine] = x
+
+
+def _known_of(trajectory) -> Known:
+    outputs = Snapshot(trajectory.t, trajectory.q, trajectory.v, trajectory.multipliers)
+    if not isinstance(trajectory, HybridTrajectory):
+        return Known(outputs, None, None)
+    outputs = jax.tree.map(np.asarray, outputs)
+    s, count = trajectory.switches, len(trajectory.switches)
+    unknown = {name: np.full((count, *x.shape[1:]), np.nan) for name, x in outputs.multipliers.items()}
+    after = jax.tree.map(lambda x: np.asarray(x)[:count], (s.t, s.q_after, s.v_after))
+    reached = np.asarray(trajectory.phase) != NO_PHASE
+    both = jax.tree.map(
+        lambda a, b: np.concatenate([a[reached], b]).astype(a.dtype), outputs, Snapshot(*after, unknown)
+    )
+    phase = np.concatenate([np.asarray(trajectory.phase)[reached], np.asarray(s.to)[:count]])
+    is_output = np.arange(len(phase)) < reached.sum()
+    # An output at the time of a switch is before it.
+    order = np.lexsort((np.arange(len(phase)), both.t))
+    return Known(jax.tree.map(lambda x: x[order], both), is_output[order], phase[order])
+
+
+def _before(known: Known, t, backward: bool):
+    """The number of the last place from which the motion is continued to each time, which is the time itself if it can.
+
+    A switch does not count at its own time, when the motion is still before it.
+    """
+    xp: Any = coordinates.numpy_of((known.at.t, t))
+    sign = -1 if backward else 1
+    times = xp.asarray(known.at.t)
+    index = xp.searchsorted(sign * times, sign * t, side="right") - 1
+    if known.is_output is not None:
+        first = xp.searchsorted(times, t, side="left")
+        here = np.minimum(first, len(times) - 1)
+        index = np.where((times[here] == t) & known.is_output[here], here, first - 1)
+    return xp.clip(index, 0, len(times) - 1)
+
+
+def _traced(trajectory, t):
+    """The same in a program: NaN where there is no motion."""
+    if isinstance(trajectory.system, Hybrid):
+        raise TypeError(
+            "at(t) of a motion in phases looks at its switches, and this one is being traced, or a batch.\n"
+            "Fix: ask one motion outside of the program; or give these times to lj.integrate as ts."
+        )
+    of_one = partial(_at_one, trajectory)
+    for _ in range(t.ndim):
+        of_one = jax.vmap(of_one)
+    if trajectory.t.ndim == 1:
+        return of_one(t)
+    return jax.vmap(lambda lane: _traced(lane, t))(trajectory)
+
+
+@compiled
+def _of_batch(trajectory, t):
+    return _traced(trajectory, t)
+
+
+def _at_one(trajectory, t):
+    sign = -1 if trajectory.static.how.backward else 1
+    first, last = trajectory.t[0], trajectory.end.t
+    slack = _slack(first, trajectory.t[-1])
+    inside = (sign * (t - first) >= -slack) & (sign * (last - t) >= -slack)
+    low, high = jnp.minimum(first, last), jnp.maximum(first, last)
+    # Not `clip`, which has half of the derivative at its ends.
+    near = jnp.where(t < low, low, jnp.where(t > high, high, t))
+    known = _known_of(trajectory)
+    index = _before(known, lax.stop_gradient(near), trajectory.static.how.backward)
+    node = jax.tree.map(lambda x: jnp.asarray(x)[index], known.at)
+    exact = node.t == near
+    aside = node.t + sign * ASIDE * lax.stop_gradient(jnp.abs(trajectory.t[-1] - first))
+    of_system = trajectory.system, trajectory.params, trajectory.asked, trajectory.tolerance
+    found, _ = _continued(*of_system, node, jnp.where(exact, aside, near), trajectory.static.how.backward)
+    # The time that is asked for, also where it is a round-off beyond the end.
+    there = _of_length_zero(trajectory.system, trajectory.params, node, jnp.where(exact, t, node.t))
+    chosen = jax.tree.map(lambda a, b: jnp.where(inside, jnp.where(exact, a, b), jnp.nan), there, found)
+    return chosen._replace(t=t)
+
+
+def _continued(system, params, asked, tolerance, node: Snapshot, t, backward):
+    """The motion at t, continued from a node, and how that went."""
+    rtol, atol = tolerance
+    by_size = atol.ndim == 2
+    settings = Settings(
+        method=asked.method,
+        controller=asked.stepsize_controller,
+        event=None,
+        adjoint=None,
+        rtol=rtol,
+        atol=rtol if by_size else atol,
+        dt0=asked.dt0,
+        max_step=asked.max_step,
+        jump_ts=asked.jump_ts,
+        shares=np.array(WHOLE_STEPS, node.t.dtype),
+        repeated_up_to=np.zeros((), np.int32),
+        by_size=by_size,
+        apart=True,
+        max_steps=patient(MAX_STEPS),
+        drift=asked.drift if system.constraints else "none",
+        progress=False,
+    )
+    ts = jnp.stack([node.t, t])
+    found = in_either_direction(system, node.q, node.v, params, ts, None, settings, backward)
+    last = lambda tree: jax.tree.map(lambda x: x[-1], tree)
+    return Snapshot(t, *map(last, (found.q, found.v, found.multipliers))), found.result
+
+
+@partial(compiled, in_numpy=True)
+def _continue_all(system, params, asked, tolerance, nodes, times, backward):
+    of_one = lambda pair: _continued(system, params, asked, tolerance, *pair, backward)
+    return lax.map(of_one, (nodes, times), batch_size=min(LANES, len(times)))
+
+
+def _of_length_zero(system, params, node: Snapshot, t):
+    """The node itself, with its derivatives by t there: t is its time."""
+    h = t - node.t
+
+    def rate(dt, y):
+        return y[1], accelerations(system, node.t + dt, *y, params)[0]
+
+    def moved(dt, slope):
+        return jax.tree.map(lambda y, k: y + dt * k, (node.q, node.v), slope)
+
+    k1 = rate(0.0 * h, (node.q, node.v))
+    k2 = rate(h / 2, moved(h / 2, k1))
+    k3 = rate(h / 2, moved(h / 2, k2))
+    k4 = rate(h, moved(h, k3))
+    slope = jax.tree.map(lambda a, b, c, d: (a + 2 * b + 2 * c + d) / 6, k1, k2, k3, k4)
+    q, v = moved(h, slope)
+    if not node.multipliers:
+        return Snapshot(t, q, v, {})
+    _, multipliers = accelerations(system, t, q, v, params)
+    # What was computed at the output, bit for bit.
+    exactly = lambda known, x: known + (x - lax.stop_gradient(x))
+    known = jax.tree.map(lax.stop_gradient, node.multipliers)
+    return Snapshot(t, q, v, jax.tree.map(exactly, known, multipliers))
+
+
+def _check_can_be_continued(trajectory):
+    if isinstance(trajectory.system, Hybrid) and trajectory.t.ndim > 1:
+        raise ValueError(
+            f"this is a batch of motions in phases, of shape {trajectory.t.shape[:-1]}: ask one of them.\n"
+            "Fix: jax.tree.map(lambda x: x[0], traj).at(t)"
+        )
+    asked = trajectory.asked
+    instead = "Fix: give these times to lj.integrate as ts."
+    if asked.drift == "baumgarte" or asked.drift == "none" and _has_constraints(trajectory.system):
+        raise ValueError(
+            f'of a motion with drift="{asked.drift}" at(t) is not known: its outputs are off the constraints, and no '
+            f"motion starts there.\n{instead}"
+        )
+    if not isinstance(asked.stepsize_controller, BEGIN_ANYWHERE):
+        raise ValueError(
+            f"{type(asked.stepsize_controller).__name__} has a plan for the whole motion, which cannot be continued "
+            f"from an output in its midst.\n{instead}"
+        )
+
+
+def _has_constraints(system):
+    return any(phase.constraints for phase in (system.systems if isinstance(system, Hybrid) else (system,)))
+
+
+def _check_ended(trajectory, t):
+    first, last, end = (float(x) for x in (*np.asarray(trajectory.t)[[0, -1]], trajectory.end.t))
+    _check_inside(t, first, last)
+    beyond = np.abs(t - first) > np.abs(end - first) + _slack(first, last)
+    if np.any(beyond) or not np.isfinite(end):
+        where = f"t = {t[beyond].flat[0]:.9g}" if np.any(beyond) else "this time"
+        raise ValueError(
+            f"the motion ended at t = {end:.9g} ({in_words(trajectory.result._value)}), before {where}.\n"
+            "Fix: times up to traj.end.t; what went wrong is in traj.result, and an event ends a motion where its "
+            "lj.Crossing is terminal."
+        )
+
+
+def _check_inside(t, first, last):
+    """Raise for a time that no motion between these comes to."""
+    low, high = np.min(np.minimum(first, last)), np.max(np.maximum(first, last))
+    slack = _slack(low, high)
+    with np.errstate(invalid="ignore"):
+        outside = ~((t >= low - slack) & (t <= high + slack))
+    if np.any(outside):
+        raise ValueError(
+            f"t = {t[outside].flat[0]:.9g} is outside of the motion, which is known from t = {low:.9g} to {high:.9g}.\n"
+            "Usual cause: another unit of time, or an end that was meant to be later.\n"
+            "Fix: integrate for longer, with ts up to there."
+        )
+
+
+def _slack(first, last):
+    xp: Any = coordinates.numpy_of((first, last))
+    return SAME * xp.finfo(xp.asarray(first).dtype).eps * xp.maximum(xp.abs(first), xp.abs(last))
+
+
+def _raise_not_continued(nodes, times, result):
+    codes = np.asarray(result._value)
+    bad = int(np.argmax(~np.asarray(ended_well(result))))
+    raise RuntimeError(
+        f"the motion cannot be continued from its output at t = {float(nodes[bad]):.9g} to t = "
+        f"{float(times[bad]):.9g}: {in_words(codes[bad])}\n"
+        "Fix: give this time to lj.integrate as one of ts."
+    )

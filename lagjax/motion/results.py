@@ -1,0 +1,76 @@
+"""How a motion or a fit ended: the results, and what they mean in words."""
+
+import diffrax
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Bool
+
+
+# For checkers equinox's enumerations are Python's, of which none can have more items than its parent.
+class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
+    """How an integration or a fit ended: diffrax's results, and what they have no word for.
+
+    >>> import lagjax as lj
+    >>> print(lj.RESULTS[lj.RESULTS.event_occurred])
+    Terminating differential equation solve because an event occurred.
+    """
+
+    start_off_constraints = "The initial state does not satisfy the constraints."
+    contradictory = "Constraints that depend on each other ask for different accelerations at the initial state."
+    start_not_finite = "L, the accelerations or the multipliers are not finite at the initial state."
+    start_singular = "The accelerations are not determined at the initial state: the equations are singular there."
+    not_finite = "The state became NaN or infinite."
+    unsolved_step = (
+        "A step could not be solved, could not be returned to the constraints, or lost the state in its error."
+    )
+    tolerance_too_small = "The tolerance is below the round-off of the state's dtype."
+    unordered = (
+        "The times do not increase throughout, or dt0 or max_step is not positive. (Times that decrease are taken "
+        "where they are known while JAX is tracing: a NumPy array.)"
+    )
+    drifted = (
+        "The motion was computed, but its error, or the change of what must stay constant, is above what is allowed."
+    )
+    not_converged = "The search of a fit, or of a periodic orbit, did not converge."
+    not_estimated = (
+        "The error was not estimated: it was not asked for, and the motion takes more than 20,000 steps; or how to "
+        "shorten the steps of its controller is not known."
+    )
+    misfit = "The residuals of a fit are no errors of measurement: they contradict sigma, or follow a curve."
+    too_many_switches = "There were more switches than most_switches."
+    guard_not_seen = "A guard is below zero, and was not seen to cross it: its phase began on it, and hardly left it."
+    guard_below_zero = "A guard of the first phase is below zero at the start."
+    reset_not_finite = "The state after a switch is NaN or infinite."
+
+
+# Diffrax has no words for a success, and equinox no other place for them.
+RESULTS._index_to_message[int(RESULTS.successful._value)] = "successful"
+ENDED_WELL = RESULTS.successful, RESULTS.event_occurred
+
+
+def ended_well(result) -> Bool[Array, "..."]:
+    """Whether a motion was computed to its end or its event."""
+    return (result == RESULTS.successful) | (result == RESULTS.event_occurred)
+
+
+def is_among(result, others) -> bool:
+    """Whether a result that is known is one of some others; without JAX, which takes ten times as long."""
+    return int(result._value) in [int(other._value) for other in others]
+
+
+def message(result) -> str:
+    """A result in words."""
+    if is_among(result, [RESULTS.event_occurred]):
+        return "ended by its event"
+    # `RESULTS[result]` does not look up a NumPy number, as a lane of a sweep has it.
+    return RESULTS._index_to_message[int(result._value)]
+
+
+def in_words(code) -> str:
+    """A result's number in words."""
+    return message(item(RESULTS.successful, code))
+
+
+def item(result, value):
+    """The result of this number, like one that is known."""
+    return eqx.tree_at(lambda r: r._value, result, jnp.asarray(value))

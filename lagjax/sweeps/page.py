@@ -1,0 +1,149 @@
+"""A sweep as a page with a slider for each axis: values, curves and motions of every point, and how each went."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import numpy as np
+from jaxtyping import PyTree
+
+from lagjax.animation import film
+from lagjax.mechanics.in_words import Call, check_arguments
+from lagjax.motion.frames import film_of_lanes
+from lagjax.motion.trajectory import RESULTS, Trajectory
+from lagjax.pages import Page, encoded, fragment
+from lagjax.pages.page import in_bytes
+from lagjax.plot import COLOURS
+from lagjax.sweeps.axes import POINT, Axes
+from lagjax.sweeps.drawn import Drawn, drawn
+from lagjax.sweeps.labels import words_of
+from lagjax.sweeps.lanes import NOT_RUN, TRUSTED
+
+# A number in base64: of one byte.
+LONGER = 4 / 3
+# What a browser opens without delay, and what a person sends by mail.
+MOST_MEGABYTES = 25.0
+# `positions` is called in Python for every frame of every point.
+MOST_FRAMES = 100_000
+EVENT = int(RESULTS.event_occurred._value)
+
+
+def page_of(
+    axes: Axes,
+    values: PyTree,
+    codes: np.ndarray,
+    positions: Callable | None,
+    megabytes: float,
+    of_film: dict[str, Any],
+) -> Page:
+    """The page of a sweep; `values` have the lanes in front, (N, ...), and so has `codes`, how each went."""
+    found = drawn(values)
+    _check_size(axes, found, megabytes)
+    moving, body = None, ""
+    if positions is not None:
+        body, moving = _film(axes, values, codes, positions, megabytes, **of_film)
+    if not found.numbers and not found.panels and moving is None:
+        there = "; ".join(found.left_out) or "nothing"
+        raise ValueError(
+            f"there is nothing to draw: a point has {there}.\n"
+            "Fix: return numbers, a lj.Trajectory, or arrays along time of few columns from run."
+        )
+    spec = {
+        "axes": _axes(axes),
+        "start": [n // 2 for n in axes.shape],
+        "status": encoded(codes, "i1"),
+        "words": {str(code): words_of(code) for code in np.unique(codes).tolist()},
+        "trusted": list(TRUSTED),
+        "numbers": [{"name": name, "values": encoded(x, "f8")} for name, x in found.numbers.items()],
+        "panels": [_panel(panel, codes) for panel in found.panels],
+        "colours": list(COLOURS),
+        "film": moving,
+    }
+    note = f'<p class="note">Not drawn: {"; ".join(found.left_out)}.</p>' if found.left_out else ""
+    waiting = "The sliders need scripts: allow them, or trust this notebook."
+    body = (
+        f'<div data-controls=""></div><p data-status="" role="status">{waiting}</p>\n{body}'
+        f'<div data-views=""></div>{note}'
+    )
+    html = fragment(body, spec, ("decode.js", "film.js", "chart.js", "sliders.js"))
+    dims = " x ".join(f"{name} ({n})" for name, n in axes.dims.items())
+    return Page(f"Sweep over {', '.join(axes.names)}", html, f"Page of {axes.size:,} points, {dims}")
+
+
+def _axes(axes):
+    """A slider each: its name, its places in words, and where they stand in a picture."""
+    if axes.paired:
+        labels = [axes.words(i) for i in range(axes.size)]
+        return [{"name": POINT, "labels": labels, "at": list(range(axes.size))}]
+    sliders = []
+    for name, x in axes.values.items():
+        plain = x.ndim == 1 and np.all(np.isfinite(x)) and x.dtype != bool and not np.iscomplexobj(x)
+        at = x.astype(float).tolist() if plain else list(range(len(x)))
+        labels = [f"{value:.6g}" for value in at] if plain else [_label(value, i) for i, value in enumerate(x)]
+        sliders.append({"name": name, "labels": labels, "at": at})
+    return sliders
+
+
+def _label(value, i):
+    return str(value) if np.ndim(value) == 0 else f"no. {i} of shape {np.shape(value)}"
+
+
+def _panel(panel, codes):
+    ran = panel.x[codes != NOT_RUN]
+    shared = len(ran) > 0 and np.array_equal(ran, np.broadcast_to(ran[0], ran.shape), equal_nan=True)
+    x = ran[0] if shared else panel.x
+    curves = [{"name": name, "y": encoded(y, _precision(y))} for name, y in panel.curves.items()]
+    told = {"label": panel.label, "across": panel.across, "length": panel.x.shape[1]}
+    return told | {"x": encoded(x, _precision(x)), "curves": curves}
+
+
+def _precision(x):
+    """Single precision, where that shows what there is to see."""
+    there = x[np.isfinite(x)]
+    if there.size == 0:
+        return "f4"
+    largest, distance = np.max(np.abs(there)), np.max(there) - np.min(there)
+    return "f4" if (largest == 0 or 1e-30 < largest < 1e30) and not 0 < distance < 1e-3 * largest else "f8"
+
+
+def _check_size(axes, found: Drawn, megabytes):
+    curves = [y for panel in found.panels for y in panel.curves.values()]
+    numbers = len(found.numbers) + sum(y.size for y in curves) // axes.size
+    size = LONGER * (8 * axes.size * len(found.numbers) + sum(int(_precision(y)[1]) * y.size for y in curves))
+    if size > 1e6 * megabytes:
+        raise ValueError(
+            f"the page would be larger than {in_bytes(size)}, and may have {megabytes:g} MB: {axes.size:,} points of "
+            f"{numbers:,} numbers each.\n"
+            "Fix: fewer points, or fewer times ts in run; or megabytes=..., for browsers with patience."
+        )
+
+
+def _film(axes, values, codes, positions, megabytes, seconds, rate, trail):
+    check_arguments(Call("positions", positions, ("t", "q", "params")), "an argument left out that is not needed")
+    motions = [x for x in jax.tree.leaves(values, is_leaf=_is_motion) if _is_motion(x)]
+    if len(motions) != 1:
+        raise ValueError(
+            f"positions(t, q, params) draws a motion, and run returned {len(motions)} trajectories.\n"
+            "Fix: run = lambda point: lj.integrate(system, q0, v0, params | point, ts=ts)."
+        )
+    lanes = jax.tree.map(np.asarray, motions[0])
+    lane = lambda i: jax.tree.map(lambda x: x[i], lanes)
+    trajs = [lane(i) if code != NOT_RUN else None for i, code in enumerate(codes)]
+    frames = axes.size * rate * (seconds or 2.0)
+    if frames > MOST_FRAMES:
+        raise ValueError(
+            f"{axes.size:,} points are more than {MOST_FRAMES:,} frames, and positions is called for each.\n"
+            "Fix: fewer points, a lower rate, as rate=10.0, or fewer seconds."
+        )
+    at, points, kept = film_of_lanes(trajs, positions, seconds, rate, trail, [code == EVENT for code in codes])
+    size = LONGER * 2 * sum(x.size for x in points.values())
+    if size > 1e6 * megabytes:
+        raise ValueError(
+            f"the film would take {in_bytes(size)}, and the page may have {megabytes:g} MB.\n"
+            "Fix: fewer points, a lower rate, as rate=10.0, or fewer seconds; or megabytes=..."
+        )
+    return film(at, points, rate, kept)
+
+
+def _is_motion(x):
+    return isinstance(x, Trajectory)

@@ -1,0 +1,251 @@
+"""Systems from SymPy: against SymPy's own equations, SciPy's integrator, closed forms, and what is written by hand."""
+
+import copy
+import dataclasses
+import pickle
+import sys
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mpmath
+import numpy as np
+import pytest
+import sympy as sp
+from scipy.integrate import solve_ivp
+from sympy.physics import mechanics as me
+
+import lagjax as lj
+from tests.systems import DOUBLE_PARAMS, DOUBLE_SWING, double_pendulum
+
+t = sp.Symbol("t")
+x, y, theta, phi, angle = me.dynamicsymbols("x y theta phi angle")
+m, g, l, c, k = symbols = sp.symbols("m g l c k", positive=True)
+KINETIC, POTENTIAL = m * (x.diff() ** 2 + y.diff() ** 2) / 2, m * g * y
+
+
+def double_pendulum_of_particles():
+    """Two particles on rods, their energies found by SymPy from the places where they are."""
+    m1, m2, l1, l2 = sp.symbols("m1 m2 l1 l2", positive=True)
+    N, pivot = me.ReferenceFrame("N"), me.Point("O")
+    pivot.set_vel(N, 0)
+    rod = lambda angle, length: length * (sp.sin(angle) * N.x - sp.cos(angle) * N.y)
+    inner = pivot.locatenew("inner", rod(theta, l1))
+    outer = inner.locatenew("outer", rod(phi, l2))
+    bodies = []
+    for point, mass in ((inner, m1), (outer, m2)):
+        point.set_vel(N, point.pos_from(pivot).dt(N))
+        bodies.append(me.Particle(point.name, point, mass))
+        bodies[-1].potential_energy = mass * g * point.pos_from(pivot).dot(N.y)
+    return me.Lagrangian(N, *bodies), [theta, phi], [m1, m2, l1, l2, g]
+
+
+def by_sympy_and_scipy(L, coordinates, parameters, params, q0, v0, ts):
+    """The coordinates at times, from SymPy's mass matrix and forcing, by SciPy's method of order 8."""
+    method = me.LagrangesMethod(L, coordinates)
+    method.form_lagranges_equations()
+    velocities = [x.diff() for x in coordinates]
+    asked = [*velocities, *coordinates, *parameters]
+    of = sp.lambdify(asked, [method.mass_matrix, method.forcing], "numpy", dummify=True)
+    values, n = [params[p.name] for p in parameters], len(coordinates)
+
+    def rate(t, y):
+        mass, forcing = of(*y[n:], *y[:n], *values)
+        return np.concatenate([y[n:], np.linalg.solve(mass, forcing[:, 0])])
+
+    return solve_ivp(rate, ts[[0, -1]], [*q0, *v0], "DOP853", ts, rtol=3e-14, atol=1e-14).y[:n]
+
+
+@pytest.mark.slow
+def test_double_pendulum():
+    """The same motion as from the Lagrangian by hand and from SymPy's own equations; twin: without a term another."""
+    L, coordinates, parameters = double_pendulum_of_particles()
+    ts, (q0, v0) = np.linspace(0.0, 3.0, 7), DOUBLE_SWING
+    expected = by_sympy_and_scipy(L, coordinates, parameters, DOUBLE_PARAMS, q0, v0, ts)
+    tight = {"ts": ts, "rtol": 1e-12, "atol": 1e-12, "estimate_error": False}
+    of_names = lambda values: {"theta": values[0], "phi": values[1]}
+    system = lj.from_sympy(L, coordinates, parameters)
+    found = lj.integrate(system, of_names(q0), of_names(v0), DOUBLE_PARAMS, **tight).q
+    found = np.stack([found["theta"], found["phi"]])
+    by_hand = np.asarray(lj.integrate(double_pendulum, q0, v0, DOUBLE_PARAMS, **tight).q).T
+    assert np.max(np.abs(found - expected)) < 1e-10
+    assert np.max(np.abs(found - by_hand)) < 1e-10
+    dropped = L + parameters[1] * g * parameters[3] * (1 - sp.cos(phi))
+    assert np.max(np.abs(by_sympy_and_scipy(dropped, coordinates, parameters, DOUBLE_PARAMS, q0, v0, ts) - found)) > 0.1
+
+
+def method_of_a_rod():
+    """A mass on a rod, in x and y, with air that drags it, as SymPy has it."""
+    N, P = me.ReferenceFrame("N"), me.Point("P")
+    P.set_vel(N, x.diff() * N.x + y.diff() * N.y)
+    drag = [(P, -c * P.vel(N))]
+    rod = [x**2 + y**2 - l**2]
+    return me.LagrangesMethod(KINETIC - POTENTIAL, [x, y], forcelist=drag, frame=N, hol_coneqs=rod)
+
+
+def test_constraints_of_lagranges_method():
+    """Accelerations and the multiplier are SymPy's, whose `lam1` has the other sign; so is the force of air."""
+    method, params = method_of_a_rod(), {"m": 1.5, "g": 9.75, "l": 1.25, "c": 0.5}
+    state = {x: 0.75, y: -1.0, x.diff(): 2.0, y.diff(): 1.5}
+    system = lj.from_sympy(method, parameters=[m, g, l, c])
+    assert {name: constraint.kind for name, constraint in system.constraints.items()} == {"constraint1": "holonomic"}
+    a, multipliers = lj.accelerations(system, 0.0, {"x": 0.75, "y": -1.0}, {"x": 2.0, "y": 1.5}, params)
+    method.form_lagranges_equations()
+    numbers = state | {p: params[p.name] for p in (m, g, l, c)}
+    number = lambda matrix: np.array(matrix.subs(numbers).evalf(), float)
+    # SymPy's unknowns: q', q'' and the multipliers.
+    *_, ax, ay, multiplier = np.linalg.solve(number(method.mass_matrix_full), number(method.forcing_full))[:, 0]
+    np.testing.assert_allclose([a["x"], a["y"], multipliers["constraint1"]], [ax, ay, multiplier], rtol=1e-13)
+    solved = method.solve_multipliers(op_point=numbers)
+    np.testing.assert_allclose(multipliers["constraint1"], -float(solved[method.lam_vec[0]]), rtol=1e-13)
+    # By hand, and so the sign: the rod pulls with m v²/l + m g cos(angle), towards the pivot, and ∂g/∂q points away.
+    pull = 1.5 * 6.25 / 1.25 + 1.5 * 9.75 * 1.0 / 1.25
+    np.testing.assert_allclose(multipliers["constraint1"], -pull / (2 * 1.25), rtol=1e-13)
+
+
+@pytest.mark.slow
+def test_knife_edge():
+    """A blade on a slope turns and slides on a cycloid; twin: without its constraint it slides straight down."""
+    omega, slope, J = 2.0, 9.75 * np.sin(0.5), sp.Symbol("J")
+    L = KINETIC + J * angle.diff() ** 2 / 2 + m * g * x
+    edge = x.diff() * sp.sin(angle) - y.diff() * sp.cos(angle)
+    method = me.LagrangesMethod(L, [x, y, angle], nonhol_coneqs=[edge])
+    system = lj.from_sympy(method, parameters=[m, g, J])
+    assert system.constraints["constraint1"].kind == "velocity"
+    ts, rest = np.linspace(0.0, 3.0, 5), {"x": 0.0, "y": 0.0, "angle": 0.0}
+    params, turning = {"m": 2.0, "g": slope, "J": 0.5}, rest | {"angle": omega}
+    q = lj.integrate(system, rest, turning, params, ts=ts, rtol=1e-11, atol=1e-11, estimate_error=False).q
+    radius = slope / (2 * omega**2)
+    np.testing.assert_allclose(q["x"], radius * np.sin(omega * ts) ** 2, atol=1e-9)
+    np.testing.assert_allclose(q["y"], radius * (omega * ts - np.sin(2 * omega * ts) / 2), atol=1e-9)
+    assert radius * np.sin(omega * ts[-1]) ** 2 < 0.1 * slope * ts[-1] ** 2 / 2
+
+
+def test_time_forces_and_dissipation():
+    """Time by itself, Q and R, a rigid body: m a = m Ω² x + F cos 3t - c v - k v, I α = -torque."""
+    N, B, P = me.ReferenceFrame("N"), me.ReferenceFrame("B"), me.Point("P")
+    B.orient_axis(N, theta, N.z)
+    P.set_vel(N, 0)
+    wheel = me.RigidBody("wheel", P, B, m, (me.inertia(B, 0, 0, m * l**2), P))
+    turned = [x * sp.cos(sp.sin(t)), x * sp.sin(sp.sin(t))]
+    L = me.Lagrangian(N, wheel) + m * sum(place.diff(t) ** 2 for place in turned) / 2
+    force = {x: g * sp.cos(3 * t) - c * x.diff(t)}
+    system = lj.from_sympy(
+        L, [x, theta], [m, g, l, c, k], force=force, dissipation=k * x.diff(t) ** 2 / 2 + theta.diff()
+    )
+    params = {"m": 2.0, "g": 3.0, "l": 0.5, "c": 0.25, "k": 0.125}
+    a, _ = lj.accelerations(system, 0.5, {"x": 1.5, "theta": 0.0}, {"x": -2.0, "theta": 1.0}, params)
+    expected = np.cos(0.5) ** 2 * 1.5 + (3.0 * np.cos(1.5) + (0.25 + 0.125) * 2.0) / 2.0
+    np.testing.assert_allclose([a["x"], a["theta"]], [expected, -1 / (2.0 * 0.25)], rtol=1e-13)
+
+
+HERTZ = sp.Piecewise((0, x < 0), (k * x ** sp.Rational(5, 2), True))
+ROOTS = sp.Piecewise((sp.sqrt(-x), x < 0), (sp.log(x), x < 1), (1 / x, True))
+EXPRESSIONS = [
+    HERTZ, ROOTS, sp.Abs(x), sp.sign(x) * x, sp.atan2(x, y), sp.Max(x, y, 0), sp.Min(x, 2, y), sp.Heaviside(x) * x,
+    sp.Abs(y) ** sp.Rational(1, 3), sp.Abs(y) ** sp.Rational(-5, 2), sp.pi * x + sp.E + sp.EulerGamma, sp.sqrt(2) * x,
+    x**-3, sp.Abs(x) ** k, 2**x, sp.Mod(x, k), sp.floor(x) * x, sp.ceiling(x) * x, sp.sec(x) + sp.cot(x), sp.coth(x),
+    sp.sinc(x), sp.erf(x), sp.gamma(x + 2), sp.exp(-(x**2)), 10**12 * x, sp.Rational(10**20, 3) * x, sp.Float(0.1) * x,
+    sp.Piecewise((x, sp.And(x > 0, y > 0)), (y, sp.Or(x < 0, sp.Not(y > 1))), (1, True)), sp.asin(x / 4),
+    x * sp.Sum(k ** sp.Symbol("n"), (sp.Symbol("n"), 0, 3)), sp.Matrix([x, y]).norm(), sp.acosh(x + 3), -(x - y) / (-k),
+    k / (l / x), (l * y**2) ** (-sp.Rational(1, 2)), -(x**2), (-x) ** 2, sp.re(x) + sp.conjugate(x), x**2.5 / x**0.5,
+    sp.sinh(x) * sp.tanh(y), 1 / (1 + 1 / (3 + 1 / x)), sp.real_root(x, 3), sp.log(x**2, 2),
+]  # fmt: skip
+STATES = [(0.75, 1.625), (1.875, -0.625), (-0.6875, 0.5)]
+
+
+def test_functions():
+    """Values and slopes of what may be in a Lagrangian are SymPy's, at numbers on all sides of its branches."""
+    params = {"k": 1.25, "l": 0.75}
+    system = lj.from_sympy(KINETIC, [x, y], [m, k, l], constraints={"all": EXPRESSIONS})
+    of_all: Any = system.constraints["all"]
+    residual = lambda q: of_all.g(0.0, {"x": q[0], "y": q[1]}, params)
+    values, slopes = map(
+        np.asarray, jax.jit(jax.vmap(lambda q: (residual(q), jax.jacrev(residual)(q))))(jnp.array(STATES))
+    )
+    a, b = sp.symbols("a b", real=True)
+    constants = {k: sp.Rational(5, 4), l: sp.Rational(3, 4)}
+    of = sp.lambdify((a, b), [e.doit().subs(constants).subs({x: a, y: b}) for e in EXPRESSIONS], "mpmath")
+    with mpmath.workdps(40):
+        for place, (p, q) in enumerate(STATES):
+            step = mpmath.mpf(10) ** -12
+            for i, expected in enumerate(of(mpmath.mpf(p), mpmath.mpf(q))):
+                if mpmath.im(expected):
+                    # SymPy's roots and logarithms of negative numbers are complex, ours are none.
+                    assert np.isnan(values[place, i]), EXPRESSIONS[i]
+                    continue
+                close = {"rtol": 1e-12, "atol": 1e-12, "err_msg": str(EXPRESSIONS[i])}
+                np.testing.assert_allclose(values[place, i], float(mpmath.re(expected)), **close)
+                moved = [(of(p + s * step, q)[i], of(p, q + s * step)[i]) for s in (1, -1)]
+                expected = [float(mpmath.re(plus - minus) / (2 * step)) for plus, minus in zip(*moved)]
+                np.testing.assert_allclose(slopes[place, i], expected, **close)
+
+
+def test_a_branch_that_is_not_taken_harms_nobody():
+    """Beside a root the slope is zero; twin: without the harmless number it is NaN."""
+    ours: Any = lj.from_sympy(HERTZ, [x], [k]).lagrangian
+    slope = lambda function, value: jax.grad(lambda x: function(0.0, {"x": x}, {"x": 0.0}, {"k": 1.0}))(value)
+    assert slope(ours, -0.5) == 0.0 and slope(ours, 4.0) == 2.5 * 4.0**1.5
+    harmless = "jnp.where((x >= 0), x, 0.5)"
+    assert harmless in ours.source
+    assert np.isnan(slope(dataclasses.replace(ours, source=ours.source.replace(harmless, "x")), -0.5))
+
+
+def test_copies_and_words():
+    """It prints its expression and its text, is equal to another one of the same text, and needs no SymPy any more."""
+    make = lambda: lj.from_sympy(KINETIC - POTENTIAL, [x, y], [m, g, l], constraints={"rod": sp.Eq(x**2 + y**2, l**2)})
+    system = make()
+    assert repr(system) == "System(-g*m*y + m*(x'**2 + y'**2)/2; constraints: rod (holonomic))"
+    assert str(system.lagrangian).splitlines()[0] == "def function(t, q, v, params):"
+    for same in (make(), copy.deepcopy(system), pickle.loads(pickle.dumps(system))):
+        assert same == system and str(same.lagrangian) == str(system.lagrangian)
+    other = lj.from_sympy(KINETIC + POTENTIAL, [x, y], [m, g, l])
+    assert other.lagrangian != system.lagrangian
+
+
+def test_without_sympy(monkeypatch):
+    """What was pickled runs without SymPy; what asks for SymPy says how to get it."""
+    pickled = pickle.dumps(lj.from_sympy(KINETIC - POTENTIAL, [x, y], [m, g]))
+    for name in [name for name in sys.modules if name.split(".")[0] == "sympy"]:
+        monkeypatch.setitem(sys.modules, name, None)
+    at = {"x": 1.0, "y": 2.0}
+    assert float(pickle.loads(pickled).lagrangian(0.0, at, at, {"m": 2.0, "g": 3.0})) == 5.0 - 12.0
+    with pytest.raises(ImportError, match="pip install 'lagjax.sympy.'"):
+        lj.from_sympy(KINETIC, [x, y], [m])
+
+
+L = KINETIC - POTENTIAL
+REFUSED = {
+    "an unknown symbol": (lambda: lj.from_sympy(L, [x, y], [m]), "(?s)'g' in it, and nothing.*parameters=.m, g."),
+    "another of its name": (lambda: lj.from_sympy(L, [x, y], [m, sp.Symbol("g")]), "'g' in it that is not the same"),
+    "a symbol named as a coordinate": (lambda: lj.from_sympy(L + sp.Symbol("y"), [x, y], [m, g]), "a coordinate, 'y'"),
+    "another time": (lambda: lj.from_sympy(L + sp.Symbol("t", real=True), [x, y], [m, g]), "as the time of"),
+    "an acceleration": (lambda: lj.from_sympy(L + x.diff(t, 2), [x, y], [m, g]), "an acceleration"),
+    "a coordinate left out": (lambda: lj.from_sympy(L, [x], [m, g]), "Fix: coordinates=.x, y."),
+    "one name for two": (lambda: lj.from_sympy(L, [x, y], [m, g, sp.Symbol("x")]), "have the name 'x'"),
+    "a coordinate twice": (lambda: lj.from_sympy(L, [x, y, x], [m, g]), "have the name 'x'"),
+    "the time": (lambda: lj.from_sympy(L, [x, y], [m, g, t]), "is the time"),
+    "a matrix": (lambda: lj.from_sympy(sp.Matrix([L]), [x, y], [m, g]), "L.0. of a matrix"),
+    "text": (lambda: lj.from_sympy("m", [x, y], [m, g]), "is a str"),
+    "no formula": (lambda: lj.from_sympy(L + sp.Function("V")(x), [x, y], [m, g]), "'V' is in L, and JAX"),
+    "nor this, of a known name": (lambda: lj.from_sympy(L + sp.Function("gamma")(x), [x, y], [m, g]), "'gamma' is in"),
+    "a function of SymPy alone": (lambda: lj.from_sympy(L + sp.besselj(0, x), [x, y], [m, g]), "'besselj' is in L"),
+    "a complex number": (lambda: lj.from_sympy(L + sp.I * x, [x, y], [m, g]), "'I' is in L"),
+    "symbols as coordinates": (lambda: lj.from_sympy(L, sp.symbols("x y"), [m, g]), "a coordinate is a function"),
+    "velocities as coordinates": (lambda: lj.from_sympy(L, [x, x.diff()], [m, g]), "is a velocity"),
+    "no list": (lambda: lj.from_sympy(L, x, [m, g]), "coordinates must be a list"),
+    "numbers": (lambda: lj.from_sympy(L, [x, y], {m: 1.0}), "numbers are given to lj.integrate"),
+    "no coordinates": (lambda: lj.from_sympy(L), "coordinates of the Lagrangian are missing"),
+    "coordinates of a method": (lambda: lj.from_sympy(me.LagrangesMethod(L, [x, y]), [x]), "has its own coordinates"),
+    "a truth": (lambda: lj.from_sympy(L, [x, y], [m, g], constraints={"rod": x == y}), "constraint 'rod' must be"),
+    "no condition": (lambda: lj.from_sympy(L, [x, y], [m, g], constraints={"rod": m - g}), "holds no coordinate"),
+    "a force on nothing": (lambda: lj.from_sympy(L, [x, y], [m, g], force={"x": 1}), "a part on 'x', and the"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_what_is_refused(case):
+    """Named in the words of the one who wrote it, with the fix."""
+    ask, words = REFUSED[case]
+    with pytest.raises((TypeError, ValueError), match=words):
+        ask()

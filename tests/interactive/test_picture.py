@@ -1,0 +1,96 @@
+"""The picture that follows: what is drawn over kept pixels is what a whole drawing gives, and limits stay."""
+
+import io
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from lagjax.interactive.picture import COLOURS, MOST_PANELS, Picture
+from lagjax.sweeps.drawn import drawn
+
+T = np.linspace(0.0, 1.0, 200)
+
+
+def of(amplitude, words="", picture=None, **more):
+    """The picture of a wave and its double, and the pixels."""
+    picture = picture or Picture()
+    amplitude = np.full((1, 1, 1), amplitude)
+    with np.errstate(invalid="ignore"):
+        waves = amplitude * np.stack([np.sin(9 * T), np.cos(9 * T)], axis=1)[None]
+    values = {"t": T[None], "x": waves, **more}
+    return picture, np.asarray(Image.open(io.BytesIO(picture.of_curves(drawn(values), words))).convert("RGB"), int)
+
+
+def test_over_kept_pixels_as_drawn_as_a_whole():
+    """Another curve over the pixels of the axes is the whole figure drawn at once, to the rounding of colours."""
+    picture, _ = of(1.0)
+    _, quick = of(0.6, picture=picture)
+    assert picture.drawn_whole == 1
+    for artist in (*sum(picture._lines, []), picture._above):
+        artist.set_animated(False)
+    picture._canvas.draw()
+    whole = np.asarray(picture._canvas.buffer_rgba(), int)[..., :3]
+    assert np.mean(np.abs(quick - whole).max(axis=-1) > 40) < 2e-3
+    # Twin: the curve before it is told apart.
+    _, other = of(1.0, picture=Picture())
+    assert np.mean(np.abs(quick - other).max(axis=-1) > 40) > 1e-2
+    assert len(np.unique(quick.reshape(-1, 3), axis=0)) <= COLOURS
+
+
+def test_limits_stay_until_they_are_left():
+    """They grow when a curve leaves them, with room for the next; they shrink when it fills less than an eighth."""
+    picture, _ = of(1.0)
+    limits = lambda: picture.axes[0].get_ylim()
+    first = limits()
+    assert first[0] < -1.0 < 1.0 < first[1]
+    of(0.2, picture=picture)
+    assert limits() == first and picture.drawn_whole == 1
+    of(1.3, picture=picture)
+    assert limits()[0] < -1.3 < 1.3 < limits()[1] and picture.drawn_whole == 2
+    of(1.4, picture=picture)
+    assert picture.drawn_whole == 2
+    of(0.01, picture=picture)
+    assert limits()[1] < 0.02 and picture.drawn_whole == 3
+
+
+@pytest.mark.parametrize("amplitude", [0.0, 1e-300, 1e300, np.nan, -np.inf])
+def test_any_number(amplitude):
+    """Curves that are flat, tiny, huge or not there have a picture."""
+    _, pixels = of(amplitude)
+    assert pixels.std() > 1
+
+
+def test_words_above():
+    """A reason is red, its dollars no formulas; numbers are black; what is not drawn is named."""
+    red = lambda pixels: np.sum((pixels[..., 0] > 120) & (pixels[..., 1] < 60) & (pixels[:, :, 2] < 60))
+    picture, failed = of(1.0, "it cost 5 $ and 3 $, and the state became NaN, " + "again and " * 40)
+    assert red(failed[:45]) > 100
+    _, well = of(1.0, picture=picture, period=np.array([2.5]), matrix=np.ones((1, 3, 40)))
+    assert red(well[:45]) == 0 and np.sum(well[:45].sum(axis=-1) < 200) > 100
+    assert picture._above.get_text() == "period = 2.5,  not drawn: matrix of shape (3, 40)"
+    assert red(np.asarray(Image.open(io.BytesIO(picture.of_words("wrong"))).convert("RGB"), int)[:45]) > 20
+
+
+def test_panels():
+    """A panel for each value of its own; more than a few are named and not drawn; other values have another figure."""
+    many = {f"value {i}": T[None] for i in range(MOST_PANELS + 1)}
+    picture = Picture()
+    picture.of_curves(drawn(many), "")
+    assert len(picture.axes) == MOST_PANELS and f"not drawn: value {MOST_PANELS}" in picture._above.get_text()
+    of(1.0, picture=picture)
+    assert len(picture.axes) == 1 and picture.axes[0].get_xlabel() == "t"
+    picture.of_curves(drawn({"number": np.array([1.0])}), "")
+    assert picture._above.get_text() == "number = 1"
+
+
+def test_what_the_user_draws():
+    """It is called with the result and empty axes each time."""
+    picture, lines = Picture(), []
+
+    def draw(result, axes):
+        axes.plot(T, result * T, "k--")
+        lines.append(len(axes.lines))
+
+    first, second = (picture.of_user(draw, x, "") for x in (1.0, -1.0))
+    assert lines == [1, 1] and first != second
