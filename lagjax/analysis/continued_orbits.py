@@ -211,7 +211,7 @@ def _left_free(tracer, z):
     """Directions in which orbits of the same parameter lie beside the start, (d, N)."""
     _, jacobian, _ = tracer.at(z)
     _, sizes, right = np.linalg.svd(jacobian)
-    rank = int(np.sum(sizes > DEPENDENT * sizes[0]))
+    rank = int(np.sum(sizes > max(DEPENDENT, 1e2 * tracer.noise) * sizes[0]))
     kernel = right[rank:]
     if len(kernel) < 2:
         return np.zeros((0, z.size - 1))

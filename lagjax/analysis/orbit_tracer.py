@@ -81,7 +81,7 @@ class OrbitTracer(Tracer):
 
     def described(self, z, jacobian, tangent) -> Point | str:
         found = self.evaluated(z)
-        if float(found.apart) > SAME:
+        if float(found.apart) > max(SAME, 1e3 * self.eps):
             return "the system is not the same after any period near the last one: its drive has no common period"
         multipliers, left = self._multipliers(found)
         plus, minus = (self._product(found, shift) for shift in (-1.0, 1.0))
