@@ -136,6 +136,7 @@ def test_formulas():
     """LaTeX as MathML; short fractions are two numbers, which docutils alone takes for one."""
     mathml = pytest.importorskip("mathml", reason="needs the extra docs")
     assert "<mn>1</mn>\n    <mn>2</mn>" in mathml.converted(r"\tfrac12 x", True)
+    assert "mspace" in mathml.converted(r"\cos\theta", True) and "mspace" not in mathml.converted(r"\cosh x", True)
     from docutils.utils.math.latex2mathml import tex2mathml
 
     assert "<mn>12</mn>" in tex2mathml(r"\frac12 x", as_block=True)

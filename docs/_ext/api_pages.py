@@ -19,7 +19,8 @@ INIT = Path(lagjax.__file__)
 # Whose example shows an object that no function is annotated to return.
 SHOWN_BY = {
     "Crossings": "Crossing", "Snapshot": "integrate", "Explanation": "explain", "Switches": "touches",
-    "Routhian": "routhian", "Branch": "continue_equilibria", "Critical": "continue_equilibria", "Mode": "normal_modes", "CriticalOrbit": "continue_orbits",
+    "Routhian": "routhian", "Branch": "continue_equilibria", "Critical": "continue_equilibria", "Mode": "normal_modes",
+    "CriticalOrbit": "continue_orbits",
     "Status": "sweep", "Knobs": "interact", "HybridTrajectory": "touches",
 }  # fmt: skip
 # Of names whose docstring has no room for one.
