@@ -78,7 +78,7 @@ def f(x):
     Fix: nothing.
     """
     if x:
-        raise ValueError(f"{x} is wrong, {x}{x}.\\nFix: " + f(x))
+        raise ValueError(f"{x} is quite wrong, {x}{x}.\\nFix: " + f(x))
     warnings.warn("beware of this", AccuracyWarning)
     return "the rope is torn.\\nUsual cause: age.\\nFix: a new one."
 '''
@@ -87,7 +87,7 @@ def f(x):
 def test_messages_are_found():
     """Raised, warned of, or made to be raised elsewhere; docstrings are none."""
     assert error_pages.messages(MESSAGES) == [
-        ("ValueError", "… is wrong, ….\nFix: …"),
+        ("ValueError", "… is quite wrong, ….\nFix: …"),
         ("AccuracyWarning", "beware of this"),
         ("", "the rope is torn.\nUsual cause: age.\nFix: a new one."),
     ]
