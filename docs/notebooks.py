@@ -32,13 +32,16 @@ def execute(script: Path) -> None:
     """Run one script cell by cell in a kernel of its own, and write the notebook beside it."""
     notebook = jupytext.read(script)
     began = time.perf_counter()
-    NotebookClient(notebook, timeout=600, kernel_name="python3", resources={"metadata": {"path": FOLDER}}).execute()
+    settings = {"kernel_name": "python3", "resources": {"metadata": {"path": FOLDER}}, "store_widget_state": False}
+    NotebookClient(notebook, timeout=600, **settings).execute()
     took = time.perf_counter() - began
     for cell in notebook.cells:
         # When each cell ran differs from run to run.
         cell.metadata.pop("execution", None)
         for output in cell.get("outputs", ()):
             if "image/png" in output.get("data", {}):
+                # Sliders need a kernel; of them the picture stays.
+                output["data"].pop("application/vnd.jupyter.widget-view+json", None)
                 output["data"]["image/png"] = smaller(output["data"]["image/png"])
     hosted = script.with_suffix(".ipynb")
     jupytext.write(notebook, hosted)

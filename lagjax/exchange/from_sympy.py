@@ -2,11 +2,10 @@
 
 A coordinate is a function of time, `dynamicsymbols("theta")` or `Function("theta")(t)`, its velocity what `.diff(t)`
 gives, and every other symbol a parameter. SymPy's equations are not used: the expressions become a function
-`L(t, q, v, params)`, and lagjax derives the motion as from any other. SymPy's `LagrangesMethod` writes them
+`L(t, q, v, params)`, and lagjax derives the motion as from any other.
 
-    d/dt ∂L/∂v - ∂L/∂q = Q + Aᵀ λ        A = ∂(dg/dt)/∂v = ∂g/∂q, or ∂phi/∂v
-
-with the sign of λ that lagjax has.
+Of multipliers SymPy has two signs. In the equations of its `LagrangesMethod` and from `solve_multipliers` they push along
+-∂g/∂q; the last unknowns of `mass_matrix_full` and `rhs()` push along +∂g/∂q, as all multipliers do here.
 """
 
 from collections.abc import Mapping, Sequence
@@ -53,8 +52,9 @@ def from_sympy(
     **Other arguments:**
 
     - `constraints`: expressions that vanish, or equations `Eq(a, b)`, by name: holonomic where no velocity is in them,
-      nonholonomic otherwise. A list gets the names that SymPy gives to multipliers, "lam1", "lam2", ...; so do those of
-      a `LagrangesMethod`, holonomic ones first. A list or a matrix under one name is a constraint of several equations.
+      nonholonomic otherwise. A list or a matrix under one name is a constraint of several equations. Without names they
+      are "constraint1", "constraint2", ...; so are those of a `LagrangesMethod`, holonomic ones first, and their
+      multipliers are minus its "lam1", "lam2", ...
     - `force`: generalized forces Q that L does not contain, `[L]/[q]`, by coordinate: `{x: -c * x.diff()}`.
     - `dissipation`: Rayleigh's function R; its force is `-∂R/∂v`.
 
@@ -277,8 +277,7 @@ def _by_name(constraints):
         return {}
     if isinstance(constraints, Mapping):
         return dict(constraints)
-    listed_ = _several(constraints, "constraints")
-    return {f"lam{i}": constraint for i, constraint in enumerate(listed_, 1)}
+    return {f"constraint{i}": constraint for i, constraint in enumerate(_several(constraints, "constraints"), 1)}
 
 
 def _equations_of(method):

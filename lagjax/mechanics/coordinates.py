@@ -225,6 +225,9 @@ def _check_real(tree, which):
             cause, fix = "the root of a negative number, or an amplitude", "its real part, jnp.real(...)"
         elif callable(leaf):
             of, cause, fix = "a function", "a function in place of what it returns", "f() in place of f"
+        elif hasattr(leaf, "magnitude"):
+            of, cause = f"{leaf!r:.60}", "a number with its unit"
+            fix = "the number, x.magnitude, all in one system of units"
         elif not jnp.issubdtype(dtype, np.bool_):
             of, cause = f"{leaf!r:.60}", "text from a file, or a number that was left to be filled in"
             fix = "a number, as q0 = 0.1, or names, as q0 = {'x': 0.1}"

@@ -128,6 +128,11 @@ def vector_of_times(ts: Any):
     """`ts` as an array of two or more numbers, or an error."""
     given, ts = ts, coordinates.numpy_of(ts).asarray(ts)
     real = jnp.issubdtype(ts.dtype, jnp.floating) or jnp.issubdtype(ts.dtype, jnp.integer)
+    if real and ts.ndim == 1 and not isinstance(ts.shape[0], int):
+        raise ValueError(
+            f"the number of output times must be known when a motion is exported, and is {ts.shape[0]}.\n"
+            "Fix: as many times as are ever needed, jax.ShapeDtypeStruct((1000,), float)."
+        )
     if not real or ts.ndim != 1 or len(ts) < 2:
         of = f"has shape {ts.shape}" if real else f"is {given!r:.60}"
         raise ValueError(

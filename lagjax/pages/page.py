@@ -83,9 +83,9 @@ def fragment(body: str, spec: dict[str, Any], scripts: tuple[str, ...], last: st
     )
 
 
-def encoded(x, dtype: str) -> str:
-    """An array in base64, little-endian, as `decode` reads it: `"f4"`, `"f8"`, `"i1"` or `"i2"`."""
-    return b64encode(np.ascontiguousarray(x, dtype=f"<{dtype}").tobytes()).decode()
+def encoded(x, dtype: str) -> tuple[str, str]:
+    """An array as `decode` reads it: its type, `"f4"`, `"f8"`, `"i1"` or `"i2"`, and base64 of it, little-endian."""
+    return dtype, b64encode(np.ascontiguousarray(x, dtype=f"<{dtype}").tobytes()).decode()
 
 
 def in_bytes(count: float) -> str:

@@ -170,11 +170,17 @@ def _check_readable(path, said):
 
 
 def create(
-    path: Path, axes: Axes, program: Program, wanted: dict, blocks: Blocks, times: dict[str, np.ndarray]
+    path: Path,
+    axes: Axes,
+    program: Program,
+    wanted: dict,
+    blocks: Blocks,
+    times: dict[str, np.ndarray],
+    structure: dict | None,
 ) -> None:
     """Make a store; where another process was first, its own stays. A failure leaves nothing behind.
 
-    `times`: of trajectories, those that all points share, by leaf.
+    `times`: of trajectories, those that all points share, by leaf. `structure`: of values (`structures`).
     """
     zarr = import_zarr()
     made = [folder for folder in (path.parent, *path.parent.parents) if not folder.exists()]
@@ -191,6 +197,7 @@ def create(
             "names": list(axes.values),
             "paired": axes.paired,
             "places": places,
+            "structure": structure,
             "attributes": {"about": "a sweep, which lagjax.open_sweep reads with its checksums"},
             "arrays": {name: metadata for name, metadata in arrays.items() if metadata["node_type"] == "array"},
         }

@@ -210,7 +210,7 @@ class Sweep:
         in_front = lambda x: np.asarray(x).reshape(self.axes.size, *np.shape(x)[len(self.axes.shape) :])
         flat = jax.tree.map(in_front, self.values)
         codes, of_film = self.status.result.reshape(-1), {"seconds": seconds, "rate": rate, "trail": trail}
-        page = page_of(self.axes, flat, codes, _words, positions, megabytes, of_film)
+        page = page_of(self.axes, flat, codes, positions, megabytes, of_film)
         if path is not None:
             page.save(path)
         return page

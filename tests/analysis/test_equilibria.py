@@ -170,7 +170,7 @@ def test_conical_pendulum():
     assert abs(held.rates[0, 0] - omega) > 0.1
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_sleeping_top():
     """Upright it is stable above ω_c = 2 √(M g l I1)/I3 and not below."""
     critical = float(slowest_sleeping_spin(TOP))

@@ -84,21 +84,23 @@ def method_of_a_rod():
 
 
 def test_constraints_of_lagranges_method():
-    """Accelerations and the multiplier are those of SymPy's own equations, signs included; so is the force of air."""
+    """Accelerations and the multiplier are SymPy's, whose `lam1` has the other sign; so is the force of air."""
     method, params = method_of_a_rod(), {"m": 1.5, "g": 9.75, "l": 1.25, "c": 0.5}
     state = {x: 0.75, y: -1.0, x.diff(): 2.0, y.diff(): 1.5}
     system = lj.from_sympy(method, parameters=[m, g, l, c])
-    assert {name: constraint.kind for name, constraint in system.constraints.items()} == {"lam1": "holonomic"}
+    assert {name: constraint.kind for name, constraint in system.constraints.items()} == {"constraint1": "holonomic"}
     a, multipliers = lj.accelerations(system, 0.0, {"x": 0.75, "y": -1.0}, {"x": 2.0, "y": 1.5}, params)
     method.form_lagranges_equations()
     numbers = state | {p: params[p.name] for p in (m, g, l, c)}
     number = lambda matrix: np.array(matrix.subs(numbers).evalf(), float)
     # SymPy's unknowns: q', q'' and the multipliers.
     *_, ax, ay, multiplier = np.linalg.solve(number(method.mass_matrix_full), number(method.forcing_full))[:, 0]
-    np.testing.assert_allclose([a["x"], a["y"], multipliers["lam1"]], [ax, ay, multiplier], rtol=1e-13)
+    np.testing.assert_allclose([a["x"], a["y"], multipliers["constraint1"]], [ax, ay, multiplier], rtol=1e-13)
+    solved = method.solve_multipliers(op_point=numbers)
+    np.testing.assert_allclose(multipliers["constraint1"], -float(solved[method.lam_vec[0]]), rtol=1e-13)
     # By hand, and so the sign: the rod pulls with m v²/l + m g cos(angle), towards the pivot, and ∂g/∂q points away.
     pull = 1.5 * 6.25 / 1.25 + 1.5 * 9.75 * 1.0 / 1.25
-    np.testing.assert_allclose(multipliers["lam1"], -pull / (2 * 1.25), rtol=1e-13)
+    np.testing.assert_allclose(multipliers["constraint1"], -pull / (2 * 1.25), rtol=1e-13)
 
 
 @pytest.mark.slow
@@ -109,7 +111,7 @@ def test_knife_edge():
     edge = x.diff() * sp.sin(angle) - y.diff() * sp.cos(angle)
     method = me.LagrangesMethod(L, [x, y, angle], nonhol_coneqs=[edge])
     system = lj.from_sympy(method, parameters=[m, g, J])
-    assert system.constraints["lam1"].kind == "velocity"
+    assert system.constraints["constraint1"].kind == "velocity"
     ts, rest = np.linspace(0.0, 3.0, 5), {"x": 0.0, "y": 0.0, "angle": 0.0}
     params, turning = {"m": 2.0, "g": slope, "J": 0.5}, rest | {"angle": omega}
     q = lj.integrate(system, rest, turning, params, ts=ts, rtol=1e-11, atol=1e-11, estimate_error=False).q
