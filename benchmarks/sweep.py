@@ -246,7 +246,7 @@ def killed_rows(wanted):
                 time.sleep(0.002)
             process.kill()
         before, store = computed(), Store(path)
-        missing, block = len(store.missing()), store.block
+        missing, block = len(store.missing()), store.blocks.block[0]
         swept = stored(path, log)
         twice = computed() - STORED
         off = error(swept.values, np.resize(OMEGA, STORED), STORED_SPAN)
@@ -266,16 +266,16 @@ def store_rows(wanted):
         lj.sweep(lambda point: jnp.sin(point["x"]), axes, store=path, chunk=10_000, workers=1, progress=False)
         store = Store(path)
         values, (status, _, _) = store.values()[0], store.status()
-        blocks = [store.points(number) for number in range(store.blocks)]
+        blocks = [store.blocks.points(number) for number in range(len(store.blocks))]
         parts = [jax.tree.map(lambda x: x[here], (values, status)) for here in blocks]
         write = lambda: [store.write(number, *part) for number, part in enumerate(parts)]
-        check = lambda: store.damage(range(store.blocks), read=True)
+        check = lambda: store.damage(range(len(store.blocks)), read=True)
         times, opened = in_turn(check, write, repeats=7), in_turn(lambda: lj.open_sweep(path), check, repeats=7)
         ratio, of_minima = times.ratio()
         seconds, writing = times.medians
         off = float(np.max(np.abs(values["value"] - np.sin(axes["x"]))))
         yield row(
-            what, ratio, 0.15, minima=of_minima, blocks=store.blocks, check_seconds=seconds, write_seconds=writing,
+            what, ratio, 0.15, minima=of_minima, blocks=len(store.blocks), check_seconds=seconds, write_seconds=writing,
             open_seconds=opened.medians[0], error=off,
         )  # fmt: skip
 

@@ -39,6 +39,7 @@ from lagjax.motion.integrate import integrate
 from lagjax.motion.ledger import EnergyLedger, energy_ledger
 from lagjax.motion.phase_graph import HybridExplanation
 from lagjax.motion.replay import Replay
+from lagjax.motion.saved import load_trajectory
 from lagjax.motion.sections import PoincareSection, periods, poincare, turning_points
 from lagjax.motion.trajectory import RESULTS, AccuracyWarning, Snapshot, Trajectory
 from lagjax.numerics.nystrom import Nystrom8, Nystrom12
@@ -47,6 +48,7 @@ from lagjax.numerics.runge_kutta import Dopri8, Tsit5
 
 # isort: split
 # Many motions.
+from lagjax.pages.page import Page
 from lagjax.sweeps.engine import sweep
 from lagjax.sweeps.lanes import Status
 from lagjax.sweeps.result import Sweep, open_sweep
@@ -59,6 +61,7 @@ from lagjax.fitting.engine import fit
 from lagjax.fitting.identifiability import Identifiability
 from lagjax.fitting.records import Record
 from lagjax.fitting.result import Fit, FitWarning
+from lagjax.fitting.saved import load_fit
 
 # isort: split
 # Error against run time.
@@ -179,6 +182,7 @@ __all__ = [
     "HybridTrajectory",
     "Switches",
     "Snapshot",
+    "load_trajectory",
     "energy_ledger",
     "EnergyLedger",
     "Animation",
@@ -224,12 +228,14 @@ __all__ = [
     "Sweep",
     "Status",
     "open_sweep",
+    "Page",
     "interact",
     "Knobs",
     "fit",
     "Record",
     "Fit",
     "FitWarning",
+    "load_fit",
     "identifiability",
     "Identifiability",
     "learned",

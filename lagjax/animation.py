@@ -32,6 +32,12 @@ class Animation:
 
     - `t` (F,): the time of each frame; `points`: by name, (F, k, 2), what is drawn.
     - `rate`: frames a second; `trail`: how many frames behind a trail reaches.
+
+    >>> import numpy as np
+    >>> t = np.linspace(0.0, 1.0, 5)
+    >>> points = {"ball": np.stack([t, t * (1.0 - t)], axis=1)[:, None]}
+    >>> print(Animation(t, points, rate=25.0, trail=3).t[-1])
+    1.0
     """
 
     def __init__(self, t: np.ndarray, points: dict[str, np.ndarray], rate: float, trail: int):

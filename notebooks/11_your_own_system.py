@@ -184,7 +184,8 @@ print(f"change of the Jacobi integral with T + V: {climbed.drift():.0e}")
 
 # %% [markdown]
 # An angle is in radians. 60.0, meant in degrees, is nine turns and a half: a motion like any other, somewhere else. A
-# place that is known by hand tells, or the film: here the height of the centre at the start.
+# place that is known by hand tells, or the film: here the height of the centre at the start. `explain` tells the angles
+# of more than a turn.
 
 # %%
 by_hand = 2.5 * np.sqrt(3) / 2
@@ -220,7 +221,8 @@ def move(system=ladder, q0=q0, v0=v0, params=params, ts=ts, **options):
     return lj.integrate(system, q0, v0, params, ts=ts, **options)
 
 
-says(lambda: move(q0=q0 | {"angle": 1}))
+says(lambda: move(system=lagrangian))
+says(lambda: lj.integrate(ladder, q0, v0, params, ts))
 says(lambda: move(v0={"x": 0.0, "y": 0.0, "theta": 0.0}))
 says(lambda: move(params={"m": 10.0, "length": 2.5, "g": 9.81}))
 says(lambda: move(ts=1.2))
@@ -228,7 +230,8 @@ says(lambda: move(method=diffrax.Dopri5))
 
 
 # %% [markdown]
-# In the functions: NumPy, which knows no derivatives; an `if`; an equation in place of its residual.
+# In the functions: NumPy, which knows no derivatives; an `if`; arguments in another order; an equation in place of its
+# residual.
 
 
 # %%
@@ -244,6 +247,7 @@ def by_cases(t, q, v, params):
 
 says(lambda: move(lj.System(by_numpy), 1.0, 0.0))
 says(lambda: move(lj.System(by_cases), 1.0, 0.0, {"k": 1.0}))
+says(lambda: move(lj.System(lambda q, v, t, params: 0.5 * v**2), 1.0, 0.0))
 says(lambda: move(lj.System(lagrangian, {"floor": lj.Holonomic(lambda t, q, params: q["y"] == 0.0)})))
 
 # %% [markdown]

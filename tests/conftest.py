@@ -38,6 +38,17 @@ SIZE, MOST_PAGES = Path("/proc/self/statm"), 4 * 2**30 // os.sysconf("SC_PAGE_SI
 allowed = [MOST_PAGES]
 
 
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup(item):
+    """In the first tier XLA optimises little: it compiles in two thirds of the time.
+
+    Order, stability, speed and what is in a compiled program are measured as users get them: in the slow tiers, in all
+    processes that tests start, in `python -m lagjax`, and where a test of the first tier is marked `optimised`.
+    """
+    as_users_get_it = any(item.get_closest_marker(name) for name in ("slow", "exhaustive", "optimised"))
+    jax.config.update("jax_disable_most_optimizations", not as_users_get_it)
+
+
 def pytest_collection_finish():
     """What is imported by now stays: no use to look through it for cycles."""
     gc.freeze()

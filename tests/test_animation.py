@@ -24,7 +24,9 @@ def page():
 def numbers(page):
     """What the script draws from, each part (F, k, 2)."""
     film = told(page)
-    decoded = lambda part: np.frombuffer(base64.b64decode(part["xy"]), "<i2").reshape(film["frames"], part["points"], 2)
+    decoded = lambda part: np.frombuffer(base64.b64decode(part["xy"][1]), "<i2").reshape(
+        film["frames"], part["points"], 2
+    )
     return [decoded(part) for part in film["parts"]]
 
 

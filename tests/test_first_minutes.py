@@ -344,3 +344,11 @@ def test_callables_of_any_kind():
         assert float(lj.momentum(lj.System(lagrangian), 0.0, *START, PARAMS)["theta"]) == 0.0
     with pytest.raises(ValueError, match="'mass'"):
         lj.momentum(lj.System(functools.partial(needs_mass)), 0.0, *START, PARAMS)
+
+
+def test_degrees():
+    """`explain` tells angles of more than a turn; twin: a length of as much, and smaller angles, are no matter."""
+    system = lj.System(lambda t, q, v, params: 0.5 * (v["a"] ** 2 + v["x"] ** 2) + jnp.cos(q["a"]) - q["x"] ** 2)
+    said = lambda a, x: str(lj.explain(system, 0, {"a": a, "x": x}, {"a": 0, "x": 0}))
+    assert re.search(r"angles +in radians: a = 90 is 14.3 turns; of degrees jnp.radians\(...\)", said(90, 90))
+    assert "radians" not in said(1, 90)

@@ -101,6 +101,8 @@ def result_codes() -> dict[int, str]:
     'successful'
 
     **Returns:** sentences by their numbers, those of this version of lagjax: write them down beside the program.
+
+    **Raises:** nothing.
     """
     return {code: result_in_words(code) for code in range(len(RESULTS))}
 

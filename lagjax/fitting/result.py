@@ -1,5 +1,6 @@
 """The answer of a fit: estimates, how certain they are, and whether the residuals look like measurement errors."""
 
+import os
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
@@ -19,11 +20,13 @@ from lagjax.fitting.identifiability import Identifiability
 from lagjax.fitting.laplace import Laplace, laplace
 from lagjax.fitting.misfit import Misfit
 from lagjax.fitting.records import channel_name
+from lagjax.fitting.saving import save
 from lagjax.fitting.search import Evaluation
 from lagjax.fitting.table import lines_of
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.compiled import compiled
 from lagjax.mechanics.diagnosis import listed
+from lagjax.mechanics.signature import UnknownSystem
 from lagjax.motion.integrate import integrate
 from lagjax.motion.reported import Report
 from lagjax.motion.trajectory import RESULTS, Trajectory
@@ -180,7 +183,7 @@ class Fit:
         # On constraints a start depends on the parameters too: that of a rod of unknown length, for example.
         xp, evaluation, windows = self._xp, self._evaluated(), self.problem.windows.first
         of, determined, of_errors = evaluation.covariance, evaluation.determined, self._of_errors()
-        _, slopes = starts_at(self.problem, self.unknowns, windows)
+        _, slopes = self.known_starts()
         found = []
         for r, w in enumerate(windows):
             joint = of_errors * xp.block([[of.shared, of.local_shared[w].T], [of.local_shared[w], of.local[w]]])
@@ -223,9 +226,15 @@ class Fit:
 
     def starts(self) -> list[tuple[PyTree, PyTree]]:
         """(q, v) at the start of each record."""
-        windows = self.problem.windows.first
-        states, _ = starts_at(self.problem, self.unknowns, windows)
-        return [jax.tree.map(lambda x, r=r: x[r], states) for r in range(len(windows))]
+        states, _ = self.known_starts()
+        return [jax.tree.map(lambda x, r=r: x[r], states) for r in range(len(self.problem.windows.first))]
+
+    def known_starts(self) -> tuple[PyTree, PyTree]:
+        """The starts of all records together, and their slopes by the unknowns."""
+        system = self.problem.system
+        if isinstance(system, UnknownSystem):
+            return system.starts
+        return starts_at(self.problem, self.unknowns, self.problem.windows.first)
 
     def motion(self, record: int = 0, ts=None) -> Trajectory:
         """The fitted motion of a record from its start, at its times or at others from the same start."""
@@ -342,6 +351,16 @@ class Fit:
         size = np.maximum(np.abs(np.asarray(found.start)), 1e-300)
         near = (x - low < AT_BOUND * size) | (high - x < AT_BOUND * size)
         return [name for name, at in zip(self.names, near) if at]
+
+    def save(self, path: str | os.PathLike) -> None:
+        """Write the fit into a file, an npz; `lj.load_fit(path, system)` reads it, bit for bit.
+
+        Functions are not in it: the system, `observe`, and options that hold some. Whoever is stopped while it is
+        written leaves the file of before.
+
+        **Raises:** `TypeError` for what is no data in `params`, by name; `OSError` where there is no such folder.
+        """
+        save(self, path)
 
     def plot(self, record: int = 0):
         """Draw data, fit and residuals of a record, a row each channel; returns a matplotlib `Figure`."""

@@ -134,7 +134,7 @@ def starts(
         charts.append(_charts(system, guess, *(_free(guess.q, hold) for hold in held), r))
     q, v = zip(*charts)
     k = max(chart.along.shape[1] for chart in q), max(chart.along.shape[1] for chart in v)
-    return Starts(_stacked(q, 0, sum(k)), _stacked(v, k[0], sum(k))), _unflatten(kinds(guesses[0].q))
+    return Starts(_stacked(q, 0, sum(k)), _stacked(v, k[0], sum(k))), unflatten_of(kinds(guesses[0].q))
 
 
 def _stacked(charts: Sequence[Chart], before: int, k: int) -> Chart:
@@ -164,7 +164,7 @@ def _vector(tree):
 
 
 @lru_cache
-def _unflatten(of_kinds) -> Callable:
+def unflatten_of(of_kinds) -> Callable:
     """The function that makes coordinates of these `kinds` of a vector."""
     structure, *arrays = of_kinds
     with jax.ensure_compile_time_eval():
@@ -280,7 +280,7 @@ def _charts(system, s: State, free_q, free_v, r) -> Starts:
         nothing = np.zeros((len(free_q), 0))
         return Starts(*(Chart(y, np.eye(len(f))[:, f], nothing) for y, f in ((x, free_q), (u, free_v))))
     with jax.ensure_compile_time_eval():
-        unflatten = _unflatten(kinds(s.q))
+        unflatten = unflatten_of(kinds(s.q))
 
         def charts(x, u, of_q, of_v):
             return Starts(_chart(x, of_q, free_q), _chart(u, of_v, free_v))

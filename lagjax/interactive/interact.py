@@ -8,6 +8,7 @@ of a slider is drawn next: dragging leaves no queue.
 import html
 import threading
 import time
+from base64 import b64encode
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -67,8 +68,9 @@ def interact(
     **Arguments:**
 
     - `run(point)`: any JAX function, as in `lj.sweep`: `point` is a dictionary with the value of each knob as an array,
-      so that nothing is compiled anew when it changes. A `Trajectory` is drawn as its coordinates against time; a
-      dictionary or an array as curves, against its entry `t` or else their index; numbers stand above the picture.
+      so that nothing is compiled anew when it changes; what `run` reads from outside stays as it was. A `Trajectory` is
+      drawn as its coordinates against time; a dictionary or an array as curves, against its entry `t` or else their
+      index; numbers stand above the picture.
     - `knobs`: what may be turned, by name. `(low, high)` or `(low, high, step)`: a slider, whose values are floats. A
       list or an array of numbers: these, in their dtype. `True` or `False`: a switch. A list of anything else (names,
       methods, functions): a choice that `run` gets as it is; each has a program of its own, compiled when it is first
@@ -233,7 +235,7 @@ class Knobs:
     def _repr_mimebundle_(self, **options):
         shown = dict(self.widget._repr_mimebundle_(**options) or {})
         # Where no widgets are shown (a hosted copy, a preview) the picture stands there.
-        return shown | {"text/plain": repr(self), "image/png": self.picture}
+        return shown | {"text/plain": repr(self), "image/png": b64encode(self.picture).decode()}
 
     def __repr__(self):
         at = [f"{_in_words(item)} ({words(self._controls[item[0]])})" for item in self.point.items()]

@@ -64,6 +64,8 @@ class Picture:
             stays &= _fits(axis.get_ylim, axis.set_ylim, values[there], ROOM, anew)
         numbers = [f"{name} = {x[0]:.6g}" for name, x in found.numbers.items()]
         left_out = [*found.left_out, *(panel.label for panel in found.panels[MOST_PANELS:])]
+        if not (found.numbers or found.panels or left_out):
+            numbers = ["run returned nothing to draw"]
         self._words(words, ",  ".join([*numbers, *(["not drawn: " + ", ".join(left_out)] if left_out else [])]))
         if not stays:
             self._whole()

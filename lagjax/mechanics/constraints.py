@@ -34,6 +34,8 @@ class Holonomic(eqx.Module):
 
     **Arguments:** `g(t, q, params)` -> scalar or (m,), smooth, with ∂g/∂q of full rank where it vanishes.
     Its multiplier λ has the shape of `g` and `[energy]/[g]`; λ > 0 pushes along +∂g/∂q.
+
+    **Raises:** `TypeError` for what is no function.
     """
 
     g: Callable
@@ -54,6 +56,8 @@ class Nonholonomic(eqx.Module):
 
     **Arguments:** `phi(t, q, v, params)` -> scalar or (m,), smooth, with ∂phi/∂v of full rank where it
     vanishes. Its multiplier μ has the shape of `phi` and `[energy]/([phi] [t])`; the force is `(∂phi/∂v)ᵀ μ`.
+
+    **Raises:** `TypeError` for what is no function.
     """
 
     phi: Callable

@@ -43,6 +43,20 @@ def flatten(tree):
     return ravel_pytree(tree)
 
 
+def vector(tree):
+    """The vector alone; of NumPy where the values are known, which compiles nothing."""
+    xp = numpy_of(tree)
+    return xp.concatenate([xp.ravel(xp.asarray(x)) for x in jtu.tree_leaves(tree)])
+
+
+def like(tree, x):
+    """A vector x (..., n) in the structure and shapes of `tree`, of NumPy where it is one."""
+    leaves, structure = jtu.tree_flatten(tree)
+    ends = np.cumsum([0, *(np.size(leaf) for leaf in leaves)])
+    parts = [x[..., a:b].reshape(x.shape[:-1] + np.shape(leaf)) for a, b, leaf in zip(ends, ends[1:], leaves)]
+    return jtu.tree_unflatten(structure, parts)
+
+
 def numbers(tree) -> tuple:
     """The coordinates one by one, in the order of `flatten(tree)[0]`."""
     vector, _ = flatten(tree)
@@ -225,6 +239,9 @@ def _check_real(tree, which):
             cause, fix = "the root of a negative number, or an amplitude", "its real part, jnp.real(...)"
         elif callable(leaf):
             of, cause, fix = "a function", "a function in place of what it returns", "f() in place of f"
+        elif hasattr(leaf, "magnitude"):
+            of, cause = f"{leaf!r:.60}", "a number with its unit"
+            fix = "the number, x.magnitude, all in one system of units"
         elif not jnp.issubdtype(dtype, np.bool_):
             of, cause = f"{leaf!r:.60}", "text from a file, or a number that was left to be filled in"
             fix = "a number, as q0 = 0.1, or names, as q0 = {'x': 0.1}"

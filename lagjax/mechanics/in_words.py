@@ -75,7 +75,7 @@ def _missing(call, given, error):
     key, line = error.args[0], _line(call, error)
     there = {name: list(x) for name, x in given.items() if isinstance(x, Mapping) and name in call.takes}
     asked = re.search(rf"(\w+)\[[\"']?{re.escape(str(key))}[\"']?\]", line)
-    parameters = list(inspect.signature(call.function).parameters)
+    parameters = _parameters(call)
     if asked and asked[1] in parameters[: len(call.takes)]:
         source = call.takes[parameters.index(asked[1])]
         there = {source: there[source]} if source in there else there
@@ -104,7 +104,7 @@ def _in_words(call, given, error):
         return None  # It is in words.
     line = _line(call, error)
     known = {name: x for name, x in given.items() if name in call.takes}
-    failure = Failure(error, str(error), line, known, _arguments(call, line))
+    failure = Failure(error, str(error), line, known, _arguments(call, line), _parameters(call))
     for recognized in MISTAKES:
         if (found := recognized(failure)) is not None:
             what, cause, fix = found
@@ -114,13 +114,20 @@ def _in_words(call, given, error):
 
 def _arguments(call, line):
     """The arguments of which the line takes something in brackets, by what is taken: {"theta": ["q", "v"]}."""
-    parameters = list(inspect.signature(call.function).parameters)[: len(call.takes)]
-    ours = dict(zip(parameters, call.takes))
+    ours = dict(zip(_parameters(call), call.takes))
     found = {}
     for name, key in re.findall(r"\b(\w+)\[\s*[\"']?([\w ]+)[\"']?\s*\]", line):
         if name in ours:
             found.setdefault(key, []).append(ours[name])
     return found
+
+
+def _parameters(call):
+    """What the user calls the arguments; nothing of a built-in without a signature."""
+    try:
+        return list(inspect.signature(call.function).parameters)
+    except ValueError:
+        return []
 
 
 def _line(call, error):

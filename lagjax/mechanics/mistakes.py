@@ -16,13 +16,15 @@ Words = tuple[str, str, str]
 
 
 class Failure(NamedTuple):
-    """An error, its text, the user's line, the arguments by name, and of which ones the line takes which entry."""
+    """An error, its text, the user's line, the arguments by name, of which ones the line takes which entry, and what
+    the user calls them."""
 
     error: Exception
     said: str
     line: str
     given: Mapping[str, Any]
     taken: Mapping[str, list[str]]
+    names: list[str]
 
 
 def what_is(x: Any) -> str:
@@ -74,7 +76,7 @@ def _decides(f: Failure) -> Words | None:
 
 def _counts(f: Failure) -> Words | None:
     """A count or an index that is no Python integer."""
-    as_float = "be converted to a scalar index" in f.said or "be interpreted as an integer" in f.said
+    as_float = re.search("be converted to a scalar index|be interpreted as an integer|Shapes must be 1D", f.said)
     if not as_float and not isinstance(f.error, jax.errors.TracerIntegerConversionError):
         return None
     return (
@@ -222,7 +224,8 @@ def _taken_apart(f: Failure) -> Words | None:
             "a start that is a number, and a function that is written for an array",
             "q0 = jnp.array([0.1, 0.2]); or q in place of q[0]",
         )
-    if re.search(r"values to unpack|(?:list|tuple) index out of range", f.said):
+    mentioned = any(re.search(rf"\b{name}\b", f.line) for name in f.names)
+    if mentioned and re.search(r"values to unpack|(?:list|tuple) index out of range", f.said):
         size = "; ".join(f"{name} is {_length(f.given[name])}" for name in ("q", "v") if name in f.given)
         return (
             f"takes another number of entries than there are{': ' + size if size else ''}",

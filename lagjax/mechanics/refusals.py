@@ -7,6 +7,7 @@ from typing import Any, ParamSpec, TypeVar
 
 from lagjax.mechanics.constraints import Holonomic, Nonholonomic
 from lagjax.mechanics.hybrid import Hybrid
+from lagjax.mechanics.signature import known_system
 from lagjax.mechanics.system import System
 
 P = ParamSpec("P")
@@ -21,6 +22,7 @@ def check_system(system: Any, *others: Any, phases: bool = False) -> None:
     """
     if type(system) is System or isinstance(system, (System, Hybrid) if phases else System):
         return
+    known_system(system)
     if isinstance(system, Hybrid):
         raise TypeError(
             "this is of one system, and a lj.Hybrid has one for each of its phases.\n"

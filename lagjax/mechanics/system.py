@@ -53,6 +53,8 @@ class System(eqx.Module):
         force: Callable | None = None,
         dissipation: Callable | None = None,
     ):
+        if isinstance(lagrangian, System):
+            raise TypeError("this is a lj.System already.\nFix: system, in place of lj.System(system).")
         for role, function in (("lagrangian", lagrangian), ("force", force), ("dissipation", dissipation)):
             if function is not None and not callable(function):
                 raise TypeError(

@@ -10,6 +10,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float, Int, PyTree
 
+from lagjax.mechanics.signature import UnknownSystem
 from lagjax.mechanics.structure import angles
 from lagjax.motion.tolerances import TURN
 
@@ -92,7 +93,9 @@ def scaled_error(xp, worst, seen, trajectory, ts, tolerance):
 
 
 def angle_mask(trajectory) -> np.ndarray:
-    """Which coordinates are angles."""
+    """Which coordinates are angles, (n,)."""
+    if isinstance(trajectory.any_system, UnknownSystem):
+        return np.array(trajectory.any_system.angles, bool)
     first = jax.tree.map(lambda x: x[0], (trajectory.t, trajectory.q, trajectory.v))
     found = angles(trajectory.system, *first, trajectory.params)
     return np.concatenate([np.full(np.size(x), yes) for yes, x in zip(*map(jax.tree.leaves, (found, first[1])))])

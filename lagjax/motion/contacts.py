@@ -129,6 +129,8 @@ def releases(contact: str) -> Releases:
 
     The reset opens the contact at a speed of some round-offs: it parts from zero with no speed and no acceleration, and
     a guard of the next phase, `lj.touches` of the same gap, would have it closed for ever.
+
+    **Raises:** `ValueError`, by `lj.integrate`, where the phase has no such constraint, or it has several equations.
     """
     return Releases(contact)
 
@@ -164,6 +166,8 @@ def slips(held: str, on: str, coefficient: Callable | ArrayLike, side: int = 0) 
     - `on`: the name of the contact, whose multiplier is the normal force: `g` a length.
     - `coefficient`: of static friction, a number or a function of `params`.
     - `side`: 1 or -1 where only a multiplier above or below zero counts: to slide in two directions are two phases.
+
+    **Raises:** `ValueError` for another side; and, by `lj.integrate`, where the phase has no constraint of these names.
     """
     if side not in (-1, 0, 1):
         raise ValueError(f"side must be 1, -1, or 0 for both, not {side!r}.")
@@ -193,6 +197,8 @@ def sticks(sliding: Callable) -> Sticks:
     **Arguments:** `sliding`: `sliding(t, q, v, params)`, the sliding velocity in the direction in which its phase
     slides, above zero there. Where friction does not hold what came to rest, the next phase ends at once by its own
     `lj.slips(..., side=...)`, and it slides on, or the other way.
+
+    **Raises:** as `lj.Switch`, where it does not return one number.
     """
     return Sticks(sliding)
 

@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 from lagjax import plot
 from lagjax.mechanics.compiled import compiled
 from lagjax.mechanics.hybrid import Hybrid
+from lagjax.mechanics.signature import UnknownSystem, known_system
 from lagjax.mechanics.system import System
 from lagjax.motion.consistency import worst_residual
 from lagjax.motion.crossings import Crossings
@@ -93,11 +94,11 @@ class HybridTrajectory(Trajectory):
 
     @property
     def system(self) -> Hybrid:  # pyright: ignore[reportIncompatibleVariableOverride]
-        return self._problem()[0]
+        return known_system(self.any_system)
 
     def named_phases(self) -> np.ndarray:
         """The name of the phase at each output; an empty one where none was reached. Not while JAX is tracing."""
-        return np.array([*self.system.names, ""])[np.asarray(self.phase)]
+        return np.array([*self.switches.names, ""])[np.asarray(self.phase)]
 
     def last_phase(self) -> int:
         """The number of the phase in which the motion ended, or failed. Not while JAX is tracing."""
@@ -132,13 +133,18 @@ class HybridTrajectory(Trajectory):
         return super().rows() | {"phase": self.phase}
 
     def _of_system(self):
-        lines = [("worst constraint residual", f"{float(self.residual()):.1e} (relative)")]
+        if isinstance(self.any_system, UnknownSystem):
+            lines = [("system", repr(self.any_system).splitlines()[0])]
+        elif any(system.constraints for system in self.system.systems):
+            lines = [("worst constraint residual", f"{float(self.residual()):.1e} (relative)")]
+        else:
+            lines = []
         names, counts = np.unique(self.named_phases(), return_counts=True)
         outputs = ", ".join(f"{count} in {name}" for name, count in zip(names, counts) if name)
         found = [row.strip() for row in self.switches._rows()]
         shown = found[:6] + (["..."] if len(found) > 6 else [])
         return [
-            *(lines if any(system.constraints for system in self.system.systems) else []),
+            *lines,
             ("phases", f"outputs: {outputs}"),
             ("switches", self.switches.in_words()),
             *(("", row) for row in shown),

@@ -16,6 +16,13 @@ class HybridExplanation:
     - `switches`: of each switch the phase that it ends, those to which it leads, what its guard is called, and the
       value of the guard at the state; None where the state is none of that phase.
     - `unreachable`: phases to which no switch leads, but the first. `final`: phases that none leaves.
+
+    >>> import lagjax as lj
+    >>> ball = lj.System(lambda t, q, v, params: 0.5 * v**2 - 10.0 * q)
+    >>> bounce = lj.Switch("flying", to="flying", when=lj.touches(lambda t, q, params: q, restitution=0.5))
+    >>> found = lj.explain(lj.Hybrid({"flying": ball}, [bounce]), 0.0, 5.0, 0.0)
+    >>> print(list(found.phases), found.final)
+    ['flying'] ()
     """
 
     phases: dict

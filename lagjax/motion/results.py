@@ -8,7 +8,12 @@ from jaxtyping import Array, Bool
 
 # For checkers equinox's enumerations are Python's, of which none can have more items than its parent.
 class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
-    """How an integration or a fit ended: diffrax's results, and what they have no word for."""
+    """How an integration or a fit ended: diffrax's results, and what they have no word for.
+
+    >>> import lagjax as lj
+    >>> print(lj.RESULTS[lj.RESULTS.event_occurred])
+    Terminating differential equation solve because an event occurred.
+    """
 
     start_off_constraints = "The initial state does not satisfy the constraints."
     contradictory = "Constraints that depend on each other ask for different accelerations at the initial state."

@@ -1,6 +1,7 @@
 """The answer of an integration: times, states, multipliers, and how it went."""
 
-from collections.abc import Callable
+import os
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import diffrax
@@ -15,20 +16,23 @@ from lagjax.animation import Animation
 from lagjax.mechanics import coordinates, packed
 from lagjax.mechanics.compiled import compiled
 from lagjax.mechanics.packed import Packed
-from lagjax.mechanics.structure import angles, what_changes_jacobi_integral
+from lagjax.mechanics.signature import UnknownSystem, known_system
+from lagjax.mechanics.structure import what_changes_jacobi_integral
 from lagjax.mechanics.system import System
 from lagjax.motion import frames, printed
-from lagjax.motion.accuracy import Errors
+from lagjax.motion.accuracy import Errors, angle_mask
 from lagjax.motion.charges import panels
 from lagjax.motion.consistency import worst_residual
 from lagjax.motion.crossings import Crossings
 from lagjax.motion.curves import curves, finite
+from lagjax.motion.labelled import dataset
 from lagjax.motion.results import ENDED_WELL as ENDED_WELL
 from lagjax.motion.results import RESULTS as RESULTS
 from lagjax.motion.results import ended_well as ended_well
 from lagjax.motion.results import in_words as in_words
 from lagjax.motion.results import is_among as is_among
 from lagjax.motion.results import message as message
+from lagjax.motion.saving import save
 
 
 class AccuracyWarning(UserWarning):
@@ -125,6 +129,11 @@ class Trajectory(eqx.Module):
 
     @property
     def system(self) -> System:
+        return known_system(self.any_system)
+
+    @property
+    def any_system(self) -> System | UnknownSystem:
+        """The system; of a trajectory from a file that was read without it what the file says of it."""
         return self._problem()[0]
 
     @property
@@ -180,6 +189,37 @@ class Trajectory(eqx.Module):
         """
         return BY_INTEGRATION["at"](self, t)
 
+    def save(self, path: str | os.PathLike) -> None:
+        """Write the motion into a file, an npz; `lj.load_trajectory(path, system)` reads it, bit for bit.
+
+        The functions of the system are not in it. Whoever is stopped while it is written leaves the file of before.
+
+        **Raises:** `TypeError` for what is no data in `params` or in the structure of q, by name; `OSError` where there
+        is no such folder.
+        """
+        save(self, path)
+
+    def to_xarray(self, dims: Sequence[str] | None = None):
+        """Return the motion as an `xarray.Dataset`.
+
+        >>> import lagjax as lj
+        >>> fall = lj.System(lambda t, q, v, params: 0.5 * v["y"] ** 2 - params["g"] * q["y"])
+        >>> traj = lj.integrate(fall, {"y": 0.0}, {"y": 3.0}, {"g": 10.0}, ts=[0.0, 0.2, 0.5])
+        >>> data = traj.to_xarray()
+        >>> print(data["q.y"].dims, data["q.y"].sel(t=0.2).item(), data.attrs["params.g"])
+        ('t',) 0.4 10.0
+
+        Variables are named as here: `q.y`, `v.y`, with their estimated errors as `error.q.y`, and multipliers as their
+        constraints. Their dimensions are `t` and, of a coordinate that is an array, `y_0` and so on. `result`, `end`
+        and the numbers of steps come with them; the method, tolerances and parameters are attributes.
+
+        **Arguments:** `dims`: the names of a batch's axes, which come first; by default "batch", or "batch_0" and so
+        on. The parameters of a batch are variables.
+
+        **Raises:** `ImportError` without xarray; `ValueError` for another number of names than of axes.
+        """
+        return dataset(self, dims)
+
     def plot(self, charges=False):
         """Plot coordinates, velocities and multipliers against time; returns a matplotlib `Figure`.
 
@@ -201,9 +241,7 @@ class Trajectory(eqx.Module):
         """
         lanes = jax.tree.map(lambda x: np.asarray(x).reshape(-1, *x.shape[self.t.ndim - 1 :]), self)
         lanes = [jax.tree.map(lambda x: x[i], lanes) for i in range(len(lanes.t))]
-        first = jax.tree.map(lambda x: x[0], (lanes[0].t, lanes[0].q, lanes[0].v))
-        of_leaves = angles(lanes[0].system, *first, lanes[0].params)
-        is_angle = coordinates.flatten(jax.tree.map(lambda yes, x: np.full(x.shape, yes), of_leaves, first[1]))[0]
+        is_angle = angle_mask(lanes[0])
         pairs = [(curves(lane.q), curves(lane.v)) for lane in lanes]
         drawn = {name: [finite(q[name], v[name]) for q, v in pairs] for name in pairs[0][0]}
         return plot.phase_portrait({name: (drawn[name], bool(yes)) for name, yes in zip(drawn, is_angle)})
@@ -240,6 +278,9 @@ class Trajectory(eqx.Module):
 
     def _of_system(self):
         """What a line each says of the system and its events."""
+        of_events = [(f"event '{name}'", crossings.in_words()) for name, crossings in self.events.items()]
+        if isinstance(self.any_system, UnknownSystem):
+            return [("system", repr(self.any_system)), *of_events]
         found = []
         if self.system.constraints:
             found.append(("worst constraint residual", f"{float(self.residual()):.1e} (relative)"))
@@ -247,7 +288,7 @@ class Trajectory(eqx.Module):
         changed_by = next(what_changes_jacobi_integral(self.system, *first, self.params), None)
         as_it_may = "" if changed_by is None else f"; need not be conserved: {changed_by}"
         found.append(("change of the Jacobi integral", f"{float(self.drift()):.1e} (relative){as_it_may}"))
-        return found + [(f"event '{name}'", crossings.in_words()) for name, crossings in self.events.items()]
+        return found + of_events
 
     def _check_alone(self, call):
         if self.t.ndim != 1:

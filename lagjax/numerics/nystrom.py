@@ -315,6 +315,9 @@ class Nystrom12(Nystrom):
     The default of `lj.integrate` where accelerations do not depend on velocities and there are no constraints: of all
     methods here the fastest to any error below 1e-4 on a bead and a pendulum. Used like `Nystrom8`.
 
+    >>> print(Nystrom12().order(None))
+    12
+
     Where a stiff spring limits its steps (`print(traj)` says "stability"), derivatives of the motion can lose all
     digits while the motion itself does not, since only that chooses the steps: `lj.Dopri8()` keeps both.
     """

@@ -127,6 +127,10 @@ class Dopri8(ExplicitRungeKutta):
 
     The default of `lj.integrate`; in `diffrax.diffeqsolve` it is used like `Tsit5`.
 
+    >>> method = Dopri8()
+    >>> print(method.order(None), method.error_order(None))
+    8 8
+
     Source: Prince & Dormand, J. Comput. Appl. Math. 7 (1981) 67, RK8(7)13M.
     """
 

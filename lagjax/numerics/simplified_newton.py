@@ -173,13 +173,13 @@ def _inverse_at(fn, y, args, options):
     return Inverse(dense.inverse(jax.jacfwd(lambda vector: ravel_pytree(fn(unravel(vector), args)[0])[0])(vector)))
 
 
-def _from_controller():
+def tolerance_of_the_controller():
     """What diffrax puts in place of tolerances that are those of the step-size controller."""
     return diffrax.with_stepsize_controller_tols(SimplifiedNewton)().rtol
 
 
 # It is known by identity, which a copy of a method, or one that was pickled, would not have.
-copyreg.pickle(type(_from_controller()), lambda _: (_from_controller, ()))
+copyreg.pickle(type(tolerance_of_the_controller()), lambda _: (tolerance_of_the_controller, ()))
 
 
 def with_tolerances(solver: diffrax.AbstractSolver, rtol, atol, norm=optx.max_norm) -> diffrax.AbstractSolver:
@@ -193,7 +193,7 @@ def with_tolerances(solver: diffrax.AbstractSolver, rtol, atol, norm=optx.max_no
     """
     if not isinstance(solver, diffrax.AbstractImplicitSolver):
         return solver
-    from_controller = _from_controller()
+    from_controller = tolerance_of_the_controller()
     wanted = {"rtol": rtol, "atol": atol, "norm": norm}
     missing = [name for name in wanted if getattr(solver.root_finder, name, None) is from_controller]
     if not missing:

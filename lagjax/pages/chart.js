@@ -7,7 +7,7 @@ const element = (parent, name, attributes = {}, text = null) => {
   return parent.appendChild(made);
 };
 const short = x => {
-  if (!Number.isFinite(x)) return "NaN";
+  if (!Number.isFinite(x)) return String(x);
   const size = Math.abs(x);
   return size !== 0 && (size < 1e-4 || size >= 1e6) ? x.toExponential(4) : String(+x.toPrecision(6));
 };
@@ -49,7 +49,8 @@ const chart = (host, label) => {
     for (const [key, value] of Object.entries({viewBox: `0 0 ${width} ${height}`, width, height})) svg.setAttribute(key, value);
     svg.setAttribute("aria-label", `${label} over ${across}; ${words}`);
     const clip = `${unique}-${label.replace(/[^a-zA-Z0-9]/g, "-")}-clip`;
-    element(element(svg, "clipPath", {id: clip}), "rect", {x: left, y: top - 2, width: width - left - right, height: height - top - bottom + 4});
+    const inside = {x: left, y: top - 2, width: width - left - right, height: height - top - bottom + 4};
+    element(element(svg, "clipPath", {id: clip}), "rect", inside);
     for (const [x, text] of ticks(x0, x1, width / 90)) {
       element(svg, "path", {d: `M${toX(x)} ${top}V${height - bottom}`, class: "grid"});
       element(svg, "text", {x: toX(x), y: height - bottom + 17, "text-anchor": "middle"}, text);
@@ -60,7 +61,8 @@ const chart = (host, label) => {
     }
     element(svg, "path", {d: `M${left} ${top}V${height - bottom}H${width - right}`, class: "frame"});
     element(svg, "text", {x: (left + width - right) / 2, y: height - 8, "text-anchor": "middle", class: "name"}, across);
-    element(svg, "text", {transform: `translate(14 ${(top + height - bottom) / 2}) rotate(-90)`, "text-anchor": "middle", class: "name"}, label);
+    const upright = `translate(14 ${(top + height - bottom) / 2}) rotate(-90)`;
+    element(svg, "text", {transform: upright, "text-anchor": "middle", class: "name"}, label);
     const lines = element(svg, "g", {"clip-path": `url(#${clip})`, fill: "none", "stroke-width": 1.8, "stroke-linejoin": "round"});
     for (const {name, x, y, colour, dash} of curves) {
       let d = "", drawing = false;

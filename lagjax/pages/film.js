@@ -4,7 +4,7 @@ const NOWHERE = -32768;
 const film = (root, spec) => {
   const groups = root.querySelectorAll("g[data-part]"), svg = groups[0].ownerSVGElement, controls = root.querySelector("[data-film]");
   const [button, slider, clock] = ["button", "input", "output"].map(name => controls.querySelector(name));
-  const parts = spec.parts.map(part => ({size: 2 * part.points, xy: decode(part.xy, Int16Array)}));
+  const parts = spec.parts.map(part => ({size: 2 * part.points, xy: decode(part.xy)}));
   let lane = 0, began = null;
   const draw = frame => {
     const empty = parts[0].xy[lane * spec.frames * parts[0].size] === NOWHERE;

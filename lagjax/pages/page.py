@@ -37,6 +37,12 @@ h1 {{ font-size: 20px; margin: 0 0 12px; }}</style>
 class Page:
     """What plays and answers in a notebook, and in a browser from the page that `save` writes.
 
+    >>> import jax.numpy as jnp
+    >>> import lagjax as lj
+    >>> swept = lj.sweep(lambda point: jnp.sin(point["angle"]), {"angle": jnp.linspace(0.0, 3.0, 31)}, progress=False)
+    >>> swept.to_html().title
+    'Sweep over angle'
+
     - `title`: what stands above it in a page of its own; `html`: itself; `words`: what it is, for `print`.
     """
 
@@ -83,9 +89,9 @@ def fragment(body: str, spec: dict[str, Any], scripts: tuple[str, ...], last: st
     )
 
 
-def encoded(x, dtype: str) -> str:
-    """An array in base64, little-endian, as `decode` reads it: `"f4"`, `"f8"`, `"i1"` or `"i2"`."""
-    return b64encode(np.ascontiguousarray(x, dtype=f"<{dtype}").tobytes()).decode()
+def encoded(x, dtype: str) -> tuple[str, str]:
+    """An array as `decode` reads it: its type, `"f4"`, `"f8"`, `"i1"` or `"i2"`, and base64 of it, little-endian."""
+    return dtype, b64encode(np.ascontiguousarray(x, dtype=f"<{dtype}").tobytes()).decode()
 
 
 def in_bytes(count: float) -> str:

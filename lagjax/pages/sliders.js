@@ -4,7 +4,7 @@ const controls = element(root.querySelector("[data-controls]"), "div", {class: "
 const status = root.querySelector("[data-status]"), views = root.querySelector("[data-views]");
 const lengths = spec.axes.map(axis => axis.labels.length), place = spec.start.slice();
 const laneAt = place => place.reduce((lane, i, k) => lane * lengths[k] + i, 0);
-const codes = decode(spec.status, Int8Array);
+const codes = decode(spec.status);
 let moved = spec.axes.length - 1, same = true;
 
 const outputs = spec.axes.map((axis, k) => {
@@ -20,14 +20,14 @@ const outputs = spec.axes.map((axis, k) => {
 });
 
 const playing = spec.film ? film(root, spec.film) : null;
-const numbers = spec.numbers.map(({name, values}) => ({name, values: decode(values, Float64Array)}));
+const numbers = spec.numbers.map(({name, values}) => ({name, values: decode(values)}));
 const list = numbers.length ? element(views, "dl") : null;
 const told = numbers.map(({name}) => { element(list, "dt", {}, name); return element(list, "dd"); });
 const sections = numbers.map(({name}) => chart(views, name));
 const panels = spec.panels.map(panel => ({
   ...panel,
-  xs: decode(panel.x, Float32Array),
-  ys: panel.curves.map(curve => decode(curve.y, Float32Array)),
+  xs: decode(panel.x),
+  ys: panel.curves.map(curve => decode(curve.y)),
   draw: chart(views, panel.label),
 }));
 panels.forEach(panel => {

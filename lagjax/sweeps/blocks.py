@@ -2,9 +2,10 @@
 
 import warnings
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from lagjax.sweeps.axes import Axes
@@ -14,6 +15,7 @@ from lagjax.sweeps.labels import labels_of
 from lagjax.sweeps.lanes import GOOD, Status, not_run
 from lagjax.sweeps.memory import bytes_of
 from lagjax.sweeps.store import Store
+from lagjax.sweeps.structures import written
 
 # A block of a store is written about so often, and holds no more than this.
 BLOCK_SECONDS, BLOCK_BYTES = 2.0, 256e6
@@ -23,29 +25,41 @@ FULL_CHUNKS = 16
 ALIKE_VERSIONS = 1e-6
 
 
-def block_of(engine: Any, axes: Axes, shares: int) -> int:
+class Begun(NamedTuple):
+    """What a new store is made of: its blocks; times of trajectories that do not depend on the point, by leaf; the
+    description of what `run` returns.
+    """
+
+    blocks: Blocks
+    times: dict[str, np.ndarray]
+    structure: dict[str, Any] | None
+
+
+def begun(engine: Any, axes: Axes, shares: int) -> Begun:
+    """The beginnings of a store, by some points that are computed for it."""
+    first = np.arange(min(engine.program.chunk, axes.size))
+    seconds, values, status = engine.timed(first)
+    good = np.flatnonzero(np.isin(status.result, GOOD))
+    lane = good[0] if len(good) else 0
+    one = jax.tree.map(lambda x: jnp.asarray(x[lane]), values)
+    blocks = divided(axes.shape, _block(engine, axes, shares, seconds))
+    return Begun(blocks, _times(engine, axes, one), written(engine.program.values, one))
+
+
+def _block(engine, axes, shares, seconds):
     """Points to write together: some seconds' worth, `shares` of them or more, no more than fits."""
     chunk = engine.program.chunk
-    first = np.arange(min(chunk, axes.size))
-    seconds = max(engine.seconds_of(first), 1e-6)
-    wanted = max(1, round(BLOCK_SECONDS * engine.workers / seconds)) * chunk
+    wanted = max(1, round(BLOCK_SECONDS * engine.workers / max(seconds, 1e-6))) * chunk
     fair = max(1, axes.size // (shares * chunk)) * chunk
     fits = max(1, int(BLOCK_BYTES / (bytes_of(engine.program) * chunk))) * chunk
     return min(wanted, fair, fits)
 
 
-def begun(engine: Any, axes: Axes, shares: int) -> tuple[Blocks, dict[str, np.ndarray]]:
-    """Of a new store the blocks, and the times of its trajectories that do not depend on the point, by leaf."""
-    return divided(axes.shape, block_of(engine, axes, shares)), _times(engine, axes)
-
-
-def _times(engine, axes):
+def _times(engine, axes, one):
     labels = labels_of(axes, engine.program.values).values
-    found = {}
-    for key, x in named_leaves(engine.program.values):
-        if key in labels and labels[key].times and len(x.shape) == 1 and _is_fixed(engine, axes, key):
-            found[key] = dict(named_leaves(engine.first(np.arange(1))[0]))[key][0]
-    return found
+    named = dict(named_leaves(one))
+    times = [key for key, label in labels.items() if label.times and np.ndim(named[key]) == 1]
+    return {key: np.asarray(named[key]) for key in times if _is_fixed(engine, axes, key)}
 
 
 def _is_fixed(engine, axes, key):

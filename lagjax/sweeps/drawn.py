@@ -41,6 +41,9 @@ def drawn(values: PyTree, of_motion: tuple[str, ...] = ("q", "v", "multipliers")
     leaves = jax.tree_util.tree_leaves_with_path(values, is_leaf=lambda x: isinstance(x, Trajectory))
     named = {jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in leaves}
     for name, x in named.items():
+        if isinstance(x, Trajectory) and np.ndim(x.t) > 2:
+            found.left_out.append(f"{name or 'value'}, a batch of trajectories")
+            continue
         if isinstance(x, Trajectory):
             found.panels.extend(_of_motion(name, x, of_motion))
             continue

@@ -47,13 +47,14 @@ def about(path: Path) -> dict[str, Any]:
     """
     if not path.exists():
         raise ValueError(f"there is no {path}.\nFix: the path that was given as store= to lj.sweep.")
-    copies = [path / KEPT_FREE, path / MARKS] if (path / KEPT_FREE).exists() else [path, path / "done"]
+    of_today = (path / KEPT_FREE / META).exists() or (path / MARKS).exists()
+    copies = [path / KEPT_FREE, path / MARKS] if of_today else [path, path / "done"]
     for folder in copies:
         said = _said(folder / META)
         if said is not None:
             break
     else:
-        if not any((path / name).exists() for name in (KEPT_FREE, "status")):
+        if not of_today and not (path / "status").exists():
             raise ValueError(
                 f"{path} exists, and is no store of a sweep.\nFix: another path, or remove it if it is not needed."
             )
@@ -170,11 +171,17 @@ def _check_readable(path, said):
 
 
 def create(
-    path: Path, axes: Axes, program: Program, wanted: dict, blocks: Blocks, times: dict[str, np.ndarray]
+    path: Path,
+    axes: Axes,
+    program: Program,
+    wanted: dict,
+    blocks: Blocks,
+    times: dict[str, np.ndarray],
+    structure: dict | None,
 ) -> None:
     """Make a store; where another process was first, its own stays. A failure leaves nothing behind.
 
-    `times`: of trajectories, those that all points share, by leaf.
+    `times`: of trajectories, those that all points share, by leaf. `structure`: of values (`structures`).
     """
     zarr = import_zarr()
     made = [folder for folder in (path.parent, *path.parent.parents) if not folder.exists()]
@@ -191,6 +198,7 @@ def create(
             "names": list(axes.values),
             "paired": axes.paired,
             "places": places,
+            "structure": structure,
             "attributes": {"about": "a sweep, which lagjax.open_sweep reads with its checksums"},
             "arrays": {name: metadata for name, metadata in arrays.items() if metadata["node_type"] == "array"},
         }

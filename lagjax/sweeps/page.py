@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import PyTree
 
 from lagjax.animation import film
-from lagjax.mechanics.first_call import Call, check_arguments
+from lagjax.mechanics.in_words import Call, check_arguments
 from lagjax.motion.frames import film_of_lanes
 from lagjax.motion.trajectory import RESULTS, Trajectory
 from lagjax.pages import Page, encoded, fragment
@@ -16,6 +16,7 @@ from lagjax.pages.page import in_bytes
 from lagjax.plot import COLOURS
 from lagjax.sweeps.axes import POINT, Axes
 from lagjax.sweeps.drawn import Drawn, drawn
+from lagjax.sweeps.labels import words_of
 from lagjax.sweeps.lanes import NOT_RUN, TRUSTED
 
 # A number in base64: of one byte.
@@ -31,7 +32,6 @@ def page_of(
     axes: Axes,
     values: PyTree,
     codes: np.ndarray,
-    in_words: Callable[[int], str],
     positions: Callable | None,
     megabytes: float,
     of_film: dict[str, Any],
@@ -52,7 +52,7 @@ def page_of(
         "axes": _axes(axes),
         "start": [n // 2 for n in axes.shape],
         "status": encoded(codes, "i1"),
-        "words": {str(code): in_words(code) for code in np.unique(codes).tolist()},
+        "words": {str(code): words_of(code) for code in np.unique(codes).tolist()},
         "trusted": list(TRUSTED),
         "numbers": [{"name": name, "values": encoded(x, "f8")} for name, x in found.numbers.items()],
         "panels": [_panel(panel, codes) for panel in found.panels],
@@ -92,18 +92,28 @@ def _panel(panel, codes):
     ran = panel.x[codes != NOT_RUN]
     shared = len(ran) > 0 and np.array_equal(ran, np.broadcast_to(ran[0], ran.shape), equal_nan=True)
     x = ran[0] if shared else panel.x
-    curves = [{"name": name, "y": encoded(y, "f4")} for name, y in panel.curves.items()]
+    curves = [{"name": name, "y": encoded(y, _precision(y))} for name, y in panel.curves.items()]
     told = {"label": panel.label, "across": panel.across, "length": panel.x.shape[1]}
-    return told | {"x": encoded(x, "f4"), "curves": curves}
+    return told | {"x": encoded(x, _precision(x)), "curves": curves}
+
+
+def _precision(x):
+    """Single precision, where that shows what there is to see."""
+    there = x[np.isfinite(x)]
+    if there.size == 0:
+        return "f4"
+    largest, distance = np.max(np.abs(there)), np.max(there) - np.min(there)
+    return "f4" if (largest == 0 or 1e-30 < largest < 1e30) and not 0 < distance < 1e-3 * largest else "f8"
 
 
 def _check_size(axes, found: Drawn, megabytes):
-    curves = sum(y.size for panel in found.panels for y in panel.curves.values())
-    size = LONGER * (8 * axes.size * len(found.numbers) + 4 * curves)
+    curves = [y for panel in found.panels for y in panel.curves.values()]
+    numbers = len(found.numbers) + sum(y.size for y in curves) // axes.size
+    size = LONGER * (8 * axes.size * len(found.numbers) + sum(int(_precision(y)[1]) * y.size for y in curves))
     if size > 1e6 * megabytes:
         raise ValueError(
             f"the page would be larger than {in_bytes(size)}, and may have {megabytes:g} MB: {axes.size:,} points of "
-            f"{len(found.numbers) + curves // axes.size:,} numbers each.\n"
+            f"{numbers:,} numbers each.\n"
             "Fix: fewer points, or fewer times ts in run; or megabytes=..., for browsers with patience."
         )
 

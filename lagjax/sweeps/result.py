@@ -210,7 +210,7 @@ class Sweep:
         in_front = lambda x: np.asarray(x).reshape(self.axes.size, *np.shape(x)[len(self.axes.shape) :])
         flat = jax.tree.map(in_front, self.values)
         codes, of_film = self.status.result.reshape(-1), {"seconds": seconds, "rate": rate, "trail": trail}
-        page = page_of(self.axes, flat, codes, _words, positions, megabytes, of_film)
+        page = page_of(self.axes, flat, codes, positions, megabytes, of_film)
         if path is not None:
             page.save(path)
         return page
@@ -289,13 +289,23 @@ def open_sweep(path: str | os.PathLike, *, run: Callable | None = None, system: 
     inside, when they are read. Either is told by name, and from then on its points are "lost from the store" in
     `status`, and not `ok`; `lj.sweep(run, axes, store=path)` computes them again.
 
-    **Arguments:** functions are not stored, so that a trajectory does not know its system. It plots and plays all the
-    same; what else it needs one for (`print`, `drift()`) it has with `system`, the one that was integrated, or with
-    `run`, the function that was swept, which is traced for it and not run.
+    >>> import tempfile
+    >>> import lagjax as lj
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     done = lj.sweep(lambda point: point["x"] ** 2, {"x": [1.0, 2.0]}, store=folder + "/squares", progress=False)
+    ...     print(open_sweep(folder + "/squares").counts())
+    {'successful': 2}
+
+    **Arguments:** `path`: the folder that `lj.sweep` was given as `store`. Functions are not stored, so that a
+    trajectory does not know its system. It plots and plays all the same; what else it needs one for (`print`,
+    `drift()`) it has with `system`, the one that was integrated, or with `run`, the function that was swept, which is
+    traced for it and not run.
+
+    **Returns:** a `Sweep`.
 
     **Raises:** `ValueError` where there is no store, nothing can be told of it, or `run` returns something else than
-    it has. Of a store in an earlier format, and of values of classes that cannot be found, `values` is a dictionary by
-    name.
+    it has. Of a store in an earlier format `values` is a dictionary by name; and of values with functions among
+    them, or of classes that are not found, which a warning names.
     """
     path = Path(path)
     if wrong := restore(path):

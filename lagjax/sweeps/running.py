@@ -67,11 +67,11 @@ class Engine:
         chunk, devices, layout = self.chunk, self.devices, self.layout
         return program_for(self.run, self.axes, chunk, devices, layout, self._patience, robust, progress)
 
-    def seconds_of(self, indices):
-        """The seconds of computing at no more than `chunk` indices."""
+    def timed(self, indices):
+        """(the seconds of computing at no more than `chunk` indices, values, status)."""
         started, (_, compiling) = time.perf_counter(), self._compiling
-        self.first(indices)
-        return time.perf_counter() - started - (self._compiling[1] - compiling)
+        found = self.first(indices)
+        return time.perf_counter() - started - (self._compiling[1] - compiling), *found
 
     def first(self, indices):
         """(values, status) at no more than `chunk` indices, as the programs of many lanes have them."""

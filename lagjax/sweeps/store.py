@@ -318,12 +318,12 @@ def open_store(
     layout: str,
     part: tuple[int, int],
     accept: bool,
-    begun: Callable[[], tuple[Blocks, dict]],
+    begun: Callable[[], tuple[Blocks, dict, dict | None]],
 ) -> Store:
     """Open the store of a sweep, made where there is none; refuse one that belongs to another sweep.
 
-    `begun()`: the blocks of a new one, and the times of its trajectories that all points share. What of a store is not
-    whole is told, put back or, of this part, marked as missing.
+    `begun()`: the blocks of a new one, the times of its trajectories that all points share, the structure of values.
+    What of a store is not whole is told, put back or, of this part, marked as missing.
     """
     wanted = fingerprint(axes, program, layout)
     if not path.exists():

@@ -44,4 +44,4 @@ def unpickled(run: bytes | None, name: str) -> Callable:
 def shapes_of(values: PyTree, lead: int) -> str:
     """The values of a point, as a person writes them; the first `lead` dimensions are those of the sweep."""
     of_one = lambda x: f"{x.dtype}{list(np.shape(x)[lead:]) or ''}"
-    return ", ".join(f"{name} {of_one(x)}" for name, x in named_leaves(values))
+    return ", ".join(sorted(f"{name} {of_one(x)}" for name, x in named_leaves(values)))

@@ -181,7 +181,7 @@ def test_several_zeros_together():
     check(critical, lambda p: jnp.sqrt(p["g"]) + 0 * p["omega"], params, "omega")
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_moving_constraint():
     """The hoop driven by a constraint, whose rate the equations find: the same pitchfork, with the motor's torque."""
     start = {"psi": 0.0, "theta": 0.0}
@@ -221,7 +221,7 @@ def test_closed_curve_and_folds_of_a_side_branch():
     assert float(found.of_kind("pitchfork")[0].parameter) == pytest.approx(0.0, abs=1e-13)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_folds_of_random_curves():
     """Branches that are graphs mu(q): every fold between their ends is found, and no other, by a fine grid of mu'."""
 

@@ -51,6 +51,7 @@ def off(value, slope, row, column):
     return np.asarray(value)[at] / np.asarray(slope)[at]
 
 
+@pytest.mark.slow
 def test_boundaries_of_mathieu():
     """M has its zero at each boundary to 1e-9 in a; twins: a shift by 1e-7 is seen, and the other entry has none."""
     value, slope, _ = swing(A, Q)

@@ -45,7 +45,7 @@ def test_the_seven_mass_distributions(name):
         assert {key.split(" with ")[0] for key in found.steady} == {key.split(" with ")[0] for key in TABLE[name]}
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_left_handed_helix_of_any_pitch():
     """The sign and the size of the screw follow h; and what is printed as conserved is not."""
     params = mass_distributions.PARAMS["helix"] | {"h": -1.7}

@@ -27,8 +27,9 @@ def test_pandas():
     for name in ("tolerance", "error", "seconds", "least", "trusted", "result"):
         np.testing.assert_array_equal(table[name].to_numpy(), [getattr(x, name) for x in found.points])
     assert table["steps"].tolist() == [x.steps for x in ALL] + [pandas.NA]
-    assert (table["order"][:3] == found["A"].order).all() and isinstance(table["method"].dtype, pandas.CategoricalDtype)
-    assert table.groupby("method", observed=True)["error"].min()["A"] == ERRORS[1e-7]
+    np.testing.assert_array_equal(table["order"].to_numpy()[:3], found["A"].order)
+    assert isinstance(table["method"].dtype, pandas.CategoricalDtype)
+    assert min(table[table["method"] == "A"]["error"].tolist()) == ERRORS[1e-7]
     # Twin: another error is seen.
     assert not table["error"].equals(found.to_pandas()["error"] * (1 + 1e-15))
 

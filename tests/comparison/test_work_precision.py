@@ -32,6 +32,7 @@ def found():
     return compared()
 
 
+@pytest.mark.optimised
 def test_default_methods_and_their_orders(found):
     """The default of `integrate` comes first; each method shows its order; Tsit5's is not Dopri8's."""
     assert list(found.curves) == ["Nystrom12", "Dopri8", "Tsit5"]
@@ -137,6 +138,7 @@ def test_a_motion_that_amplifies_is_said_to():
     assert "WARNING" in repr(found)
 
 
+@pytest.mark.slow
 def test_errors_of_an_event_are_those_of_its_time_and_state():
     """The quarter period is K(1/2)/ω; a loose tolerance misses it by as much as is said, relative to the span."""
     down = {"down": lj.Crossing(lambda t, q, v, params: q, direction=-1)}
@@ -164,6 +166,7 @@ def test_a_failing_point_keeps_its_reason_and_the_others_go_on():
     assert found["exact"].points[1].result == "failed"
 
 
+@pytest.mark.slow
 def test_nothing_in_reach_is_said_with_its_reason():
     """Where every solve fails, what `integrate` says of it."""
     with pytest.raises(RuntimeError, match=r"no method came to the end.*Tsit5"):

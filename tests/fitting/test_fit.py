@@ -46,7 +46,7 @@ def noisy(x, sigma=0.01, seed=0):
 def test_finds_parameters_and_start(swinging, capsys):
     """Without errors: parameters, start and their names, to 1e-8; without a guess of the start. It shows its steps."""
     record = lj.Record(TS, q=swinging[0])
-    found = lj.fit(pendulum, record, GUESS, free=FREE, bounds={"l": (0.0, None)}, progress=True)
+    found = lj.fit(pendulum, record, GUESS, free=FREE, progress=True)
     shown = capsys.readouterr().err
     assert f"{int(found.steps)} steps" in shown and "stage 3 of 3, cost" in shown
     assert bool(found.converged) and found.names == ("c", "l")
@@ -307,7 +307,7 @@ def test_outliers_priors_and_bounds(swinging):
     assert float(held.values[1]) == pytest.approx(1.3, abs=1e-5) and held.at_bounds() == ["l"]
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_outliers_from_far(swinging, monkeypatch):
     """With a wild value first, and others, a robust loss still gets from a bad guess to the truth."""
     rng = np.random.default_rng(2)

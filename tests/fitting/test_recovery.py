@@ -23,7 +23,7 @@ def inside(values, sd, truth):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", exhaustive_but(("pendulum", "bead", "cross-rails"), CASES))
+@pytest.mark.parametrize("name", exhaustive_but(("pendulum",), CASES))
 def test_recovers_the_truth_and_its_uncertainty(name):
     """Without errors the truth to 1e-8; with errors the truth within the 95 % interval in 95 % of 200 repeats."""
     case = CASES[name]

@@ -38,6 +38,7 @@ def measured(clean, seed):
     return clean + SIGMA * jax.random.normal(jax.random.key(seed), clean.shape)
 
 
+@pytest.mark.slow
 def test_a_stage_does_not_move_what_it_cannot_see(clean, monkeypatch):
     """Of this record the growing part once sent the drive to a negative frequency; now its first search is right."""
     record = lj.Record(TS, q=measured(clean, 11), sigma=SIGMA)
@@ -126,7 +127,7 @@ def spring_problem(count, sigma, loss="squares"):
     return problem_of(spring, record, {"k": 1.0}, None, None, None, None, loss, None, {})
 
 
-@pytest.mark.parametrize("loss", ["squares", pytest.param("huber", marks=pytest.mark.slow), "cauchy"])
+@pytest.mark.parametrize("loss", ["squares", pytest.param("huber", marks=pytest.mark.exhaustive), "cauchy"])
 def test_false_alarms(loss):
     """Of thousands of fits with errors as they were said to be none is doubted, and next to none looked at again."""
     problem = spring_problem(104, 0.01, loss)

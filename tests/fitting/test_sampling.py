@@ -63,6 +63,7 @@ def on_a_grid(data):
     return found
 
 
+@pytest.mark.exhaustive
 def test_a_normal_posterior():
     """A fall: the draws have the exact mean, standard deviation and quantile of every unknown."""
     y = measured()

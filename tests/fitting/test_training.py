@@ -93,6 +93,7 @@ def problem_with(records, **options):
     return problem_of(spring, records, {"k": 3.0}, None, None, None, None, "squares", options.get("window"), settings)
 
 
+@pytest.mark.slow
 def test_starts_of_their_own():
     """Each window's start, for a k that is wrong, is that of SciPy's least squares with cos and sin."""
     records = [record(i, known=False, amplitude=a) for i, a in enumerate((1.0, 0.5))]

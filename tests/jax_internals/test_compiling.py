@@ -23,6 +23,7 @@ def test_unknown_options_are_left_out(monkeypatch):
     compiler_options.cache_clear()
 
 
+@pytest.mark.optimised
 @pytest.mark.skipif(compiler_options() is None, reason="this XLA has no such option")
 def test_another_way_to_write_kernels(tmp_path):
     """The option reaches XLA: of the same program another machine code is written."""

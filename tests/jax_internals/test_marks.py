@@ -12,6 +12,7 @@ from lagjax.jax_internals.one_function import kept_as_call, one_function
 from lagjax.jax_internals.plain import is_plain
 
 pytestmark = [
+    pytest.mark.optimised,
     pytest.mark.skipif(is_plain(), reason="LAGJAX_PLAIN: nothing is marked"),
     pytest.mark.skipif(jax.default_backend() != "cpu", reason="the marks are for CPUs"),
 ]

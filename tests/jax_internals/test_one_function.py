@@ -12,7 +12,10 @@ import lagjax.jax_internals.one_function as one_function_module
 from lagjax.jax_internals.one_function import calls_host, fits, one_function, without_checks, without_library
 from lagjax.jax_internals.plain import is_plain
 
-pytestmark = pytest.mark.skipif(is_plain(), reason="LAGJAX_PLAIN: no program is compiled as one function")
+pytestmark = [
+    pytest.mark.optimised,
+    pytest.mark.skipif(is_plain(), reason="LAGJAX_PLAIN: no program is compiled as one function"),
+]
 
 
 def grown(x, y):

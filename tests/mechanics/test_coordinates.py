@@ -53,3 +53,26 @@ def test_a_float_is_one_in_whatever_it_comes():
     assert of(9.81) == of(jnp.array(9.81)) == of(np.float64(9.81)) == of(jnp.asarray(9.81, jnp.float64))
     assert not of(jnp.array(9.81)).weak_type and jnp.array(9.81).weak_type
     assert of(jnp.asarray(9.81, jnp.float32)).dtype == jnp.float32
+
+
+def test_what_is_no_number():
+    """Text, and a quantity with its unit: by coordinate, with what may have been meant."""
+
+    class Quantity:
+        magnitude, unit = 2.0, "m"
+
+        def __repr__(self):
+            return "2.0 m"
+
+    for x, words in (("2 m", "'2 m'.*text from a file"), (Quantity(), "2.0 m.*with its unit.*\n.*magnitude")):
+        with pytest.raises(TypeError, match="(?s)coordinate 'x' of v is " + words):
+            coordinates.state(0.0, {"x": 1.0}, {"x": x}, None)
+
+
+def test_a_time_is_one_number():
+    """Of whatever kind; twin: a vector of times, a dict, text and a condition are refused."""
+    for t in (0, 0.0, np.float32(0.0), np.zeros((), int), jnp.zeros(())):
+        assert coordinates.state(t, 1.0, 0.0, None).t.dtype == np.float64
+    for t in (np.zeros(1), {"x": 0.0}, "0", True, None):
+        with pytest.raises(TypeError, match="t must be one number, and is (?s:.*)another order"):
+            coordinates.state(t, 1.0, 0.0, None)

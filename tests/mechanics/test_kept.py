@@ -15,7 +15,7 @@ from lagjax.mechanics.compiled import compiled
 from tests.counting import compiles
 from tests.plain import not_plain
 
-MANY = 40
+MANY = 24
 
 
 @eqx.filter_jit

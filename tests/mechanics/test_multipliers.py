@@ -122,6 +122,6 @@ def test_gradient_of_a_multiplier():
         "l": 1.5 * rate**2,
     }
     for mode in (jax.jacfwd, jax.jacrev):
-        gradient = mode(tension)(params)
+        gradient = jax.jit(mode(tension))(params)
         for name, value in exact.items():
             np.testing.assert_allclose(gradient[name], value, rtol=1e-12)

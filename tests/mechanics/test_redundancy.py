@@ -7,6 +7,7 @@ import pytest
 
 import lagjax as lj
 from tests.systems import PARAMS, cartesian_lagrangian, rod, rod_pendulum
+from tests.tiers import exhaustive_but
 
 STATE = (
     0.0,
@@ -143,7 +144,7 @@ def test_report_of_a_state_with_other_velocities():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("mode", [jax.jacfwd, pytest.param(jax.jacrev, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("mode", exhaustive_but((jax.jacrev,), (jax.jacfwd, jax.jacrev)))
 def test_derivatives_of_shared_multipliers(mode):
     """Accelerations and shortest multipliers have the derivatives of their closed forms, in lanes too."""
 

@@ -126,7 +126,7 @@ def test_there_and_back(options):
     assert float(back.residual()) < (1e-6 if "drift" in options else 1e-14) and float(back.drift()) < 1e-6
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_fixed_steps_backward():
     """A controller of the user's is turned around with the times: 200 steps of 0.01."""
     traj = lj.integrate(pendulum, 0.5, 1.0, PARAMS, ts=DOWN, dt0=0.01, stepsize_controller=diffrax.ConstantStepSize())
@@ -179,7 +179,7 @@ def test_a_direction_that_is_not_known():
     assert run(2.5) == lj.RESULTS.successful
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_times_closed_over_inside_jit():
     """Arrays of JAX's that a traced function closes over are looked at beforehand, in both directions."""
     for ts in (jnp.asarray(DOWN), jnp.asarray(DOWN[::-1])):

@@ -51,6 +51,7 @@ def falling(g, shift=0.0):
     return lj.System(lambda t, q, v, p: 0.5 * p["m"] * v**2 - p["m"] * kept[0] * (q - shift)), kept
 
 
+@pytest.mark.slow
 def test_the_same_program_serves():
     """Whole numbers after floats, other numbers of outputs, functions that mean the same; not those that do not."""
     at = np.linspace(0.0, 1.0, 100)
@@ -138,6 +139,7 @@ def test_programs_of_many_systems_are_dropped():
     assert grown("2") < 40 and grown("100") > 60
 
 
+@pytest.mark.slow
 def test_regular_and_robust_agree():
     """On what is regular, to round-off; the twin's robust way is that of a program that JAX traces."""
     at_once = lj.integrate(rod_pendulum, *HORIZONTAL, PARAMS, ts=TS, rtol=1e-12)
@@ -160,6 +162,7 @@ def test_where_nothing_is_traced():
     assert seen[0] and seen[-1] and not any(seen[1:-1])
 
 
+@pytest.mark.slow
 def test_lanes_of_what_functions_close_over():
     """Numbers that L and a guard close over, batched without `jit`: each lane has its own. Twin: its neighbour's."""
 

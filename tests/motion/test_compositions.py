@@ -92,18 +92,15 @@ OF_LANES_TWICE = {
     ),
 }
 ALL = {**SLOPES, **OF_LANES, **CURVATURES, **OF_LANES_TWICE}
-FAST = {("free", "grad")}
 SLOW = {
     *(
         ("free", name)
         for name in (
-            "jvp of grad",
+            "grad",
             "grad of grad",
-            "hessian",
             "vmap of jvp of grad",
             "grad of vmap",
             "grad of scan",
-            "grad of cond",
         )
     ),
     ("stiff", "jvp of grad"),
@@ -124,8 +121,7 @@ def cases():
     for motion in MOTIONS:
         for composition in ALL:
             case = motion, composition
-            marks = [] if case in FAST else [pytest.mark.slow if case in SLOW else pytest.mark.exhaustive]
-            yield pytest.param(*case, marks=marks)
+            yield pytest.param(*case, marks=pytest.mark.slow if case in SLOW else pytest.mark.exhaustive)
 
 
 @pytest.mark.parametrize("motion, composition", list(cases()))
@@ -136,6 +132,7 @@ def test_compositions(motion, composition):
     np.testing.assert_allclose(found, expected, rtol=1e-7, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_third_derivatives_are_refused():
     """In one sentence; twin: two derivatives are not, above."""
     twice = lambda p: jax.jvp(jax.grad(of_free), (p,), (W,))[1] @ U

@@ -44,6 +44,7 @@ def crank_state(x, u):
     return {"crank": angle, "x": x}, {"crank": -u / (CRANK["l"] * np.sin(angle)), "x": u}
 
 
+@pytest.mark.slow
 def test_massless_crank():
     """θ's equation κ l² sin θ cos θ + λ l sin θ = 0 gives λ = -κ x, so x swings at √((k + κ)/m) and θ follows."""
     q0, v0 = crank_state(0.5, 1.0)

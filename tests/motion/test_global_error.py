@@ -51,9 +51,9 @@ FEW, MANY = np.linspace(0.0, 40.0, 9), np.linspace(0.0, 20.0, 101)
 CASES = {
     "default, loose": (FEW, dict(rtol=1e-5, atol=1e-5)),
     "default": (FEW, dict()),
-    "outputs choose the steps": (MANY, dict(method=lj.Dopri8())),
 }
 OTHERS = {
+    "outputs choose the steps": (MANY, dict(method=lj.Dopri8())),
     "a longest step": (FEW, dict(max_step=0.1, method=lj.Dopri8())),
     "backward": (FEW[::-1], dict(rtol=1e-7, atol=1e-7)),
     "Tsit5": (FEW, dict(method=lj.Tsit5(), rtol=1e-6, atol=1e-6)),
@@ -62,7 +62,17 @@ OTHERS = {
 }
 
 
-@pytest.mark.parametrize("name", [*CASES, *(pytest.param(name, marks=pytest.mark.slow) for name in OTHERS)])
+marked = lambda mark, *names: [pytest.param(name, marks=mark) for name in names]
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        *CASES,
+        *marked(pytest.mark.slow, "outputs choose the steps", "backward", "implicit"),
+        *marked(pytest.mark.exhaustive, "a longest step", "Tsit5", "fixed steps"),
+    ],
+)
 def test_estimated_as_they_are(name):
     """Within ten of the true errors nearly everywhere; a thousandth of the estimate would not be."""
     ts, settings = (CASES | OTHERS)[name]
@@ -148,6 +158,7 @@ def test_when_asked():
     assert jax.jacfwd(lambda g: swung(g, estimate_error=True).error.q[-1])(9.81) == 0.0
 
 
+@pytest.mark.slow
 def test_what_cannot_be_estimated():
     """NaN with its reason; the motion itself is kept."""
     ts = np.array([0.0, 10.0])
@@ -163,6 +174,7 @@ def test_what_cannot_be_estimated():
         orbit(ts, estimate_error="yes")
 
 
+@pytest.mark.slow
 def test_what_chose_the_steps():
     """Outputs, tolerances, a longest step, stability; and how often the equations were asked."""
     said = lambda traj: next(line for line in repr(traj).splitlines() if "steps chosen by" in line)

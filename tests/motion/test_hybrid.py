@@ -9,6 +9,7 @@ import pytest
 
 import lagjax as lj
 from tests.counting import compiles
+from tests.tiers import exhaustive_but
 
 G = 9.81
 FALL = np.sqrt(2 / G)
@@ -77,7 +78,7 @@ RESTITUTION, LEVEL = 0.5, 0.0
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("ready_made", [True, False])
+@pytest.mark.parametrize("ready_made", exhaustive_but((True,), (True, False)))
 def test_what_functions_read_may_change(monkeypatch, ready_made):
     """A reset, a restitution and a gap that read globals, as cells of a notebook do: each call has their values."""
     gap = lambda t, q, params: q - LEVEL
@@ -239,6 +240,7 @@ def test_a_sphere_thrown_sliding():
     assert len(traj.switches) == 0
 
 
+@pytest.mark.slow
 def test_forces_of_multipliers():
     """Friction enters the equations: a block on an incline, written out, in arrays, and with the robust way."""
     incline = lj.Holonomic(lambda t, q, p: q["y"] - jnp.tan(p["angle"]) * q["x"])

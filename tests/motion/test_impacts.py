@@ -156,6 +156,7 @@ def test_newton_may_gain():
     assert any(gained)
 
 
+@pytest.mark.slow
 def test_sliding_that_is_settled():
     """A contact that cannot slide keeps its constraints; where friction jams what must slide there is no impulse."""
     rng = np.random.default_rng(2)

@@ -23,6 +23,7 @@ from lagjax.numerics.simplified_newton import SimplifiedNewton
 from tests.systems import DOUBLE_PARAMS, DOUBLE_SWING, double_pendulum, double_rods, rods_from_angles
 from tests.tiers import exhaustive_but
 
+pytestmark = pytest.mark.optimised
 CLAIM = 0.35
 OUTPUTS = np.concatenate([[0.0], np.linspace(0.3, 8.0, 28) + 0.013 * np.sin(7 * np.arange(28.0))])
 ROD_SWING = jax.tree.map(np.asarray, rods_from_angles(*DOUBLE_SWING, DOUBLE_PARAMS))
@@ -119,16 +120,25 @@ OTHERS = [
     (diffrax.ReversibleHeun(), 2, (200, 400, 800)),
     (diffrax.HalfSolver(diffrax.Heun()), 2, (100, 200, 400)),
 ]
-marked = lambda cases, *marks: [pytest.param(*case, marks=marks) for case in cases]
 name_of = lambda value: type(value).__name__ if isinstance(value, diffrax.AbstractSolver) else None
+TIERS = {
+    ("Tsit5", "free"): (),
+    ("Dopri8", "free"): (),
+    ("Dopri8", "constrained"): pytest.mark.slow,
+    ("Radau5", "constrained"): pytest.mark.slow,
+}
 
 
-@pytest.mark.parametrize("form", ["free", pytest.param("constrained", marks=pytest.mark.slow)])
-@pytest.mark.parametrize(
-    ("method", "order", "steps"),
-    FAST + marked(SLOW, pytest.mark.slow) + marked(OTHERS, pytest.mark.exhaustive),
-    ids=name_of,
-)
+def cases():
+    """Every method free and projected, in its tier."""
+    for method, order, steps in FAST + SLOW + OTHERS:
+        for form in ("free", "constrained"):
+            case = name_of(method), form
+            marks = TIERS.get(case, pytest.mark.exhaustive)
+            yield pytest.param(form, method, order, steps, marks=marks, id="-".join(case))
+
+
+@pytest.mark.parametrize(("form", "method", "order", "steps"), list(cases()))
 def test_order(exact, form, method, order, steps):
     """Each method has its order in positions, velocities and multipliers, free and projected, between its steps."""
     measured = orders(exact[form], steps, lambda n: computed(form, run(form, method, 1 / n)))
@@ -144,7 +154,9 @@ def with_lower_weights(method):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("form", exhaustive_but(("free",), ("free", "constrained")))
-@pytest.mark.parametrize(("method", "order", "steps"), FAST[:2], ids=name_of)
+@pytest.mark.parametrize(
+    ("method", "order", "steps"), [FAST[0], pytest.param(*FAST[1], marks=pytest.mark.exhaustive)], ids=name_of
+)
 def test_a_lower_order_would_be_seen(exact, form, method, order, steps):
     """Failing twin: with the embedded weights no quantity passes."""
     lower = with_lower_weights(method)

@@ -56,6 +56,7 @@ def test_a_pendulum_by_parameters_state_and_times():
     modes_agree(lambda x: end(system, *x[:2], x[2], x[3]), (0.75, 0.25, PARAMS, jnp.asarray(TS)))
 
 
+@pytest.mark.slow
 def test_a_cotangent_that_is_dropped_is_seen(monkeypatch):
     """Twin: without the cotangent of one output the modes disagree."""
     swept = replay.swept_back
@@ -84,6 +85,7 @@ def test_more_steps_than_there_is_room_for(monkeypatch, room):
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-12), of(system), expected)
 
 
+@pytest.mark.slow
 def test_lanes_that_fail_have_no_part():
     """A lane without mass does not start; the derivatives by what lanes share are those of the others, its own zero."""
     heavy = lj.System(lambda t, q, v, p: 0.5 * p["m"] * v**2 - 0.5 * p["k"] * q**2)

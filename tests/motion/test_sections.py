@@ -188,6 +188,7 @@ def orbit(y, span=70.0, **settings):
     return lj.poincare(henon_heiles, *start, section=plane, ts=np.array([0.0, span]), events=back, **settings)
 
 
+@pytest.mark.slow
 def test_section_of_henon_and_heiles():
     """On it x = 0, vx > 0, and the energy is the start's; twin: crossed the other way it is other points."""
     section = orbit(0.125)

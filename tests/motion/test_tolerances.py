@@ -41,6 +41,7 @@ def on_spring(length=1.0, time=1.0, **options):
     return lj.integrate(turning, q0, v0, params, ts=np.linspace(0.0, 20.0, 9) * time, **options)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::lagjax.AccuracyWarning")
 def test_any_units():
     """The same digits and the same steps; twin: with an absolute tolerance a nanometre is nothing."""

@@ -49,6 +49,7 @@ class Misprinted(Nystrom8):
     )
 
 
+@pytest.mark.optimised
 @pytest.mark.parametrize(
     ("method", "steps", "order"),
     [

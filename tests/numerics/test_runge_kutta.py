@@ -11,7 +11,10 @@ import pytest
 from lagjax import Dopri8, Tsit5
 
 ENDS = (0.0, 5.0)
-PAIRS = [(Tsit5(), diffrax.Tsit5()), (Dopri8(), diffrax.Dopri8())]
+PAIRS = [
+    pytest.param(Tsit5(), diffrax.Tsit5(), marks=pytest.mark.exhaustive, id="Tsit5"),
+    pytest.param(Dopri8(), diffrax.Dopri8(), id="Dopri8"),
+]
 name_of = lambda value: type(value).__name__
 
 
@@ -45,7 +48,7 @@ def test_stages_in_a_loop(kind, known):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("ours", "shipped"), PAIRS, ids=name_of)
+@pytest.mark.parametrize(("ours", "shipped"), PAIRS)
 def test_the_steps_of_diffrax(ours, shipped):
     """The same steps, states and dense output as diffrax's implementation."""
     # At constant steps: an error of the size of round-off, as in a first step, chooses them differently.
@@ -78,6 +81,7 @@ def exact():
     return integrate.solve_ivp(field, ENDS, [1.0, 0.0], "DOP853", rtol=1e-13, atol=1e-15).y[0, -1]
 
 
+@pytest.mark.optimised
 @pytest.mark.parametrize(
     ("method", "steps", "order"),
     [(Tsit5(), (80, 160), 5), (Dopri8(), (10, 20), 8), (Misprinted(), (80, 160), 2)],

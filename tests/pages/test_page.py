@@ -22,7 +22,8 @@ def told(html):
 def test_numbers_come_back(dtype):
     """Base64 holds the array, little-endian, in the order of its last axis; of a transposed one, too."""
     x = np.arange(-6, 6).reshape(3, 4).T
-    back = np.frombuffer(base64.b64decode(encoded(x, dtype)), f"<{dtype}")
+    kind, text = encoded(x, dtype)
+    back = np.frombuffer(base64.b64decode(text), f"<{kind}")
     np.testing.assert_array_equal(back, x.reshape(-1))
     # Twin: the other order is another array.
     assert not np.array_equal(back, x.T.reshape(-1))

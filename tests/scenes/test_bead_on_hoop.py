@@ -15,6 +15,7 @@ from lagjax.report import relative_error
 from lagjax.scenes import bead_on_hoop as scene
 from lagjax.scenes.elliptic import agm, jacobi_elliptic
 from tests.references import keys, reference
+from tests.tiers import exhaustive_but
 
 SLOW, FAST, CRITICAL = scene.PARAMS | {"omega": 2.5}, scene.PARAMS, scene.CRITICAL
 STATE = (1.25, -2.0)
@@ -272,7 +273,7 @@ def _driven(periods, tolerance):
     return integrate(scene.driven_system, *start, SLOW, ts=ts, rtol=tolerance, atol=tolerance)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_constraint_holds_for_twenty_periods():
     """The hoop's angle stays on ω t to 1e-12, and h = E - ω L_z is kept, where E itself is not."""
     trajectory = _driven(np.linspace(0.0, 20.3, 11), 1e-10)
@@ -324,14 +325,14 @@ def _check_gradient(derivative, function):
     return exact
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_reverse_gradient_of_state():
     """The final ψ and ψ̇, in reverse mode in m, a, g and ω, agree with the elliptic functions' gradient to 1e-6."""
     _check_gradient(jax.jacrev, _final)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("derivative", [jax.jacfwd, jax.jacrev])
+@pytest.mark.parametrize("derivative", exhaustive_but((jax.jacrev,), (jax.jacfwd, jax.jacrev)))
 def test_gradient_of_torque(derivative):
     """So do the driven bead's state and the motor's torque, in both modes; the torque's explicit ω is in it."""
     exact = _check_gradient(derivative, _driven_final)

@@ -290,7 +290,7 @@ def _check_gradient(derivative):
             assert bool(jnp.allclose(got[name], expected, rtol=1e-6, atol=0)) == right, name
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_forward_gradient():
     """The final state, in forward mode in m, K, k, R0 and ω, has the matrix exponential's gradient to 1e-6."""
     _check_gradient(jax.jacfwd)

@@ -11,6 +11,7 @@ from lagjax.report import relative_error
 from lagjax.scenes import mass_distributions as scene
 from lagjax.scenes import potentials
 from tests.references import keys, reference
+from tests.tiers import exhaustive_but
 
 NAMES = tuple(scene.POTENTIALS)
 # Other tests share the compiled orbits of the rest.
@@ -336,7 +337,7 @@ def test_euler_integral():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("mode", [jax.jacfwd, jax.grad])
+@pytest.mark.parametrize("mode", exhaustive_but((jax.grad,), (jax.jacfwd, jax.grad)))
 def test_gradient_of_the_final_state(mode):
     """A final state inside the ellipse by G, ρ, a, b: reverse and forward mode against the closed form."""
     params = jax.tree.map(jnp.asarray, scene.PARAMS["elliptic cylinder"])

@@ -145,7 +145,7 @@ def test_refused_cases():
     assert not geodesic._undetermined("", geodesic.ENDS).passed
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_thousand_turns():
     """1,000 turns leave the sphere by less than 1e-12, and the phase is off by no more than tolerances add up to."""
     case = geodesic._thousand_turns()
@@ -166,7 +166,7 @@ def test_the_major_arc_is_a_saddle():
     assert float(geodesic.varied_length(np.pi, 0.1)) == pytest.approx(np.pi, abs=1e-4)
 
 
-@pytest.mark.parametrize("mode", [jax.jacrev, pytest.param(jax.jacfwd, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("mode", [jax.jacrev, pytest.param(jax.jacfwd, marks=pytest.mark.exhaustive)])
 def test_gradients_over_the_azimuth(mode):
     """∂ψ(1)/∂(ψ, ψ')(0) against the exact one to 1e-6."""
     ends = np.array([0.0, 1.0])

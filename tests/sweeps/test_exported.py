@@ -153,7 +153,7 @@ def test_pandas():
     assert isinstance(table["result"].dtype, pandas.CategoricalDtype) and set(table["result"]) == {"successful"}
     failed = lj.sweep(lambda point: jnp.sqrt(point["x"]), {"x": np.array([4.0, -1.0])}, progress=False).to_pandas()
     assert failed["result"].tolist() == ["successful", "The state became NaN or infinite."]
-    assert failed["value"][0] == 2.0 and np.isnan(failed["value"][1])
+    np.testing.assert_array_equal(failed["value"], [2.0, np.nan])
 
 
 def test_pandas_of_pairs_and_of_a_choice():

@@ -79,6 +79,7 @@ def all_robust(monkeypatch):
     remembered._PROGRAMS.clear()
 
 
+@pytest.mark.slow
 @not_plain
 def test_lanes_that_are_not_regular(compiled):
     """They have their exact values, and the others those that they had. Twin: without the second program they fail."""
@@ -98,6 +99,7 @@ def test_where_all_are_regular(compiled):
     assert swept.ok.all() and compiled == {"regular": 1}
 
 
+@pytest.mark.slow
 @not_plain
 def test_what_run_makes_of_a_failure():
     """A run that catches NaN, and looks at `result`: the whole lane is computed anew. Twin: the first program alone."""

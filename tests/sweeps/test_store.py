@@ -53,7 +53,7 @@ def test_written_resumed_and_read(tmp_path):
     np.testing.assert_array_equal(alone.values, whole.values)
     assert alone.to_xarray()["value"].dims == ("g", "angle")
     with pytest.raises(ValueError, match="does not know what ran it"):
-        alone.resweep()
+        alone.resweep(where=True)
 
 
 def test_only_what_is_missing(tmp_path):

@@ -3,6 +3,7 @@
 import base64
 import re
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -13,7 +14,6 @@ from tests.pages.test_page import told
 
 AXES = {"a": np.array([1.0, 2.0, 3.0]), "b": np.array([-1, 0, 4, 9])}
 T = np.linspace(0.0, 1.0, 6)
-TYPES = {"f4": "<f4", "f8": "<f8", "i1": "<i1"}
 
 
 def run(point):
@@ -33,9 +33,10 @@ def swept():
     return lj.sweep(run, AXES, progress=False)
 
 
-def array(text, dtype, *shape):
-    """An array of the page."""
-    return np.frombuffer(base64.b64decode(text), TYPES[dtype]).reshape(shape)
+def array(encoded, dtype, *shape):
+    """An array of the page, which has this type."""
+    assert encoded[0] == dtype
+    return np.frombuffer(base64.b64decode(encoded[1]), f"<{dtype}").reshape(shape)
 
 
 def test_the_values_of_every_lane(swept):
@@ -94,6 +95,28 @@ def test_writes_a_file_and_reads_a_store(tmp_path):
     assert told(text)["numbers"] == spec["numbers"] != [] and "<title>Sweep over a</title>" in text
 
 
+def test_what_single_precision_would_hide():
+    """Small changes of large numbers, huge and tiny ones keep all their digits; infinity is a number, too."""
+    t = np.linspace(0.0, 1.0, 11)
+    run = lambda p: {
+        "near": 1e6 + p["a"] * t, "huge": 1e300 * p["a"] * t, "tiny": 1e-60 * p["a"] * t, "plain": p["a"] * t,
+    }  # fmt: skip
+    page = told(lj.sweep(run, {"a": np.array([1.0, 2.0])}, progress=False).to_html().html)
+    curves = {panel["label"]: panel["curves"][0]["y"] for panel in page["panels"]}
+    for name, dtype in (("near", "f8"), ("huge", "f8"), ("tiny", "f8"), ("plain", "f4")):
+        expected = np.asarray(run({"a": 2.0})[name], dtype)
+        np.testing.assert_allclose(array(curves[name], dtype, 2, 11)[1], expected, rtol=1e-15)
+
+
+@pytest.mark.slow
+def test_batches_in_a_point_are_named():
+    """A run that returns many motions at once is not drawn, and said so."""
+    free = lj.System(lambda t, q, v, params: 0.5 * v**2)
+    several = jax.vmap(lambda v: lj.integrate(free, 0.0, v, ts=np.array([0.0, 1.0])))
+    swept = lj.sweep(lambda p: {"all": several(p["v"] * np.ones(2)), "v": p["v"]}, {"v": np.ones(1)}, progress=False)
+    assert "Not drawn: all, a batch of trajectories." in swept.to_html().html
+
+
 def refused(*parts):
     """Expect an error that holds all parts and a fix."""
     return pytest.raises(ValueError, match="(?s)" + "".join(f"(?=.*{re.escape(part)})" for part in (*parts, "Fix:")))
@@ -121,7 +144,7 @@ def test_films_of_all_lanes():
     spec = told(page.html)
     film = spec["film"]
     assert (film["frames"], film["start"], film["parts"][0]["points"]) == (21, 0.0, 1)
-    points = np.frombuffer(base64.b64decode(film["parts"][0]["xy"]), "<i2").reshape(3, 21, 2)
+    points = np.frombuffer(base64.b64decode(film["parts"][0]["xy"][1]), "<i2").reshape(3, 21, 2)
     assert np.all(points[0] == NOWHERE) and np.all(points[1:] != NOWHERE)
     # Pixels downward for height: linear, from both ends of the slow one, which falls by g t²/2 to 1.
     top, bottom = points[1, [0, -1], 1].astype(float)

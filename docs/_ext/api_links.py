@@ -1,0 +1,33 @@
+"""Code such as `lj.fit` in a text leads to the page of that name."""
+
+import re
+
+from api_pages import page_of
+from docutils import nodes
+
+import lagjax
+
+NAME = re.compile(r"lj\.(\w+)\b")
+
+
+def link(app, doctree, docname):
+    """Wrap each such piece of code that is not already part of a link or a title, or on its own page."""
+    for literal in list(doctree.findall(nodes.literal)):
+        found = NAME.match(literal.astext())
+        if not found or found[1] not in lagjax.__all__:
+            continue
+        parents, node = [], literal.parent
+        while node is not None:
+            parents.append(node)
+            node = node.parent
+        target = f"api/{page_of(found[1])}"
+        if target == docname or any(isinstance(node, (nodes.reference, nodes.title)) for node in parents):
+            continue
+        uri = app.builder.get_relative_uri(docname, target)
+        literal.replace_self(nodes.reference("", "", literal.deepcopy(), refuri=uri, internal=True))
+
+
+def setup(app):
+    """Run when all pages are known."""
+    app.connect("doctree-resolved", link)
+    return {"parallel_read_safe": True, "parallel_write_safe": True}

@@ -1,0 +1,216 @@
+"""A page for each public name, in the sections of `lagjax/__init__.py`: signature, docstring, example, errors.
+
+The docstrings are Markdown with examples as in the interpreter; doctest has run these (`pytest lagjax`).
+"""
+
+import ast
+import inspect
+import re
+import typing
+from operator import attrgetter
+from pathlib import Path
+from statistics import median
+
+from written import clear, write
+
+import lagjax
+
+FOLDER = Path(__file__).parent.parent / "api"
+INIT = Path(lagjax.__file__)
+# Whose example shows an object that no function is annotated to return.
+SHOWN_BY = {
+    "Crossings": "Crossing", "Snapshot": "integrate", "Explanation": "explain", "Switches": "touches",
+    "Routhian": "routhian", "Branch": "continue_equilibria", "Critical": "continue_equilibria", "Mode": "normal_modes",
+    "CriticalOrbit": "continue_orbits",
+    "Status": "sweep", "Knobs": "interact", "HybridTrajectory": "touches",
+}  # fmt: skip
+# Of names whose docstring has no room for one.
+EXAMPLES = {
+    "scenes": """
+>>> import lagjax as lj
+>>> hoop = lj.scenes.bead_on_hoop
+>>> print(f"{hoop.equilibrium_angle(hoop.PARAMS):.3f}")
+1.199
+""",
+}
+RAISE_IT = """
+>>> import warnings
+>>> import lagjax as lj
+>>> with warnings.catch_warnings():
+...     warnings.simplefilter("error", lj.{name})  # in here it is raised
+...     warnings.warn("for example", lj.{name})
+Traceback (most recent call last):
+{module}.{name}: for example
+"""
+
+
+def sections() -> dict[str, list[str]]:
+    """The public names under the comments above their imports, in the order of `__all__`."""
+    found, title = {}, ""
+    for line in INIT.read_text().splitlines():
+        if re.match(r"\s*# (?!isort)", line) and not found.get("closed"):
+            title = line.strip("# .")
+        elif named := re.match(r"\s*from lagjax\S* import (.*)", line):
+            for name in re.findall(r"\w+", named[1]):
+                found[name] = title
+    place = {name: i for i, name in enumerate(lagjax.__all__)}
+    groups: dict[str, list[str]] = {}
+    for name in lagjax.__all__:
+        groups.setdefault(found.get(name, "More"), []).append(name)
+    return dict(sorted(groups.items(), key=lambda item: median(place[name] for name in item[1])))
+
+
+def page_of(name: str) -> str:
+    """The file of a name: `fit` and `Fit` must differ where the case of letters does not count."""
+    twins = [other for other in lagjax.__all__ if other.lower() == name.lower()]
+    return name if len(twins) == 1 or name.islower() else f"{name.lower()}-class"
+
+
+def markdown(docstring: str) -> str:
+    """A docstring as Markdown, with its examples fenced."""
+    lines, inside = [], False
+    for line in inspect.cleandoc(docstring).splitlines():
+        if line.lstrip().startswith(">>>") and not inside:
+            lines.append("```pycon")
+            inside = True
+        elif inside and not line.strip():
+            lines.append("```")
+            inside = False
+        lines.append(line)
+    return "\n".join(lines + ["```"] * inside)
+
+
+def example(docstring: str) -> str:
+    """The first example of a docstring."""
+    found = re.search(r"```pycon\n.*?```", markdown(docstring), re.DOTALL)
+    return found[0] if found else ""
+
+
+def signature(thing, name: str, method: bool = False) -> str:
+    """`name(arguments)` with defaults, without types: the docstring says more than these."""
+    try:
+        found = inspect.signature(thing)
+    except (TypeError, ValueError):
+        return name
+    kept = [p.replace(annotation=p.empty) for p in found.parameters.values()]
+    if method and kept and kept[0].name in ("self", "cls"):
+        kept = kept[1:]
+    # The repr of an object has an address in it; a short one is a default that can be typed.
+    kept = [
+        p if len(repr(p.default)) < 40 and " at 0x" not in repr(p.default) else p.replace(default=...) for p in kept
+    ]
+    return name + str(found.replace(parameters=kept, return_annotation=inspect.Signature.empty)).replace(
+        "Ellipsis", "..."
+    )
+
+
+def makers(cls: type) -> list[str]:
+    """The public functions that are annotated to return this class."""
+    found = []
+    for name in lagjax.__all__:
+        function = getattr(lagjax, name)
+        if inspect.isfunction(inspect.unwrap(function)):
+            returned = inspect.unwrap(function).__annotations__.get("return")
+            if returned is cls or cls in typing.get_args(returned):
+                found.append(name)
+    return found
+
+
+def members(cls: type) -> list[str]:
+    """Directives for the documented methods and properties that a class of ours defines or inherits from ours."""
+    parts = []
+    for name, member in inspect.getmembers_static(cls):
+        owner = next((base for base in cls.__mro__ if name in vars(base)), object)
+        if name.startswith("_") or not owner.__module__.startswith("lagjax"):
+            continue
+        function = member.__func__ if isinstance(member, (classmethod, staticmethod)) else member
+        doc = inspect.getdoc(function) if inspect.isroutine(function) or isinstance(function, property) else None
+        if not doc:
+            continue
+        if isinstance(function, property):
+            parts.append(f":::{{py:property}} {name}\n{markdown(doc)}\n:::\n")
+        else:
+            parts.append(f":::{{py:method}} {signature(function, name, True)}\n{markdown(doc)}\n:::\n")
+    return parts
+
+
+def added_example(thing, name: str) -> str:
+    """An example that is not in a docstring; a test runs these."""
+    if inspect.isclass(thing) and issubclass(thing, Warning):
+        return RAISE_IT.format(name=name, module=thing.__module__)
+    return EXAMPLES.get(name, "")
+
+
+def borrowed(thing, name: str) -> str:
+    """The example of the function that makes such an object, or one added here."""
+    if added := added_example(thing, name):
+        return f"\n{markdown(added)}\n"
+    maker = SHOWN_BY.get(name) or next(iter(makers(thing)), None)
+    if maker is None:
+        return ""
+    return f"\nAn example, that of `lj.{maker}`:\n\n{example(inspect.getdoc(attrgetter(maker)(lagjax)) or '')}\n"
+
+
+def described(thing, name: str) -> str:
+    """The directive of a function or class."""
+    doc = markdown(inspect.getdoc(thing) or "")
+    if inspect.isclass(thing):
+        kind = "exception" if issubclass(thing, BaseException) else "class"
+        head = name if kind == "exception" or issubclass(thing, tuple) else signature(thing, name)
+        shown = "" if "```pycon" in doc else borrowed(thing, name)
+        inner = "\n".join(members(thing)) if kind == "class" else ""
+        return f"::::{{py:{kind}}} {head}\n{doc}\n{shown}\n{inner}::::\n"
+    if callable(thing):
+        return f"::::{{py:function}} {signature(thing, name)}\n{doc}\n::::\n"
+    return f"::::{{py:data}} {name}\n{doc}\n::::\n"
+
+
+def page(name: str) -> str:
+    """The whole page of a public name."""
+    thing = getattr(lagjax, name)
+    if not inspect.ismodule(thing):
+        return f"# lj.{name}\n\n:::{{py:currentmodule}} lagjax\n:::\n\n{described(thing, name)}"
+    parts = [
+        f"# lj.{name}\n",
+        markdown(inspect.getdoc(thing) or ""),
+        markdown(EXAMPLES.get(name, "")),
+        f"\n:::{{py:currentmodule}} lagjax.{name}\n:::\n",
+    ]
+    if hasattr(thing, "__path__"):
+        inner = {key: value for key, value in vars(thing).items() if inspect.ismodule(value) and key in thing.__all__}
+        lines = [
+            f"- `lagjax.{name}.{key}`: {(inspect.getdoc(value) or '').splitlines()[0]}" for key, value in inner.items()
+        ]
+        parts += ["", *lines, "\nThe [gallery](../gallery.md) has a picture and a closed form of each.\n"]
+    defined = ast.parse(Path(thing.__file__).read_text()).body
+    for node in defined:
+        if isinstance(node, (ast.FunctionDef, ast.ClassDef)) and not node.name.startswith("_"):
+            parts.append(f"## {node.name}\n\n{described(getattr(thing, node.name), node.name)}")
+    return "\n".join(parts)
+
+
+def index(groups: dict[str, list[str]]) -> str:
+    """The list of all names with what each says of itself in one line."""
+    parts = ["# Reference\n", "`import lagjax as lj`; the names stand in the order of the physics.\n"]
+    for title, names in groups.items():
+        parts.append(f"## {title}\n")
+        for name in names:
+            first = (inspect.getdoc(getattr(lagjax, name)) or "").split("\n\n")[0].replace("\n", " ")
+            parts.append(f"- [`lj.{name}`]({page_of(name)}.md): {first}")
+        parts.append(f"\n```{{toctree}}\n:hidden:\n:caption: {title}\n\n" + "\n".join(map(page_of, names)) + "\n```\n")
+    return "\n".join(parts)
+
+
+def generate(app):
+    """Write all pages."""
+    groups = sections()
+    for name in lagjax.__all__:
+        write(FOLDER / f"{page_of(name)}.md", page(name))
+    write(FOLDER / "index.md", index(groups))
+    clear(FOLDER, {"index.md"} | {f"{page_of(name)}.md" for name in lagjax.__all__})
+
+
+def setup(app):
+    """Generate before the sources are read."""
+    app.connect("builder-inited", generate)
+    return {"parallel_read_safe": True, "parallel_write_safe": True}

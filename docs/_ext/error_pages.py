@@ -1,0 +1,185 @@
+"""What lagjax says when something is wrong, read off its code: every message, by theme, with a link to each.
+
+A message is text of three parts: what happened, the usual cause, the fix. Where numbers and names stand in one, the
+page has an ellipsis.
+"""
+
+import ast
+import re
+from pathlib import Path
+
+from written import write
+
+import lagjax
+
+ROOT = Path(lagjax.__file__).parent
+PAGE = Path(__file__).parent.parent / "generated" / "errors.md"
+# Folder or module, and what it is about; the first that fits counts.
+THEMES = {
+    "mechanics/hybrid": "Phases, contacts and impacts",
+    "motion/contacts": "Phases, contacts and impacts",
+    "motion/impacts": "Phases, contacts and impacts",
+    "motion/switching": "Phases, contacts and impacts",
+    "motion/phase_graph": "Phases, contacts and impacts",
+    "motion/hybrid": "Phases, contacts and impacts",
+    "motion/crossings": "Events and sections",
+    "motion/sections": "Events and sections",
+    "motion/works": "Energy and conserved quantities",
+    "motion/ledger": "Energy and conserved quantities",
+    "motion/charges": "Energy and conserved quantities",
+    "mechanics/noether": "Energy and conserved quantities",
+    "mechanics/generators": "Energy and conserved quantities",
+    "motion/consistent_state": "States and constraints",
+    "mechanics/constraints": "States and constraints",
+    "mechanics": "A system and its Lagrangian",
+    "motion": "Motion",
+    "numerics": "Motion",
+    "jax_internals": "Motion",
+    "analysis": "What a system is like",
+    "sweeps": "Sweeps",
+    "fitting": "Fits",
+    "learned": "Learned models",
+    "comparison": "Error against run time",
+    "exchange": "In and out",
+    "interactive": "Knobs",
+    "plot": "Pictures",
+    "animation": "Pictures",
+    "pages": "Pictures",
+}
+ORDER = list(dict.fromkeys([*("A system and its Lagrangian", "States and constraints", "Motion"), *THEMES.values()]))
+ELSEWHERE = "Elsewhere"
+INTRO = """# What went wrong
+
+Every message that lagjax can give, as it stands in the code: what happened, the usual cause, the fix. Search this page
+(or the site) for words of yours; `…` stands for names and numbers of your system. Errors are raised where values are
+looked at, outside of `jit`; in a batch or a sweep a failed motion keeps its reason in `traj.result` or `swept.status`
+instead.
+
+"""
+
+
+def text_of(node: ast.expr) -> str | None:
+    """A string expression as text, with an ellipsis for what is put into it; None for what is no string."""
+    if isinstance(node, ast.Constant) and isinstance(node.value, str):
+        return node.value
+    if isinstance(node, ast.JoinedStr):
+        return "".join(text_of(part) or "…" for part in node.values)
+    if isinstance(node, ast.FormattedValue):
+        return "…"
+    if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Add):
+        parts = [text_of(node.left), text_of(node.right)]
+        return None if parts == [None, None] else "".join(part or "…" for part in parts)
+    if isinstance(node, ast.IfExp):
+        return text_of(node.body) or text_of(node.orelse)
+    if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.func.attr == "format":
+        found = text_of(node.func.value)
+        return found and re.sub(r"\{[^{}]*\}", "…", found)
+    return None
+
+
+def telling(text: str) -> str:
+    """The first line of a message that has words of its own, and is not all put together elsewhere; or nothing."""
+    lines = [re.sub("^…?(Usual cause|Fix): …?", "", line) for line in text.split("\n")]
+    return next((line for line in lines if len(re.findall("[a-z]{3,}", line)) > 1), "").strip()
+
+
+def kind_of(node: ast.Call) -> str:
+    """`ValueError`, or the category of a warning."""
+    if isinstance(node.func, ast.Name):
+        return node.func.id
+    named = [a for a in [*node.args[1:2], *(k.value for k in node.keywords if k.arg == "category")]]
+    return ast.unparse(named[0]) if named else "UserWarning"
+
+
+def messages(source: str) -> list[tuple[str, str]]:
+    """(kind, text) of each message in a module: raised, warned of, or made by a function and raised by another."""
+    found, seen = [], set()
+
+    def add(kind, text):
+        text = text and re.sub(r"…(?:\s?…)+", "…", text).strip()
+        if text and telling(text) and text not in seen:
+            seen.add(text)
+            found.append((kind, text))
+
+    tree = ast.parse(source)
+    documented = (ast.Module, ast.ClassDef, ast.FunctionDef)
+    docstrings = {
+        id(node.body[0].value) for node in ast.walk(tree) if isinstance(node, documented) and ast.get_docstring(node)
+    }
+    inside: set[int] = set()
+    for node in ast.walk(tree):
+        call = node.exc if isinstance(node, ast.Raise) else node
+        raised = isinstance(node, ast.Raise) and isinstance(call, ast.Call)
+        warned = isinstance(call, ast.Call) and ast.unparse(call.func) in ("warnings.warn", "warn")
+        if (raised or warned) and call.args:
+            add(kind_of(call), text_of(call.args[0]))
+            inside |= {id(part) for part in ast.walk(call)}
+    for node in ast.walk(tree):
+        if (
+            id(node) in inside
+            or id(node) in docstrings
+            or not isinstance(node, (ast.Constant, ast.JoinedStr, ast.BinOp))
+        ):
+            continue
+        text = text_of(node)
+        if text and "\nFix:" in text:
+            add("", text)
+            inside |= {id(part) for part in ast.walk(node)}
+    return found
+
+
+def theme_of(module: str) -> str:
+    """The heading under which the messages of a module stand."""
+    return next((theme for begin, theme in THEMES.items() if module.startswith(begin)), ELSEWHERE)
+
+
+def anchor(text: str, taken: set[str]) -> str:
+    """A name for a message that stays while its first words do."""
+    words = re.findall(r"[a-z0-9]+", text.lower())[:7]
+    name = base = "-".join(words)
+    number = 2
+    while name in taken:
+        name, number = f"{base}-{number}", number + 1
+    taken.add(name)
+    return name
+
+
+def title(line: str) -> str:
+    """The first sentence of a message, or what fits on a line or two of it."""
+    parts = re.split(r"(?<=[a-z)'…])([.:;] )", line)
+    ends = (i for i in range(1, len(parts) + 1, 2) if len(re.findall("[a-z]{3,}", "".join(parts[:i]))) > 2)
+    short = "".join(parts[: next(ends, len(parts))]).rstrip(":.")
+    return short if len(short) <= 130 else short[:130].rsplit(" ", 1)[0] + " …"
+
+
+def entry(kind: str, text: str, taken: set[str]) -> str:
+    """One message as Markdown: its first line that says something is its heading."""
+    first = telling(text)
+    name = anchor(first, taken)
+    # A heading is a line of text: what is code or a formula to Markdown must not become so.
+    heading = re.sub(r"([\\`*_{}\[\]<>#$|])", r"\\\1", title(first))
+    shown = f"```text\n{kind + ': ' if kind else ''}{text}\n```\n"
+    return f"({name})=\n### {heading}\n\n{shown}"
+
+
+def page() -> str:
+    """The whole page."""
+    by_theme: dict[str, list[tuple[str, str]]] = {}
+    for path in sorted(ROOT.rglob("*.py")):
+        module = str(path.relative_to(ROOT).with_suffix(""))
+        if module.startswith(("scenes", "mechanisms", "stability", "report", "job", "__")):
+            continue
+        by_theme.setdefault(theme_of(module), []).extend(messages(path.read_text()))
+    taken: set[str] = set()
+    parts = [INTRO]
+    for theme in [*ORDER, ELSEWHERE]:
+        if found := by_theme.get(theme):
+            parts.append(f"## {theme}\n")
+            parts += [entry(kind, text, taken) for kind, text in found]
+    return "\n".join(parts)
+
+
+def setup(app):
+    """Generate before the sources are read."""
+    app.connect("builder-inited", lambda app: write(PAGE, page()))
+    return {"parallel_read_safe": True, "parallel_write_safe": True}

@@ -1,0 +1,71 @@
+"""The notebooks as pages, with the outputs that are stored in them; nothing is executed here.
+
+A figure is described to those who cannot see it by the metadata `alt` of its cell, or else by the words that its code
+writes into it: titles and labels.
+"""
+
+import ast
+import json
+import re
+from pathlib import Path
+
+from written import clear, write
+
+FOLDER = Path(__file__).parent.parent / "notebooks"
+SOURCE = Path(__file__).parents[2] / "notebooks"
+INDEX = """# Notebooks
+
+One question each, with its Lagrangian in the first lines. They are shown with the outputs that are stored in them; the
+tests run them.
+
+```{toctree}
+:maxdepth: 1
+
+"""
+
+
+def words(code: str) -> str:
+    """The titles and labels that a cell's code gives to its figure."""
+    found = []
+    for node in ast.walk(ast.parse(code)):
+        if isinstance(node, ast.keyword) and node.arg in ("title", "xlabel", "ylabel", "label"):
+            parts = node.value.values if isinstance(node.value, ast.JoinedStr) else [node.value]
+            found.append("".join(str(p.value) for p in parts if isinstance(p, ast.Constant)).strip())
+    return "; ".join(dict.fromkeys(filter(None, found)))
+
+
+def with_alt_texts(notebook: dict, name: str) -> dict:
+    """Each cell that shows a picture says in words what it is."""
+    heading = name
+    for cell in notebook["cells"]:
+        text = "".join(cell["source"])
+        if cell["cell_type"] == "markdown":
+            headings = re.findall(r"^#+ (.*)", text, re.MULTILINE)
+            heading = headings[-1] if headings else heading
+        elif any("image/png" in output.get("data", {}) for output in cell["outputs"]):
+            said = words(text) or "drawn by " + text.strip().splitlines()[-1]
+            alt = cell["metadata"].get("alt") or f"Figure, {heading}: {said}"
+            cell["metadata"]["mystnb"] = {"image": {"alt": alt.replace("$", "")}}
+    return notebook
+
+
+def generate(app):
+    """Write the notebooks and the list of them."""
+    names = sorted(path.stem for path in SOURCE.glob("*.ipynb"))
+    for name in names:
+        text = (SOURCE / f"{name}.ipynb").read_text().replace("](../docs/", "](../")
+        write(FOLDER / f"{name}.ipynb", json.dumps(with_alt_texts(json.loads(text), name), ensure_ascii=False))
+    write(FOLDER / "index.md", INDEX + "\n".join(names) + "\n```\n")
+    clear(FOLDER, {"index.md"} | {f"{name}.ipynb" for name in names})
+
+
+def point_to_pages(app, docname, source):
+    """Links of a text to a notebook of the repository lead to its page."""
+    source[0] = source[0].replace("](../notebooks/", "](notebooks/")
+
+
+def setup(app):
+    """Generate before the sources are read."""
+    app.connect("source-read", point_to_pages)
+    app.connect("builder-inited", generate)
+    return {"parallel_read_safe": True, "parallel_write_safe": True}

@@ -1,0 +1,84 @@
+"""Fits read from files, with the functions that the user gives again."""
+
+import os
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from lagjax.fitting.result import Fit
+from lagjax.fitting.starts import unflatten_of
+from lagjax.mechanics import files
+from lagjax.mechanics.hybrid import Hybrid, first_phase, replace_fields
+from lagjax.mechanics.memory import kinds
+from lagjax.mechanics.outside import first_alike, up_to_date
+from lagjax.mechanics.signature import UnknownSystem
+from lagjax.mechanics.system import System
+from lagjax.mechanics.written_trees import NotGiven, Reader
+from lagjax.motion.saved import check_same
+from lagjax.motion.switching import each_phase
+
+
+def load_fit(
+    path: str | os.PathLike, system: System | Hybrid | None = None, observe: Callable | None = None, **options
+) -> Fit:
+    """Read a fit that `found.save(path)` has written, bit for bit.
+
+    >>> import os
+    >>> import tempfile
+    >>> import numpy as np
+    >>> import lagjax as lj
+    >>> fall = lj.System(lambda t, q, v, params: 0.5 * v**2 - params["g"] * q)
+    >>> t = np.linspace(0.0, 1.0, 6)
+    >>> found = lj.fit(fall, lj.Record(t, q=3.0 * t - 5.0 * t**2 + 1e-3 * np.cos(9.0 * t), sigma=1e-3), {"g": 9.0})
+    >>> path = os.path.join(tempfile.mkdtemp(), "fall.npz")
+    >>> found.save(path)
+    >>> again = lj.load_fit(path, fall)
+    >>> print(again.names, bool(again.sd == found.sd), again.motion().q.shape)
+    ('g',) True (6,)
+
+    **Arguments:**
+
+    - `path`: the file.
+    - `system`, `observe`: the system and the function that were fitted, which are not in the file; `options`: those of
+      `lj.fit` that hold functions, as `events=`. They are needed for what asks them: `motion()`, `log_likelihood`,
+      `laplace()`. Without them the estimates, their uncertainties and the residuals are there, and these say what they
+      miss.
+
+    **Returns:** the `Fit`.
+
+    **Raises:**
+
+    - `FileNotFoundError` where there is no such file.
+    - `ValueError` for a file that is damaged, of something else, of a newer lagjax, or of another version that keeps
+      fits in another form; for a `system` other than the one that was fitted; for a file in float64 where JAX works in
+      float32.
+    - `TypeError` for functions that the fit did not have.
+    """
+    said, arrays = files.read(path, "fit")
+    known = {"system": system, "observe": observe} | {f"options.{name}": x for name, x in options.items()}
+    known = {role: x for role, x in known.items() if x is not None}
+    if unknown := sorted(set(known) - set(said["functions"])):
+        raise TypeError(
+            f"this fit has no {', '.join(_short(role) for role in unknown)} that would have to be given again.\n"
+            f"It has {', '.join(_short(role) for role in said['functions'])}."
+        )
+    try:
+        placeholder: Any = UnknownSystem(**Reader(arrays).up(said["known"]))
+        if system is not None:
+            check_same(system, placeholder, path)
+            alike = each_phase(system, lambda of: first_alike(of, up_to_date(of)))
+            phase = placeholder.phase
+            placeholder = alike if phase is None else replace_fields(alike, first=np.asarray(phase, np.int32))
+        like = Reader(arrays).up(said["q"])
+        known |= {"system": placeholder, "unflatten": unflatten_of(kinds(like))}
+        known["first"] = placeholder if system is None else first_phase(placeholder)
+        return Reader(arrays, lambda role: known[role] if role in known else NotGiven(_short(role))).up(said["fit"])
+    except (KeyError, AttributeError, TypeError, IndexError, StopIteration) as error:
+        if isinstance(error, TypeError) and "lj.System" in str(error):
+            raise
+        files.raise_damaged(path, f"what it says of itself is not whole ({error})", error)
+
+
+def _short(role):
+    return role.removeprefix("options.")

@@ -1,0 +1,53 @@
+"""Fits written into files: all that they are but functions, of which the system's have a signature."""
+
+import os
+from typing import Any
+
+import jax
+import numpy as np
+
+from lagjax.mechanics import coordinates, files
+from lagjax.mechanics.coordinates import State
+from lagjax.mechanics.hybrid import Hybrid
+from lagjax.mechanics.signature import UnknownSystem, signature
+from lagjax.mechanics.written_trees import NotGiven, NotWritable, Writer
+
+
+def save(fit, path: str | os.PathLike) -> None:
+    """Write a fit into a file: see `Fit.save`."""
+    if coordinates.is_traced(fit):
+        raise TypeError("this fit is being traced, and has no numbers yet.\nFix: save it outside of the program.")
+    problem = fit.problem
+    # Of a motion without phases the first system is the system.
+    roles = {id(problem.first): "first", id(problem.system): "system", id(problem.unflatten): "unflatten"}
+    if problem.observe is not None:
+        roles[id(problem.observe)] = "observe"
+    for name, value in problem.options.items():
+        if isinstance(value, NotGiven) or not _is_data(value):
+            roles[id(value)] = f"options.{name}"
+    writer = Writer(lambda value: roles.get(id(value)))
+    told = {"fit": writer.down(fit, ""), "known": writer.down(_described(fit), "system")}
+    told["q"] = writer.down(jax.tree.map(np.asarray, problem.unflatten(problem.starts.q.guess[0])), "coordinates")
+    told["functions"] = sorted(set(roles.values()) - {"first", "unflatten"})
+    files.write(path, "fit", told, writer.arrays)
+
+
+def _is_data(value):
+    try:
+        Writer().down(value, "")
+    except NotWritable:
+        return False
+    return True
+
+
+def _described(fit) -> dict[str, Any]:
+    system = fit.problem.system
+    if isinstance(system, UnknownSystem):
+        return {name: getattr(system, name) for name in system.__dataclass_fields__}
+    q, v = jax.tree.map(np.asarray, fit.starts()[0])
+    params = jax.tree.map(np.asarray, fit.problem.params(fit.unknowns.shared, 0))
+    t = np.asarray(np.asarray(fit.problem.windows.ts)[0, 0], jax.tree.leaves(q)[0].dtype)
+    state = State(t, q, v, params)
+    phase = int(system.first) if isinstance(system, Hybrid) else None
+    about = {"words": repr(system), "angles": (), "signature": signature(system, state), "state": tuple(state)}
+    return about | {"starts": jax.tree.map(np.asarray, fit.known_starts()), "phase": phase}

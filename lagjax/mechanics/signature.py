@@ -1,0 +1,136 @@
+"""Whether a system is the one that a motion was computed with: what its functions say at one of the motion's states.
+
+Values and slopes of L, of R and of each constraint, and the force, each in one row. Two systems of which all of these
+agree at a state in the midst of a motion are taken for the same.
+"""
+
+from dataclasses import fields
+from functools import partial
+from typing import Any, NoReturn
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, PyTree
+
+from lagjax.mechanics.arguments import takes_of
+from lagjax.mechanics.compiled import compiled
+from lagjax.mechanics.constraints import Holonomic, zero_multipliers
+from lagjax.mechanics.coordinates import State
+from lagjax.mechanics.hybrid import Hybrid
+from lagjax.mechanics.outside import up_to_date
+from lagjax.mechanics.system import System
+
+# Values that differ by more than this, relative to the largest beside them, are another function's. Round-off is below
+# it also where large terms cancel, in float32 too, but for the last digits.
+SAME = {np.dtype("float64"): 1e-7, np.dtype("float32"): 1e-3}
+
+# What is asked of a system.
+OF_SYSTEMS = {field.name for of in (System, Hybrid) for field in fields(of)} - {"first"}
+
+
+class UnknownSystem(eqx.Module):
+    """In place of a system that was not given: what a file knows of it.
+
+    - `words`: as it printed itself; `angles` (n,): which coordinates are angles.
+    - `signature`: what its functions said at `state`, by what they are. `starts`: where the motions of a fit start,
+    and `phase`: the number of the phase in which they do.
+    """
+
+    words: str = eqx.field(static=True)
+    angles: tuple[bool, ...] = eqx.field(static=True)
+    signature: dict[str, Array]
+    state: PyTree
+    starts: PyTree = None
+    phase: int | None = eqx.field(static=True, default=None)
+
+    def __repr__(self):
+        return f"{self.words}, not given"
+
+    def __getattr__(self, name):
+        if name in OF_SYSTEMS:
+            _raise_unknown(self)
+        raise AttributeError(name)
+
+
+def signature(system: System | Hybrid, state: State) -> dict[str, np.ndarray]:
+    """What each function of a system says at a state, by what it is."""
+    if isinstance(system, System):
+        return _signature(up_to_date(system), *state)
+    found = {}
+    for name, phase in zip(system.names, system.systems):
+        found |= {f"{role} of phase '{name}'": x for role, x in _signature(up_to_date(phase), *state).items()}
+    names = [f"{i}: {switch.phase} -> {switch.to}, {switch.rest}" for i, switch in enumerate(system.switches)]
+    return found | {f"switch {name}": np.zeros(0) for name in names}
+
+
+def differences(there: dict[str, Any], here: dict[str, Any]) -> list[str]:
+    """What of two signatures differs, in words."""
+    found = [f"{role} is missing" for role in there if role not in here]
+    found += [f"{role} is there, and was not" for role in here if role not in there]
+    for role in there:
+        if role not in here:
+            continue
+        a, b = (np.asarray(x[role]) for x in (there, here))
+        size = np.max(
+            np.abs(np.nan_to_num(np.concatenate([a.ravel(), b.ravel()]), posinf=0.0, neginf=0.0)), initial=0.0
+        )
+        tolerance = SAME.get(a.dtype, 1e-2) * size
+        if a.shape != b.shape:
+            found.append(f"{role} has {len(b)} values and slopes, and had {len(a)}")
+        elif not np.allclose(a, b, rtol=0.0, atol=tolerance, equal_nan=True):
+            what = (
+                "value" if a.size and not np.isclose(a[0], b[0], rtol=0.0, atol=tolerance, equal_nan=True) else "slope"
+            )
+            i = 0 if what == "value" else int(np.nanargmax(np.abs(a - b)))
+            found.append(f"{role}: its {what} was {a[i]:.9g}, and is {b[i]:.9g}")
+    return found
+
+
+@partial(compiled, in_numpy=True)
+def _signature(system, t, q, v, params):
+    s, found = State(t, q, v, params), {}
+    flat = lambda *trees: jnp.concatenate([jnp.ravel(jnp.asarray(x, t.dtype)) for x in jax.tree.leaves(trees)])
+
+    def of(function, *args, slopes):
+        return flat(function(*args), jax.jacfwd(function, argnums=slopes)(*args))
+
+    found["the Lagrangian"] = of(system.lagrangian, *s, slopes=(1, 2))
+    if system.dissipation is not None:
+        found["the dissipation"] = of(system.dissipation, *s, slopes=(2,))
+    for name, c in system.constraints.items():
+        if isinstance(c, Holonomic):
+            found[f"the constraint '{name}'"] = of(c.g, t, q, params, slopes=(1,))
+        else:
+            found[f"the constraint '{name}', of velocities,"] = of(c.phi, *s, slopes=(1, 2))
+    if system.force is not None:
+        ones = jax.tree.map(np.ones_like, zero_multipliers(system, s))
+        given = s._asdict() | {"multipliers": ones}
+        found["the force"] = flat(system.force(*(given[name] for name in takes_of(system.force))))
+    return found
+
+
+def middle_state(t, q, v, params) -> State:
+    """A state in the midst of a motion, of those that are known; of a batch one of the first lane's."""
+    first = (0,) * (np.ndim(t) - 1)
+    one = lambda x: np.asarray(x)[first]
+    t, q, v = jax.tree.map(one, (t, q, v))
+    params = jax.tree.map(lambda x: one(x) if first and isinstance(x, (jax.Array, np.ndarray)) else x, params)
+    known = np.all([np.isfinite(x.reshape(len(t), -1)).all(axis=1) for x in jax.tree.leaves((q, v))], axis=0)
+    i = int(known.sum()) // 2
+    return State(*jax.tree.map(lambda x: x[i], (t, q, v)), params)
+
+
+def known_system(system: Any) -> Any:
+    """The system, or an error where it is not known."""
+    if isinstance(system, UnknownSystem):
+        _raise_unknown(system)
+    return system
+
+
+def _raise_unknown(system) -> NoReturn:
+    raise ValueError(
+        f"this needs the functions of the system ({system.words}), which are not in a file.\n"
+        "Fix: lj.load_trajectory(path, system=system), or load_fit or open_sweep, with the system that was integrated."
+    )

@@ -1,0 +1,194 @@
+"""Trajectories that a sweep stored or pickled come back as trajectories; their systems when they are given again."""
+
+import copy
+import pickle
+import sys
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import xarray
+
+import lagjax as lj
+
+TS = np.linspace(0.0, 2.0, 5)
+AXES = {"k": np.array([1.0, 2.0, 3.0]), "x": np.array([0.5, 1.0])}
+# x cos k t, with a number and a text in params that are no arrays.
+spring = lj.System(lambda t, q, v, params: 0.5 * v["x"] ** 2 - 0.5 * params["k"] ** params["power"] * q["x"] ** 2)
+EXACT = AXES["x"][:, None] * np.cos(AXES["k"][:, None, None] * TS)
+
+
+class Pair(NamedTuple):
+    """Named."""
+
+    square: jax.Array
+    rest: tuple
+
+
+def swing(point, ts=TS):
+    """The spring let go."""
+    params = {"k": point["k"], "power": 2, "name": "spring"}
+    return lj.integrate(spring, {"x": point["x"]}, {"x": 0.0}, params, ts=ts)
+
+
+def run(point):
+    """A trajectory among other values."""
+    return {"motion": swing(point), "pair": Pair(point["k"] ** 2, (point["x"], [jnp.ones(2)]))}
+
+
+def quiet(of, axes=AXES, **settings):
+    """In silence."""
+    return lj.sweep(of, axes, progress=False, **settings)
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory):
+    """The sweep in a store."""
+    path = tmp_path_factory.mktemp("swept") / "store"
+    assert quiet(run, store=path).ok.all()
+    return path
+
+
+def lane(motions, *at):
+    """One of the trajectories."""
+    return jax.tree.map(lambda x: x[at], motions)
+
+
+def test_structures_without_trajectories(tmp_path):
+    """Tuples, named tuples, lists and None come back as they were; there is nothing to give a system to."""
+    of = lambda point: {"pair": Pair(point["k"] ** 2, (point["x"], [point["k"] * jnp.ones(2), None])), "a.b": 1.0}
+    swept = quiet(of, store=tmp_path / "store")
+    opened = lj.open_sweep(tmp_path / "store")
+    assert jax.tree.structure(opened.values) == jax.tree.structure(swept.values)
+    assert isinstance(opened.values["pair"], Pair) and repr(opened.values) == repr(swept.values)
+    with pytest.raises(ValueError, match="has no trajectories that ask for a system"):
+        lj.open_sweep(tmp_path / "store", system=spring)
+    with pytest.raises(ValueError, match="run returns value float64, and .* has a.b float64, pair.rest.0 float64"):
+        lj.open_sweep(tmp_path / "store", run=lambda point: point["x"])
+
+
+def test_what_cannot_be_written_down(tmp_path):
+    """A function among the values: a dictionary by name, or what it was with `run` given again."""
+    of = lambda point: jax.tree_util.Partial(lambda k, x: k * x, point["k"])
+    quiet(of, {"k": AXES["k"]}, store=tmp_path / "store")
+    values = lj.open_sweep(tmp_path / "store").values
+    assert isinstance(values, dict) and [x.tolist() for x in values.values()] == [[1.0, 2.0, 3.0]]
+    again = lj.open_sweep(tmp_path / "store", run=of).values
+    np.testing.assert_array_equal(again(2.0), 2.0 * AXES["k"])
+
+
+class Law(eqx.Module):
+    """Of the user's."""
+
+    k: jax.Array
+
+
+def test_a_class_that_is_not_found(tmp_path, monkeypatch):
+    """As in a process that has not imported it: by name, and told. Twin: before, it came back."""
+    quiet(lambda point: Law(point["k"]), {"k": AXES["k"]}, store=tmp_path / "store")
+    assert isinstance(lj.open_sweep(tmp_path / "store").values, Law)
+    monkeypatch.delattr(sys.modules[__name__], "Law")
+    with pytest.warns(UserWarning, match="are a dictionary by name: it holds an object of class .*Law(.|\n)*run=run"):
+        values = lj.open_sweep(tmp_path / "store").values
+    assert list(values) == ["k"] and values["k"].tolist() == [1.0, 2.0, 3.0]
+
+
+@pytest.mark.slow
+def test_a_store_opened(store):
+    """Trajectories in closed form, bit for bit those of the sweep; they print, plot and play without their system."""
+    swept, opened = quiet(run, store=store), lj.open_sweep(store)
+    motions = opened.values["motion"]
+    assert swept.ran == 0 and isinstance(motions, lj.Trajectory) and isinstance(opened.values["pair"], Pair)
+    np.testing.assert_allclose(motions.q["x"], EXACT, atol=1e-8)
+    for name in ("t", "q", "v", "end", "stats", "scaled_error", "result"):
+        same = jax.tree.map(np.array_equal, getattr(motions, name), getattr(swept.values["motion"], name))
+        assert all(jax.tree.leaves(same))
+    one = lane(motions, 1, 1)
+    assert one.params == {"k": 2.0, "power": 2, "name": "spring"} and one.tolerance[0][0] == 1e-9
+    assert "successful" in repr(one) and "System(<lambda>), not given" in repr(one)
+    assert len(one.plot().axes) > 0 and len(one.phase_portrait().axes) > 0
+    assert "frames" in repr(one.animate(lambda t, q, params: (q["x"], 0.0)))
+    with pytest.raises(ValueError, match="needs the functions of the system(.|\n)*open_sweep"):
+        one.drift()
+    assert "motion Trajectory at 5 times" in repr(opened)
+
+
+@pytest.mark.slow
+def test_the_system_given_again(store):
+    """By itself or by `run` it makes trajectories whole; twins: another one, and another run."""
+    known = lane(quiet(run, store=store).values["motion"], 1, 1)
+    for given in ({"system": spring}, {"run": run}):
+        one = lane(lj.open_sweep(store, **given).values["motion"], 1, 1)
+        assert repr(one) == repr(known) and float(one.drift()) == float(known.drift()) < 1e-9
+        assert one.system is spring or one.system == spring
+    other = lj.System(lambda t, q, v, params: 0.5 * v["x"] ** 2 - 0.6 * params["k"] ** params["power"] * q["x"] ** 2)
+    with pytest.raises(ValueError, match="this system is not the one of .*store(.|\n)*the Lagrangian: its"):
+        lj.open_sweep(store, system=other)
+    with pytest.raises(TypeError, match="system must be a lj.System, not int"):
+        lj.open_sweep(store, system=3)
+    with pytest.raises(ValueError, match="run returns"):
+        lj.open_sweep(store, run=swing)
+
+
+@pytest.mark.slow
+def test_labelled_with_the_axes_in_front(store):
+    """As xarray reads the store, and as each trajectory labels itself."""
+    data, opened = xarray.open_zarr(store).load(), lj.open_sweep(store)
+    assert data["motion.q.x"].dims == ("k", "x", "motion.t") and np.array_equal(data["motion.t"], TS)
+    np.testing.assert_allclose(data["motion.q.x"], EXACT, atol=1e-8)
+    np.testing.assert_array_equal(data["motion.params.k"], AXES["k"][:, None] * np.ones(2))
+    xarray.testing.assert_equal(data, opened.to_xarray())
+    own = lane(opened.values["motion"], 2, 0).to_xarray()
+    for name in ("q.x", "v.x", "end"):
+        found = data[f"motion.{name}"].isel(k=2, x=0)
+        np.testing.assert_array_equal(found, own[name])
+        assert tuple(str(dim).removeprefix("motion.") for dim in found.dims) == own[name].dims
+
+
+@pytest.mark.slow
+def test_times_of_their_own(tmp_path):
+    """Where each point has other times they are a variable; where all have the same, the coordinate. Alone: no prefix.
+
+    An axis named as the times keeps its name.
+    """
+    of = lambda point: swing({"k": point["t"], "x": 1.0}, ts=TS * point["t"])
+    axes = {"t": AXES["k"]}
+    swept = quiet(of, axes, store=tmp_path / "own")
+    data = xarray.open_zarr(tmp_path / "own").load()
+    assert data["q.x"].dims == ("t", "value_t") and "value_t" not in data.coords
+    np.testing.assert_allclose(data["times"], TS * AXES["k"][:, None], rtol=1e-15)
+    np.testing.assert_allclose(data["q.x"], np.cos(AXES["k"][:, None] ** 2 * TS), atol=1e-7)
+    xarray.testing.assert_equal(data, swept.to_xarray())
+    assert isinstance(lj.open_sweep(tmp_path / "own").values, lj.Trajectory)
+
+
+@pytest.mark.slow
+def test_part_of_it(store, tmp_path):
+    """What was not run is NaN, with its times; the rest is there."""
+    half = quiet(run, store=tmp_path / "store", chunk=1, part=(0, 2))
+    data = xarray.open_zarr(tmp_path / "store").load()
+    not_run = data["result"].values == -1
+    assert 0 < not_run.sum() == not_run.size - half.ran and np.array_equal(data["motion.t"], TS)
+    np.testing.assert_array_equal(np.isnan(data["motion.q.x"]).all("motion.t"), not_run)
+    xarray.testing.assert_equal(data, lj.open_sweep(tmp_path / "store").to_xarray())
+    np.testing.assert_allclose(
+        lj.open_sweep(tmp_path / "store").values["motion"].q["x"][~not_run], EXACT[~not_run], atol=1e-8
+    )
+
+
+@pytest.mark.slow
+def test_pickled_with_a_lambda():
+    """The functions stay where they are, all else goes along; a copy in this process has them."""
+    swept = quiet(run)
+    found = pickle.loads(pickle.dumps(swept))
+    assert repr(found) == repr(swept) and found.to_xarray().identical(swept.to_xarray())
+    one = lane(found.values["motion"], 1, 1)
+    assert "not given" in repr(one) and one.params["name"] == "spring"
+    np.testing.assert_array_equal(one.q["x"], swept.values["motion"].q["x"][1, 1])
+    assert float(lane(copy.deepcopy(swept).values["motion"], 1, 1).drift()) < 1e-9
+    again = found.resweep(where=np.eye(3, 2, dtype=bool))
+    assert again.ran == 2
+    np.testing.assert_allclose(again.values["motion"].q["x"], EXACT, atol=1e-8)

@@ -1,0 +1,229 @@
+"""The site: every public name with an example and its errors, every message found, pages that anybody can read.
+
+The code on its pages is run by `test_readme.py`; `docs/check_pages.mjs` looks at them in a browser.
+"""
+
+import doctest
+import importlib.util
+import inspect
+import json
+import re
+import subprocess
+import sys
+from html.parser import HTMLParser
+from pathlib import Path
+from urllib.parse import unquote, urlsplit
+
+import api_pages
+import error_pages
+import notebook_pages
+import pytest
+import result_pages
+
+import lagjax as lj
+from lagjax.mechanisms import MECHANISMS
+from lagjax.scenes import SCENES
+
+ROOT = Path(__file__).parent.parent
+DOCS = ROOT / "docs"
+GALLERY = (DOCS / "gallery.md").read_text()
+
+
+def lacks(name, thing, page):
+    """What the page of a public name does not have."""
+    function = inspect.isfunction(inspect.unwrap(thing)) if callable(thing) else False
+    parts = {"signature": "{py:" in page, "example": ">>> " in page, "errors": not function or "**Raises:**" in page}
+    return [part for part, there in parts.items() if not there]
+
+
+def test_every_public_name_has_a_page():
+    """Signature, example and, for functions, errors."""
+    found = {name: lacks(name, getattr(lj, name), api_pages.page(name)) for name in lj.__all__}
+    assert {name: missing for name, missing in found.items() if missing} == {}
+    pages = [api_pages.page_of(name).lower() for name in lj.__all__]
+    assert len(set(pages)) == len(pages)
+    listed = api_pages.index(api_pages.sections())
+    assert all(f"({api_pages.page_of(name)}.md)" in listed for name in lj.__all__)
+
+
+def test_what_a_page_lacks_is_seen():
+    """Twin: a function without an example and without its errors."""
+
+    def silent(t):
+        """Say nothing."""
+
+    assert lacks("silent", silent, api_pages.described(silent, "silent")) == ["example", "errors"]
+
+
+def test_sections_are_those_of_the_front_door():
+    """All names stand under the comments of `lagjax/__init__.py`, in the order of `__all__`."""
+    sections = api_pages.sections()
+    assert sorted(sum(sections.values(), [])) == sorted(lj.__all__)
+    assert list(sections)[0].startswith("A system") and "momentum" in next(v for k, v in sections.items() if "One" in k)
+
+
+def test_added_examples_run():
+    """Examples that stand on pages and in no docstring."""
+    parser, runner = doctest.DocTestParser(), doctest.DocTestRunner(verbose=False)
+    for name in lj.__all__:
+        if text := api_pages.added_example(getattr(lj, name), name):
+            runner.run(parser.get_doctest(text, {}, name, None, 0), out=lambda line: None)
+    assert runner.tries >= 10 and runner.failures == 0
+
+
+MESSAGES = '''
+def f(x):
+    """Not a message.
+
+    Fix: nothing.
+    """
+    if x:
+        raise ValueError(f"{x} is quite wrong, {x}{x}.\\nFix: " + f(x))
+    warnings.warn("beware of this", AccuracyWarning)
+    return "the rope is torn.\\nUsual cause: age.\\nFix: a new one."
+'''
+
+
+def test_messages_are_found():
+    """Raised, warned of, or made to be raised elsewhere; docstrings are none."""
+    assert error_pages.messages(MESSAGES) == [
+        ("ValueError", "… is quite wrong, ….\nFix: …"),
+        ("AccuracyWarning", "beware of this"),
+        ("", "the rope is torn.\nUsual cause: age.\nFix: a new one."),
+    ]
+
+
+def test_every_message_has_its_place():
+    """One that is given stands on the page, and each has an anchor of its own."""
+    page = error_pages.page()
+    with pytest.raises(TypeError) as raised:
+        lj.Holonomic(3)  # pyright: ignore[reportArgumentType]
+    pattern = re.escape("… needs a function …, not ….").replace("…", ".+")
+    assert re.match(pattern, str(raised.value)) and "… needs a function …, not …." in page
+    anchors = re.findall(r"^\((.*)\)=$", page, re.MULTILINE)
+    assert len(anchors) == len(set(anchors)) > 300
+
+
+def test_results_keep_what_is_missed():
+    """Rows that missed their target stand in bold; twin: the same row with its target met does not."""
+    row = {"what": "a_b", "value": 2.0, "target": 1.0, "met": False, "better": "less"}
+    assert result_pages.line(row) == "| a\\_b | 2 | ≤ 1 | **missed** |"
+    assert "missed" not in result_pages.line(row | {"met": True})
+
+
+@pytest.mark.parametrize("name", [*SCENES, "woodpecker", *MECHANISMS])
+def test_gallery_has_a_picture_and_a_formula(name):
+    """Of every scene and mechanism, with words for the picture."""
+    section = next(part for part in GALLERY.split("\n### ") if f"gallery/{name}.png" in part)
+    alt = re.search(r"!\[(.*)\]", section)
+    assert alt and len(alt[1]) > 40
+    assert "$$" in section and f".{name}`" in section
+    assert 4_000 < (DOCS / "gallery" / f"{name}.png").stat().st_size < 100_000
+
+
+@pytest.mark.slow
+def test_a_picture_is_drawn():
+    """One mechanism's, as the script draws it; its closed form is on the computed dots."""
+    spec = importlib.util.spec_from_file_location("gallery", DOCS / "gallery.py")
+    assert spec and spec.loader
+    gallery = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(gallery)
+    known, found = gallery.picture("slider_crank").axes[1].lines
+    assert max(abs(known.get_ydata()[::6] - found.get_ydata())) < 1e-4
+
+
+def test_formulas():
+    """LaTeX as MathML; short fractions are two numbers, which docutils alone takes for one."""
+    mathml = pytest.importorskip("mathml", reason="needs the extra docs")
+    assert "<mn>1</mn>\n    <mn>2</mn>" in mathml.converted(r"\tfrac12 x", True)
+    assert "mspace" in mathml.converted(r"\cos\theta", True) and "mspace" not in mathml.converted(r"\cosh x", True)
+    from docutils.utils.math.latex2mathml import tex2mathml
+
+    assert "<mn>12</mn>" in tex2mathml(r"\frac12 x", as_block=True)
+
+
+def test_pictures_of_notebooks_have_words():
+    """Each has an alternative text that says what is drawn."""
+    for path in notebook_pages.SOURCE.glob("*.ipynb"):
+        notebook = notebook_pages.with_alt_texts(json.loads(path.read_text()), path.stem)
+        for cell in notebook["cells"]:
+            if any("image/png" in output.get("data", {}) for output in cell.get("outputs", ())):
+                assert len(cell["metadata"]["mystnb"]["image"]["alt"]) > 25, path.stem
+
+
+class Page(HTMLParser):
+    """What a reader without eyes, or a link, needs of a page."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.links, self.ids, self.wordless, self.outside = [], set(), [], []
+        self.headings, self.lang, self.title = 0, "", ""
+        self.within = ""
+        self.feed(text)
+
+    def handle_starttag(self, tag, attrs):
+        found = dict(attrs)
+        self.within = tag
+        self.ids |= {found[key] for key in ("id", "name") if found.get(key)}
+        self.headings += tag == "h1"
+        if tag == "html":
+            self.lang = found.get("lang") or ""
+        if tag == "img" and not found.get("alt"):
+            self.wordless.append(found.get("src"))
+        if tag == "a" and "href" in found:
+            self.links.append(found["href"] or "")
+        for key in ("src", "href") if tag in ("link", "script", "img", "iframe", "source") else ():
+            if re.match("(https?:)?//", found.get(key) or ""):
+                self.outside.append(found[key])
+
+    def handle_data(self, data):
+        if self.within == "title":
+            self.title += data.strip()
+
+
+def faults(pages):
+    """What is wrong with pages by their paths: each fault as a line."""
+    found = []
+    for path, page in pages.items():
+        if page.wordless or page.outside or page.headings != 1 or not page.lang or not page.title:
+            found.append(f"{path}: {page.wordless} {page.outside} {page.headings} h1, '{page.lang}', '{page.title}'")
+        for link in page.links:
+            parts = urlsplit(link)
+            if parts.scheme or parts.netloc:
+                continue
+            target = (path.parent / unquote(parts.path)).resolve() if parts.path else path
+            if not target.exists():
+                found.append(f"{path}: no file {link}")
+            elif parts.fragment and target in pages and unquote(parts.fragment) not in pages[target].ids | {"", "top"}:
+                found.append(f"{path}: no place {link}")
+    return found
+
+
+def test_faults_are_seen(tmp_path):
+    """Twin: a picture without words, a dead link, a dead place, a missing heading, something from outside."""
+    good = '<html lang="en"><title>T</title><h1 id="a">T</h1><a href="#a">a</a><img src="x" alt="words"></html>'
+    path = tmp_path / "page.html"
+    path.write_text(good)
+    assert faults({path: Page(good)}) == []
+    for part, bad in (
+        ('alt="words"', ""), ('href="#a"', 'href="no.html"'), ('href="#a"', 'href="#b"'), ("h1", "h2"),
+        ('lang="en"', ""), ("<title>T", "<title>"), ('src="x"', 'src="https://example.org/x"'),
+    ):  # fmt: skip
+        assert len(faults({path: Page(good.replace(part, bad))})) == 1, part
+
+
+@pytest.mark.slow
+def test_the_site_builds(tmp_path):
+    """No warning, no dead link, no picture without words, nothing from the network; headings, titles, a language."""
+    for module in ("sphinx", "myst_nb", "pydata_sphinx_theme"):
+        pytest.importorskip(module, reason="needs the extra docs")
+    built = subprocess.run(
+        [sys.executable, "-m", "sphinx", "-q", "-W", "-d", tmp_path / "doctrees", DOCS, tmp_path / "html"],
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert built.returncode == 0, built.stderr[-3000:]
+    made = [path for path in (tmp_path / "html").rglob("*.html") if "_static" not in path.parts]
+    pages = {path.resolve(): Page(path.read_text()) for path in made}
+    assert len(pages) > 100
+    assert faults(pages) == []
+    assert all((tmp_path / "html" / "api" / f"{api_pages.page_of(name)}.html").exists() for name in lj.__all__)
