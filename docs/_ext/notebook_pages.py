@@ -50,13 +50,13 @@ def with_alt_texts(notebook: dict, name: str) -> dict:
 
 
 def without_widgets(notebook: dict) -> dict:
-    """Sliders need a running Python and scripts from the network: the text beside them stays, but not that of a meter."""
+    """Sliders need a running Python and scripts from the network: the text beside them stays, but of a meter."""
     notebook["metadata"].pop("widgets", None)
     for cell in notebook["cells"]:
         kept = []
         for output in cell.get("outputs", ()):
             widget = output.get("data", {}).pop("application/vnd.jupyter.widget-view+json", None)
-            if not widget or not "".join(output["data"].get("text/plain", "")).startswith("compiling"):
+            if widget is None or not "".join(output["data"].get("text/plain", "")).startswith("compiling"):
                 kept.append(output)
         if "outputs" in cell:
             cell["outputs"] = kept
