@@ -22,7 +22,7 @@ SHOWN_BY = {
     "Crossings": "Crossing", "Snapshot": "integrate", "Explanation": "explain", "Switches": "touches",
     "Routhian": "routhian", "Branch": "continue_equilibria", "Critical": "continue_equilibria", "Mode": "normal_modes",
     "CriticalOrbit": "continue_orbits",
-    "Status": "sweep", "Knobs": "interact", "HybridTrajectory": "touches", "Page": "Sweep.to_html",
+    "Status": "sweep", "Knobs": "interact", "HybridTrajectory": "touches",
 }  # fmt: skip
 # Of names whose docstring has no room for one.
 EXAMPLES = {
