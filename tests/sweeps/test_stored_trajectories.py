@@ -192,3 +192,26 @@ def test_pickled_with_a_lambda():
     again = found.resweep(where=np.eye(3, 2, dtype=bool))
     assert again.ran == 2
     np.testing.assert_allclose(again.values["motion"].q["x"], EXACT, atol=1e-8)
+
+
+class Stiff(eqx.Module):
+    """A Lagrangian with an array in it."""
+
+    k: jax.Array
+
+    def __call__(self, t, q, v, params):
+        return 0.5 * v**2 - 0.5 * self.k * q**2
+
+
+@pytest.mark.slow
+def test_a_system_with_arrays(tmp_path):
+    """They are stored, and come back with the system; without it there is no place for them, and all else is there."""
+    stiff = lj.System(Stiff(jnp.array(4.0)), dissipation=lambda t, q, v, params: 0.0 * v**2)
+    of = lambda point: lj.integrate(stiff, point["x"], 0.0, None, ts=TS)
+    swept = quiet(of, {"x": AXES["x"]}, store=tmp_path / "store")
+    exact = AXES["x"][:, None] * np.cos(2.0 * TS)
+    for found in (swept, lj.open_sweep(tmp_path / "store"), pickle.loads(pickle.dumps(quiet(of, {"x": AXES["x"]})))):
+        np.testing.assert_allclose(found.values.q, exact, atol=1e-8)
+        assert found.values.asked.drift == swept.values.asked.drift
+    whole = lane(lj.open_sweep(tmp_path / "store", system=stiff).values, 1)
+    assert whole.system.lagrangian.k == 4.0 and repr(whole) == repr(lane(swept.values, 1))
