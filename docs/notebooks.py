@@ -18,6 +18,7 @@ from PIL import Image
 FOLDER = Path(__file__).parent.parent / "notebooks"
 # The figures have few colours; so many are enough for their antialiased edges.
 COLOURS = 128
+METER = "application/vnd.jupyter.widget-view+json"
 
 
 def smaller(png: str) -> str:
@@ -38,11 +39,15 @@ def execute(script: Path) -> None:
     for cell in notebook.cells:
         # When each cell ran differs from run to run.
         cell.metadata.pop("execution", None)
+        if "outputs" in cell:
+            # A meter that was shown while something took long shows nothing in a copy.
+            cell.outputs = [output for output in cell.outputs if METER not in output.get("data", {})]
         for output in cell.get("outputs", ()):
             if "image/png" in output.get("data", {}):
                 # Sliders need a kernel; of them the picture stays.
                 output["data"].pop("application/vnd.jupyter.widget-view+json", None)
                 output["data"]["image/png"] = smaller(output["data"]["image/png"])
+    notebook.metadata.pop("widgets", None)
     hosted = script.with_suffix(".ipynb")
     jupytext.write(notebook, hosted)
     print(f"{script.stem}: {took:.0f} s, {hosted.stat().st_size / 1000:.0f} kB", flush=True)

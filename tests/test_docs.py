@@ -78,7 +78,7 @@ def f(x):
     Fix: nothing.
     """
     if x:
-        raise ValueError(f"{x} is wrong, {x}{x}.\\nFix: " + f(x))
+        raise ValueError(f"{x} is quite wrong, {x}{x}.\\nFix: " + f(x))
     warnings.warn("beware of this", AccuracyWarning)
     return "the rope is torn.\\nUsual cause: age.\\nFix: a new one."
 '''
@@ -87,7 +87,7 @@ def f(x):
 def test_messages_are_found():
     """Raised, warned of, or made to be raised elsewhere; docstrings are none."""
     assert error_pages.messages(MESSAGES) == [
-        ("ValueError", "… is wrong, ….\nFix: …"),
+        ("ValueError", "… is quite wrong, ….\nFix: …"),
         ("AccuracyWarning", "beware of this"),
         ("", "the rope is torn.\nUsual cause: age.\nFix: a new one."),
     ]
@@ -136,6 +136,7 @@ def test_formulas():
     """LaTeX as MathML; short fractions are two numbers, which docutils alone takes for one."""
     mathml = pytest.importorskip("mathml", reason="needs the extra docs")
     assert "<mn>1</mn>\n    <mn>2</mn>" in mathml.converted(r"\tfrac12 x", True)
+    assert "mspace" in mathml.converted(r"\cos\theta", True) and "mspace" not in mathml.converted(r"\cosh x", True)
     from docutils.utils.math.latex2mathml import tex2mathml
 
     assert "<mn>12</mn>" in tex2mathml(r"\frac12 x", as_block=True)

@@ -7,6 +7,7 @@ import ast
 import inspect
 import re
 import typing
+from operator import attrgetter
 from pathlib import Path
 from statistics import median
 
@@ -19,7 +20,8 @@ INIT = Path(lagjax.__file__)
 # Whose example shows an object that no function is annotated to return.
 SHOWN_BY = {
     "Crossings": "Crossing", "Snapshot": "integrate", "Explanation": "explain", "Switches": "touches",
-    "Routhian": "routhian", "Branch": "continue_equilibria", "Critical": "continue_equilibria", "Mode": "normal_modes", "CriticalOrbit": "continue_orbits",
+    "Routhian": "routhian", "Branch": "continue_equilibria", "Critical": "continue_equilibria", "Mode": "normal_modes",
+    "CriticalOrbit": "continue_orbits",
     "Status": "sweep", "Knobs": "interact", "HybridTrajectory": "touches",
 }  # fmt: skip
 # Of names whose docstring has no room for one.
@@ -146,7 +148,7 @@ def borrowed(thing, name: str) -> str:
     maker = SHOWN_BY.get(name) or next(iter(makers(thing)), None)
     if maker is None:
         return ""
-    return f"\nAn example, that of `lj.{maker}`:\n\n{example(inspect.getdoc(getattr(lagjax, maker)) or '')}\n"
+    return f"\nAn example, that of `lj.{maker}`:\n\n{example(inspect.getdoc(attrgetter(maker)(lagjax)) or '')}\n"
 
 
 def described(thing, name: str) -> str:

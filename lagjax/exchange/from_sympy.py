@@ -4,8 +4,8 @@ A coordinate is a function of time, `dynamicsymbols("theta")` or `Function("thet
 gives, and every other symbol a parameter. SymPy's equations are not used: the expressions become a function
 `L(t, q, v, params)`, and lagjax derives the motion as from any other.
 
-Of multipliers SymPy has two signs. In the equations of its `LagrangesMethod` and from `solve_multipliers` they push along
--∂g/∂q; the last unknowns of `mass_matrix_full` and `rhs()` push along +∂g/∂q, as all multipliers do here.
+Of multipliers SymPy has two signs. In the equations of its `LagrangesMethod` and from `solve_multipliers` they push
+along -∂g/∂q; the last unknowns of `mass_matrix_full` and `rhs()` push along +∂g/∂q, as all multipliers do here.
 """
 
 from collections.abc import Mapping, Sequence

@@ -7,6 +7,7 @@ description: its values are a dictionary by name.
 
 import base64
 import pickle
+import warnings
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -48,7 +49,8 @@ def written(like: PyTree, one: PyTree | None) -> dict[str, Any] | None:
     try:
         for motion, numbers in zip(motions, asked):
             system = described(numbers) if one is not None else UnknownSystem(repr(motion.any_system), (), {}, None)
-            of = {name: getattr(system, name) for name in system.__dataclass_fields__}
+            # In NumPy: a process that works in float32 can read these, too.
+            of = jax.tree.map(_in_numpy, {name: getattr(system, name) for name in system.__dataclass_fields__})
             nodes = parts(motion, lambda result: {"codes": result._value, "names": {}}) | {"system": of}
             found.append({name: writer.down(x, name) for name, x in nodes.items()})
         said = {"tree": writer.down(tree, "values"), "trajectories": found}
@@ -103,9 +105,14 @@ def as_stored(store: Store, system: Any = None) -> PyTree | None:
         return None
     try:
         tree = read(said, system, store.path)
-    except ValueError:
+    except ValueError as error:
         if system is not None:
             raise
+        warnings.warn(
+            f"the values of {store.path} are a dictionary by name: {error}\n"
+            "Fix, where that does not help: lj.open_sweep(path, run=run), with the function that was swept.",
+            stacklevel=3,
+        )
         return None
     one = store.one()
     names = iter([name for name, _ in named_leaves(tree)])
@@ -162,6 +169,10 @@ class Travelling(NamedTuple):
 
 def _is_motion(x):
     return isinstance(x, Trajectory)
+
+
+def _in_numpy(x):
+    return np.asarray(x) if isinstance(x, jax.Array) else x
 
 
 def _in_json(x):

@@ -22,7 +22,9 @@ def shuffled(m, half_bandwidth, seed=0):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "size", exhaustive_but(((1, 0), (20, 2)), ((1, 0), (2, 1), (3, 1), (20, 0), (20, 1), (20, 2), (30, 5), (5, 4)))
+    "size",
+    exhaustive_but(((1, 0), (20, 2)), ((1, 0), (2, 1), (3, 1), (20, 0), (20, 1), (20, 2), (30, 5), (5, 4))),
+    ids=str,
 )
 def test_solves_as_lapack(size):
     """Found in its random order, coloured, and solved to round-off, some rows left out."""

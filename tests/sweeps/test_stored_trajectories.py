@@ -2,8 +2,10 @@
 
 import copy
 import pickle
+import sys
 from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -76,6 +78,22 @@ def test_what_cannot_be_written_down(tmp_path):
     assert isinstance(values, dict) and [x.tolist() for x in values.values()] == [[1.0, 2.0, 3.0]]
     again = lj.open_sweep(tmp_path / "store", run=of).values
     np.testing.assert_array_equal(again(2.0), 2.0 * AXES["k"])
+
+
+class Law(eqx.Module):
+    """Of the user's."""
+
+    k: jax.Array
+
+
+def test_a_class_that_is_not_found(tmp_path, monkeypatch):
+    """As in a process that has not imported it: by name, and told. Twin: before, it came back."""
+    quiet(lambda point: Law(point["k"]), {"k": AXES["k"]}, store=tmp_path / "store")
+    assert isinstance(lj.open_sweep(tmp_path / "store").values, Law)
+    monkeypatch.delattr(sys.modules[__name__], "Law")
+    with pytest.warns(UserWarning, match="are a dictionary by name: it holds an object of class .*Law(.|\n)*run=run"):
+        values = lj.open_sweep(tmp_path / "store").values
+    assert list(values) == ["k"] and values["k"].tolist() == [1.0, 2.0, 3.0]
 
 
 @pytest.mark.slow
