@@ -58,12 +58,13 @@ def load_trajectory(path: str | os.PathLike, system: System | Hybrid | None = No
     reader = Reader(arrays)
     try:
         found = {name: reader.up(node) for name, node in said["trajectory"].items()}
+        known = UnknownSystem(**found["system"])
+        trajectory = trajectory_of(found, known)
     except (KeyError, TypeError, IndexError, StopIteration) as error:
         files.raise_damaged(path, f"what it says of itself is not whole ({error})", error)
     except ValueError as error:
         raise ValueError(f"{path} cannot be read: {error}") from error
-    known = UnknownSystem(**found["system"])
-    return trajectory_of(found, known if system is None else same_system(system, known, path))
+    return trajectory if system is None else trajectory_of(found, same_system(system, known, path))
 
 
 def trajectory_of(found: dict, kept: System | Hybrid | UnknownSystem) -> Trajectory:
@@ -73,12 +74,10 @@ def trajectory_of(found: dict, kept: System | Hybrid | UnknownSystem) -> Traject
     fields["events"] = {name: Crossings(**x) for name, x in found["events"].items()}
     error = found["error"]
     fields["error"] = None if error is None else Errors(**error | {"result": result_of_names(error["result"])})
-    of: type[Trajectory] = Trajectory
-    if "phase" in found:
-        of, more = HybridTrajectory, found["switches"]
-        fields |= {"phase": found["phase"], "switches": _made(Switches, more)}
     fields["arrays"], fields["static"] = pack(kept, found["params"], Asked(**found["asked"]), How(**found["how"]))
-    return of(**fields)
+    if "phase" not in found:
+        return Trajectory(**fields)
+    return HybridTrajectory(**fields, phase=found["phase"], switches=_made(Switches, found["switches"]))
 
 
 def same_system(system, known: UnknownSystem, path) -> System | Hybrid:
