@@ -172,6 +172,18 @@ import bicycle
 system, params, ts = bicycle.system, bicycle.PARAMS, np.linspace(0.0, 2.0, 5)
 start = bicycle.straight(4.6, roll_rate=0.5)
 """
+# A bead on a hoop that turns; a system is asked what it is like.
+BEAD = """
+hoop = lj.System(lambda t, q, v, p: 0.5 * (v**2 + (p["w"] * jnp.sin(q)) ** 2) + p["g"] * jnp.cos(q))
+at_rest = {"x": 0.0, "y": -2.0}, {"x": 0.0, "y": 0.0}
+"""
+HELIX = """
+from lagjax.scenes import mass_distributions as scene
+helix, (q, v, _), params = scene.SYSTEMS["helix"], scene.ORBITS["helix"], scene.PARAMS["helix"]
+"""
+GOVERNOR = """
+from lagjax.mechanisms.governor import MECHANISM
+"""
 SOLVED = """
 options = globals().get("options", {})
 answer = lambda x: lj.integrate(system, *start, params | {'g': 9.81 * x}, ts=ts, **options)
@@ -206,6 +218,41 @@ QUESTIONS = {
         PENDULUM, "run = lambda point: lj.integrate(system, point['angle'], 0.0, {'g': 9.81}, ts=ts).q[-1]\n"
         "answer = lambda x: lj.sweep(run, {'angle': x * np.linspace(0.1, 2.0, 1000)}, progress=False).values",
         SOLVED, 1.5, what="one of its motions",
+    ),
+    "symmetries of a helix": Question(
+        HELIX, "answer = lambda x: lj.symmetries(helix, q, v, params | {'h': 2.0 * x}).gap", None, 2.0,
+    ),
+    "equilibria on the rod": Question(
+        ROD, "answer = lambda x: lj.equilibria(system, params | {'m': x}, starts=[{'x': 0.3, 'y': -1.9}]).q", None, 2.0,
+    ),
+    "equilibria of a governor": Question(
+        GOVERNOR, "answer = lambda x: lj.equilibria(MECHANISM.system, MECHANISM.params | {'g': 9.81 * x}, "
+        "starts=[MECHANISM.q0]).q", None, 2.0,
+    ),
+    "branches of a bead on a hoop": Question(
+        BEAD, "answer = lambda x: lj.continue_equilibria(hoop, {'w': x, 'g': 9.0}, 0.0, along='w', to=5.0).critical",
+        None, 2.0,
+    ),
+    "normal modes on the rod": Question(
+        ROD + BEAD, "answer = lambda x: lj.normal_modes(system, 0.0, *at_rest, params | {'m': x}).roots", None, 2.0,
+    ),
+    "periodic orbit of a pendulum": Question(
+        PENDULUM, "answer = lambda x: lj.periodic_orbit(system, start, 2.0, {'g': 9.81 * x}).period", None, 2.0,
+    ),
+    "periodic orbit on the rod": Question(
+        ROD, "answer = lambda x: lj.periodic_orbit(system, start, 3.0, params | {'m': x}).period", None, 2.0,
+    ),
+    "cycles of a pendulum by amplitude": Question(
+        PENDULUM, "orbit = lj.periodic_orbit(system, start, 2.0, params)\n"
+        "answer = lambda x: lj.continue_orbits(orbit, along='q', to=2.0 * x).period", None, 2.0,
+    ),
+    "Floquet multipliers on the rod": Question(
+        ROD + BEAD, "answer = lambda x: lj.floquet(system, 0.0, *at_rest, params | {'m': x}, 2.0).multipliers", None,
+        2.0,
+    ),
+    "Lyapunov exponent of a double pendulum": Question(
+        DOUBLE, "answer = lambda x: lj.lyapunov_exponents(system, *start, {'g': 9.81 * x}, ts=np.linspace(0, 20, 201))"
+        ".exponents", None, 2.0,
     ),
     "fit of one number": Question(
         PENDULUM + "record = lambda x: lj.Record(np.linspace(0.0, 1.0, 21), q=x * np.cos(3.0 * np.linspace(0, 1, 21)), "

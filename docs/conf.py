@@ -4,14 +4,15 @@ What is generated (the pages of public names, errors, results, notebooks) is wri
 """
 
 import sys
-from importlib.metadata import version as installed
 from pathlib import Path
 
 HERE = Path(__file__).parent
 sys.path[:0] = [str(HERE / "_ext"), str(HERE.parent)]
 
+from lagjax import __version__  # noqa: E402  (of this checkout)
+
 project, author, copyright = "lagjax", "the authors of lagjax", "the authors of lagjax, Apache-2.0"
-release = version = installed("lagjax")
+release = version = __version__
 language = "en"
 extensions = [
     "myst_nb",
@@ -53,6 +54,8 @@ html_theme_options = {
 myst_enable_extensions = ["colon_fence", "dollarmath"]
 myst_heading_anchors = 3
 nb_execution_mode = "off"
+# Scripts for widgets, which would come from the network.
+nb_ipywidgets_js = {}
 copybutton_prompt_text = r">>> |\.\.\. |\$ "
 copybutton_prompt_is_regexp = True
 copybutton_only_copy_prompt_lines = True

@@ -78,7 +78,7 @@ def f(x):
     Fix: nothing.
     """
     if x:
-        raise ValueError(f"{x} is wrong, {x}{x}.\\nFix: " + f(x))
+        raise ValueError(f"{x} is quite wrong, {x}{x}.\\nFix: " + f(x))
     warnings.warn("beware of this", AccuracyWarning)
     return "the rope is torn.\\nUsual cause: age.\\nFix: a new one."
 '''
@@ -87,7 +87,7 @@ def f(x):
 def test_messages_are_found():
     """Raised, warned of, or made to be raised elsewhere; docstrings are none."""
     assert error_pages.messages(MESSAGES) == [
-        ("ValueError", "… is wrong, ….\nFix: …"),
+        ("ValueError", "… is quite wrong, ….\nFix: …"),
         ("AccuracyWarning", "beware of this"),
         ("", "the rope is torn.\nUsual cause: age.\nFix: a new one."),
     ]
@@ -136,6 +136,7 @@ def test_formulas():
     """LaTeX as MathML; short fractions are two numbers, which docutils alone takes for one."""
     mathml = pytest.importorskip("mathml", reason="needs the extra docs")
     assert "<mn>1</mn>\n    <mn>2</mn>" in mathml.converted(r"\tfrac12 x", True)
+    assert "mspace" in mathml.converted(r"\cos\theta", True) and "mspace" not in mathml.converted(r"\cosh x", True)
     from docutils.utils.math.latex2mathml import tex2mathml
 
     assert "<mn>12</mn>" in tex2mathml(r"\frac12 x", as_block=True)
@@ -148,6 +149,16 @@ def test_pictures_of_notebooks_have_words():
         for cell in notebook["cells"]:
             if any("image/png" in output.get("data", {}) for output in cell.get("outputs", ())):
                 assert len(cell["metadata"]["mystnb"]["image"]["alt"]) > 25, path.stem
+
+
+def test_notebooks_need_nothing_from_the_network():
+    """A slider becomes its text, a meter nothing, and the scripts of both are left out; other outputs stay."""
+    view = "application/vnd.jupyter.widget-view+json"
+    outputs = [{"data": {view: {}, "text/plain": [text]}} for text in ("compiling, 00:00", "Knobs: a = 1")]
+    notebook = {"metadata": {"widgets": {}}, "cells": [{"outputs": [*outputs, {"data": {"image/png": "x"}}]}]}
+    kept = notebook_pages.without_widgets(notebook)["cells"][0]["outputs"]
+    assert kept == [{"data": {"text/plain": ["Knobs: a = 1"]}}, {"data": {"image/png": "x"}}]
+    assert notebook["metadata"] == {}
 
 
 class Page(HTMLParser):

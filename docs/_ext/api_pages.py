@@ -7,6 +7,7 @@ import ast
 import inspect
 import re
 import typing
+from operator import attrgetter
 from pathlib import Path
 from statistics import median
 
@@ -147,7 +148,7 @@ def borrowed(thing, name: str) -> str:
     maker = SHOWN_BY.get(name) or next(iter(makers(thing)), None)
     if maker is None:
         return ""
-    return f"\nAn example, that of `lj.{maker}`:\n\n{example(inspect.getdoc(getattr(lagjax, maker)) or '')}\n"
+    return f"\nAn example, that of `lj.{maker}`:\n\n{example(inspect.getdoc(attrgetter(maker)(lagjax)) or '')}\n"
 
 
 def described(thing, name: str) -> str:

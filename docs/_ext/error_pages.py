@@ -77,6 +77,12 @@ def text_of(node: ast.expr) -> str | None:
     return None
 
 
+def telling(text: str) -> str:
+    """The first line of a message that has words of its own, and is not all put together elsewhere; or nothing."""
+    lines = [re.sub("^…?(Usual cause|Fix): …?", "", line) for line in text.split("\n")]
+    return next((line for line in lines if len(re.findall("[a-z]{3,}", line)) > 1), "").strip()
+
+
 def kind_of(node: ast.Call) -> str:
     """`ValueError`, or the category of a warning."""
     if isinstance(node.func, ast.Name):
@@ -91,7 +97,7 @@ def messages(source: str) -> list[tuple[str, str]]:
 
     def add(kind, text):
         text = text and re.sub(r"…(?:\s?…)+", "…", text).strip()
-        if text and re.search(r"[a-z]{3}", text) and text not in seen:
+        if text and telling(text) and text not in seen:
             seen.add(text)
             found.append((kind, text))
 
@@ -140,13 +146,15 @@ def anchor(text: str, taken: set[str]) -> str:
 
 def title(line: str) -> str:
     """The first sentence of a message, or what fits on a line or two of it."""
-    short = re.split(r"(?<=[a-z)'…])[.:;] ", line)[0].rstrip(":.")
+    parts = re.split(r"(?<=[a-z)'…])([.:;] )", line)
+    ends = (i for i in range(1, len(parts) + 1, 2) if len(re.findall("[a-z]{3,}", "".join(parts[:i]))) > 2)
+    short = "".join(parts[: next(ends, len(parts))]).rstrip(":.")
     return short if len(short) <= 130 else short[:130].rsplit(" ", 1)[0] + " …"
 
 
 def entry(kind: str, text: str, taken: set[str]) -> str:
-    """One message as Markdown: its first line is its heading."""
-    first, *rest = text.split("\n")
+    """One message as Markdown: its first line that says something is its heading."""
+    first = telling(text)
     name = anchor(first, taken)
     # A heading is a line of text: what is code or a formula to Markdown must not become so.
     heading = re.sub(r"([\\`*_{}\[\]<>#$|])", r"\\\1", title(first))

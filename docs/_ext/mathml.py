@@ -10,6 +10,8 @@ from sphinx.util import logging
 logger = logging.getLogger(__name__)
 # What docutils does not know, in what it knows.
 SPELT_OUT = {r"\tfrac": r"\frac", r"\dfrac": r"\frac", r"\lvert": "|", r"\rvert": "|", "°": r"^{\circ}"}
+# Between a function and its argument it sets no space.
+FUNCTION = re.compile(r"\\(?:sin|cos|tan|cot|ln|log|exp|arcsin|arccos|arctan)(?=\\[a-zA-Z]| +\\?[a-zA-Z])")
 # It takes the 12 of `\frac12` for one number.
 SHORT_FRACTION = re.compile(r"\\frac\s*(\w)\s*(\w)")
 
@@ -18,7 +20,8 @@ def converted(source: str, block: bool) -> str:
     """LaTeX as MathML."""
     for name, known in SPELT_OUT.items():
         source = source.replace(name, known)
-    return tex2mathml(SHORT_FRACTION.sub(r"\\frac{\1}{\2}", source), as_block=block)
+    source = SHORT_FRACTION.sub(r"\\frac{\1}{\2}", FUNCTION.sub(r"\g<0>\\,", source))
+    return tex2mathml(source, as_block=block)
 
 
 def mathml(translator, node, block: bool) -> str:

@@ -25,13 +25,15 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Float, PyTree
 
+from lagjax.analysis.roots import roots_beside_zeros
 from lagjax.mechanics import constraints, coordinates
 from lagjax.mechanics.lagrangian import forcing_and_inertia
 from lagjax.mechanics.reactions import response
 from lagjax.mechanics.system import System
-from lagjax.numerics import lapack
+from lagjax.numerics import dense, lapack
 from lagjax.numerics.dense import reciprocal_condition
 from lagjax.numerics.rank import independent_rows
 
@@ -103,6 +105,8 @@ class Steady(eqx.Module):
         return self.fields(x) @ jax.grad(of)(u)
 
 
+# Jitted, so that a Lagrangian is traced once wherever its balance is asked for.
+@eqx.filter_jit
 def imbalance(s: Steady, t, x, u, a, multipliers):
     """`M a - F - Aᵀ λ - B λ`, for any velocity and acceleration."""
     state = s.system, t, x, u, s.params, s.unflatten
@@ -113,6 +117,7 @@ def imbalance(s: Steady, t, x, u, a, multipliers):
     return left.astype(x.dtype)
 
 
+@eqx.filter_jit
 def forces(s: Steady, t, x, u) -> Float[Array, "m n"]:
     """The force of each multiplier: the rows of A, and what a force makes of it."""
     state = s.system, t, x, u, s.params, s.unflatten
@@ -120,6 +125,7 @@ def forces(s: Steady, t, x, u) -> Float[Array, "m n"]:
     return rows if reaction is None else rows + reaction.T
 
 
+@eqx.filter_jit
 def restrictions(s: Steady, t, x, u):
     """`g` or `phi` of each constraint, stacked in the order of their names."""
     q, v = s.unflatten(x), s.unflatten(u)
@@ -221,14 +227,20 @@ def directions(s: Steady, d: Departures, y):
     kept = independent_rows(barred) & jnp.any(barred != 0, axis=1)
     used = jnp.where(kept[:, None], barred, 0.0)
     gram = used @ used.T + jnp.diag(jnp.where(kept, 0.0, 1.0))
-    return jnp.eye(2 * n, dtype=rows.dtype) - used.T @ lapack.solve(gram, used), 2 * n - jnp.sum(kept)
+    return jnp.eye(2 * n, dtype=rows.dtype) - used.T @ _solved(gram, used), 2 * n - jnp.sum(kept)
 
 
-def characteristic_roots(s: Steady, y, jacobian):
+def _solved(matrix, rhs):
+    """`matrix⁻¹ rhs` by LAPACK, refined once, which has the derivatives."""
+    return dense.refined(lapack.solve(matrix, jnp.eye(matrix.shape[0], dtype=matrix.dtype)), matrix, rhs)
+
+
+def characteristic_roots(s: Steady, y, jacobian, derivatives=True):
     """All roots s of departures e^(st), (2n,), NaN in place of those that constraints leave no room for.
 
     Departures along the symmetry, which lead to the same motion, are left out. All NaN where the equations of motion
-    are singular. `lj.linearise` says more of one state; this is for many, in programs and along any symmetry.
+    are singular. Their derivatives are those of `roots.py`, as of `lj.normal_modes`, which says more of one state; this
+    is for many, in programs and along any symmetry.
     """
     d, n = departures(s, y, jacobian), s.n
     project, count = directions(s, d, y)
@@ -242,12 +254,13 @@ def characteristic_roots(s: Steady, y, jacobian):
     sizes = jnp.maximum(jnp.max(jnp.abs(d.mass), axis=1), jnp.max(jnp.abs(rows), axis=0, initial=0.0))
     sound = reciprocal_condition(matrix) > SINGULAR_BELOW[np.dtype(matrix.dtype)]
     sound = sound & (jnp.min(sizes) > jnp.finfo(sizes.dtype).eps ** 1.3 * jnp.max(sizes))
-    accelerations = lapack.solve(jnp.where(sound, matrix, jnp.eye(n + m, dtype=matrix.dtype)), known)[:n]
+    accelerations = _solved(jnp.where(sound, matrix, jnp.eye(n + m, dtype=matrix.dtype)), known)[:n]
     unit = jnp.eye(n, dtype=rows.dtype)
     whole = jnp.concatenate([jnp.concatenate([jnp.zeros_like(unit), unit], axis=1), accelerations])
-    roots = lapack.characteristic(project @ whole @ project)
+    unit = jnp.eye(2 * n, dtype=rows.dtype)
+    roots = roots_beside_zeros(project @ whole @ project, unit, derivatives)[0].values
     # Ranked by comparisons, as sorting takes long to compile; the nearest to zero belong to what is left out.
-    size, order = jnp.abs(roots), np.arange(2 * n)
+    size, order = lax.stop_gradient(jnp.abs(roots)), np.arange(2 * n)
     before = (size[None, :] < size[:, None]) | (size[None, :] == size[:, None]) & (order[None, :] < order[:, None])
     return jnp.where(sound & (jnp.sum(before, axis=1) >= 2 * n - count), roots, jnp.nan)
 

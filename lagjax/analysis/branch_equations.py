@@ -127,7 +127,7 @@ def seen_at(frame: Frame, z):
         multipliers = equations.shortest(pushes, multipliers @ pushes)
     by_name = equations.constraints.split(s.system, multipliers, s.t, s.like, s.like, s.params) if s.m else {}
     jacobian = jax.jacfwd(lambda y: equations.balance(s, y))(y)
-    roots = equations.characteristic_roots(s, y, jacobian)
+    roots = equations.characteristic_roots(s, y, jacobian, derivatives=False)
     return z[-1] * frame.unit, s.unflatten(x), s.unflatten(u), by_name, roots
 
 

@@ -8,7 +8,6 @@ from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import ArrayLike, PyTree
 
@@ -16,7 +15,7 @@ from lagjax.analysis.balance import VELOCITY, Steady
 from lagjax.analysis.branch_equations import Frame, Place, full_jacobian, place_of
 from lagjax.analysis.branches import Branch, Branches, Critical
 from lagjax.analysis.critical_points import Found, between, escape
-from lagjax.analysis.equilibria import conserves_balance, held_at, searched
+from lagjax.analysis.equilibria import held_at, searched
 from lagjax.analysis.found_equilibria import OK, WORDS
 from lagjax.analysis.starts import checked, stacked, stacked_one, symmetries_of
 from lagjax.analysis.steady_tracer import SteadyTracer
@@ -27,7 +26,7 @@ from lagjax.mechanics.compiled import compiled
 from lagjax.mechanics.coordinates import State
 from lagjax.mechanics.diagnosis import describe
 from lagjax.mechanics.refusals import by_name, check_system
-from lagjax.mechanics.structure import angles
+from lagjax.mechanics.structure import angles, is_autonomous
 
 # Points at which a branch begins and critical points are the same within so much.
 SAME = 1e-5
@@ -102,9 +101,9 @@ def continue_equilibria(
     system, s = checked(system, t, q, v, params)
     moving = np.concatenate([np.ravel(x) for x in jax.tree.leaves(s.v)]) != 0
     symmetries = symmetries_of(system, s, cyclic, hold, None if velocity is None else moving)
-    x, u = coordinates.flatten(s.q)[0], coordinates.flatten(s.v)[0]
-    steady = Steady(system, s.t, s.params, jnp.zeros(symmetries.count, s.t.dtype), s.q, symmetries)
-    steady = Steady(system, s.t, s.params, _held(steady, x, u), s.q, symmetries)
+    steady = Steady(system, s.t, s.params, np.zeros(symmetries.count, s.t.dtype), s.q, symmetries)
+    held = _held(steady, coordinates.vector(s.q), coordinates.vector(s.v)) if symmetries.count else steady.held
+    steady = Steady(system, s.t, s.params, held, s.q, symmetries)
     place = place_of(steady, along)
     first, last = float(place.get(steady)), float(to)
     if not np.isfinite(last) or first == last:
@@ -139,10 +138,10 @@ def _velocity(steady, x):
 def _solution(steady: Steady, v) -> np.ndarray | str:
     """The unknowns of the equilibrium near `steady.like`, or in words why there is none."""
     if steady.symmetries.count and steady.symmetries.hold == VELOCITY:
-        v = steady.unflatten(_velocity(steady, coordinates.flatten(steady.like)[0]))
-    one = lambda tree: jax.tree.map(lambda x: jnp.asarray(x)[None], tree)
+        v = coordinates.like(v, np.asarray(_velocity(steady, coordinates.vector(steady.like))))
+    one = lambda tree: jax.tree.map(lambda x: np.asarray(x)[None], tree)
     s = State(steady.t, steady.like, v, steady.params)
-    lasting = not steady.symmetries.count and conserves_balance(steady.system, s)
+    lasting = not steady.symmetries.count and is_autonomous(steady.system, *s)
     row = jax.tree.map(lambda x: np.asarray(x)[0], searched(steady, one(steady.like), one(v), lasting, True))
     if row.status != OK:
         return WORDS[row.status]
@@ -170,7 +169,7 @@ def _frame(steady: Steady, place: Place, first: float, last: float, v, units) ->
     rows, columns, u, sizes, vt = _parts(steady, y, positions)
     rank = int(np.sum(sizes > DEPENDENT * sizes[0]))
     # At a critical point more is dependent than elsewhere: the rank is asked once more close by.
-    x = coordinates.flatten(steady.like)[1](jnp.asarray(y[:n], steady.t.dtype))
+    x = coordinates.like(steady.like, np.asarray(y[:n], steady.t.dtype))
     beside = Steady(steady.system, steady.t, steady.params, steady.held, x, steady.symmetries)
     beside = place.put(beside, first + NEARBY * (last - first))
     other = _solution(beside, v)
@@ -183,7 +182,7 @@ def _frame(steady: Steady, place: Place, first: float, last: float, v, units) ->
             earlier = _solution(place.put(beside, before), v)
             first, y = (first, y) if isinstance(earlier, str) else (before, earlier)
     dtype = steady.t.dtype
-    arrays = [jnp.asarray(a, dtype) for a in (u[:, :rank].T, vt[rank:], y / columns, rows, columns, unit)]
+    arrays = [np.asarray(a, dtype) for a in (u[:, :rank].T, vt[rank:], y / columns, rows, columns, unit)]
     frame = Frame(steady, *arrays, place)
     return frame, np.append(y / columns, first / unit)
 

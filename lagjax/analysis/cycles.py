@@ -7,6 +7,7 @@ import difflib
 import warnings
 from collections.abc import Iterable, Mapping
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import ArrayLike, PyTree
@@ -207,13 +208,15 @@ def _complain(found, period, problem):
 
 
 def _orbit(problem, found, asked) -> PeriodicOrbit:
-    s = problem.state
-    _, unflatten = coordinates.flatten(s.q)
+    s, xp = problem.state, coordinates.numpy_of(found)
+    if xp is np:
+        found = jax.tree.map(np.asarray, found)
+    like = lambda x: coordinates.like(s.q, x)
     z, n = found.place.nodes[0], found.guess.turns.shape[0]
-    shift = jnp.where(np.array(asked.relative), found.seen.gone[:n], 0.0)
+    shift = xp.where(np.array(asked.relative), found.seen.gone[:n], xp.zeros_like(z[:n]))
     arrays, static = pack((problem.system, coordinates.state(*s).params))
     return PeriodicOrbit(
-        jnp.asarray(s.t), unflatten(z[:n]), unflatten(z[n:]), found.place.period, unflatten(found.guess.turns),
-        unflatten(shift), found.seen.size, found.converged, found.iterations, found.place.nodes, arrays, static,
+        xp.asarray(s.t), like(z[:n]), like(z[n:]), found.place.period, like(found.guess.turns),
+        like(shift), found.seen.size, found.converged, found.iterations, found.place.nodes, arrays, static,
         asked,
     )  # fmt: skip

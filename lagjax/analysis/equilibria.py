@@ -9,6 +9,7 @@ so that a minimum of |r| which is no root, and a flight to where forces only fad
 """
 
 from collections.abc import Callable, Iterable
+from functools import partial
 from typing import Any
 
 import jax
@@ -35,9 +36,8 @@ from lagjax.jax_internals.tracing import is_eager
 from lagjax.mechanics import constraints, coordinates
 from lagjax.mechanics.closures import lift
 from lagjax.mechanics.compiled import compiled
-from lagjax.mechanics.reactions import force_with_ones
 from lagjax.mechanics.refusals import by_name, check_system
-from lagjax.mechanics.structure import angles, sees_time
+from lagjax.mechanics.structure import angles, is_autonomous
 from lagjax.motion.consistency import stopped
 from lagjax.numerics import lapack
 from lagjax.numerics.roots import MOST, differentiable, least_squares_root, zero_below
@@ -105,7 +105,8 @@ def equilibria(
     check_system(system, params, starts)
     q = stacked(starts)
     count = jax.tree.leaves(q)[0].shape[0]
-    v = jax.tree.map(jnp.zeros_like, q) if velocities is None else _velocities(velocities, q, count)
+    zeros = lambda x: coordinates.numpy_of(x).zeros_like(x)
+    v = jax.tree.map(zeros, q) if velocities is None else _velocities(velocities, q, count)
     first = jax.tree.map(lambda x: x[0], (q, v))
     try:
         system, s = checked(system, t, *first, params)
@@ -121,9 +122,9 @@ def equilibria(
         )
     symmetries = symmetries_of(system, s, cyclic, hold, moving)
     # What a function closes over may be traced where nothing that is passed is.
-    steady = Steady(lift(system, s), s.t, s.params, jnp.zeros(symmetries.count, s.t.dtype), s.q, symmetries)
+    steady = Steady(lift(system, s), s.t, s.params, np.zeros(symmetries.count, s.t.dtype), s.q, symmetries)
     q, v = jax.tree.map(lambda x: x.astype(s.t.dtype), (q, v))
-    lasting = not symmetries.count and conserves_balance(system, s)
+    lasting = not symmetries.count and is_autonomous(system, *s)
     plain = is_eager() and not coordinates.is_traced((steady, q, v))
     rows = searched(steady, q, v, lasting, plain)
     found = Equilibria(t=s.t, params=s.params, symmetries=symmetries, starts=q, **rows._asdict())
@@ -141,23 +142,12 @@ def _is_a_state(system, t, q, params) -> bool:
     return True
 
 
-def conserves_balance(system, s) -> bool:
-    """Whether a balance at rest lasts because nothing depends on t."""
-    holonomic = [lambda t, q, v, params, g=c.g: g(t, q, params) for c in system.constraints.values()
-                 if isinstance(c, constraints.Holonomic)]  # fmt: skip
-    others = [c.phi for c in system.constraints.values() if not isinstance(c, constraints.Holonomic)]
-    functions = [system.lagrangian, *holonomic, *others]
-    functions += [force_with_ones(system)] if system.force is not None else []
-    functions += [system.dissipation] if system.dissipation is not None else []
-    return not any(sees_time(function, *s) for function in functions)
-
-
 def _velocities(velocities, q, count):
     """One velocity a start."""
     v = stacked([velocities] if _is_one(velocities, q) else velocities, "velocities")
     if jax.tree.structure(v) != jax.tree.structure(q):
         coordinates.state(0.0, jax.tree.map(lambda x: x[0], q), jax.tree.map(lambda x: x[0], v), None)
-    return jax.tree.map(lambda x, of: jnp.broadcast_to(x, (count, *of.shape[1:])), v, q)
+    return jax.tree.map(lambda x, of: coordinates.numpy_of(x).broadcast_to(x, (count, *of.shape[1:])), v, q)
 
 
 def _is_one(velocities, q):
@@ -170,7 +160,7 @@ def _moving(v, count):
     return np.any(np.concatenate([np.asarray(x).reshape(count, -1) for x in jax.tree.leaves(v)], axis=1) != 0, axis=0)
 
 
-@compiled
+@partial(compiled, in_numpy=True)
 def searched(steady: Steady, q, v, lasting, plain) -> Row:
     """What each start leads to, one row each."""
     return jax.vmap(lambda q, v: _settled(steady, q, v, lasting, plain))(q, v)
@@ -194,10 +184,10 @@ def _settled(steady: Steady, q, v, lasting, plain) -> Row:
     fixed, linear = stopped(steady), np.arange(y0.size) >= steady.n + steady.symmetries.count
     root = least_squares_root(lambda y: equations.balance(fixed, y), lax.stop_gradient(y0), linear)
     y = root.y if plain else differentiable(lambda y: equations.balance(steady, y), root)
-    return described(steady, y, root, y0, lasting)
+    return described(steady, y, root, y0, lasting, plain)
 
 
-def described(steady: Steady, y, root, y0, lasting) -> Row:
+def described(steady: Steady, y, root, y0, lasting, plain) -> Row:
     """A root in the user's structure, with what is to be known of it."""
     x, rates, multipliers = steady.parts(y)
     u, a = steady.velocity_and_acceleration(x, rates)
@@ -208,8 +198,8 @@ def described(steady: Steady, y, root, y0, lasting) -> Row:
     if steady.m:
         of_names = steady.system, multipliers, steady.t, steady.like, steady.like, steady.params
         by_name = constraints.split(*of_names)
-    # Roots that coincide have no derivatives: those of `lj.normal_modes` say where.
-    roots = equations.characteristic_roots(*stopped((steady, y, root.jacobian)))
+    jacobian = root.jacobian if plain else jax.jacfwd(lambda y: equations.balance(steady, y))(y)
+    roots = equations.characteristic_roots(steady, y, jacobian, derivatives=not plain)
     status, imbalance, zero_modes = _verdict(steady, root, y0, lasting)
     grows = GROWS_ABOVE[np.dtype(x.dtype)] * jnp.nanmax(jnp.abs(roots))
     stable = ~jnp.any(roots.real > grows) & jnp.any(jnp.isfinite(roots)) & (status == OK)

@@ -5,7 +5,6 @@ from typing import NamedTuple
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int, PyTree
 
@@ -51,7 +50,8 @@ class Equilibria(eqx.Module):
     - `rates`, `momenta` (E, k): of each cyclic motion, `1/[t]` (`[q]/[t]` for a coordinate) and `[L][t]`.
     - `stable` (E,): no small departure grows. (Where none decays either, as without friction, of the linear equations:
       roots on the imaginary axis are their border.)
-    - `eigenvalues` (E, 2n): the roots s of departures e^(st), `1/[t]`, NaN beyond the last one; without derivatives.
+    - `eigenvalues` (E, 2n): the roots s of departures e^(st), `1/[t]`, NaN beyond the last one; of double ones
+      the derivative is that of their mean.
     - `zero_modes` (E,): along how many directions, besides the cyclic ones, the balance is kept to first order: it is
       one of a family, the one nearest to its start, or a critical point where branches meet.
     - `imbalance` (E,): the imbalance, relative to what a displacement as large as the coordinates makes.
@@ -128,7 +128,7 @@ def merged(rows: Equilibria, is_angle: PyTree[bool]) -> Equilibria:
             kept.append(i)
     pick = lambda tree: jax.tree.map(lambda x: x[np.array(kept, int)], tree)
     of_rows = [name for name in Row._fields if name not in ("status", "last")]
-    return replace(rows, **{name: pick(getattr(rows, name)) for name in of_rows}, of_start=jnp.asarray(of_start))
+    return replace(rows, **{name: pick(getattr(rows, name)) for name in of_rows}, of_start=of_start)
 
 
 def _close(off, size, angle):

@@ -80,7 +80,7 @@ def refuse_singular(problem: Problem):
 
 
 def _check_freedom(system, state, rows):
-    n, known = coordinates.flatten(state.q)[0].size, rows is not None
+    n, known = sum(np.size(x) for x in jax.tree.leaves(state.q)), rows is not None
     rows = all_rows(system, *state) if rows is None else rows
     if len(rows) < 2 * n:
         return

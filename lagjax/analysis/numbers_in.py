@@ -6,6 +6,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import PyTree
 
+from lagjax.mechanics import coordinates
 from lagjax.mechanics.diagnosis import listed
 
 
@@ -19,13 +20,19 @@ class Number(eqx.Module):
     def put(self, params: PyTree, value) -> PyTree:
         """`params` with another value of it."""
         leaves, structure = jtu.tree_flatten(params)
-        leaf = jnp.asarray(leaves[self.leaf])
-        leaves[self.leaf] = leaf.reshape(-1).at[self.entry].set(value).reshape(leaf.shape).astype(leaf.dtype)
+        if coordinates.is_traced((leaves[self.leaf], value)):
+            leaf = jnp.asarray(leaves[self.leaf])
+            leaf = leaf.reshape(-1).at[self.entry].set(value).reshape(leaf.shape).astype(leaf.dtype)
+        else:
+            leaf = np.array(leaves[self.leaf])
+            leaf.reshape(-1)[self.entry] = value
+        leaves[self.leaf] = leaf
         return jtu.tree_unflatten(structure, leaves)
 
     def get(self, params: PyTree):
         """Its value."""
-        return jnp.ravel(jtu.tree_leaves(params)[self.leaf])[self.entry]
+        leaf = jtu.tree_leaves(params)[self.leaf]
+        return coordinates.numpy_of(leaf).ravel(leaf)[self.entry]
 
 
 def numbers_in(params: PyTree) -> dict[str, Number]:

@@ -82,7 +82,7 @@ class OrbitBranch(eqx.Module):
         system, params = self.orbit.system, self.orbit.params
         if self.place.kind == NUMBER and self.place.number is not None:
             params = self.place.number.put(params, self.parameter[i])
-        arrays, static = pack((system, params))
+        arrays, static = pack((system, coordinates.as_arrays(params, self.orbit.t.dtype)))
         return replace(
             self.orbit, q=pick(self.q), v=pick(self.v), period=self.period[i], nodes=self.nodes[i], arrays=arrays,
             static=static,

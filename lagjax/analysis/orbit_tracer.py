@@ -81,7 +81,7 @@ class OrbitTracer(Tracer):
 
     def described(self, z, jacobian, tangent) -> Point | str:
         found = self.evaluated(z)
-        if float(found.apart) > SAME:
+        if float(found.apart) > max(SAME, 1e3 * self.eps):
             return "the system is not the same after any period near the last one: its drive has no common period"
         multipliers, left = self._multipliers(found)
         plus, minus = (self._product(found, shift) for shift in (-1.0, 1.0))
@@ -90,7 +90,7 @@ class OrbitTracer(Tracer):
         size = np.abs(left)
         within = ON_CIRCLE * np.sqrt(self.noise)
         growing = int(np.sum(size > 1 + within)) if np.all(np.isfinite(size)) else None
-        below = int(np.sum((np.abs(left.imag) == 0) & (left.real < -1)))
+        below = int(np.sum((np.imag(left) == 0) & (np.real(left) < -1)))
         period = float(self.frame.period) * np.exp(z[-2])
         nodes = z[:-2].reshape(self.frame.parts, -1) * np.asarray(self.frame.scale)
         seen = OrbitSeen(
@@ -99,7 +99,7 @@ class OrbitTracer(Tracer):
         )  # fmt: skip
         return Point(z, jacobian, tangent, float(np.sign(seen.plus)), seen, growing, below)
 
-    def _multipliers(self, found: Evaluated):
+    def _multipliers(self, found: Evaluated) -> tuple[np.ndarray, np.ndarray]:
         """All of them, those that are trivial first as 1; and those that are not, by falling size."""
         count = int(np.sum(found.there))
         reduced = self._without(found, found.whole)

@@ -63,16 +63,18 @@ def general_roots(matrix, inertia) -> Roots:
     return _followed(values, vectors, left, matrix, inertia, jnp.max(jnp.abs(values), initial=0.0), condition)
 
 
-def roots_beside_zeros(matrix, inertia) -> tuple[Roots, Bool[Array, " k"]]:
+def roots_beside_zeros(matrix, inertia, derivatives=True) -> tuple[Roots, Bool[Array, " k"]]:
     """The same, where A has directions that it takes to zero; and which roots are zero."""
     eps = jnp.finfo(matrix.dtype).eps
     values, beside, vectors, left, condition, null = lapack.eigen_without_null_space(matrix, inertia, eps)
     largest = jnp.max(jnp.abs(values), initial=0.0)
-    roots = _followed(values, vectors, left, matrix, inertia, largest, condition, beside, null)
+    roots = _followed(values, vectors, left, matrix, inertia, largest, condition, beside, null, derivatives)
     return roots, null | (jnp.abs(roots.values) <= roots.round_off)
 
 
-def _followed(values, vectors, left, matrix, inertia, largest, condition, beside=None, null=None) -> Roots:
+def _followed(
+    values, vectors, left, matrix, inertia, largest, condition, beside=None, null=None, derivatives=True
+) -> Roots:
     """The roots by their quotients, which follow the matrices; `left` (k, n) with `left @ inertia @ vectors` = 1."""
     real = jnp.zeros(0, values.dtype).real.dtype
     condition = jnp.where(jnp.isfinite(condition), condition, jnp.inf)
@@ -87,10 +89,10 @@ def _followed(values, vectors, left, matrix, inertia, largest, condition, beside
     if null is not None:
         # What a mode shifts, of what may be shifted, is as 1/λ.
         follows = follows & ~null[:, None] & ~null[None, :]
-    start = values
+    start, new_vectors = values, vectors
     # Twice: the first time for the digits of small roots, then for the derivatives alone. With an exact left vector any
     # right one has the root: that without shifts, which are as 1/λ.
-    for live in (False, True):
+    for live in (False, True) if derivatives else (False,):
         A, E = (matrix, inertia) if live else lax.stop_gradient((matrix, inertia))
         left_of = left @ (A @ vectors - (E @ vectors) * start[None, :])
         change = jnp.where(follows, left_of / jnp.where(follows, start[None, :] - start[:, None], 1.0), 0.0)

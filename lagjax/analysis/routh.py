@@ -5,7 +5,8 @@ With a cyclic coordinate c its momentum p_c = ∂L/∂v_c is constant. Solved fo
     R(t, q, v) = L(t, q, v, v_c) - p_c·v_c
 
 is a Lagrangian for the other coordinates: ∂R/∂q = ∂L/∂q and ∂R/∂v = ∂L/∂v with v_c taken from p_c, since what v_c
-changes cancels. (Goldstein's R has the other sign.)
+changes cancels. (Goldstein's R has the other sign.) Forces on the others stay what they are, with v_c taken from p_c,
+where they do not depend on the cyclic coordinate; on it none may act.
 
 Source: Goldstein, *Classical Mechanics*, §8.3; Landau & Lifshitz, *Mechanics*, §41.
 """
@@ -22,8 +23,9 @@ from lagjax.mechanics import coordinates
 from lagjax.mechanics.constraints import Holonomic
 from lagjax.mechanics.diagnosis import listed
 from lagjax.mechanics.memory import kinds, remembered
+from lagjax.mechanics.reactions import reacts
 from lagjax.mechanics.refusals import check_system
-from lagjax.mechanics.structure import what_changes_momentum
+from lagjax.mechanics.structure import forced_by, what_changes_momentum
 from lagjax.mechanics.system import System
 
 
@@ -46,6 +48,27 @@ class Routhian(eqx.Module):
     def full(self, q, of_cyclic: Mapping):
         """A position or a velocity of all coordinates, of one of those that are left and one by name of the others."""
         return _together(q, self.cyclic, [of_cyclic[name] for name in self.cyclic])
+
+    def force(self, t, q, v, params):
+        """The generalized forces on the coordinates that are left, like these."""
+        force = self.system.force
+        assert force is not None
+        found = force(t, *self._state(t, q, v, params), self._parted(params)[0])
+        if isinstance(found, Mapping):
+            return {name: found[name] for name in q}
+        places = [_place(name) for name in self.cyclic]
+        return jnp.stack([x for i, x in enumerate(jnp.asarray(found)) if i not in places])
+
+    def dissipation(self, t, q, v, params):
+        """Rayleigh's function of the coordinates that are left."""
+        dissipation = self.system.dissipation
+        assert dissipation is not None
+        return dissipation(t, *self._state(t, q, v, params), self._parted(params)[0])
+
+    def _state(self, t, q, v, params):
+        """Positions, cyclic ones zero, and velocities of all coordinates."""
+        u = self._at(t, q, v, params)[1]
+        return _together(q, self.cyclic, [jnp.zeros_like(x) for x in u]), _together(v, self.cyclic, list(u))
 
     def _at(self, t, q, v, params):
         params, momenta = self._parted(params)
@@ -77,6 +100,12 @@ class Routhian(eqx.Module):
     def _check(self, t, q, v, params):
         for name in self.cyclic:
             reason = next(what_changes_momentum(self.system, name, t, q, v, params), None)
+            depends = next(forced_by(self.system, name, t, q, v, params), None)
+            if reason is None and depends is not None:
+                raise ValueError(
+                    f"'{name}' cannot be eliminated: {depends}, and the others then depend on where it is.\n"
+                    f"Fix: leave '{name}' out of cyclic."
+                )
             if reason is not None:
                 raise ValueError(
                     f"'{name}' is not cyclic: {reason}, and its momentum need not stay.\n"
@@ -105,11 +134,12 @@ def routhian(system: System, cyclic: str | Iterable[str]) -> System:
 
     **Returns:** a `System` in the coordinates that are left, the dict without these keys, or the shorter array. Its
     parameters are `{"params": those of the system, "momenta": {name: p}}`, with p as `lj.momentum` gives it.
-    Its constraints are those of the system. `routhian(...).lagrangian.velocities(t, q, v, params)` gives the cyclic
-    velocities, by name.
+    Its constraints, forces and dissipation are those of the system. `routhian(...).lagrangian.velocities(t, q, v,
+    params)` gives the cyclic velocities, by name.
 
-    **Raises:** `ValueError`, when L is called, for a coordinate that is not cyclic or acted on by a force or a
-    constraint, and for parameters without the momenta; NaN where the momenta do not tell the cyclic velocities.
+    **Raises:** `ValueError`, when L is called, for a coordinate that is not cyclic, is acted on by a force or a
+    constraint, or that forces on others depend on; for parameters without the momenta; NaN where the momenta do not
+    tell the cyclic velocities. At once where a force depends on multipliers.
 
     Source: Goldstein, §8.3, with the other sign; Landau & Lifshitz, *Mechanics*, §41.
     """
@@ -117,6 +147,11 @@ def routhian(system: System, cyclic: str | Iterable[str]) -> System:
     names = (cyclic,) if isinstance(cyclic, str) else tuple(cyclic)
     if not names or len(set(names)) < len(names):
         raise ValueError('cyclic names each coordinate to eliminate once.\nFix: cyclic=["phi", "psi"].')
+    if reacts(system):
+        raise ValueError(
+            "the force depends on multipliers, and those of the coordinates that are left are not asked for.\n"
+            "Fix: lj.routhian of a system whose force is a function of (t, q, v, params)."
+        )
     reduced = Routhian(system, names)
 
     def constraint(g):
@@ -128,7 +163,10 @@ def routhian(system: System, cyclic: str | Iterable[str]) -> System:
         return of_rest
 
     left = {name: Holonomic(constraint(c.g)) for name, c in system.constraints.items() if isinstance(c, Holonomic)}
-    return System(reduced, left)
+    return System(
+        reduced, left, force=None if system.force is None else reduced.force,
+        dissipation=None if system.dissipation is None else reduced.dissipation,
+    )  # fmt: skip
 
 
 def _together(rest, names, values):

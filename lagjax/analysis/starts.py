@@ -26,12 +26,14 @@ def stacked(starts, what="starts") -> PyTree:
         structures = {jtu.tree_structure(start) for start in starts}
         if len(structures) > 1:
             raise ValueError(f"the {what} differ in structure: each must be like q.\nFix: {AS_STARTS}.")
+        # Known values stay with NumPy, which compiles nothing.
         starts = coordinates.as_floats(starts)
-        return jtu.tree_map(lambda *x: jnp.stack([jnp.asarray(y) for y in x]), *starts)
+        xp = coordinates.numpy_of(starts)
+        return jtu.tree_map(lambda *x: xp.stack([xp.asarray(y) for y in x]), *starts)
     leaves = jtu.tree_leaves(starts)
     if not leaves:
         raise ValueError(f"{what} has no coordinates.\nFix: {AS_STARTS}.")
-    starts = jtu.tree_map(jnp.asarray, coordinates.as_floats(starts))
+    starts = jtu.tree_map(lambda x: coordinates.numpy_of(x).asarray(x), coordinates.as_floats(starts))
     leaves = jtu.tree_leaves(starts)
     if all(x.ndim == 0 for x in leaves):
         return jtu.tree_map(lambda x: x[None], starts)
@@ -51,7 +53,7 @@ def stacked(starts, what="starts") -> PyTree:
 def stacked_one(q):
     """A state of rest at q."""
     q = jax.tree.map(lambda x: x[0], stacked([q]))
-    return q, jax.tree.map(jnp.zeros_like, q)
+    return q, jax.tree.map(lambda x: coordinates.numpy_of(x).zeros_like(x), q)
 
 
 def checked(system, t, q, v, params):

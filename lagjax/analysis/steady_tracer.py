@@ -30,7 +30,8 @@ class SteadyTracer(Tracer):
         self.unit = float(frame.unit)
 
     def at(self, z):
-        return jax.tree.map(np.asarray, evaluated(self.frame, z.astype(self.dtype)))
+        value, jacobian, largest = jax.tree.map(np.asarray, evaluated(self.frame, z.astype(self.dtype)))
+        return value, jacobian, float(largest)
 
     def described(self, z, jacobian, tangent) -> Point:
         seen = jax.tree.map(np.asarray, seen_at(self.frame, z.astype(self.dtype)))

@@ -91,7 +91,7 @@ class Tracer(abc.ABC):
         return self.eps
 
     @abc.abstractmethod
-    def at(self, z):
+    def at(self, z) -> tuple[np.ndarray, np.ndarray, float]:
         """E, J and the largest of all equations."""
 
     @abc.abstractmethod

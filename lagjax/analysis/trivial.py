@@ -20,13 +20,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from lagjax.analysis.flow import Flow
-from lagjax.jax_internals.programs import depends
 from lagjax.mechanics import coordinates
-from lagjax.mechanics.constraints import Holonomic, count, evaluate
-from lagjax.mechanics.in_numbers import WRITTEN, Numbers, in_numbers
-from lagjax.mechanics.reactions import force_with_ones
-from lagjax.mechanics.structure import UP_TO, conserves_jacobi_integral, sees_time
-from lagjax.numerics.scalars import TooLong
+from lagjax.mechanics.constraints import Holonomic
+from lagjax.mechanics.structure import conserves_jacobi_integral, is_autonomous, unseen_coordinates
 
 # What is shorter than this, relative to what it could be, is a direction of round-off.
 NO_DIRECTION = 1e-7
@@ -58,11 +54,14 @@ class Reasons(NamedTuple):
 def reasons_of(system, t, q, v, params) -> Reasons:
     """What the programs of a system tell; of whose state only shapes count."""
     state = t, q, v, params
-    autonomous = not any(sees_time(f, *state) for f in _functions(system))
+    autonomous = is_autonomous(system, *state)
     potential = system.force is None and system.dissipation is None
     momenta = potential and all(isinstance(c, Holonomic) for c in system.constraints.values())
     return Reasons(
-        autonomous, autonomous and conserves_jacobi_integral(system, *state), _ignorable(system, *state), momenta
+        autonomous,
+        autonomous and conserves_jacobi_integral(system, *state),
+        tuple(bool(x) for x in unseen_coordinates(system, *state)),
+        momenta,
     )
 
 
@@ -118,29 +117,3 @@ def _length(row):
     squared = row @ row
     # The root has no derivative at zero.
     return jnp.where(squared > 0, jnp.sqrt(jnp.where(squared > 0, squared, 1.0)), 0.0)
-
-
-def _functions(system):
-    """All functions that the motion depends on, of (t, q, v, params)."""
-    found = [system.lagrangian, None if system.force is None else force_with_ones(system), system.dissipation]
-    found += [lambda *state, c=c: evaluate(c, *state) for c in system.constraints.values()]
-    return [f for f in found if f is not None]
-
-
-def _ignorable(system, t, q, v, params) -> tuple[bool, ...]:
-    """The coordinates on which nothing depends; none of a system too large to tell."""
-    x, unflatten = coordinates.flatten(q)
-    none = (False,) * x.size
-    if x.size + count(system, t, q, v, params) > UP_TO:
-        return none
-    numbers = in_numbers(system, unflatten)
-    args = numbers, t, coordinates.numbers(q), coordinates.numbers(v), params
-    seen = np.zeros(x.size, bool)
-    try:
-        for function in _functions(numbers):
-            program = Numbers(lambda _, *state, f=function: f(*state), args, most=WRITTEN)
-            places = program.state_variables[1 : 1 + x.size]
-            seen |= [depends(program.program.jaxpr, [place]) for place in places]
-    except TooLong:
-        return none
-    return tuple(bool(x) for x in ~seen)

@@ -43,6 +43,20 @@ def flatten(tree):
     return ravel_pytree(tree)
 
 
+def vector(tree):
+    """The vector alone; of NumPy where the values are known, which compiles nothing."""
+    xp = numpy_of(tree)
+    return xp.concatenate([xp.ravel(xp.asarray(x)) for x in jtu.tree_leaves(tree)])
+
+
+def like(tree, x):
+    """A vector x (..., n) in the structure and shapes of `tree`, of NumPy where it is one."""
+    leaves, structure = jtu.tree_flatten(tree)
+    ends = np.cumsum([0, *(np.size(leaf) for leaf in leaves)])
+    parts = [x[..., a:b].reshape(x.shape[:-1] + np.shape(leaf)) for a, b, leaf in zip(ends, ends[1:], leaves)]
+    return jtu.tree_unflatten(structure, parts)
+
+
 def numbers(tree) -> tuple:
     """The coordinates one by one, in the order of `flatten(tree)[0]`."""
     vector, _ = flatten(tree)

@@ -87,7 +87,7 @@ def _structure(args, names):
     nonzero = np.array([not is_zero(x) for x in mass.program.jaxpr.outvars]).reshape(n, n)
     lagrangian = _numbers(lambda system, *state: system.lagrangian(*state), args)
     linear = _numbers(_momentum_at_rest, args)
-    seen = [_numbers(lambda _, *state, f=f: f(*state), args) for f in _seen(system)]
+    seen = [_numbers(lambda _, *state, f=f: f(*state), args) for f in functions_of(system)]
     return Structure(
         mass_depends_on=_depends_on(mass, names),
         blocks=tuple(tuple(names[i] for i in block) for block in banded.blocks(nonzero)),
@@ -109,7 +109,7 @@ def unseen_coordinates(system, t, q, v, params) -> np.ndarray:
     written = in_numbers(system, unflatten), t, coordinates.numbers(q), coordinates.numbers(v), params
     seen = np.zeros(x.size, bool)
     try:
-        for f in _seen(written[0]):
+        for f in functions_of(written[0]):
             numbers = _numbers(lambda _, *state, f=f: f(*state), written)
             _, *state = numbers.state_variables
             seen |= np.array([depends(numbers.program.jaxpr, [y]) for y in state[: x.size]])
@@ -123,7 +123,7 @@ def _unseen_leaves(system, t, q, v, params):
     unseen = []
     for i, leaf in enumerate(jtu.tree_leaves(q)):
         at = lambda args, i=i: jtu.tree_leaves(args[1])[i]
-        kinds = {_dependence(f, (t, q, v, params), at) for f in _seen(system)}
+        kinds = {_dependence(f, (t, q, v, params), at) for f in functions_of(system)}
         unseen += [kinds == {Depends.NOT}] * int(np.size(leaf))
     return np.array(unseen)
 
@@ -204,7 +204,8 @@ def angles(system, t, q, v, params) -> PyTree[bool]:
     found = []
     for i in range(len(leaves)):
         kinds = {
-            _dependence(f, (t, q, v, params), lambda args, i=i: jtu.tree_leaves(args[1])[i]) for f in _seen(system)
+            _dependence(f, (t, q, v, params), lambda args, i=i: jtu.tree_leaves(args[1])[i])
+            for f in functions_of(system)
         }
         found.append(kinds - {Depends.NOT} == {Depends.PERIODICALLY})
     return jtu.tree_unflatten(structure, found)
@@ -220,7 +221,7 @@ def conserved_momenta(system, t, q, v, params) -> list[str]:
     system = in_numbers(system, unflatten)
     args = (system, t, coordinates.numbers(q), coordinates.numbers(v), params)
     try:
-        seen = [_depends_on(_numbers(lambda _, *state, f=f: f(*state), args), names) for f in _seen(system)]
+        seen = [_depends_on(_numbers(lambda _, *state, f=f: f(*state), args), names) for f in functions_of(system)]
     except TooLong:
         return []
     return [name for name in names if not any(name in found for found in seen)]
@@ -230,10 +231,10 @@ def what_changes_momentum(system, name, t, q, v, params) -> Iterator[str]:
     """What may change the momentum of a coordinate, in words."""
     if not _contains(system.lagrangian, name, t, q, v, params, argument=2):
         yield "L does not contain its velocity"
-    if system.force is not None:
-        yield "there is a force"
-    if system.dissipation is not None:
-        yield "there is dissipation"
+    if system.force is not None and _pushes(system, name, t, q, v, params):
+        yield "a force acts on it"
+    if system.dissipation is not None and _contains(system.dissipation, name, t, q, v, params, argument=2):
+        yield "dissipation acts on it"
     functions = {"L contains it": system.lagrangian}
     for other, c in system.constraints.items():
         if isinstance(c, Holonomic):
@@ -243,6 +244,25 @@ def what_changes_momentum(system, name, t, q, v, params) -> Iterator[str]:
     for words, function in functions.items():
         if _contains(function, name, t, q, v, params):
             yield words
+
+
+def forced_by(system, name, t, q, v, params) -> Iterator[str]:
+    """Which forces on others depend on a coordinate, in words."""
+    if system.force is not None and _contains(force_with_ones(system), name, t, q, v, params):
+        yield "the force contains it"
+    if system.dissipation is not None and _contains(system.dissipation, name, t, q, v, params):
+        yield "dissipation contains it"
+
+
+def _pushes(system, name, t, q, v, params) -> bool:
+    """Whether the force has an entry for a coordinate that is not written as zero; also where that is not known."""
+    _, unflatten = coordinates.flatten(q)
+    args = in_numbers(system, unflatten), t, coordinates.numbers(q), coordinates.numbers(v), params
+    try:
+        force = _numbers(lambda system, *state: force_with_ones(system)(*state), args)
+    except TooLong:
+        return True
+    return not is_zero(force.program.jaxpr.outvars[coordinates.names(q).index(name)])
 
 
 def _contains(function, name, t, q, v, params, argument=1) -> bool:
@@ -256,7 +276,8 @@ def _contains(function, name, t, q, v, params, argument=1) -> bool:
     alone, known = in_numbers(System(function), unflatten), coordinates.names(q)
     args = alone, t, coordinates.numbers(q), coordinates.numbers(v), params
     try:
-        numbers = _numbers(lambda system, *state: system.lagrangian(*state), args)
+        # Of a force all entries count.
+        numbers = _numbers(lambda system, *state: coordinates.flatten(system.lagrangian(*state))[0], args)
     except TooLong:
         return True
     place = 1 + (argument - 1) * len(known) + known.index(name)
@@ -293,7 +314,12 @@ def _of_state(constraint):
     return lambda t, q, v, params: constraint.g(t, q, params)
 
 
-def _seen(system):
+def is_autonomous(system, t, q, v, params) -> bool:
+    """Whether nothing that the motion depends on depends on t."""
+    return not any(sees_time(f, t, q, v, params) for f in functions_of(system))
+
+
+def functions_of(system):
     """All functions that the motion depends on, of (t, q, v, params)."""
     functions = []
     for phase in phases_of(system):

@@ -102,9 +102,3 @@ def solve(matrix, rhs):
 def decomposed(matrix):
     """U, σ and Vᵀ of any matrix, without what belongs to no singular value."""
     return jnp.linalg.svd(matrix, full_matrices=False)
-
-
-@one_by_one
-def characteristic(matrix):
-    """All eigenvalues, complex."""
-    return jnp.linalg.eigvals(matrix)

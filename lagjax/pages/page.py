@@ -37,6 +37,12 @@ h1 {{ font-size: 20px; margin: 0 0 12px; }}</style>
 class Page:
     """What plays and answers in a notebook, and in a browser from the page that `save` writes.
 
+    >>> import jax.numpy as jnp
+    >>> import lagjax as lj
+    >>> swept = lj.sweep(lambda point: jnp.sin(point["angle"]), {"angle": jnp.linspace(0.0, 3.0, 31)}, progress=False)
+    >>> swept.to_html().title
+    'Sweep over angle'
+
     - `title`: what stands above it in a page of its own; `html`: itself; `words`: what it is, for `print`.
     """
 

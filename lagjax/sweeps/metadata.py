@@ -47,13 +47,14 @@ def about(path: Path) -> dict[str, Any]:
     """
     if not path.exists():
         raise ValueError(f"there is no {path}.\nFix: the path that was given as store= to lj.sweep.")
-    copies = [path / KEPT_FREE, path / MARKS] if (path / KEPT_FREE).exists() else [path, path / "done"]
+    of_today = (path / KEPT_FREE / META).exists() or (path / MARKS).exists()
+    copies = [path / KEPT_FREE, path / MARKS] if of_today else [path, path / "done"]
     for folder in copies:
         said = _said(folder / META)
         if said is not None:
             break
     else:
-        if not any((path / name).exists() for name in (KEPT_FREE, "status")):
+        if not of_today and not (path / "status").exists():
             raise ValueError(
                 f"{path} exists, and is no store of a sweep.\nFix: another path, or remove it if it is not needed."
             )

@@ -304,8 +304,8 @@ def open_sweep(path: str | os.PathLike, *, run: Callable | None = None, system: 
     **Returns:** a `Sweep`.
 
     **Raises:** `ValueError` where there is no store, nothing can be told of it, or `run` returns something else than
-    it has. Of a store in an earlier format, and of values of classes that cannot be found, `values` is a dictionary by
-    name.
+    it has. Of a store in an earlier format `values` is a dictionary by name; and of values with functions among
+    them, or of classes that are not found, which a warning names.
     """
     path = Path(path)
     if wrong := restore(path):

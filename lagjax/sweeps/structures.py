@@ -7,6 +7,7 @@ description: its values are a dictionary by name.
 
 import base64
 import pickle
+import warnings
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -48,7 +49,8 @@ def written(like: PyTree, one: PyTree | None) -> dict[str, Any] | None:
     try:
         for motion, numbers in zip(motions, asked):
             system = described(numbers) if one is not None else UnknownSystem(repr(motion.any_system), (), {}, None)
-            of = {name: getattr(system, name) for name in system.__dataclass_fields__}
+            # In NumPy: a process that works in float32 can read these, too.
+            of = jax.tree.map(_in_numpy, {name: getattr(system, name) for name in system.__dataclass_fields__})
             nodes = parts(motion, lambda result: {"codes": result._value, "names": {}}) | {"system": of}
             found.append({name: writer.down(x, name) for name, x in nodes.items()})
         said = {"tree": writer.down(tree, "values"), "trajectories": found}
@@ -103,9 +105,14 @@ def as_stored(store: Store, system: Any = None) -> PyTree | None:
         return None
     try:
         tree = read(said, system, store.path)
-    except ValueError:
+    except ValueError as error:
         if system is not None:
             raise
+        warnings.warn(
+            f"the values of {store.path} are a dictionary by name: {error}\n"
+            "Fix, where that does not help: lj.open_sweep(path, run=run), with the function that was swept.",
+            stacklevel=3,
+        )
         return None
     one = store.one()
     names = iter([name for name, _ in named_leaves(tree)])
@@ -136,32 +143,42 @@ class Travelling(NamedTuple):
     leaves: list
     structure: bytes | None
     described: dict[str, Any] | None
+    # Of the leaves. A system that is not known has none of those that it had.
+    names: list[str]
 
     @classmethod
     def of(cls, values: PyTree) -> "Travelling":
         """Values, to be pickled."""
         leaves, structure = jax.tree.flatten(values)
         said = written(values, None) if any(map(_is_motion, jax.tree.leaves(values, is_leaf=_is_motion))) else None
-        return cls(leaves, pickled(jax.tree.unflatten(structure, range(len(leaves)))), said)
+        names = [] if said is None else [name for name, _ in named_leaves(values)]
+        numbers = jax.tree.unflatten(structure, range(len(leaves)))
+        # Where there is no other way, pickle says itself what it does not take.
+        return cls(leaves, pickle.dumps(numbers) if said is None else pickled(numbers), said, names)
 
     def unpacked(self) -> PyTree:
         """The values again."""
         try:
-            tree = None if self.structure is None else pickle.loads(self.structure)
+            if self.structure is not None:
+                return jax.tree.unflatten(jax.tree.structure(pickle.loads(self.structure)), self.leaves)
         except (AttributeError, ImportError):
-            tree = None
-        if tree is None and self.described is not None:
-            tree = read(self.described, None, None)
-        if tree is None:
-            raise pickle.UnpicklingError(
-                "the values of this sweep have functions among them, or objects of a class, that are not found here.\n"
-                "Fix: import where they are defined before this; or open_sweep, of a sweep in a store."
-            )
-        return jax.tree.unflatten(jax.tree.structure(tree), self.leaves)
+            # Where it was written its functions had names.
+            pass
+        if self.described is not None:
+            tree, leaves = read(self.described, None, None), dict(zip(self.names, self.leaves))
+            return jax.tree.unflatten(jax.tree.structure(tree), [leaves[name] for name, _ in named_leaves(tree)])
+        raise pickle.UnpicklingError(
+            "the values of this sweep have functions among them, or objects of a class, that are not found here.\n"
+            "Fix: import where they are defined before this; or lj.open_sweep, of a sweep in a store."
+        )
 
 
 def _is_motion(x):
     return isinstance(x, Trajectory)
+
+
+def _in_numpy(x):
+    return np.asarray(x) if isinstance(x, jax.Array) else x
 
 
 def _in_json(x):

@@ -156,17 +156,44 @@ def test_a_routhian_moves_as_the_whole():
     np.testing.assert_allclose(alone.q[:, 0], whole.q[:, 1], atol=1e-9)
 
 
+@pytest.mark.slow
+def test_a_routhian_with_forces_on_what_is_left():
+    """A top whose tilt is pushed, by its cyclic velocity too, and rubbed: as the whole; twin: without the push."""
+    push = lambda t, q, v, p: {"phi": 0.0 * t, "psi": 0.0 * t, "theta": p["f"] * jnp.cos(t) * v["phi"]}
+    forced = lj.System(top, force=push, dissipation=lambda t, q, v, p: 0.5 * p["c"] * v["theta"] ** 2)
+    params, (_, state, reduced) = OF_TOP | {"f": 0.5, "c": 0.25}, reduced_top()
+    of = lambda system, params: lj.accelerations(system, 0.25, *state, reduced | {"params": params})[0]["theta"]
+    whole = lj.accelerations(forced, 0.25, *SPINNING, params)[0]["theta"]
+    left = lj.routhian(forced, ["phi", "psi"])
+    np.testing.assert_allclose(of(left, params), whole, rtol=1e-12)
+    assert abs(of(left, params | {"f": 0.0}) - whole) > 0.1 and abs(of(left, params | {"c": 0.0}) - whole) > 0.01
+    entries = lambda t, q, v, p: jnp.stack([0.0 * t, -p["f"] * q[1] * v[0]])
+    polar = lambda t, q, v, p: 0.5 * (v[1] ** 2 + (q[1] * v[0]) ** 2) + p["k"] / q[1]
+    system, start, p = (
+        lj.System(polar, force=entries),
+        (np.array([0.25, 1.0]), np.array([0.5, 0.125])),
+        {"k": 0.25, "f": 1.0},
+    )
+    params = {"params": p, "momenta": {"q[0]": lj.momentum(system, 0.0, *start, p)[0]}}
+    alone = lj.accelerations(lj.routhian(system, "q[0]"), 0.0, start[0][1:], start[1][1:], params)[0]
+    np.testing.assert_allclose(alone, lj.accelerations(system, 0.0, *start, p)[0][1:], rtol=1e-12)
+
+
 def test_what_is_not_cyclic_is_named():
     """A coordinate that L contains, a force, a constraint; parameters without momenta; one eliminated and given."""
     of_theta = {"phi": 0.1, "psi": 0.2}, {"phi": 0.1, "psi": 0.2}
     of_phi = {"theta": 0.5, "psi": 0.2}, {"theta": 0.1, "psi": 0.2}
     momenta = {"params": OF_TOP, "momenta": {"theta": 1.0, "phi": 1.0, "x": 1.0}}
     rubbed = lj.System(top, dissipation=lambda t, q, v, params: 0.5 * v["phi"] ** 2)
+    pushed = lj.System(top, force=lambda t, q, v, p: {"phi": jnp.cos(t), "psi": 0.0, "theta": 0.0})
+    steered = lj.System(top, force=lambda t, q, v, p: {"phi": 0.0, "psi": 0.0, "theta": jnp.sin(q["phi"])})
     held = lj.System(top, {"held": lj.Holonomic(lambda t, q, params: q["phi"] - q["psi"])})
     cases = [
         (TOP, "theta", of_theta, momenta, "'theta' is not cyclic: L contains it"),
         (TOP, "x", of_phi, momenta, "'x' is not cyclic: L does not contain its velocity"),
-        (rubbed, "phi", of_phi, momenta, "'phi' is not cyclic: there is dissipation"),
+        (rubbed, "phi", of_phi, momenta, "'phi' is not cyclic: dissipation acts on it"),
+        (pushed, "phi", of_phi, momenta, "'phi' is not cyclic: a force acts on it"),
+        (steered, "phi", of_phi, momenta, "'phi' cannot be eliminated: the force contains it"),
         (held, "phi", of_phi, momenta, "'phi' is not cyclic: constraint 'held' contains it"),
         (TOP, "phi", of_phi, OF_TOP, "the parameters of a Routhian are those of the system and the momenta"),
         (TOP, "phi", of_phi, {"params": OF_TOP, "momenta": {}}, "the momentum of 'phi' is missing"),

@@ -138,7 +138,7 @@ def cases():
             yield pytest.param(form, method, order, steps, marks=marks, id="-".join(case))
 
 
-@pytest.mark.parametrize(("form", "method", "order", "steps"), cases())
+@pytest.mark.parametrize(("form", "method", "order", "steps"), list(cases()))
 def test_order(exact, form, method, order, steps):
     """Each method has its order in positions, velocities and multipliers, free and projected, between its steps."""
     measured = orders(exact[form], steps, lambda n: computed(form, run(form, method, 1 / n)))

@@ -22,7 +22,9 @@ def shuffled(m, half_bandwidth, seed=0):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "size", exhaustive_but(((1, 0), (20, 2)), ((1, 0), (2, 1), (3, 1), (20, 0), (20, 1), (20, 2), (30, 5), (5, 4)))
+    "size",
+    exhaustive_but(((1, 0), (20, 2)), ((1, 0), (2, 1), (3, 1), (20, 0), (20, 1), (20, 2), (30, 5), (5, 4))),
+    ids=str,
 )
 def test_solves_as_lapack(size):
     """Found in its random order, coloured, and solved to round-off, some rows left out."""
@@ -58,6 +60,7 @@ def test_ill_conditioned():
         assert backward_error(np.asarray(banded.solver(entries)(jnp.asarray(r)))) <= max(4 * lapack, 1e-15)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("half_bandwidth", exhaustive_but((2,), (1, 2)))
 def test_derivatives_pass_by_the_elimination(half_bandwidth):
     """Both modes, through the solution of a linear system that is known as a function."""

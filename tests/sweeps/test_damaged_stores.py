@@ -200,6 +200,9 @@ def test_nothing_known(store, tmp_path):
             call(store)
     with pytest.raises(ValueError, match="there is no .*nowhere"):
         lj.open_sweep(tmp_path / "nowhere")
+    (tmp_path / "other" / "lagjax").mkdir(parents=True)
+    with pytest.raises(ValueError, match="exists, and is no store of a sweep"):
+        lj.open_sweep(tmp_path / "other")
 
 
 def test_parts_look_after_their_own(store):

@@ -2,8 +2,10 @@
 
 import copy
 import pickle
+import sys
 from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -76,6 +78,22 @@ def test_what_cannot_be_written_down(tmp_path):
     assert isinstance(values, dict) and [x.tolist() for x in values.values()] == [[1.0, 2.0, 3.0]]
     again = lj.open_sweep(tmp_path / "store", run=of).values
     np.testing.assert_array_equal(again(2.0), 2.0 * AXES["k"])
+
+
+class Law(eqx.Module):
+    """Of the user's."""
+
+    k: jax.Array
+
+
+def test_a_class_that_is_not_found(tmp_path, monkeypatch):
+    """As in a process that has not imported it: by name, and told. Twin: before, it came back."""
+    quiet(lambda point: Law(point["k"]), {"k": AXES["k"]}, store=tmp_path / "store")
+    assert isinstance(lj.open_sweep(tmp_path / "store").values, Law)
+    monkeypatch.delattr(sys.modules[__name__], "Law")
+    with pytest.warns(UserWarning, match="are a dictionary by name: it holds an object of class .*Law(.|\n)*run=run"):
+        values = lj.open_sweep(tmp_path / "store").values
+    assert list(values) == ["k"] and values["k"].tolist() == [1.0, 2.0, 3.0]
 
 
 @pytest.mark.slow
@@ -174,3 +192,26 @@ def test_pickled_with_a_lambda():
     again = found.resweep(where=np.eye(3, 2, dtype=bool))
     assert again.ran == 2
     np.testing.assert_allclose(again.values["motion"].q["x"], EXACT, atol=1e-8)
+
+
+class Stiff(eqx.Module):
+    """A Lagrangian with an array in it."""
+
+    k: jax.Array
+
+    def __call__(self, t, q, v, params):
+        return 0.5 * v**2 - 0.5 * self.k * q**2
+
+
+@pytest.mark.slow
+def test_a_system_with_arrays(tmp_path):
+    """They are stored, and come back with the system; without it there is no place for them, and all else is there."""
+    stiff = lj.System(Stiff(jnp.array(4.0)), dissipation=lambda t, q, v, params: 0.0 * v**2)
+    of = lambda point: lj.integrate(stiff, point["x"], 0.0, None, ts=TS)
+    swept = quiet(of, {"x": AXES["x"]}, store=tmp_path / "store")
+    exact = AXES["x"][:, None] * np.cos(2.0 * TS)
+    for found in (swept, lj.open_sweep(tmp_path / "store"), pickle.loads(pickle.dumps(quiet(of, {"x": AXES["x"]})))):
+        np.testing.assert_allclose(found.values.q, exact, atol=1e-8)
+        assert found.values.asked.drift == swept.values.asked.drift
+    whole = lane(lj.open_sweep(tmp_path / "store", system=stiff).values, 1)
+    assert whole.system.lagrangian.k == 4.0 and repr(whole) == repr(lane(swept.values, 1))
