@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from lagjax import Holonomic, Nonholonomic, System, accelerations, constraint_force, constraint_residual
 
