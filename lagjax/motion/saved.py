@@ -98,13 +98,13 @@ def check_same(system, known: UnknownSystem, path) -> None:
         here = signature(system, State(*known.state))
     except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
         raise ValueError(
-            f"this system is not the one of {path} ({known.words}): it cannot be asked at a state of that motion.\n"
+            f"this system is not the one of {path} ({known.words.splitlines()[0]}): it cannot be asked at a state of that motion.\n"
             f"It says: {error}"
         ) from error
     if found := differences(known.signature, here):
         lines = "".join(f"    {line}\n" for line in found)
         raise ValueError(
-            f"this system is not the one of {path} ({known.words}):\n{lines}"
+            f"this system is not the one of {path} ({known.words.splitlines()[0]}):\n{lines}"
             "Usual cause: a function that has changed since, or another file.\n"
             "Fix: the system that was integrated; or leave system out, and read what was computed."
         )

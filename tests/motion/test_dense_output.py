@@ -177,6 +177,7 @@ def test_derivatives(of):
         np.testing.assert_allclose(by_t, np.cos(exact(t)[0]) * v, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_second_derivative_at_an_output():
     """By t twice at an output, where no step is taken: the acceleration -g sin q. Twin: a straight line has none."""
     traj = swing()
@@ -188,7 +189,7 @@ def test_second_derivative_at_an_output():
 
 def test_one_program_for_all_times():
     """Another motion of the system, at other times, compiles nothing; twin: another number of them does."""
-    swing().at(0.3)
+    swing().at([0.3, 0.5])
     other = swing(q0=1.0, g=2.0)
     with compiles() as again:
         other.at([0.7, 2.9])
