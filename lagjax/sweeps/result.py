@@ -132,9 +132,9 @@ class Sweep:
         >>> run = lambda point: {"sum": point["a"] + point["b"], "both": point["a"] * np.array([1.0, 10.0])}
         >>> swept = lj.sweep(run, {"a": np.array([1.0, 2.0]), "b": np.array([0.5])}, progress=False)
         >>> print(swept.to_pandas().drop(columns=["steps", "scaled_error", "residual"]))
-             a    b  sum  both[0]  both[1]      result
-        0  1.0  0.5  1.5      1.0     10.0  successful
-        1  2.0  0.5  2.5      2.0     20.0  successful
+             a    b  both[0]  both[1]  sum      result
+        0  1.0  0.5      1.0     10.0  1.5  successful
+        1  2.0  0.5      2.0     20.0  2.5  successful
 
         Rows are in the order of the points, the last axis fastest. An array of a point has a column a number, up to
         100; `result` is categorical, in words.
