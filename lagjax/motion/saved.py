@@ -98,8 +98,8 @@ def check_same(system, known: UnknownSystem, path) -> None:
         here = signature(system, State(*known.state))
     except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
         raise ValueError(
-            f"this system is not the one of {path} ({known.words.splitlines()[0]}): it cannot be asked at a state of that motion.\n"
-            f"It says: {error}"
+            f"this system is not the one of {path} ({known.words.splitlines()[0]}): it cannot be asked at a state of "
+            f"that motion.\nIt says: {error}"
         ) from error
     if found := differences(known.signature, here):
         lines = "".join(f"    {line}\n" for line in found)
