@@ -151,6 +151,16 @@ def test_pictures_of_notebooks_have_words():
                 assert len(cell["metadata"]["mystnb"]["image"]["alt"]) > 25, path.stem
 
 
+def test_notebooks_need_nothing_from_the_network():
+    """A slider becomes its text, a meter nothing, and the scripts of both are left out; other outputs stay."""
+    view = "application/vnd.jupyter.widget-view+json"
+    outputs = [{"data": {view: {}, "text/plain": [text]}} for text in ("compiling, 00:00", "Knobs: a = 1")]
+    notebook = {"metadata": {"widgets": {}}, "cells": [{"outputs": [*outputs, {"data": {"image/png": "x"}}]}]}
+    kept = notebook_pages.without_widgets(notebook)["cells"][0]["outputs"]
+    assert kept == [{"data": {"text/plain": ["Knobs: a = 1"]}}, {"data": {"image/png": "x"}}]
+    assert notebook["metadata"] == {}
+
+
 class Page(HTMLParser):
     """What a reader without eyes, or a link, needs of a page."""
 

@@ -49,12 +49,27 @@ def with_alt_texts(notebook: dict, name: str) -> dict:
     return notebook
 
 
+def without_widgets(notebook: dict) -> dict:
+    """Sliders need a running Python and scripts from the network: the text beside them stays, but of a meter."""
+    notebook["metadata"].pop("widgets", None)
+    for cell in notebook["cells"]:
+        kept = []
+        for output in cell.get("outputs", ()):
+            widget = output.get("data", {}).pop("application/vnd.jupyter.widget-view+json", None)
+            if widget is None or not "".join(output["data"].get("text/plain", "")).startswith("compiling"):
+                kept.append(output)
+        if "outputs" in cell:
+            cell["outputs"] = kept
+    return notebook
+
+
 def generate(app):
     """Write the notebooks and the list of them."""
     names = sorted(path.stem for path in SOURCE.glob("*.ipynb"))
     for name in names:
         text = (SOURCE / f"{name}.ipynb").read_text().replace("](../docs/", "](../")
-        write(FOLDER / f"{name}.ipynb", json.dumps(with_alt_texts(json.loads(text), name), ensure_ascii=False))
+        shown = without_widgets(with_alt_texts(json.loads(text), name))
+        write(FOLDER / f"{name}.ipynb", json.dumps(shown, ensure_ascii=False))
     write(FOLDER / "index.md", INDEX + "\n".join(names) + "\n```\n")
     clear(FOLDER, {"index.md"} | {f"{name}.ipynb" for name in names})
 

@@ -11,12 +11,10 @@ from lagjax.fitting.starts import unflatten_of
 from lagjax.mechanics import files
 from lagjax.mechanics.hybrid import Hybrid, first_phase, replace_fields
 from lagjax.mechanics.memory import kinds
-from lagjax.mechanics.outside import first_alike, up_to_date
 from lagjax.mechanics.signature import UnknownSystem
 from lagjax.mechanics.system import System
 from lagjax.mechanics.written_trees import NotGiven, Reader
-from lagjax.motion.saved import check_same
-from lagjax.motion.switching import each_phase
+from lagjax.motion.saved import same_system
 
 
 def load_fit(
@@ -66,8 +64,7 @@ def load_fit(
     try:
         placeholder: Any = UnknownSystem(**Reader(arrays).up(said["known"]))
         if system is not None:
-            check_same(system, placeholder, path)
-            alike = each_phase(system, lambda of: first_alike(of, up_to_date(of)))
+            alike = same_system(system, placeholder, path)
             phase = placeholder.phase
             placeholder = alike if phase is None else replace_fields(alike, first=np.asarray(phase, np.int32))
         like = Reader(arrays).up(said["q"])

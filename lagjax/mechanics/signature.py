@@ -46,7 +46,7 @@ class UnknownSystem(eqx.Module):
     phase: int | None = eqx.field(static=True, default=None)
 
     def __repr__(self):
-        return f"{self.words}, not given"
+        return f"{self.words.splitlines()[0]}, not given"
 
     def __getattr__(self, name):
         if name in OF_SYSTEMS:
@@ -131,6 +131,6 @@ def known_system(system: Any) -> Any:
 
 def _raise_unknown(system) -> NoReturn:
     raise ValueError(
-        f"this needs the functions of the system ({system.words}), which are not in a file.\n"
+        f"this needs the functions of the system ({system.words.splitlines()[0]}), which are not in a file.\n"
         "Fix: lj.load_trajectory(path, system=system), or load_fit or open_sweep, with the system that was integrated."
     )

@@ -79,8 +79,8 @@ class Writer:
             return {"dict": [[self._key(k, path), self.down(x, _under(path, k))] for k, x in value.items()]}
         if type(value) in (list, tuple):
             return {type(value).__name__: [self.down(x, f"{path}[{i}]") for i, x in enumerate(value)]}
-        if isinstance(value, tuple) and hasattr(value, "_fields"):
-            parts = {name: self.down(getattr(value, name), _under(path, name)) for name in value._fields}
+        if isinstance(value, tuple) and (names := getattr(value, "_fields", None)) is not None:
+            parts = {name: self.down(getattr(value, name), _under(path, name)) for name in names}
             return {"namedtuple": _name_of(type(value)), "fields": parts}
         if isinstance(value, types.FunctionType) or callable(value) and not dataclasses.is_dataclass(value):
             return self._function(value, path)

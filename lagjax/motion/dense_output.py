@@ -31,7 +31,7 @@ from lagjax.motion.backward import in_either_direction
 from lagjax.motion.hybrid_trajectory import NO_PHASE, HybridTrajectory
 from lagjax.motion.reported import patient
 from lagjax.motion.solve import Settings
-from lagjax.motion.trajectory import Snapshot, Trajectory, ended_well, in_words
+from lagjax.motion.trajectory import ENDED_WELL, Snapshot, Trajectory, in_words
 
 # Controllers that can begin anywhere. Others have a plan of their own for the whole motion.
 BEGIN_ANYWHERE = type(None), diffrax.PIDController, diffrax.ConstantStepSize, diffrax.ClipStepSizeController
@@ -90,8 +90,10 @@ def _fill(found, mine, trajectory, phase, nodes, times):
     of_system = system, trajectory.params, trajectory.asked, trajectory.tolerance
     new, result = _continue_all(*of_system, nodes, times, trajectory.static.how.backward)
     new, result = jax.tree.map(lambda x: np.asarray(x)[: mine.size], (new, result))
-    if not np.all(ended_well(result)):
-        _raise_not_continued(nodes.t, times, result)
+    # Not `ended_well`, which would compile a comparison for each number of times.
+    well = np.isin(result._value, [int(good._value) for good in ENDED_WELL])
+    if not well.all():
+        _raise_not_continued(nodes.t, times, result._value, int(np.argmin(well)))
     for name, x in found.multipliers.items():
         x[mine] = new.multipliers[name] if name in multipliers else np.nan
     for old, x in zip(jax.tree.leaves((found.q, found.v)), jax.tree.leaves((new.q, new.v))):
@@ -289,9 +291,7 @@ def _slack(first, last):
     return SAME * xp.finfo(xp.asarray(first).dtype).eps * xp.maximum(xp.abs(first), xp.abs(last))
 
 
-def _raise_not_continued(nodes, times, result):
-    codes = np.asarray(result._value)
-    bad = int(np.argmax(~np.asarray(ended_well(result))))
+def _raise_not_continued(nodes, times, codes, bad):
     raise RuntimeError(
         f"the motion cannot be continued from its output at t = {float(nodes[bad]):.9g} to t = "
         f"{float(times[bad]):.9g}: {in_words(codes[bad])}\n"

@@ -134,7 +134,7 @@ class HybridTrajectory(Trajectory):
 
     def _of_system(self):
         if isinstance(self.any_system, UnknownSystem):
-            lines = [("system", repr(self.any_system).splitlines()[0])]
+            lines = [("system", repr(self.any_system))]
         elif any(system.constraints for system in self.system.systems):
             lines = [("worst constraint residual", f"{float(self.residual()):.1e} (relative)")]
         else:

@@ -69,7 +69,7 @@ def dims_of(trajectory, dims: Sequence[str] | None = None) -> tuple[str, ...]:
     if len(dims) != count:
         raise ValueError(
             f"dims has {len(dims)} names, {', '.join(map(repr, dims))}, and this trajectory {count} axes in front of "
-            f"its outputs.\nFix: dims=({', '.join(f'{chr(34)}axis_{i}{chr(34)}' for i in range(count))})."
+            f"its outputs.\nFix: dims={tuple(f'axis_{i}' for i in range(count))}."
         )
     return dims
 
@@ -124,7 +124,9 @@ def attributes(trajectory) -> dict[str, Any]:
         for path, x in jax.tree_util.tree_leaves_with_path(trajectory.params):
             if isinstance(x, (bool, int, float, str, np.generic, np.ndarray, jax.Array)):
                 if np.ndim(x) <= 1 and np.size(x) <= 64:
-                    found[named("params", path)] = np.asarray(x).tolist() if np.ndim(x) else np.asarray(x).item()
+                    # NetCDF has no place for true and false.
+                    x = np.asarray(x, int) if np.asarray(x).dtype == bool else np.asarray(x)
+                    found[named("params", path)] = x.tolist()
     return found
 
 

@@ -58,12 +58,13 @@ def load_trajectory(path: str | os.PathLike, system: System | Hybrid | None = No
     reader = Reader(arrays)
     try:
         found = {name: reader.up(node) for name, node in said["trajectory"].items()}
+        known = UnknownSystem(**found["system"])
+        trajectory = trajectory_of(found, known)
     except (KeyError, TypeError, IndexError, StopIteration) as error:
         files.raise_damaged(path, f"what it says of itself is not whole ({error})", error)
     except ValueError as error:
         raise ValueError(f"{path} cannot be read: {error}") from error
-    known = UnknownSystem(**found["system"])
-    return trajectory_of(found, known if system is None else same_system(system, known, path))
+    return trajectory if system is None else trajectory_of(found, same_system(system, known, path))
 
 
 def trajectory_of(found: dict, kept: System | Hybrid | UnknownSystem) -> Trajectory:
@@ -73,12 +74,10 @@ def trajectory_of(found: dict, kept: System | Hybrid | UnknownSystem) -> Traject
     fields["events"] = {name: Crossings(**x) for name, x in found["events"].items()}
     error = found["error"]
     fields["error"] = None if error is None else Errors(**error | {"result": result_of_names(error["result"])})
-    of: type[Trajectory] = Trajectory
-    if "phase" in found:
-        of, more = HybridTrajectory, found["switches"]
-        fields |= {"phase": found["phase"], "switches": _made(Switches, more)}
     fields["arrays"], fields["static"] = pack(kept, found["params"], Asked(**found["asked"]), How(**found["how"]))
-    return of(**fields)
+    if "phase" not in found:
+        return Trajectory(**fields)
+    return HybridTrajectory(**fields, phase=found["phase"], switches=_made(Switches, found["switches"]))
 
 
 def same_system(system, known: UnknownSystem, path) -> System | Hybrid:
@@ -99,13 +98,13 @@ def check_same(system, known: UnknownSystem, path) -> None:
         here = signature(system, State(*known.state))
     except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
         raise ValueError(
-            f"this system is not the one of {path} ({known.words}): it cannot be asked at a state of that motion.\n"
-            f"It says: {error}"
+            f"this system is not the one of {path} ({known.words.splitlines()[0]}): it cannot be asked at a state of "
+            f"that motion.\nIt says: {error}"
         ) from error
     if found := differences(known.signature, here):
         lines = "".join(f"    {line}\n" for line in found)
         raise ValueError(
-            f"this system is not the one of {path} ({known.words}):\n{lines}"
+            f"this system is not the one of {path} ({known.words.splitlines()[0]}):\n{lines}"
             "Usual cause: a function that has changed since, or another file.\n"
             "Fix: the system that was integrated; or leave system out, and read what was computed."
         )

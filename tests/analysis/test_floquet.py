@@ -61,6 +61,7 @@ def test_boundaries_of_mathieu():
     assert np.abs(off(value, slope, COLUMN, ROW)).min() > 1e-7
 
 
+@pytest.mark.slow
 def test_verdict_across_boundaries():
     """Unstable a hundred millionth inside a tongue, stable as much outside, but in those that let nothing grow."""
     wide = np.abs(WIDTH) > 1e-2

@@ -95,6 +95,7 @@ def test_best_times_against_all_choices(count):
             candidate.at_best(12)
 
 
+@pytest.mark.slow
 def test_falling():
     """g after another fall: from a start that is unknown, or known; longer, or not; after one further measurement."""
     zeros = {"q": np.zeros(21), "q0": 0.0, "v0": 0.0, "sigma": SIGMA}

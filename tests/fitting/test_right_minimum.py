@@ -80,6 +80,7 @@ def test_what_only_round_off_sees_keeps_its_guess(monkeypatch):
         assert not abs(float(fitted().params["m"]) - 2.0) < 10.0
 
 
+@pytest.mark.slow
 def test_what_contradicts_sigma_is_no_success(clean):
     """Something that the system leaves out, an error in size: not converged, in words, from whatever start."""
     data = measured(clean, 3) + SIGMA * np.sin(7 * TS)

@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from lagjax import Holonomic, Nonholonomic, System, accelerations, constraint_force, constraint_residual
 
@@ -105,6 +106,7 @@ def test_residuals_by_level():
     assert float(constraint_residual(system, *state, level="velocity")["rod"]) == 22.0
 
 
+@pytest.mark.slow
 def test_gradient_of_a_multiplier():
     """∂λ/∂(params) of the pendulum, forward and reverse, against the closed form."""
     angle, rate = 0.75, 1.25

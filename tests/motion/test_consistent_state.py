@@ -50,6 +50,7 @@ def flat(state):
     return jnp.stack([q["x"], q["y"], v["x"], v["y"]])
 
 
+@pytest.mark.slow
 def test_nearest_in_the_metric_of_the_masses():
     """From far away the nearest point of a moving ellipse is found, 1e-12 from its one-angle solution.
 

@@ -67,6 +67,7 @@ def test_the_first_of_two_crossings_in_a_step_ends_the_motion():
 # Where crossings lie.
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rtol", [1e-4, 1e-9, 1e-12])
 def test_levels_just_below_the_extremum(rtol):
     """Two crossings in one step, from 0.3 to 1e-8 below the top; their times to what the motion's error lets expect."""

@@ -76,6 +76,7 @@ def test_massless_crank_at_its_dead_centre():
         lj.accelerations(crank, 0.0, q0, v0, CRANK)
 
 
+@pytest.mark.slow
 def test_massless_crank_does_not_start_at_its_dead_centre():
     """Nor does it move from there."""
     q0, v0 = {"crank": 0.0, "x": CRANK["l"]}, {"crank": 0.25, "x": 0.0}

@@ -360,6 +360,7 @@ def test_methods_of_diffrax_run_in_our_form(shipped, ours, own):
     assert "form)" not in repr(expected) + repr(by_method(ours)(g))
 
 
+@pytest.mark.slow
 def test_methods_with_options_stay():
     """Another method, one with an option set, and one that a condition needs are not ours."""
     looped = diffrax.Dopri8(scan_kind="lax")

@@ -204,6 +204,7 @@ def test_section_of_henon_and_heiles():
     assert np.ptp(0.5 * found.v["y"] ** 2) > 1e-3
 
 
+@pytest.mark.slow
 def test_more_than_there_is_room_for():
     """It is said when it happens, printed and drawn; twin: nothing is said where there is room."""
     with pytest.warns(lj.EventWarning, match="'section' happened 19 times, and the first 12 are kept"):

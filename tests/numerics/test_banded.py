@@ -60,6 +60,7 @@ def test_ill_conditioned():
         assert backward_error(np.asarray(banded.solver(entries)(jnp.asarray(r)))) <= max(4 * lapack, 1e-15)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("half_bandwidth", exhaustive_but((2,), (1, 2)))
 def test_derivatives_pass_by_the_elimination(half_bandwidth):
     """Both modes, through the solution of a linear system that is known as a function."""

@@ -194,7 +194,7 @@ def test_poisson(name, inside):
         pytest.param("finite cylinder", 2, ("a", "b"), marks=pytest.mark.slow),
         ("elliptic cylinder", 2, ("a", "b")),
         ("dumbbell", -1, ("radius", "c", "length")),
-        ("helix", 0, ("a", "h")),
+        pytest.param("helix", 0, ("a", "h"), marks=pytest.mark.slow),
     ],
 )
 def test_homogeneous_in_all_lengths(name, degree, lengths):

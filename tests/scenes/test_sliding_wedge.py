@@ -89,6 +89,7 @@ def motions():
     return {"rest": run(*rest, jnp.asarray(T)), "init": run(*moving, jnp.asarray(T)), "drop": run(*rest, drop)}
 
 
+@pytest.mark.slow
 def test_motion(motions):
     """Positions, energies, power, work and momentum after 0.75 s, and the drop to y = 1, to 1e-9."""
     m, M, g = PARAMS["m"], PARAMS["M"], PARAMS["g"]
@@ -125,6 +126,7 @@ def test_motion(motions):
     assert abs(wedge.horizontal_momentum(PARAMS, v) - reference("s5.p_x(t)")) < 1e-12
 
 
+@pytest.mark.slow
 def test_signs_of_the_work(motions):
     """The normal force brakes the particle and drives the wedge; the source's signs are both the other way."""
     traj = motions["rest"]

@@ -1,0 +1,82 @@
+"""Fits in files: bit for bit, with the functions that are given again."""
+
+import jax
+import numpy as np
+import pytest
+
+import lagjax as lj
+
+T = np.linspace(0.0, 3.0, 16)
+
+
+def swing(t, q, v, params):
+    """A spring of stiffness k."""
+    return 0.5 * v["x"] ** 2 - 0.5 * params["k"] * q["x"] ** 2
+
+
+def squared(t, q, v, params):
+    """What is measured."""
+    return {"d": q["x"] ** 2}
+
+
+spring = lj.System(swing)
+NOISE = 1e-3 * np.random.default_rng(0).normal(size=len(T))
+
+
+def check(found, path, *given):
+    """All arrays bit for bit, all else equal, and the same in print."""
+    found.save(path)
+    again = lj.load_fit(path, *given)
+    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(again), strict=True):
+        same = np.asarray(a).tobytes() == np.asarray(b).tobytes() if isinstance(a, (jax.Array, np.ndarray)) else a == b
+        assert type(a) is type(b) and same
+    assert jax.tree.structure(found) == jax.tree.structure(again) and repr(found) == repr(again)
+    return again
+
+
+@pytest.mark.slow
+def test_saved_and_loaded(tmp_path):
+    """With its functions it goes on as before; without, it has what was found, and says what it misses."""
+    path, guess = tmp_path / "fit.npz", {"k": 3.5}
+    record = lj.Record(T, q={"x": np.cos(2.0 * T) + NOISE}, observed={"d": np.cos(2.0 * T) ** 2 + NOISE}, sigma=1e-3)
+    found = lj.fit(spring, record, guess, observe=squared)
+    again = check(found, path, spring, squared)
+    np.testing.assert_array_equal(again.motion().q["x"], found.motion().q["x"])
+    without = lj.load_fit(path)
+    assert repr(without) == repr(found) and without.params == found.params
+    np.testing.assert_array_equal(without.sd, found.sd)
+    np.testing.assert_array_equal(without.start_sd[0][0]["x"], found.start_sd[0][0]["x"])
+    np.testing.assert_array_equal(without.residuals()["d"], found.residuals()["d"])
+    for ask in (without.motion, without.laplace):
+        with pytest.raises(ValueError, match=r"needs the functions of the system \(System\(swing\)\)"):
+            ask()
+    check(without, path)
+    half = lj.load_fit(path, spring)
+    with pytest.raises(ValueError, match=r"needs observe, .*\n.*load_fit\(path, system, observe=...\)"):
+        half.laplace()
+    stiffer = lj.System(lambda t, q, v, params: swing(t, q, v, {"k": 2 * params["k"]}))
+    with pytest.raises(ValueError, match="the Lagrangian: its value was"):
+        lj.load_fit(path, stiffer)
+    with pytest.raises(TypeError, match="has no events that would have to be given"):
+        lj.load_fit(path, spring, events={})
+    with pytest.raises(ValueError, match=r"holds a fit, not a trajectory.\nFix: lj.load_fit"):
+        lj.load_trajectory(path)
+
+
+@pytest.mark.slow
+def test_constraints_and_options(tmp_path):
+    """The starts on constraints are known without them; options that hold functions are given again."""
+    rod = lj.System(
+        lambda t, q, v, params: 0.5 * (v["x"] ** 2 + v["y"] ** 2) - params["g"] * q["y"],
+        {"rod": lj.Holonomic(lambda t, q, params: q["x"] ** 2 + q["y"] ** 2 - 1.0)},
+    )
+    t, events = np.linspace(0.0, 0.4, 9), {"low": lj.Crossing(lambda t, q, v, params: q["x"])}
+    motion = lj.integrate(rod, {"x": 1.0, "y": 0.0}, {"x": 0.0, "y": 0.0}, {"g": 9.81}, ts=t)
+    record = lj.Record(t, q=jax.tree.map(lambda x: np.asarray(x) + NOISE[:9], motion.q), sigma=1e-3)
+    found = lj.fit(rod, record, {"g": 9.0}, events=events)
+    found.save(tmp_path / "fit.npz")
+    without, again = lj.load_fit(tmp_path / "fit.npz"), lj.load_fit(tmp_path / "fit.npz", rod, events=events)
+    assert repr(without) == repr(found) == repr(again)
+    for whole in (without, again):
+        assert jax.tree.map(float, whole.q0) == jax.tree.map(float, found.q0)
+    np.testing.assert_array_equal(again.motion().q["x"], found.motion().q["x"])

@@ -1,0 +1,61 @@
+"""Trajectories with names: dimensions, coordinates and attributes of their datasets."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import lagjax as lj
+
+TS = np.linspace(0.0, 1.0, 5)
+system = lj.System(
+    lambda t, q, v, params: 0.5 * jnp.sum(v["r"] ** 2) + 0.5 * v["a"] ** 2 - params["g"] * q["r"][1],
+    {"table": lj.Holonomic(lambda t, q, params: q["a"] - 2.0 * t)},
+)
+
+
+def thrown(g, ts=TS, **settings):
+    """A stone, and beside it what moves at the speed 2."""
+    q, v = {"r": jnp.array([0.0, 1.0]), "a": 0.0}, {"r": jnp.array([3.0, 4.0]), "a": 2.0}
+    return lj.integrate(system, q, v, {"g": g, "who": "me", "w": np.array([1.0, 2.0])}, ts=ts, **settings)
+
+
+def test_one_motion():
+    """Leaves by name, against time; what was integrated, in attributes; values are those of the trajectory."""
+    traj = thrown(10.0)
+    data = traj.to_xarray()
+    assert data["q.r"].dims == data["v.r"].dims == ("t", "r_0") and data["q.a"].dims == data["table"].dims == ("t",)
+    np.testing.assert_array_equal(data["t"], TS)
+    np.testing.assert_array_equal(data["v.r"], traj.v["r"])
+    np.testing.assert_allclose(data["q.r"].sel(t=0.5), [1.5, 1.75], atol=1e-12)
+    assert data.attrs["params.g"] == 10.0 and data.attrs["params.who"] == "me" and data.attrs["params.w"] == [1.0, 2.0]
+    assert data.attrs["method"] == "Dopri8" and data.attrs["rtol"] == [1e-9, 1e-9]
+    assert data.attrs["result"] == data["result"].attrs["flag_meanings"] == "successful"
+    assert int(data["num_steps"]) == traj.stats["num_steps"] and "error.q.a" in data
+
+
+@pytest.mark.slow
+def test_batches():
+    """Axes in front, under their names; parameters are variables, and times that lanes do not share too."""
+    lanes = jax.vmap(thrown)(jnp.array([1.0, 10.0]))
+    data = lanes.to_xarray()
+    assert data["q.r"].dims == ("batch", "t", "r_0") and data["params.g"].dims == ("batch",)
+    np.testing.assert_array_equal(data["params.g"], [1.0, 10.0])
+    named = lanes.to_xarray("g")
+    assert named["q.a"].dims == ("g", "t") and named["params.w"].dims == ("g", "params.w_0")
+    with pytest.raises(ValueError, match="2 names, 'g', 'm', and this trajectory 1 axes"):
+        lanes.to_xarray(("g", "m"))
+    own = jax.tree.map(lambda x: x, lanes)
+    own = own.__class__(**{**vars(own), "t": jnp.stack([lanes.t[0], 2 * lanes.t[1]])})
+    assert "t" not in own.to_xarray().coords and own.to_xarray()["times"].dims == ("batch", "t")
+
+
+@pytest.mark.slow
+def test_phases_and_events():
+    """The phase of each output, in numbers with their meaning; the times of switches."""
+    ball = lj.System(lambda t, q, v, params: 0.5 * v**2 - 10.0 * q)
+    floor = lj.Switch("air", to="air", when=lambda t, q, v, params: q, reset=lambda t, q, v, params: -0.5 * v)
+    data = lj.integrate(lj.Hybrid({"air": ball}, [floor], most_switches=3), 5.0, 0.0, ts=np.array([0.0, 1.5]))
+    data = data.to_xarray()
+    assert data["phase"].dims == ("t",) and data["phase"].attrs["flag_meanings"] == "air"
+    np.testing.assert_allclose(data["events.switches"][0], 1.0, atol=1e-9)
