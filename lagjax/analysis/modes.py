@@ -143,7 +143,7 @@ class NormalModes(eqx.Module):
     def __repr__(self):
         if coordinates.is_traced(self.roots) or np.ndim(self.code):
             return f"NormalModes of shape {np.shape(self.roots)}"
-        rows = [f"{len(self)} modes: {self.verdict}", f"  {self.reason}"]
+        rows = [f"{len(self)} mode{'s' * (len(self) > 1)}: {self.verdict}", f"  {self.reason}"]
         for i in range(len(self)):
             values = (
                 ""
@@ -172,7 +172,7 @@ def normal_modes(system, t=None, q=None, v=None, params=None) -> NormalModes:
     ...     return 0.5 * v**2 + turning + params["g"] * jnp.cos(q)
     >>> system = lj.System(bead)
     >>> normal_modes(system, 0.0, 0.0, 0.0, {"omega": 2.0, "g": 20.0})
-    1 modes: stable
+    1 mode: stable
       all that oscillates has positive energy, which is conserved
       0  frequency 4            growth 0           swings: q
     >>> print(normal_modes(system, 0.0, 0.0, 0.0, {"omega": 5.0, "g": 9.0}).verdict)

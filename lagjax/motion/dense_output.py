@@ -59,7 +59,7 @@ def at(trajectory: Trajectory, t: ArrayLike) -> Snapshot:
     """The motion at times of any shape: see `Trajectory.at`."""
     _check_can_be_continued(trajectory)
     dtype = trajectory.t.dtype
-    t = coordinates.numpy_of(t).asarray(t, dtype)
+    t = _times(t, dtype)
     if not is_eager() or coordinates.is_traced((trajectory, t)):
         return _traced(trajectory, t)
     if trajectory.t.ndim > 1:
@@ -270,6 +270,13 @@ def _check_ended(trajectory, t):
             "Fix: times up to traj.end.t; what went wrong is in traj.result, and an event ends a motion where its "
             "lj.Crossing is terminal."
         )
+
+
+def _times(t, dtype):
+    given, t = t, coordinates.numpy_of(t).asarray(t)
+    if not (jnp.issubdtype(t.dtype, jnp.floating) or jnp.issubdtype(t.dtype, jnp.integer)):
+        raise TypeError(f"t must be a time or an array of times, not {given!r:.60}.\nFix: traj.at(0.5).")
+    return t.astype(dtype)
 
 
 def _check_inside(t, first, last):

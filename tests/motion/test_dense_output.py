@@ -109,6 +109,8 @@ def test_where_there_is_no_motion():
     for t, words in ((3.0, "ended by its event"), (-0.1, "outside of the motion"), (np.nan, "outside of the motion")):
         with pytest.raises(ValueError, match=words):
             traj.at(t)
+    with pytest.raises(TypeError, match="a time or an array of times, not 'noon'"):
+        traj.at("noon")
     inside = jax.jit(lambda traj, t: traj.at(t).q)(traj, np.array([-0.1, 1.0, 3.0]))
     assert list(np.isnan(inside)) == [True, False, True] and abs(inside[1] - exact(1.0)[0]) < 1e-9
 
