@@ -118,7 +118,7 @@ class Hybrid(eqx.Module):
     >>> bouncing
     Hybrid: 1 phase, 1 switch, at most 4 in a motion
       flying -> flying  (resets the state)
-    >>> traj = lj.integrate(bouncing, 5.0, 0.0, {"g": 10.0}, ts=jnp.array([0.0, 1.0, 1.5]))
+    >>> traj = lj.integrate(bouncing, 5.0, 0.0, {"g": 10.0}, ts=jnp.array([0.0, 0.5, 1.5]))
     >>> print(f"{traj.q[-1]:.6f} {traj.switches.t[0]:.6f}")
     1.250000 1.000000
 
