@@ -134,11 +134,8 @@ def test_killed_and_resumed(tmp_path):
 @pytest.mark.slow
 def test_interrupted_from_the_keyboard(tmp_path):
     """The process ends well, with what it had, and says so."""
-    path, computed, tries = tmp_path / "sweep", POINTS, 0
+    path, computed = tmp_path / "sweep", POINTS
     while computed == POINTS:
-        tries += 1
-        if tries > 20:
-            pytest.skip("each sweep was over before it was interrupted")
         # On a busy machine a sweep may be over before it is interrupted, and is tried again.
         shutil.rmtree(path, ignore_errors=True)
         process = started(path)

@@ -4,6 +4,7 @@ It rests after each chunk, so that there is a while in which it can be killed.
 With a port the processes know of each other by `jax.distributed`, which then says which part is whose.
 """
 
+import signal
 import sys
 import time
 
@@ -46,6 +47,8 @@ class Resting(Silent):
 
 
 if __name__ == "__main__":
+    # A shell has what it starts in the background ignore Ctrl-C, and Python keeps to that.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     engine._meter = lambda total, progress: Resting()
     store, k, n, points, *port = sys.argv[1], *map(int, sys.argv[2:])
     if port:
