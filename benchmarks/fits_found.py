@@ -25,7 +25,7 @@ from measure import machine, row, versions, written
 
 import lagjax as lj
 from lagjax.fitting.equations import dampened
-from lagjax.motion.trajectory import in_words
+from lagjax.motion.results import in_words
 from lagjax.scenes import bead_on_hoop, cross_rails, mass_distributions
 
 jax.config.update("jax_enable_x64", True)

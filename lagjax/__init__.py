@@ -39,9 +39,10 @@ from lagjax.motion.integrate import integrate
 from lagjax.motion.ledger import EnergyLedger, energy_ledger
 from lagjax.motion.phase_graph import HybridExplanation
 from lagjax.motion.replay import Replay
+from lagjax.motion.results import RESULTS
 from lagjax.motion.saved import load_trajectory
 from lagjax.motion.sections import PoincareSection, periods, poincare, turning_points
-from lagjax.motion.trajectory import RESULTS, AccuracyWarning, Snapshot, Trajectory
+from lagjax.motion.trajectory import AccuracyWarning, Snapshot, Trajectory
 from lagjax.numerics.nystrom import Nystrom8, Nystrom12
 from lagjax.numerics.radau import Radau5
 from lagjax.numerics.runge_kutta import Dopri8, Tsit5

@@ -23,7 +23,7 @@ from lagjax.mechanics.packed import pack
 from lagjax.mechanics.system import System
 from lagjax.motion.consistency import stopped
 from lagjax.motion.reported import Report, reported
-from lagjax.motion.trajectory import RESULTS
+from lagjax.motion.results import RESULTS
 
 # A driven system must be the same after a period to this part of what it does in one.
 SAME = 1e-5

@@ -15,7 +15,8 @@ from jaxtyping import PyTree
 from lagjax.comparison.programs import Motion, Program
 from lagjax.motion.backward import runs_backward
 from lagjax.motion.crossings import Crossing
-from lagjax.motion.trajectory import Trajectory, ended_well
+from lagjax.motion.results import ended_well
+from lagjax.motion.trajectory import Trajectory
 
 # Where a motion is looked at to find its largest values, at this tolerance.
 PLACES, ROUGHLY = 200, 1e-5

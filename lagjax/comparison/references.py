@@ -20,7 +20,8 @@ from lagjax.comparison.compared import Compared, Scales, States
 from lagjax.comparison.methods import TIGHTEST, usual
 from lagjax.comparison.programs import Motion, Program
 from lagjax.mechanics import coordinates
-from lagjax.motion.trajectory import Trajectory, ended_well, message
+from lagjax.motion.results import ended_well, message
+from lagjax.motion.trajectory import Trajectory
 from lagjax.numerics.radau import Radau5
 
 # A given answer that is farther from solves than these are from each other, by so much, is off.

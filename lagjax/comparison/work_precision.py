@@ -23,7 +23,8 @@ from lagjax.mechanics.system import System
 from lagjax.motion import problem
 from lagjax.motion.crossings import Crossing
 from lagjax.motion.integrate import integrate
-from lagjax.motion.trajectory import Trajectory, ended_well, message
+from lagjax.motion.results import ended_well, message
+from lagjax.motion.trajectory import Trajectory
 from lagjax.numerics.evaluations import evaluations_a_step
 
 # What of `integrate` means the same for every method.

@@ -21,8 +21,9 @@ from jaxtyping import PyTree
 from lagjax.jax_internals.one_function import calls_host, poisoned
 from lagjax.jax_internals.primitives import jaxpr_as_fun
 from lagjax.jax_internals.tracing import SILENT
-from lagjax.motion.trajectory import RESULTS, Trajectory
-from lagjax.motion.trajectory import in_words as result_in_words
+from lagjax.motion.results import RESULTS
+from lagjax.motion.results import in_words as result_in_words
+from lagjax.motion.trajectory import Trajectory
 
 # What a process without lagjax can take and give.
 PLAIN = (dict, list, tuple)

@@ -25,7 +25,7 @@ from lagjax.fitting.records import PADDING, Windows
 from lagjax.fitting.starts import Starts
 from lagjax.mechanics.compiled import compiled
 from lagjax.motion.integrate import integrate
-from lagjax.motion.trajectory import ended_well
+from lagjax.motion.results import ended_well
 from lagjax.numerics.chained import Equations, Slopes, Unknowns
 
 # A sample that is not reached counts as missed by this many spreads of its data.

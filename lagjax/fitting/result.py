@@ -29,7 +29,8 @@ from lagjax.mechanics.diagnosis import listed
 from lagjax.mechanics.signature import UnknownSystem
 from lagjax.motion.integrate import integrate
 from lagjax.motion.reported import Report
-from lagjax.motion.trajectory import RESULTS, Trajectory
+from lagjax.motion.results import RESULTS
+from lagjax.motion.trajectory import Trajectory
 from lagjax.numerics.chained import Unknowns
 
 # A number that is closer to its bound than this, relative to the bound's size, or its start's, is at it.

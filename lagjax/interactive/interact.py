@@ -31,7 +31,7 @@ from lagjax.interactive.controls import (
     words,
 )
 from lagjax.interactive.picture import DPI, WIDTH, Picture
-from lagjax.motion.trajectory import in_words
+from lagjax.motion.results import in_words
 from lagjax.sweeps.axes import axes_of
 from lagjax.sweeps.drawn import drawn
 from lagjax.sweeps.lanes import LAYOUTS, TRUSTED

@@ -30,8 +30,9 @@ from lagjax.motion.arriving import WHOLE_STEPS
 from lagjax.motion.backward import in_either_direction
 from lagjax.motion.hybrid_trajectory import NO_PHASE, HybridTrajectory
 from lagjax.motion.reported import patient
+from lagjax.motion.results import ENDED_WELL, in_words
 from lagjax.motion.solve import Settings
-from lagjax.motion.trajectory import ENDED_WELL, Snapshot, Trajectory, in_words
+from lagjax.motion.trajectory import Snapshot, Trajectory
 
 # Controllers that can begin anywhere. Others have a plan of their own for the whole motion.
 BEGIN_ANYWHERE = type(None), diffrax.PIDController, diffrax.ConstantStepSize, diffrax.ClipStepSizeController

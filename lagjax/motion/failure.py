@@ -12,10 +12,11 @@ from lagjax.mechanics.multipliers import accelerations
 from lagjax.motion import problem
 from lagjax.motion.hybrid_trajectory import HybridTrajectory
 from lagjax.motion.one_solve import START_TOLERANCES
+from lagjax.motion.results import RESULTS, is_among, message
 from lagjax.motion.solve import Settings
 from lagjax.motion.stopped_early import stopped_early
 from lagjax.motion.tolerances import tolerances_at
-from lagjax.motion.trajectory import RESULTS, Trajectory, is_among, message, pack
+from lagjax.motion.trajectory import Trajectory, pack
 
 # Switches at times that differ by less than this part of the last time are at one time.
 AT_ONE_TIME = 1e-12

@@ -23,7 +23,8 @@ from jax import lax
 from lagjax.jax_internals.tracing import is_eager
 from lagjax.motion.accuracy import Errors, columns, scaled_error
 from lagjax.motion.consistency import stopped
-from lagjax.motion.trajectory import ENDED_WELL, RESULTS, Trajectory, ended_well, is_among
+from lagjax.motion.results import ENDED_WELL, RESULTS, ended_well, is_among
+from lagjax.motion.trajectory import Trajectory
 
 # The tightest tolerance that is not below round-off.
 ROUND_OFFS = 8

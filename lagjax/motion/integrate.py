@@ -30,10 +30,11 @@ from lagjax.motion.global_error import steps_to_repeat
 from lagjax.motion.no_lanes import raise_at_run_time
 from lagjax.motion.replay import Replay
 from lagjax.motion.reported import patient, report
+from lagjax.motion.results import ENDED_WELL, is_among
 from lagjax.motion.slips import warn_of_odd_dissipation
 from lagjax.motion.solve import Settings
 from lagjax.motion.switching import each_phase, phases_in, refuse_beside_switches, starting
-from lagjax.motion.trajectory import BY_INTEGRATION, ENDED_WELL, Trajectory, is_among
+from lagjax.motion.trajectory import BY_INTEGRATION, Trajectory
 
 BY_INTEGRATION["at"] = at
 

@@ -36,8 +36,9 @@ from lagjax.motion.hybrid_trajectory import NO_PHASE, SWITCHES, Switches
 from lagjax.motion.loop import resolution
 from lagjax.motion.one_solve import solved
 from lagjax.motion.recorded import nothing, with_those_of
+from lagjax.motion.results import RESULTS
 from lagjax.motion.sight import uneven
-from lagjax.motion.trajectory import RESULTS, Snapshot
+from lagjax.motion.trajectory import Snapshot
 
 # What a guard may be below zero where a motion starts, in tolerances of what it is made of.
 NOT_BELOW = 1e2

@@ -7,7 +7,8 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from lagjax.jax_internals.primitives import primitive
-from lagjax.motion.trajectory import RESULTS, Trajectory, ended_well
+from lagjax.motion.results import RESULTS, ended_well
+from lagjax.motion.trajectory import Trajectory
 
 
 def raise_at_run_time(trajectory: Trajectory) -> Trajectory:

@@ -20,8 +20,9 @@ from lagjax.motion.consistency import returned, stopped, within, worst_residual
 from lagjax.motion.crossing_times import all_known, by_name, end_of
 from lagjax.motion.global_error import ROUND_OFFS
 from lagjax.motion.loop import Solution, solution_of
+from lagjax.motion.results import RESULTS, ended_well
 from lagjax.motion.tolerances import Scales, rounding, scales_of, shared, span_of, tolerances_at
-from lagjax.motion.trajectory import RESULTS, Snapshot, ended_well, worst_drift
+from lagjax.motion.trajectory import Snapshot, worst_drift
 from lagjax.numerics.nystrom import Nystrom
 from lagjax.numerics.runge_kutta import ExplicitRungeKutta
 

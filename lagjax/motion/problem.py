@@ -17,7 +17,8 @@ from lagjax.motion.account import account_of, warning_of
 from lagjax.motion.consistency import departures
 from lagjax.motion.global_error import ROUND_OFFS
 from lagjax.motion.replay import Replay
-from lagjax.motion.trajectory import RESULTS, AccuracyWarning
+from lagjax.motion.results import RESULTS
+from lagjax.motion.trajectory import AccuracyWarning
 
 # Tolerances that each dtype reaches with room to spare.
 DEFAULT_TOLERANCE = {np.dtype("float64"): 1e-9, np.dtype("float32"): 1e-5}

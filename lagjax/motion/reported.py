@@ -19,7 +19,8 @@ from lagjax.jax_internals.primitives import primitive
 from lagjax.jax_internals.programs import applied, bodies, equations, interpreted, stands_for
 from lagjax.jax_internals.tracing import REGULAR_FIRST, WATCHED
 from lagjax.motion.consistency import stopped
-from lagjax.motion.trajectory import RESULTS, Trajectory
+from lagjax.motion.results import RESULTS
+from lagjax.motion.trajectory import Trajectory
 
 # In a program for many lanes that wait for each other, the steps after which a motion is given up, to be run alone.
 PATIENCE = jax.make_user_context(default_value=None)

@@ -31,10 +31,10 @@ from lagjax.mechanics.equations import equations_of
 from lagjax.motion.accuracy import of_a_step
 from lagjax.motion.consistent_state import consistent_state
 from lagjax.motion.loop import method_alone
+from lagjax.motion.results import RESULTS
 from lagjax.motion.solve import method_of
 from lagjax.motion.stepping import Field
 from lagjax.motion.tolerances import tolerances_at
-from lagjax.motion.trajectory import RESULTS
 
 # The steps that are looked at; the first of them only find their length.
 LOOKED_AT, SETTLED = 160, 40

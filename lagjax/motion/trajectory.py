@@ -26,12 +26,7 @@ from lagjax.motion.consistency import worst_residual
 from lagjax.motion.crossings import Crossings
 from lagjax.motion.curves import curves, finite
 from lagjax.motion.labelled import dataset
-from lagjax.motion.results import ENDED_WELL as ENDED_WELL
-from lagjax.motion.results import RESULTS as RESULTS
-from lagjax.motion.results import ended_well as ended_well
-from lagjax.motion.results import in_words as in_words
-from lagjax.motion.results import is_among as is_among
-from lagjax.motion.results import message as message
+from lagjax.motion.results import RESULTS
 from lagjax.motion.saving import save
 
 

@@ -22,7 +22,8 @@ from lagjax.mechanics.reactions import force_at
 from lagjax.mechanics.structure import sees_time
 from lagjax.motion.hybrid_trajectory import HybridTrajectory
 from lagjax.motion.integrate import integrate
-from lagjax.motion.trajectory import ENDED_WELL, Trajectory, is_among, message
+from lagjax.motion.results import ENDED_WELL, is_among, message
+from lagjax.motion.trajectory import Trajectory
 from lagjax.numerics import quadrature
 
 FORCE, DISSIPATION, TIME = "force", "dissipation", "explicit time"

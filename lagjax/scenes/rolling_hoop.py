@@ -43,7 +43,7 @@ from lagjax.mechanics.multipliers import accelerations
 from lagjax.mechanics.system import System
 from lagjax.motion.crossings import Crossing
 from lagjax.motion.integrate import integrate
-from lagjax.motion.trajectory import RESULTS
+from lagjax.motion.results import RESULTS
 from lagjax.report import Case, Run, Scene, relative_error
 from lagjax.scenes import by_hand
 

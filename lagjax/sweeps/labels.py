@@ -13,7 +13,8 @@ import jax
 import numpy as np
 from jaxtyping import PyTree
 
-from lagjax.motion.trajectory import RESULTS, Trajectory, in_words
+from lagjax.motion.results import RESULTS, in_words
+from lagjax.motion.trajectory import Trajectory
 from lagjax.sweeps.axes import POINT, Axes
 from lagjax.sweeps.lanes import LOST, NOT_RUN, Status
 

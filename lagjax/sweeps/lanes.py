@@ -17,7 +17,8 @@ from jaxtyping import PyTree
 from lagjax.jax_internals.tracing import REGULAR_FIRST
 from lagjax.mechanics.in_words import Call, check_arguments, in_words
 from lagjax.motion.reported import PATIENCE, reporting
-from lagjax.motion.trajectory import ENDED_WELL, RESULTS, Trajectory
+from lagjax.motion.results import ENDED_WELL, RESULTS
+from lagjax.motion.trajectory import Trajectory
 from lagjax.sweeps.axes import POINT, Axes
 from lagjax.sweeps.digests import program_digest
 

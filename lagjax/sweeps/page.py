@@ -10,7 +10,8 @@ from jaxtyping import PyTree
 from lagjax.animation import film
 from lagjax.mechanics.in_words import Call, check_arguments
 from lagjax.motion.frames import film_of_lanes
-from lagjax.motion.trajectory import RESULTS, Trajectory
+from lagjax.motion.results import RESULTS
+from lagjax.motion.trajectory import Trajectory
 from lagjax.pages import Page, encoded, fragment
 from lagjax.pages.page import in_bytes
 from lagjax.plot import COLOURS

@@ -11,7 +11,7 @@ import jax
 import numpy as np
 
 from lagjax.jax_internals.one_function import TOGETHER
-from lagjax.motion.trajectory import RESULTS
+from lagjax.motion.results import RESULTS
 from lagjax.sweeps.remembered import program_for
 
 # On a CPU each core gets so many chunks or more, so that none waits long for the last.
