@@ -30,6 +30,15 @@ def figure(rows=1, columns=1, size=(4.6, 3.2), **options):
     return fig, axes
 
 
+def panel_axes(count, across, size):
+    """Make a figure of `count` axes of `size` inches, at most `across` beside each other; returns (figure, axes)."""
+    columns = min(across, count)
+    fig, axes = figure(-(-count // columns), columns, size)
+    for axis in axes.flat[count:]:
+        axis.set_visible(False)
+    return fig, list(axes.flat[:count])
+
+
 def _png(fig):
     buffer = io.BytesIO()
     fig.savefig(buffer, format="png")
@@ -105,9 +114,8 @@ def phase_portrait(panels: dict[str, tuple[list[tuple[np.ndarray, np.ndarray]], 
 
     **Returns:** a matplotlib `Figure`.
     """
-    columns = min(3, len(panels))
-    fig, axes = figure(-(-len(panels) // columns), columns, size=(4.2, 3.4))
-    for axis, (name, (curves, is_angle)) in zip(axes.flat, panels.items()):
+    fig, axes = panel_axes(len(panels), 3, (4.2, 3.4))
+    for axis, (name, (curves, is_angle)) in zip(axes, panels.items()):
         around = is_angle and any(np.ptp(q) > 2 * np.pi for q, _ in curves)
         for i, (q, v) in enumerate(curves):
             x, y = _cut_at_half_turns(q, v) if around else (q, v)
@@ -117,8 +125,6 @@ def phase_portrait(panels: dict[str, tuple[list[tuple[np.ndarray, np.ndarray]], 
             _ticks_in_pi(axis)
         entry = name[1:] if name == "q" or name.startswith("q[") else f": {name}"
         axis.set(xlabel=f"q{entry}", ylabel=f"v{entry}")
-    for axis in axes.flat[len(panels) :]:
-        axis.set_visible(False)
     return fig
 
 
@@ -130,9 +136,8 @@ def section(panels: dict[tuple[str, str], tuple[list[tuple[np.ndarray, np.ndarra
 
     **Returns:** a matplotlib `Figure`.
     """
-    columns = min(3, len(panels))
-    fig, axes = figure(-(-len(panels) // columns), columns, size=(4.2, 3.4))
-    for axis, ((to_the_right, upward), (motions, is_angle)) in zip(axes.flat, panels.items()):
+    fig, axes = panel_axes(len(panels), 3, (4.2, 3.4))
+    for axis, ((to_the_right, upward), (motions, is_angle)) in zip(axes, panels.items()):
         # Small enough for curves of many points to be told from areas.
         size = np.clip(80 / np.sqrt(1 + sum(len(x) for x, _ in motions)), 1.2, 5.0)
         for i, (x, y) in enumerate(motions):
@@ -140,8 +145,6 @@ def section(panels: dict[tuple[str, str], tuple[list[tuple[np.ndarray, np.ndarra
         if is_angle:
             _ticks_in_pi(axis)
         axis.set(xlabel=to_the_right, ylabel=upward)
-    for axis in axes.flat[len(panels) :]:
-        axis.set_visible(False)
     if note:
         fig.suptitle(note, fontsize=9)
     return fig
@@ -194,16 +197,13 @@ def work_precision(panels: Sequence[Drawn]):
 
     Errors of zero are drawn at half a unit of round-off; what is not to be trusted is hollow, on grey.
     """
-    columns = min(3, len(panels))
-    fig, axes = figure(-(-len(panels) // columns), columns, size=(4.9, 3.9))
+    fig, axes = panel_axes(len(panels), 3, (4.9, 3.9))
     names = list(dict.fromkeys(name for panel in panels for name in panel.curves))
-    for axis, panel in zip(axes.flat, panels):
+    for axis, panel in zip(axes, panels):
         _draw_work(axis, panel, names)
-    for axis in axes.flat[len(panels) :]:
-        axis.set_visible(False)
-    found = {label: line for axis in axes.flat for line, label in zip(*axis.get_legend_handles_labels())}
+    found = {label: line for axis in axes for line, label in zip(*axis.get_legend_handles_labels())}
     shown = [name for name in names if name in found]
-    handles, ncols = [found[name] for name in shown], min(len(shown), 3 * columns)
+    handles, ncols = [found[name] for name in shown], min(len(shown), 3 * min(3, len(panels)))
     fig.legend(handles, shown, fontsize=8, frameon=False, ncols=ncols, loc="outside lower center")
     return fig
 

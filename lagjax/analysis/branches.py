@@ -138,12 +138,9 @@ class Branches(eqx.Module):
                 f"Fix: plot({self.names[0]!r})."
             )
         shown = list(names) or self._varying(self._curves())
-        columns = min(2, len(shown))
-        fig, axes = plot.figure(-(-len(shown) // columns), columns, size=(4.8, 3.4))
-        for axis, name in zip(axes.flat, shown):
+        fig, axes = plot.panel_axes(len(shown), 2, (4.8, 3.4))
+        for axis, name in zip(axes, shown):
             self.draw(axis, name)
-        for axis in axes.flat[len(shown) :]:
-            axis.set_visible(False)
         handles = dict(zip(*reversed(_all_handles(axes))))
         fig.legend(
             handles.values(), handles.keys(), fontsize=8, frameon=False, ncols=min(4, len(handles)),
@@ -195,7 +192,7 @@ class Branches(eqx.Module):
 
 def _all_handles(axes):
     handles, labels = [], []
-    for axis in axes.flat:
+    for axis in axes:
         found = axis.get_legend_handles_labels()
         handles += found[0]
         labels += found[1]

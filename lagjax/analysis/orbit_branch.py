@@ -108,13 +108,10 @@ class OrbitBranch(eqx.Module):
                 f"Fix: plot({known[0]!r})."
             )
         shown = list(names) or known[:6]
-        columns = min(2, len(shown))
-        fig, axes = plot.figure(-(-len(shown) // columns), columns, size=(4.8, 3.4))
-        for axis, name in zip(axes.flat, shown):
+        fig, axes = plot.panel_axes(len(shown), 2, (4.8, 3.4))
+        for axis, name in zip(axes, shown):
             self.draw(axis, name)
-        for axis in axes.flat[len(shown) :]:
-            axis.set_visible(False)
-        axes.flat[0].legend(fontsize=8, frameon=False)
+        axes[0].legend(fontsize=8, frameon=False)
         return fig
 
     def draw(self, axis, name: str | None = None):
