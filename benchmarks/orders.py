@@ -23,6 +23,7 @@ from measure import main, row
 from scipy.integrate import solve_ivp
 
 import lagjax as lj
+from lagjax.mechanisms import double_pendulum
 from lagjax.numerics.simplified_newton import SimplifiedNewton
 
 jax.config.update("jax_enable_x64", True)
@@ -56,22 +57,10 @@ def by_angles(t, q, v, params):
     return kinetic + coupling + (m1 + m2) * g * l1 * jnp.cos(q[0]) + m2 * g * l2 * jnp.cos(q[1])
 
 
-def by_points(t, q, v, params):
-    """The two masses in their plane."""
-    kinetic = 0.5 * params["m1"] * v["a"] @ v["a"] + 0.5 * params["m2"] * v["b"] @ v["b"]
-    return kinetic - params["g"] * (params["m1"] * q["a"][1] + params["m2"] * q["b"][1])
-
-
 def henon_heiles(t, q, v, params):
     """A star in a galaxy's plane: cubic terms that couple two equal oscillators."""
     x, y = q
     return 0.5 * v @ v - (0.5 * (x**2 + y**2) + x**2 * y - y**3 / 3)
-
-
-RODS = {
-    "inner": lj.Holonomic(lambda t, q, params: q["a"] @ q["a"] - params["l1"] ** 2),
-    "outer": lj.Holonomic(lambda t, q, params: (q["b"] - q["a"]) @ (q["b"] - q["a"]) - params["l2"] ** 2),
-}
 
 
 def points(angles, rates):
@@ -79,7 +68,7 @@ def points(angles, rates):
     length = np.array([P["l1"], P["l2"]])[:, None]
     rods = length * np.stack([np.sin(angles), -np.cos(angles)], axis=-1)
     moves = length * np.stack([np.cos(angles), np.sin(angles)], axis=-1) * rates[..., None]
-    return tuple({"a": x[..., 0, :], "b": x[..., 0, :] + x[..., 1, :]} for x in (rods, moves))
+    return tuple(double_pendulum.Masses(x[..., 0, :], x[..., 0, :] + x[..., 1, :]) for x in (rods, moves))
 
 
 def textbook(t, y):
@@ -121,7 +110,7 @@ def rows(wanted):
     stars = [tuple(0.2 * rng.normal(size=(2, 2))) for _ in range(8)]
     forms = {
         "in angles": (lj.System(by_angles), [((ANGLES, RATES), angles)], OUTPUTS),
-        "on constraints": (lj.System(by_points, RODS), [rods], OUTPUTS),
+        "on constraints": (double_pendulum.system, [rods], OUTPUTS),
         "Hénon and Heiles": (lj.System(henon_heiles), [(star, exact(pull, *star, end)) for star in stars], end),
     }
     cases = [(form, *case) for case in GENERAL for form in ("in angles", "on constraints")]

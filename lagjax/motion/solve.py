@@ -90,14 +90,16 @@ def trajectory_of(*problem) -> Trajectory:
         share_used()
         return _inside(*problem)
     *motion, ts, guards, settings = problem
+    # Whether the compiler is told of makes no other program.
+    shown, settings = settings.progress, replace(settings, progress=bool(settings.progress))
     # Filled up by its last time.
     many = np.append(ts, np.full(filled_up(len(ts)) - len(ts), ts[-1]))
     of = lambda settings: parted((*motion, many, guards, settings))
     static, arrays = of(settings)
-    programs = kept((_Programs, static), lambda: _Programs(static, len(ts), settings.progress))
+    programs = kept((_Programs, static), lambda: _Programs(static, len(ts)))
     try:
-        found = programs.run(arrays, len(ts))
-        again = lambda closer: programs.run(of(closer)[1], len(ts), settled=True)
+        found = programs.run(arrays, len(ts), shown)
+        again = lambda closer: programs.run(of(closer)[1], len(ts), shown, settled=True)
         return with_errors(again, found, settings, ts) if settings.repeated_up_to else found
     except jax.errors.JaxRuntimeError:
         return _trajectory_of(*problem)[0]
@@ -120,27 +122,27 @@ class _Programs:
     """The compiled programs of one kind of motion: of equations taken for regular (None where they are not), and with
     the robust way. JAX keeps them as long as this object lives."""
 
-    def __init__(self, static, count, progress):
+    def __init__(self, static, count):
         jit = partial(jax.jit, compiler_options=compiler_options())
         self.regular: Callable | None = jit(partial(_of_arrays, static, False, count))
         self.robust: Callable = jit(partial(_of_arrays, static, True, count))
-        self._count, self._progress, self._compiled = count, progress, set()
+        self._count, self._compiled = count, set()
 
-    def run(self, arrays, count, settled=False):
+    def run(self, arrays, count, shown, settled=False):
         """The trajectory with so many outputs; where it is not settled, by the robust way, but if `settled`."""
         if self.regular is not None:
-            found, rows, well = self._called(self.regular, arrays)
+            found, rows, well = self._called(self.regular, arrays, shown)
             if settled or well:
                 return self._first_outputs(found, rows, count)
             self.regular = None
-        found, rows, _ = jax.block_until_ready(self._called(self.robust, arrays))
+        found, rows, _ = jax.block_until_ready(self._called(self.robust, arrays, shown))
         return self._first_outputs(found, rows, count)
 
-    def _called(self, program, arrays):
-        """What a program returns; the first time somebody is told that it compiles."""
+    def _called(self, program, arrays, shown):
+        """What a program returns; the first time somebody is told that it compiles, as `shown` (see `waiting`) says."""
         if program in self._compiled:
             return program(arrays)
-        with waiting(self._progress, "compiling"):
+        with waiting(shown, "compiling"):
             found = program(arrays)
         self._compiled.add(program)
         return found

@@ -1,5 +1,7 @@
 """The answer prints itself, plots itself, and carries what it was made of."""
 
+from contextlib import nullcontext
+
 import diffrax
 import jax
 import jax.numpy as jnp
@@ -9,6 +11,7 @@ import pytest
 
 import lagjax as lj
 from lagjax.mechanics.structure import what_changes_jacobi_integral
+from lagjax.motion import solve
 from tests.systems import HORIZONTAL, PARAMS, TS, pendulum, rod_pendulum
 
 matplotlib.use("agg")
@@ -136,6 +139,21 @@ def test_phase_portrait_ends_with_the_motion():
 
 
 @pytest.mark.slow
+def test_the_wait_for_the_compiler_is_told_once(monkeypatch):
+    """The first motion of a kind says that it compiles, to whom `progress` says; the next one compiles nothing."""
+    told = []
+    monkeypatch.setattr(solve, "waiting", lambda *said: told.append(said) or nullcontext())
+    system = lj.System(lambda t, q, v, params: 0.5 * v**2 - params["g"] * q)
+    for g in (1.0, 2.0):
+        lj.integrate(system, 1.0, 0.0, {"g": g}, ts=TS, estimate_error=False)
+    assert told == [(None, "compiling")]
+    # Not to show it makes no other program, and another system does.
+    lj.integrate(system, 1.0, 0.0, {"g": 1.0}, ts=TS, estimate_error=False, progress=False)
+    assert len(told) == 1
+    lj.integrate(lj.System(lambda t, q, v, params: v**2), 1.0, 0.0, ts=TS, estimate_error=False, progress=False)
+    assert told[1:] == [(False, "compiling")]
+
+
 def test_progress_is_shown(capfd):
     """`progress=True` shows a meter."""
     jax.block_until_ready(lj.integrate(pendulum, 1.0, 0.0, PARAMS, ts=TS, progress=True))
