@@ -13,8 +13,8 @@ import jaxlib.version
 
 from lagjax.jax_internals.trial import survives
 
-# With 0.10.2 all tests run; with 0.12.0.1 those of this package, a pendulum and a rod.
-KNOWN = {"0.10.2", "0.12.0.1"}
+# With 0.10.2 all tests run; with 0.10.1 the fast ones; with 0.12.0.1 those of this package, a pendulum and a rod.
+KNOWN = {"0.10.1", "0.10.2", "0.12.0.1"}
 # Read once: compiled programs are kept, and must not mix.
 _WANTED = os.environ.get("LAGJAX_PLAIN", "")
 _decided: list[bool] = []
