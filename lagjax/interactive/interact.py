@@ -1,8 +1,8 @@
 """Turn parameters and see the motion follow: one compiled program, one picture, and a slider for each parameter.
 
-A change of a slider costs a call of the program (about a millisecond for a small system), 2 ms of drawing, 4 ms of PNG,
-and what the notebook takes to bring it to the screen. While a picture is made others wait, and only the last position
-of a slider is drawn next: dragging leaves no queue.
+A change of a slider costs a call of the program (about a millisecond for a small system), another to write the lines,
+and the time the notebook takes to bring them to the screen. While a picture is made others wait, and only the last
+position of a slider is drawn next: dragging leaves no queue.
 """
 
 import html
@@ -103,7 +103,7 @@ class Knobs:
 
     - `point`: the values of the knobs, by name; `set(omega=2.0)` changes them.
     - `result`: what `run` returned there, in NumPy; `status`: how it went, in words; `ok`: whether it is to be trusted.
-    - `picture`: the PNG that is shown; `save(path)` writes it.
+    - `picture`: what is shown, as PNG; `save(path)` writes it.
     - `seconds`: how long the last one took.
     - `widget`: the ipywidgets of it, to be put beside others.
     """
@@ -112,15 +112,18 @@ class Knobs:
         widgets = import_widgets()
         self._run, self._controls, self._draw, self._progress = run, controls, draw, progress
         self._programs, self._picture, self._lock = {}, Picture(), threading.RLock()
-        self._free_at, self._shown, self._held = 0.0, None, False
+        self._free_at, self._sent, self._shown, self._held = 0.0, 0, None, False
         self.result: Any = None
         self.status, self.ok, self.seconds = "", False, 0.0
         self._sliders = {name: widget(name, control, point[name]) for name, control in controls.items()}
-        whole = widgets.Layout(width=f"{round(WIDTH * DPI)}px", max_width="100%", object_fit="contain")
-        self._image = widgets.Image(format="png", layout=whole)
+        # Two layers in one cell of a grid.
+        size = {"width": f"{round(WIDTH * DPI)}px", "max_width": "100%", "margin": "0"}
+        layer = widgets.Layout(grid_area="1 / 1", **size)
+        self._below, self._over = widgets.Image(format="png", layout=layer), widgets.HTML(layout=layer)
+        both = widgets.GridBox([self._below, self._over], layout=widgets.Layout(**size))
         # What failed stands in the picture, and here for those who have it read to them.
         self._message = widgets.HTML()
-        self.widget = widgets.VBox([*self._sliders.values(), self._image, self._message])
+        self.widget = widgets.VBox([*self._sliders.values(), both, self._message])
         # What `run` or `draw` raises at the first point is the user's to see.
         self._picture_at(point)
         self._follow()
@@ -134,8 +137,9 @@ class Knobs:
 
     @property
     def picture(self) -> bytes:
-        """The PNG that is shown."""
-        return self._image.value
+        """The picture that is shown, as PNG."""
+        with self._lock:
+            return self._picture.png()
 
     def set(self, **values) -> "Knobs":
         """Turn knobs to other values, all at once; returns itself.
@@ -172,7 +176,7 @@ class Knobs:
                 at = tuple(slider.value for slider in self._sliders.values())
             self._show(self.point)
             self._shown = at
-            self._free_at = time.monotonic() + len(self._image.value) / MOST_A_SECOND
+            self._free_at = time.monotonic() + self._sent / MOST_A_SECOND
 
     def _show(self, point):
         began = time.perf_counter()
@@ -182,7 +186,8 @@ class Knobs:
             # In a callback of a widget nobody would see it, and the sliders would be dead.
             self.ok, self.status = False, f"{type(error).__name__}: {error}"
             picture = self._picture.of_words(self.status)
-        self._image.value = picture
+        self._sent = len(picture.over) + (len(picture.below) if self._below.value != picture.below else 0)
+        self._below.value, self._over.value = picture
         said = "" if self.ok else f'<span role="status">{html.escape(self.status)}</span>'
         if self._message.value != said:
             self._message.value = said

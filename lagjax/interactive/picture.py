@@ -1,15 +1,17 @@
-"""A picture that follows: lines in a matplotlib figure without a window, of which only the lines are drawn again.
+"""A picture that follows: axes in a PNG that seldom changes, and over them lines and words as SVG.
 
-A whole figure takes matplotlib 30 ms and more, most of it for axes, ticks and words that stay. So these are drawn once
-and kept as pixels; for another value the pixels are put back and the lines drawn over them, in 2 ms. Limits stay, so
-that two values can be compared by eye, until the lines leave them, or fill less than an eighth of them; then the whole
-is drawn again. 64 colours make the PNG small (15 kB) and quick (4 ms): a notebook's server lets through 1 MB/s.
+Drawing a whole figure takes matplotlib 30 ms and more, most of it for axes, ticks and labels that stay the same. These
+are drawn once, as a PNG. For another value only the lines change, and a browser draws a few kilobytes of SVG sooner
+than it fetches and decodes another PNG. The limits of the axes stay, so that two values can be compared by eye, until
+the lines leave them or fill less than an eighth of them; then the whole figure is drawn again. With 64 colours the PNG
+is small (10 kB) and quick to write (4 ms): a notebook's server lets through 1 MB/s.
 """
 
+import html
 import io
 import textwrap
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -23,6 +25,17 @@ COLOURS = 64
 # What stands around the lines, as a share of their size, and the share of the limits that they must fill.
 ROOM, LEAST = 0.08, 1 / 8
 MOST_PANELS = 4
+# Units of the SVG in a pixel: whole numbers are short to write.
+FINE = 10
+# Curves of more points than this are thinned to what a column of pixels shows.
+MOST_POINTS = 4000
+
+
+class Layers(NamedTuple):
+    """A picture in two layers: the PNG `below`, and the SVG `over` it, of the same size or empty."""
+
+    below: bytes
+    over: str
 
 
 class Picture:
@@ -32,8 +45,8 @@ class Picture:
         plot.import_matplotlib()
         self.kind, self.drawn_whole = None, 0
 
-    def of_curves(self, found: Drawn, words: str) -> bytes:
-        """The PNG of numbers and curves, those of the first lane."""
+    def of_curves(self, found: Drawn, words: str) -> Layers:
+        """Numbers and curves, those of the first lane."""
         panels = found.panels[:MOST_PANELS]
         kind = [(panel.label, panel.across, *panel.curves) for panel in panels]
         if kind != self.kind:
@@ -70,15 +83,22 @@ class Picture:
         if not stays:
             self._whole()
             self._background = self._canvas.copy_from_bbox(self.figure.bbox)
+            self._below = self._written()
+        return Layers(self._below, self._over())
+
+    def png(self) -> bytes:
+        """Both layers of the last picture in one PNG."""
+        if self._background is None:
+            return self._below
         self._canvas.restore_region(self._background)
         for axis, lines in zip(self.axes, self._lines):
             for line in lines:
                 axis.draw_artist(line)
         self.figure.draw_artist(self._above)
-        return self._png()
+        return self._written()
 
-    def of_user(self, draw: Callable, result: Any, words: str) -> bytes:
-        """The PNG of what the user's `draw(result, axes)` draws: the whole is drawn again."""
+    def of_user(self, draw: Callable, result: Any, words: str) -> Layers:
+        """What the user's `draw(result, axes)` draws: the whole figure is drawn again, with nothing over it."""
         if self.kind != "user":
             self._new(1)
             self.kind = "user"
@@ -86,22 +106,23 @@ class Picture:
         axis.clear()
         axis.grid(True, linewidth=0.4, alpha=0.5)
         draw(result, axis)
-        self._words(words, "")
-        self._whole()
-        self.figure.draw_artist(self._above)
-        return self._png()
+        return self._in_one_layer(words)
 
-    def of_words(self, words: str) -> bytes:
-        """The PNG of what went wrong: what was drawn before, without its lines."""
+    def of_words(self, words: str) -> Layers:
+        """What went wrong, above the axes that were drawn before, without their lines."""
         if self.kind is None or self.kind == "user":
             self._new(1)
             self.axes[0].set_axis_off()
             self.kind = "words"
+        return self._in_one_layer(words)
+
+    def _in_one_layer(self, words):
         self._words(words, "")
         self._whole()
         self._background = None
         self.figure.draw_artist(self._above)
-        return self._png()
+        self._below = self._written()
+        return Layers(self._below, "")
 
     def _new(self, panels):
         from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -117,7 +138,7 @@ class Picture:
             axis.grid(True, linewidth=0.4, alpha=0.5)
             axis.spines[["top", "right"]].set_visible(False)
         self._above = self.figure.text(0.02, 1 - 0.08 / height, "", va="top", fontsize=9, animated=True)
-        self._lines, self._background, self._fresh = [], None, True
+        self._lines, self._background, self._below, self._fresh = [], None, b"", True
 
     def _words(self, words, numbers):
         lines = textwrap.wrap(words or numbers, 100)
@@ -129,7 +150,25 @@ class Picture:
         self._canvas.draw()
         self.drawn_whole += 1
 
-    def _png(self):
+    def _over(self):
+        """The lines, each panel cut off at its axes, and the words above them."""
+        width, height = self._canvas.get_width_height()
+        panels = [_panel(axis, lines, height) for axis, lines in zip(self.axes, self._lines) if lines]
+        size = self._above.get_fontsize() * DPI / 72
+        x, y = self._above.get_position()
+        rows = "".join(
+            f'<tspan x="{x * width:g}" dy="{1.2 * size if i else size:g}">{html.escape(row)}</tspan>'
+            for i, row in enumerate(self._above.get_text().replace(r"\$", "$").split("\n"))
+        )
+        words = f'<text y="{(1 - y) * height:g}" font-size="{size:g}" fill="{self._above.get_color()}">{rows}</text>'
+        name = "; ".join(f"{axis.get_ylabel()} against {axis.get_xlabel()}" for axis in self.axes if axis.lines)
+        return (
+            f'<svg role="img" aria-label="{html.escape(name or "numbers")}" viewBox="0 0 {width} {height}" '
+            'style="display:block;width:100%;font-family:DejaVu Sans,Verdana,sans-serif" '
+            f'xmlns="http://www.w3.org/2000/svg">{"".join(panels)}{words}</svg>'
+        )
+
+    def _written(self):
         from PIL import Image
 
         pixels = Image.fromarray(np.asarray(self._canvas.buffer_rgba())).convert("RGB")
@@ -137,6 +176,60 @@ class Picture:
         written = io.BytesIO()
         few.save(written, "png", compress_level=1)
         return written.getvalue()
+
+
+def _panel(axis, lines, height):
+    """The lines of one panel, in an SVG that ends where its axes do."""
+    box = axis.get_window_extent()
+    paths = []
+    for i, line in enumerate(lines):
+        x, y = axis.transData.transform(np.column_stack(line.get_data())).T
+        with np.errstate(invalid="ignore"):
+            path = _path(FINE * (x - box.x0), FINE * (box.y1 - y))
+        thick = FINE * line.get_linewidth() * DPI / 72
+        dashes = " ".join(f"{x * thick:.3g}" for x in _dashes(plot.style(i)["linestyle"])) or "none"
+        paths.append(
+            f'<path d="{path}" stroke="{line.get_color()}" stroke-width="{thick:.3g}" stroke-dasharray="{dashes}"/>'
+        )
+    where = f'x="{box.x0:g}" y="{height - box.y1:g}" width="{box.width:g}" height="{box.height:g}"'
+    units = f'viewBox="0 0 {FINE * box.width:g} {FINE * box.height:g}" preserveAspectRatio="none"'
+    return f'<svg {where} {units} fill="none" stroke-linejoin="round">{"".join(paths)}</svg>'
+
+
+def _dashes(style):
+    """The lengths of dashes and gaps, in widths of the line, as matplotlib draws a line style."""
+    names = {"--": "lines.dashed_pattern", "-.": "lines.dashdot_pattern", ":": "lines.dotted_pattern"}
+    if isinstance(style, tuple):
+        return style[1]
+    return plot.import_matplotlib().rcParams[names[style]] if style in names else ()
+
+
+def _path(x, y):
+    """The `d` of an SVG path through points (n,), interrupted where one is not finite."""
+    there = np.isfinite(x) & np.isfinite(y)
+    begins = np.flatnonzero(there & ~np.append(False, there[:-1]))
+    ends = np.flatnonzero(there & ~np.append(there[1:], False)) + 1
+    parts = []
+    for begin, end in zip(begins, ends):
+        points = np.rint(np.column_stack([x[begin:end], y[begin:end]])).astype(np.int64)
+        if len(points) > MOST_POINTS:
+            points = _thinned(points)
+        steps = " ".join(map(str, np.diff(points, axis=0).ravel().tolist()))
+        parts.append(f"M{points[0, 0]} {points[0, 1]}l{steps or '0 0'}")
+    return "".join(parts)
+
+
+def _thinned(points):
+    """Of successive points in one column of pixels the first, the last, the highest and the lowest."""
+    column = points[:, 0] // FINE
+    begins = np.append(0, np.flatnonzero(np.diff(column)) + 1)
+    count = np.diff(np.append(begins, len(points)))
+    y = points[:, 1]
+    stays = y == np.repeat(np.minimum.reduceat(y, begins), count)
+    stays |= y == np.repeat(np.maximum.reduceat(y, begins), count)
+    stays[begins] = stays[begins + count - 1] = True
+    stays[1:] &= np.any(np.diff(points, axis=0), axis=1)
+    return points[stays]
 
 
 def _fits(get, set_, values, room, anew):

@@ -1,12 +1,14 @@
-"""The picture that follows: what is drawn over kept pixels is what a whole drawing gives, and limits stay."""
+"""The picture that follows: what is drawn over kept axes is what a whole drawing gives, and limits stay."""
 
 import io
+import re
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
 from PIL import Image
 
-from lagjax.interactive.picture import COLOURS, MOST_PANELS, Picture
+from lagjax.interactive.picture import COLOURS, FINE, MOST_PANELS, MOST_POINTS, Picture
 from lagjax.sweeps.drawn import drawn
 
 T = np.linspace(0.0, 1.0, 200)
@@ -19,7 +21,54 @@ def of(amplitude, words="", picture=None, **more):
     with np.errstate(invalid="ignore"):
         waves = amplitude * np.stack([np.sin(9 * T), np.cos(9 * T)], axis=1)[None]
     values = {"t": T[None], "x": waves, **more}
-    return picture, np.asarray(Image.open(io.BytesIO(picture.of_curves(drawn(values), words))).convert("RGB"), int)
+    picture.of_curves(drawn(values), words)
+    return picture, pixels_of(picture.png())
+
+
+def pixels_of(png):
+    """The colours of a PNG (rows, columns, 3)."""
+    return np.asarray(Image.open(io.BytesIO(png)).convert("RGB"), int)
+
+
+def points_of(over):
+    """The points (n, 2) of each path of an SVG, in pixels from its left upper corner, and the paths' attributes."""
+    tag = "{http://www.w3.org/2000/svg}"
+    for panel in ElementTree.fromstring(over).iter(f"{tag}svg"):
+        for path in panel.findall(f"{tag}path"):
+            parts = re.findall(r"M([^M]*)", path.get("d"))
+            steps = [np.array(re.findall(r"-?\d+", part), int).reshape(-1, 2) for part in parts]
+            corner = float(panel.get("x")), float(panel.get("y"))
+            yield [corner + np.cumsum(x, axis=0) / FINE for x in steps], path.attrib
+
+
+def test_lines_over_the_axes():
+    """The points of the SVG are where matplotlib draws them, in their colours and dashes, with gaps where NaN is."""
+    picture, x = Picture(), np.stack([np.sin(9 * T), np.where(abs(T - 0.5) < 0.1, np.nan, T)], axis=1)
+    _, over = picture.of_curves(drawn({"t": T[None], "x": x[None]}), "")
+    axis, height = picture.axes[0], picture.figure.bbox.height
+    (first, look), (second, other_look) = points_of(over)
+    expected = axis.transData.transform(np.column_stack([T, x[:, 0]])) * [1, -1] + [0, height]
+    assert np.abs(first[0] - expected).max() < 0.51 / FINE
+    # Twin: upside down.
+    assert np.abs(first[0] - (expected * [1, -1] + [0, height])).max() > 100
+    assert [len(part) for part in second] == [80, 80]
+    assert (
+        look["stroke"] != other_look["stroke"] and look["stroke-dasharray"] == "none" != other_look["stroke-dasharray"]
+    )
+    # Another value changes the lines, and not what is below.
+    assert picture.of_curves(drawn({"t": T[None], "x": 0.9 * x[None]}), "").over != over and picture.drawn_whole == 1
+
+
+def test_many_points_are_thinned():
+    """Of 2e5 points each column of pixels keeps its highest and lowest, and the message stays small."""
+    t = np.linspace(0.0, 1.0, 200_001)
+    picture = Picture()
+    _, over = picture.of_curves(drawn({"t": t[None], "x": np.sin(30_000 * t)[None]}), "")
+    (((points,), _),) = points_of(over)
+    assert MOST_POINTS / 8 < len(points) < MOST_POINTS and len(over) < 40_000
+    sizes = [np.ptp(points[points[:, 0] // 1 == column, 1]) for column in range(100, 600, 50)]
+    whole = picture.axes[0].transData.transform([(0, -1), (0, 1)])[:, 1]
+    assert min(sizes) > 0.9 * np.ptp(whole)
 
 
 def test_over_kept_pixels_as_drawn_as_a_whole():
@@ -69,7 +118,11 @@ def test_words_above():
     _, well = of(1.0, picture=picture, period=np.array([2.5]), matrix=np.ones((1, 3, 40)))
     assert red(well[:45]) == 0 and np.sum(well[:45].sum(axis=-1) < 200) > 100
     assert picture._above.get_text() == "period = 2.5,  not drawn: matrix of shape (3, 40)"
-    assert red(np.asarray(Image.open(io.BytesIO(picture.of_words("wrong"))).convert("RGB"), int)[:45]) > 20
+    below, over = picture.of_words("wrong")
+    assert red(pixels_of(below)[:45]) > 20 and not over and picture.png() == below
+    # What is over the axes says it in the same words, as text.
+    said = picture.of_curves(drawn({"t": T[None], "x": T[None]}), "a < b & 5 $").over
+    assert ElementTree.fromstring(said)[-1][0].text == "a < b & 5 $"
 
 
 def test_panels():
@@ -93,4 +146,4 @@ def test_what_the_user_draws():
         lines.append(len(axes.lines))
 
     first, second = (picture.of_user(draw, x, "") for x in (1.0, -1.0))
-    assert lines == [1, 1] and first != second
+    assert lines == [1, 1] and first.below != second.below and first.over == "" and picture.png() == second.below
