@@ -166,7 +166,7 @@ MISTAKES = {
     "a product of lists": (
         lambda: move(lambda t, q, v, p: 0.5 * v @ v, ([1.0, 2.0], [0.0, 0.0])), TYPE, "with a list", r"jnp.array\("),
     "an array beside a list": (
-        lambda: move(of_a_vector, (np.ones(2), [0.0, 0.0])), VALUE, "an array beside a list", r"jnp.array\("),
+        lambda: move(of_a_vector, (np.ones(2), [0.0, 0.0])), VALUE, "an array for one and a list", r"jnp.array\("),
     "entries of a number": (
         lambda: move(lambda t, q, v, p: 0.5 * v[0] ** 2, (1.0, 0.0)), TYPE, "of a single number", "q in place of q"),
     "too few entries": (

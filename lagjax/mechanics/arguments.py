@@ -1,4 +1,4 @@
-"""What a function of the user's takes: the state, or the state and the multipliers."""
+"""The arguments of a user's function: the state, or the state and the multipliers."""
 
 import inspect
 from collections.abc import Callable
@@ -8,10 +8,10 @@ WITH_MULTIPLIERS = ("t", "q", "v", "multipliers", "params")
 
 
 def takes_of(function: Callable) -> tuple[str, ...]:
-    """What a function takes: of the state, and the multipliers where it has room for them."""
-    known = getattr(function, "takes", None)
-    if known is not None:
-        return known
+    """The names of a function's arguments: the state, and the multipliers if its signature has room for them."""
+    declared = getattr(function, "takes", None)
+    if declared is not None:
+        return declared
     try:
         inspect.signature(function).bind(*WITH_MULTIPLIERS)
         with_multipliers = not _binds(function, OF_STATE)

@@ -1,8 +1,8 @@
-"""Which of the coordinates are Cartesian ones of points, by their names and shapes.
+"""Find which coordinates are Cartesian coordinates of points, by their names and shapes.
 
-A point is a group of scalars whose names differ by x, y, z alone (`x, y`; `x1, z1`; `bead_x, bead_y, bead_z`), or an
-array of shape (2,) or (3,), or one row of an array (n, 2) or (n, 3). Nothing rests on the guess but which motions of
-space are tried: what is no position simply has no such symmetry.
+A point is a group of scalars whose names differ only by x, y, z (`x, y`; `x1, z1`; `bead_x, bead_y, bead_z`), or an
+array of shape (2,) or (3,), or one row of an array (n, 2) or (n, 3). The guess only decides which motions of space are
+tried: coordinates that are not positions simply have no such symmetry.
 """
 
 import re
@@ -18,7 +18,7 @@ NAMES = re.compile(r"(?P<before>(?:.*\.)?(?:\w+_)?)(?P<axis>[xyzXYZ])(?P<after>\
 
 
 class Point(NamedTuple):
-    """A point: what it is called, "" for the only one, and where its coordinates along x, y, z are (None: not)."""
+    """A point: its label ("" for the only one), and the places of its coordinates along x, y, z (None: it has none)."""
 
     label: str
     places: tuple[int | None, int | None, int | None]
@@ -32,7 +32,7 @@ def points(q) -> list[Point]:
     >>> [point.label for point in points({"r": np.zeros((2, 3))})]
     ['r[0]', 'r[1]']
     """
-    found, named, start = [], {}, 0
+    found, axes_by_point, start = [], {}, 0
     for (path, leaf), name in zip(jtu.tree_flatten_with_path(q)[0], leaf_names(q)):
         shape = np.shape(leaf)
         size = int(np.prod(shape))
@@ -44,9 +44,9 @@ def points(q) -> list[Point]:
                 found.append(Point(label, (where[0], where[1], where[2] if len(where) > 2 else None)))
         elif path and not shape and (match := NAMES.fullmatch(name)):
             key = match["before"], match["after"], match["axis"].isupper()
-            named.setdefault(key, {})[match["axis"].lower()] = start, name
+            axes_by_point.setdefault(key, {})[match["axis"].lower()] = start, name
         start += size
-    for axes in named.values():
+    for axes in axes_by_point.values():
         if len(axes) > 1:
             where = tuple(axes[axis][0] if axis in axes else None for axis in AXES)
             found.append(Point(", ".join(name for _, name in axes.values()), where))
@@ -56,12 +56,12 @@ def points(q) -> list[Point]:
 def leaf_names(q) -> list[str]:
     """The name of each leaf of q, as the user would write it."""
     paths = [path for path, _ in jtu.tree_flatten_with_path(q)[0]]
-    # A leaf's name is that of its coordinates without their indices: a scalar in its place has only the name.
+    # A scalar in place of each leaf: the names of the coordinates then have no indices.
     return coordinates.names(jtu.tree_unflatten(jtu.tree_structure(q), [0.0] * len(paths)))
 
 
 def turned(point: Point, axis: str) -> tuple[int, int] | None:
-    """The two places that a rotation about an axis turns into each other, the first towards the second; else None."""
+    """The two places that a rotation about an axis mixes, the first turning to the second; None if one is missing."""
     k = AXES.index(axis)
     first, second = point.places[(k + 1) % 3], point.places[(k + 2) % 3]
     return None if first is None or second is None else (first, second)

@@ -1,8 +1,8 @@
 """Values that a user's function closes over, made explicit where JAX is tracing them.
 
 Parameters belong in `params`. A Lagrangian that closes over one still works as long as it is a number; while it is
-being differentiated or batched, a solve with a derivative rule of its own would not see it and return a zero
-gradient in silence. `lift` turns such values into arrays that the system carries, where every derivative finds them.
+being differentiated or batched, a solve with a derivative rule of its own would not see it and would silently return
+a zero gradient. `lift` turns such values into arrays that the system carries, where every derivative finds them.
 """
 
 import types
@@ -21,7 +21,7 @@ from lagjax.mechanics.system import System
 
 
 class Lifted(eqx.Module):
-    """A function with the values that it closed over beside it."""
+    """A function together with the values that it closed over."""
 
     function: Callable
     values: list[Array]
@@ -52,12 +52,12 @@ def lift(system: System, s: State) -> System:
 
 
 def lift_function(function: Callable | None, args: tuple):
-    """A function with the traced values that it closes over lifted; itself where there are none."""
+    """The function with the traced values that it closes over lifted; the same object where there are none."""
     if function is None or is_eager() or (isinstance(function, types.FunctionType) and function.__closure__ is None):
         return function
     arrays, static = eqx.partition(args, eqx.is_array)
     of_arrays = lambda arrays: function(*eqx.combine(arrays, static))
-    # JAX's `closure_convert` lifts what may be differentiated, and leaves what is batched.
+    # JAX's `closure_convert` would lift only values that may be differentiated, not those that are batched.
     program, shapes = jax.make_jaxpr(of_arrays, return_shape=True)(arrays)
     traced = [isinstance(value, Tracer) for value in program.consts]
     if not any(traced):
@@ -65,9 +65,9 @@ def lift_function(function: Callable | None, args: tuple):
 
     def lifted(*args):
         arrays, values = eqx.filter(args[: len(static)], eqx.is_array), iter(args[len(static) :])
-        every = [next(values) if t else value for value, t in zip(program.consts, traced)]
-        found = eval_jaxpr(program.jaxpr, every, *jax.tree.leaves(arrays))
-        return jax.tree.unflatten(jax.tree.structure(shapes), found)
+        constants = [next(values) if t else value for value, t in zip(program.consts, traced)]
+        results = eval_jaxpr(program.jaxpr, constants, *jax.tree.leaves(arrays))
+        return jax.tree.unflatten(jax.tree.structure(shapes), results)
 
     return Lifted(lifted, [value for value, t in zip(program.consts, traced) if t])
 

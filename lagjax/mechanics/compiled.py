@@ -1,4 +1,4 @@
-"""Programs that are called from Python: equinox's wrapper of `jit` takes longer than a short motion or fit."""
+"""Compile programs that Python calls: equinox's wrapper of `jit` takes longer than a short motion or fit."""
 
 from collections.abc import Callable
 from functools import partial, wraps
@@ -16,22 +16,23 @@ from lagjax.mechanics.memory import parted
 
 
 def compiled(function: Callable, in_numpy: bool = False) -> Callable:
-    """`function` of pytrees as a program, compiled for their structure and shapes; inside of another it is a part.
+    """Compile `function` for the structure and shapes of its pytrees; inside another program it becomes part of that.
 
-    Where it is called by itself, it may return NumPy's arrays.
+    With `in_numpy`, a call from Python returns NumPy arrays.
     """
-    inside, done = eqx.filter_jit(function), partial(jtu.tree_map, np.asarray) if in_numpy else jax.block_until_ready
+    as_part = eqx.filter_jit(function)
+    finish = partial(jtu.tree_map, np.asarray) if in_numpy else jax.block_until_ready
 
     @wraps(function)
     def program(*args):
         if not is_eager() or coordinates.is_traced(args):
-            return inside(*args)
+            return as_part(*args)
         static, arrays = parted(args)
         try:
-            return done(kept((function, static), lambda: _jitted(function, static))(arrays))
+            return finish(kept((function, static), lambda: _jitted(function, static))(arrays))
         except jax.errors.JaxRuntimeError:
-            # Equinox has better words for the checks that it puts into a program.
-            return done(inside(*args))
+            # Equinox's wrapper has a better message for the checks that equinox puts into a program.
+            return finish(as_part(*args))
 
     return program
 

@@ -35,7 +35,7 @@ class Holonomic(eqx.Module):
     **Arguments:** `g(t, q, params)` -> scalar or (m,), smooth, with ∂g/∂q of full rank where it vanishes.
     Its multiplier λ has the shape of `g` and `[energy]/[g]`; λ > 0 pushes along +∂g/∂q.
 
-    **Raises:** `TypeError` for what is no function.
+    **Raises:** `TypeError` if `g` is not a function.
     """
 
     g: Callable
@@ -57,7 +57,7 @@ class Nonholonomic(eqx.Module):
     **Arguments:** `phi(t, q, v, params)` -> scalar or (m,), smooth, with ∂phi/∂v of full rank where it
     vanishes. Its multiplier μ has the shape of `phi` and `[energy]/([phi] [t])`; the force is `(∂phi/∂v)ᵀ μ`.
 
-    **Raises:** `TypeError` for what is no function.
+    **Raises:** `TypeError` if `phi` is not a function.
     """
 
     phi: Callable
@@ -89,11 +89,11 @@ def shapes(system, t, q, v, params) -> dict[str, tuple[int, ...]]:
     """The shape of each constraint's residual, by name, found without computing anything."""
     if not system.constraints:
         return {}
-    found = lambda: {
+    find = lambda: {
         name: jnp.shape(shape_of(evaluate, constraint, t, q, v, params))
         for name, constraint in system.constraints.items()
     }
-    return remembered(system, (shapes, system.read, kinds((t, q, v, params))), found)
+    return remembered(system, (shapes, system.read, kinds((t, q, v, params))), find)
 
 
 def count(system, t, q, v, params) -> int:
@@ -102,7 +102,7 @@ def count(system, t, q, v, params) -> int:
 
 
 def split(system, stacked, t, q, v, params) -> dict[str, Array]:
-    """Undo the stacking: a vector over all constraint equations -> one array a name."""
+    """Undo the stacking: a vector over all constraint equations -> one array per name."""
     parts, start = {}, 0
     for name, shape in shapes(system, t, q, v, params).items():
         size = shape[0] if shape else 1
@@ -112,7 +112,7 @@ def split(system, stacked, t, q, v, params) -> dict[str, Array]:
 
 
 def zero_multipliers(system, s: coordinates.State) -> dict[str, np.ndarray]:
-    """Multipliers by name that are all zero: their shapes."""
+    """Zero multipliers of the right shapes, by name."""
     return {name: np.zeros(shape, s.t.dtype) for name, shape in shapes(system, *s).items()}
 
 
@@ -140,14 +140,14 @@ def acceleration_rows(system, t, x, u, params, unflatten) -> Rows:
 
 
 def evaluate(constraint, t, q, v, params):
-    """The residual of one constraint, as it was written: `g` or `phi`."""
+    """The residual of one constraint as the user wrote it: `g` or `phi`."""
     if isinstance(constraint, Holonomic):
         return constraint.g(t, q, params)
     return constraint.phi(t, q, v, params)
 
 
 def baumgarte_feedback(system, t, x, u, params, unflatten, rate):
-    """What Baumgarte adds to gamma: the constraint then obeys g'' + 2 rate g' + rate² g = 0, or phi' + rate phi = 0.
+    """Baumgarte's term in gamma, with which g'' + 2 rate g' + rate² g = 0, or phi' + rate phi = 0.
 
     Source: Baumgarte, Comput. Methods Appl. Mech. Eng. 1 (1972) 1.
     """

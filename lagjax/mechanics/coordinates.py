@@ -22,15 +22,15 @@ from lagjax.jax_internals.tracing import is_eager
 from lagjax.mechanics.single_precision import warn_of_float32
 
 FLOAT64 = np.dtype("float64")
-# Tuples that are made once: a call takes 20 microseconds, and to make a union of types takes one.
+# Tuples made once: building a union of types takes one microsecond of a call's twenty.
 ARRAYS = (np.ndarray, np.generic, jax.Array)
 NUMBERS = (float, int, *ARRAYS)
-OF_NUMPY = (bool, int, float, complex, np.ndarray, np.generic)
-MADE_OF_FLOAT64 = (np.ndarray, np.float64)
+NUMPY_OR_PYTHON = (bool, int, float, complex, np.ndarray, np.generic)
+FLOAT64_TYPES = (np.ndarray, np.float64)
 
 
 class State(NamedTuple):
-    """A time, a position and a velocity, made of arrays of one dtype, with the parameters."""
+    """A time, a position and a velocity, as arrays of one dtype, with the parameters."""
 
     t: Float[Array, ""]
     q: PyTree[Float[Array, "..."]]
@@ -44,13 +44,13 @@ def flatten(tree):
 
 
 def vector(tree):
-    """The vector alone; of NumPy where the values are known, which compiles nothing."""
+    """The vector alone; a NumPy array where the values are known, so that nothing is compiled."""
     xp = numpy_of(tree)
     return xp.concatenate([xp.ravel(xp.asarray(x)) for x in jtu.tree_leaves(tree)])
 
 
 def like(tree, x):
-    """A vector x (..., n) in the structure and shapes of `tree`, of NumPy where it is one."""
+    """Give a vector x (..., n) the structure and shapes of `tree`; a NumPy vector becomes NumPy arrays."""
     leaves, structure = jtu.tree_flatten(tree)
     ends = np.cumsum([0, *(np.size(leaf) for leaf in leaves)])
     parts = [x[..., a:b].reshape(x.shape[:-1] + np.shape(leaf)) for a, b, leaf in zip(ends, ends[1:], leaves)]
@@ -94,63 +94,63 @@ def state(t, q, v, params) -> State:
     Whole numbers among the coordinates become floats. Python floats become arrays of the state's dtype, in `params`
     too: a float that stayed a Python number would be compiled in, and each new value would compile again.
 
-    **Raises:** `TypeError` for a coordinate that is no real number, and a time that is none; `ValueError` where `v`
-    does not have the structure and shapes of `q`, or `q` is empty.
+    **Raises:** `TypeError` for a coordinate that is not a real number, or a time that is not one number; `ValueError`
+    where `v` does not have the structure and shapes of `q`, or `q` is empty.
     """
-    return _of_jax(given_state(t, q, v, params))
+    return _as_jax_arrays(given_state(t, q, v, params))
 
 
 def given_state(t, q, v, params) -> State:
-    """The same, but for NumPy's arrays, which stay: a compiled program takes them in a tenth of the time."""
+    """The same as `state`, but NumPy arrays stay: a compiled program takes them in a tenth of the time."""
     t, given = _time(t), jtu.tree_leaves((q, v))
-    of_q, of_v = _numbers(q, "q"), _numbers(v, "v")
-    _check_alike(of_q, of_v, params)
+    q_arrays, v_arrays = _numbers(q, "q"), _numbers(v, "v")
+    _check_alike(q_arrays, v_arrays, params)
     if not any(getattr(x, "size", 1) for x in given):
         raise ValueError(
             "q has no coordinates.\n"
             "Usual cause: None, an empty list, or a dict that is filled later.\n"
             "Fix: give at least one, such as q0 = {'theta': 0.1}."
         )
-    # A Python float has the dtype of those beside it.
+    # A Python float takes the dtype of the other coordinates.
     dtype = _dtype_of(given)
     if dtype != FLOAT64:
         warn_of_float32(dtype, given)
-    q, v = (jtu.tree_map(lambda x: _of_dtype(x, dtype), tree) for tree in (of_q, of_v))
-    return State(_of_dtype(t, dtype), q, v, given_params(params, dtype))
+    q, v = (jtu.tree_map(lambda x: _cast(x, dtype), tree) for tree in (q_arrays, v_arrays))
+    return State(_cast(t, dtype), q, v, given_params(params, dtype))
 
 
 def _dtype_of(given):
-    """The dtype of numbers beside each other: JAX's own answer, which takes a tenth of a short call."""
-    if all(isinstance(x, float) or isinstance(x, MADE_OF_FLOAT64) and x.dtype == FLOAT64 for x in given):
+    """The common dtype of numbers: JAX's answer, and a shortcut, since asking JAX takes a tenth of a short call."""
+    if all(isinstance(x, float) or isinstance(x, FLOAT64_TYPES) and x.dtype == FLOAT64 for x in given):
         return FLOAT64 if jax.config.read("jax_enable_x64") else jnp.result_type(*given)
-    # Whole numbers take part as floats.
+    # Whole numbers become floats, and do not decide the dtype.
     floats = [x for x in given if not jnp.issubdtype(jnp.result_type(x), jnp.integer)]
     return jnp.result_type(*floats) if floats else jax.dtypes.canonicalize_dtype(FLOAT64)
 
 
 def prepared(t, q, v, params) -> State:
-    """A state for a compiled program: of NumPy's arrays where JAX traces nothing."""
+    """A state for a compiled program, in NumPy arrays where JAX is not tracing."""
     return (given_state if is_eager() else state)(t, q, v, params)
 
 
 def as_arrays(tree, dtype):
     """Make arrays of the Python floats and NumPy arrays in `tree`; leave the rest as it is.
 
-    An array that JAX has made of a Python float is one still: `jnp.array(9.81)`, of a weak type.
+    An array that JAX made from a Python float, as `jnp.array(9.81)`, has a weak type and counts as a Python float.
     """
-    return _of_jax(given_params(tree, dtype))
+    return _as_jax_arrays(given_params(tree, dtype))
 
 
-def _of_jax(tree):
+def _as_jax_arrays(tree):
     return jtu.tree_map(lambda x: jnp.asarray(x) if isinstance(x, np.ndarray) else x, tree)
 
 
 def given_params(params, dtype):
-    """The same, but for NumPy's arrays, which stay."""
+    """The same as `as_arrays`, but NumPy arrays stay."""
 
     def convert(x):
-        of_float = isinstance(x, jax.Array) and not is_traced(x) and x.weak_type
-        if isinstance(x, float) or of_float and jnp.issubdtype(x.dtype, jnp.floating):
+        is_weak = isinstance(x, jax.Array) and not is_traced(x) and x.weak_type
+        if isinstance(x, float) or is_weak and jnp.issubdtype(x.dtype, jnp.floating):
             return np.asarray(x, dtype)
         return _as_array(x) if isinstance(x, (np.ndarray, np.generic)) else x
 
@@ -158,39 +158,39 @@ def given_params(params, dtype):
 
 
 def _as_array(x):
-    """An array in one of JAX's dtypes, of NumPy where it is none yet."""
+    """x as an array in one of JAX's dtypes; NumPy and Python numbers become NumPy arrays."""
     if isinstance(x, jax.Array):
         return x
-    if not isinstance(x, OF_NUMPY):
+    if not isinstance(x, NUMPY_OR_PYTHON):
         return jnp.asarray(x)
     x = np.asarray(x)
     return x.astype(jax.dtypes.canonicalize_dtype(x.dtype), copy=False)
 
 
-def _of_dtype(x, dtype):
-    as_it_is = x.dtype == dtype and not getattr(x, "weak_type", False)
-    return x if as_it_is else x.astype(dtype)
+def _cast(x, dtype):
+    has_dtype = x.dtype == dtype and not getattr(x, "weak_type", False)
+    return x if has_dtype else x.astype(dtype)
 
 
 def as_floats(tree):
-    """The whole numbers in `tree` as floats of the default size; the rest as it is."""
+    """Convert the whole numbers in `tree` to floats of the default size; leave the rest as it is."""
 
     def convert(x):
         if not isinstance(x, NUMBERS) or isinstance(x, bool | float):
             return x
         whole = isinstance(x, int) or jnp.issubdtype(x.dtype, jnp.integer)
-        return _of_dtype(_as_array(x), jax.dtypes.canonicalize_dtype(FLOAT64)) if whole else x
+        return _cast(_as_array(x), jax.dtypes.canonicalize_dtype(FLOAT64)) if whole else x
 
     return jtu.tree_map(convert, tree)
 
 
 def numpy_of(tree):
-    """NumPy where the values of `tree` can be looked at, which compiles nothing; else `jax.numpy`."""
+    """NumPy where the values of `tree` are known, so that nothing is compiled; else `jax.numpy`."""
     return jnp if is_traced(tree) else np
 
 
 def is_traced(tree) -> bool:
-    """Whether JAX is tracing through `tree`, so that its values cannot be looked at."""
+    """Whether JAX is tracing through `tree`, so that its values are not known."""
     return any(isinstance(leaf, Tracer) for leaf in jtu.tree_leaves(tree))
 
 
@@ -200,16 +200,16 @@ def _time(t):
         return np.asarray(t)
     if isinstance(t, NUMBERS) and not isinstance(t, bool) and np.ndim(t) == 0:
         return _as_array(t)
-    of = f"an array of shape {np.shape(t)}" if isinstance(t, ARRAYS) else f"a {type(t).__name__}"
+    got = f"an array of shape {np.shape(t)}" if isinstance(t, ARRAYS) else f"a {type(t).__name__}"
     raise TypeError(
-        f"t must be one number, and is {of}.\n"
+        f"t must be one number, not {got}.\n"
         "Usual cause: arguments in another order.\n"
         "Fix: (system, t, q, v, params), as t=0.0."
     )
 
 
 def _numbers(tree, which):
-    """The coordinates as arrays, with whole numbers still as they are; an error where one is no real number."""
+    """The coordinates as arrays, whole numbers not yet converted; raises if one is not a real number."""
     try:
         found = jtu.tree_map(_as_number, tree)
     except TypeError:
@@ -221,7 +221,7 @@ def _numbers(tree, which):
 
 
 def _as_number(x):
-    # Also a whole number that is beyond those of arrays.
+    # float() also takes a whole number too large for an array of integers.
     return _as_array(float(x) if type(x) is int else x)
 
 
@@ -234,19 +234,19 @@ def _check_real(tree, which):
         dtype = leaf.dtype if hasattr(leaf, "dtype") else np.asarray(leaf).dtype
         if _is_real(dtype):
             continue
-        of, cause, fix = str(dtype), "a condition in place of a number", "0.0 or 1.0"
+        got, cause, fix = str(dtype), "a condition in place of a number", "0.0 or 1.0"
         if jnp.issubdtype(dtype, jnp.complexfloating):
             cause, fix = "the root of a negative number, or an amplitude", "its real part, jnp.real(...)"
         elif callable(leaf):
-            of, cause, fix = "a function", "a function in place of what it returns", "f() in place of f"
+            got, cause, fix = "a function", "a function in place of what it returns", "f() in place of f"
         elif hasattr(leaf, "magnitude"):
-            of, cause = f"{leaf!r:.60}", "a number with its unit"
+            got, cause = f"{leaf!r:.60}", "a number with its unit"
             fix = "the number, x.magnitude, all in one system of units"
         elif not jnp.issubdtype(dtype, np.bool_):
-            of, cause = f"{leaf!r:.60}", "text from a file, or a number that was left to be filled in"
+            got, cause = f"{leaf!r:.60}", "text from a file, or a number that was left to be filled in"
             fix = "a number, as q0 = 0.1, or names, as q0 = {'x': 0.1}"
         raise TypeError(
-            f"coordinate '{_path_name(path)}' of {which} is {of}, and the equations of motion need real numbers.\n"
+            f"coordinate '{_path_name(path)}' of {which} is {got}, and the equations of motion need real numbers.\n"
             f"Usual cause: {cause}.\n"
             f"Fix: {fix}."
         )
@@ -261,10 +261,10 @@ def _check_alike(q, v, params):
         cause = "a coordinate missing from v, or a name written in two ways"
         fix = "start from v = jax.tree.map(jnp.zeros_like, q)"
         if params is not None and jtu.tree_structure(params) in (q_structure, v_structure):
-            cause = "arguments in another order, params before q or v; or a start with names and without"
+            cause = "arguments in another order, params before q or v; or names in only one of q and v"
             fix = "lj.integrate(system, q0, v0, params, ts=ts); and (system, t, q, v, params) at one state"
         elif isinstance(q, list | tuple) != isinstance(v, list | tuple) and "no names" in has:
-            cause, fix = "an array beside a list of numbers", "arrays, q0 = jnp.array([0.1, 0.2])"
+            cause, fix = "an array for one and a list of numbers for the other", "arrays, q0 = jnp.array([0.1, 0.2])"
         raise ValueError(
             f"v must have the structure of q.\n  q: {has[0]}\n  v: {has[1]}\nUsual cause: {cause}.\nFix: {fix}."
         )
@@ -272,6 +272,6 @@ def _check_alike(q, v, params):
         if a.shape != b.shape:
             raise ValueError(
                 f"coordinate '{_path_name(path)}' has shape {a.shape} in q but {b.shape} in v.\n"
-                "Usual cause: a scalar beside an array of one entry.\n"
+                "Usual cause: a scalar in one and an array of one entry in the other.\n"
                 "Fix: give both the same shape, for instance v = jax.tree.map(jnp.zeros_like, q)."
             )

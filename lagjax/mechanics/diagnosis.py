@@ -1,6 +1,6 @@
-"""What is wrong with a state, in the user's names: the coordinate or the constraint, the usual cause, the fix.
+"""Explain what is wrong with a state in the user's names: the coordinate or constraint, the usual cause, the fix.
 
-Everything here looks at values, and so happens outside compiled programs.
+Everything here looks at values, and so runs outside compiled programs.
 """
 
 import numpy as np
@@ -9,9 +9,9 @@ from lagjax.mechanics import constraints, coordinates
 from lagjax.mechanics.equations import equations_of
 from lagjax.mechanics.saddle_point import SINGULAR_BELOW, Examined, combinations, examined
 
-# A row counts as part of a combination where it makes up more than this share of it.
+# A row counts as part of a combination if it makes up more than this share of it.
 SHARE = 1e-6
-# Velocities count as off a constraint where they would have to change by more than this share of their size.
+# Velocities violate a constraint if they would have to change by more than this share of their size to satisfy it.
 OFF_ABOVE = 1e-6
 
 
@@ -58,10 +58,10 @@ def _explain_paradox(found: Examined, s):
     return (
         f"friction leaves no acceleration, or two, {where(s)}: the force grows with the multipliers faster than these "
         "can balance it (Painlevé's paradox).\n"
-        "Usual cause: a rod or a wedge that is pushed against what it slides on, with a large coefficient; or a "
+        "Usual cause: a rod or a wedge that is pushed against the surface it slides on, with a large coefficient; or a "
         "friction force with the wrong sign.\n"
-        "Fix: the sign first: it acts against the sliding velocity; else a smaller coefficient, or a contact that "
-        "gives way (a stiff spring in L)."
+        "Fix: check the sign first: friction acts against the sliding velocity; else take a smaller coefficient, or a "
+        "contact that gives way (a stiff spring in L)."
     )
 
 
@@ -94,16 +94,16 @@ def explain_singular(matrix, system, s: coordinates.State) -> str | None:
 
 def explain_contradiction(found: Examined, system, s: coordinates.State) -> str | None:
     """Name dependent constraints that ask for different accelerations; None where there are none."""
-    against = np.flatnonzero(found.contradictory)
-    if not against.size:
+    contradicting = np.flatnonzero(found.contradictory)
+    if not contradicting.size:
         return None
     names = equation_names(system, s)
     groups = {group[0]: group for group in dependencies(found.rows.jacobian, found.independent, names)}
-    involved = groups[names[against[0]]]
-    off = _velocities_off(system, s, involved)
-    if off:
+    involved = groups[names[contradicting[0]]]
+    violated = _violated_by_velocities(system, s, involved)
+    if violated:
         return (
-            f"constraints {listed(involved)} depend on each other, and the state is off them: {off}, where 0 is asked. "
+            f"constraints {listed(involved)} depend on each other, and the state is off them: {violated} instead of 0. "
             f"They agree about the acceleration only where they hold. This is {where(s)}.\n"
             "Usual cause: velocities that the constraints do not allow, computed for other parameters or guessed.\n"
             "Fix: q, v = lj.consistent_state(system, t, q, v, params) for a consistent state near it."
@@ -113,11 +113,11 @@ def explain_contradiction(found: Examined, system, s: coordinates.State) -> str 
         "acceleration satisfies all of them.\n"
         "Usual cause: one motion prescribed twice, with functions of time or parameters that differ, or a loop that "
         "cannot close.\n"
-        f"Fix: remove '{involved[0]}', or let it ask for what the others ask for."
+        f"Fix: remove '{involved[0]}', or make it demand the same as the others."
     )
 
 
-def _velocities_off(system, s, names):
+def _violated_by_velocities(system, s, names):
     """Which of the named equations the velocities violate, with their residuals."""
     x, unflatten = coordinates.flatten(s.q)
     u, _ = coordinates.flatten(s.v)
@@ -144,7 +144,7 @@ def dependencies(jacobian, independent, names) -> list[tuple[str, ...]]:
 
 
 def listed(names) -> str:
-    """Names in quotes, the last after "and"."""
+    """Names in quotes, joined by commas and "and"."""
     quoted = [f"'{name}'" for name in names]
     if not quoted:
         return "none"
@@ -180,5 +180,5 @@ def _singular_message(i, system, s):
 
 
 def where(s: coordinates.State) -> str:
-    """The state on one line, as it ends an error message."""
+    """The state on one line, for the end of an error message."""
     return f"at t = {float(s.t):.6g}, q = {describe(s.q)}, v = {describe(s.v)}"

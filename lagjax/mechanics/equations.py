@@ -1,11 +1,11 @@
-"""The equations of a system: all that is asked of them at a state, and the one place that knows how they are solved.
+"""The equations of a system: everything asked of them at a state, and the one place that knows how to solve them.
 
-There are three ways. In arrays the equations are one matrix (`saddle_point.py`), or a band where the system is large
-and its parts touch few others (`sparse_saddle_point.py`): the robust way, which exchanges rows, leaves dependent
-constraints out and says what is wrong. Those of a small system are written out number by number besides
-(`written_out.py`), which is many times as fast, and NaN where that does not do.
+There are three ways. The robust way works in arrays: one matrix (`saddle_point.py`), or a band where the system is
+large and its parts touch few others (`sparse_saddle_point.py`). It exchanges rows, leaves dependent constraints out and
+says what is wrong. The fast way is for small systems: their equations are also written out number by number
+(`written_out.py`), which is many times as fast, and gives NaN where it fails.
 
-Who asks has an `Equations` and does not choose between them.
+A caller has an `Equations` and does not choose between them.
 """
 
 from collections.abc import Callable
@@ -36,9 +36,10 @@ from lagjax.mechanics.written_out import UP_TO, WrittenOut, has_networks, is_sma
 class Equations(eqx.Module):
     """The equations of a system with its parameters, for states of one shape.
 
-    `form` solves them in arrays. `written` are the same number by number, with what does not depend on the state
-    `prepared`; None of a system that is not small. `fallback`: whether programs contain the robust way for where these
-    fail. `unflatten` puts the coordinates, one by one in a small system, back into the user's structure.
+    `form` solves them in arrays. `written` solves them number by number, given the part that does not depend on the
+    state, `prepared`; it is None for a system that is not small. `fallback`: whether programs contain the robust way,
+    for states where `written` fails. `unflatten` puts the coordinates of a small system, which come one by one, back
+    into the user's structure.
     """
 
     system: System
@@ -56,15 +57,15 @@ class Equations(eqx.Module):
 
     @property
     def are_taken_for_regular(self) -> bool:
-        """Whether what fails the fast way gives NaN, and nothing says why."""
+        """Whether the equations are assumed regular: the result is NaN, unexplained, where the fast way fails."""
         return self.written is not None and self.written.may_fail and not self.fallback
 
     def inside(self, y):
-        """A position or velocity of the user's as these equations take it."""
+        """Convert the user's position or velocity to the form that these equations take."""
         return y if self.unflatten is None else coordinates.numbers(y)
 
     def outside(self, y):
-        """The same back in the user's structure."""
+        """Convert a position, velocity or acceleration back to the user's structure."""
         return y if self.unflatten is None else self.unflatten(jnp.stack(y))
 
     def rates(self, t, q, v) -> tuple[PyTree[Array], dict[str, Array]]:
@@ -75,11 +76,11 @@ class Equations(eqx.Module):
         fast = a, constraints.split(self.system, stacked, t, q, v, self.params)
         if not self.fallback:
             return fast
-        # A branch also in a batch, where it is taken for all lanes or none.
+        # `unvmap_all` keeps it a branch in a batch, taken for all lanes or for none.
         return lax.cond(eqxi.unvmap_all(all_finite(fast)), lambda: fast, lambda: self.accelerations(t, q, v))
 
     def multipliers(self, t, q, v) -> dict[str, Array]:
-        """The multipliers by name, one way for all states of a batch: derivatives flow through them."""
+        """The multipliers by name, solved the same way for all states of a batch: derivatives flow through them."""
         if not self.system.constraints:
             return {}
         return self.rates(t, q, v)[1] if self.are_taken_for_regular else self.accelerations(t, q, v)[1]
@@ -99,7 +100,7 @@ class Equations(eqx.Module):
         """Solve the equations at one state, and say whether the solution is valid."""
         if not self.are_taken_for_regular:
             return _verdict(self.form, self.system, t, q, v, self.params)
-        # What speaks against one that is not regular is not told apart.
+        # The different ways of not being regular are not told apart here.
         a, multipliers = self.rates(t, q, v)
         lagrangian = self.system.lagrangian(t, q, v, self.params)
         finite = jnp.all(jnp.isfinite(coordinates.flatten((a, multipliers, lagrangian))[0]))
@@ -108,12 +109,12 @@ class Equations(eqx.Module):
         return Verdict(a, multipliers, finite, ~regular, jnp.asarray(False), mass)
 
     def fast(self, t, q, v):
-        """The accelerations, and the multipliers in one vector, as they are written out."""
+        """The accelerations, and the multipliers in one vector, by the written-out equations."""
         assert self.written is not None
         return kept_as_call(self.written.equations.at(self.prepared[0], t, q, v))
 
     def projected(self, t, q, v):
-        """The state returned to the constraints, as it is written out; NaN where it is not near them."""
+        """The state returned to the constraints, by the written-out equations; NaN where it is not near them."""
         assert self.written is not None and self.written.project is not None
         return kept_as_call(self.written.project.at(self.prepared[1], t, q, v))
 
@@ -125,13 +126,13 @@ class Equations(eqx.Module):
         return _accelerations(self.form, self.system, t, q, v, self.params, baumgarte_rate, independent)
 
     def independent(self, t, q, v, dependent_below=None) -> Bool[Array, " m"] | None:
-        """Which constraint equations to solve with near a state; None where one or none leaves no choice."""
+        """Which constraint equations to solve with near a state; None where fewer than two leave no choice."""
         if constraints.count(self.system, t, q, v, self.params) < 2:
             return None
         return _independent(self.form, self.system, t, q, v, self.params, dependent_below)
 
     def displacement(self, t, q, v):
-        """`displacement(which, r)`, the shortest in the metric of M that changes the residuals `which` by r."""
+        """`displacement(which, r)`: the shortest one, in the metric of M, that changes the residuals `which` by r."""
         return self.form.displacement(*_vectors(self.system, t, q, v, self.params))
 
     def row_sizes(self, t, q, v) -> Float[Array, " m"]:
@@ -140,10 +141,10 @@ class Equations(eqx.Module):
 
 
 def equations_of(system, t, q, v, params, *, fast=False, fallback=True) -> Equations:
-    """The equations of a system, for states like this one, of which only shapes and dtypes count.
+    """The equations of a system, for states with the shapes and dtypes of this one; its values do not count.
 
-    With `fast` those of a small system are written out, too, and take states number by number (`Equations.inside`).
-    Without `fallback` they are taken for regular; that is settled by who asks.
+    With `fast` the equations of a small system are also written out, and take states number by number
+    (`Equations.inside`). Without `fallback` they are assumed regular; the caller deals with states where they are not.
     """
     written, unflatten = None, None
     if fast and is_small(system, t, q, v, params):
@@ -161,23 +162,23 @@ def _form(system, t, q, v, params):
     if sparse is not None:
         return Banded(sparse)
     # Other small systems are written out, where zeros cost nothing.
-    asked = has_networks(system, params) and not system.constraints and unknowns <= UP_TO
-    return Dense(unknowns, asked and is_diagonal(system, t, q, v, params))
+    may_divide = has_networks(system, params) and not system.constraints and unknowns <= UP_TO
+    return Dense(unknowns, may_divide and is_diagonal(system, t, q, v, params))
 
 
 def _written_for(*problem) -> WrittenOut | None:
     leaves, structure = jtu.tree_flatten(problem)
     leaves = tuple(jax.ShapeDtypeStruct(x.shape, x.dtype) if eqx.is_array(x) else x for x in leaves)
-    # Who watches has a failed check of the user's put into the equations as NaN.
-    kind = structure, leaves, WATCHED.value
+    # In a watched motion a failed check of the user's becomes NaN in the equations.
+    key = structure, leaves, WATCHED.value
     try:
-        hash(kind)
+        hash(key)
     except TypeError:
-        return _written.__wrapped__(*kind)
-    return _written(*kind)
+        return _written.__wrapped__(*key)
+    return _written(*key)
 
 
-# A motion is traced with and without the robust way, for its derivatives, in lanes: the equations are the same.
+# A motion is traced several times (with and without the robust way, for derivatives, in lanes) with these equations.
 @lru_cache(maxsize=64)
 def _written(structure, leaves, watched) -> WrittenOut | None:
     found = []
@@ -225,5 +226,5 @@ def _vectors(system, t, q, v, params):
 
 def all_finite(tree) -> Bool[Array, ""]:
     """Whether nothing in a tree of floats is NaN or infinite."""
-    # One sum instead of a reduction a leaf: zero times NaN or infinity is NaN.
+    # One sum instead of a reduction per leaf: zero times NaN or infinity is NaN.
     return jnp.asarray(sum(jnp.sum(0 * x) for x in jtu.tree_leaves(tree)) == 0)

@@ -74,5 +74,5 @@ def test_a_time_is_one_number():
     for t in (0, 0.0, np.float32(0.0), np.zeros((), int), jnp.zeros(())):
         assert coordinates.state(t, 1.0, 0.0, None).t.dtype == np.float64
     for t in (np.zeros(1), {"x": 0.0}, "0", True, None):
-        with pytest.raises(TypeError, match="t must be one number, and is (?s:.*)another order"):
+        with pytest.raises(TypeError, match="t must be one number, not (?s:.*)another order"):
             coordinates.state(t, 1.0, 0.0, None)
