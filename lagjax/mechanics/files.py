@@ -1,7 +1,7 @@
-"""Files of the library: an npz of NumPy, whose first entry says in JSON what the arrays are.
+"""lagjax's files: NumPy npz files whose first entry says in JSON what the arrays are.
 
-Each entry has a checksum, which zip files have anyway. A file is written under another name beside its own and then
-renamed: who is killed leaves the file of before. `numpy.load(path)` reads the arrays, by their names, without lagjax.
+The zip format gives each entry a checksum. A file is written under a temporary name in the same folder, and then
+renamed: if the process is killed, the previous file remains. `numpy.load(path)` reads the arrays without lagjax.
 """
 
 import io
@@ -20,18 +20,18 @@ FORMAT = 1
 HEADER = "lagjax.json"
 # The kinds of files, with the function that reads each.
 KINDS = {"trajectory": "lj.load_trajectory", "fit": "lj.load_fit"}
-# What zip, zlib, JSON and NumPy raise for files that are not what they were.
+# What zip, zlib, JSON and NumPy raise for damaged files.
 DAMAGED = (zipfile.BadZipFile, zlib.error, EOFError, ValueError, KeyError, NotImplementedError, OSError)
 
 
-def write(path: str | os.PathLike, kind: str, said: dict, arrays: dict[str, np.ndarray]) -> None:
-    """Write a file, or leave the one that is there."""
+def write(path: str | os.PathLike, kind: str, description: dict, arrays: dict[str, np.ndarray]) -> None:
+    """Write a file; if that fails, an existing file stays as it was."""
     path = Path(path)
     if path.is_dir():
-        raise IsADirectoryError(f'{path} is a folder.\nFix: a name in it, "{path / (kind + ".npz")}".')
+        raise IsADirectoryError(f'{path} is a folder.\nFix: give the name of a file in it, "{path / (kind + ".npz")}".')
     if not path.parent.is_dir():
         raise FileNotFoundError(f"there is no folder {path.parent}.\nFix: make it first: os.makedirs(...).")
-    header = {"format": FORMAT, "kind": kind, "versions": _versions(), **said}
+    header = {"format": FORMAT, "kind": kind, "versions": _versions(), **description}
     partial = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}.partial")
     try:
         with open(partial, "wb") as file:
@@ -48,18 +48,18 @@ def write(path: str | os.PathLike, kind: str, said: dict, arrays: dict[str, np.n
 
 
 def read(path: str | os.PathLike, kind: str) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """(what a file says, its arrays).
+    """Return the header of a file and its arrays.
 
-    **Raises:** `FileNotFoundError` where there is none; `ValueError`, in words, for a file that is damaged, of another
-    kind, of something else, or of a newer lagjax.
+    **Raises:** `FileNotFoundError` where there is none; `ValueError` for a file that is damaged, not lagjax's, of
+    another kind, or written by a newer lagjax.
     """
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"there is no file {path}.\nFix: the path that was given to .save(path).")
     try:
         return _read(path, kind)
-    except _Told as told:
-        raise ValueError(str(told)) from None
+    except _Explained as explained:
+        raise ValueError(str(explained)) from None
 
 
 def _read(path, kind):
@@ -75,38 +75,38 @@ def _read(path, kind):
             header = json.loads(entries.read(HEADER))
             _check_header(path, header, kind)
             arrays = {name.removesuffix(".npy"): _array(entries, name) for name in entries.namelist() if name != HEADER}
-    except _Told:
+    except _Explained:
         raise
     except DAMAGED as error:
         raise_damaged(path, str(error) or type(error).__name__, error)
     return header, arrays
 
 
-class _Told(ValueError):
-    """What is said already."""
+class _Explained(ValueError):
+    """An error whose message is complete."""
 
 
 def _array(entries, name):
-    # At once: NumPy reads a compressed entry, or one of a zip, in small pieces.
+    # Read the whole entry first: NumPy would read it from the zip in small pieces.
     return np.lib.format.read_array(io.BytesIO(entries.read(name)), allow_pickle=False)
 
 
 def _check_header(path, header, kind):
     if header["format"] > FORMAT:
-        raise _Told(
-            f"{path} was written by lagjax {header['versions']['lagjax']}, whose files this one, "
-            f"{version('lagjax')}, does not read.\nFix: pip install -U lagjax."
+        raise _Explained(
+            f"{path} was written by lagjax {header['versions']['lagjax']}, and this one, "
+            f"{version('lagjax')}, cannot read it.\nFix: pip install -U lagjax."
         )
     if header["kind"] != kind:
-        raise _Told(f"{path} holds a {header['kind']}, not a {kind}.\nFix: {KINDS[header['kind']]}(path).")
+        raise _Explained(f"{path} holds a {header['kind']}, not a {kind}.\nFix: {KINDS[header['kind']]}(path).")
 
 
 def _raise_foreign(path, kind) -> NoReturn:
-    raise _Told(f"{path} is no {kind} of lagjax's.\nFix: the path that was given to .save(path).")
+    raise _Explained(f"{path} is not a {kind} saved by lagjax.\nFix: the path that was given to .save(path).")
 
 
 def raise_damaged(path, why: str, error: Exception | None = None) -> NoReturn:
-    """Raise `ValueError` for a file that is not what it was."""
+    """Raise `ValueError` for a damaged file."""
     raise ValueError(
         f"{path} is damaged: {why}.\n"
         "Usual cause: a copy that was cut short, or a disk that failed.\n"

@@ -1,6 +1,6 @@
 """The first call of the user's functions: on shapes alone, before anything is computed or compiled.
 
-What goes wrong in there is said by `in_words.py`.
+`in_words.py` explains the errors that occur inside them.
 """
 
 import equinox as eqx
@@ -24,7 +24,7 @@ from lagjax.mechanics.system import System
 
 
 def looked_at(system: System, s: State) -> System:
-    """The system as its functions are now, which `check_functions` found to be in order; the first one of its kind."""
+    """Check a system's functions; return it with what they read from outside now, or an earlier system like it."""
     check_system(system)
     now = up_to_date(system)
     remembered(system, (check_functions, now.read, kinds(s)), lambda: check_functions(now, *s))
@@ -34,21 +34,21 @@ def looked_at(system: System, s: State) -> System:
 def with_known_kinds(system: System, s: State) -> State:
     """The state with whole numbers in `params` as floats, where the system was given floats there before.
 
-    `g=10` after `g=9.81` is another number, not another program. A function for which it matters that a number is whole
-    (an index, a count) has refused the float.
+    `g=10` after `g=9.81` must not compile another program. A function that needs a whole number (an index, a count) has
+    already refused the float.
     """
-    seen: dict = remembered(system, with_known_kinds, dict)
-    mine = kinds(s.params)
-    if mine not in seen and (places := _whole_numbers(s.params)):
+    known_kinds: dict = remembered(system, with_known_kinds, dict)
+    kind = kinds(s.params)
+    if kind not in known_kinds and (places := _whole_numbers(s.params)):
         leaves, structure = jtu.tree_flatten(s.params)
-        for known in seen:
-            asked = [i for i, (a, b) in enumerate(zip(known[1:], mine[1:])) if a != b]
-            if known[0] != structure or not places.issuperset(asked):
+        for known in known_kinds:
+            differing = [i for i, (a, b) in enumerate(zip(known[1:], kind[1:])) if a != b]
+            if known[0] != structure or not places.issuperset(differing):
                 continue
-            changed = [np.asarray(x, s.t.dtype) if i in asked else x for i, x in enumerate(leaves)]
+            changed = [np.asarray(x, s.t.dtype) if i in differing else x for i, x in enumerate(leaves)]
             if kinds(changed)[1:] == known[1:]:
                 return s._replace(params=jtu.tree_unflatten(structure, changed))
-    seen[mine] = True
+    known_kinds[kind] = True
     return s
 
 
@@ -70,7 +70,7 @@ def check_functions(system, t, q, v, params):
         else:
             _check_constraint(Call("phi", constraint.phi, OF_STATE, f" of constraint '{name}'"), given)
     if system.force is not None:
-        # After the constraints, which say what multipliers there are.
+        # After the constraints, which determine the multipliers.
         given |= {"multipliers": zero_multipliers(system, State(t, q, v, params))}
         _check_force(Call("force", system.force, takes_of(system.force)), given)
         if reacts(system):
@@ -82,13 +82,13 @@ def _check_energy(call, given):
     shape, dtype = getattr(value, "shape", None), getattr(value, "dtype", None)
     if isinstance(value, float) or shape == () and jnp.issubdtype(dtype, jnp.floating):
         return
-    cause = "energies left unsummed, as in 0.5 * m * v**2 with v a vector, be it of one"
+    cause = "energies left unsummed, as in 0.5 * m * v**2 with v a vector, even one of length 1"
     fix = "0.5 * m * jnp.sum(v**2), or jnp.dot(v, v); for one coordinate q0 = 0.1, not q0 = [0.1]"
     got = f"shape {shape}, {dtype}" if shape is not None else f"a {type(value).__name__}"
     if value is None:
         got, cause, fix = "None", "a function without return", "return kinetic - potential"
     elif isinstance(value, tuple | list | dict):
-        cause, fix = "the energies one by one", "return kinetic - potential"
+        cause, fix = "the energies returned one by one", "return kinetic - potential"
     elif shape is None and isinstance(value, bool | int) or shape == () and not _is_complex(dtype):
         got = f"{value!r}, a {type(value).__name__}" if shape is None else got
         cause, fix = "a condition or a whole number in place of an energy", "return kinetic - potential"
@@ -105,15 +105,15 @@ def _check_force(call, given):
     force, expected = _shapes(call, given), jax.tree.map(jnp.shape, given["q"])
     if force is None:
         raise ValueError(
-            f"{call} must return one force a coordinate, like q, and returned None.\n"
+            f"{call} must return one force per coordinate, like q, and returned None.\n"
             "Usual cause: a function without return.\n"
             "Fix: return the structure of q, with 0.0 where no force acts."
         )
     if jax.tree.map(jnp.shape, force) != expected:
         raise ValueError(
-            f"{call} must return one force a coordinate, like q.\n"
+            f"{call} must return one force per coordinate, like q.\n"
             f"  q has shapes {expected}\n  the force has {jax.tree.map(jnp.shape, force)}\n"
-            "Usual cause: a force for one of the coordinates alone.\n"
+            "Usual cause: a force for only one of the coordinates.\n"
             "Fix: return the structure of q, with 0.0 where no force acts."
         )
 
@@ -151,7 +151,7 @@ def _check_constraint(call, given):
     if 0 in shape:
         raise ValueError(
             f"{call} must return a scalar or a vector, and returned no equation at all, shape {shape}.\n"
-            "Usual cause: a list of joints that is empty.\n"
+            "Usual cause: an empty list of joints.\n"
             "Fix: leave the constraint out where it has none."
         )
     if not jnp.issubdtype(dtype, jnp.floating):
@@ -164,7 +164,7 @@ def _check_constraint(call, given):
 
 def _shapes(call, given):
     """The shapes and dtypes that the function returns, or an error in the user's words."""
-    check_arguments(call, "an argument left out that the function does not need, or one too many: positions are "
-                    "constrained without v")  # fmt: skip
+    check_arguments(call, "an argument left out as the function does not need it, or one too many: a constraint of "
+                    "positions takes no v")  # fmt: skip
     with in_words(call, given):
         return shape_of(call.function, *(given[name] for name in call.takes))

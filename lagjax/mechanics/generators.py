@@ -1,6 +1,6 @@
 """Infinitesimal motions of a system: of its coordinates, of its clock, and of L by a total derivative.
 
-Translations, rotations and boosts move the points that `cartesian.py` finds among the coordinates, all together.
+Translations, rotations and boosts move all points that `cartesian.py` finds among the coordinates.
 """
 
 import numbers
@@ -29,15 +29,15 @@ class Generator(eqx.Module):
 
     **Arguments:**
 
-    - `delta`: `ξ(t, q, params)` -> like q, `[q]/[ε]`. None where the coordinates stay.
+    - `delta`: `ξ(t, q, params)` -> like q, `[q]/[ε]`. None if the coordinates do not move.
     - `time`: `τ(t, q, params)` -> scalar, or a number, `[t]/[ε]`.
     - `gauge`: `F(t, q, params)` -> scalar, `[L] [t]/[ε]`; L changes by dF/dt, as under a boost.
-    - `name`: what its charge is called.
+    - `name`: the name of its charge.
 
-    Ready ones are `Generator.shift`, `translation`, `rotation`, `screw`, `boost` and `time_translation`; they add up,
-    and may be multiplied by numbers.
+    Ready-made ones are `Generator.shift`, `translation`, `rotation`, `screw`, `boost` and `time_translation`; they can
+    be added, and multiplied by numbers.
 
-    **Raises:** `TypeError` for what is no function.
+    **Raises:** `TypeError` for an argument that is not a function.
 
     Source: Goldstein, *Classical Mechanics*, §13.7.
     """
@@ -67,20 +67,20 @@ class Generator(eqx.Module):
         self.name = name or getattr(delta, "__name__", None) or "charge"
 
     def at(self, t, q, params):
-        """ξ, like q, τ and F at a place, in the dtype of the coordinates."""
+        """ξ (like q), τ and F at one time and position, in the dtype of the coordinates."""
         like = lambda x, y: jnp.broadcast_to(jnp.asarray(y, x.dtype), x.shape)
         xi = jtu.tree_map(jnp.zeros_like, q) if self.delta is None else jtu.tree_map(like, q, self.delta(t, q, params))
         number = lambda f: jnp.zeros_like(t) if f is None else like(t, f(t, q, params))
         return xi, number(self.time), number(self.gauge)
 
     def check(self, s: coordinates.State):
-        """Raise where this is no generator for such coordinates."""
+        """Raise if this generator does not fit such coordinates."""
         given = {"t": s.t, "q": s.q, "params": s.params}
         for role, function in (("delta", self.delta), ("time", self.time), ("gauge", self.gauge)):
             if function is None:
                 continue
             call = Call(role, function, OF_POSITION, f" of the generator '{self.name}'")
-            check_arguments(call, "a function of the velocities too; a generator moves positions")
+            check_arguments(call, "a function that takes the velocities too; a generator moves positions")
             with in_words(call, given):
                 value = shape_of(function, s.t, s.q, s.params)
             if role == "delta":
@@ -88,7 +88,7 @@ class Generator(eqx.Module):
             elif np.shape(value) != ():
                 raise ValueError(
                     f"{call} must return one number, and returned shape {np.shape(value)}.\n"
-                    "Usual cause: a sum over coordinates that was left out.\nFix: jnp.sum(...)."
+                    "Usual cause: a missing sum over coordinates.\nFix: jnp.sum(...)."
                 )
 
     @staticmethod
@@ -100,24 +100,25 @@ class Generator(eqx.Module):
     @staticmethod
     def translation(axis) -> "Generator":
         """Move all points along an axis, `"x"`, `"y"`, `"z"` or a vector: the charge is a momentum."""
-        return Generator(_Translation(_vector(axis)), name=_about("p", axis))
+        return Generator(_Translation(_vector(axis)), name=_charge_name("p", axis))
 
     @staticmethod
     def rotation(axis, about=(0.0, 0.0, 0.0)) -> "Generator":
         """Turn all points about an axis through a point, counterclockwise: the charge is an angular momentum."""
-        return Generator(_Rotation(_vector(axis), _array((*about, 0.0, 0.0)[:3])), name=_about("L", axis))
+        return Generator(_Rotation(_vector(axis), _array((*about, 0.0, 0.0)[:3])), name=_charge_name("L", axis))
 
     @staticmethod
     def screw(axis, pitch: float) -> "Generator":
-        """Move all points along a screw by `pitch` a turn, right-handed: the charge is pitch p + 2π L."""
+        """Move all points along a right-handed screw, by `pitch` per turn: the charge is pitch p + 2π L."""
         moved = pitch * Generator.translation(axis) + 2 * np.pi * Generator.rotation(axis)
-        name = added([(pitch, _about("p", axis))]) + f" + 2π {_about('L', axis)}"
+        name = added([(pitch, _charge_name("p", axis))]) + f" + 2π {_charge_name('L', axis)}"
         return Generator(moved.delta, name=name)
 
     @staticmethod
     def boost(axis, gauge: Callable) -> "Generator":
         """Let all points drift along an axis, by ε t; `gauge(t, q, params)` is Σ m x. The charge is t p - Σ m x."""
-        return Generator(_Boost(_Translation(_vector(axis))), gauge=gauge, name=f"t {_about('p', axis)} - m {axis}")
+        name = f"t {_charge_name('p', axis)} - m {axis}"
+        return Generator(_Boost(_Translation(_vector(axis))), gauge=gauge, name=name)
 
     @staticmethod
     def time_translation() -> "Generator":
@@ -145,7 +146,7 @@ class Generator(eqx.Module):
 
 
 def as_generator(given) -> Generator:
-    """A generator, of one or of the function that moves the coordinates."""
+    """Return a generator as it is, and make one of a function that moves the coordinates."""
     if isinstance(given, Generator):
         return given
     if not callable(given):
@@ -157,7 +158,7 @@ def as_generator(given) -> Generator:
 
 
 def added(terms, digits: str = ".6g") -> str:
-    """A sum in words, of (coefficient, name)."""
+    """Write a sum of (coefficient, name) terms as text."""
     words = ""
     for coefficient, name in terms:
         if not coordinates.is_traced(coefficient) and np.ndim(coefficient) == 0:
@@ -223,7 +224,7 @@ class _Boost(eqx.Module):
 
 
 class _Sum(eqx.Module):
-    """A linear combination of functions of (t, q, params); `place`: of the ξ, τ, F of a generator."""
+    """A linear combination of functions of (t, q, params); `place` selects ξ, τ or F of each generator."""
 
     generators: tuple[Generator, ...]
     weights: tuple
@@ -239,13 +240,13 @@ def _combined(first, second, name):
     weights = tuple(float(w) if isinstance(w, numbers.Real) else w for w in weights)
     moved = []
     for place, role in enumerate(("delta", "time", "gauge")):
-        has = any(getattr(generator, role) is not None for generator in generators)
-        moved.append(_Sum(generators, weights, place) if has else None)
+        occurs = any(getattr(generator, role) is not None for generator in generators)
+        moved.append(_Sum(generators, weights, place) if occurs else None)
     return Generator(*moved, name=name)
 
 
 def places_of(name, q, known=None) -> list[int]:
-    """Where the coordinates of a name are in the vector of all; a leaf's name stands for all of it."""
+    """The places of the named coordinate in the vector of all; a leaf's name stands for all its entries."""
     known = coordinates.names(q) if known is None else known
     found = [i for i, other in enumerate(known) if other == name]
     if not found and name in leaf_names(q):
@@ -278,7 +279,7 @@ def _vector(axis) -> np.ndarray:
     return _array((*axis, 0.0)[:3])
 
 
-def _about(letter, axis):
+def _charge_name(letter, axis):
     return f"{letter}_{axis}" if isinstance(axis, str) else f"{letter}·({', '.join(f'{x:g}' for x in axis)})"
 
 
@@ -290,17 +291,17 @@ def _check_displacement(call, value, q):
     names = leaf_names(q)
     structure, expected = jtu.tree_structure(value), jtu.tree_structure(q)
     if structure != expected:
-        has = _named(value)
-        missing = [name for name in names if name not in has] if has is not None else []
-        unknown = [name for name in has if name not in names] if has is not None else []
-        about = "; ".join(
+        returned = _names_in(value)
+        missing = [name for name in names if name not in returned] if returned is not None else []
+        unknown = [name for name in returned if name not in names] if returned is not None else []
+        difference = "; ".join(
             f"{word} {listed(some)}" for word, some in (("it lacks", missing), ("q has no", unknown)) if some
         )
-        returned = about or f"it is {_kind(value)} where q has {listed(names)}"
+        difference = difference or f"it is {_kind(value)} where q has {listed(names)}"
         raise ValueError(
-            f"{call} must return one velocity a coordinate, like q: {returned}.\n"
-            "Usual cause: a coordinate that does not move left out.\n"
-            f"Fix: return the structure of q, with 0.0 for {missing[0] if missing else 'what stays'}."
+            f"{call} must return one velocity per coordinate, like q: {difference}.\n"
+            "Usual cause: a coordinate left out because it does not move.\n"
+            f"Fix: return the structure of q, with 0.0 for {missing[0] if missing else 'what does not move'}."
         )
     for name, x, y in zip(names, jtu.tree_leaves(q), jtu.tree_leaves(value)):
         if np.shape(y) not in ((), np.shape(x)):
@@ -310,7 +311,7 @@ def _check_displacement(call, value, q):
             )
 
 
-def _named(value):
+def _names_in(value):
     return leaf_names(value) if isinstance(value, Mapping) or hasattr(value, "_fields") else None
 
 

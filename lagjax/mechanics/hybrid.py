@@ -32,21 +32,23 @@ class Switch(eqx.Module):
 
     **Arguments:**
 
-    - `phase`: the name of the phase that it ends; `to`: that of the next one, which may be the same.
+    - `phase`: the name of the phase that it ends; `to`: the name of the next phase, which may be the same.
     - `when`: the guard, `when(t, q, v, params)`, or `when(t, q, v, multipliers, params)` with the phase's own
-      multipliers by constraint name; a number of any unit, above zero as long as the phase lasts. What it closes over
-      is differentiated too.
-    - `reset`: what jumps, or None: `reset(t, q, v, params)` -> velocities like `v`, or a pair (q, v) for the whole
-      state; or with multipliers, as `when`. `lj.touches` and the like bring their own.
+      multipliers by constraint name; a number of any unit, above zero as long as the phase lasts. Values that it
+      closes over are differentiated too.
+    - `reset`: the jump, or None: `reset(t, q, v, params)` -> velocities like `v`, or a pair (q, v) for the whole state;
+      it may take multipliers, as `when`. Guards such as `lj.touches` have a reset of their own.
 
-    - `rest`: the name of the phase to go to in place of `to` where the guard, after the reset, opens by less than
-      `slower_than` in a unit of time: of infinitely many impacts in finite time the last ones. The velocities become
-      the nearest that the constraints of that phase allow. What is left out of the motion is of that size squared.
+    - `rest`: the name of the phase to enter instead of `to` where the guard, after the reset, opens more slowly than
+      `slower_than` per unit of time: this ends infinitely many impacts in finite time. The velocities become the
+      nearest ones that the constraints of that phase allow. The part of the motion left out is of the size of
+      `slower_than` squared.
 
-    **Raises:** `TypeError` where these are not what they should be.
+    **Raises:** `TypeError` for an argument of the wrong type.
 
     A guard that is at zero where its phase begins and goes up, as after an impact, is not crossed there; one that goes
-    down, or is below zero after another switch, ends the phase at once. At the start of a motion it is refused.
+    down, or is below zero after another switch, ends the phase at once. At the start of a motion such a guard is
+    refused.
     """
 
     phase: str = eqx.field(static=True)
@@ -80,7 +82,7 @@ class Switch(eqx.Module):
                 )
         self.phase, self.to, self.when, self.rest = phase, to, when, rest
         self.slower_than = slower_than if isinstance(slower_than, jax.Array) else np.asarray(slower_than, float)
-        # A contact that is made brings its impact along.
+        # A guard such as `lj.touches` has its impact as `reset`.
         self.reset = getattr(when, "reset", None) if reset is None else reset
 
     def __repr__(self):
@@ -98,12 +100,12 @@ class Switch(eqx.Module):
         return super().__reduce_ex__(protocol)
 
     def value(self, t, q, v, multipliers, params):
-        """The guard at one state."""
+        """The value of the guard at one state."""
         given = {"t": t, "q": q, "v": v, "multipliers": multipliers, "params": params}
         return self.when(*(given[name] for name in takes_of(self.when)))
 
     def in_words(self) -> str:
-        """From where to where."""
+        """The switch in words: from which phase to which."""
         return f"'{self.phase}' -> '{self.to}'" + (", with a reset" if self.reset is not None else "")
 
 
@@ -126,11 +128,12 @@ class Hybrid(eqx.Module):
 
     - `phases`: by name, `System`s over the same coordinates. A constraint of the same name in several phases has the
       same shape in all. Motions start in the first one, or with `lj.integrate(..., start=name)`.
-    - `switches`: `Switch`es, or lists of them. Of two guards that cross at the same time the one that is named first
-      counts, and the other one at once in the next phase, if it is one of that.
-    - `most_switches`: the largest number of switches in a motion, for which there is room.
+    - `switches`: `Switch`es, or lists of them. Where two guards cross at the same time, the one listed first takes
+      effect; the other one does so at once in the next phase, if it belongs to that phase.
+    - `most_switches`: the largest number of switches in a motion; memory is reserved for so many.
 
-    **Raises:** `TypeError`, `ValueError` for what is no phase, no switch, or a name that no phase has.
+    **Raises:** `TypeError` for a phase that is not a `System` or a switch that is not a `Switch`; `ValueError` for a
+    name that no phase has.
     """
 
     systems: tuple[System, ...]
@@ -139,7 +142,7 @@ class Hybrid(eqx.Module):
     first: Int[Array, ""] | np.ndarray
     names: tuple[str, ...] = eqx.field(static=True)
     most_switches: int = eqx.field(static=True)
-    # What the switches' functions read from outside, which a compiled program holds.
+    # What the switches' functions read from outside; a compiled program contains these values.
     read: Hashable = eqx.field(static=True)
 
     def __init__(
@@ -164,7 +167,7 @@ class Hybrid(eqx.Module):
         for switch in listed:
             if not isinstance(switch, Switch):
                 raise TypeError(
-                    f"a switch is {type(switch).__name__}.\n"
+                    f"a switch must be a lj.Switch, not a {type(switch).__name__}.\n"
                     'Fix: lj.Switch("flying", to="rolling", when=lambda t, q, v, params: ...).'
                 )
             if switch.phase == switch.to and switch.reset is None:
@@ -175,7 +178,7 @@ class Hybrid(eqx.Module):
             for name in (switch.phase, switch.to, switch.rest):
                 if name is not None and name not in phases:
                     raise ValueError(
-                        f"the switch {switch.in_words()} names a phase '{name}', and there is none.\n"
+                        f"the switch {switch.in_words()} names a phase '{name}', which does not exist.\n"
                         f"The phases are {', '.join(map(repr, phases))}."
                     )
         self.systems, self.names = tuple(phases.values()), tuple(phases)
@@ -183,13 +186,13 @@ class Hybrid(eqx.Module):
         self.first, self.read = np.zeros((), np.int32), ()
 
     def starting(self, start: str | None) -> "Hybrid":
-        """The same, for motions that start in the phase of this name; with None in the one that is known already."""
+        """The same hybrid with motions that start in the named phase; None keeps the present one."""
         if start is None:
             return self
         if start not in self.names:
             raise ValueError(
-                f"start={start!r} is no phase.\nThe phases are {', '.join(map(repr, self.names))}, of which the first "
-                "is the start by default."
+                f"start={start!r} is not a phase.\nThe phases are {', '.join(map(repr, self.names))}; motions start in "
+                "the first one by default."
             )
         return replace_fields(self, first=np.asarray(self.names.index(start), np.int32))
 
@@ -205,7 +208,7 @@ class Hybrid(eqx.Module):
 
     @property
     def targets(self) -> np.ndarray:
-        """Of each switch the number of the next phase, and of the phase of rest, which is the same if it has none."""
+        """For each switch the numbers of the next phase and of the phase of rest (the next one if it has none)."""
         number = lambda name, other: self.names.index(other if name is None else name)
         return np.array([[number(s.to, s.to), number(s.rest, s.to)] for s in self.switches], np.int32)
 
@@ -226,7 +229,7 @@ def _count(n, word, plural):
 
 
 def replace_fields(hybrid: Hybrid, **fields) -> Hybrid:
-    """A hybrid with other values of some of its fields, which are not checked again."""
+    """Replace some fields of a hybrid without checking them again."""
     same = object.__new__(Hybrid)
     for name in ("systems", "switches", "first", "names", "most_switches", "read"):
         object.__setattr__(same, name, fields.get(name, getattr(hybrid, name)))
@@ -239,5 +242,5 @@ def first_phase(system: System | Hybrid) -> System:
 
 
 def phases_of(system: System | Hybrid) -> tuple[System, ...]:
-    """The systems of all phases; of a system itself."""
+    """The systems of all phases; a `System` is its own only phase."""
     return system.systems if isinstance(system, Hybrid) else (system,)

@@ -1,7 +1,7 @@
-"""A system seen as numbers: coordinates one by one, programs as operations on single numbers.
+"""A system in single numbers: coordinates one by one, programs as operations on single numbers.
 
 `in_numbers` gives the same system with a tuple of numbers in place of the user's q and v. `Numbers` traces a function
-of the system and its state, writes it out, and parts it in what depends on the parameters alone and the rest.
+of the system and its state, writes it out, and splits it into a part that depends on the parameters alone and the rest.
 """
 
 import math
@@ -22,8 +22,8 @@ from lagjax.mechanics.constraints import Holonomic, Nonholonomic
 from lagjax.mechanics.system import System
 from lagjax.numerics.scalars import written_out
 
-# Up to so many operations are written before it is known which are needed. To write a hundred thousand, as of an L with
-# tables or a quadrature in it, only to leave them takes 15 s.
+# The most operations that are written out, before it is known which are needed. Writing a hundred thousand, as for an L
+# with tables or a quadrature in it, only to discard them takes 15 s.
 WRITTEN = 6000
 
 
@@ -40,7 +40,7 @@ class InNumbers(eqx.Module):
 
     def __call__(self, t, *states_and_params):
         *states, params = states_and_params
-        # Multipliers come by name.
+        # Multipliers come by name, and pass unchanged.
         together = lambda state: self.unflatten(jnp.stack(state)) if isinstance(state, tuple) else state
         result = self.function(t, *map(together, states), params)
         return coordinates.numbers(result) if self.returns_coordinates else result
@@ -64,7 +64,7 @@ class Numbers:
     """A function of (system, t, q, v, params), traced once and written out.
 
     What depends on the system and the parameters alone is computed by `prepare`, once; `at` does the rest. `calls_host`
-    says whether a function of the user's calls Python at run time. Beyond about `most` operations it raises `TooLong`.
+    says whether a user's function calls Python at run time. Beyond about `most` operations it raises `TooLong`.
     """
 
     def __init__(self, function, args, most=math.inf):
@@ -82,9 +82,9 @@ class Numbers:
         self.calls_host = calls_host(program.jaxpr)
         if WATCHED.value:
             program = poisoned(program)
-        program = _with_needed(program)
+        program = _without_unused(program)
         full = jax.make_jaxpr(lambda *leaves: written_out(program, *leaves, most=most))(*like)
-        self.program = _with_needed(full)
+        self.program = _without_unused(full)
         of_problem, of_state = _leaves_of(arrays, (0, 4)), _leaves_of(arrays, (1, 2, 3))
         self.state_variables = [self.program.jaxpr.invars[i] for i in of_state]
         early, late = staged(self.program, of_problem, of_state)
@@ -96,7 +96,7 @@ class Numbers:
         return length(self.program.jaxpr)
 
     def prepare(self, system, params) -> tuple | None:
-        """What does not depend on the state; None where that is nothing, since equinox takes `()` amiss."""
+        """What does not depend on the state; None if there is nothing, since equinox mishandles `()`."""
         return tuple(self._early(*jtu.tree_leaves(eqx.filter((system, params), eqx.is_array)))) or None
 
     def at(self, prepared, t, q, v):
@@ -108,12 +108,12 @@ class Numbers:
         return self.at(self.prepare(system, params), t, q, v)
 
 
-def _with_needed(program):
+def _without_unused(program):
     return program.replace(jaxpr=program.jaxpr.replace(eqns=needed(program.jaxpr)))
 
 
 def _leaves_of(arguments, places):
-    """Where the leaves of some of the arguments are among those of all."""
+    """The places of some arguments' leaves among the leaves of all."""
     sizes = [len(jtu.tree_leaves(x)) for x in arguments]
     starts = np.cumsum([0, *sizes])
     return [i for place in places for i in range(starts[place], starts[place + 1])]

@@ -135,9 +135,9 @@ def test_said_by_name():
         lj.integrate(bouncing, 1.0, 0.0, PARAMS, ts=np.array([0.0, 0.25, 0.5, 0.75, 3.0]))
     with pytest.raises(ValueError, match="guard of phase 'flying' is below zero at the start.*is -1"):
         lj.integrate(bouncing, -1.0, 0.0, PARAMS, ts=np.array([0.0, 0.25, 0.5, 0.75, 3.0]))
-    with pytest.raises(ValueError, match="names a phase 'rolling', and there is none"):
+    with pytest.raises(ValueError, match="names a phase 'rolling', which does not exist"):
         lj.Hybrid({"flying": ball}, [lj.Switch("flying", to="rolling", when=lambda t, q, v, p: q)])
-    with pytest.raises(ValueError, match="start='rolling' is no phase"):
+    with pytest.raises(ValueError, match="start='rolling' is not a phase"):
         lj.integrate(bouncing, 1.0, 0.0, PARAMS, ts=np.array([0.0, 1.0]), start="rolling")
     with pytest.raises(ValueError, match="start= names the first phase"):
         lj.integrate(ball, 1.0, 0.0, PARAMS, ts=np.array([0.0, 1.0]), start="flying")

@@ -228,14 +228,14 @@ def test_files_that_are_not_whole(tmp_path):
     for content, words in (
         (changed, "is damaged: Bad CRC-32"),
         (whole[: len(whole) // 2], "is damaged: its end is missing"),
-        (b"", "is no trajectory of lagjax's"),
-        (b"t,x\n0,1\n", "is no trajectory of lagjax's"),
+        (b"", "is not a trajectory saved by lagjax"),
+        (b"t,x\n0,1\n", "is not a trajectory saved by lagjax"),
     ):
         path.write_bytes(content)
         with pytest.raises(ValueError, match=words):
             lj.load_trajectory(path)
     np.savez(path, x=np.ones(3))
-    with pytest.raises(ValueError, match="is no trajectory of lagjax's"):
+    with pytest.raises(ValueError, match="is not a trajectory saved by lagjax"):
         lj.load_trajectory(path)
     with pytest.raises(FileNotFoundError, match="there is no file"):
         lj.load_trajectory(tmp_path / "other.npz")
