@@ -143,7 +143,7 @@ MISTAKES = {
     "the system last": (
         lambda: lj.integrate(*START, PARAMS, pendulum, ts=TS), TYPE, "is a dict", "number 4 here", "system, q0, v0"),
     "times by place": (
-        lambda: lj.integrate(pendulum, *START, PARAMS, TS), TYPE, "without ts=", "by place", r"params, ts=ts\)"),
+        lambda: lj.integrate(pendulum, *START, PARAMS, TS), TYPE, "without ts=", "by position", r"params, ts=ts\)"),
     "times left out": (lambda: lj.integrate(pendulum, *START, PARAMS), TYPE, "without ts=", r"params, ts=ts\)"),
     "times as params": (lambda: move(swing, params=TS), TYPE, "'m' of params", r"shape \(5,\)", "another order"),
     "L in another order": (
@@ -182,7 +182,7 @@ MISTAKES = {
         r"shapes \(2,\) and \(3,\)", r"q is an array of shape \(2,\)"),
     "attributes of an array": (lambda: move(attributes, (1.0, 0.0)), TYPE, ".theta of an array", r'v\["theta"\]'),
     "a power": (lambda: move(lambda t, q, v, p: 0.5 * v["theta"] ^ 2), TYPE, "no power", r"v\*\*2"),
-    "a count as a float": (lambda: move(counts, params={"n": 3.0}), TYPE, "no whole number", '"n": 3'),
+    "a count as a float": (lambda: move(counts, params={"n": 3.0}), TYPE, "not a whole number", '"n": 3'),
     "a count in an array": (lambda: move(counts, params={"n": jnp.array(3)}), TYPE, "not known while JAX", '"n": 3'),
     "entries by a condition": (
         lambda: move(lambda t, q, v, p: jnp.sum(v[v > 0] ** 2), (np.ones(2), np.ones(2))), TYPE, "how many", "where"),

@@ -1,13 +1,12 @@
-"""The programs that were compiled for calls from Python: bounded together, whatever they compute.
+"""The programs compiled for calls from Python, whatever they compute, with one limit on their number.
 
-A program keeps the functions of the user that it was compiled for, and 1 to 130 MB and up to 500 memory maps with them,
-for as long as it is here. Weak references would not help, as it is the program itself that holds the functions; so one
-that is not used any more goes when enough others have been used after it. What is dropped and called again is compiled
-again.
+As long as a program is kept here, it holds the user's functions that it was compiled for, and with them 1 to 130 MB and
+up to 500 memory maps. Weak references would not help, since the program itself holds the functions; so a program is
+dropped when enough others have been used after it. When it is called again, it is compiled again.
 
-That frees a program if nothing else keeps it: each has a `jax.jit` of its own, and what JAX keeps of functions that it
-traced inside of it is forgotten, too (3 MB of each motion). The programs of the user's own `jax.jit` stay in JAX's
-caches; `jax.clear_caches()` gives them back.
+Dropping a program frees it if nothing else keeps it: each has a `jax.jit` of its own, and JAX's traces of the functions
+inside it are dropped too (3 MB for each motion). The programs of the user's own `jax.jit` stay in JAX's caches;
+`jax.clear_caches()` frees them.
 """
 
 import threading
@@ -19,18 +18,18 @@ from lagjax.jax_internals.tracing import forget_traces
 from lagjax.mechanics.memory_maps import share_used
 
 T = TypeVar("T")
-# Programs; a motion's take 10 to 130 MB, one evaluation's 1 to 20.
+# The most programs kept; those of a motion take 10 to 130 MB, those of one evaluation 1 to 20.
 AT_MOST = 150
-# Where more of the memory maps is used than this, by whomever, older programs go; the last ones stay even then.
+# Where more than this share of the memory maps is in use, by any code, all but the last few programs may be dropped.
 MAPS_SHARE, AT_LEAST = 0.25, 8
 
-# What was used last at the end.
+# The most recently used program is the last one.
 _programs: OrderedDict = OrderedDict()
 _one_thread = threading.Lock()
 
 
 def kept(key: Hashable, make: Callable[[], T]) -> T:
-    """The program of this key, made where there is none."""
+    """The program of this key, made if there is none yet."""
     with _one_thread:
         found = _programs.get(key)
         if found is not None:
@@ -38,9 +37,9 @@ def kept(key: Hashable, make: Callable[[], T]) -> T:
             return found
         scarce = share_used() > MAPS_SHARE
         if len(_programs) >= (AT_LEAST if scarce else AT_MOST):
-            # Several at once: to count again after each takes long, and to forget traces makes others be traced again.
-            few = max(AT_LEAST, len(_programs) // 2) if scarce else AT_MOST * 15 // 16
-            while len(_programs) > few:
+            # Drop several at once: counting the maps again takes long, and forgetting traces makes others trace again.
+            target = max(AT_LEAST, len(_programs) // 2) if scarce else AT_MOST * 15 // 16
+            while len(_programs) > target:
                 _programs.popitem(last=False)
             forget_traces()
         found = _programs[key] = make()

@@ -41,13 +41,13 @@ def mass_and_forcing(system, t, x, u, params, unflatten) -> Linear:
     if x.size == 1:
         mass = inertia(jnp.ones_like(u))[None]
     else:
-        # The columns of M by name of velocity; M is symmetric.
+        # One column of M for each velocity, stacked as rows: M is symmetric.
         mass = jax.vmap(inertia)(jnp.eye(x.size, dtype=x.dtype))
     return Linear(mass.astype(x.dtype), forcing, response(system, t, x, u, params, unflatten))
 
 
 def forcing_and_inertia(system, t, x, u, params, unflatten):
-    """F at a state without what multipliers add to it, and the product with M as a function of an acceleration."""
+    """F at a state without the part of the multipliers, and the function that multiplies an acceleration by M."""
 
     def lagrangian(t, x, u):
         return system.lagrangian(t, unflatten(x), unflatten(u), params)
@@ -157,6 +157,6 @@ def _jacobi_integral(system, t, q, v, params):
 
 def _force_vector(system, t, x, u, params, unflatten):
     q, v = unflatten(x), unflatten(u)
-    none = jnp.zeros(constraints.count(system, t, q, v, params), x.dtype)
-    force = force_at(system, t, q, v, params, none)
+    no_multipliers = jnp.zeros(constraints.count(system, t, q, v, params), x.dtype)
+    force = force_at(system, t, q, v, params, no_multipliers)
     return coordinates.flatten(force)[0].astype(x.dtype)

@@ -1,4 +1,4 @@
-"""What was found of an object, for as long as the object lives."""
+"""Results about an object, remembered for as long as the object lives."""
 
 import math
 import weakref
@@ -13,21 +13,21 @@ from jax.core import Tracer
 from jaxtyping import PyTree
 
 T = TypeVar("T")
-# Of one object. Shapes that never end are a user's loop, and the first of them are not asked for again.
+# The most results of one object. Only a user's loop over new shapes has more, and does not need the first ones again.
 AT_MOST = 256
-_found: dict[int, tuple[weakref.ref, dict]] = {}
+_results: dict[int, tuple[weakref.ref, dict]] = {}
 
 
 def remembered(thing: Any, key: Hashable, find: Callable[[], T]) -> T:
-    """`find()`, or what it found before for this very object and this key."""
+    """`find()`, or its earlier result for this very object and this key."""
     try:
         hash(key)
     except TypeError:
         return find()
-    reference, found = _found.get(id(thing), (None, {}))
+    reference, found = _results.get(id(thing), (None, {}))
     if reference is None or reference() is not thing:
         number, found = id(thing), {}
-        _found[number] = weakref.ref(thing, lambda _: _found.pop(number, None)), found
+        _results[number] = weakref.ref(thing, lambda _: _results.pop(number, None)), found
     if key not in found:
         value = find()
         if len(found) >= AT_MOST:
@@ -37,13 +37,13 @@ def remembered(thing: Any, key: Hashable, find: Callable[[], T]) -> T:
 
 
 def kinds(tree: PyTree):
-    """Structure, shapes and dtypes of a tree, and what in it is no array: what a program is compiled for."""
+    """Structure, shapes and dtypes of a tree, and its leaves that are not arrays: what a program is compiled for."""
     leaves, structure = jtu.tree_flatten(tree)
     return structure, *((x.shape, x.dtype) if is_array(x) else (type(x), x) for x in leaves)
 
 
 def same(a: PyTree, b: PyTree) -> bool:
-    """Whether two trees are the same, their arrays by value; those that JAX is tracing by identity."""
+    """Whether two trees are the same: arrays by value, arrays that JAX is tracing by identity."""
     if kinds(a) != kinds(b):
         return False
     pairs = [(x, y) for x, y in zip(jtu.tree_leaves(a), jtu.tree_leaves(b)) if x is not y and is_array(x)]
@@ -53,23 +53,23 @@ def same(a: PyTree, b: PyTree) -> bool:
 
 
 class Parted(NamedTuple):
-    """What of a tree is no array: what a program of its arrays is compiled for."""
+    """The part of a tree that is not arrays: what a program of its arrays is compiled for."""
 
     rest: tuple
     structure: Any
 
     def together(self, arrays):
-        """The tree again."""
+        """Put the tree together again."""
         arrays = iter(arrays)
         return jtu.tree_unflatten(self.structure, [next(arrays) if x is None else x for x in self.rest])
 
 
 def parted(tree: PyTree) -> tuple[Parted, list]:
-    """A tree as what is no array, and the arrays, among which is a number of NumPy's: it is another one each time."""
+    """Split off a tree's arrays; NumPy numbers are among them, as their values vary between calls."""
     leaves, structure = jtu.tree_flatten(tree)
-    goes = [is_array(x) or isinstance(x, np.generic) for x in leaves]
-    rest = tuple(None if array else x for x, array in zip(leaves, goes))
-    return Parted(rest, structure), [x for x, array in zip(leaves, goes) if array]
+    varies = [is_array(x) or isinstance(x, np.generic) for x in leaves]
+    rest = tuple(None if array else x for x, array in zip(leaves, varies))
+    return Parted(rest, structure), [x for x, array in zip(leaves, varies) if array]
 
 
 def is_array(x) -> bool:
@@ -78,15 +78,15 @@ def is_array(x) -> bool:
 
 
 def shape_of(function: Callable, *args):
-    """What a function returns of arrays of JAX or NumPy, as shapes; nothing is computed."""
+    """The shapes that a function returns for JAX or NumPy arrays; nothing is computed."""
     shaped = lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype) if isinstance(x, np.ndarray) else x
     return eqx.filter_eval_shape(function, *jtu.tree_map(shaped, args))
 
 
 def filled_up(count: int) -> int:
-    """One of few numbers that is not below `count`: a program of that length serves all that are filled up to it.
+    """Round `count` up to one of few numbers: a program of that length serves everything filled up to it.
 
-    No more than 7 are filled up, or an eighth of them.
+    This adds at most 7, or an eighth of `count`.
     """
     step = 2 ** max(3, count.bit_length() - 4)
     return math.ceil(count / step) * step

@@ -1,4 +1,4 @@
-"""The multipliers and what they say: accelerations, constraint forces, residuals at one state.
+"""The multipliers and what follows from them: accelerations, constraint forces, residuals at one state.
 
 The equations and their solution are those of `saddle_point.py`.
 """
@@ -52,7 +52,7 @@ def accelerations(system, t, q, v, params) -> tuple[PyTree[Array], dict[str, Arr
     check_system(system, t, q, v, params)
     s = coordinates.prepared(t, q, v, params)
     system = looked_at(system, s)
-    # What a function closes over may be traced where nothing that is passed is.
+    # A value that a function closes over may be traced where no argument is.
     if not is_eager() or coordinates.is_traced((s, eqx.filter(system, eqx.is_array))):
         equations = equations_of(lift(system, s), *s, fast=True)
         a, multipliers = equations.solution_or_nan(s.t, equations.inside(s.q), equations.inside(s.v))
@@ -65,8 +65,8 @@ def accelerations(system, t, q, v, params) -> tuple[PyTree[Array], dict[str, Arr
     found = examined(system, *s)
     solution = found.a, found.multipliers
     finite = all(np.all(np.isfinite(x)) for x in jax.tree.leaves((solution, found.lagrangian)))
-    well = finite and bool(found.unique) and not np.any(np.asarray(found.contradictory))
-    if not well or explain_singular(np.asarray(found.matrix), system, s):
+    valid = finite and bool(found.unique) and not np.any(np.asarray(found.contradictory))
+    if not valid or explain_singular(np.asarray(found.matrix), system, s):
         raise ValueError(explain_failure(system, s) or f"the accelerations are not finite {where(s)}.")
     return solution
 

@@ -1,7 +1,7 @@
 """One-parameter groups of motions of a system, and what each of them conserves.
 
 A generator moves the coordinates by ε ξ(t, q) and the time by ε τ(t, q). It is a symmetry of L where the action changes
-by what does not count, the ends: by ε times the total derivative of a function F(t, q), the gauge term,
+only by terms at its ends: by ε times the total derivative of a function F(t, q), the gauge term,
 
     τ ∂L/∂t + ξ·∂L/∂q + (dξ/dt - v dτ/dt)·p + L dτ/dt - dF/dt = 0,        p = ∂L/∂v
 
@@ -10,7 +10,7 @@ equations of motion `dp/dt = ∂L/∂q + f` give
 
     C = p·ξ - τ (v·p - L) - F,        dC/dt = ρ + f·(ξ - τ v)
 
-at every state, symmetry or not. So C stays where ρ = 0 and no force acts along ξ - τ v; a constraint's own force
+at every state, symmetry or not. So C is constant where ρ = 0 and no force acts along ξ - τ v; a constraint's own force
 λ·A (ξ - τ v) vanishes for all λ where the displacement is one that the constraint allows.
 
 Source: Noether, Nachr. Ges. Wiss. Göttingen (1918) 235, §2; Goldstein, *Classical Mechanics*, §13.7;
@@ -35,9 +35,9 @@ from lagjax.mechanics.system import System
 
 
 class NoetherCharge(eqx.Module):
-    """What a generator conserves: a function of (t, q, v, params), `[L] [t]`; `noether_charge` makes it.
+    """The charge of a generator: a function of (t, q, v, params), `[L] [t]`; `noether_charge` makes it.
 
-    `rate(t, q, v, params)`: its rate of change on a motion, zero where it is conserved, and right where it is not.
+    `rate(t, q, v, params)`: its rate of change along a motion, zero where it is conserved and correct where it is not.
     """
 
     system: System
@@ -55,7 +55,7 @@ class NoetherCharge(eqx.Module):
         return _rate(system, self.generator, *s, multipliers)
 
     def size(self, t, q, v, params) -> Float[Array, ""]:
-        """The size of the terms that the charge is a sum of: what a change of it is compared with."""
+        """The size of the terms that the charge is a sum of, to compare a change of it with."""
         system, s = self._checked(t, q, v, params)
         return _size(system, self.generator, *s)
 
@@ -89,9 +89,9 @@ def noether_charge(system: System, generator) -> NoetherCharge:
       group moves the coordinates, `[q]/[ε]`.
 
     **Returns:** a function of (t, q, v, params) -> scalar, `[L] [t]/[ε]`, for `jit`, `vmap` and derivatives; its
-    `rate` of the same arguments is dC/dt on a motion, also where that is not zero.
+    `rate` of the same arguments is dC/dt along a motion, also where that is not zero.
 
-    **Raises:** `TypeError` for a generator that is no function; `ValueError`, when it is called, for one whose
+    **Raises:** `TypeError` for a generator that is not a function; `ValueError`, when it is called, for one whose
     displacement does not have the structure of q, with the coordinate by name.
 
     Source: Goldstein, §13.7; the gauge term as in Derivation 8 of its chapter 1.
@@ -112,7 +112,7 @@ class Flow(NamedTuple):
 
 
 def flow(generator: Generator, t, q, v, params) -> Flow:
-    """What a generator does at one state."""
+    """A generator and its total derivatives at one state."""
     at = lambda t, q: generator.at(t, q, params)
     (xi, tau, gauge), (xi_rate, tau_rate, gauge_rate) = jax.jvp(at, (t, q), (jnp.ones_like(t), v))
     vector = lambda y: coordinates.flatten(y)[0]

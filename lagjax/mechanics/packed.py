@@ -1,4 +1,4 @@
-"""A pytree as its arrays and a hashable rest, so that JAX can carry a system along with what was computed of it."""
+"""Split a pytree into arrays and a hashable rest, so that JAX can carry a system along with what was computed of it."""
 
 from typing import Any, NamedTuple
 
@@ -8,18 +8,18 @@ from jaxtyping import PyTree
 
 
 class Packed(NamedTuple):
-    """What of a pytree is not an array: its other leaves, with None in place of arrays, and its structure."""
+    """The part of a pytree that is not arrays: its other leaves, with None in place of arrays, and its structure."""
 
     leaves: tuple
     structure: Any
 
     def together(self, arrays: PyTree) -> Any:
-        """The pytree again."""
+        """Put the pytree together again."""
         return eqx.combine(arrays, jtu.tree_unflatten(self.structure, self.leaves))
 
     def __reduce__(self):
-        # Equinox has a marker in the structure of its modules that it knows by identity. A copy of the structure would
-        # have a copy of the marker: the tree itself is copied in its place.
+        # Equinox puts a marker into the structure of its modules and recognises it by identity. A copied structure
+        # would contain a copy of the marker, so the tree itself is copied instead.
         return _rest_of, (jtu.tree_unflatten(self.structure, self.leaves),)
 
 

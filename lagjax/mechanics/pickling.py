@@ -1,7 +1,7 @@
-"""What can be pickled, said before pickle itself says it in words of its own.
+"""Check that functions can be pickled, and explain it where they cannot, before pickle fails with its own message.
 
-Pickle writes down where a function is found, its module and its name, and not what it does. A lambda has no name, and a
-function inside another one cannot be reached by it.
+Pickle writes down where a function is found, its module and name, not what it does. A lambda has no name, and a
+function inside another one cannot be reached by its name.
 """
 
 import copy
@@ -10,21 +10,21 @@ import sys
 from collections.abc import Callable, Mapping
 from types import FrameType, FunctionType
 
-# Who takes functions as they are, whatever their names: copies keep them, and others write down what they do.
+# Packages that pickle any function, whatever its name: they write down what it does.
 TAKES_ANY_FUNCTION = ("cloudpickle", "dill")
 
 
 def check_functions(functions: Mapping[str, Callable | None]) -> None:
-    """Raise `pickle.PicklingError` where one of these functions, each by what it is, cannot be found by its name."""
+    """Raise `pickle.PicklingError` if one of these functions, given by role, cannot be found by its name."""
     for role, function in functions.items():
-        if isinstance(function, FunctionType) and not _is_found(function) and not _any_function_will_do():
+        if isinstance(function, FunctionType) and not _is_found(function) and not _any_function_is_taken():
             code, name = function.__code__, function.__name__
             raise pickle.PicklingError(
                 f"{role} cannot be pickled: {_why(function)} "
                 f"({code.co_filename.rsplit('/', 1)[-1]}, line {code.co_firstlineno}).\n"
                 "Usual cause: pickle, or a pool of processes, which finds functions by their module and name.\n"
                 f"Fix: define it with def at the top of a module, as def {'f' if name == '<lambda>' else name}(...); "
-                "for a trajectory or a fit alone .save(path), which needs no functions."
+                "or save a trajectory or a fit alone with .save(path), which needs no functions."
             )
 
 
@@ -40,11 +40,11 @@ def _why(function):
         return "it is a lambda"
     if "<locals>" in function.__qualname__:
         return f"{function.__name__} is defined inside of another function"
-    return f"{function.__module__}.{function.__qualname__} is another function by now"
+    return f"{function.__module__}.{function.__qualname__} names another function now"
 
 
-def _any_function_will_do():
-    """Whether somebody is at work who takes any function."""
+def _any_function_is_taken():
+    """Whether a caller takes any function: `copy`, which keeps functions, or one of `TAKES_ANY_FUNCTION`."""
     frame: FrameType | None = sys._getframe(1)
     while frame is not None:
         module = frame.f_globals.get("__name__", "")

@@ -1,16 +1,16 @@
-"""Forces that depend on multipliers, as Coulomb's friction on the normal force: what they add to the equations.
+"""Forces that depend on multipliers, as Coulomb's friction does on the normal force: what they add to the equations.
 
-A force Q = Q₀ + B λ acts beside the constraints' own, Aᵀ λ:
+A force Q = Q₀ + B λ acts in addition to the constraints' own, Aᵀ λ:
 
     M a - Aᵀ λ = F + B λ,    A a = gamma
 
-The matrix is that of the equations without it, and so it is solved by their solution, which is linear in the force.
-With (a₀, λ₀) for F, and (a_j, λ_j) for each column of B alone, where R has the columns λ_j,
+The equations without B λ have the same matrix, and their solution, which is linear in the force, solves these too. With
+(a₀, λ₀) for F, (a_j, λ_j) for each column of B alone, and R the matrix with the columns λ_j,
 
     (I - R) λ = λ₀,    a = a₀ + Σ_j λ_j a_j
 
-What the pivots of I - R are below zero for has no motion, or two: where friction pushes a contact harder than the
-contact keeps it away, a paradox of Painlevé. It counts as singular.
+Where a pivot of I - R is below zero there is no motion, or there are two: friction pushes a contact together harder
+than the contact pushes it apart (Painlevé's paradox). This counts as singular.
 
 Source: Painlevé, *Leçons sur le frottement* (1895); Génot & Brogliato, Eur. J. Mech. A/Solids 18 (1999) 653, §2.
 """
@@ -25,7 +25,7 @@ from jaxtyping import Array, Bool, Float
 from lagjax.mechanics import constraints, coordinates
 from lagjax.mechanics.arguments import WITH_MULTIPLIERS, takes_of
 
-# A pivot of I - R, which is one without friction.
+# The pivots of I - R must be above this; without friction they are one.
 PIVOT_ABOVE = 1e-10
 
 
@@ -50,7 +50,7 @@ def force_at(system, t, q, v, params, multipliers):
 
 
 def force_with_ones(system) -> Callable:
-    """The force as a function of the state alone, which depends on all that it depends on with multipliers."""
+    """The force with all multipliers one: a function of the state alone that depends on the same arguments."""
 
     def of_state(t, q, v, params):
         ones = jnp.ones(constraints.count(system, t, q, v, params), jnp.result_type(t))
@@ -60,7 +60,7 @@ def force_with_ones(system) -> Callable:
 
 
 def response(system, t, x, u, params, unflatten) -> Float[Array, "n m"] | None:
-    """B, the change of the force with each multiplier; None where there is none."""
+    """B, the change of the force with each multiplier; None if it does not depend on them."""
     if not reacts(system):
         return None
     q, v = unflatten(x), unflatten(u)
@@ -69,13 +69,13 @@ def response(system, t, x, u, params, unflatten) -> Float[Array, "n m"] | None:
 
 
 def with_reactions(solve: Callable, forcing, gamma, response) -> Reactions:
-    """`solve(forcing, gamma)` -> (a, λ) of the equations without the force's own part in the multipliers, with it."""
+    """Solve the equations with the force B λ, given `solve(forcing, gamma)` -> (a, λ) for those without it."""
     a, multipliers = solve(forcing, gamma)
     if response is None:
         return Reactions(a, multipliers, jnp.asarray(True))
     count = response.shape[1]
     columns = [solve(response[:, j], jnp.zeros_like(gamma)) for j in range(count)]
-    # I - R, and λ₀ beside it.
+    # The rows of I - R, and λ₀ as the right-hand side.
     rows = [[(1.0 if i == j else 0.0) - columns[j][1][i] for j in range(count)] for i in range(count)]
     known, unique = [multipliers[i] for i in range(count)], jnp.asarray(True)
     for k in range(count):

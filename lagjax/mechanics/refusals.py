@@ -1,4 +1,4 @@
-"""Calls that cannot be meant, in the user's words: what is no system, and what has to be given by name."""
+"""Explain wrong calls in the user's words: a first argument that is not a system, arguments to give by name."""
 
 from collections.abc import Callable
 from functools import wraps
@@ -16,23 +16,23 @@ CONSTRAINTS = (Holonomic, Nonholonomic)
 
 
 def check_system(system: Any, *others: Any, phases: bool = False) -> None:
-    """Raise where the first argument of a function is no `System`, nor, with `phases`, a `Hybrid`.
+    """Raise if the first argument of a function is not a `System`, or with `phases` a `Hybrid`.
 
-    `others`: the arguments after it, among which the system may be.
+    `others`: the following arguments, among which the system may be.
     """
     if type(system) is System or isinstance(system, (System, Hybrid) if phases else System):
         return
     known_system(system)
     if isinstance(system, Hybrid):
         raise TypeError(
-            "this is of one system, and a lj.Hybrid has one for each of its phases.\n"
+            "this takes one system, and a lj.Hybrid has one for each of its phases.\n"
             f"Fix: hybrid.systems[{len(system.names) - 1}] for '{system.names[-1]}'; print(hybrid) shows how "
             "the phases follow each other."
         )
-    raise TypeError(f"the first argument must be a lj.System, and is {_what(system)}.\n{_remedy(system, others)}")
+    raise TypeError(f"the first argument must be a lj.System, not {_describe(system)}.\n{_remedy(system, others)}")
 
 
-def _what(thing):
+def _describe(thing):
     if isinstance(thing, type):
         return f"the class {thing.__name__}"
     if callable(thing) and hasattr(thing, "__name__"):
@@ -44,7 +44,7 @@ def _remedy(system, others):
     places = [i for i, x in enumerate(others, 2) if isinstance(x, System | Hybrid)]
     if places:
         return (
-            f"Usual cause: arguments in another order; the system is number {places[0]} here.\n"
+            f"Usual cause: arguments in another order; the system is argument {places[0]} here.\n"
             "Fix: lj.integrate(system, q0, v0, params, ts=ts); and (system, t, q, v, params) at one state."
         )
     if system is System:
@@ -55,7 +55,7 @@ def _remedy(system, others):
             'Fix: system = lj.System(lagrangian, constraints={"rod": constraint}).'
         )
     if isinstance(getattr(system, "system", None), System | Hybrid):
-        return "Usual cause: what was found of a system in its place.\nFix: its .system."
+        return "Usual cause: a result of a system in place of the system.\nFix: its .system."
     name = getattr(system, "__name__", "lagrangian") if callable(system) else "lagrangian"
     name = "lagrangian" if name == "<lambda>" else name
     cause = "the Lagrangian in place of its system" if callable(system) else "arguments in another order"
@@ -63,32 +63,32 @@ def _remedy(system, others):
 
 
 def by_name(call: str, *required: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
-    """Let a function say, in the user's words, that it takes `required` by name; `call`: how it is called."""
+    """Let a function explain a call without its `required` keyword arguments; `call`: a correct call."""
 
     def decorate(function):
         parameters = signature(function).parameters
-        most = sum(x.kind is Parameter.POSITIONAL_OR_KEYWORD for x in parameters.values())
+        most_positional = sum(x.kind is Parameter.POSITIONAL_OR_KEYWORD for x in parameters.values())
         needed = frozenset(required)
 
         @wraps(function)
-        def called(*args, **kwargs):
-            # What Python has words for is left to it.
-            if (len(args) > most or not kwargs.keys() >= needed) and kwargs.keys() <= parameters.keys():
+        def checked(*args, **kwargs):
+            # Unknown keywords are left to Python's own error.
+            if (len(args) > most_positional or not kwargs.keys() >= needed) and kwargs.keys() <= parameters.keys():
                 missing = [name for name in required if name not in kwargs]
-                raise TypeError(_misplaced(function.__name__, len(args) - most, missing, call))
+                raise TypeError(_wrong_call(function.__name__, len(args) - most_positional, missing, call))
             return function(*args, **kwargs)
 
-        return called
+        return checked
 
     return decorate
 
 
-def _misplaced(name, more, missing, call):
+def _wrong_call(name, excess, missing, call):
     words = [f"without {', '.join(f'{x}=' for x in missing)}"] if missing else []
-    words += [f"with {more} argument{'s' * (more > 1)} too many by place"] if more > 0 else []
-    which = " and ".join(missing) or "what follows"
+    words += [f"with {excess} positional argument{'s' * (excess > 1)} too many"] if excess > 0 else []
+    which = " and ".join(missing) or "further arguments"
     return (
         f"lj.{name} was called {' and '.join(words)}.\n"
-        f"Usual cause: {which} given by place, or left out.\n"
+        f"Usual cause: {which} given by position, or left out.\n"
         f"Fix: {call}, by name."
     )

@@ -20,7 +20,7 @@ the unit matrix. With every row a combination of the chosen ones, A = C A_chosen
 Cᵀ λ = λ_chosen, and the shortest such λ is `C (Cᵀ C)⁻¹ λ_chosen`.
 
 The choice is made where the constraints hold. Away from there, as in the stages of a step, dependent rows
-disagree by as much as the state is off, and solving with all of them would divide that by itself.
+disagree by as much as the state is off, and solving with all of them would divide two such errors by each other.
 
 Source: Goldstein, Eq. (2.24)-(2.27); Hairer & Wanner, *Solving ODEs II*, Eq. (VII.1.46); García de Jalón &
 Gutiérrez-López, Multibody Syst. Dyn. 30 (2013) 311 (uniqueness of a, minimum-norm λ).
@@ -47,7 +47,7 @@ SINGULAR_BELOW = {np.dtype("float64"): 1e-13, np.dtype("float32"): 1e-6}
 
 
 class Dense(NamedTuple):
-    """The equations solved in one matrix, of so many rows. A state is given as (system, t, x, u, params, unflatten).
+    """The equations solved as one matrix of `unknowns` rows. A state is given as (system, t, x, u, params, unflatten).
 
     `diagonal`: there are no constraints, and the mass matrix is known to be diagonal.
     """
@@ -58,14 +58,14 @@ class Dense(NamedTuple):
     def accelerations(self, system, t, x, u, params, unflatten, baumgarte_rate=None, independent=None):
         """The accelerations and the stacked multipliers, as vectors; `independent` (m,): which equations to solve with.
 
-        Those are chosen at this state if None.
+        If None, they are chosen at this state.
         """
         linear = mass_and_forcing(system, t, x, u, params, unflatten)
         if not system.constraints:
-            alone = jnp.zeros(0, x.dtype)
+            no_multipliers = jnp.zeros(0, x.dtype)
             if self.diagonal:
-                return linear.forcing / jnp.sum(linear.mass, axis=1), alone
-            return dense.solve(linear.mass, linear.forcing), alone
+                return linear.forcing / jnp.sum(linear.mass, axis=1), no_multipliers
+            return dense.solve(linear.mass, linear.forcing), no_multipliers
         jacobian, gamma = constraints.acceleration_rows(system, t, x, u, params, unflatten)
         if baumgarte_rate is not None:
             gamma = gamma + constraints.baumgarte_feedback(system, t, x, u, params, unflatten, baumgarte_rate)
@@ -77,9 +77,9 @@ class Dense(NamedTuple):
         return independent_rows(constraints.jacobian(system, t, x, u, params, unflatten), dependent_below)
 
     def displacement(self, *state) -> Callable:
-        """`displacement(which, r)`, the shortest in the metric of M that changes the residuals `which` by r."""
+        """`displacement(which, r)`: the shortest one, in the metric of M, that changes the residuals `which` by r."""
         jacobian = constraints.jacobian(*state)
-        # Chosen here and not at the step's start: the step may have come near a singular position.
+        # The rows are chosen here and not at the step's start, as the step may have come near a singular position.
         matrix = displacement_map(mass_and_forcing(*state).mass, jacobian, independent_rows(jacobian))
         return lambda which, r: matrix[:, which] @ r
 
@@ -92,9 +92,9 @@ class Dense(NamedTuple):
         found = _examined(*state)
         solution = jnp.concatenate([found.a, found.multipliers, jnp.ravel(found.lagrangian)])
         singular = dense.reciprocal_condition(found.matrix) <= SINGULAR_BELOW[np.dtype(found.matrix.dtype)]
-        finite, against = jnp.all(jnp.isfinite(solution)), jnp.any(found.contradictory)
+        finite, contradictory = jnp.all(jnp.isfinite(solution)), jnp.any(found.contradictory)
         singular = singular | ~found.unique
-        return Verdict(found.a, found.multipliers, finite, singular, against, _of_rows(found.linear.mass))
+        return Verdict(found.a, found.multipliers, finite, singular, contradictory, _largest_of_rows(found.linear.mass))
 
     def solution_or_nan(self, *state):
         """The solution as vectors, NaN where constraints contradict each other."""
@@ -117,23 +117,23 @@ def saddle_point(mass, jacobian, forcing, gamma, independent):
 
 
 def _solved(linear: Linear, jacobian, gamma, independent) -> Reactions:
-    """The solution with what the force has of the multipliers."""
+    """The solution where the force may depend on the multipliers."""
     solve = lambda forcing, gamma: saddle_point(linear.mass, jacobian, forcing, gamma, independent)
     return with_reactions(solve, linear.forcing, gamma, linear.response)
 
 
 def saddle_point_matrix(mass, jacobian, independent):
-    """`[[M, Aᵀ], [A, 0]]` with the independent rows of A; those of the unit matrix in place of the others."""
+    """`[[M, Aᵀ], [A, 0]]` with the independent rows of A, and rows of the unit matrix in place of the others."""
     m, n = jacobian.shape
     rows = _pick(jacobian, independent, n)
     filled = _pick(jnp.ones_like(jacobian[:, 0]), independent, n) if m > 1 else jnp.ones(m, mass.dtype)
     return jnp.block([[mass, rows.T], [rows, jnp.diag(1 - filled)]])
 
 
-def _comparable(mass, jacobian, independent):
-    """The saddle-point matrix of M and A in units in which the largest of either is one: what tells it is singular."""
-    in_its_size = lambda x: x / jnp.where(jnp.any(x != 0), jnp.max(jnp.abs(x), initial=0.0), 1.0)
-    return saddle_point_matrix(in_its_size(mass), in_its_size(jacobian), independent)
+def _scaled_matrix(mass, jacobian, independent):
+    """The saddle-point matrix with M and A each divided by its largest entry, to judge whether it is singular."""
+    scaled = lambda x: x / jnp.where(jnp.any(x != 0), jnp.max(jnp.abs(x), initial=0.0), 1.0)
+    return saddle_point_matrix(scaled(mass), scaled(jacobian), independent)
 
 
 def displacement_map(mass, jacobian, independent):
@@ -194,28 +194,28 @@ def combinations(jacobian: Float[Array, "m n"], independent: Bool[Array, " m"]) 
 
 
 def is_regular(*state) -> tuple[Bool[Array, ""], Float[Array, " n"]]:
-    """Whether the equations at one state are regular, and the largest of each row of M.
+    """Whether the equations at one state are regular, and the largest entry of each row of M.
 
-    They are where no constraint depends on others, and nothing is undetermined.
+    They are regular if no constraint depends on others and nothing is undetermined.
     """
     linear, rows = mass_and_forcing(*state), _without_vanishing(*state)
     mass, jacobian = linear.mass, rows.jacobian
     independent = independent_rows(jacobian)
     unique = linear.response is None or _solved(linear, jacobian, rows.gamma, independent).unique
-    matrix = _comparable(mass, jacobian, independent)
+    matrix = _scaled_matrix(mass, jacobian, independent)
     regular = jnp.all(independent) & (dense.reciprocal_condition(matrix) > SINGULAR_BELOW[np.dtype(mass.dtype)])
-    return regular & unique, _of_rows(mass)
+    return regular & unique, _largest_of_rows(mass)
 
 
-def _of_rows(mass):
+def _largest_of_rows(mass):
     return jnp.max(jnp.abs(mass), axis=1)
 
 
 class Examined(NamedTuple):
-    """A solution of the equations beside what tells whether to believe it.
+    """A solution of the equations, with what decides whether it is valid.
 
-    `matrix`: the saddle-point matrix, M and A each in units of its largest. `unique`: whether what the force has of
-    the multipliers leaves one solution.
+    `matrix`: the saddle-point matrix, with M and A each divided by its largest entry. `unique`: whether the equations
+    have one solution where the force depends on the multipliers.
     """
 
     a: PyTree[Array]
@@ -251,14 +251,14 @@ def _examined(system, t, x, u, params, unflatten) -> Examined:
         rows=rows,
         independent=independent,
         lagrangian=jnp.asarray(system.lagrangian(t, unflatten(x), unflatten(u), params)),
-        matrix=_comparable(linear.mass, rows.jacobian, independent),
+        matrix=_scaled_matrix(linear.mass, rows.jacobian, independent),
         contradictory=_contradictory(linear, rows, independent, a, multipliers, x, u),
         unique=unique,
     )
 
 
 def _without_vanishing(system, t, x, u, params, unflatten):
-    """The rows of all constraints, with those set to zero that are round-off: far larger a little way off."""
+    """The rows of all constraints; those that are round-off, being far larger at a nearby state, are set to zero."""
     rows = constraints.acceleration_rows(system, t, x, u, params, unflatten)
     if not rows.gamma.size:
         return rows

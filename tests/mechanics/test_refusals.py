@@ -60,7 +60,7 @@ def test_every_door_asks_for_a_system(door):
     """The Lagrangian itself, a number, the class, ..., at each function of a system."""
     act, phases = DOORS[door]
     for given, what, fix in NO_SYSTEMS.values():
-        with pytest.raises(TypeError, match=f"first argument must be a lj.System, and is {what}") as caught:
+        with pytest.raises(TypeError, match=f"first argument must be a lj.System, not {what}") as caught:
             act(given)
         assert re.search(f"Usual cause: .*\nFix: .*{fix}", str(caught.value)), str(caught.value)
     if not phases:
@@ -97,7 +97,7 @@ def test_a_system_in_another_place():
         (lambda: lj.equilibria(PARAMS, pendulum, starts=[1.0]), 2),
         (lambda: lj.fit(RECORD, pendulum, PARAMS), 2),
     ):
-        with pytest.raises(TypeError, match=rf"number {place} here.\nFix: .*\(system, "):
+        with pytest.raises(TypeError, match=rf"argument {place} here.\nFix: .*\(system, "):
             act()
 
 
@@ -116,7 +116,7 @@ def test_what_is_given_by_name(name):
     """Times, starts and a section that stand in a row with the others, or are missing."""
     act, words = BY_NAME[name]
     with pytest.raises(
-        TypeError, match=rf"lj.{name} was called .*\n.*{words} given by place.*\nFix: lj.{name}\(system"
+        TypeError, match=rf"lj.{name} was called .*\n.*{words} given by position.*\nFix: lj.{name}\(system"
     ):
         act()
 
