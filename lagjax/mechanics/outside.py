@@ -1,12 +1,13 @@
 """What the user's functions read from outside: globals, closed-over values, defaults, the attributes of objects.
 
-A compiled program holds the values that these had when it was traced. So each public call looks at them, and a change
-makes another `System`, which is traced anew. Functions are followed into those that they call, but not into installed
-packages, whose globals are constants; a class into its methods. Values that JAX is tracing are left to `closures.py`.
+A compiled program holds the values that these had when it was traced. So each public call reads them again, and a
+change makes another `System`, which is traced again. The reading follows a function into those that it calls, but not
+into installed packages, whose globals are constants, and a class into its methods. Values that JAX is tracing are left
+to `closures.py`.
 
-There are two looks. `read_by` is fast, as it comes with every call: arrays beyond `WHOLE` bytes are compared by
-identity and a sample, what has attributes by those one level deep. `meaning_of` compares everything by its content, so
-that two functions that mean the same have the same meaning, or says that it cannot.
+There are two ways of reading. `read_by` is fast, since every call uses it: arrays of more than `WHOLE` bytes are
+compared by identity and a sample, objects by their attributes one level deep. `meaning_of` compares everything by
+content, so that two functions that do the same have the same meaning, or says that it cannot.
 """
 
 import builtins
@@ -33,27 +34,27 @@ from lagjax.mechanics.constraints import Holonomic
 from lagjax.mechanics.memory import AT_MOST, remembered
 from lagjax.mechanics.system import System
 
-# Bytes of an array that is compared whole (10 microseconds); of a larger one so many entries are.
+# Arrays of up to so many bytes are compared whole (10 microseconds), larger ones by a sample of so many entries.
 WHOLE, SAMPLE = 2**14, 256
-# Entries of a list or a dictionary that is looked into.
+# Lists and dictionaries of up to so many entries are read.
 SHORT = 64
-# The same where everything is compared, and how many objects there may be.
+# The same limits where everything is compared, and the most objects that are read.
 WHOLE_IN_FULL, SHORT_IN_FULL, MOST = 2**26, 2**13, 2**14
 MISSING = object()
 INSTALLED = tuple(sysconfig.get_paths()[name] for name in ("stdlib", "platstdlib", "purelib", "platlib"))
-OWN = __file__.rsplit("mechanics", 1)[0]
-# What these return may be another value each time.
+LAGJAX = __file__.rsplit("mechanics", 1)[0]
+# Modules and functions that may return another value each time.
 VARYING_MODULES = ("datetime", "importlib", "io", "numpy.random", "os", "random", "secrets", "time")
 VARYING = {"open", "input", "eval", "exec", "globals", "locals", "vars", "__import__"}
 FUNCTIONS = (types.FunctionType, types.MethodType, types.BuiltinFunctionType, partial)
-# The flag of a class that is made by Python or lives like one that is.
-OF_PYTHON = 1 << 9
-# What a class has of its own accord.
-OF_EACH_CLASS = (types.MemberDescriptorType, types.GetSetDescriptorType, types.WrapperDescriptorType)
+# The flag of a class made by Python code, or created at run time like one (Py_TPFLAGS_HEAPTYPE).
+HEAP_TYPE = 1 << 9
+# Descriptors that Python itself puts into a class.
+AUTOMATIC_DESCRIPTORS = (types.MemberDescriptorType, types.GetSetDescriptorType, types.WrapperDescriptorType)
 
 
 def up_to_date(system: System) -> System:
-    """The system, as a new one where what its functions read from outside has changed since it was made."""
+    """The system with the values that its functions read from outside now; the same object if they read none."""
     functions = [system.lagrangian, system.force, system.dissipation]
     functions += [c.g if isinstance(c, Holonomic) else c.phi for c in system.constraints.values()]
     found = tuple(read_by(function) for function in functions)
@@ -61,9 +62,9 @@ def up_to_date(system: System) -> System:
 
 
 def first_alike(system: System, now: System) -> System:
-    """The first system that means the same as `system`, which is `now`, and of which programs have been compiled.
+    """The first system with the meaning of `system`, whose present form is `now`: its programs may be compiled already.
 
-    A cell of a notebook that is run again makes the same functions anew.
+    Running a notebook cell again makes new functions that do the same.
     """
     of = (now.lagrangian, now.force, now.dissipation, *now.constraints.values())
     meaning = remembered(system, (first_alike, now.read), lambda: _meaning_of_all(of, tuple(now.constraints)))
@@ -71,14 +72,14 @@ def first_alike(system: System, now: System) -> System:
 
 
 def first_guard_alike(guard: Callable) -> tuple[Callable, Hashable]:
-    """The first function, or module that can be called, that means the same as `guard`, and what it reads."""
+    """The first function or callable module with the meaning of `guard`, and what it reads."""
     read = read_by(guard)
     reading = lambda: meaning_of(guard) if isinstance(guard, types.FunctionType | eqx.Module) else None
     meaning = remembered(guard, (first_guard_alike, read), reading)
     return _first_of(_guards, meaning, (guard, read), lambda first: read_by(first[0]) == first[1])
 
 
-# What was met first, by what it means.
+# The first system and the first guard of each meaning.
 _systems, _guards = OrderedDict(), OrderedDict()
 _one_thread = threading.Lock()
 
@@ -94,13 +95,13 @@ def _meaning_of_all(functions, names):
     return tuple(meanings)
 
 
-def _first_of(known, meaning, mine, is_still):
+def _first_of(known, meaning, present, is_unchanged):
     if meaning is None:
-        return mine
-    first = known.get(meaning, mine)
-    # What it reads may have changed since.
-    if first is not mine and not is_still(first):
-        first = mine
+        return present
+    first = known.get(meaning, present)
+    # What the first one reads may have changed since.
+    if first is not present and not is_unchanged(first):
+        first = present
     with _one_thread:
         known[meaning] = first
         known.move_to_end(meaning)
@@ -110,7 +111,7 @@ def _first_of(known, meaning, mine, is_still):
 
 
 def read_by(function: Callable | None) -> Hashable:
-    """The values that a function reads from outside, as something to compare; () where there are none."""
+    """The values that a function reads from outside, in a form to compare; () if there are none."""
     reading = _Reading(whole=False)
     if isinstance(function, eqx.Module):
         # The arrays of a module are arguments of each program, and need no reading.
@@ -122,10 +123,10 @@ def read_by(function: Callable | None) -> Hashable:
 
 
 def meaning_of(function: Callable) -> Hashable | None:
-    """All that decides what a function computes, its code included, as something to compare by content.
+    """Everything that decides what a function computes, its code included, in a form to compare by content.
 
-    None where that cannot be told: of what is traced, random generators, open files, very large or foreign objects.
-    What a function returns once and another time not, by the clock or by a file, is no meaning either.
+    None if that cannot be determined: for traced values, random generators, open files, very large or foreign objects,
+    and for functions whose result varies from call to call, with the clock or a file.
     """
     reading = _Reading(whole=True)
     try:
@@ -136,18 +137,18 @@ def meaning_of(function: Callable) -> Hashable | None:
 
 
 class _Reading:
-    """One reading. Afterwards: whether anything of it can change, and whether it is complete."""
+    """One reading. Afterwards `changing` says whether anything read can change, `complete` whether all was read."""
 
     def __init__(self, whole: bool):
         self.whole, self.changing, self.complete = whole, False, True
         self._numbers, self._kept = {}, []
 
-    def _again(self, value):
-        """What stands for something met before; None the first time."""
+    def _back_reference(self, value):
+        """A reference to an object met before; None the first time."""
         if id(value) in self._numbers:
             return ("again", self._numbers[id(value)])
         self._numbers[id(value)] = len(self._numbers)
-        # Else another one could have its address.
+        # Kept alive: another object could get its address otherwise.
         self._kept.append(value)
         if len(self._kept) > MOST:
             return self._unknown("...")
@@ -158,30 +159,30 @@ class _Reading:
         return found
 
     def function(self, function):
-        """A function, or an object that can be called."""
+        """Read a function or a callable object."""
         if function is None:
             return ()
         if isinstance(function, type):
             return self._class(function)
-        if (again := self._again(function)) is not None:
-            return again
+        if (reference := self._back_reference(function)) is not None:
+            return reference
         if isinstance(function, partial):
             return ("partial", *map(self.token, (function.func, function.args, function.keywords)))
         if isinstance(function, types.MethodType):
             return ("method", self.token(function.__func__), self.token(function.__self__))
         if isinstance(function, types.FunctionType):
-            return self._plain(function)
+            return self._python_function(function)
         if isinstance(function, types.BuiltinFunctionType):
             return (function.__qualname__, self.token(function.__self__))
         return self._object(function, self._class(type(function)), True)
 
-    def _plain(self, function):
+    def _python_function(self, function):
         code = function.__code__
-        digest, read = _of_code(code)
+        digest, read = _digest_and_globals(code)
         found = [digest]
         if not _is_installed(code.co_filename):
             found += [self._global(function.__globals__, *names) for names in read]
-        # A function that a library has made of another one has it in its closure.
+        # A function that a library made from another one holds that one in its closure.
         for cell in function.__closure__ or ():
             try:
                 found.append(self.token(cell.cell_contents))
@@ -208,22 +209,22 @@ class _Reading:
             value = inner
         if value is not MISSING:
             return self.token(value)
-        # One that is not there yet may come, and one that was there has gone.
+        # A missing global may be defined later, or may have been deleted.
         built_in = hasattr(builtins, name)
         self.changing |= not built_in
         return ("missing", built_in)
 
     def token(self, value, deep=True):
-        """A value as something to compare."""
+        """A value in a form to compare."""
         if value is None:
             return None
         if isinstance(value, types.ModuleType):
             known = _is_library(value) and not _varies(value)
             return ("module", value.__name__) if known else self._unknown("module", value.__name__)
         if isinstance(value, FUNCTIONS):
-            # It may be defined anew under its name.
-            users = isinstance(value, types.FunctionType) and not _is_installed(value.__code__.co_filename)
-            self.changing |= users
+            # The user may define another function under its name.
+            is_users = isinstance(value, types.FunctionType) and not _is_installed(value.__code__.co_filename)
+            self.changing |= is_users
             return self.function(value)
         if isinstance(value, type):
             return self.function(value)
@@ -233,18 +234,18 @@ class _Reading:
             return (kind, value)
         if isinstance(value, (float, complex)):
             self.changing = True
-            return (kind, repr(value))  # Not a number is not equal to itself.
+            return (kind, repr(value))  # NaN is not equal to itself.
         if isinstance(value, (np.ndarray, np.generic, jax.Array)):
             return (kind, *self._array(value))
-        if (again := self._again(value)) is not None:
-            return again
+        if (reference := self._back_reference(value)) is not None:
+            return reference
         if isinstance(value, (list, tuple, set, frozenset, Mapping)):
             self.changing = True
             if not deep or len(value) > (SHORT_IN_FULL if self.whole else SHORT):
                 return self._unknown(kind, id(value), len(value))
             parts = value.items() if isinstance(value, Mapping) else value
-            beside = [self.token(x) for x in (getattr(value, "__dict__", None),) if x]
-            return (kind, *map(self.token, parts), *beside)
+            attributes = [self.token(x) for x in (getattr(value, "__dict__", None),) if x]
+            return (kind, *map(self.token, parts), *attributes)
         return self._object(value, kind, deep)
 
     def _array(self, x):
@@ -259,7 +260,7 @@ class _Reading:
         if x.nbytes <= (WHOLE_IN_FULL if self.whole else WHOLE):
             return (*found, hash(np.asarray(x).tobytes()))
         if isinstance(x, jax.Array):
-            return self._unknown(*found, id(x))  # It cannot be changed, and the program that holds it keeps it.
+            return self._unknown(*found, id(x))  # It cannot change, and the program that holds it keeps it alive.
         sample = x.reshape(-1)[:: x.size // SAMPLE] if x.flags.c_contiguous else x[:1]
         return self._unknown(*found, id(x), hash(sample.tobytes()))
 
@@ -267,8 +268,8 @@ class _Reading:
         named = (cls.__module__, cls.__qualname__)
         if _is_library(sys.modules.get(cls.__module__, MISSING)):
             return named
-        if (again := self._again(cls)) is not None:
-            return again
+        if (reference := self._back_reference(cls)) is not None:
+            return reference
         self.changing = True
         found = []
         for name, value in vars(cls).items():
@@ -278,13 +279,13 @@ class _Reading:
                 value = (value.fget, value.fset)
             elif isinstance(value, cached_property):
                 value = value.func
-            own = name.startswith("__") or name == "_abc_impl"
-            if isinstance(value, types.FunctionType) or not (own or isinstance(value, OF_EACH_CLASS)):
+            automatic = name.startswith("__") or name == "_abc_impl"
+            if isinstance(value, types.FunctionType) or not (automatic or isinstance(value, AUTOMATIC_DESCRIPTORS)):
                 found.append((name, self.token(value)))
         return (*named, *map(self._class, cls.__bases__), *found)
 
     def _object(self, value, kind, deep):
-        """Anything else, by its class and its attributes."""
+        """Read any other object by its class and attributes."""
         cls = type(value)
         if isinstance(value, eqx.Module):
             names = [field.name for field in dataclasses.fields(value)]
@@ -297,16 +298,16 @@ class _Reading:
             attributes |= {name: getattr(value, name) for name in slots if hasattr(value, name) and name[:2] != "__"}
         wrapped = attributes.get("__wrapped__")
         if wrapped is not None:
-            # Of a rule for derivatives the functions; what begins with _ is for JAX alone.
+            # A function with a rule for derivatives: read its functions; names that begin with _ are internal to JAX.
             rest = {name: x for name, x in attributes.items() if name[:1] != "_"} if self.whole else {}
             return (kind, self.function(wrapped), *((name, self.token(x)) for name, x in rest.items()))
         if cls is object:
-            return kind  # It stands for itself alone.
+            return kind  # A bare object() has no content.
         if not self.whole and (not attributes or library or not deep):
             self.changing |= bool(attributes)
             return (kind, id(value)) if attributes else kind
-        # What is written in C has more than its attributes.
-        opaque = any(not base.__flags__ & OF_PYTHON for base in cls.__mro__[:-1]) and cls is not types.SimpleNamespace
+        # An object of a class written in C has more content than its attributes.
+        opaque = any(not base.__flags__ & HEAP_TYPE for base in cls.__mro__[:-1]) and cls is not types.SimpleNamespace
         if library and (opaque or not attributes):
             return self._by_value(kind, value)
         self.changing = True
@@ -314,7 +315,7 @@ class _Reading:
         return (kind, *((name, self.token(x, deep=self.whole)) for name, x in attributes.items()))
 
     def _by_value(self, kind, value):
-        """What a library compares by value cannot change; what it compares by identity may."""
+        """Read an object of a library: one that it compares by value cannot change, one compared by identity may."""
         if type(value).__hash__ in (None, object.__hash__):
             return self._unknown(kind, id(value))
         try:
@@ -324,16 +325,16 @@ class _Reading:
         return (kind, value)
 
 
-# By code, which may be gone as its function is.
-_OF_CODE = weakref.WeakKeyDictionary()
+# By code object; weak, since the code goes with its function.
+_DIGESTS = weakref.WeakKeyDictionary()
 
 
-def _of_code(code):
-    """(a digest of what a function does, the globals that it and those written inside it read).
+def _digest_and_globals(code):
+    """Return a digest of a function's code, and the globals that it and the functions inside it read.
 
-    A global comes with the attributes that are asked of it. Not the hash of a code, to which -1 and -2 are the same.
+    A global comes with the attributes looked up on it. The hash of a code object does not tell -1 from -2.
     """
-    if (known := _OF_CODE.get(code)) is not None:
+    if (known := _DIGESTS.get(code)) is not None:
         return known
     read, reading, constants = {}, None, []
     for instruction in dis.get_instructions(code):
@@ -348,7 +349,7 @@ def _of_code(code):
             read["__import__",] = None
     for constant in code.co_consts:
         if isinstance(constant, types.CodeType):
-            digest, inside = _of_code(constant)
+            digest, inside = _digest_and_globals(constant)
             constants.append(digest)
             read.update(dict.fromkeys(inside))
         else:
@@ -356,7 +357,7 @@ def _of_code(code):
     parts = (code.co_code, constants, code.co_names, code.co_varnames, code.co_freevars, code.co_cellvars,
              code.co_argcount, code.co_kwonlyargcount, code.co_flags, code.co_exceptiontable)  # fmt: skip
     found = hashlib.sha256(repr(parts).encode()).hexdigest()[:32], tuple(read)
-    _OF_CODE[code] = found
+    _DIGESTS[code] = found
     return found
 
 
@@ -366,7 +367,7 @@ def _varies(module):
 
 @lru_cache(maxsize=4096)
 def _is_installed(filename):
-    return filename.startswith((*INSTALLED, OWN)) or "site-packages" in filename
+    return filename.startswith((*INSTALLED, LAGJAX)) or "site-packages" in filename
 
 
 def _is_library(module):

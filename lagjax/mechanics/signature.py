@@ -1,7 +1,7 @@
-"""Whether a system is the one that a motion was computed with: what its functions say at one of the motion's states.
+"""Tell whether a system is the one of a motion, by what its functions return at one state of the motion.
 
-Values and slopes of L, of R and of each constraint, and the force, each in one row. Two systems of which all of these
-agree at a state in the midst of a motion are taken for the same.
+A signature holds the values and slopes of L, of R and of each constraint, and the force, each in one row. Two systems
+whose signatures agree at a state in the middle of a motion count as the same.
 """
 
 from dataclasses import fields
@@ -22,20 +22,20 @@ from lagjax.mechanics.hybrid import Hybrid
 from lagjax.mechanics.outside import up_to_date
 from lagjax.mechanics.system import System
 
-# Values that differ by more than this, relative to the largest beside them, are another function's. Round-off is below
-# it also where large terms cancel, in float32 too, but for the last digits.
+# Values that differ by more than this, relative to the largest of their row, come from another function. Round-off is
+# below it also where large terms cancel, in float32 too, unless only the last digits remain.
 SAME = {np.dtype("float64"): 1e-7, np.dtype("float32"): 1e-3}
 
-# What is asked of a system.
-OF_SYSTEMS = {field.name for of in (System, Hybrid) for field in fields(of)} - {"first"}
+# The attributes that other code reads from a system.
+SYSTEM_FIELDS = {field.name for of in (System, Hybrid) for field in fields(of)} - {"first"}
 
 
 class UnknownSystem(eqx.Module):
-    """In place of a system that was not given: what a file knows of it.
+    """A placeholder for a system that was not given: what a file knows about it.
 
-    - `words`: as it printed itself; `angles` (n,): which coordinates are angles.
-    - `signature`: what its functions said at `state`, by what they are. `starts`: where the motions of a fit start,
-    and `phase`: the number of the phase in which they do.
+    - `words`: its printed form; `angles` (n,): which coordinates are angles.
+    - `signature`: what its functions returned at `state`, by role. `starts`: where the motions of a fit start, and
+    `phase`: the number of the phase in which they start.
     """
 
     words: str = eqx.field(static=True)
@@ -49,13 +49,13 @@ class UnknownSystem(eqx.Module):
         return f"{self.words.splitlines()[0]}, not given"
 
     def __getattr__(self, name):
-        if name in OF_SYSTEMS:
+        if name in SYSTEM_FIELDS:
             _raise_unknown(self)
         raise AttributeError(name)
 
 
 def signature(system: System | Hybrid, state: State) -> dict[str, np.ndarray]:
-    """What each function of a system says at a state, by what it is."""
+    """What each function of a system returns at a state, by role."""
     if isinstance(system, System):
         return _signature(up_to_date(system), *state)
     found = {}
@@ -66,9 +66,9 @@ def signature(system: System | Hybrid, state: State) -> dict[str, np.ndarray]:
 
 
 def differences(there: dict[str, Any], here: dict[str, Any]) -> list[str]:
-    """What of two signatures differs, in words."""
+    """The differences between two signatures, in words."""
     found = [f"{role} is missing" for role in there if role not in here]
-    found += [f"{role} is there, and was not" for role in here if role not in there]
+    found += [f"{role} is there, but was not before" for role in here if role not in there]
     for role in there:
         if role not in here:
             continue
@@ -78,7 +78,7 @@ def differences(there: dict[str, Any], here: dict[str, Any]) -> list[str]:
         )
         tolerance = SAME.get(a.dtype, 1e-2) * size
         if a.shape != b.shape:
-            found.append(f"{role} has {len(b)} values and slopes, and had {len(a)}")
+            found.append(f"{role} has {len(b)} values and slopes, but had {len(a)}")
         elif not np.allclose(a, b, rtol=0.0, atol=tolerance, equal_nan=True):
             what = (
                 "value" if a.size and not np.isclose(a[0], b[0], rtol=0.0, atol=tolerance, equal_nan=True) else "slope"
@@ -93,17 +93,17 @@ def _signature(system, t, q, v, params):
     s, found = State(t, q, v, params), {}
     flat = lambda *trees: jnp.concatenate([jnp.ravel(jnp.asarray(x, t.dtype)) for x in jax.tree.leaves(trees)])
 
-    def of(function, *args, slopes):
+    def values_and_slopes(function, *args, slopes):
         return flat(function(*args), jax.jacfwd(function, argnums=slopes)(*args))
 
-    found["the Lagrangian"] = of(system.lagrangian, *s, slopes=(1, 2))
+    found["the Lagrangian"] = values_and_slopes(system.lagrangian, *s, slopes=(1, 2))
     if system.dissipation is not None:
-        found["the dissipation"] = of(system.dissipation, *s, slopes=(2,))
+        found["the dissipation"] = values_and_slopes(system.dissipation, *s, slopes=(2,))
     for name, c in system.constraints.items():
         if isinstance(c, Holonomic):
-            found[f"the constraint '{name}'"] = of(c.g, t, q, params, slopes=(1,))
+            found[f"the constraint '{name}'"] = values_and_slopes(c.g, t, q, params, slopes=(1,))
         else:
-            found[f"the constraint '{name}', of velocities,"] = of(c.phi, *s, slopes=(1, 2))
+            found[f"the constraint '{name}', of velocities,"] = values_and_slopes(c.phi, *s, slopes=(1, 2))
     if system.force is not None:
         ones = jax.tree.map(np.ones_like, zero_multipliers(system, s))
         given = s._asdict() | {"multipliers": ones}
@@ -112,7 +112,7 @@ def _signature(system, t, q, v, params):
 
 
 def middle_state(t, q, v, params) -> State:
-    """A state in the midst of a motion, of those that are known; of a batch one of the first lane's."""
+    """A state in the middle of a motion, among the finite ones; for a batch, of the first lane."""
     first = (0,) * (np.ndim(t) - 1)
     one = lambda x: np.asarray(x)[first]
     t, q, v = jax.tree.map(one, (t, q, v))
@@ -123,7 +123,7 @@ def middle_state(t, q, v, params) -> State:
 
 
 def known_system(system: Any) -> Any:
-    """The system, or an error where it is not known."""
+    """Return the system, or raise if it is not known."""
     if isinstance(system, UnknownSystem):
         _raise_unknown(system)
     return system
@@ -131,6 +131,6 @@ def known_system(system: Any) -> Any:
 
 def _raise_unknown(system) -> NoReturn:
     raise ValueError(
-        f"this needs the functions of the system ({system.words.splitlines()[0]}), which are not in a file.\n"
+        f"this needs the functions of the system ({system.words.splitlines()[0]}), which a file does not contain.\n"
         "Fix: lj.load_trajectory(path, system=system), or load_fit or open_sweep, with the system that was integrated."
     )

@@ -1,8 +1,8 @@
-"""Whether a system is large and made of parts that touch few others, and how it is then solved.
+"""Decide whether a system is large and made of parts that touch few others, and how to solve it then.
 
-Read off the jaxpr: which velocities M couples, and which velocities each constraint equation restricts. With M in small
+The jaxpr shows which velocities M couples, and which velocities each constraint equation restricts. With M in small
 blocks, the matrix S = A M⁻¹ Aᵀ of the multipliers couples equations that act on a common block; ordered, it is a band.
-Nothing here depends on values, so that a plan holds at every state.
+Nothing here depends on values, so a plan holds at every state.
 """
 
 from dataclasses import dataclass
@@ -24,13 +24,13 @@ from lagjax.numerics import banded, dense
 UNKNOWNS_AT_LEAST = 24
 # Blocks of M are inverted by elimination up to this size.
 BLOCK_AT_MOST = dense.ELIMINATE_UP_TO
-# Of a band wider than this share of its rows little is left out.
+# A band wider than this share of its rows leaves little out.
 BAND_AT_MOST = 0.5
 
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """What is known of a system before any value: blocks of M, colours of M and A, the band of S."""
+    """What is known of a system independently of values: blocks of M, colours of M and A, the band of S."""
 
     members: Int[np.ndarray, "blocks size"]
     place: Int[np.ndarray, " n"]
@@ -87,17 +87,17 @@ def _plan(structure, leaves) -> Plan | None:
     if max(map(len, blocks)) > BLOCK_AT_MOST:
         return None
     members = np.full((len(blocks), max(map(len, blocks))), u.size)
-    together = np.zeros((u.size, u.size), np.float32)
+    coupled = np.zeros((u.size, u.size), np.float32)
     for k, block in enumerate(blocks):
         members[k, : len(block)] = block
-        together[np.ix_(block, block)] = 1
+        coupled[np.ix_(block, block)] = 1
     of_rows = pattern(residual, u, arrays)
     m, band = len(of_rows), None
     if m:
         rows = of_rows.astype(np.float32)
-        band = banded.band(rows @ together @ rows.T > 0)
+        band = banded.band(rows @ coupled @ rows.T > 0)
         if band.order.half_bandwidth > max(1, BAND_AT_MOST * m):
             return None
     where = np.flatnonzero(members.ravel() < u.size)
     place = where[np.argsort(members.ravel()[where])]
-    return Plan(members, place, *map(banded.colours, (together > 0, of_rows, of_rows.T)), band)
+    return Plan(members, place, *map(banded.colours, (coupled > 0, of_rows, of_rows.T)), band)

@@ -2,14 +2,14 @@
 
     M a = F + Aᵀ λ,    A a = gamma        =>        S λ = gamma - A M⁻¹ F,    S = A M⁻¹ Aᵀ
 
-M is taken apart into blocks that share no velocity (bodies, particles), and inverted block by block. S couples
-constraint equations that act on a common block, and is a band once they are ordered (`numerics/banded.py`). M, A and Aᵀ
-are functions, those that differentiate the user's, and S is found from the products with a few coloured vectors. Which
-entries can be other than zero is read off the jaxpr (`sparse_plan.py`) and holds at every state.
+M is split into blocks that share no velocity (bodies, particles), and inverted block by block. S couples constraint
+equations that act on a common block, and is a band once they are ordered (`numerics/banded.py`). M, A and Aᵀ are
+functions, derivatives of the user's, and S is found from its products with a few coloured vectors. Which entries can
+be nonzero is read off the jaxpr (`sparse_plan.py`) and holds at every state.
 
-One step of iterative refinement on the whole system follows. It mends what S, being a square, loses, and the error
-that a vanishing mass makes: such a mass counts as small in M⁻¹. Where the refinement does not converge the answer is
-NaN: S is singular, or far from definite.
+One step of iterative refinement on the whole system follows. It restores the digits that S, being a square, loses, and
+corrects the error from a vanishing mass, which counts as a small one in M⁻¹. Where the refinement does not converge the
+answer is NaN: S is singular, or far from definite.
 
 **Redundant constraints**, as in `saddle_point.py`: rows that depend on others are found by the pivots of G = A Aᵀ,
 which is a band as well, and left out; the shortest multipliers that exert the same force are their part outside the
@@ -35,18 +35,18 @@ from lagjax.mechanics.sparse_plan import Plan
 from lagjax.mechanics.verdict import Verdict, acceleration_round_off, slightly_off, vanishing
 from lagjax.numerics import banded, dense
 
-# The sine of a dependent row; it is seen through its square, which round-off reaches sooner than in `rank.py`.
+# The sine below which a row is dependent; only its square is known, which round-off reaches sooner than in `rank.py`.
 DEPENDENT_BELOW = {np.dtype("float64"): 1e-5, np.dtype("float32"): 1e-2}
-# A vanishing mass counts as this much of the largest: small enough that one refinement makes up for it.
+# A vanishing mass counts as this share of the largest: small enough for one refinement to correct.
 VANISHING_MASS = {np.dtype("float64"): 1e-8, np.dtype("float32"): 1e-4}
-# What a refinement may change, relative to the terms of the acceleration.
+# The most that a refinement may change, relative to the terms of the acceleration.
 CORRECTION_AT_MOST = 1e-4
-# `mu` relative to G, powers of `mu (G + mu)⁻¹`, and how often the part so found is taken away.
+# `mu` relative to G, powers of `mu (G + mu)⁻¹`, and how often the part found with it is subtracted.
 NULL_SHIFT, NULL_POWER, NULL_ROUNDS = {np.dtype("float64"): 1e-9, np.dtype("float32"): 1e-4}, 3, 3
 
 
 class Operators(NamedTuple):
-    """The products with M, M⁻¹, A and Aᵀ at one state, and which equations count; what M was given to be inverted."""
+    """The products with M, M⁻¹, A and Aᵀ at one state, what was added to M for M⁻¹, and which equations count."""
 
     inertia: Callable
     mass_inverse: Callable
@@ -57,7 +57,7 @@ class Operators(NamedTuple):
 
 
 class Banded(NamedTuple):
-    """The equations solved by way of S, by a plan. A state is given as (system, t, x, u, params, unflatten)."""
+    """The equations solved through S, by a plan. A state is given as (system, t, x, u, params, unflatten)."""
 
     plan: Plan
 
@@ -83,7 +83,7 @@ class Banded(NamedTuple):
         return _independent(self.plan, push, pull, x.dtype, dependent_below)
 
     def displacement(self, system, t, x, u, params, unflatten) -> Callable:
-        """`displacement(which, r)`, the shortest in the metric of M that changes the residuals `which` by r."""
+        """`displacement(which, r)`: the shortest one, in the metric of M, that changes the residuals `which` by r."""
         plan = self.plan
         _, inertia = forcing_and_inertia(system, t, x, u, params, unflatten)
         push, pull, _ = _rows(system, t, x, u, params, unflatten)
@@ -142,14 +142,14 @@ class Banded(NamedTuple):
 
 
 def _undetermined(plan, operators, dtype):
-    """Whether the constraints leave a direction free that has no mass: there what was added to M decides."""
-    some = jnp.cos(jnp.arange(operators.added.size, dtype=dtype))
-    moved, _ = _eliminated(plan, operators, dtype)(operators.added * some, jnp.zeros(operators.kept.size, dtype))
+    """Whether the constraints leave a massless direction free: what was added to M would decide there."""
+    probe = jnp.cos(jnp.arange(operators.added.size, dtype=dtype))
+    moved, _ = _eliminated(plan, operators, dtype)(operators.added * probe, jnp.zeros(operators.kept.size, dtype))
     return jnp.max(jnp.abs(moved)) > CORRECTION_AT_MOST**0.5
 
 
 def _by_colours(push, coloured, y):
-    """The product of absolute values, of the matrix that `push` stands for and of y."""
+    """The product of the absolute values of y and of the matrix that `push` multiplies with."""
     seeds = np.arange(coloured.count)[:, None] == coloured.of_column[None, :]
     return jnp.sum(jnp.abs(jax.vmap(push)(jnp.where(seeds, y[None], 0.0))), axis=0)
 
@@ -171,7 +171,7 @@ def _rows(system, t, x, u, params, unflatten):
 
 
 def _mass_inverse(plan, inertia, x):
-    """The product with M⁻¹, block by block, without derivatives; and what was added to the diagonal for it."""
+    """The product with M⁻¹, block by block, without derivatives; and what was added to the diagonal for that."""
     n, size = x.size, plan.members.shape[1]
     products = lax.stop_gradient(banded.compressed(inertia, plan.of_mass, x.dtype))
     least = VANISHING_MASS[np.dtype(x.dtype)] * jnp.max(jnp.abs(products))
@@ -193,7 +193,7 @@ def _mass_inverse(plan, inertia, x):
 
 
 def _schur(plan, operators, dtype):
-    """The product with S, rows not kept being those of the unit matrix; and with its inverse."""
+    """The products with S and with its inverse; rows that are not kept are those of the unit matrix."""
     _, mass_inverse, _, push, pull, kept = operators
     rows = plan.band.order.rows
     back = np.argsort(rows)
@@ -237,7 +237,7 @@ def _solve(plan, operators, forcing, gamma):
         converged = jnp.max(jnp.abs(da)) <= CORRECTION_AT_MOST * jnp.max(terms)
         return jnp.where(converged, jnp.concatenate([a + da, -(multipliers + more)]), jnp.nan)
 
-    # One vector: with two, JAX 0.10 fails in a second derivative by which one of them does not change.
+    # One vector of unknowns: with two, JAX 0.10 fails in a second derivative that leaves one of them unchanged.
     known, n = jnp.concatenate([forcing, jnp.where(kept, gamma, 0.0)]), forcing.size
     a, minus = jnp.split(lax.custom_linear_solve(product, known, refined, symmetric=True), [n])
     return a, -minus

@@ -2,11 +2,11 @@
 
 Every intermediate value carries, entry by entry, the set of inputs that it depends on; a set is a Python integer, one
 bit an input. Primitives that work entry by entry unite the sets of their operands; those that move entries move the
-sets; sums and products of matrices unite what they sum. What is unknown here, a loop for instance, or an index that is
-not a constant, makes every entry of its results depend on all that its operands depend on. The pattern so found holds
-at every state: it may be too full, never too empty, as no value but that of a constant is ever looked at.
+sets; sums and products of matrices unite what they sum. Where an operation is unknown here, such as a loop or an index
+that is not constant, every entry of its results depends on everything that its operands depend on. The pattern holds at
+every state: it may be too full, never too empty, since no values but those of constants are used.
 
-The package asdex finds the same patterns, as fast; it needs numba, and stops at a primitive that it does not know.
+The package asdex finds the same patterns, just as fast; it needs numba, and stops at a primitive that it does not know.
 """
 
 from collections.abc import Callable
@@ -25,7 +25,7 @@ from lagjax.jax_internals.programs import interpreted
 
 
 class Value(NamedTuple):
-    """An intermediate value: of which inputs each entry is made, and its entries where they are constants."""
+    """An intermediate value: the inputs that each entry depends on, and the entries if they are constants."""
 
     sets: np.ndarray
     known: np.ndarray | None = None
@@ -44,8 +44,8 @@ def pattern(function: Callable, vector, *rest) -> Bool[np.ndarray, "m n"]:
     [[1 1 0]
      [0 1 1]]
 
-    **Arguments:** a function that returns one array, a vector, and pytrees of arrays; of all of these shapes and dtypes
-    alone count. What the function closes over is a constant, unless JAX is tracing it.
+    **Arguments:** a function that returns one array, a vector, and pytrees of arrays, of which only shapes and
+    dtypes count. What the function closes over is a constant, unless JAX is tracing it.
 
     **Returns:** (m, n) booleans: false where the output never depends on the entry.
     """
@@ -59,7 +59,7 @@ def pattern(function: Callable, vector, *rest) -> Bool[np.ndarray, "m n"]:
 
 
 def _as_booleans(sets, count):
-    """One row a set."""
+    """One row per set."""
     width = count // 8 + 1
     rows = np.frombuffer(b"".join(int(s).to_bytes(width, "little") for s in sets), np.uint8).reshape(-1, width)
     return np.unpackbits(rows, axis=1, bitorder="little")[:, :count].astype(bool)
@@ -83,7 +83,7 @@ def _apply(equation, operands):
     elif name in RULES and None not in (results := RULES[name](operands, params, equation)):
         pass
     else:
-        # Anything else: each result depends on all that the operands depend on.
+        # Anything else: each result depends on everything that the operands depend on.
         everything = np.bitwise_or.reduce([_union(x.sets) for x in operands] + [0])
         results = [Value(np.full(shape, everything, object)) for shape in shapes]
     return results
@@ -103,7 +103,7 @@ def _united(name, operands, shape):
     for i, operand in enumerate(operands):
         part = operand.sets
         if name == "mul":
-            # A product with zero is zero: a mask that is a constant.
+            # A product with a constant zero is zero, as with a mask.
             other = operands[1 - i].known
             part = part if other is None else np.where(other == 0, 0, part)
         elif name == "select_n" and operands[0].known is not None:
@@ -113,7 +113,7 @@ def _united(name, operands, shape):
 
 
 def _evaluated(name, equation, operands):
-    """The entries of a result that is made of constants alone, as indices are."""
+    """The entries of a result made of constants alone, as indices are."""
     known = [x.known for x in operands]
     if any(x is None for x in known):
         return None
@@ -123,10 +123,10 @@ def _evaluated(name, equation, operands):
 
 
 def _moving(move):
-    """The rule of a primitive that moves entries, from the same motion of an array."""
+    """The rule of a primitive that moves entries, given the same move of NumPy arrays."""
 
     def rule(operands, params, equation):
-        # Padding comes second, and is a number.
+        # The second operand of a padding is a number.
         known = [x.known for x in operands]
         moved = None if any(x is None for x in known) else move(known, params)
         sets = move([x.sets for x in operands], params)
@@ -179,10 +179,10 @@ def _gather(operands, params, equation):
 
 
 def _by_positions(move, source, indices, equation):
-    """Where constant indices take entries from: the primitive itself, applied to the entries' positions."""
+    """Find where constant indices take entries from: apply the primitive itself to the entries' positions."""
     if any(x.known is None for x in indices):
         return [None]
-    # From one: where nothing is taken, the fill is zero. Of the dtype that a gather fills with zeros.
+    # Positions count from one, as zero means that nothing is taken: a gather fills float32 with NaN, made zero here.
     with jax.ensure_compile_time_eval():
         positions = jnp.arange(1, source.sets.size + 1, dtype=jnp.float32).reshape(source.sets.shape)
         taken = np.nan_to_num(np.asarray(move(positions, *(jnp.asarray(x.known) for x in indices)))).astype(int)
@@ -191,7 +191,7 @@ def _by_positions(move, source, indices, equation):
 
 
 def _scatter(operands, params, equation):
-    """The operand's entries, united with those that are written there; both where the latter replace the former."""
+    """The operand's entries united with those written there, also where the latter replace the former."""
     onto, indices, updates = operands
     if indices.known is None:
         return [None]
@@ -213,7 +213,7 @@ def _dynamic_slice(operands, params, equation):
     if any(x is None for x in starts):
         return [None]
     source, sizes = operands[0].sets, params["slice_sizes"]
-    # XLA moves a slice that would reach beyond the end.
+    # XLA shifts a slice back that would reach beyond the end.
     first = [int(np.clip(s, 0, n - k)) for s, n, k in zip(starts, source.shape, sizes)]
     return [Value(source[tuple(slice(i, i + k) for i, k in zip(first, sizes))])]
 

@@ -1,14 +1,14 @@
-"""What a scene is, read off its jaxpr: never from values, so that it holds at every state.
+"""The structure of a system, read off its jaxpr and never from values, so that it holds at every state.
 
-`structure` says on what the mass matrix depends and which coordinates it couples, which coordinates are cyclic, whether
-time is explicit, whether L has terms linear in the velocities, and what is constant in the constraints. It looks at the
-programs of these written out number by number (`in_numbers.py`): an entry that is a zero there is zero everywhere, and
-one that no chain of operations connects with a coordinate does not depend on it. Of the packages for the sparsity of
+`structure` says what the mass matrix depends on and which coordinates it couples, which coordinates are cyclic, whether
+time is explicit, whether L has terms linear in the velocities, and what is constant in the constraints. It examines
+their programs written out number by number (`in_numbers.py`): an entry that is a zero there is zero everywhere, and one
+that no chain of operations connects with a coordinate does not depend on it. Of the packages for the sparsity of
 jaxprs, asdex finds the patterns, but neither what an entry depends on nor the program without its zeros, which the
 solver runs; one pass gives all three.
 
-A coordinate is an *angle* where L, R, Q and the constraints see it only through sines and cosines of expressions
-linear in it. Its size then means nothing: after a thousand turns an error counts as it did in the first.
+A coordinate is an *angle* where L, R, Q and the constraints contain it only through sines and cosines of expressions
+linear in it. Its size then means nothing: an error counts the same after a thousand turns as in the first.
 
 The jaxpr is walked once for each leaf of q. Every intermediate value is, as a function of that leaf, constant, linear,
 periodic (made of sines and cosines), or anything else; what a primitive makes of its operands follows from these.
@@ -37,25 +37,25 @@ from lagjax.mechanics.system import System
 from lagjax.numerics import banded
 from lagjax.numerics.scalars import TooLong
 
-# Coordinates and equations together: of larger systems the programs are not written out.
+# Coordinates and equations together; the programs of larger systems are not written out.
 UP_TO = 24
 
 
 class ConstraintStructure(NamedTuple):
-    """Of one constraint: is it linear with constant coefficients (in q, or in v), does it depend on time."""
+    """Whether a constraint is linear with constant coefficients (in q, or in v), and whether it depends on time."""
 
     linear: bool
     moving: bool
 
 
 class Structure(NamedTuple):
-    """What a system is at every state.
+    """What holds for a system at every state.
 
     - `mass_depends_on`: "t", names of coordinates, "velocities"; empty where M is constant.
     - `blocks`: the coordinates that M couples with each other, by name; one each where M is diagonal.
     - `explicit_time`: whether L, R, Q or a constraint depends on t.
     - `cyclic`: the coordinates that L does not contain.
-    - `linear_terms`: the coordinates in whose velocities L has linear terms (gyroscopic forces, or none at all where
+    - `linear_terms`: the coordinates in whose velocities L has linear terms (they give gyroscopic forces, or none where
       they are a total derivative).
     - `constraints`: a `ConstraintStructure` by name.
     """
@@ -69,7 +69,7 @@ class Structure(NamedTuple):
 
 
 def structure(system, t, q, v, params) -> Structure | None:
-    """The structure of a system, of whose state only names and shapes count; None where it or its program is large."""
+    """The structure of a system; only names and shapes of the state count. None if it or its program is large."""
     names = coordinates.names(q)
     if len(names) + constraints.count(system, t, q, v, params) > UP_TO:
         return None
@@ -87,39 +87,39 @@ def _structure(args, names):
     nonzero = np.array([not is_zero(x) for x in mass.program.jaxpr.outvars]).reshape(n, n)
     lagrangian = _numbers(lambda system, *state: system.lagrangian(*state), args)
     linear = _numbers(_momentum_at_rest, args)
-    seen = [_numbers(lambda _, *state, f=f: f(*state), args) for f in functions_of(system)]
+    programs = [_numbers(lambda _, *state, f=f: f(*state), args) for f in functions_of(system)]
     return Structure(
         mass_depends_on=_depends_on(mass, names),
         blocks=tuple(tuple(names[i] for i in block) for block in banded.blocks(nonzero)),
-        explicit_time=any("t" in _depends_on(f, names) for f in seen),
+        explicit_time=any("t" in _depends_on(program, names) for program in programs),
         cyclic=tuple(name for name in names if name not in _depends_on(lagrangian, names)),
         linear_terms=tuple(name for name, x in zip(names, linear.program.jaxpr.outvars) if not is_zero(x)),
-        constraints={name: _of_constraint(c, args, names) for name, c in system.constraints.items()},
+        constraints={name: _constraint_structure(c, args, names) for name, c in system.constraints.items()},
     )
 
 
 def unseen_coordinates(system, t, q, v, params) -> np.ndarray:
-    """Which coordinates nothing is known to depend on, L, R, Q and constraints: (n,) booleans.
+    """Which coordinates are known to occur in none of L, R, Q and the constraints: (n,) booleans.
 
-    All of them may be shifted, and nothing of the motion changes.
+    They may all be shifted, and nothing else of the motion changes.
     """
     x, unflatten = coordinates.flatten(q)
     if x.size + constraints.count(system, t, q, v, params) > UP_TO:
         return _unseen_leaves(system, t, q, v, params)
     written = in_numbers(system, unflatten), t, coordinates.numbers(q), coordinates.numbers(v), params
-    seen = np.zeros(x.size, bool)
+    occurs = np.zeros(x.size, bool)
     try:
         for f in functions_of(written[0]):
             numbers = _numbers(lambda _, *state, f=f: f(*state), written)
             _, *state = numbers.state_variables
-            seen |= np.array([depends(numbers.program.jaxpr, [y]) for y in state[: x.size]])
+            occurs |= np.array([depends(numbers.program.jaxpr, [y]) for y in state[: x.size]])
     except TooLong:
         return _unseen_leaves(system, t, q, v, params)
-    return ~seen
+    return ~occurs
 
 
 def _unseen_leaves(system, t, q, v, params):
-    """The same by whole leaves of q."""
+    """The same, for whole leaves of q."""
     unseen = []
     for i, leaf in enumerate(jtu.tree_leaves(q)):
         at = lambda args, i=i: jtu.tree_leaves(args[1])[i]
@@ -137,8 +137,8 @@ def is_diagonal(system, t, q, v, params) -> bool:
         mass = _numbers(_mass, (system, t, q, v, params))
     except TooLong:
         return False
-    off = ~np.eye(x.size, dtype=bool).reshape(-1)
-    return all(is_zero(x) for x, outside in zip(mass.program.jaxpr.outvars, off) if outside)
+    off_diagonal = ~np.eye(x.size, dtype=bool).reshape(-1)
+    return all(is_zero(x) for x, off in zip(mass.program.jaxpr.outvars, off_diagonal) if off)
 
 
 def is_free_of_velocities(system, t, q, v, params) -> bool:
@@ -152,7 +152,7 @@ def is_free_of_velocities(system, t, q, v, params) -> bool:
 
 
 def is_zero(x) -> bool:
-    """Whether a result of a written-out program is a zero that is written in it."""
+    """Whether a result of a written-out program is a literal zero."""
     return isinstance(x, Literal) and x.val == 0
 
 
@@ -180,7 +180,7 @@ def _depends_on(numbers, names):
     return tuple([*found, "velocities"] if depends(jaxpr, state[n:]) else found)
 
 
-def _of_constraint(constraint, args, names):
+def _constraint_structure(constraint, args, names):
     by = 1 if isinstance(constraint, Holonomic) else 2
     value = _numbers(lambda _, *state: constraint_value(constraint, *state), args)
     slope = _numbers(
@@ -212,7 +212,7 @@ def angles(system, t, q, v, params) -> PyTree[bool]:
 
 
 def conserved_momenta(system, t, q, v, params) -> list[str]:
-    """The coordinates whose momentum is known to stay: neither L nor a constraint contains them, and no force acts."""
+    """The coordinates with a momentum known to be conserved: not in L or a constraint, and no force acts."""
     names = coordinates.names(q)
     holonomic = all(isinstance(c, Holonomic) for c in system.constraints.values())
     if system.force is not None or system.dissipation is not None or not holonomic or len(names) > UP_TO:
@@ -221,10 +221,10 @@ def conserved_momenta(system, t, q, v, params) -> list[str]:
     system = in_numbers(system, unflatten)
     args = (system, t, coordinates.numbers(q), coordinates.numbers(v), params)
     try:
-        seen = [_depends_on(_numbers(lambda _, *state, f=f: f(*state), args), names) for f in functions_of(system)]
+        occurring = [_depends_on(_numbers(lambda _, *state, f=f: f(*state), args), names) for f in functions_of(system)]
     except TooLong:
         return []
-    return [name for name in names if not any(name in found for found in seen)]
+    return [name for name in names if not any(name in found for found in occurring)]
 
 
 def what_changes_momentum(system, name, t, q, v, params) -> Iterator[str]:
@@ -240,14 +240,14 @@ def what_changes_momentum(system, name, t, q, v, params) -> Iterator[str]:
         if isinstance(c, Holonomic):
             functions[f"constraint '{other}' contains it"] = _of_state(c)
         else:
-            yield f"constraint '{other}' is one of velocities"
+            yield f"constraint '{other}' restricts velocities"
     for words, function in functions.items():
         if _contains(function, name, t, q, v, params):
             yield words
 
 
 def forced_by(system, name, t, q, v, params) -> Iterator[str]:
-    """Which forces on others depend on a coordinate, in words."""
+    """Which forces on other coordinates depend on this one, in words."""
     if system.force is not None and _contains(force_with_ones(system), name, t, q, v, params):
         yield "the force contains it"
     if system.dissipation is not None and _contains(system.dissipation, name, t, q, v, params):
@@ -255,7 +255,7 @@ def forced_by(system, name, t, q, v, params) -> Iterator[str]:
 
 
 def _pushes(system, name, t, q, v, params) -> bool:
-    """Whether the force has an entry for a coordinate that is not written as zero; also where that is not known."""
+    """Whether the force on a coordinate is not a literal zero; also True if that is not known."""
     _, unflatten = coordinates.flatten(q)
     args = in_numbers(system, unflatten), t, coordinates.numbers(q), coordinates.numbers(v), params
     try:
@@ -266,7 +266,7 @@ def _pushes(system, name, t, q, v, params) -> bool:
 
 
 def _contains(function, name, t, q, v, params, argument=1) -> bool:
-    """Whether a function depends on a coordinate, or with `argument` 2 on a velocity; also where that is not known."""
+    """Whether a function depends on a coordinate, or with `argument` 2 on a velocity; also True if not known."""
     sizes = [np.size(leaf) for leaf in jtu.tree_leaves(q)]
     leaf = int(np.searchsorted(np.cumsum(sizes), coordinates.names(q).index(name), side="right"))
     if sizes[leaf] == 1:
@@ -276,7 +276,7 @@ def _contains(function, name, t, q, v, params, argument=1) -> bool:
     alone, known = in_numbers(System(function), unflatten), coordinates.names(q)
     args = alone, t, coordinates.numbers(q), coordinates.numbers(v), params
     try:
-        # Of a force all entries count.
+        # The function may be a force: all its entries count.
         numbers = _numbers(lambda system, *state: coordinates.flatten(system.lagrangian(*state))[0], args)
     except TooLong:
         return True
@@ -297,7 +297,7 @@ def what_changes_jacobi_integral(system, t, q, v, params) -> Iterator[str]:
         yield "there is dissipation"
     for name, c in system.constraints.items():
         if not isinstance(c, Holonomic):
-            yield f"constraint '{name}' is one of velocities"
+            yield f"constraint '{name}' restricts velocities"
     if sees_time(system.lagrangian, t, q, v, params):
         yield "L depends on t"
     for name, c in system.constraints.items():
@@ -343,14 +343,14 @@ def _dependence(function, args, leaf_of):
 
 
 def _apply(equation, kinds):
-    """What a primitive makes of operands of these kinds, one for each of its results."""
+    """The kind of each result of a primitive, given the kinds of its operands."""
     name, worst, count = equation.primitive.name, max(kinds, default=Depends.NOT), len(equation.outvars)
     if worst in (Depends.NOT, Depends.OTHERWISE):
         return [worst] * count
     linear = Depends.LINEARLY in kinds
     if name in PERIODIC or not linear:
         return [Depends.PERIODICALLY] * count
-    # From here on something is linear; beside it something periodic makes neither.
+    # From here on an operand is linear; together with a periodic one the result is neither.
     pure = Depends.PERIODICALLY not in kinds
     if name in ADDITIVE and pure:
         return [Depends.LINEARLY] * count

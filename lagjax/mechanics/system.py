@@ -1,4 +1,4 @@
-"""A mechanical system: a Lagrangian, its constraints, and the forces that no potential gives."""
+"""A mechanical system: a Lagrangian, its constraints, and the forces that do not come from a potential."""
 
 from collections.abc import Callable, Hashable, Mapping
 from dataclasses import fields
@@ -27,12 +27,12 @@ class System(eqx.Module):
     - `constraints`: by name, `Holonomic(g)` or `Nonholonomic(phi)`. The name is the key of its multiplier.
     - `force`: `Q(t, q, v, params)` -> like `q`, the generalized force that L does not contain,
       `[L]/[q]`. It does the work `Q·v` per unit of time. A force on a contact, as Coulomb's friction, is
-      `Q(t, q, v, multipliers, params)`, linear in these: it enters the equations that give them.
+      `Q(t, q, v, multipliers, params)`, linear in the multipliers: it enters the equations that determine them.
     - `dissipation`: Rayleigh's function `R(t, q, v, params)` -> scalar; its force is `-∂R/∂v`, so
       `R = ½ c v²` gives `-c v`.
 
-    Systems of the same functions are equal, and can be static arguments of `jax.jit`. They can be pickled where their
-    functions can: those that are defined with `def` in a module.
+    Systems with the same functions are equal, and can be static arguments of `jax.jit`. They can be pickled if their
+    functions can, that is if these are defined with `def` in a module.
 
     **Raises:** `TypeError` where one of these is not a function or a constraint has no kind.
 
@@ -43,7 +43,7 @@ class System(eqx.Module):
     constraints: dict[str, Holonomic | Nonholonomic]
     force: Callable | None
     dissipation: Callable | None
-    # What these read from outside, as far as `outside.py` has looked.
+    # What these functions read from outside, as found by `outside.py`.
     read: Hashable = eqx.field(static=True)
 
     def __init__(
@@ -62,17 +62,17 @@ class System(eqx.Module):
                     f"Fix: pass the function itself, {role}=f, not its value f(...)."
                 )
         if constraints is not None and not isinstance(constraints, Mapping):
-            apart = callable(constraints) and not isinstance(constraints, Holonomic | Nonholonomic)
+            separate = callable(constraints) and not isinstance(constraints, Holonomic | Nonholonomic)
             raise TypeError(
                 f"constraints must be given by name, not as {type(constraints).__name__}.\n"
-                + ("Usual cause: kinetic and potential energy given apart.\n" if apart else "")
+                + ("Usual cause: kinetic and potential energy given separately.\n" if separate else "")
                 + 'Fix: constraints={"rod": lj.Holonomic(g)}'
-                + ("; L is one function, return kinetic - potential." if apart else ".")
+                + ("; L is one function, return kinetic - potential." if separate else ".")
             )
         for name, constraint in (constraints or {}).items():
             if not isinstance(name, str):
                 raise TypeError(
-                    f'a constraint is named {name!r}, and its name must be text.\nFix: "{name}": lj.Holonomic(g).'
+                    f'a constraint is named {name!r}, but its name must be text.\nFix: "{name}": lj.Holonomic(g).'
                 )
             if isinstance(constraint, float | int):
                 raise TypeError(
@@ -94,14 +94,14 @@ class System(eqx.Module):
         self.read = ()
 
     def reading(self, values: Hashable) -> "System":
-        """The same system, other than one whose functions read other values from outside."""
+        """The same system, equal only to one whose functions read the same values from outside."""
         same = object.__new__(System)
         for field in fields(self):
             object.__setattr__(same, field.name, values if field.name == "read" else getattr(self, field.name))
         return same
 
     def functions(self) -> dict[str, Callable | None]:
-        """The user's functions, each by what it is."""
+        """The user's functions by role."""
         of_constraints = {
             f"{name} of constraint '{key}'": getattr(c, name)
             for key, c in self.constraints.items()

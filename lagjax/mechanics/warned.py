@@ -1,4 +1,4 @@
-"""Warnings that show the line of the user, however deep in the library, or in JAX's tracing, they come up."""
+"""Warnings that show the user's line, however deep in the library or in JAX's tracing they arise."""
 
 import os
 import sys
@@ -9,13 +9,13 @@ import diffrax
 import equinox as eqx
 import jax
 
-# The code between the user's line and here, which no warning is about.
+# The code between the user's line and here: warnings skip it.
 PACKAGES = tuple(str(Path(str(module.__file__)).parent) + os.sep for module in (jax, eqx, diffrax))
 BETWEEN = (*PACKAGES, __file__.rsplit("mechanics", 1)[0])
 
 
 def warn(words: str, category: type[Warning]) -> None:
-    """Warn at the innermost line that is neither of this library nor of those below it."""
+    """Warn at the innermost line outside this library and the libraries that it calls."""
     frame = sys._getframe(1)
     while frame.f_back is not None and frame.f_code.co_filename.startswith(BETWEEN):
         frame = frame.f_back

@@ -1,7 +1,7 @@
 """The equations of a small system, written out number by number.
 
 Accelerations, multipliers and the return to the constraints of `saddle_point.py` and `consistency.py`, for systems of a
-few coordinates, as straight code on single numbers. The matrix
+few coordinates, as straight-line code on single numbers. The matrix
 
     [M  Aᵀ] [ a]   [  F  ]
     [A  0 ] [-λ] = [gamma]
@@ -9,7 +9,7 @@ few coordinates, as straight code on single numbers. The matrix
 is eliminated in the order in which it is written, coordinates before constraints, so that its zeros, which are known
 before anything runs, cost nothing. That is as accurate as pivoting where M is definite; where it is not, where
 constraints depend on each other, and where a state is too far from the constraints to be returned in two iterations,
-the results are NaN: a caller then does it the robust way.
+the results are NaN: a caller then takes the robust way.
 
 Source: Golub & Van Loan, *Matrix Computations*, §4.1.2 (L D Lᵀ), §4.2.7 (without pivoting where definite).
 """
@@ -35,12 +35,12 @@ from lagjax.numerics.scalars import TooLong
 # Coordinates and constraint equations together. Measured on chains: a full mass matrix of nine is as fast in arrays;
 # with constraints, whose matrix is mostly zeros, a step is seven times faster up to here, for twice the compile time.
 UP_TO, CONSTRAINED_UP_TO = 8, 16
-# Products with matrices of this size, as of a network in L, are for arrays: two coordinates in a network of a thousand
-# numbers take 1.7 microseconds written out and 1.1 in arrays, and in reverse 15 and 0.6.
+# Products with matrices of this size, as of a network in L, are left to arrays: two coordinates in a network of a
+# thousand numbers take 1.7 microseconds written out and 1.1 in arrays, and in reverse 15 and 0.6.
 MATRIX = 64
-# Operations of a program that takes long to compile.
+# A program of more operations takes too long to compile.
 LONG = 2000
-# Two iterations are enough where the second one moves the state by less than this part of its size.
+# Two iterations are enough where the second one moves the state by less than this share of its size.
 SMALL_CORRECTION = 1e-7
 
 
@@ -55,9 +55,9 @@ class WrittenOut(NamedTuple):
     may_fail: bool
 
     def prepare(self, system, params) -> tuple[tuple | None, tuple | None]:
-        """What does not depend on the state: of the equations, and of the return to the constraints."""
-        of = lambda numbers: None if numbers is None else numbers.prepare(system, params)
-        return of(self.equations), of(self.project)
+        """The parts that do not depend on the state, of the equations and of the return to the constraints."""
+        prepare = lambda numbers: None if numbers is None else numbers.prepare(system, params)
+        return prepare(self.equations), prepare(self.project)
 
 
 def has_networks(system, params) -> bool:
@@ -76,7 +76,7 @@ def is_small(system, t, q, v, params) -> bool:
 
 
 def write_out(system, t, q, v, params) -> WrittenOut | None:
-    """The equations of a small system near a state, of which only shapes count; None where L makes them too long."""
+    """Write out the equations of a small system; only the state's shapes count. None if L makes them too long."""
     count = constraints.count(system, t, q, v, params)
     args = (system, t, q, v, params)
     diagonal = count == 0 and is_diagonal(*args)
@@ -107,20 +107,20 @@ def _projected(system, t, q, v, params):
     u, _ = coordinates.flatten(v)
     mass = mass_and_forcing(system, t, x, u, params, unflatten).mass
     jacobian = constraints.jacobian(system, t, x, u, params, unflatten)
-    # Where the residual vanishes, the derivative of the matrix does not count.
+    # The residual vanishes at the solution, so that the derivative of the matrix does not count.
     solver = dense.Saddle(*map(lax.stop_gradient, (mass, jacobian)))
     holonomic = constraints.holonomic_equations(system, t, q, v, params)
-    still = jnp.zeros_like(x)
-    last_x = last_u = still
+    no_force = jnp.zeros_like(x)
+    last_x = last_u = no_force
     if holonomic.any():
         for _ in range(2):
             position = iter(constraints.position_residual(system, t, x, params, unflatten))
             wanted = jnp.stack([-next(position) if restored else jnp.zeros_like(x[0]) for restored in holonomic])
-            last_x, _ = solver.solve(still, wanted, refine=False)
+            last_x, _ = solver.solve(no_force, wanted, refine=False)
             x = x + last_x
     for _ in range(2):
         last_u, _ = solver.solve(
-            still, -constraints.velocity_residual(system, t, x, u, params, unflatten), refine=False
+            no_force, -constraints.velocity_residual(system, t, x, u, params, unflatten), refine=False
         )
         u = u + last_u
     near = solver.valid & _tiny(last_x, x) & _tiny(last_u, u)
@@ -128,5 +128,5 @@ def _projected(system, t, q, v, params):
 
 
 def _tiny(correction, y) -> Array:
-    largest = lambda z: jnp.sum(jnp.abs(z))
-    return largest(correction) <= SMALL_CORRECTION * largest(y) + 1e-300
+    norm = lambda z: jnp.sum(jnp.abs(z))
+    return norm(correction) <= SMALL_CORRECTION * norm(y) + 1e-300

@@ -1,9 +1,9 @@
-"""Pytrees written down: a structure that JSON can hold, and arrays by name. No pickle, and no functions.
+"""Write pytrees as a structure that JSON can hold and arrays by name: no pickle, and no functions.
 
-What is written down are numbers, text, dicts, lists, tuples, named tuples, and objects of dataclasses (modules of
-equinox among them) by the name of their class and the values of their fields. Functions are only named, and only those
-of lagjax and of the packages that it stands on. Reading runs nothing: a class of the user's must have been imported
-before; of a named tuple that has not been one with the same fields is made.
+Numbers, text, dicts, lists, tuples and named tuples are written as they are, dataclass objects (equinox modules among
+them) as the name of their class and the values of their fields. Functions are only named, and only those of lagjax and
+the packages that it depends on. Reading runs no code: a class of the user's must have been imported before; in place of
+a named tuple that has not, one with the same fields is made.
 """
 
 import dataclasses
@@ -21,16 +21,16 @@ import numpy as np
 
 from lagjax.numerics.simplified_newton import tolerance_of_the_controller
 
-# Whose modules may be imported by their name, and whose functions may be named.
+# Packages whose modules may be imported by name, and whose functions may be named.
 KNOWN = ("lagjax", "diffrax", "optimistix", "lineax", "equinox", "jax", "numpy")
 
 
 class NotWritable(TypeError):
-    """What is no data, and cannot be written down."""
+    """A value that is not data, and cannot be written down."""
 
 
 class NotGiven:
-    """In place of a function that is not in a file, and was not given again."""
+    """A placeholder for a function that is not in a file and was not given again."""
 
     def __init__(self, role: str):
         self.role = role
@@ -46,15 +46,15 @@ class NotGiven:
 
     def __call__(self, *args, **kwargs):
         raise ValueError(
-            f"this needs {self.role}, a function that is not in a file.\n"
+            f"this needs {self.role}, a function, which a file does not contain.\n"
             f"Fix: lj.load_fit(path, system, {self.role}=...)."
         )
 
 
 class Writer:
-    """Writes trees down; `arrays` are those of all that was written, by name.
+    """Writes trees down; `arrays` are the arrays of everything written, by name.
 
-    `given(value)`: what stands for a value that cannot be written and is given again by the user, or None.
+    `given(value)`: the role of a value that is not written but given again by the user, or None.
     """
 
     def __init__(self, given: Callable[[Any], str | None] = lambda value: None):
@@ -62,7 +62,7 @@ class Writer:
         self._given = given
 
     def down(self, value, path: str):
-        """A value as JSON has it; `path` is how the user would write it."""
+        """A value in a form for JSON; `path` is how the user would write it."""
         if value is None or isinstance(value, (bool, str)) or type(value) is int:
             return value
         if type(value) is float:
@@ -89,8 +89,8 @@ class Writer:
             parts = {name: self.down(getattr(value, name), _under(path, name)) for name in names}
             return {"object": _name_of(type(value)), "fields": parts}
         raise NotWritable(
-            f"{path} is a {type(value).__name__}, which has no form that could be written down.\n"
-            "Fix: numbers, arrays, text, dicts, lists, tuples, named tuples and dataclasses of these."
+            f"{path} is a {type(value).__name__}, which cannot be written down.\n"
+            "Fix: use numbers, arrays, text, dicts, lists, tuples, named tuples and dataclasses of these."
         )
 
     def _key(self, key, path):
@@ -118,7 +118,7 @@ class Writer:
     def _free(self, path):
         wanted = "".join(c if c.isalnum() or c in "._-[]" else "_" for c in path) or "value"
         name, number = wanted, 1
-        # File systems that do not tell cases apart must not matter where somebody unpacks the file.
+        # Names must differ by more than case: somebody may unpack the file on a file system that ignores it.
         while name.lower() in {other.lower() for other in self.arrays}:
             name, number = f"{wanted}.{number}", number + 1
         return name
@@ -126,20 +126,20 @@ class Writer:
     def _function(self, value, path):
         module = getattr(value, "__module__", None) or ""
         if _is_known(module):
-            # By the name that it has, or under which its module keeps it.
+            # By its own name, or the name under which its module keeps it.
             kept_as = [name for name, x in vars(sys.modules.get(module, sys)).items() if x is value]
             for name in (getattr(value, "__qualname__", ""), *kept_as):
                 if name and _find(module, name) is value:
                     return {"function": {"module": module, "name": name}}
         raise NotWritable(
-            f"{path} is a function ({getattr(value, '__name__', type(value).__name__)}), and functions are no data.\n"
+            f"{path} is a function ({getattr(value, '__name__', type(value).__name__)}), and functions are not data.\n"
             "Usual cause: a function in params.\n"
             "Fix: write it into the Lagrangian, and leave its numbers in params."
         )
 
 
 class Reader:
-    """Reads what was written down; `given` are the user's values for what was not."""
+    """Reads trees; `given(role)` returns the user's value for one that was not written."""
 
     def __init__(self, arrays: dict[str, np.ndarray], given: Callable[[str], Any] | None = None):
         self._arrays, self._given = arrays, given
@@ -222,14 +222,14 @@ def _is_known(module):
 
 
 def _name_of(cls):
-    # By its public name, which stays where its file moves.
+    # By its public name, which stays the same when its file moves.
     public = getattr(sys.modules.get("lagjax"), cls.__name__, None) is cls
     module, name = ("lagjax", cls.__name__) if public else (cls.__module__, cls.__qualname__)
     return {"module": module, "name": name}
 
 
 def _find(module: str, name: str):
-    """What a module has under this name; of a module of the user's only where it was imported already."""
+    """Look up a name in a module; a module of the user's must have been imported already."""
     if _is_known(module) and module not in sys.modules:
         try:
             importlib.import_module(module)

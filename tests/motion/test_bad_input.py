@@ -257,11 +257,11 @@ def test_called_lagrangian_and_bare_constraint():
         lj.System(3.0)
     with refusal(TypeError, "'rod'", "lj.Holonomic"):
         lj.System(pendulum.lagrangian, {"rod": lambda t, q, params: q})
-    with refusal(TypeError, "kinetic and potential energy given apart", "return kinetic - potential"):
+    with refusal(TypeError, "kinetic and potential energy given separately", "return kinetic - potential"):
         lj.System(pendulum.lagrangian, pendulum.lagrangian)
     with refusal(TypeError, "params in the place of constraints", "each call takes them"):
         lj.System(pendulum.lagrangian, PARAMS)
-    with refusal(TypeError, "named 3, and its name must be text"):
+    with refusal(TypeError, "named 3, but its name must be text"):
         lj.System(pendulum.lagrangian, {3: lj.Holonomic(lambda t, q, params: q)})
 
 

@@ -122,10 +122,10 @@ def test_another_system_is_told(tmp_path):
     pull = lambda t, q, v, params: {"x": 0.0 * q["x"], "y": 0.0 * q["y"]}
     for other, words in (
         (lj.System(falling), "the constraint 'rod' is missing"),
-        (lj.System(falling, {"bar": lj.Holonomic(on_rod)}), "the constraint 'bar' is there, and was not"),
+        (lj.System(falling, {"bar": lj.Holonomic(on_rod)}), "the constraint 'bar' is there, but was not before"),
         (lj.System(falling, {"rod": lj.Holonomic(lambda t, q, params: q["x"])}), "the constraint 'rod': its value was"),
         (lj.System(lambda *state: falling(*state) + 0.1 * state[1]["x"], rod.constraints), "Lagrangian: its value was"),
-        (lj.System(falling, rod.constraints, force=pull), "the force is there, and was not"),
+        (lj.System(falling, rod.constraints, force=pull), "the force is there, but was not before"),
         (lj.System(lambda t, q, v, params: params["mass"]), "cannot be asked at a state of that motion"),
     ):
         with pytest.raises(ValueError, match=words):
@@ -201,7 +201,7 @@ def test_parameters(tmp_path):
     traj = lj.integrate(springs, 1.0, 0.0, {"of": params}, ts=TS)
     check(traj, springs, tmp_path / "x.npz")
     traj = lj.integrate(springs, 1.0, 0.0, {"f": [lambda x: x]}, ts=TS)
-    with pytest.raises(TypeError, match=r"params.f\[0\] is a function \(<lambda>\), and functions are no data"):
+    with pytest.raises(TypeError, match=r"params.f\[0\] is a function \(<lambda>\), and functions are not data"):
         traj.save(tmp_path / "y.npz")
     assert not (tmp_path / "y.npz").exists()
 

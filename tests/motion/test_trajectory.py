@@ -53,7 +53,7 @@ def test_says_what_need_not_be_conserved(traj):
 CHANGES = {
     "there is a force": {"force": lambda t, q, v, params: -q},
     "there is dissipation": {"dissipation": lambda t, q, v, params: v**2},
-    "constraint 'c' is one of velocities": {"constraints": {"c": lj.Nonholonomic(lambda t, q, v, params: v)}},
+    "constraint 'c' restricts velocities": {"constraints": {"c": lj.Nonholonomic(lambda t, q, v, params: v)}},
     "constraint 'c' depends on t": {"constraints": {"c": lj.Holonomic(lambda t, q, params: q - t)}},
 }
 
