@@ -139,9 +139,9 @@ MISTAKES = {
     "params before v": (
         lambda: move(swing, (START[0], PARAMS), START[1]), VALUE, "structure of q", "another order", "q0, v0, params"),
     "q and v before t": (
-        lambda: lj.accelerations(pendulum, *START, 0.0, PARAMS), TYPE, "one number, and is a dict", "t, q, v"),
+        lambda: lj.accelerations(pendulum, *START, 0.0, PARAMS), TYPE, "one number, not a dict", "t, q, v"),
     "the system last": (
-        lambda: lj.integrate(*START, PARAMS, pendulum, ts=TS), TYPE, "is a dict", "number 4 here", "system, q0, v0"),
+        lambda: lj.integrate(*START, PARAMS, pendulum, ts=TS), TYPE, "not a dict", "argument 4 here", "system, q0, v0"),
     "times by place": (
         lambda: lj.integrate(pendulum, *START, PARAMS, TS), TYPE, "without ts=", "by position", r"params, ts=ts\)"),
     "times left out": (lambda: lj.integrate(pendulum, *START, PARAMS), TYPE, "without ts=", r"params, ts=ts\)"),
@@ -181,7 +181,7 @@ MISTAKES = {
         lambda: move(lambda t, q, v, p: v @ jnp.ones(3), (np.ones(2), np.zeros(2))), TYPE,
         r"shapes \(2,\) and \(3,\)", r"q is an array of shape \(2,\)"),
     "attributes of an array": (lambda: move(attributes, (1.0, 0.0)), TYPE, ".theta of an array", r'v\["theta"\]'),
-    "a power": (lambda: move(lambda t, q, v, p: 0.5 * v["theta"] ^ 2), TYPE, "no power", r"v\*\*2"),
+    "a power": (lambda: move(lambda t, q, v, p: 0.5 * v["theta"] ^ 2), TYPE, "not a power", r"v\*\*2"),
     "a count as a float": (lambda: move(counts, params={"n": 3.0}), TYPE, "not a whole number", '"n": 3'),
     "a count in an array": (lambda: move(counts, params={"n": jnp.array(3)}), TYPE, "not known while JAX", '"n": 3'),
     "entries by a condition": (
@@ -217,7 +217,7 @@ MISTAKES = {
     "NumPy": (lambda: move(by_numpy), TYPE, r"L\(t, q, v, params\)", NUMPY, r'np.cos\(q\["theta"\]\)', "jnp.cos"),
     "math": (lambda: move(by_math), TYPE, "Python number", "jnp.cos in place of math.cos"),
     "float": (lambda: move(by_float), TYPE, "Python number", "leave out float"),
-    "if": (lambda: move(with_if), TYPE, "decides", r'if q\["theta"\] > 0', "jnp.where"),
+    "if": (lambda: move(with_if), TYPE, "branches on", r'if q\["theta"\] > 0', "jnp.where"),
     "a pair of energies": (lambda: move(lambda t, q, v, p: (0.5, 1.0)), VALUE, "a tuple", "one by one", "kinetic -"),
     "energies by name": (lambda: move(lambda t, q, v, p: {"T": 0.5}), VALUE, "a dict", "one by one", "kinetic -"),
     "a whole number": (lambda: move(lambda t, q, v, p: 1), VALUE, "returned 1, ", "in place of an energy"),
@@ -247,7 +247,7 @@ MISTAKES = {
     "an axis as an attribute": (lambda: swept(lambda point: point.m**2), TYPE, ".m of a dict", r'point\["m"\]'),
     "a point for a number": (lambda: swept(lambda m: m**2), TYPE, "with a dict", r"point\['m'\]"),
     "axes one by one": (lambda: swept(lambda m, g: m * g), TYPE, "with 1 argument,", r"f\(m, g\)", r"f\(point\)"),
-    "if in a sweep": (lambda: swept(lambda p: 1.0 if p["m"] > 1 else 0.0), TYPE, "decides", "jnp.where"),
+    "if in a sweep": (lambda: swept(lambda p: 1.0 if p["m"] > 1 else 0.0), TYPE, "branches on", "jnp.where"),
     "float in a sweep": (lambda: swept(lambda p: float(p["m"])), TYPE, "Python number", "leave out float"),
     "a film of q alone": (
         lambda: move(swing).animate(lambda q: (q["theta"], 0.0)), TYPE, r"positions\(t, q, params\)",

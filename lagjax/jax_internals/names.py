@@ -1,11 +1,11 @@
-"""JAX's primitives by name, as the walkers over programs sort them: one table, each of whose names is tested.
+"""JAX's primitives by name, classified for the code that walks over programs; a test checks each name.
 
-What is no name here is treated as unknown by all of them, which is slower and never wrong.
+A primitive that is not listed is treated as unknown, which is slower and never wrong.
 """
 
 import numpy as np
 
-# Entry by entry, of numbers alone.
+# They work entry by entry, on numbers alone.
 ELEMENTWISE = {
     "abs", "acos", "acosh", "add", "add_any", "and", "asin", "asinh", "atan", "atan2", "atanh", "cbrt", "ceil",
     "clamp", "cos", "cosh", "convert_element_type", "digamma", "div", "eq", "erf", "erf_inv", "erfc", "exp", "exp2",
@@ -13,7 +13,7 @@ ELEMENTWISE = {
     "max", "min", "mul", "ne", "neg", "nextafter", "not", "or", "pow", "rem", "round", "rsqrt", "select_n", "sign",
     "sin", "sinh", "sqrt", "square", "stop_gradient", "sub", "tan", "tanh", "xor",
 }  # fmt: skip
-# Of these, what NumPy does the same way: constants are computed by it.
+# Those of these that NumPy computes the same way: it computes constants.
 IN_NUMPY = {
     "abs": np.abs, "add": np.add, "and": np.bitwise_and, "eq": np.equal, "ge": np.greater_equal, "gt": np.greater,
     "le": np.less_equal, "lt": np.less, "max": np.maximum, "min": np.minimum, "mul": np.multiply, "ne": np.not_equal,
@@ -22,12 +22,12 @@ IN_NUMPY = {
 }  # fmt: skip
 REDUCING = {"reduce_sum", "reduce_max", "reduce_min", "reduce_prod", "reduce_and", "reduce_or"}
 ACCUMULATING = {"cumsum", "cumprod", "cummax", "cummin", "cumlogsumexp"}
-# What moves entries, and makes none.
+# They move entries and compute none.
 MOVING = {
     "broadcast_in_dim", "concatenate", "copy", "dynamic_slice", "gather", "iota", "pad", "reshape", "rev", "slice",
     "split", "squeeze", "stack", "transpose", "unstack",
 }  # fmt: skip
-# Sums of what they take, linear in all of it; in the first operand, where the others choose or scale; in each of two.
+# Linear in all operands together; in the first operand, where the others choose or scale; in each of two operands.
 ADDITIVE = {
     "add", "add_any", "broadcast_in_dim", "concatenate", "convert_element_type", "copy", "cumsum", "neg", "pad",
     "reduce_sum", "reshape", "rev", "slice", "split", "squeeze", "stack", "stop_gradient", "sub", "transpose",
@@ -39,8 +39,8 @@ PERIODIC = {"cos", "sin"}
 CALLS = {"jit", "closed_call"}
 CALLS_WITH_RULES = {"custom_jvp_call", "custom_vjp_call", "remat2"}
 CONTROL_FLOW = {"cond", "scan", "while"}
-# Of equinox: what holds under `vmap`, and marks for derivatives.
-OF_EQUINOX = {
+# Equinox's primitives: for use under `vmap`, and marks for derivatives.
+EQUINOX_PRIMITIVES = {
     "maybe_set", "nonbatchable", "nondifferentiable_backward", "select_if_vmap", "unvmap_all", "unvmap_any",
     "unvmap_max", "vprim",
 }  # fmt: skip

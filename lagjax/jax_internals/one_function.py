@@ -2,13 +2,13 @@
 
 On a CPU, XLA runs a compiled program as a list of kernels and library calls, and going from one to the next costs 0.05
 to 0.1 microseconds. A step of a mechanical system is hundreds of operations on single numbers: nearly all of its time
-would go there. XLA knows a remedy for loops that touch very little memory: it compiles them into one function and calls
+would go there. XLA has a remedy for loops that touch very little memory: it compiles them into one function and calls
 that. `one_function` asks for the same for a program of ours; measured on the bead and the Cartesian pendulum it is 7 to
 13 times faster, and compiles in less time.
 
-What can be asked for is limited: no library call (LAPACK, the host), no large reduction or product, no general scatter.
-`fits` reads off the jaxpr whether a program is of that kind, and what is not runs as it always did. In a batch the
-operations are long enough to be kernels, and the request is dropped; on a CPU a large batch is taken in blocks.
+Such a program may contain no library call (LAPACK, the host), no large reduction or product, no general scatter. `fits`
+reads off the jaxpr whether a program qualifies; one that does not runs as usual. In a batch the operations are long
+enough to be kernels, and the request is dropped; on a CPU a large batch is taken in blocks.
 
 The request is made by attributes of the call (`marks.py`).
 """
@@ -32,21 +32,21 @@ from lagjax.jax_internals.names import (
     CALLS_WITH_RULES,
     CONTROL_FLOW,
     ELEMENTWISE,
+    EQUINOX_PRIMITIVES,
     MOVING,
-    OF_EQUINOX,
     REDUCING,
 )
 from lagjax.jax_internals.plain import is_plain
 from lagjax.jax_internals.programs import bodies, equations, rewritten, without_chains
 
-# Reductions and products above this become calls of a library.
+# Reductions and products above this become library calls.
 LARGE = 1024
 # Lanes of a batch that a CPU takes together: a sweep of pendulums takes 143 microseconds a lane one by one, 94 in
 # blocks of 64, 42 in blocks of 256, and 55 in blocks of 2048, which do not fit into its caches.
 TOGETHER = 256
-# The multiplications of a product of matrices above which the library is worth more than one function.
+# A matrix product of more multiplications is left to the library: that gains more than one function.
 PRODUCT = 4096
-AT_ANY_SIZE = ELEMENTWISE | MOVING | OF_EQUINOX | {
+AT_ANY_SIZE = ELEMENTWISE | MOVING | EQUINOX_PRIMITIVES | {
     "bessel_i0e", "bessel_i1e", "bitcast_convert_type", "dynamic_update_slice", "reduce_precision", "sincos", "tile",
     "xla_metadata_value",
 }  # fmt: skip
@@ -62,24 +62,24 @@ def one_function(function: Callable, *args, checked: bool = False, in_blocks: bo
     6.0
 
     **Arguments:** pytrees, of which the arrays are passed and all else is compiled in; what `function` returns may
-    contain anything too. It must not close over traced values. `checked` says that all checks of
-    equinox (`error_if`, a call of the host) in it are known to pass: they are left out. In a batch on a CPU, with
-    `in_blocks`, a few hundred lanes are taken at a time.
+    contain anything too. It must not close over traced values. `checked` says that all of equinox's checks in it
+    (`error_if`, a call of the host) are known to pass: they are left out. With `in_blocks`, a batch on a CPU is
+    processed a few hundred lanes at a time.
 
-    Its forward derivative is one function too, also along many directions. Reverse mode needs the function as it is.
+    Its forward derivative is one function too, also along many directions. Reverse mode must use `function` itself.
     """
     if is_plain():
         return function(*args)
     arrays, static = eqx.partition(args, eqx.is_array)
     given, structure = jtu.tree_flatten(arrays)
-    # What is passed twice, as by a solver and by the controller that asks it, is one operand.
+    # An array that is passed twice, as by a solver and its controller, is one operand.
     leaves = list({id(x): x for x in given}.values())
     places = {id(x): i for i, x in enumerate(leaves)}
     rest = []
 
     def of_leaves(*leaves):
-        every = [leaves[places[id(x)]] for x in given]
-        result = function(*eqx.combine(jtu.tree_unflatten(structure, every), static))
+        repeated = [leaves[places[id(x)]] for x in given]
+        result = function(*eqx.combine(jtu.tree_unflatten(structure, repeated), static))
         arrays, others = eqx.partition(result, eqx.is_array)
         rest.append(others)
         return arrays
@@ -93,7 +93,7 @@ def one_function(function: Callable, *args, checked: bool = False, in_blocks: bo
 
 
 def kept_as_call(results):
-    """`results` of a jitted function that stays a call; else XLA computes it anew for each of those who need them."""
+    """Keep the jitted function of these `results` a call; else XLA computes it again for each use of a result."""
     if jax.default_backend() != "cpu" or is_plain():
         return results
     first, *others = jtu.tree_leaves(results)
@@ -101,7 +101,7 @@ def kept_as_call(results):
 
 
 def apart(function: Callable, *args):
-    """`function(*args)` as a call of its own: what XLA fuses it computes anew for each of those who need it.
+    """`function(*args)` as a call of its own: what XLA fuses, it computes again for each use.
 
     >>> import jax.numpy as jnp
     >>> print(apart(jnp.sin, jnp.asarray(0.0)))
@@ -116,7 +116,7 @@ def _jitted(function, args):
 
 
 def fits(jaxpr: Jaxpr) -> bool:
-    """Whether XLA can compile a program, `without_library` if it can be, as one function."""
+    """Whether XLA can compile a program as one function; to be asked after `without_library`."""
     return all(_equation_fits(equation) for equation in jaxpr.eqns)
 
 
@@ -135,19 +135,19 @@ def _equation_fits(equation):
     if name in SMALL:
         return max(sizes) <= LARGE
     if name.startswith("scatter"):
-        # One place at a time becomes an update of a slice.
+        # A scatter to one place becomes an update of a slice.
         indices = equation.invars[1].aval
         return indices.size == (indices.shape[-1] if indices.ndim else 1)
     return name in WITH_BODIES and all(fits(body) for body in bodies(equation))
 
 
 def without_checks(closed: ClosedJaxpr) -> ClosedJaxpr:
-    """The program without the checks of equinox (`error_if`); what else calls the host stays."""
+    """The program without equinox's checks (`error_if`); other calls of the host stay."""
     return rewritten(closed, _without_check) if calls_host(closed.jaxpr) else closed
 
 
 def poisoned(closed: ClosedJaxpr) -> ClosedJaxpr:
-    """The program in which a check of equinox that fails gives NaN, in its lane alone, and ends nothing."""
+    """The program in which a failing equinox check gives NaN, in its lane only, instead of raising."""
     return without_checks(rewritten(closed, _poisoned)) if calls_host(closed.jaxpr) else closed
 
 
@@ -157,24 +157,24 @@ def _poisoned(equation):
         return equation
     inner = equation.params["jaxpr"]
     inside = inner.jaxpr
-    # Of all lanes together it asks one question, about what says for each whether it fails.
-    asked = [e.invars[0] for e in inside.eqns if e.primitive.name == "unvmap_any"]
-    places = [i for i, x in enumerate(inside.invars) if any(x is y for y in asked)]
-    silent = jaxpr_as_fun(without_checks(inner))
+    # It asks once for all lanes (`unvmap_any`) whether any fails: the operand says so for each lane.
+    conditions = [e.invars[0] for e in inside.eqns if e.primitive.name == "unvmap_any"]
+    places = [i for i, x in enumerate(inside.invars) if any(x is y for y in conditions)]
+    unchecked = jaxpr_as_fun(without_checks(inner))
 
-    def of(*operands):
+    def with_nan(*operands):
         fails = jnp.any(jnp.stack([jnp.any(operands[i]) for i in places]))
         nan = lambda x: jnp.where(fails, jnp.nan, x) if jnp.issubdtype(x.dtype, jnp.inexact) else x
-        return [nan(x) for x in silent(*operands)]
+        return [nan(x) for x in unchecked(*operands)]
 
     if not places:
         return equation
-    made = jax.make_jaxpr(of)(*(jax.ShapeDtypeStruct(x.aval.shape, x.aval.dtype) for x in inside.invars))
-    return equation.replace(params={**equation.params, "jaxpr": made})
+    program = jax.make_jaxpr(with_nan)(*(jax.ShapeDtypeStruct(x.aval.shape, x.aval.dtype) for x in inside.invars))
+    return equation.replace(params={**equation.params, "jaxpr": program})
 
 
 def _without_check(equation):
-    """A branch that calls the host for nothing but raising an error is replaced by the one beside it that does not."""
+    """Replace a branch that calls the host only to raise an error by the other branch, which does not."""
     branches = equation.params.get("branches", ())
     silent = [branch for branch in branches if not calls_host(branch.jaxpr)]
     raising = [branch for branch in branches if calls_host(branch.jaxpr) and _only_raises(branch.jaxpr)]
@@ -190,12 +190,12 @@ def calls_host(jaxpr: Jaxpr) -> bool:
 
 def _only_raises(jaxpr):
     calls = [equation for equation in equations(jaxpr) if "callback" in equation.primitive.name]
-    called = [getattr(equation.params.get("callback"), "callback_func", None) for equation in calls]
-    return all(getattr(function, "__module__", None) == "equinox._errors" for function in called)
+    host_functions = [getattr(equation.params.get("callback"), "callback_func", None) for equation in calls]
+    return all(getattr(function, "__module__", None) == "equinox._errors" for function in host_functions)
 
 
 def without_library(closed: ClosedJaxpr) -> ClosedJaxpr:
-    """The program with products of matrices and eliminations as loops of ours."""
+    """The program with matrix products and eliminations as loops of lagjax's own."""
     return rewritten(closed, _equation_without_library)
 
 
@@ -212,9 +212,9 @@ def _equation_without_library(equation):
 
 
 def _product(left, right, dimension_numbers, like):
-    """A product of matrices that XLA does not pass on to a library, as it does with sums of many multiplications.
+    """A matrix product that XLA does not pass on to a library, as it does with sums of many multiplications.
 
-    Those are added up in a loop over the terms of each sum.
+    Such sums are added up in a loop over their terms.
     """
     (of_left, of_right), (left_lanes, right_lanes) = dimension_numbers
 
@@ -240,53 +240,53 @@ def _product(left, right, dimension_numbers, like):
     return lax.fori_loop(0, summed, added, zero, unroll=4).reshape(like.shape)
 
 
-def _plainly(*operands, jaxpr, **params):
+def _unmarked(*operands, jaxpr, **params):
     return jaxpr_as_fun(jaxpr)(*operands)
 
 
 def _marked(*operands, jaxpr, **params):
     original, jaxpr = jaxpr, without_library(jaxpr)
     if not fits(jaxpr.jaxpr):
-        return _plainly(*operands, jaxpr=original)
+        return _unmarked(*operands, jaxpr=original)
 
-    # XLA ends the process where an operand of such a call is not used in it: one that is never used, one that it finds
-    # out not to need, and one that it knows and writes into the function, above 10 kB. So each of them is a result
-    # too, and none of them is known.
+    # XLA ends the process if an operand of such a call is not used in it: one that is never used, one that it finds to
+    # be unnecessary, or one above 10 kB that it knows and writes into the function. So each operand is a result too,
+    # and the barrier hides its value.
     def function(*operands):
         return *jaxpr_as_fun(jaxpr)(*operands), *map(jnp.copy, operands)
 
-    # The mark of a result is put on what makes it: the call.
+    # The mark of a result is put on the operation that makes it: the call.
     first, *others = jax.jit(function)(*lax.optimization_barrier(operands))
     return [marked(first, ONE_KERNEL), *others][: len(jaxpr.out_avals)]
 
 
-def _pushed(jaxpr, known, checked):
-    """The program of values and derivatives, of the operands and the tangents of those that are `known` to have one."""
+def _jvp_program(jaxpr, has_tangent, checked):
+    """The program of values and derivatives; it takes the operands, and the tangents of those with `has_tangent`."""
 
-    def pushed(*operands):
-        primals, moving = operands[: len(known)], operands[len(known) :]
+    def values_and_derivatives(*operands):
+        primals, moving = operands[: len(has_tangent)], operands[len(has_tangent) :]
 
         def of_moved(*moved):
             moved = iter(moved)
-            return jaxpr_as_fun(jaxpr)(*(next(moved) if k else x for x, k in zip(primals, known)))
+            return jaxpr_as_fun(jaxpr)(*(next(moved) if k else x for x, k in zip(primals, has_tangent)))
 
-        y, dy = jax.jvp(of_moved, [x for x, k in zip(primals, known) if k], list(moving))
-        # What is no floating number has no derivative.
+        y, dy = jax.jvp(of_moved, [x for x, k in zip(primals, has_tangent) if k], list(moving))
+        # Results that are not floating-point numbers have no derivative.
         return *y, *(d for d in dy if d.dtype != jax.dtypes.float0)
 
-    moving = [aval for aval, k in zip(jaxpr.in_avals, known) if k]
+    moving = [aval for aval, k in zip(jaxpr.in_avals, has_tangent) if k]
     like = [jax.ShapeDtypeStruct(aval.shape, aval.dtype) for aval in (*jaxpr.in_avals, *moving)]
-    program = jax.make_jaxpr(pushed)(*like)
+    program = jax.make_jaxpr(values_and_derivatives)(*like)
     # The derivative of a check is a check.
     return without_checks(program) if checked else program
 
 
 def _jvp(primitive, primals, tangents, *, jaxpr, checked, **params):
-    known = [not isinstance(t, ad.Zero) for t in tangents]
-    moving = [t for t, k in zip(tangents, known) if k]
-    program, count = _pushed(jaxpr, known, checked), len(jaxpr.out_avals)
+    has_tangent = [not isinstance(t, ad.Zero) for t in tangents]
+    moving = [t for t, k in zip(tangents, has_tangent) if k]
+    program, count = _jvp_program(jaxpr, has_tangent, checked), len(jaxpr.out_avals)
     if "batched" in params:
-        params["batched"] += tuple(b for b, k in zip(params["batched"], known) if k)
+        params["batched"] += tuple(b for b, k in zip(params["batched"], has_tangent) if k)
     else:
         params |= {"points": len(primals), "values": count}
     found = primitive.bind(*primals, *moving, jaxpr=program, checked=checked, **params)
@@ -316,13 +316,13 @@ def _batched(operands, axes, *, jaxpr, in_blocks, points, values, checked):
 
 def _lanes_together(*operands, jaxpr, batched, lanes=None, **params):
     if isinstance(lanes, int) and lanes == 0:
-        # A loop that waits for the slowest of no lanes has none to ask.
+        # A loop that runs until the slowest lane is done has none to ask here.
         return [jnp.zeros((0, *aval.shape), aval.dtype) for aval in jaxpr.out_avals]
     return jax.vmap(jaxpr_as_fun(jaxpr), [0 if b else None for b in batched])(*operands)
 
 
 def _lanes_in_blocks(*operands, jaxpr, batched, lanes, **params):
-    """A loop over blocks of lanes, as few as fit and all of one length: the last lane fills the last block."""
+    """A loop over as few blocks of lanes as fit, all of one length: copies of the last lane fill the last block."""
     together = partial(_lanes_together, jaxpr=jaxpr, batched=batched)
     if not isinstance(lanes, int):
         # An exported program of any number of lanes does not know how many blocks there are.
@@ -336,11 +336,11 @@ def _lanes_in_blocks(*operands, jaxpr, batched, lanes, **params):
         filled = jnp.concatenate([x, jnp.broadcast_to(x[-1:], (blocks * length - lanes, *x.shape[1:]))])
         return filled.reshape(blocks, length, *x.shape[1:])
 
-    def block(mine):
-        mine = iter(mine)
-        return tuple(together(*(next(mine) if b else x for x, b in zip(operands, batched))))
+    def of_block(batched_operands):
+        remaining = iter(batched_operands)
+        return tuple(together(*(next(remaining) if b else x for x, b in zip(operands, batched))))
 
-    found = lax.map(block, [in_blocks(x) for x, b in zip(operands, batched) if b])
+    found = lax.map(of_block, [in_blocks(x) for x, b in zip(operands, batched) if b])
     return [x.reshape(blocks * length, *x.shape[2:])[:lanes] for x in found]
 
 
@@ -380,5 +380,5 @@ _product_p = Primitive("product")
 _product_p.def_abstract_eval(lambda left, right, like, **params: like)
 mlir.register_lowering(_product_p, mlir.lower_fun(_product, multiple_results=False))
 
-_one_function_p = _define("one_function", _plainly, _marked, lambda *x, jaxpr, **params: jaxpr.out_avals, _batched)
+_one_function_p = _define("one_function", _unmarked, _marked, lambda *x, jaxpr, **params: jaxpr.out_avals, _batched)
 _in_blocks_p = _define("in_blocks", _lanes_together, _lanes_in_blocks, _lane_shapes, _batched_again)

@@ -21,9 +21,9 @@ def primitive(
 ) -> Primitive:
     """Define a primitive that gives one result, or a list of `several`.
 
-    **Arguments:** `evaluate`, the operation on arrays; `compiled`, the same by JAX where a program contains it, if that
-    is another function; `shapes`, of the abstract values of the results from those of the operands; and the rules, as
-    JAX wants them, of derivatives, of transposition and of batches. What has no rule raises.
+    **Arguments:** `evaluate`, the operation on arrays; `compiled`, the operation in compiled programs, if that is
+    another function; `shapes`, the abstract values of the results from those of the operands; and the rules, as JAX
+    wants them, of derivatives, of transposition and of batches. A transformation without a rule raises.
     """
     new = Primitive(name)
     new.multiple_results = several

@@ -1,4 +1,4 @@
-"""JAX programs (jaxprs) as data: one equation of them, what depends on what, one program as two."""
+"""JAX programs (jaxprs) as data: evaluate and rewrite equations, find what depends on what, split a program."""
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -13,7 +13,7 @@ from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, jaxpr_as_fun
 
 from lagjax.jax_internals.names import CALLS, CALLS_WITH_RULES
 
-# Calls in a row that are worth a loop.
+# Chains of at least so many calls are worth a loop.
 LONG_CHAIN = 16
 
 
@@ -35,19 +35,19 @@ def rewritten(closed: ClosedJaxpr, change: Callable) -> ClosedJaxpr:
 def _rewritten(closed: ClosedJaxpr, change: Callable[[Jaxpr], Jaxpr]) -> ClosedJaxpr:
     """The program with its list of equations changed, and the lists inside loops, branches and functions.
 
-    What is the same in several places stays so, and what does not change stays the object that it is: JAX knows
-    functions that it has compiled by their identity.
+    An object used in several places stays one object, and one that does not change stays the same object: JAX
+    recognises functions that it has compiled by their identity.
     """
-    # Each with what it was made of, whose number another object could have later.
-    found = {}
+    # New objects by the id of the old one, which is kept alive lest another object get its id.
+    made = {}
 
     def once(value, make):
-        if id(value) not in found:
-            found[id(value)] = value, make()
-        return found[id(value)][1]
+        if id(value) not in made:
+            made[id(value)] = value, make()
+        return made[id(value)][1]
 
     def inside(value):
-        # From jax 0.12 on a program is closed by itself: then both names are one class.
+        # From jax 0.12 on both names are one class, and a program is closed by itself.
         if isinstance(value, ClosedJaxpr) and value.jaxpr is not value:
             jaxpr = inside(value.jaxpr)
             return value if jaxpr is value.jaxpr else once(value, lambda: value.replace(jaxpr=jaxpr))
@@ -55,7 +55,7 @@ def _rewritten(closed: ClosedJaxpr, change: Callable[[Jaxpr], Jaxpr]) -> ClosedJ
             return once(value, lambda: of_program(value))
         if isinstance(value, tuple):
             new = [inside(item) for item in value]
-            # A named one keeps its names.
+            # A named tuple keeps its type.
             make = type(value) if not hasattr(value, "_fields") else lambda items: type(value)(*items)
             return value if _same(new, value) else make(new)
         return value
@@ -77,7 +77,7 @@ def _same(new, old):
 
 
 def without_chains(closed: ClosedJaxpr) -> ClosedJaxpr:
-    """The program with long chains f(f(f(... x))) of one and the same call as loops.
+    """The program with long chains f(f(f(... x))) of the same call turned into loops.
 
     (diffrax takes the hundredth floating number before the last time, one after the other.)
     """
@@ -87,7 +87,7 @@ def without_chains(closed: ClosedJaxpr) -> ClosedJaxpr:
 def _chains_as_loops(jaxpr):
     uses = Counter(x for e in jaxpr.eqns for x in variables(e))
     uses.update(x for x in jaxpr.outvars if not isinstance(x, Literal))
-    # By the variable that it ends with, each chain so far: its equations.
+    # The equations of each chain so far, by the variable that it ends with.
     chains = {}
     for equation in jaxpr.eqns:
         if not bodies(equation) or equation.effects or len(variables(equation)) != 1 or len(equation.outvars) != 1:
@@ -101,8 +101,8 @@ def _chains_as_loops(jaxpr):
         chains.pop(operand, None)
         chains[result] = [*before, equation]
     loops = {id(chain[-1]): chain for chain in chains.values() if len(chain) >= LONG_CHAIN}
-    gone = {id(e) for chain in loops.values() for e in chain[:-1]}
-    kept = [e if id(e) not in loops else _loop(jaxpr, loops[id(e)]) for e in jaxpr.eqns if id(e) not in gone]
+    absorbed = {id(e) for chain in loops.values() for e in chain[:-1]}
+    kept = [e if id(e) not in loops else _loop(jaxpr, loops[id(e)]) for e in jaxpr.eqns if id(e) not in absorbed]
     return jaxpr.replace(eqns=kept)
 
 
@@ -132,13 +132,13 @@ def length(jaxpr: Jaxpr) -> int:
 
 
 def variables(equation) -> list:
-    """The distinct operands of an equation that are not written in it."""
+    """The distinct operands of an equation that are not literals."""
     return list(dict.fromkeys(x for x in equation.invars if not isinstance(x, Literal)))
 
 
 def written(literal: Literal) -> np.ndarray:
-    """The number that stands in a program in place of a variable, in the dtype that it has there."""
-    # To JAX an operand may be no array at all; such a one is never written down.
+    """The value of a literal, in the dtype that it has in the program."""
+    # JAX also has operands that are not arrays; those are never literals.
     assert isinstance(literal.aval, ShapedArray)
     return np.asarray(literal.val, literal.aval.dtype)
 
@@ -155,7 +155,7 @@ def evaluate(jaxpr: Jaxpr, equation, values) -> list:
 
 
 def applied(jaxpr: Jaxpr, equation, operands) -> list:
-    """The same, with its operands in their order."""
+    """The same as `evaluate`, given the operands in order."""
     return evaluate(
         jaxpr, equation, {x: value for x, value in zip(equation.invars, operands) if not isinstance(x, Literal)}
     )
@@ -166,8 +166,8 @@ def interpreted(
 ) -> list:
     """The results of a program with values of any kind in place of its arrays.
 
-    `rule(equation, operands)` returns what a primitive makes of such values; what a call stands for is interpreted in
-    its turn, unless `enters(equation)` says no. `of_constant(x, aval)` turns what is known beforehand into a value.
+    `rule(equation, operands)` returns the results of a primitive for such values; the program that a call stands for is
+    interpreted too, unless `enters(equation)` is false. `of_constant(x, aval)` turns a constant into a value.
     """
     jaxpr = closed.jaxpr
     values = {x: of_constant(constant, x.aval) for x, constant in zip(jaxpr.constvars, closed.consts)}
@@ -184,7 +184,7 @@ def interpreted(
 
 
 def stands_for(equation) -> ClosedJaxpr | None:
-    """The program that a primitive stands for; None of others: a reduction carries one for pairs of entries."""
+    """The program that a call stands for; None for others: a reduction, too, holds one, for pairs of entries."""
     inner = [p for p in equation.params.values() if isinstance(p, (ClosedJaxpr, Jaxpr))]
     if equation.primitive.name not in CALLS | CALLS_WITH_RULES or len(inner) != 1:
         return None
@@ -218,9 +218,9 @@ def needed(jaxpr: Jaxpr) -> list:
 
 
 def staged(program: ClosedJaxpr, first: Sequence[int], then: Sequence[int]):
-    """A program as two functions: of the inputs `first`, and of what that returns and the inputs `then`.
+    """Split a program into two functions: of the inputs `first`, and of the first one's results and the inputs `then`.
 
-    A division of floating numbers by what the first one knows becomes a multiplication by its inverse.
+    A division of floating-point numbers by a value of the first function becomes a multiplication by its inverse.
     """
     jaxpr = program.jaxpr
     late = reached(jaxpr, (jaxpr.invars[i] for i in then))

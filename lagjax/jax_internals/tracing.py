@@ -1,4 +1,4 @@
-"""Whether JAX is tracing, here and now, and for whom; and what it keeps of that."""
+"""Whether JAX is tracing here and now, and in which context; and the traces that it keeps."""
 
 from concurrent.futures import ThreadPoolExecutor
 from importlib import import_module
@@ -13,21 +13,21 @@ from lagjax.jax_internals.plain import is_plain
 with ThreadPoolExecutor(1) as _thread:
     _EAGER = _thread.submit(get_opaque_trace_state).result()
 
-# Whether somebody watches how motions go, lane by lane. A context of JAX's: under it what the user has jitted is traced
-# again.
+# Whether a caller watches the course of motions, lane by lane. A JAX context: inside it, functions that the user has
+# jitted are traced again.
 WATCHED = jax.make_user_context(default_value=False)
-# Whether failures are told by their codes alone, in a program that has nobody to raise an error to.
+# Whether failures are reported by their codes alone, in a program that cannot raise an error to anybody.
 SILENT = jax.make_user_context(default_value=False)
-# Whether who watches runs again, with the robust way, what was taken for regular and is not.
+# Whether the caller solves again with the robust method when equations assumed regular turn out singular.
 REGULAR_FIRST = jax.make_user_context(default_value=False)
 
 
 def takes_for_regular() -> bool:
-    """Whether equations are taken for regular where JAX traces here and now."""
+    """Whether equations are assumed regular in what JAX traces here and now."""
     return WATCHED.value and REGULAR_FIRST.value
 
 
-# Caches whose keys hold what a program was traced for: the traces, without a limit, and 4,096 of each of the others.
+# Caches whose keys hold what a program was traced for: the traces without a limit, the others up to 4,096 entries each.
 TRACES = (
     ("jax._src.interpreters.partial_eval", "trace_to_jaxpr"),
     ("jax._src.api_util", "donation_vector"),
@@ -42,19 +42,19 @@ def is_eager() -> bool:
 
 
 def forget_traces() -> None:
-    """Drop what JAX keeps of functions that it has traced; what it has compiled stays. Not with `LAGJAX_PLAIN=1`.
+    """Drop JAX's traces of functions; compiled programs stay. Does nothing with `LAGJAX_PLAIN=1`.
 
-    It keeps that by the function, of functions such as diffrax's `diffeqsolve` for each system that ever came by. A JAX
-    that calls them otherwise keeps more.
+    JAX keeps traces by function; a function such as diffrax's `diffeqsolve` has one for each system ever used. With a
+    JAX that has other names for these caches, more is kept.
     """
     if is_plain():
         return
     for module, name in TRACES:
         if find_spec(module) is not None:
-            getattr(getattr(import_module(module), name, None), "cache_clear", _none)()
-    # What leads to the traces: all of it, as a side effect of a method that every program has.
-    getattr(jax.jit(_none), "clear_cache", _none)()
+            getattr(getattr(import_module(module), name, None), "cache_clear", _do_nothing)()
+    # The entries that lead to the traces: a method that every program has drops all of them as a side effect.
+    getattr(jax.jit(_do_nothing), "clear_cache", _do_nothing)()
 
 
-def _none():
+def _do_nothing():
     pass

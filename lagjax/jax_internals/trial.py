@@ -1,7 +1,7 @@
-"""Whether programs that are compiled as one machine function survive with this XLA, and are right.
+"""Whether programs compiled as one machine function run with this XLA and give right results.
 
-XLA does not check what its marks promise: where it takes one amiss it ends the process. So the trial runs in a process
-of its own. What came of it is remembered, a file for each version, in the user's cache directory.
+XLA does not check what its marks promise: where it mishandles one it ends the process. So the trial runs in a process
+of its own. Its outcome is remembered in the user's cache directory, in a file for each version.
 """
 
 import contextlib
@@ -15,7 +15,7 @@ from pathlib import Path
 import jax
 import jaxlib.version
 
-# The number of the trial below; another one is not what was remembered.
+# The version of the trial; the outcome of another version does not count.
 TRIAL = 1
 SECONDS = 300.0
 PASSED, FAILED = "passed", "failed"
@@ -23,20 +23,20 @@ CODE = "import sys; sys.path[:] = {path!r}; from lagjax.jax_internals.trial_prog
 
 
 def survives() -> bool:
-    """Whether marked programs survive and are right: as remembered, or by a trial of a few seconds."""
-    place = _remembered_at()
+    """Whether marked programs run and give right results: as remembered, or by a trial of a few seconds."""
+    place = _outcome_file()
     with contextlib.suppress(OSError, UnicodeError):
-        if (told := place.read_text()) in (PASSED, FAILED):
-            return told == PASSED
-    outcome = _tried()
+        if (remembered := place.read_text()) in (PASSED, FAILED):
+            return remembered == PASSED
+    outcome = _run_trial()
     if outcome is not None:
         _remember(place, outcome)
     return outcome == PASSED
 
 
-def _tried():
-    """What came of a trial; None where none could be held, which the next process may find otherwise."""
-    # The marks are for CPUs, and another device may be taken by this process.
+def _run_trial():
+    """The outcome of a trial; None if it could not be run, which may differ in the next process."""
+    # The marks are for CPUs, and this process may occupy another device.
     env = os.environ | {"LAGJAX_PLAIN": "0", "JAX_PLATFORMS": "cpu"}
     command = [sys.executable, "-c", CODE.format(path=sys.path)]
     try:
@@ -46,7 +46,7 @@ def _tried():
     return PASSED if done.returncode == 0 else FAILED
 
 
-def _remembered_at():
+def _outcome_file():
     name = f"trial-{TRIAL}-jax-{jax.__version__}-jaxlib-{jaxlib.version.__version__}-{platform.machine()}"
     return _cache_directory() / name
 
@@ -62,7 +62,7 @@ def _cache_directory():
 
 
 def _remember(place, outcome):
-    """Write it beside and rename, so that nobody reads half of it; a disk that cannot be written to is no matter."""
+    """Write a temporary file and rename it, so that nobody reads half of it; ignore a disk that is read-only."""
     with contextlib.suppress(OSError):
         place.parent.mkdir(parents=True, exist_ok=True)
         number, path = tempfile.mkstemp(dir=place.parent)

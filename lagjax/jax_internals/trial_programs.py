@@ -1,4 +1,4 @@
-"""The programs of the trial (`trial.py`): those at which an XLA has ended the process once, or would first."""
+"""The programs of the trial (`trial.py`): those at which an XLA has ended the process, or is most likely to."""
 
 import jax
 import jax.numpy as jnp
@@ -9,7 +9,7 @@ from lagjax.jax_internals.one_function import kept_as_call, one_function
 
 
 def main():
-    """Run each of them as one function; what does not agree with NumPy raises."""
+    """Run each of them as one function; raise if a result does not agree with NumPy."""
     x, table = jnp.asarray(2.0), np.linspace(0.0, 1.0, 5000)
 
     def grown(x, y):
@@ -30,7 +30,7 @@ def main():
         a = 1.5 * a if b > 0 else 1.25 * a
         b = np.sin(a) + b
     _agree(grown, (a, b), x, jnp.asarray(0.5))
-    # Operands that are not used, that turn out not to be, and that are known: XLA must not drop these.
+    # Operands that are not used, that turn out not to be used, and that are known: XLA must not drop these.
     _agree(lambda x, y: 2 * x, 4.0, x, x)
     _agree(lambda x, y: jnp.where(jnp.asarray(1.0) > 0, 2 * x, y), 4.0, x, x)
     expected = 2.0 + sum(table[::1000])
@@ -43,5 +43,5 @@ def main():
 
 def _agree(function, expected, *args):
     found = jax.jit(lambda *args: one_function(function, *args))(*args)
-    # In single precision, where a user asks for no other.
+    # The tolerances allow for single precision, JAX's default.
     jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, rtol=1e-4, atol=1e-5), found, expected)

@@ -74,14 +74,14 @@ def test_no_trial_is_not_remembered(monkeypatch, cache):
 def test_a_disk_that_cannot_be_written_to(monkeypatch, cache):
     """Nothing is said, and the trial counts."""
     cache.write_text("a file in the place of the directory")
-    monkeypatch.setattr(trial, "_tried", lambda: trial.PASSED)
+    monkeypatch.setattr(trial, "_run_trial", lambda: trial.PASSED)
     assert plain.is_plain() is False
 
 
 def test_half_a_file_is_no_answer(monkeypatch, cache):
     """What stands there is believed only if it is one of the two answers."""
     told = iter([trial.PASSED, trial.FAILED])
-    monkeypatch.setattr(trial, "_tried", lambda: next(told))
+    monkeypatch.setattr(trial, "_run_trial", lambda: next(told))
     assert trial.survives()
     (file,) = cache.iterdir()
     file.write_text("pas")

@@ -64,7 +64,7 @@ def test_every_door_asks_for_a_system(door):
             act(given)
         assert re.search(f"Usual cause: .*\nFix: .*{fix}", str(caught.value)), str(caught.value)
     if not phases:
-        with pytest.raises(TypeError, match=r"of one system.*\n.*hybrid.systems\[0\]"):
+        with pytest.raises(TypeError, match=r"takes one system.*\n.*hybrid.systems\[0\]"):
             act(lj.Hybrid({"swinging": pendulum}))
 
 

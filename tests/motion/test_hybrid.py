@@ -145,7 +145,7 @@ def test_said_by_name():
         lj.integrate(bouncing, 1.0, 0.0, PARAMS, ts=np.array([1.0, 0.0]))
     with pytest.raises(ValueError, match="leads back to its phase and resets nothing"):
         lj.Hybrid({"flying": ball}, [lj.Switch("flying", to="flying", when=lambda t, q, v, p: v)])
-    with pytest.raises(TypeError, match=r"(?s)of one system.*hybrid.systems\[0\] for 'flying'"):
+    with pytest.raises(TypeError, match=r"(?s)takes one system.*hybrid.systems\[0\] for 'flying'"):
         lj.mass_matrix(bouncing, 0.0, 1.0, 0.0, PARAMS)
     with pytest.raises(TypeError, match="phase 'a' is function"):
         lj.Hybrid({"a": falling})
