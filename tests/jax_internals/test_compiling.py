@@ -1,4 +1,4 @@
-"""Options of XLA: they are left out where it does not know them, and do something where it does."""
+"""Options of XLA: they are left out if it does not know them, and have an effect if it does."""
 
 import jax
 import jax.numpy as jnp
@@ -9,7 +9,7 @@ from lagjax.jax_internals.compiling import WITHOUT_EMITTERS, compiler_options
 
 
 def test_unknown_options_are_left_out(monkeypatch):
-    """An option that no XLA knows is none; twin: that of a known one is used, but not where all is plain."""
+    """An option that XLA does not know is not used; twin: a known one is, but not in plain mode."""
     compiler_options.cache_clear()
     known = compiler_options()
     assert known in (None, WITHOUT_EMITTERS) and jax.jit(jnp.sin, compiler_options=known)(0.0) == 0.0
@@ -26,7 +26,7 @@ def test_unknown_options_are_left_out(monkeypatch):
 @pytest.mark.optimised
 @pytest.mark.skipif(compiler_options() is None, reason="this XLA has no such option")
 def test_another_way_to_write_kernels(tmp_path):
-    """The option reaches XLA: of the same program another machine code is written."""
+    """The option reaches XLA: it writes different machine code for the same program."""
 
     def code(options, folder):
         shown = {"xla_dump_to": str(folder), "xla_dump_hlo_as_text": True}

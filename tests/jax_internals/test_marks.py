@@ -1,4 +1,4 @@
-"""The marks do something: by the kernels that XLA makes of a small program with them, and without each of them."""
+"""The marks have an effect: count XLA's kernels of a small program with them, and without each of them."""
 
 import jax
 import jax.numpy as jnp
@@ -19,14 +19,14 @@ pytestmark = [
 
 
 def branches(x):
-    """Branches in a row, none of them in a loop; a loop XLA may take for itself."""
+    """Branches in a row, none of them in a loop, since XLA may choose a loop by itself."""
     for i in range(20):
         x = jnp.sin(x) + lax.cond(x > i, lambda x: x, lambda x: 2 * x, x)
     return x
 
 
 def kernels(function, folder):
-    """How many pieces of machine code XLA makes of a function of one number; and the compiled program."""
+    """How many pieces of machine code XLA makes of a function of one number, and the compiled program."""
     lowered = jax.jit(function).lower(jnp.asarray(2.0))
     compiled = lowered.compile(compiler_options={"xla_dump_to": str(folder)})
     return len(list(folder.glob("*.obj-file.*"))), compiled
@@ -49,7 +49,7 @@ def test_each_mark_is_needed(monkeypatch, tmp_path, mark):
 
 
 def test_a_call_stays_one():
-    """What is marked as a call is in the compiled program once; twin: not marked, it is copied to where it is used."""
+    """A marked call stays a call in the compiled program; twin: without the mark it is inlined."""
 
     def twice(mark):
         part = jax.jit(lambda x: (branches(x), x))

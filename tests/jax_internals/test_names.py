@@ -1,4 +1,4 @@
-"""The tables of primitives by name: each name is one of a primitive of the JAX that is installed."""
+"""The tables of primitives by name: each name is that of a primitive of the installed JAX."""
 
 import sys
 
@@ -15,7 +15,7 @@ from lagjax.jax_internals.marks import STAYS_A_CALL, marked
 from lagjax.mechanics import sparsity
 from lagjax.numerics import scalars
 
-# jax 0.12 makes none of these any more.
+# jax 0.12 no longer has these.
 UP_TO_0_11 = {"closed_call"}
 TABLES = {
     f"{module.__name__.removeprefix('lagjax.')}.{name}": set(table)
@@ -27,7 +27,7 @@ TABLES = {
 
 def primitives():
     """The names of all primitives that JAX, equinox and lagjax have defined, in the modules that are loaded."""
-    # That of the marks is a variable of no module.
+    # The primitive of the marks is not a variable of any module.
     program = jax.make_jaxpr(lambda x: marked(jnp.sin(x), STAYS_A_CALL))(1.0)
     found = {equation.primitive.name for equation in program.eqns}
     for name, module in list(sys.modules.items()):
@@ -37,19 +37,19 @@ def primitives():
 
 
 def unknown(table):
-    """The names of a table that are of no primitive."""
+    """The names of a table that belong to no primitive."""
     gone = UP_TO_0_11 if jax.__version_info__ >= (0, 12) else set()
     return sorted(table - primitives() - gone)
 
 
 @pytest.mark.parametrize("table", TABLES)
 def test_each_name_is_one(table):
-    """A name that JAX has changed would be treated as unknown, in silence and slower."""
+    """Every name is known: a primitive that JAX has renamed would silently be treated as unknown, and be slower."""
     assert unknown(TABLES[table]) == []
 
 
 def test_the_tables_are_found():
-    """Twin: there are tables in all of the modules, and a misspelt name is seen."""
+    """Twin: all of the modules have tables, and a misspelt name is noticed."""
     assert {name.rsplit(".", 1)[0].split(".")[-1] for name in TABLES} == {
         "names", "one_function", "scalars", "sparsity",
     }  # fmt: skip
@@ -61,7 +61,7 @@ OF_WHOLE_NUMBERS = {"and", "or", "not"}
 
 
 def the_same_in_numpy(name, by_jax):
-    """Whether a primitive makes of some numbers what the table says, and is the one that is meant."""
+    """Whether a primitive and the table's NumPy function agree on some numbers; check that it is the one meant."""
     numbers = np.array([-3, 0, 2, 5]), np.array([4, -1, 2, -2])
     operands = numbers if name in OF_WHOLE_NUMBERS else tuple(0.7 * x for x in numbers)
     if name == "select_n":
@@ -74,12 +74,12 @@ def the_same_in_numpy(name, by_jax):
 
 @pytest.mark.parametrize("name", names.IN_NUMPY)
 def test_numpy_does_the_same(name):
-    """On numbers of both signs, equal ones among them."""
+    """NumPy's functions agree with the primitives on numbers of both signs, equal ones among them."""
     assert the_same_in_numpy(name, OTHERWISE_CALLED[name] if name in OTHERWISE_CALLED else getattr(lax, name))
 
 
 def test_another_function_would_be_seen(monkeypatch):
-    """Twin: "less" in place of "less or equal"."""
+    """Twin: "less" in place of "less or equal" is noticed."""
     monkeypatch.setitem(names.IN_NUMPY, "le", np.less)
     assert not the_same_in_numpy("le", lax.le)
 
@@ -120,13 +120,13 @@ def is_linear(function):
 
 @pytest.mark.parametrize("name", LINEAR)
 def test_linear_primitives(name):
-    """In their first operand, as the dependence of a result on a coordinate takes them."""
+    """They are linear in their first operand, as the analysis of dependence assumes."""
     found = [equation.primitive.name for equation in programs.equations(jax.make_jaxpr(LINEAR[name])(FACTOR).jaxpr)]
     assert name in found and is_linear(LINEAR[name])
 
 
 def test_all_linear_primitives_are_tried():
-    """Twin: what is none is seen; and which of the table are not tried is known."""
+    """Twin: a function that is not linear is noticed; and only the named primitives of the tables are not tried."""
     assert not is_linear(lambda x: lax.mul(x, x)) and not is_linear(jnp.sin)
     untried = names.ADDITIVE | names.LINEAR_IN_FIRST | names.BILINEAR - set(LINEAR)
     assert untried - set(LINEAR) == {"stack", "stop_gradient"}

@@ -1,4 +1,4 @@
-"""A program as one machine function: same results, same derivatives, and compiled so only where XLA can."""
+"""A program as one machine function: same results and derivatives, and compiled in this way only where XLA can."""
 
 import equinox as eqx
 import jax
@@ -19,7 +19,7 @@ pytestmark = [
 
 
 def grown(x, y):
-    """A loop of numbers whose length depends on them."""
+    """A loop over numbers whose length depends on them."""
     return lax.while_loop(lambda s: s[0] < 100.0, lambda s: (1.5 * s[0] + s[1], jnp.sin(s[0]) + s[1]), (x, y))
 
 
@@ -34,7 +34,7 @@ TWO = (jnp.asarray(2.0), jnp.asarray(0.3))
 
 
 def test_same_results_and_derivatives():
-    """Value and forward derivative are those of the function; reverse mode says that it has none."""
+    """Value and forward derivative are those of the function; reverse mode raises."""
     np.testing.assert_array_equal(whole(*TWO), grown(*TWO))
     forward = jax.jit(jax.jacfwd(whole))(*TWO)
     np.testing.assert_allclose(forward, jax.jacfwd(grown)(*TWO), rtol=1e-14)
@@ -57,7 +57,7 @@ def test_lanes_in_blocks(monkeypatch, block):
 
 @pytest.mark.skipif(jax.default_backend() != "cpu", reason="one function is for CPUs")
 def test_compiled_as_one_call():
-    """The loop is inside the call that we marked; plainly compiled, or with a library call in it, it is not."""
+    """The loop is inside the marked call; a program without marks, or with a library call, has none."""
     marked = entry(whole, *TWO)
     assert 'inlineable="false"' in marked and "while(" not in marked
     assert 'inlineable="false"' not in entry(grown, *TWO)
@@ -66,14 +66,14 @@ def test_compiled_as_one_call():
 
 
 def test_operands_that_are_not_needed():
-    """One that is not used, and one that XLA finds out not to be: either would end the process if it were dropped."""
+    """An unused operand, and one that XLA finds to be unused: either would end the process if it were dropped."""
     never = jax.jit(lambda x, y: one_function(lambda x, y: 2 * x, x, y))
     found_out = jax.jit(lambda x, y: one_function(lambda x, y: jnp.where(jnp.asarray(1.0) > 0, 2 * x, y), x, y))
     assert never(*TWO) == found_out(*TWO) == 4.0
 
 
 def test_checks_are_left_out_where_they_are_known_to_pass():
-    """`error_if` calls the host; without it the program fits, and gives the same."""
+    """`error_if` calls the host; without it the program fits, and gives the same result."""
 
     def checked(x):
         return 3 * eqx.error_if(x, x < 0, "negative")
@@ -101,12 +101,12 @@ def test_checks_are_left_out_where_they_are_known_to_pass():
     ],
 )
 def test_what_fits(function, expected):
-    """Library calls, large reductions and general scatters do not fit, also inside a loop."""
+    """Library calls, large reductions and general scatters do not fit, nor inside a loop."""
     assert fits(without_library(jax.make_jaxpr(function)(jnp.arange(5.0))).jaxpr) is expected
 
 
 def test_products_of_matrices():
-    """Sums of multiplications in place of the library's, whatever is contracted; several from one operand."""
+    """Sums of multiplications replace library products, whatever is contracted; several products share an operand."""
     rng = np.random.default_rng(0)
     a, b, c = (jnp.asarray(rng.normal(size=shape)) for shape in ((3, 4, 5), (5, 3, 4, 2), (3, 5, 6)))
 
@@ -128,7 +128,7 @@ def test_products_of_matrices():
 
 
 def test_a_linear_solve_of_functions():
-    """Its programs stand in a named tuple, which the rewriting keeps."""
+    """Its programs are in a named tuple, which the rewriting keeps."""
 
     def solve(x):
         return lax.custom_linear_solve(lambda y: 3 * y, x, lambda _, b: b / 3, symmetric=True)
@@ -137,7 +137,7 @@ def test_a_linear_solve_of_functions():
 
 
 def test_what_is_no_check_stays():
-    """A call of the host in one branch that does something, and one of two that raise; a check alone is left out."""
+    """A host call that computes something stays; only one that does nothing but raise is left out."""
     host = lambda x: jax.pure_callback(lambda x: 2 * x, jax.ShapeDtypeStruct((), jnp.float64), x)
     works = jax.make_jaxpr(lambda x: lax.cond(x > 0, host, lambda x: x, x))(TWO[0])
     assert calls_host(without_checks(works).jaxpr) and jaxpr_as_fun(without_checks(works))(TWO[0])[0] == 4.0
@@ -147,7 +147,7 @@ def test_what_is_no_check_stays():
 
 @pytest.mark.parametrize("size", [1, 1000, 1251, 5000])
 def test_large_arrays_that_are_known(size):
-    """Closed over by the whole program, captured by ours, and made there: above 10 kB XLA ended the process."""
+    """Arrays closed over, captured or made inside: above 10 kB XLA ended the process."""
     table = np.linspace(0.0, 1.0, size)
     known, given = jnp.asarray(table), jnp.asarray(2.0)
 
@@ -164,12 +164,12 @@ def test_large_arrays_that_are_known(size):
 
 
 def layer(x, w):
-    """Two products with a matrix, twice."""
+    """Two products with a matrix, done twice in a loop."""
     return lax.while_loop(lambda s: s[0] < 2, lambda s: (s[0] + 1, jnp.tanh(w.T @ (w @ s[1]))), (0, x))[1]
 
 
 def check_products(sizes):
-    """Products of these sizes, each in one function, are those of NumPy; of twenty sizes in one program."""
+    """Products of these sizes, each in one function, are those of NumPy; twenty sizes share a program."""
     rng = np.random.default_rng(0)
     square = lambda a: a @ a @ a.T
     for some in (sizes[i : i + 20] for i in range(0, len(sizes), 20)):
@@ -188,18 +188,18 @@ def check_products(sizes):
 
 @pytest.mark.parametrize("size", [16, 63, 64, 65])
 def test_products_of_many_multiplications(size):
-    """Around 4,096 of them, where XLA takes a sum for a product of the library's and knows it no more."""
+    """Around 4,096 multiplications, where XLA may take a sum for a library product, which one function cannot contain."""
     check_products([size])
 
 
 @pytest.mark.exhaustive
 def test_products_of_every_size():
-    """Of 2 to 300, as matrix times vector; and of their square roots, as matrix times matrix."""
+    """Sizes 2 to 300 as matrix times vector, and their square roots as matrix times matrix."""
     check_products(range(2, 301))
 
 
 def test_a_checkpoint_is_looked_into():
-    """Its program is held in another way; a product in it is one of ours as well."""
+    """A checkpoint holds its program in another way; products in it are replaced too."""
     w = jnp.asarray(np.random.default_rng(0).normal(size=(70, 70)))
     inside = lambda x: jax.checkpoint(lambda x: w[:9, :9] @ x)(x)
     program = without_library(jax.make_jaxpr(inside)(w[0, :9]))
@@ -209,7 +209,7 @@ def test_a_checkpoint_is_looked_into():
 
 
 def test_products_of_mixed_kinds():
-    """Integers, truth values and lower precision times float64, as `@` hands them over."""
+    """Integers, booleans and lower precision times float64, as `@` passes them."""
     x = jnp.arange(1.0, 4.0)
     for matrix in (2 * jnp.eye(3, dtype=int), jnp.eye(3, dtype=bool), jnp.eye(3, dtype=jnp.float32) / 3):
         one = jax.jit(lambda x: one_function(lambda x: matrix @ x, x))(x)

@@ -1,4 +1,4 @@
-"""The way out: when it is taken, what is tried before, and what is remembered of that."""
+"""The fallback to plain JAX: when it is taken, what is tried before, and what is remembered of that."""
 
 import subprocess
 import sys
@@ -12,7 +12,7 @@ from lagjax.jax_internals import plain, trial, trial_programs
 
 @pytest.fixture
 def cache(monkeypatch, tmp_path):
-    """A cache directory of this test, an undecided process, and a jaxlib that is not known."""
+    """A cache directory of this test, an undecided process, and an unknown jaxlib."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setattr(plain, "_decided", [])
     monkeypatch.setattr(plain, "_WANTED", "")
@@ -21,27 +21,27 @@ def cache(monkeypatch, tmp_path):
 
 
 def test_this_version_is_known():
-    """The tests run with a version that is not tried: the list of known ones says so."""
+    """The tests run with a version that needs no trial: it is in the list of known ones."""
     assert jaxlib.version.__version__ in plain.KNOWN
 
 
 @pytest.mark.parametrize(("wanted", "expected"), [("1", True), ("0", False)])
 def test_the_variable_decides(monkeypatch, cache, wanted, expected):
-    """With the variable set nothing is tried."""
+    """With the variable set there is no trial."""
     monkeypatch.setattr(plain, "_WANTED", wanted)
     monkeypatch.setattr(subprocess, "run", None)
     assert plain.is_plain() is expected
 
 
 def test_a_known_version_costs_nothing(monkeypatch, cache):
-    """No process and no look at the disk."""
+    """A known version starts no process and reads no file."""
     monkeypatch.setattr(plain, "KNOWN", {jaxlib.version.__version__})
     monkeypatch.setattr(plain, "survives", None)
     assert plain.is_plain() is False and not cache.exists()
 
 
 def test_an_unknown_version_is_tried_once(monkeypatch, cache):
-    """The trial passes with this XLA, in a process of its own; afterwards what is remembered is enough."""
+    """The trial passes with this XLA, in a process of its own; afterwards the remembered outcome is enough."""
     assert plain.is_plain() is False
     assert [path.read_text() for path in cache.iterdir()] == ["passed"]
     monkeypatch.setattr(plain, "_decided", [])
@@ -50,7 +50,7 @@ def test_an_unknown_version_is_tried_once(monkeypatch, cache):
 
 
 def test_a_trial_that_ends_the_process(monkeypatch, cache):
-    """The way out is taken with one warning, now and in the next process, which does not try again."""
+    """The fallback is taken with one warning, now and in the next process, which does not try again."""
     monkeypatch.setattr(trial, "CODE", "import os, sys; {path!r}; os.abort()")
     with pytest.warns(
         UserWarning, match=f"does not know jaxlib {jaxlib.version.__version__}(?s:.*)several times slower"
@@ -64,7 +64,7 @@ def test_a_trial_that_ends_the_process(monkeypatch, cache):
 
 
 def test_no_trial_is_not_remembered(monkeypatch, cache):
-    """Where no process can be started, the way out is taken this time only."""
+    """If no process can be started, the fallback is taken this time only."""
     monkeypatch.setattr(sys, "executable", "/nowhere/python")
     with pytest.warns(UserWarning, match="does not know jaxlib"):
         assert plain.is_plain() is True
@@ -72,14 +72,14 @@ def test_no_trial_is_not_remembered(monkeypatch, cache):
 
 
 def test_a_disk_that_cannot_be_written_to(monkeypatch, cache):
-    """Nothing is said, and the trial counts."""
+    """There is no error, and the trial counts."""
     cache.write_text("a file in the place of the directory")
     monkeypatch.setattr(trial, "_run_trial", lambda: trial.PASSED)
     assert plain.is_plain() is False
 
 
 def test_half_a_file_is_no_answer(monkeypatch, cache):
-    """What stands there is believed only if it is one of the two answers."""
+    """The content of the file counts only if it is one of the two outcomes."""
     told = iter([trial.PASSED, trial.FAILED])
     monkeypatch.setattr(trial, "_run_trial", lambda: next(told))
     assert trial.survives()
@@ -89,7 +89,7 @@ def test_half_a_file_is_no_answer(monkeypatch, cache):
 
 
 def test_import_decides_nothing():
-    """Importing lagjax looks at no disk and starts no process: the decision is made by the first program."""
+    """Importing lagjax reads no outcome and starts no process: the first program decides."""
     code = "import lagjax; from lagjax.jax_internals import plain; assert not plain._decided"
     subprocess.run([sys.executable, "-c", f"import sys; sys.path[:] = {sys.path!r}; {code}"], check=True)
 

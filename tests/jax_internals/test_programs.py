@@ -11,7 +11,7 @@ from lagjax.jax_internals.programs import applied, interpreted, length, without_
 
 
 def below(x, count=100):
-    """The floating number so many places below x, times a number that is used before the end, too."""
+    """The floating-point number that is `count` places below x."""
     for _ in range(count):
         x = eqxi.prevbefore(x)
     return x
@@ -25,7 +25,7 @@ def inside(x):
 
 @pytest.mark.parametrize("function", [below, inside])
 def test_a_chain_becomes_a_loop(function):
-    """The same number and derivative, from a program of a tenth the length."""
+    """The same number and derivative, from a program less than a fifth as long."""
     program = jax.make_jaxpr(function)(1.0)
     looped = without_chains(program)
     assert length(looped.jaxpr) < 0.2 * length(program.jaxpr)
@@ -36,7 +36,7 @@ def test_a_chain_becomes_a_loop(function):
 
 
 def test_what_is_no_chain_stays():
-    """Short ones, those of other calls, and those whose members are used."""
+    """Short chains, chains of different calls, and chains whose members are used elsewhere stay."""
 
     def used(x):
         every = [x]
@@ -65,13 +65,13 @@ TABLE = np.arange(3.0)
 
 
 def calls(x):
-    """Calls of both kinds, one inside of the other, a constant, and a loop, which is none."""
+    """Calls of both kinds, one inside the other, a constant, and a loop, which is not a call."""
     inner = jax.jit(lambda x: sine(x) + TABLE)
     return inner(x) * 2.0, jax.lax.fori_loop(0, 3, lambda _, x: 2.0 * x, x)
 
 
 def entered(enters=None):
-    """The results of a program by `interpreted`, beside which primitives it met; and what JAX finds."""
+    """The results of a program by `interpreted`, the primitives that it met, and JAX's results."""
     program, x, met = jax.make_jaxpr(calls)(jnp.ones(3)), jnp.array([0.1, 0.2, 0.3]), []
 
     def rule(equation, operands):
@@ -82,7 +82,7 @@ def entered(enters=None):
 
 
 def test_a_program_is_interpreted():
-    """With arrays for values it is the program itself; calls are entered, a loop is one primitive."""
+    """With arrays as values it gives the program's results; calls are entered, a loop is one primitive."""
     found, met, expected = entered()
     np.testing.assert_allclose(found, expected, rtol=1e-15)
     assert {"sin", "add", "mul"} <= set(met) and not {"jit", "custom_jvp_call"} & set(met)
@@ -90,6 +90,6 @@ def test_a_program_is_interpreted():
 
 
 def test_calls_that_are_not_entered():
-    """Twin: those stay primitives of which the rule says what they make."""
+    """Twin: calls that are not entered stay primitives, which the rule evaluates."""
     _, met, _ = entered(lambda equation: equation.primitive.name == "jit")
     assert "custom_jvp_call" in met and "sin" not in met

@@ -29,7 +29,7 @@ class Polar(NamedTuple):
     ],
 )
 def test_names_follow_the_vector(tree, names):
-    """There is one name an entry of the vector, written as the user writes it."""
+    """There is one name per entry of the vector, written as the user writes it."""
     assert coordinates.names(tree) == names
     assert coordinates.flatten(tree)[0].shape == (len(names),)
 
@@ -48,7 +48,7 @@ def test_python_numbers_that_are_not_floats_stay_static():
 
 
 def test_a_float_is_one_in_whatever_it_comes():
-    """Of one type for JAX, so that none is compiled again. Twin: an array of another dtype stays what it is."""
+    """Each form of a float has the same type for JAX, so none compiles again. Twin: another dtype stays as it is."""
     of = lambda g: jax.typeof(coordinates.state(0.0, 1.0, 0.0, {"g": g}).params["g"])
     assert of(9.81) == of(jnp.array(9.81)) == of(np.float64(9.81)) == of(jnp.asarray(9.81, jnp.float64))
     assert not of(jnp.array(9.81)).weak_type and jnp.array(9.81).weak_type
@@ -56,7 +56,7 @@ def test_a_float_is_one_in_whatever_it_comes():
 
 
 def test_what_is_no_number():
-    """Text, and a quantity with its unit: by coordinate, with what may have been meant."""
+    """Text and a quantity with its unit raise, with the coordinate and the usual cause."""
 
     class Quantity:
         magnitude, unit = 2.0, "m"
@@ -70,7 +70,7 @@ def test_what_is_no_number():
 
 
 def test_a_time_is_one_number():
-    """Of whatever kind; twin: a vector of times, a dict, text and a condition are refused."""
+    """One number of any kind is a time; twin: a vector of times, a dict, text and a condition raise."""
     for t in (0, 0.0, np.float32(0.0), np.zeros((), int), jnp.zeros(())):
         assert coordinates.state(t, 1.0, 0.0, None).t.dtype == np.float64
     for t in (np.zeros(1), {"x": 0.0}, "0", True, None):

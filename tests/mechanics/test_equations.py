@@ -1,4 +1,4 @@
-"""One object is the equations: its three ways say the same, and one place chooses between them."""
+"""One object holds the equations: its three ways give the same results, and one place chooses between them."""
 
 import jax
 import jax.numpy as jnp
@@ -37,7 +37,7 @@ def flat(tree):
 
 @not_plain
 def test_the_three_ways_say_the_same(monkeypatch):
-    """Accelerations, multipliers, verdicts; slopes and displacements; twin: another state's are others."""
+    """They agree on accelerations, multipliers, verdicts, slopes and displacements; twin: another state differs."""
     dense, banded, written, s = in_three_ways(monkeypatch)
     r = jnp.array([1e-3, -2e-3])
 
@@ -64,7 +64,7 @@ def test_the_three_ways_say_the_same(monkeypatch):
 
 @not_plain
 def test_the_robust_way_is_there_unless_they_are_taken_for_regular():
-    """Where what is written out gives NaN the fallback finds out why; without it NaN stays, and a verdict says so."""
+    """Where the written-out equations give NaN the fallback solves them; without it NaN stays, as the verdict says."""
     same = lambda t, q, params: jnp.stack([q["x"] ** 2 + q["y"] ** 2 - params["l"] ** 2] * 2)
     twice = lj.System(rod_pendulum.lagrangian, {"rod": lj.Holonomic(same)})
     s = coordinates.state(0.0, *HORIZONTAL, PARAMS)
@@ -74,13 +74,13 @@ def test_the_robust_way_is_there_unless_they_are_taken_for_regular():
     ((a, multipliers), finite), ((unknown, _), nowhere) = of(robust), of(regular)
     assert np.all(np.isfinite(flat(a))) and np.all(np.isnan(flat(unknown)))
     assert bool(finite) and not bool(nowhere)
-    # Dependent equations share their force.
+    # Dependent equations share the force equally.
     np.testing.assert_allclose(*multipliers["rod"], rtol=1e-12)
 
 
 @not_plain
 def test_equations_are_written_out_once_for_all_traces():
-    """Again in another program, in lanes, in a derivative; anew for another shape or another function."""
+    """Another program, lanes and a derivative reuse them; another function has its own."""
     s = coordinates.state(0.0, *HORIZONTAL, PARAMS)
     written = []
 
@@ -100,7 +100,7 @@ def test_equations_are_written_out_once_for_all_traces():
 
 @pytest.mark.parametrize("change", ["closed over", "given"])
 def test_what_is_written_does_not_outlive_a_value(change):
-    """A value that L closes over, traced and changed between traces, is that of the trace that asks."""
+    """A traced value that L closes over, and that changes between traces, is the one of the present trace."""
     held = {"g": 9.81}
 
     def lagrangian(t, q, v, params):
@@ -119,7 +119,7 @@ def test_what_is_written_does_not_outlive_a_value(change):
 
 @not_plain
 def test_explain_prints_the_choice(monkeypatch):
-    """What is printed is the form that the equations have, not another judgement of it."""
+    """`explain` prints the form that the equations really have."""
     assert "elimination without the zeros" in repr(lj.explain(rod_pendulum, 0.0, *HORIZONTAL, PARAMS))
     monkeypatch.setattr(equations, "is_small", lambda *problem: False)
     assert "3 equations by elimination" in repr(lj.explain(rod_pendulum, 0.0, *HORIZONTAL, PARAMS))

@@ -1,4 +1,4 @@
-"""Programs of many systems in one process: no more than so many are kept, whatever they compute."""
+"""Programs of many systems in one process: only a limited number is kept, whatever they compute."""
 
 import gc
 import weakref
@@ -20,36 +20,36 @@ MANY = 24
 
 @eqx.filter_jit
 def inside(function, x):
-    """A part of a program, of which JAX keeps the traces for itself."""
+    """A part of a program whose traces JAX keeps."""
     return function(x)
 
 
 @compiled
 def called(function, x):
-    """A function of the user's."""
+    """A compiled program that holds a function of the user's."""
     return inside(function, x)
 
 
 def waves(number):
-    """A function like no other, of more than one kernel."""
+    """A function unlike any other, with more than one kernel."""
     return lambda x: jnp.cumsum(jnp.sin(x + number)) @ jnp.sort(jnp.cos(number * x))
 
 
 def maps():
-    """The memory maps of this process."""
+    """The number of memory maps of this process."""
     gc.collect()
     return memory_maps.MAPS.read_bytes().count(b"\n") if memory_maps.MAPS.exists() else 0
 
 
 def call(number, x):
-    """Call a function that is then gone; a weak reference to it."""
+    """Call a function that nothing here keeps; return a weak reference to it."""
     function = waves(number)
     called(function, x)
     return weakref.ref(function)
 
 
 def after_many(x):
-    """How many functions are still there after many calls of one each, and by how many maps the later ones grew."""
+    """How many of many functions, each called once, still exist, and how many maps the later half added."""
     functions = [call(number, x) for number in range(MANY // 2)]
     before = maps()
     functions += [call(number, x) for number in range(MANY // 2, MANY)]
@@ -59,7 +59,7 @@ def after_many(x):
 
 @not_plain
 def test_programs_are_bounded(monkeypatch):
-    """Functions are let go of, and maps given back; the twin, with no limit, keeps all."""
+    """Functions are released and maps freed; the twin, without a limit, keeps all."""
     monkeypatch.setattr(kept, "_programs", kept.OrderedDict())
     there, grown_at_all = after_many(np.ones(8))
     assert there == MANY
@@ -71,14 +71,14 @@ def test_programs_are_bounded(monkeypatch):
 
 
 def test_traces_would_keep_functions(monkeypatch):
-    """Twin: dropped alone, a program leaves them with JAX."""
+    """Twin: if only the program is dropped, JAX's traces still keep its functions."""
     monkeypatch.setattr(kept, "AT_MOST", 5)
     monkeypatch.setattr(kept, "forget_traces", lambda: None)
     assert after_many(np.ones(7))[0] == MANY
 
 
 def test_the_last_ones_stay(monkeypatch):
-    """What was used last is compiled once, also after others were dropped; the twin is what was used longest ago."""
+    """The programs used last are not compiled again after others were dropped; twin: one unused for long is."""
     monkeypatch.setattr(kept, "_programs", kept.OrderedDict())
     monkeypatch.setattr(kept, "AT_MOST", 5)
     x, functions = np.ones(10), [waves(number) for number in range(9)]
@@ -95,7 +95,7 @@ def test_the_last_ones_stay(monkeypatch):
 
 
 def test_scarce_maps_drop_more(monkeypatch):
-    """Half of them, where there are many; the last ones stay even then."""
+    """Half of many programs are dropped; the last few stay even then."""
     monkeypatch.setattr(kept, "_programs", kept.OrderedDict((number, object()) for number in range(100)))
     monkeypatch.setattr(kept, "share_used", lambda: 0.9)
     counts = []
@@ -109,7 +109,7 @@ def test_scarce_maps_drop_more(monkeypatch):
 
 @pytest.mark.parametrize("of", ["function", "argument"])
 def test_a_key_is_all_that_a_program_is_compiled_for(of):
-    """The same function of other static arguments, and another function of the same, are others."""
+    """Other static arguments, or another function, give another program."""
     other = compiled(lambda function, x: -function(x)) if of == "function" else called
     one, two = waves(1), waves(1 if of == "function" else 2)
     x = np.ones(4)
@@ -118,5 +118,5 @@ def test_a_key_is_all_that_a_program_is_compiled_for(of):
 
 @pytest.mark.parametrize(("module", "name"), TRACES)
 def test_what_is_forgotten_is_there(module, name):
-    """A cache that JAX has given another name would be left out in silence."""
+    """A cache that JAX has renamed would silently not be cleared."""
     assert callable(getattr(import_module(module), name).cache_clear)

@@ -1,4 +1,4 @@
-"""Compiled programs take memory maps, of which a process has so many: told before they are used up."""
+"""Compiled programs take memory maps, of which a process has a limited number: a warning comes before the limit."""
 
 import subprocess
 import sys
@@ -12,13 +12,13 @@ from tests.systems import PARAMS, TS
 
 
 def integrated(system):
-    """For one time span."""
+    """A motion over one time span."""
     return lj.integrate(system, 1.0, 0.0, PARAMS, ts=TS)
 
 
 @pytest.fixture
 def process(tmp_path, monkeypatch):
-    """A process of 751 maps, and a system that allows 1,000."""
+    """A process with 751 maps, on an operating system that allows 1,000."""
     maps, limit = tmp_path / "maps", tmp_path / "max_map_count"
     maps.write_text("7f00-7f01 r-xp\n" * 751)
     limit.write_text("1000\n")
@@ -28,7 +28,7 @@ def process(tmp_path, monkeypatch):
 
 
 def test_told_where_something_is_compiled(process):
-    """With the remedy, by the call that compiles; not by the next one, which does not count."""
+    """The call that compiles warns and names the remedy; the next call does not count maps."""
     system = lj.System(lambda t, q, v, params: 0.5 * v**2)
     with pytest.warns(UserWarning, match=r"751 of the 1,000 memory maps(.|\n)*jax.clear_caches\(\)"):
         integrated(system)

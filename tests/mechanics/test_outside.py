@@ -28,12 +28,12 @@ def strength():
 
 
 def weight():
-    """Another one, which a test puts something else in place of."""
+    """Another one, which a test replaces."""
     return G
 
 
 class Potential:
-    """An object that can be called."""
+    """A callable object."""
 
     def __init__(self):
         self.g = 1.0
@@ -48,7 +48,7 @@ def closed_over(value):
 
 
 def set_global(name, value):
-    """As in a notebook."""
+    """Set a global of this module, as a notebook does."""
     globals()[name] = value
 
 
@@ -79,7 +79,7 @@ CHANGES = {
 
 @pytest.mark.parametrize("where", CHANGES)
 def test_what_is_read_is_seen(where):
-    """The same twice while nothing changes, another after the change."""
+    """Two readings agree while nothing changes, and differ after the change."""
     function, change = CHANGES[where]
     before = read_by(function)
     assert before and read_by(function) == before and hash(before) == hash(read_by(function))
@@ -91,7 +91,7 @@ fall = lj.System(lambda t, q, v, p: 0.5 * v**2 - G * q)
 
 
 def test_the_next_call_has_the_new_value():
-    """Gravity changed in the notebook's globals, at one state."""
+    """After gravity changed in the globals, evaluations at one state use the new value."""
     for g in (9.81, 1.62):
         set_global("G", g)
         np.testing.assert_allclose(lj.jacobi_integral(fall, 0.0, 1.0, 0.0, None), g, rtol=1e-15)
@@ -101,7 +101,7 @@ def test_the_next_call_has_the_new_value():
 @pytest.mark.slow
 @pytest.mark.filterwarnings("error")
 def test_the_next_motion_has_the_new_value():
-    """The same in motion, by the closed form, and in a sweep."""
+    """The same for a motion, by its closed form, and for a sweep."""
     for g in (9.81, 1.62):
         set_global("G", g)
         np.testing.assert_allclose(lj.accelerations(fall, 0.0, 0.0, 0.0, None)[0], -g, rtol=1e-15)
@@ -113,13 +113,13 @@ def test_the_next_motion_has_the_new_value():
 
 
 def test_what_reads_nothing_is_left_alone():
-    """No new system, and no trace for the library's own functions, modules and numbers of JAX."""
+    """A system that reads only JAX's functions and constants stays the same object."""
     plain = lj.System(lambda t, q, v, p: 0.5 * v**2 + jnp.cos(q) * jnp.pi, force=lambda t, q, v, p: -v)
     assert up_to_date(plain) is plain
 
 
 def test_a_look_calls_nothing():
-    """It comes with every call: reading is all it does, and what has not changed stays an equal system."""
+    """Reading, which every call does, does not call the functions, and an unchanged system stays equal."""
 
     def lagrangian(t, q, v, p):
         raise AssertionError("called")
@@ -135,7 +135,7 @@ def test_a_look_calls_nothing():
 
 
 def test_a_global_that_has_gone_is_a_change():
-    """Of two functions alike, the first without its module's names, as after `del jnp`: the second one counts."""
+    """Of two equal functions, the first has lost a global, as after `del jnp`: the second one is used."""
 
     def made():
         names = {"jnp": jnp}
@@ -147,6 +147,6 @@ def test_a_global_that_has_gone_is_a_change():
     del names["jnp"]
     _, second = made()
     np.testing.assert_allclose(lj.jacobi_integral(second, 0.0, 0.5, 0.0, None), -41.0 * np.cos(0.5))
-    # Twin: without it the first would stand for the second.
+    # Twin: the first one itself fails.
     with pytest.raises(NameError):
         lj.jacobi_integral(first, 0.0, 0.5, 0.0, None)

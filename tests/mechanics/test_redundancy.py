@@ -23,7 +23,7 @@ def rod_square(q):
 
 
 def twice(factor):
-    """The rod given once more, in another scale."""
+    """The rod given again, in another scale."""
     again = lj.Holonomic(lambda t, q, params: factor * rod(t, q, params))
     return lj.System(cartesian_lagrangian, {"rod": lj.Holonomic(rod), "again": again})
 
@@ -119,9 +119,9 @@ def test_report_of_a_rounded_state():
 
 @pytest.mark.exhaustive
 def test_report_of_a_state_with_other_velocities():
-    """Off its constraints by the velocity: that is said first, and the nearest state on them judged: no contradiction.
+    """Velocities off the constraints are reported first, and the nearest state on them is judged: no contradiction.
 
-    `accelerations` takes the state as it is and says the same. Where nothing is on them, that is the problem.
+    `accelerations` takes the state as it is, and its error says so too. If no state is on them, that is the problem.
     """
     length = lj.Holonomic(lambda t, q, params: jnp.sqrt(rod_square(q)) - params["l"])
     pair = lj.System(cartesian_lagrangian, {"rod": lj.Holonomic(rod), "length": length})
@@ -138,7 +138,7 @@ def test_report_of_a_state_with_other_velocities():
     torn = lj.System(cartesian_lagrangian, {"rod": lj.Holonomic(rod), "longer": longer})
     report = lj.explain(torn, *STATE)
     assert "no state near it is on them" in repr(report) and "no consistent state" in str(report.problem)
-    # On the velocities of both, with a path that only one of them follows: these do contradict each other.
+    # The velocities satisfy both, but only one of them can be followed: these do contradict each other.
     moved = lj.Holonomic(lambda t, q, params: rod_square(q) - (params["l"] + t**2) ** 2)
     against = lj.System(cartesian_lagrangian, {"rod": lj.Holonomic(rod), "moved": moved})
     assert "contradict each other" in str(lj.explain(against, *STATE).problem)

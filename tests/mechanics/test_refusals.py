@@ -1,4 +1,4 @@
-"""What is no system is refused at every door, in the same words, before anything is traced."""
+"""Every public function raises the same error for anything but a system, before anything is traced."""
 
 import inspect
 import re
@@ -24,7 +24,7 @@ OF_STATES = (
     *("momentum", "mass_matrix", "accelerations", "jacobi_integral", "constraint_force", "constraint_residual"),
     *("consistent_state", "linearise", "normal_modes"),
 )
-# With what takes a motion in phases, too.
+# Each with whether it also takes a motion in phases.
 DOORS = {name: (of_states(name), False) for name in OF_STATES} | {
     "explain": (of_states("explain"), True),
     "integrate": (lambda system: lj.integrate(system, 1.0, 0.0, PARAMS, ts=TS), True),
@@ -57,7 +57,7 @@ NO_SYSTEMS = {
 
 @pytest.mark.parametrize("door", DOORS)
 def test_every_door_asks_for_a_system(door):
-    """The Lagrangian itself, a number, the class, ..., at each function of a system."""
+    """Each function of a system raises for the Lagrangian itself, a number, the class, and so on."""
     act, phases = DOORS[door]
     for given, what, fix in NO_SYSTEMS.values():
         with pytest.raises(TypeError, match=f"first argument must be a lj.System, not {what}") as caught:
@@ -69,7 +69,7 @@ def test_every_door_asks_for_a_system(door):
 
 
 def test_no_door_is_left_out():
-    """Every public function whose first argument is called `system` is among them, but one with words of its own."""
+    """All public functions whose first argument is called `system` are tested, but one with a message of its own."""
     functions = {name: getattr(lj, name) for name in lj.__all__ if inspect.isfunction(getattr(lj, name))}
     first = {name: next(iter(inspect.signature(function).parameters), "") for name, function in functions.items()}
     of_systems = {name for name, argument in first.items() if argument == "system"}
@@ -79,7 +79,7 @@ def test_no_door_is_left_out():
 
 
 def test_other_refusals_of_what_is_no_system():
-    """A ledger is one of a motion; a sweep runs a function; phases are systems."""
+    """`energy_ledger` needs a motion, `sweep` a function and `Hybrid` systems as phases."""
     for act, words in (
         (lambda: lj.energy_ledger(pendulum), "made of a motion"),
         (lambda: lj.sweep(pendulum, {"g": [1.0, 2.0]}), "a function of a point"),
@@ -90,7 +90,7 @@ def test_other_refusals_of_what_is_no_system():
 
 
 def test_a_system_in_another_place():
-    """The system after the state: where it is, and the order."""
+    """A system among the later arguments: the error says where it is, and gives the order."""
     for act, place in (
         (lambda: lj.integrate(1.0, 0.0, PARAMS, pendulum, ts=TS), 4),
         (lambda: lj.accelerations(0.0, 1.0, 0.0, PARAMS, rod_pendulum), 5),
@@ -113,7 +113,7 @@ BY_NAME = {
 
 @pytest.mark.parametrize("name", BY_NAME)
 def test_what_is_given_by_name(name):
-    """Times, starts and a section that stand in a row with the others, or are missing."""
+    """Times, starts or a section given by position, or left out, raise."""
     act, words = BY_NAME[name]
     with pytest.raises(
         TypeError, match=rf"lj.{name} was called .*\n.*{words} given by position.*\nFix: lj.{name}\(system"
@@ -122,7 +122,7 @@ def test_what_is_given_by_name(name):
 
 
 def test_what_python_says_better_is_left_to_it():
-    """A keyword that there is not, and too few arguments; the signature is that of the function."""
+    """Python's own errors remain for an unknown keyword and too few arguments, and the signature is unchanged."""
     with pytest.raises(TypeError, match="unexpected keyword argument 't_span'"):
         lj.integrate(pendulum, 1.0, 0.0, PARAMS, t_span=(0.0, 1.0))  # pyright: ignore[reportCallIssue]
     with pytest.raises(TypeError, match="missing 1 required positional argument: 'v0'"):

@@ -1,4 +1,4 @@
-"""Single precision that nobody asked for is told once, at whatever comes first, at the user's line."""
+"""Single precision that nobody asked for gives one warning, at the first function called, at the user's line."""
 
 import inspect
 import subprocess
@@ -20,14 +20,14 @@ TS = np.linspace(0.0, 1.0, 2)
 
 @pytest.fixture
 def untold(monkeypatch):
-    """As in a process in which nothing was told, without x64."""
+    """A process without x64 in which nothing has warned yet."""
     monkeypatch.setattr(single_precision, "_settled", [])
     with jax.enable_x64(False):
         yield
 
 
 def told(act):
-    """What is told meanwhile, with the lines."""
+    """The warnings that a call issues, with their lines."""
     with warnings.catch_warnings(record=True) as found:
         warnings.simplefilter("always")
         act()
@@ -36,7 +36,7 @@ def told(act):
 
 @pytest.mark.parametrize("number", (1.0, 1, np.float64(1.0), np.ones(()), np.int32(1)))
 def test_told_once(untold, number):
-    """By the first state that is none of NumPy's float32, and no more; the message has the line that changes it."""
+    """Only the first state that is not NumPy float32 warns; the message has the line that changes it."""
     for count in (1, 0):
         found = told(lambda: coordinates.state(0.0, number, number, None))
         assert [kind for kind, *_ in found] == [lj.PrecisionWarning] * count
@@ -47,14 +47,14 @@ def test_told_once(untold, number):
 
 @pytest.mark.parametrize("number", (np.float32(1.0), np.ones(2, np.float32), jnp.ones(2, jnp.float16)))
 def test_not_told_where_it_is_meant(untold, number):
-    """A start of NumPy's float32 says that it is meant, from then on; half precision says so by itself."""
+    """A NumPy float32 state shows that it is meant, from then on; half precision does not warn, but later states do."""
     assert told(lambda: coordinates.state(0.0, number, number, None)) == []
     again = told(lambda: coordinates.state(0.0, 1.0, 1.0, None))
     assert len(again) == (number.dtype == np.float16)
 
 
 def test_not_told_with_x64(monkeypatch):
-    """Twin: with x64 nothing is told, also of float32."""
+    """Twin: with x64 nothing warns, not even float32."""
     monkeypatch.setattr(single_precision, "_settled", [])
     assert told(lambda: [coordinates.state(0.0, x, x, None) for x in (1.0, jnp.float32(1.0))]) == []
 
@@ -70,7 +70,7 @@ DOORS = {
 
 @pytest.mark.parametrize("door", DOORS)
 def test_told_at_the_users_line(untold, door):
-    """Whatever comes first, through JAX's tracing and what is between: at the line of this file."""
+    """Whichever function comes first, also through JAX's tracing, the warning is at the line of this file."""
     act, error = DOORS[door]
 
     def called():

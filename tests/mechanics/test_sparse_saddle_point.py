@@ -1,4 +1,4 @@
-"""Large systems of small parts: the banded solve says what the dense equations say, and forms nothing dense."""
+"""Large systems of small parts: the banded solve agrees with the dense equations, and forms nothing dense."""
 
 import jax
 import jax.numpy as jnp
@@ -23,7 +23,7 @@ def dense_equations(system, q, v, params):
 
 
 def dense_solution(system, q, v, params):
-    """a and the shortest multipliers, by least squares in extended precision's place: refined twice."""
+    """a and the shortest multipliers, by least squares, refined twice instead of in extended precision."""
     mass, forcing, rows, gamma = map(np.asarray, dense_equations(system, q, v, params))
     n, m = len(forcing), len(gamma)
     matrix = np.block([[mass, rows.T], [rows, np.zeros((m, m))]])
@@ -41,7 +41,7 @@ def of_library(system, q, v, params):
 
 
 def planned(system, q, v, params):
-    """The plan for a system, None where it is solved densely."""
+    """The plan for a system; None if it is solved densely."""
     return sparse_plan.plan(system, *coordinates.state(0.0, q, v, params))
 
 
@@ -74,7 +74,7 @@ def test_same_as_dense(name):
     case = CASES[name]()
     assert planned(*case) is not None
     expected, found = dense_solution(*case), of_library(*case)
-    # What was put in the place of vanishing masses is mended by one refinement, to this.
+    # One refinement corrects the masses that replace vanishing ones, to this tolerance.
     tolerance = 1e-10 if name.startswith("massless") else 1e-12
     for x, y in zip(found, expected):
         assert largest(x - y) <= tolerance * largest(y)
@@ -103,7 +103,7 @@ def test_redundant_constraints_have_the_shortest_multipliers():
 
 @pytest.mark.exhaustive
 def test_contradictory_constraints_are_named():
-    """The same links asked for at another rate contradict: an error, and NaN while tracing."""
+    """The same links demanded at another rate contradict each other: an error, and NaN while tracing."""
     system, q, v, params = chain(10)
     faster = lambda t, q, params: links(t, q, params)[:2] + t**2
     broken = lj.System(particles, system.constraints | {"faster": lj.Holonomic(faster)})
@@ -114,7 +114,7 @@ def test_contradictory_constraints_are_named():
 
 
 def test_undetermined_is_refused():
-    """A massless end hangs on one link: its acceleration across it is not determined, and no number is made up."""
+    """A massless end hangs on one link: its acceleration across it is not determined, and an error says so."""
     system, q, v, params = with_masses(np.append(np.ones(11), 0.0))
     with pytest.raises(ValueError, match="singular"):
         lj.accelerations(system, 0.0, q, v, params)
@@ -122,7 +122,7 @@ def test_undetermined_is_refused():
 
 @pytest.mark.exhaustive
 def test_undetermined_is_refused_at_the_start_of_a_motion():
-    """The same, by the verdict inside the compiled program."""
+    """The same for a motion, by the verdict inside the compiled program."""
     system, q, v, params = with_masses(np.append(np.ones(11), 0.0))
     with pytest.raises(ValueError, match="singular"):
         lj.integrate(system, q, v, params, ts=np.array([0.0, 0.1]))
@@ -147,7 +147,7 @@ def acceleration(system, q, v):
 
 @pytest.mark.slow
 def test_derivatives_in_both_modes():
-    """By every mass and by gravity, forward and reverse, as the dense equations'."""
+    """Derivatives by every mass, forward and reverse, are those of the dense equations."""
     system, q, v, params = chain(8)
     assert planned(system, q, v, params) is not None
     sparse, dense = acceleration(system, q, v)
@@ -161,7 +161,7 @@ def test_derivatives_in_both_modes():
 
 @pytest.mark.slow
 def test_second_derivatives_and_lanes():
-    """Forward over forward, and a batch of states."""
+    """Forward-over-forward derivatives and a batch agree with the dense equations."""
     system, q, v, params = chain(8)
     sparse, dense = acceleration(system, q, v)
     twice = lambda f: jax.jit(jax.jacfwd(jax.jacfwd(lambda s: f(params | {"m": params["m"].at[2].mul(s)}))))(1.0)
@@ -189,7 +189,7 @@ def running(system, q, v, params):
 
 
 def test_nothing_dense_is_formed():
-    """Of 40 links no array has 40 × 40 entries; twin: where a loop hides which link touches which, there are."""
+    """With 40 links no array has 40 × 40 entries; twin: one has if a loop hides which link touches which."""
     assert largest_array(*running(*chain(40))) < 40 * 40
     system, q, v, params = chain(40)
     hidden = lambda t, q, params: jax.lax.scan(lambda c, x: (c, x + c), 0.0, links(t, q, params))[1]
@@ -199,7 +199,7 @@ def test_nothing_dense_is_formed():
 
 
 def test_small_and_entangled_systems_are_solved_densely():
-    """Below the threshold, with a mass matrix that couples all velocities, or multipliers that all touch."""
+    """Small systems, a mass matrix that couples all velocities, or multipliers that all touch have no plan."""
     assert planned(*chain(7)) is None and planned(*chain(8)) is not None
     system, q, v, params = chain(12)
     coupled = lambda t, q, v, params: particles(t, q, jnp.cumsum(v, axis=0), params)
@@ -209,7 +209,7 @@ def test_small_and_entangled_systems_are_solved_densely():
 
 
 def test_without_constraints():
-    """Free particles: M by its diagonal, and a vanishing mass is no plausible number."""
+    """Free particles are solved by the diagonal of M, and a vanishing mass raises."""
     _, q, v, params = chain(20)
     free = lj.System(particles)
     assert planned(free, q, v, params).band is None
@@ -221,7 +221,7 @@ def test_without_constraints():
 
 @pytest.mark.exhaustive
 def test_explain_says_so():
-    """The row names band and size; a small system has none."""
+    """`explain` names the band and its size; for a small system it names none."""
     explained = lambda system, *state: lj.explain(system, 0.0, *state)
     assert "banded, half bandwidth 1, 9 equations" in repr(explained(*chain(9)))
     assert "banded" not in repr(explained(*chain(4)))
@@ -229,7 +229,7 @@ def test_explain_says_so():
 
 @pytest.mark.exhaustive
 def test_a_motion_stays_on_its_links():
-    """A short motion of 16 links, against the dense path of the same motion, and its energy."""
+    """A short motion of 16 links agrees with the dense solution, and keeps constraints and energy."""
     system, q, v, params = chain(16)
     hidden = lj.Holonomic(lambda t, q, p: jax.lax.scan(lambda c, x: (c, x + c), 0.0, links(t, q, p))[1])
     ts = np.linspace(0.0, 0.05, 3)
@@ -242,7 +242,7 @@ def test_a_motion_stays_on_its_links():
 
 @pytest.mark.exhaustive
 def test_gradient_of_a_motion():
-    """Of the end of a chain by gravity: forward, reverse, and a difference of two motions."""
+    """The derivative of a chain's end by gravity: forward, reverse, and by the difference of two motions."""
     system, q, v, params = chain(8)
 
     def end(g):

@@ -1,4 +1,4 @@
-"""What is read off a jaxpr: angles, each with a coordinate that is none."""
+"""What is read off a jaxpr: angles, each with a coordinate that is not one."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -28,14 +28,14 @@ free = lambda t, q, v, params: 0.5 * (v["a"] ** 2 + v["b"] ** 2)
     ],
 )
 def test_angles(potential, found):
-    """A coordinate is an angle where it is seen through sines and cosines alone."""
+    """A coordinate is an angle if it occurs only inside sines and cosines."""
     system = lj.System(lambda t, q, v, params: free(t, q, v, params) - potential(q))
     s = coordinates.state(0.0, {"a": 0.1, "b": 0.2}, {"a": 0.0, "b": 0.0}, None)
     assert tuple(angles(system, *s).values()) == found
 
 
 def test_constraints_and_forces_count():
-    """An angle in L is none where a constraint, a force or the dissipation sees its value."""
+    """An angle in L is not one if a constraint or a force depends on its value."""
     turning = lambda t, q, v, params: free(t, q, v, params) + jnp.cos(q["a"]) + jnp.cos(q["b"])
     s = coordinates.state(0.0, {"a": 0.1, "b": 0.2}, {"a": 0.0, "b": 0.0}, None)
     gear = {"gear": lj.Holonomic(lambda t, q, params: q["a"] - 2 * q["b"])}
@@ -65,7 +65,7 @@ def test_conserved_jacobi_integral():
     assert not known(constraints={"rolling": lj.Nonholonomic(lambda t, q, v, params: v["a"] - v["b"])})
     assert not known(force=lambda t, q, v, params: v)
     assert not known(dissipation=lambda t, q, v, params: v["a"] ** 2)
-    # Time enters the expression but multiplies zero: not seen as constant, which errs on the safe side.
+    # Time enters the expression but multiplies zero: not recognised as constant, which errs on the safe side.
     assert not known(constraints={"fixed": fixed})
 
 
@@ -76,7 +76,7 @@ def of(lagrangian, q, constraints=None, **functions):
 
 
 def test_mass_matrix():
-    """On what it depends and what it couples: constant or not, diagonal, in blocks, dense."""
+    """What the mass matrix depends on and couples: constant or not, diagonal, in blocks, dense."""
     q = jnp.array([0.2, 0.4, 0.6])
     constant = of(lambda t, q, v, params: 0.5 * jnp.sum(v**2) - jnp.sum(q**2) * jnp.cos(t), q)
     assert constant.mass_depends_on == () and len(constant.blocks) == 3
@@ -85,12 +85,12 @@ def test_mass_matrix():
     assert coupled.blocks == (("q[0]", "q[2]"), ("q[1]",))
     dense = of(lambda t, q, v, params: -jnp.sqrt(1 - jnp.dot(v, v)), q)
     assert dense.mass_depends_on == ("velocities",) and len(dense.blocks) == 1
-    # What is a zero at this state alone is none, and what cancels in numbers only is not known to.
+    # A zero at this state alone is not a zero entry.
     assert len(of(lambda t, q, v, params: jnp.dot(v, v) + v[0] * v[1] * (q[0] - 0.2), q).blocks) == 2
 
 
 def test_time_cyclic_coordinates_and_linear_terms():
-    """Each with a twin that differs by one term."""
+    """Cyclic coordinates, explicit time and linear terms, each with a twin that differs by one term."""
     q = jnp.array([0.2, 0.4])
     planar = lambda t, q, v, params: 0.5 * (v[0] ** 2 + (q[0] * v[1]) ** 2)
     central = of(planar, q)
@@ -103,7 +103,7 @@ def test_time_cyclic_coordinates_and_linear_terms():
 
 
 def test_constraints():
-    """Linear with constant coefficients or not, moving or not."""
+    """Constraints that are linear with constant coefficients or not, moving or not."""
     q = jnp.array([0.2, 0.4])
     found = of(
         lambda t, q, v, params: 0.5 * jnp.sum(v**2),
@@ -121,14 +121,14 @@ def test_constraints():
 
 
 def test_a_large_system_is_not_taken_apart():
-    """Beyond two dozen coordinates there is no structure of this kind."""
+    """Beyond two dozen coordinates the structure is not examined."""
     assert of(lambda t, q, v, params: 0.5 * jnp.sum(v**2), jnp.ones(25)) is None
 
 
 @not_plain
 @pytest.mark.parametrize(("nodes", "known"), [(4, True), (500, False)])
 def test_a_long_program_is_not_taken_apart(nodes, known):
-    """Nothing is known of a potential by quadrature of many nodes, and `explain` does without; twin: of a few it is."""
+    """A potential by quadrature of many nodes has no structure, and `explain` works without; twin: few nodes."""
     angles = jnp.linspace(0.0, 6.0, nodes)
     wire = lambda q: jnp.sum(1 / jnp.sqrt((q[0] - jnp.cos(angles)) ** 2 + (q[1] - jnp.sin(angles)) ** 2 + q[2] ** 2))
     system = lj.System(lambda t, q, v, params: 0.5 * v @ v + q[0] * v[1] * wire(q))
@@ -140,7 +140,7 @@ def test_a_long_program_is_not_taken_apart(nodes, known):
 
 
 def test_a_long_mass_matrix_is_not_known_to_be_diagonal():
-    """Its program is left before it is written to its end; the twin's is short."""
+    """Writing out a long program is given up before its end; the twin's is short."""
 
     def of(count):
         def lagrangian(t, q, v, params):

@@ -1,4 +1,4 @@
-"""Equations written out: the same accelerations, multipliers, projections; operations only for what is there."""
+"""Written-out equations: the same accelerations, multipliers and projections, without operations for zeros."""
 
 from collections import Counter
 
@@ -30,7 +30,7 @@ def states(like, count=5):
 
 
 def operations(program):
-    """How often each primitive stands in a program, its functions included."""
+    """How often each primitive occurs in a program, its functions included."""
     count = Counter()
     for equation in program.eqns:
         count[equation.primitive.name] += 1
@@ -51,7 +51,7 @@ SYSTEMS = {
 
 @pytest.mark.parametrize("name", SYSTEMS)
 def test_the_same_accelerations(name):
-    """As by pivoting, at random states (on the constraints or not)."""
+    """The same as by pivoting, at random states (on the constraints or not)."""
     system, like, params = SYSTEMS[name]
     for q, v in states(like):
         s = coordinates.state(0.4, q, v, params)
@@ -63,7 +63,7 @@ def test_the_same_accelerations(name):
 
 
 def test_the_same_projection():
-    """From 1e-5 off, the nearest state of the robust way; from far off, NaN."""
+    """From 1e-5 off, the same nearest state as by the robust way; from far off, NaN."""
     q, v = {"x": 1.25 + 1e-5, "y": 2e-5}, {"x": 1e-5, "y": 3.0}
     s = coordinates.state(0.0, q, v, PARAMS)
     project = write_out(rod_pendulum, *s).project
@@ -77,7 +77,7 @@ def test_the_same_projection():
 
 
 def evaluated(name):
-    """The program of one evaluation, less what is computed once, before the loop."""
+    """The program of one evaluation, without the part computed once before the loop."""
     system, like, params = SYSTEMS[name]
     s = coordinates.state(0.4, *states(like, 1)[0], params)
     numbers = write_out(system, *s).equations
@@ -115,14 +115,14 @@ def test_the_compiled_program():
     assert "lapack" in text.lower()
     assert not is_small(many, *coordinates.state(0.0, np.ones(9), np.ones(9), PARAMS))
     assert is_small(seven, *coordinates.state(0.0, np.ones(7), np.ones(7), PARAMS))
-    # A network in L is for arrays; twin: as many numbers in a vector are not.
+    # A network in L is left to arrays; twin: the same count of numbers in a vector is not.
     assert not is_small(seven, *coordinates.state(0.0, np.ones(7), np.ones(7), np.ones((8, 8))))
     assert is_small(seven, *coordinates.state(0.0, np.ones(7), np.ones(7), np.ones(64)))
 
 
 @pytest.mark.slow
 def test_changed_numbers_do_not_compile_again():
-    """Tolerances, parameters, times and initial states are arguments, and a few more times a part of what there is."""
+    """Other tolerances, parameters, times and initial states compile nothing; twin: many more times do."""
     system = lj.System(lambda t, q, v, params: 0.5 * v**2 + params["k"] * jnp.cos(q))
     lj.integrate(system, 1.0, 0.0, {"k": 1.0}, ts=[0.0, 1.0], rtol=1e-6, atol=1e-6)
     with compiles() as again:
@@ -133,7 +133,7 @@ def test_changed_numbers_do_not_compile_again():
 
 
 def test_a_long_program_is_not_written_out(monkeypatch):
-    """A potential by quadrature of 500 nodes is left before it is written to its end; a short one is written out."""
+    """Writing out a potential by quadrature of 500 nodes is given up before its end; a short one is written out."""
     monkeypatch.setattr("lagjax.mechanics.written_out.LONG", np.inf)
     nodes = jnp.linspace(0.0, 6.0, 500)
     wire = lambda q: jnp.sum(1 / jnp.sqrt((q[0] - jnp.cos(nodes)) ** 2 + (q[1] - jnp.sin(nodes)) ** 2 + q[2] ** 2))
