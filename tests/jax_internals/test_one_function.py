@@ -188,7 +188,7 @@ def check_products(sizes):
 
 @pytest.mark.parametrize("size", [16, 63, 64, 65])
 def test_products_of_many_multiplications(size):
-    """Around 4,096 multiplications, where XLA may take a sum for a library product, which one function cannot contain."""
+    """Around 4,096 multiplications, where XLA may take a sum for a library product, which must not occur."""
     check_products([size])
 
 
