@@ -79,7 +79,7 @@ def _same(new, old):
 def without_chains(closed: ClosedJaxpr) -> ClosedJaxpr:
     """The program with long chains f(f(f(... x))) of the same call turned into loops.
 
-    (diffrax takes the hundredth floating number before the last time, one after the other.)
+    (diffrax goes back a hundred floating-point numbers from the last time, one after the other.)
     """
     return _rewritten(closed, _chains_as_loops)
 

@@ -37,7 +37,7 @@ TRACES = (
 
 
 def is_eager() -> bool:
-    """Whether JAX traces nothing here and now, not even in a function that closes over it."""
+    """Whether JAX is tracing nothing here and now, not even a function without traced arguments."""
     return get_opaque_trace_state() == _EAGER
 
 

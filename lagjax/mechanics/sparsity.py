@@ -1,7 +1,7 @@
 """Which outputs of a function depend on which entries of a vector, read off its jaxpr.
 
 Every intermediate value carries, entry by entry, the set of inputs that it depends on; a set is a Python integer, one
-bit an input. Primitives that work entry by entry unite the sets of their operands; those that move entries move the
+bit per input. Primitives that work entry by entry unite the sets of their operands; those that move entries move the
 sets; sums and products of matrices unite what they sum. Where an operation is unknown here, such as a loop or an index
 that is not constant, every entry of its results depends on everything that its operands depend on. The pattern holds at
 every state: it may be too full, never too empty, since no values but those of constants are used.
