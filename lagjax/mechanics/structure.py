@@ -11,7 +11,8 @@ A coordinate is an *angle* where L, R, Q and the constraints contain it only thr
 linear in it. Its size then means nothing: an error counts the same after a thousand turns as in the first.
 
 The jaxpr is walked once for each leaf of q. Every intermediate value is, as a function of that leaf, constant, linear,
-periodic (made of sines and cosines), or anything else; the kind of a primitive's result follows from those of its operands.
+periodic (made of sines and cosines), or anything else; the kind of a primitive's result follows from those of its
+operands.
 """
 
 from collections.abc import Iterator
