@@ -2,8 +2,8 @@
 
 If L is quadratic in the velocities, p is linear in them and one solve with M = ∂²L/∂v∂v is exact; the program of L
 shows whether this is so. Otherwise Newton's method finds v, with steps shortened until L is finite and the residual
-falls. The derivatives of v, of any order and in both modes, are those of the implicit function: dv = M⁻¹ (dp - d(∂L/∂v)
-at fixed v).
+falls. The derivatives of v, of any order and in both modes, are those of the implicit function:
+dv = M⁻¹ (dp - d(∂L/∂v) at fixed v).
 
 Source: Goldstein, *Classical Mechanics*, Eq. (8.15)-(8.18); Arnold, *Mathematical Methods of Classical Mechanics*, §14.
 """

@@ -197,7 +197,7 @@ def test_what_is_not_cyclic_is_named():
         (held, "phi", of_phi, momenta, "'phi' is not cyclic: constraint 'held' contains it"),
         (TOP, "phi", of_phi, OF_TOP, "the parameters of a Routhian are those of the system and the momenta"),
         (TOP, "phi", of_phi, {"params": OF_TOP, "momenta": {}}, "the momentum of 'phi' is missing"),
-        (TOP, "phi", SPINNING, momenta, "'phi' is eliminated, and among the coordinates still"),
+        (TOP, "phi", SPINNING, momenta, "'phi' is eliminated, but still among the coordinates"),
     ]
     for system, name, state, params, words in cases:
         reduced = lj.routhian(system, name)
