@@ -167,5 +167,6 @@ def too_few(system, s, count) -> str:
     return (
         f"only {count} states were found around q = {describe(s.q)} that satisfy the constraints and where L is finite."
         f"\nUsual cause: {cause}, or a state at the edge of the domain of L.\n"
-        "Fix: a state from the middle of the motion; lj.consistent_state(system, t, q, v, params) moves one onto the constraints."
+        "Fix: a state from the middle of the motion; lj.consistent_state(system, t, q, v, params) moves one onto the "
+        "constraints."
     )
