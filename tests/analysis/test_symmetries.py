@@ -47,7 +47,7 @@ def test_the_seven_mass_distributions(name):
 
 @pytest.mark.exhaustive
 def test_a_left_handed_helix_of_any_pitch():
-    """The sign and the size of the screw follow h; the generator with h and without 2π is another one."""
+    """The sign and the size of the screw follow h; the book's printed h p_z + L_z is another generator."""
     params = mass_distributions.PARAMS["helix"] | {"h": -1.7}
     q, v, _ = mass_distributions.ORBITS["helix"]
     found = lj.symmetries(mass_distributions.SYSTEMS["helix"], q, v, params, basis={})
