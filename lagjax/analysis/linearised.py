@@ -152,12 +152,12 @@ def linearise(system, t, q, v, params) -> Linearisation:
         )
     if traced:
         return _linearised(kind, system, *s)[0]
-    found, steadiness = _linearised(kind, system, *s)
-    if not np.all(np.asarray(found.parts.independent)[list(kind.independent)]):
+    linearisation, steadiness = _linearised(kind, system, *s)
+    if not np.all(np.asarray(linearisation.parts.independent)[list(kind.independent)]):
         kind = kind._replace(independent=_chosen(kind, system, s, traced))
-        found, steadiness = _linearised(kind, system, *s)
-    check_steady(system, found, steadiness, lambda *later: linearised(kind, system, State(*later)))
-    return found
+        linearisation, steadiness = _linearised(kind, system, *s)
+    check_steady(system, linearisation, steadiness, lambda *later: linearised(kind, system, State(*later)))
+    return linearisation
 
 
 def _kind(system, s: State) -> Kind:
@@ -222,7 +222,7 @@ def _linearised(kind: Kind, system, t, q, v, params) -> tuple[Linearisation, Ste
     sound = parts.sound
     if all(kind.independent) and kind.independent:
         sound = sound & jnp.all(parts.independent)
-    found = Linearisation(
+    linearisation = Linearisation(
         mass=parts.mass,
         gyroscopic=half(parts.velocity, -1),
         damping=half(parts.velocity, 1),
@@ -238,4 +238,4 @@ def _linearised(kind: Kind, system, t, q, v, params) -> tuple[Linearisation, Ste
         kind=kind,
         names=tuple(coordinates.names(q)),
     )
-    return found, steadiness
+    return linearisation, steadiness

@@ -187,58 +187,60 @@ def normal_modes(system, t=None, q=None, v=None, params=None) -> NormalModes:
     Source: Goldstein, *Classical Mechanics*, §6.2-6.3; Meirovitch, *Methods of Analytical Dynamics*, §6 and §9;
     Kirillov, *Nonconservative Stability Problems of Modern Physics*, ch. 3 and 5.
     """
-    found = system if isinstance(system, Linearisation) else linearise(system, t, q, v, params)
-    motions = _motions(found, True)
+    linearisation = system if isinstance(system, Linearisation) else linearise(system, t, q, v, params)
+    motions = _motions(linearisation, True)
     if not is_eager() or coordinates.is_traced(motions):
-        return _collected(found, motions)
+        return _collected(linearisation, motions)
     if not np.all(np.isfinite(motions.roots)):
         # The mass matrix is regular but not positive definite.
-        motions = _motions(found, False)
+        motions = _motions(linearisation, False)
     kept = ~np.asarray(motions.mirrored)
     of_modes = jax.tree.map(lambda x: np.asarray(x)[kept] if np.ndim(x) else np.asarray(x), motions)
     words = []
-    if not found.kind.conservative:
-        shapes, words = with_neutral(found, of_modes.shapes, of_modes.zero)
+    if not linearisation.kind.conservative:
+        shapes, words = with_neutral(linearisation, of_modes.shapes, of_modes.zero)
         of_modes = of_modes._replace(shapes=shapes)
     if int(of_modes.code) == UNDECIDED and int(of_modes.unexplained) and not isinstance(system, Linearisation):
-        of_modes = _with_symmetries(system, found, of_modes)
-    return _collected(found, of_modes, tuple(words))
+        of_modes = _with_symmetries(system, linearisation, of_modes)
+    return _collected(linearisation, of_modes, tuple(words))
 
 
-def _with_symmetries(system, found, motions: Motions) -> Motions:
+def _with_symmetries(system, linearisation, motions: Motions) -> Motions:
     """The motions, with a stable verdict if the zero modes lead to other equilibria."""
-    unseen = np.array(found.kind.unseen, bool)
+    unseen = np.array(linearisation.kind.unseen, bool)
     explained = np.all(np.abs(motions.shapes[:, ~unseen]) <= 1e-6, axis=1)
-    _, unflatten = coordinates.flatten(found.state.q)
-    at = lambda x: linearised(found.kind, system, found.state._replace(q=unflatten(jnp.asarray(x, found.mass.dtype))))
-    if not leads_to_others(found, motions.shapes[motions.zero & ~explained], at):
+    _, unflatten = coordinates.flatten(linearisation.state.q)
+    at = lambda x: linearised(
+        linearisation.kind, system, linearisation.state._replace(q=unflatten(jnp.asarray(x, linearisation.mass.dtype)))
+    )
+    if not leads_to_others(linearisation, motions.shapes[motions.zero & ~explained], at):
         return motions
     lasting = ~motions.zero
-    decays = not found.kind.conservative and bool(np.all(motions.roots.real[lasting] < 0))
+    decays = not linearisation.kind.conservative and bool(np.all(motions.roots.real[lasting] < 0))
     code = ASYMPTOTIC if decays else GYROSCOPIC if np.any(motions.energies < 0) else STABLE
     return motions._replace(code=np.asarray(code, motions.code.dtype), unexplained=np.zeros_like(motions.unexplained))
 
 
 @compiled
-def _motions(found: Linearisation, definite: bool) -> Motions:
-    return motions_of(found, definite)
+def _motions(linearisation: Linearisation, definite: bool) -> Motions:
+    return motions_of(linearisation, definite)
 
 
-def _collected(found, motions: Motions, zero_words=()) -> NormalModes:
+def _collected(linearisation, motions: Motions, zero_words=()) -> NormalModes:
     shapes, start = [], 0
-    for leaf in jax.tree.leaves(found.state.q):
+    for leaf in jax.tree.leaves(linearisation.state.q):
         size = int(np.size(leaf))
         shapes.append(motions.shapes[:, start : start + size].reshape(-1, *np.shape(leaf)))
         start += size
     return NormalModes(
         roots=motions.roots,
-        shapes=jax.tree.unflatten(jax.tree.structure(found.state.q), shapes),
+        shapes=jax.tree.unflatten(jax.tree.structure(linearisation.state.q), shapes),
         energy=motions.energies,
         zero=motions.zero,
         growing=motions.growing,
         double=motions.double,
         code=motions.code,
         unexplained=motions.unexplained,
-        linearisation=found,
+        linearisation=linearisation,
         zero_words=zero_words,
     )

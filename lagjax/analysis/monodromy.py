@@ -111,14 +111,14 @@ def period_of(problem: Problem, period, rtol, nodes=None) -> tuple[Period, Float
     in_a_loop = not WATCHED.value or sum(np.size(x) for x in jax.tree.leaves(s.q)) > 1
     rtol, period = tolerance_of(rtol, s.t.dtype), coordinates.numpy_of(period).asarray(period, s.t.dtype)
     run = lambda rtol: _period(system, *s, nodes, period, rtol, reasons, rows, is_angle, in_a_loop, not eager)
-    found = run(rtol)
+    first = run(rtol)
     if eager:
-        looser = run(LOOSER * rtol)
-        error = np.max(np.abs(np.asarray(found.reduced) - np.asarray(looser.reduced)))
-        return found, jnp.asarray(error)
+        second = run(LOOSER * rtol)
+        error = np.max(np.abs(np.asarray(first.reduced) - np.asarray(second.reduced)))
+        return first, jnp.asarray(error)
     # Only the product of the multipliers is known independently; the error is at least the tolerance of the steps.
-    off = jnp.abs(jnp.linalg.det(lax.stop_gradient(found.reduced)) * jnp.exp(-lax.stop_gradient(found.log_volume)) - 1)
-    return found, jnp.maximum(off, LOOSER * rtol) * jnp.maximum(1.0, jnp.max(jnp.abs(lax.stop_gradient(found.reduced))))
+    off = jnp.abs(jnp.linalg.det(lax.stop_gradient(first.reduced)) * jnp.exp(-lax.stop_gradient(first.log_volume)) - 1)
+    return first, jnp.maximum(off, LOOSER * rtol) * jnp.maximum(1.0, jnp.max(jnp.abs(lax.stop_gradient(first.reduced))))
 
 
 @compiled
@@ -158,16 +158,16 @@ def _sorted(matrix, trivial):
     """The eigenvalues: first the `trivial` ones, which are exactly 1, then the others by falling size."""
     finite = jnp.all(jnp.isfinite(matrix))
     # LAPACK may not return if the matrix is not finite.
-    found = jnp.linalg.eigvals(jnp.where(finite, matrix, jnp.eye(len(matrix), dtype=matrix.dtype)))
-    found = jnp.where(finite, found, jnp.nan)
-    near = jnp.argsort(jnp.argsort(jnp.abs(lax.stop_gradient(found) - 1)))
+    eigenvalues = jnp.linalg.eigvals(jnp.where(finite, matrix, jnp.eye(len(matrix), dtype=matrix.dtype)))
+    eigenvalues = jnp.where(finite, eigenvalues, jnp.nan)
+    near = jnp.argsort(jnp.argsort(jnp.abs(lax.stop_gradient(eigenvalues) - 1)))
     first = near < trivial
-    size = jnp.abs(lax.stop_gradient(found))
+    size = jnp.abs(lax.stop_gradient(eigenvalues))
     # Rounded, because the sizes of a conjugate pair differ by round-off; the one with positive imaginary part comes
     # first.
-    size = jnp.round(size / jnp.max(size), 9) + 1e-12 * jnp.sign(jnp.imag(lax.stop_gradient(found)))
+    size = jnp.round(size / jnp.max(size), 9) + 1e-12 * jnp.sign(jnp.imag(lax.stop_gradient(eigenvalues)))
     order = jnp.argsort(jnp.where(first, -jnp.inf, -size))
-    return found[order], first[order]
+    return eigenvalues[order], first[order]
 
 
 def _apart(flow, reasons, is_angle, difference, scale):

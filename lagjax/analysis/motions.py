@@ -59,19 +59,19 @@ class _Reduced(NamedTuple):
     with_rate: Float[Array, "c d"]
 
 
-def motions_of(found: Linearisation, definite: bool = True) -> Motions:
+def motions_of(linear: Linearisation, definite: bool = True) -> Motions:
     """The motions of a linearisation; `definite`: assume that the mass matrix is positive definite."""
-    if not found.kind.conservative:
-        return _judged(found, _of_first_order(found))
-    if definite and (found.kind.at_rest or found.parts.positions.shape[1] < 2):
-        return _judged(found, _at_rest(found))
-    return _judged(found, _gyroscopic(found))
+    if not linear.kind.conservative:
+        return _judged(linear, _of_first_order(linear))
+    if definite and (linear.kind.at_rest or linear.parts.positions.shape[1] < 2):
+        return _judged(linear, _at_rest(linear))
+    return _judged(linear, _gyroscopic(linear))
 
 
-def _routh(found) -> _Reduced:
-    c = len(found.shifts)
-    mass = jnp.where(found.sound, found.parts.mass, jnp.eye(found.parts.mass.shape[0], dtype=found.mass.dtype))
-    velocity, position = (jnp.where(found.sound, x, 0.0) for x in (found.parts.velocity, found.parts.position))
+def _routh(linear) -> _Reduced:
+    c = len(linear.shifts)
+    mass = jnp.where(linear.sound, linear.parts.mass, jnp.eye(linear.parts.mass.shape[0], dtype=linear.mass.dtype))
+    velocity, position = (jnp.where(linear.sound, x, 0.0) for x in (linear.parts.velocity, linear.parts.position))
     M, G, K = mass[c:, c:], velocity[c:, c:], position[c:]
     if not c:
         return _Reduced(M, G, K, M[:0], M[:0])
@@ -84,14 +84,14 @@ def _routh(found) -> _Reduced:
     )
 
 
-def _at_rest(found) -> Motions:
+def _at_rest(linear) -> Motions:
     """Without gyroscopic forces: the eigenvalues are the squares of the frequencies."""
-    reduced = _routh(found)
+    reduced = _routh(linear)
     if reduced.mass.shape[0]:
         roots = symmetric_roots(reduced.position, reduced.mass)
     else:
-        empty = jnp.zeros(0, found.mass.dtype)
-        roots = Roots(empty, jnp.zeros((0, 0), found.mass.dtype), empty, empty > 0, empty > 0)
+        empty = jnp.zeros(0, linear.mass.dtype)
+        roots = Roots(empty, jnp.zeros((0, 0), linear.mass.dtype), empty, empty > 0, empty > 0)
     squares = roots.values
     # The round-off that remains when terms cancel.
     x = lax.stop_gradient(jnp.abs(roots.vectors))
@@ -104,13 +104,13 @@ def _at_rest(found) -> Motions:
     x = roots.vectors.astype(values.dtype)
     energies = jnp.where(positive, 1, 0)
     return _with_shifts(
-        found, reduced, values, x, jnp.zeros_like(zero), energies, roots.double, zero, ~positive & ~zero
+        linear, reduced, values, x, jnp.zeros_like(zero), energies, roots.double, zero, ~positive & ~zero
     )
 
 
-def _gyroscopic(found) -> Motions:
+def _gyroscopic(linear) -> Motions:
     """With gyroscopic forces: roots come in pairs λ and -λ, of which one is kept."""
-    reduced = _routh(found)
+    reduced = _routh(linear)
     d = reduced.mass.shape[0]
     scale = _units(reduced.mass)
     M, G, K = (scale[:, None] * m * scale[None, :] for m in reduced[:3])
@@ -137,18 +137,18 @@ def _gyroscopic(found) -> Motions:
     order = _order(values, mirrored)[:d]
     pick = lambda y: y[order]
     return _with_shifts(
-        found, reduced, pick(values) * rate, (scale[:, None] * x)[:, order], pick(mirrored), pick(energies),
+        linear, reduced, pick(values) * rate, (scale[:, None] * x)[:, order], pick(mirrored), pick(energies),
         pick(roots.double), pick(zero), pick(growing), pick(roots.defective),
     )  # fmt: skip
 
 
-def _of_first_order(found) -> Motions:
+def _of_first_order(linear) -> Motions:
     """Systems with forces, dissipation or velocity constraints: all roots."""
-    p = found.parts
+    p = linear.parts
     eye = jnp.eye(p.mass.shape[0], dtype=p.mass.dtype)
-    mass = jnp.where(found.sound, p.mass, eye)
-    velocity, position, drift = (jnp.where(found.sound, x, 0.0) for x in (p.velocity, p.position, p.drift))
-    transfer = jnp.where(found.sound, p.transfer, 0.0)
+    mass = jnp.where(linear.sound, p.mass, eye)
+    velocity, position, drift = (jnp.where(linear.sound, x, 0.0) for x in (p.velocity, p.position, p.drift))
+    transfer = jnp.where(linear.sound, p.transfer, 0.0)
     count = drift.shape[0]
     of_w, of_q = _units(mass), _units(p.positions.T @ p.raw.mass @ p.positions)
     M, C = (of_w[:, None] * m * of_w[None, :] for m in (mass, velocity))
@@ -164,7 +164,7 @@ def _of_first_order(found) -> Motions:
     # Velocity directions that change no position η and cause no force are other speeds of a steady motion.
     columns = lapack.singular_values(jnp.concatenate([transfer, C]))
     speeds = jnp.sum(columns <= 1e-12 * jnp.max(columns, initial=0.0))
-    unexplained = jnp.where(all(found.kind.holonomic), jnp.maximum(jnp.sum(zero) - speeds, 0), 0)
+    unexplained = jnp.where(all(linear.kind.holonomic), jnp.maximum(jnp.sum(zero) - speeds, 0), 0)
     rho, w = of_q[:, None] * roots.vectors[:count], of_w[:, None] * roots.vectors[count:] * rate
     moving = p.velocities @ w + p.turning @ rho
     still = p.positions @ rho
@@ -172,7 +172,7 @@ def _of_first_order(found) -> Motions:
     size = lambda y: jnp.max(jnp.abs(y), axis=0, initial=0.0)
     # The shape of a zero mode is its velocities if it only changes speeds, and its positions if it is a shift.
     only_speed = size(roots.vectors[:count]) <= 1e-6 * size(roots.vectors)
-    unseen = np.array(found.kind.unseen, bool)[:, None]
+    unseen = np.array(linear.kind.unseen, bool)[:, None]
     drifting = jnp.where(only_speed[None, :], moving, still)
     full = jnp.where(zero[None, :], drifting, jnp.where(unseen, moving / nonzero[None, :], still))
     grow = roots.round_off * rate
@@ -242,11 +242,11 @@ def _rank(keys):
     return jnp.sum(before, axis=0)
 
 
-def _with_shifts(found, reduced, values, x, mirrored, energies, double, zero, growing, defective=None) -> Motions:
+def _with_shifts(linear, reduced, values, x, mirrored, energies, double, zero, growing, defective=None) -> Motions:
     """The motions of the reduced equations, preceded by the shifts of coordinates that nothing depends on."""
-    c, names = len(found.shifts), np.array(found.kind.unseen, bool)
+    c, names = len(linear.shifts), np.array(linear.kind.unseen, bool)
     n = names.size
-    full = found.parts.positions.astype(x.dtype) @ x
+    full = linear.parts.positions.astype(x.dtype) @ x
     if c:
         nonzero = jnp.where(zero, 1.0, values)
         rest = reduced.with_rate.astype(x.dtype) @ x + (reduced.follow.astype(x.dtype) @ x) / nonzero[None, :]
@@ -286,6 +286,6 @@ def _normalised(shapes):
     return shapes / jnp.where(at != 0, at, 1.0)
 
 
-def _judged(found, motions: Motions) -> Motions:
-    steady = found.sound & (found.residual <= STEADY_BELOW)
+def _judged(linear, motions: Motions) -> Motions:
+    steady = linear.sound & (linear.residual <= STEADY_BELOW)
     return motions._replace(code=jnp.where(steady, motions.code, UNSTEADY).astype(jnp.int32))

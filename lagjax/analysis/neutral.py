@@ -13,7 +13,7 @@ ZERO_BELOW = 1e-9
 NEWTON_STEPS, STEADY_AFTER = 8, 1e-9
 
 
-def with_neutral(found, shapes, zero):
+def with_neutral(linearisation, shapes, zero):
     """The shapes (k, N), with those of zero roots replaced by a reduced basis; and a description of each zero root.
 
     There may be fewer neutral directions than zero roots; the remaining roots are motions along them that grow with
@@ -22,7 +22,7 @@ def with_neutral(found, shapes, zero):
     words = [""] * len(zero)
     if not np.any(zero):
         return shapes, words
-    p, kind = found.parts, found.kind
+    p, kind = linearisation.parts, linearisation.kind
     drift, transfer, position, velocity = (np.asarray(x) for x in (p.drift, p.transfer, p.position, p.velocity))
     A = np.block([[drift, transfer], [-position, -velocity]])
     # Rows have different units, so each is scaled by its largest entry.
@@ -38,7 +38,7 @@ def with_neutral(found, shapes, zero):
         shifts = np.max(np.abs(row[:n])) > 1e-6
         row = row[:n] if shifts else row[n:]
         shapes[i] = row / row[np.argmax(np.abs(row))]
-        moved = _listed(found.names, shapes[i])
+        moved = _listed(linearisation.names, shapes[i])
         if not shifts:
             words[i] = f"other speeds in {moved}"
         elif all(kind.holonomic):
@@ -50,14 +50,14 @@ def with_neutral(found, shapes, zero):
     return shapes, words
 
 
-def leads_to_others(found, shapes, linearised_at) -> bool:
+def leads_to_others(linearisation, shapes, linearised_at) -> bool:
     """Whether other equilibria lie along each of the zero `shapes` (k, N): a symmetry, not a critical point.
 
     From points displaced along each shape, Newton's method looks for an equilibrium in the directions across all
     shapes. `linearised_at(x)`: the `Linearisation` at other positions.
     """
-    start = np.concatenate([np.ravel(x) for x in jax.tree.leaves(found.state.q)])
-    P = np.asarray(found.parts.positions)
+    start = np.concatenate([np.ravel(x) for x in jax.tree.leaves(linearisation.state.q)])
+    P = np.asarray(linearisation.parts.positions)
     along = np.linalg.qr(np.linalg.pinv(P) @ np.real(shapes).T)[0]
     across = null_space(along.T)
     size = np.max(np.abs(start)) or 1.0

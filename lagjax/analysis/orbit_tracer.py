@@ -72,20 +72,20 @@ class OrbitTracer(Tracer):
         return self.cached[1]
 
     def at(self, z):
-        found = self.evaluated(z)
-        if np.isfinite(found.amplified):
-            self.amplified = float(found.amplified)
-        return found.value, found.jacobian, float(found.largest)
+        evaluation = self.evaluated(z)
+        if np.isfinite(evaluation.amplified):
+            self.amplified = float(evaluation.amplified)
+        return evaluation.value, evaluation.jacobian, float(evaluation.largest)
 
     def moved_to(self, point):
         self.guide = self.evaluated(point.z).guide
 
     def described(self, z, jacobian, tangent) -> Point | str:
-        found = self.evaluated(z)
-        if float(found.apart) > max(SAME, 1e3 * self.eps):
+        evaluation = self.evaluated(z)
+        if float(evaluation.apart) > max(SAME, 1e3 * self.eps):
             return "the system is not the same after any period near the last one: its drive has no common period"
-        multipliers, left = self._multipliers(found)
-        plus, minus = (self._product(found, shift) for shift in (-1.0, 1.0))
+        multipliers, left = self._multipliers(evaluation)
+        plus, minus = (self._product(evaluation, shift) for shift in (-1.0, 1.0))
         times, states = path_at(self.frame, z.astype(self.dtype))
         low, high = extent(np.asarray(times), np.asarray(states))
         size = np.abs(left)
@@ -100,10 +100,10 @@ class OrbitTracer(Tracer):
         )  # fmt: skip
         return Point(z, jacobian, tangent, float(np.sign(seen.plus)), seen, growing, below)
 
-    def _multipliers(self, found: Evaluated) -> tuple[np.ndarray, np.ndarray]:
+    def _multipliers(self, evaluation: Evaluated) -> tuple[np.ndarray, np.ndarray]:
         """All multipliers, the trivial ones first as exactly 1; and the nontrivial ones alone, by falling size."""
-        count = int(np.sum(found.there))
-        reduced = self._without(found, found.whole)
+        count = int(np.sum(evaluation.there))
+        reduced = self._without(evaluation, evaluation.whole)
         left = np.linalg.eigvals(reduced)
         left = left[np.argsort(np.abs(left - 1), kind="stable")][count:]
         left = left[
@@ -111,12 +111,12 @@ class OrbitTracer(Tracer):
         ]
         return np.concatenate([np.ones(count, complex), left.astype(complex)]), left.astype(complex)
 
-    def _without(self, found, matrix):
-        rest = np.eye(len(matrix)) - found.trivial.T @ found.trivial
-        return rest @ matrix @ rest + found.trivial.T @ found.trivial
+    def _without(self, evaluation, matrix):
+        rest = np.eye(len(matrix)) - evaluation.trivial.T @ evaluation.trivial
+        return rest @ matrix @ rest + evaluation.trivial.T @ evaluation.trivial
 
-    def _product(self, found, shift):
-        return float(np.linalg.det(self._without(found, found.whole + shift * np.eye(len(found.whole)))))
+    def _product(self, evaluation, shift):
+        return float(np.linalg.det(self._without(evaluation, evaluation.whole + shift * np.eye(len(evaluation.whole)))))
 
     def _pairs(self, left):
         """A function that changes its sign where a pair leaves the unit circle.

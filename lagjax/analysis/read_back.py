@@ -132,11 +132,11 @@ def _symbols(s) -> tuple[list[Formula], list[str]]:
     short = [name.split(".")[-1] for name in known]
     # Parameters with the same last name, such as the masses of two bodies, get the body as an index.
     letters = [x if short.count(x) == 1 else "_".join(reversed(name.split("."))) for x, name in zip(short, known)]
-    found = [("t", "t", 1)]
-    found += [(f"q:{name}", position(name), 2) for name in names]
-    found += [(f"v:{name}", rf"\dot{{{position(name)}}}", 3) for name in names]
-    found += [(f"p:{name}", typeset.written(letter), 0) for name, letter in zip(known, letters)]
-    return [symbol(*one) for one in found], [name for name, *_ in found]
+    entries = [("t", "t", 1)]
+    entries += [(f"q:{name}", position(name), 2) for name in names]
+    entries += [(f"v:{name}", rf"\dot{{{position(name)}}}", 3) for name in names]
+    entries += [(f"p:{name}", typeset.written(letter), 0) for name, letter in zip(known, letters)]
+    return [symbol(*one) for one in entries], [name for name, *_ in entries]
 
 
 def _formulas(program, alone, s) -> tuple[list[Formula], list[str]]:
@@ -162,10 +162,10 @@ def _known(x) -> np.ndarray:
 
 
 def _filled(entries, shape) -> np.ndarray:
-    found = np.empty(len(entries), object)
+    array = np.empty(len(entries), object)
     for i, entry in enumerate(entries):
-        found[i] = entry
-    return found.reshape(shape)
+        array[i] = entry
+    return array.reshape(shape)
 
 
 def _applied(equation, operands) -> list[np.ndarray]:
@@ -242,10 +242,10 @@ def _verified(program, formulas, names, alone, s) -> float:
         exact = np.asarray([float(x) for x in run(*given, *inputs)])
         by_name = dict(zip(names, at))
         with np.errstate(all="ignore"):
-            found = np.asarray([formula.value(by_name) for formula in formulas])
+            values = np.asarray([formula.value(by_name) for formula in formulas])
         if np.all(np.isfinite(exact)):
             seen += 1
-            worst = max(worst, float(np.max(np.abs(found - exact) / (1e-3 * np.max(np.abs(exact)) + np.abs(exact)))))
+            worst = max(worst, float(np.max(np.abs(values - exact) / (1e-3 * np.max(np.abs(exact)) + np.abs(exact)))))
         if seen == STATES:
             break
     if seen < STATES or not worst <= (AGREE if flat.dtype == np.float64 else 1e-3):

@@ -57,12 +57,13 @@ def steadiness_of(kind: Kind, s: State, parts: Parts) -> Steadiness:
     return Steadiness(relative, jnp.max(relative, initial=0.0))
 
 
-def check_steady(system, found, steadiness: Steadiness, linearised: Callable) -> None:
+def check_steady(system, linearisation, steadiness: Steadiness, linearised: Callable) -> None:
     """Raise if a state is not in steady motion, or its linear equations are singular or change with time.
 
-    `found`: a `Linearisation`; `linearised(t, q, v, params)`: the `Linearisation` at another state.
+    `linearisation`: the `Linearisation` at the state; `linearised(t, q, v, params)`: the `Linearisation` at another
+    state.
     """
-    kind, s, parts = found.kind, found.state, found.parts
+    kind, s, parts = linearisation.kind, linearisation.state, linearisation.parts
     relative, a = np.asarray(steadiness.relative), np.asarray(parts.a)
     dtype, n = relative.dtype, len(kind.unseen)
     if not parts.sound:
@@ -94,7 +95,7 @@ def check_steady(system, found, steadiness: Steadiness, linearised: Callable) ->
                 else "Fix: found = lj.equilibria(system, params, starts=q) gives the equilibrium nearby."
             )
         )
-    _check_time(system, found, linearised)
+    _check_time(system, linearisation, linearised)
 
 
 def _singular(kind, parts, s):
@@ -108,9 +109,9 @@ def _singular(kind, parts, s):
     )
 
 
-def _check_time(system, found, linearised):
+def _check_time(system, linearisation, linearised):
     """Raise if the matrices differ further along the motion."""
-    kind, s, parts = found.kind, found.state, found.parts
+    kind, s, parts = linearisation.kind, linearisation.state, linearisation.parts
     u = np.concatenate([np.ravel(x) for x in jax.tree.leaves(s.v)])
     if kind.timeless and not np.any(u[~np.array(kind.unseen)]):
         return

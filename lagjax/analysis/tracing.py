@@ -194,16 +194,16 @@ class Tracer(abc.ABC):
             row = self.weights * point.tangent
             z = self.corrected(point.z + step * point.tangent, row)
             contraction = self.contraction
-            found = self.point(z, point.tangent) if z is not None else None
-            if isinstance(found, Point):
-                turn = np.arccos(np.clip((self.weights * found.tangent) @ point.tangent, -1, 1))
-                moved = np.sqrt(self.weights @ (found.z - point.z) ** 2)
+            candidate = self.point(z, point.tangent) if z is not None else None
+            if isinstance(candidate, Point):
+                turn = np.arccos(np.clip((self.weights * candidate.tangent) @ point.tangent, -1, 1))
+                moved = np.sqrt(self.weights @ (candidate.z - point.z) ** 2)
                 if turn < MOST_TURN and moved < 1.2 * step and contraction < MOST_CONTRACTION:
                     grow = min(TURN / max(turn, 1e-3), CONTRACTION / max(contraction, 1e-3))
-                    return found, step * float(np.clip(grow, 0.5, 2.0)), ""
+                    return candidate, step * float(np.clip(grow, 0.5, 2.0)), ""
                 why = "the branch turns more sharply than steps can follow: a corner of L, or a cusp"
-            elif isinstance(found, str):
-                why = found
+            elif isinstance(candidate, str):
+                why = candidate
             step /= 3
         return None, step, why
 
@@ -212,8 +212,8 @@ class Tracer(abc.ABC):
         row = self.weights * a.tangent
         guess = a.z + share * (b.z - a.z)
         z = self.corrected(guess, row)
-        found = self.point(z, a.tangent) if z is not None else None
-        return found if isinstance(found, Point) else None
+        candidate = self.point(z, a.tangent) if z is not None else None
+        return candidate if isinstance(candidate, Point) else None
 
     def zero_between(self, a: Point, b: Point, of: Callable[[Point], float]) -> tuple[Point, float] | None:
         """The point between two others where a function of points changes sign, and the error of its parameter."""
@@ -254,8 +254,8 @@ class Tracer(abc.ABC):
         row = np.zeros_like(a.z)
         row[-1] = 1.0
         z = self.corrected(a.z + share * (b.z - a.z), row, edge)
-        found = self.point(z, a.tangent) if z is not None else None
-        return found if isinstance(found, Point) else None
+        candidate = self.point(z, a.tangent) if z is not None else None
+        return candidate if isinstance(candidate, Point) else None
 
     def closes(self, path: Path, step: float) -> bool:
         """Whether a path has returned to its start."""

@@ -67,7 +67,7 @@ def reasons_of(system, t, q, v, params) -> Reasons:
 
 def directions(flow: Flow, reasons: Reasons, t, z, scale, basis) -> Float[Array, "r k"]:
     """The directions of `reasons.names`, in coordinates of the tangent space; zero if there is none."""
-    n, found = flow.size, []
+    n, rows = flow.size, []
     shifts = [jnp.eye(2 * n, dtype=z.dtype)[i] for i in np.flatnonzero(reasons.ignorable)]
 
     def momentum(z):
@@ -75,17 +75,17 @@ def directions(flow: Flow, reasons: Reasons, t, z, scale, basis) -> Float[Array,
         return coordinates.flatten(jax.grad(flow.system.lagrangian, argnums=2)(t, q, v, flow.params))[0]
 
     if reasons.autonomous:
-        found.append(flow.rate(t, z) / scale)
+        rows.append(flow.rate(t, z) / scale)
     if reasons.energy:
         integral = lambda z: momentum(z) @ z[n:] - flow.system.lagrangian(t, *flow.state(z), flow.params)
-        found.append(jax.grad(integral)(z) * scale)
-    found += shifts
+        rows.append(jax.grad(integral)(z) * scale)
+    rows += shifts
     if reasons.momenta and shifts:
         slopes = jax.jacfwd(momentum)(z) * scale[None]
-        found += [slopes[i] for i in np.flatnonzero(reasons.ignorable)]
-    if not found:
+        rows += [slopes[i] for i in np.flatnonzero(reasons.ignorable)]
+    if not rows:
         return jnp.zeros((0, basis.shape[1]), z.dtype)
-    return jnp.stack(found) @ basis
+    return jnp.stack(rows) @ basis
 
 
 def orthonormal(reasons: Reasons, rows: Float[Array, "r k"], rate) -> tuple[Float[Array, "r k"], Bool[Array, " r"]]:
@@ -94,11 +94,11 @@ def orthonormal(reasons: Reasons, rows: Float[Array, "r k"], rate) -> tuple[Floa
     `rate`: the typical rate of the motion, from its period; a state is at rest if its rate is negligible compared to
     it.
     """
-    found, kept = [], []
+    basis, kept = [], []
     for i, row in enumerate(rows):
         length = _length(row)
         rest = row / jnp.where(length > 0, length, 1.0)
-        for other in found:
+        for other in basis:
             rest = rest - (other @ rest) * other
         left = _length(rest)
         is_new = (length > 0) & (left > NO_DIRECTION)
@@ -107,11 +107,11 @@ def orthonormal(reasons: Reasons, rows: Float[Array, "r k"], rate) -> tuple[Floa
         if reasons.energy and i == 1:
             # At rest the energy has no slope either.
             is_new = is_new & kept[0]
-        found.append(jnp.where(is_new, rest / jnp.where(is_new, left, 1.0), 0.0))
+        basis.append(jnp.where(is_new, rest / jnp.where(is_new, left, 1.0), 0.0))
         kept.append(is_new)
-    if not found:
+    if not basis:
         return rows, jnp.zeros(0, bool)
-    return jnp.stack(found), jnp.stack(kept)
+    return jnp.stack(basis), jnp.stack(kept)
 
 
 def _length(row):

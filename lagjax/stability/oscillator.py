@@ -67,19 +67,19 @@ class StableStep:
         low, high = 0.05, 40.0
         limit = stable_limit(self.method)
         if self._stable(1e6):
-            found, effort = np.inf, "any h"
+            measured, effort = np.inf, "any h"
         else:
             for _ in range(HALVINGS):
                 middle = 0.5 * (low + high)
                 low, high = (middle, high) if self._stable(middle) else (low, middle)
-            found, effort = low, f"h = {low:.4f}/omega"
-        same = np.isinf(limit) and np.isinf(found)
+            measured, effort = low, f"h = {low:.4f}/omega"
+        same = np.isinf(limit) and np.isinf(measured)
         return Outcome(
             family=self.family,
             name=f"oscillator of omega = {OMEGA:g}, against |R(ihω)| = 1",
             method=type(self.method).__name__,
             effort=effort,
-            error=0.0 if same else abs(found / limit - 1),
+            error=0.0 if same else abs(measured / limit - 1),
             allowed=1e-3,
             expected=self.expected,
         )
