@@ -127,10 +127,10 @@ def parts_of(kind: Kind, system, t, q, v, params) -> Parts:
     stacked = _spread(rows, live, lift, chosen, -_least_squares(pushing[:, chosen], forcing))
 
     if m:
-        held = lambda x, u: jax.grad(
+        constraint_force = lambda x, u: jax.grad(
             lambda u: stacked @ constraints.velocity_residual(system, t, x, u, params, unflatten)
         )(u)
-        by_position, by_velocity = jax.jacfwd(held, argnums=(0, 1))(x, u)
+        by_position, by_velocity = jax.jacfwd(constraint_force, argnums=(0, 1))(x, u)
         velocity, position = velocity - by_velocity.astype(x.dtype), position - by_position.astype(x.dtype)
     if friction is not None:
 
@@ -178,9 +178,9 @@ def parts_of(kind: Kind, system, t, q, v, params) -> Parts:
     a = onto + velocities @ lapack.solve(safe, (left.T @ (forcing - mass @ onto))[:, None])[:, 0]
     off = [constraints.position_residual(system, t, x, params, unflatten)] if holonomic.any() else []
     off += [constraints.velocity_residual(*problem)] if m else []
-    held = pushing @ stacked if m else jnp.zeros_like(x)
+    constraint_force = pushing @ stacked if m else jnp.zeros_like(x)
     diagonal = jnp.abs(jnp.diag(mass))
-    forces = (jnp.abs(forcing) + jnp.abs(held)) / jnp.where(diagonal > 0, diagonal, 1.0)
+    forces = (jnp.abs(forcing) + jnp.abs(constraint_force)) / jnp.where(diagonal > 0, diagonal, 1.0)
     return Parts(
         *parts, positions, velocities, turning @ positions,
         constraints.split(system, stacked, t, q, v, params), a,

@@ -163,8 +163,7 @@ def _sorted(matrix, trivial):
     near = jnp.argsort(jnp.argsort(jnp.abs(lax.stop_gradient(eigenvalues) - 1)))
     first = near < trivial
     size = jnp.abs(lax.stop_gradient(eigenvalues))
-    # Rounded, because the sizes of a conjugate pair differ by round-off; the one with positive imaginary part comes
-    # first.
+    # Rounded because the sizes of a conjugate pair differ by round-off; the one in the upper half plane comes first.
     size = jnp.round(size / jnp.max(size), 9) + 1e-12 * jnp.sign(jnp.imag(lax.stop_gradient(eigenvalues)))
     order = jnp.argsort(jnp.where(first, -jnp.inf, -size))
     return eigenvalues[order], first[order]

@@ -62,7 +62,7 @@ class _Reduced(NamedTuple):
 def motions_of(linear: Linearisation, definite: bool = True) -> Motions:
     """The motions of a linearisation; `definite`: assume that the mass matrix is positive definite."""
     if not linear.kind.conservative:
-        return _judged(linear, _of_first_order(linear))
+        return _judged(linear, _general(linear))
     if definite and (linear.kind.at_rest or linear.parts.positions.shape[1] < 2):
         return _judged(linear, _at_rest(linear))
     return _judged(linear, _gyroscopic(linear))
@@ -142,7 +142,7 @@ def _gyroscopic(linear) -> Motions:
     )  # fmt: skip
 
 
-def _of_first_order(linear) -> Motions:
+def _general(linear) -> Motions:
     """Systems with forces, dissipation or velocity constraints: all roots."""
     p = linear.parts
     eye = jnp.eye(p.mass.shape[0], dtype=p.mass.dtype)

@@ -151,7 +151,7 @@ class OrbitBranch(eqx.Module):
             f"Branch of cycles along {self.along}, from {self.first:.6g} to {self.last:.6g}: {len(self)} of them, "
             f"with {points}"
         ]
-        lines += [f"  {c.kind:<16}{self.along} = {number(c.parameter):<14} {_of_multipliers(c)}" for c in self.critical]
+        lines += [f"  {c.kind:<16}{self.along} = {number(c.parameter):<14} {_torus_angle(c)}" for c in self.critical]
         low, high = np.min(self.period), np.max(self.period)
         lines.append(f"  {'periods':<16}{low:.6g}" + (f" to {high:.6g}" if high - low > 1e-9 * high else ""))
         lines.append(f"  {'stability':<16}{stability_in_words(self._verdicts())}")
@@ -159,7 +159,7 @@ class OrbitBranch(eqx.Module):
         return "\n".join(lines)
 
 
-def _of_multipliers(c: CriticalOrbit):
+def _torus_angle(c: CriticalOrbit):
     """For a torus, the angle of its pair of multipliers; otherwise nothing."""
     if c.kind != "torus":
         return ""

@@ -95,25 +95,25 @@ class _StateRates(NamedTuple):
 def rates(system, affine: Affine, generators: tuple[Generator, ...], s, places) -> Rates:
     """The rates of change of all charges at states around the given one."""
     states, scales = around(system, s, places)
-    of = _rates(system, affine, generators, s, states, scales)
-    xp = coordinates.numpy_of(of)
-    of = _StateRates(*(xp.asarray(y) for y in of))
-    finite = xp.isfinite(of.energy) & xp.all(xp.isfinite(of.by_lagrangian + of.by_force), axis=1)
+    raw = _rates(system, affine, generators, s, states, scales)
+    xp = coordinates.numpy_of(raw)
+    raw = _StateRates(*(xp.asarray(y) for y in raw))
+    finite = xp.isfinite(raw.energy) & xp.all(xp.isfinite(raw.by_lagrangian + raw.by_force), axis=1)
     found = states.found & finite
     seen = lambda y: xp.where(found.reshape(-1, *[1] * (y.ndim - 1)), y, xp.zeros_like(y))
-    count = xp.maximum(xp.sum(found), 1).astype(of.energy.dtype)
-    size = xp.sqrt(xp.sum(seen(of.size) ** 2, axis=0) / count)
+    count = xp.maximum(xp.sum(found), 1).astype(raw.energy.dtype)
+    size = xp.sqrt(xp.sum(seen(raw.size) ** 2, axis=0) / count)
     size = xp.where(size > 0, size, xp.ones_like(size))
     # A state where nothing moves and no force acts has no scale of its own.
-    energy = seen(of.energy) + of.energy.dtype.type(1e-12) * xp.max(seen(of.energy))
+    energy = seen(raw.energy) + raw.energy.dtype.type(1e-12) * xp.max(seen(raw.energy))
     energy = xp.where(found & (energy > 0), energy, xp.ones_like(energy))
     relative = lambda y: seen(y) / (energy[:, None] * size[None])
-    slope = xp.where(of.slope > 0, of.slope, xp.ones_like(of.slope))[:, :, None] * size[None, None]
+    slope = xp.where(raw.slope > 0, raw.slope, xp.ones_like(raw.slope))[:, :, None] * size[None, None]
     return Rates(
         states._replace(found=found),
-        relative(of.by_lagrangian + of.by_force), relative(of.by_lagrangian), relative(of.by_force),
-        seen(of.forbidden) / slope, seen(of.changed) * scales.t / slope, seen(of.value) / energy,
-        size, energy, seen(of.xi), seen(of.tau), of.charges, (of.by_lagrangian + of.by_force)[0], of.forbidden[0],
+        relative(raw.by_lagrangian + raw.by_force), relative(raw.by_lagrangian), relative(raw.by_force),
+        seen(raw.forbidden) / slope, seen(raw.changed) * scales.t / slope, seen(raw.value) / energy,
+        size, energy, seen(raw.xi), seen(raw.tau), raw.charges, (raw.by_lagrangian + raw.by_force)[0], raw.forbidden[0],
     )  # fmt: skip
 
 
@@ -142,13 +142,13 @@ def _rates(system, affine, generators, s, states, scales) -> _StateRates:
         force = applied_force(system, t, q, v, s.params, multipliers)
         energy = jnp.abs(p) @ jnp.abs(u) + (jnp.abs(slope) + jnp.abs(force)) @ scales.x
         size = jnp.sqrt(moved.xi**2 @ (1 / scales.x**2)) + jnp.abs(moved.tau) / scales.t
-        rows = _of_constraints(system, s.params, unflatten, scales, (t, x, u), moved, turned, displaced)
+        rows = _constraint_rates(system, s.params, unflatten, scales, (t, x, u), moved, turned, displaced)
         return _StateRates(of_L, displaced @ force, *rows, size, energy, moved.xi, moved.tau, value, charges)
 
     return jax.vmap(at)(*states[:3])
 
 
-def _of_constraints(system, params, unflatten, scales, state, moved, turned, displaced):
+def _constraint_rates(system, params, unflatten, scales, state, moved, turned, displaced):
     """A (ξ - τ v) (m, K), the size of each row of A (m,), and the change of each velocity constraint (m, K)."""
     t, x, u = state
     if not system.constraints:

@@ -90,17 +90,17 @@ def latex(system, q, v, params=None, *, t=0.0) -> EquationsOfMotion:
     if n > COORDINATES:
         raise ValueError(f"the system has {n} coordinates, but equations are written only for up to {COORDINATES}.")
     _, unflatten = coordinates.flatten(s.q)
-    alone = in_numbers(system, unflatten)
-    args = alone, s.t, coordinates.numbers(s.q), coordinates.numbers(s.v), s.params
+    scalarised = in_numbers(system, unflatten)
+    args = scalarised, s.t, coordinates.numbers(s.q), coordinates.numbers(s.v), s.params
     try:
         program = Numbers(_parts, args, most=OPERATIONS).program
-        formulas, names = _formulas(program, alone, s)
+        formulas, names = _formulas(program, scalarised, s)
     except (scalars.TooLong, expressions.TooLong):
         raise ValueError(
             "the equations are too long to be read.\n"
             "Usual cause: an L with sums over many parts, or a quadrature.\nFix: print a system with fewer parts."
         ) from None
-    error = _verified(program, formulas, names, alone, s)
+    error = _verified(program, formulas, names, scalarised, s)
     return EquationsOfMotion(tuple(_lines(system, s, formulas)), error, STATES)
 
 
@@ -139,11 +139,11 @@ def _symbols(s) -> tuple[list[Formula], list[str]]:
     return [symbol(*one) for one in entries], [name for name, *_ in entries]
 
 
-def _formulas(program, alone, s) -> tuple[list[Formula], list[str]]:
+def _formulas(program, scalarised, s) -> tuple[list[Formula], list[str]]:
     jaxpr = program.jaxpr
     symbols, names = _symbols(s)
     values = dict(zip(jaxpr.constvars, map(_known, program.consts)))
-    inputs, given = iter(symbols), jtu.tree_leaves(eqx.filter(alone, eqx.is_array))
+    inputs, given = iter(symbols), jtu.tree_leaves(eqx.filter(scalarised, eqx.is_array))
     for i, variable in enumerate(jaxpr.invars):
         size, shape = int(np.prod(variable.aval.shape)), variable.aval.shape
         # Arrays inside the functions come first and have no names.
@@ -222,9 +222,9 @@ def _apply_scalar(name, params, *x: Formula) -> Formula:
     )
 
 
-def _verified(program, formulas, names, alone, s) -> float:
+def _verified(program, formulas, names, scalarised, s) -> float:
     """The largest relative difference of formulas and program at random states; raises if they do not agree."""
-    given = jtu.tree_leaves(eqx.filter(alone, eqx.is_array))
+    given = jtu.tree_leaves(eqx.filter(scalarised, eqx.is_array))
     leaves = [np.asarray(x) for x in jtu.tree_leaves(eqx.filter((s.t, *s[1:]), eqx.is_array))]
     flat = np.concatenate([np.ravel(x) for x in leaves])
     run = jax.jit(lambda *inputs: eval_jaxpr(program.jaxpr, program.consts, *inputs))

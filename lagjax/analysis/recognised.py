@@ -122,10 +122,10 @@ def _recognised(value: float, params, agrees, parameters_first) -> Number | None
 
 
 def _agreeing(value, number: Number, params, agrees):
-    of = _value(number, params) if all(params[p] for p, _ in number.params) else 0.0
-    if not of or abs(abs(value) - abs(of)) > agrees * abs(value):
+    recognised = _value(number, params) if all(params[p] for p, _ in number.params) else 0.0
+    if not recognised or abs(abs(value) - abs(recognised)) > agrees * abs(value):
         return None
-    return number._replace(fraction=number.fraction * int(np.sign(value * of)))
+    return number._replace(fraction=number.fraction * int(np.sign(value * recognised)))
 
 
 def _only(found: Number, alike):

@@ -127,10 +127,10 @@ def _check_time(system, linearisation, linearised):
             continue
         what, i, j, before, after = changed
         names, equations = coordinates.names(s.q), equation_names(system, s)
-        of = f"'{equations[i]}' by '{names[j]}'" if what.startswith("constraint") else f"'{names[i]}', '{names[j]}'"
+        entry = f"'{equations[i]}' by '{names[j]}'" if what.startswith("constraint") else f"'{names[i]}', '{names[j]}'"
         raise ValueError(
-            f"the linear equations change along the motion: {what} of {of} is {before:.6g}, and {time:.3g} later it is "
-            f"{after:.6g}. This is {where(s)}.\n"
+            f"the linear equations change along the motion: {what} of {entry} is {before:.6g}, and {time:.3g} later it "
+            f"is {after:.6g}. This is {where(s)}.\n"
             "Usual cause: explicit time, or velocities in coordinates that L contains.\n"
             "Fix: coordinates that move along, in which the equations are the same at all times; for a periodic motion "
             "lj.floquet(...) gives the multipliers."
