@@ -126,7 +126,7 @@ def test_another_system_is_told(tmp_path):
         (lj.System(falling, {"rod": lj.Holonomic(lambda t, q, params: q["x"])}), "the constraint 'rod': its value was"),
         (lj.System(lambda *state: falling(*state) + 0.1 * state[1]["x"], rod.constraints), "Lagrangian: its value was"),
         (lj.System(falling, rod.constraints, force=pull), "the force is there, and was not"),
-        (lj.System(lambda t, q, v, params: params["mass"]), "cannot be asked at a state of that motion"),
+        (lj.System(lambda t, q, v, params: params["mass"]), "cannot be evaluated at a state of that motion"),
     ):
         with pytest.raises(ValueError, match=words):
             lj.load_trajectory(path, other)
@@ -242,7 +242,7 @@ def test_files_that_are_not_whole(tmp_path):
     for header, words in (
         ({"format": files.FORMAT + 1, "versions": {"lagjax": "9.0"}}, "written by lagjax 9.0, .*\nFix: pip install -U"),
         ({"format": files.FORMAT, "kind": "fit"}, r"holds a fit, not a trajectory.\nFix: lj.load_fit\(path\)"),
-        ({"format": files.FORMAT, "kind": "trajectory", "trajectory": {}}, "is damaged: what it says of itself"),
+        ({"format": files.FORMAT, "kind": "trajectory", "trajectory": {}}, "is damaged: its description is incomplete"),
     ):
         with zipfile.ZipFile(path, "w") as entries:
             entries.writestr(files.HEADER, json.dumps(header))
