@@ -161,7 +161,7 @@ class Trajectory(eqx.Module):
         return _worst_residual(self.system, self.t, self.q, self.v, self.params)
 
     def at(self, t: ArrayLike) -> Snapshot:
-        """Return the motion at any time, at the order of its method: continued from the last output before by its own steps.
+        """Return the motion at any time, at the order of its method: continued from the output before by its own steps.
 
         >>> import lagjax as lj
         >>> fall = lj.System(lambda t, q, v, params: 0.5 * v**2 - params["g"] * q)

@@ -309,8 +309,8 @@ class Watching(diffrax.AbstractStepSizeController):
         return Move(takes, jnp.where(found, until, at), later, tuple(followed), tuple(crossing), no, no)
 
     def _nearer(self, segment: Segment, part: Part):
-        """Whether the root is found, whether another one is `sooner`, whether the part is taken; the root to seek next, and
-        where."""
+        """Whether the root is found, whether another one is `sooner`, whether the part is taken; the root to seek next,
+        and where."""
         root, t = part.root, segment.right.t
         g, rate = (_chosen(root.guard, [getattr(v, name) for v in segment.right.values]) for name in ("g", "rate"))
         crossed = g * root.after >= 0

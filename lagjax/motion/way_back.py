@@ -101,7 +101,7 @@ class Sweep(NamedTuple):
 
 
 def swept_back(leaves, found: Recorded, asked, *, motion: Motion, moved, lanes: Lanes | None):
-    """The cotangents of the arrays with indices `moved`, from those of the outputs, of the last time and the last state.
+    """The cotangents of the arrays with indices `moved`, from those of the outputs, the last time and the last state.
 
     The first of several outputs at one time has the cotangents of all of them: see `together`.
     """
@@ -185,7 +185,7 @@ class _Way:
         return of if self.lanes is None else self.lanes.each(of, more)
 
     def safe(self, tree):
-        """Values per lane; a lane without steps gets those of the longest lane: its own may be NaN, and NaN times zero is NaN."""
+        """Values per lane; a lane without steps gets the longest lane's: its own may be NaN, and NaN times zero is NaN."""
         if self.lanes is None:
             return tree
         idle, longest = self.record.count == 0, jnp.argmax(self.record.count)
@@ -218,7 +218,7 @@ class _Way:
 
         _, pull, valid = jax.vjp(partial(end, OnManifold.again), *start, has_aux=True)
         if self.motion.robust:
-            # Choose between two pulls, not two ends: the derivative of an invalid end is NaN, and so is zero times that.
+            # Choose between pulls, not between ends: the derivative of an invalid end is NaN, and so is zero times that.
             robustly = lambda ct: jax.vjp(partial(end, OnManifold.again_robustly), *start)[1](ct)
             pull = partial(lax.cond, eqxi.unvmap_all(valid), pull, robustly)
         of_arrays, *of_start = pull(ct)

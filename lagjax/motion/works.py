@@ -36,8 +36,8 @@ APART = 2e3
 class Work(NamedTuple):
     """The work that one source does on a motion, at every output.
 
-    `power`, like v: by coordinate, `[L]/[t]`; `work`, like v: its integral from the first output on, `[L]`. For explicit
-    time, which belongs to no coordinate, they are (T,). `total` (T,): the work summed over the coordinates.
+    `power`, like v: by coordinate, `[L]/[t]`; `work`, like v: its integral from the first output on, `[L]`. Those of
+    explicit time, which belongs to no coordinate, are (T,). `total` (T,): the work summed over the coordinates.
     """
 
     power: PyTree[Float[Array, "T ..."]]
@@ -187,7 +187,7 @@ class Motion:
         return self._powers(phase, t, **rows)
 
     def _with_others(self, t):
-        """These times in order, the first and last instant, and so many others that one compiled program serves all calls."""
+        """These times in order, the first and last instant, and others up to a length for which a program is compiled."""
         self.room = max(self.room, 2 ** (len(t) + 1).bit_length())
         others = np.linspace(self.t[0], self.t[-1], self.room - len(t), dtype=self.t.dtype)
         return self.forward * np.unique(self.forward * np.concatenate([t, others]))
