@@ -185,7 +185,7 @@ class _Way:
         return of if self.lanes is None else self.lanes.each(of, more)
 
     def safe(self, tree):
-        """Values per lane; a lane without steps gets the longest lane's: its own may be NaN, and NaN times zero is NaN."""
+        """Values per lane; lanes without steps get the longest lane's, since their own may be NaN, as is zero times it."""
         if self.lanes is None:
             return tree
         idle, longest = self.record.count == 0, jnp.argmax(self.record.count)
@@ -218,7 +218,7 @@ class _Way:
 
         _, pull, valid = jax.vjp(partial(end, OnManifold.again), *start, has_aux=True)
         if self.motion.robust:
-            # Choose between pulls, not between ends: the derivative of an invalid end is NaN, and so is zero times that.
+            # Choose between pulls, not between ends: the derivative of an invalid end is NaN, and zero times it too.
             robustly = lambda ct: jax.vjp(partial(end, OnManifold.again_robustly), *start)[1](ct)
             pull = partial(lax.cond, eqxi.unvmap_all(valid), pull, robustly)
         of_arrays, *of_start = pull(ct)

@@ -187,7 +187,7 @@ class Motion:
         return self._powers(phase, t, **rows)
 
     def _with_others(self, t):
-        """These times in order, the first and last instant, and others up to a length for which a program is compiled."""
+        """These times in order, the first and last instant, and others: up to a length that one program serves."""
         self.room = max(self.room, 2 ** (len(t) + 1).bit_length())
         others = np.linspace(self.t[0], self.t[-1], self.room - len(t), dtype=self.t.dtype)
         return self.forward * np.unique(self.forward * np.concatenate([t, others]))
