@@ -185,7 +185,7 @@ class _Way:
         return of if self.lanes is None else self.lanes.each(of, more)
 
     def safe(self, tree):
-        """Values per lane; lanes without steps get the longest lane's, since their own may be NaN, as is zero times it."""
+        """Values per lane; lanes without steps get the longest lane's, since zero times their own may be NaN."""
         if self.lanes is None:
             return tree
         idle, longest = self.record.count == 0, jnp.argmax(self.record.count)
