@@ -172,7 +172,7 @@ def step_length(value: Any, name: str, dtype):
         fixed = ", or with fixed steps dt0=1e-3 for example" if name == "dt0" else ", or max_step=0.1 for example"
         raise ValueError(
             f"{name} must be one positive number, not {value!r}.\n"
-            "Usual cause: a negative step for times that decrease; it is a length in both directions.\n"
+            "Usual cause: a negative step where ts decreases; it is a length in both directions.\n"
             f"Fix: leave {name} out{fixed}."
         )
     return coordinates.numpy_of(value).asarray(value, dtype)
