@@ -89,7 +89,7 @@ def refuse_beside_switches(hybrid: Hybrid, start: State, ts, adjoint, event):
     check_phases(hybrid, start)
     if runs_backward(ts):
         raise ValueError(
-            "a motion in phases runs only forward: the energy that an impact loses is not known backward.\n"
+            "a motion in phases runs forward only: what an impact has lost cannot be restored backward in time.\n"
             "Fix: times that increase."
         )
     if isinstance(adjoint, diffrax.BacksolveAdjoint):
