@@ -35,8 +35,8 @@ def warn_of_odd_dissipation(dissipation, state: State) -> None:
         both = [dissipation(t, q, jax.tree.map(lambda x: sign * x, v), params) for sign in (1, -1)]
     if coordinates.is_traced(both):
         return
-    minus, plus = map(float, both)
-    if minus != 0 and abs(minus + plus) <= ROUND_OFFS * float(jnp.finfo(t.dtype).eps) * abs(minus):
+    plus, minus = map(float, both)
+    if plus != 0 and abs(plus + minus) <= ROUND_OFFS * float(jnp.finfo(t.dtype).eps) * abs(plus):
         name = getattr(dissipation, "__name__", "f")
         name = "f" if name == "<lambda>" else name
         warn(
