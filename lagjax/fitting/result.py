@@ -222,8 +222,8 @@ class Fit:
                 xp: Any = coordinates.numpy_of((x, s))
                 known = xp.isfinite(x) & xp.isfinite(s)
                 parts.append(known.reshape(known.shape[0], -1))
-        together: Any = coordinates.numpy_of(parts).concatenate(parts, axis=1)
-        return together.reshape(-1)
+        by_window: Any = coordinates.numpy_of(parts).concatenate(parts, axis=1)
+        return by_window.reshape(-1)
 
     def starts(self) -> list[tuple[PyTree, PyTree]]:
         """(q, v) at the start of each record."""

@@ -30,13 +30,13 @@ from lagjax.fitting.equations import (
     WHOLE,
     Problem,
     Stage,
+    assemble,
+    assemble_slopes,
     equations,
-    hold,
-    known_before,
-    of_window,
+    hold_weights,
     over_windows,
-    slopes_together,
-    together,
+    prior_and_hold,
+    window_part,
 )
 from lagjax.fitting.misfit import OF_NORMAL, Misfit, misfit
 from lagjax.fitting.predicted import check_predicted
@@ -130,7 +130,7 @@ def linearised(problem: Problem, u: Unknowns, stage: Stage, loss: str) -> Linear
     p = u.shared.size
 
     def at(w, s):
-        of = lambda both: of_window(problem, both[:p], both[p:], w, stage, diffrax.ForwardMode(), loss)
+        of = lambda both: window_part(problem, both[:p], both[p:], w, stage, diffrax.ForwardMode(), loss)
         both = jnp.concatenate([u.shared, s])
         # The values are the same along all directions, and computed once; the machine function repeats them.
         along = lambda d: jax.jvp(of, (both,), (d,), has_aux=True)
@@ -139,7 +139,7 @@ def linearised(problem: Problem, u: Unknowns, stage: Stage, loss: str) -> Linear
 
     (values, well), pushed = over_windows(at, problem, u)
     by_shared, by_local = (jax.tree.map(lambda x: x[..., part], pushed) for part in (slice(p), slice(p, None)))
-    return Linear(together(problem, u, values, stage), slopes_together(problem, by_shared, by_local, stage), well)
+    return Linear(assemble(problem, u, values, stage), assemble_slopes(problem, by_shared, by_local, stage), well)
 
 
 def evaluation_from(problem: Problem, u: Unknowns, linear: Linear, stage: Stage) -> Evaluation:
@@ -150,7 +150,7 @@ def evaluation_from(problem: Problem, u: Unknowns, linear: Linear, stage: Stage)
     triangular = eliminate(linear.slopes, linear.values, floor)
     # In units of the slopes: what the data do not see has a singular value of about FLOOR.
     size = filled(sizes).shared
-    size = jnp.where(size > BESIDE_HOLD * hold(problem, stage), size, jnp.inf)
+    size = jnp.where(size > BESIDE_HOLD * hold_weights(problem, stage), size, jnp.inf)
     left, singular, right = jnp.linalg.svd(triangular.shared / size[None])
     unseen = UNSEEN / np.sqrt(np.finfo(size.dtype).eps)
     seen = singular > 1 / unseen
@@ -357,7 +357,7 @@ def _search(problem, course, optimiser, limit, tell):
         _, rate = jax.jvp(problem.found.natural, (best.y.shared,), (jnp.ones_like(best.y.shared),))
         slopes = best.slopes.scaled(jnp.where(rate != 0, 1 / rate, 0.0))
         # What is known is not what the search held.
-        mean, weight = known_before(problem, WHOLE)
+        mean, weight = prior_and_hold(problem, WHOLE)
         values = best.values._replace(shared=weight * (u.shared - mean))
         linear = Linear(values, slopes._replace(shared=jnp.diag(weight)), best.well)
         evaluation = evaluation_from(problem, u, linear, jax.tree.map(lambda x: x[-1], course.stages))

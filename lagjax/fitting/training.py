@@ -25,10 +25,10 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from lagjax.fitting.equations import WHOLE, Problem, dampened, equations, known_before, of_window
+from lagjax.fitting.equations import WHOLE, Problem, dampened, equations, prior_and_hold, window_part
 from lagjax.fitting.misfit import OF_NORMAL, Misfit, misfit
 from lagjax.fitting.optimisers import Optimiser
-from lagjax.fitting.own_starts import DAMPING, Squares, inverse_of, settled, squares
+from lagjax.fitting.own_starts import DAMPING, Squares, fit_starts, inverse_of, squares
 from lagjax.fitting.predicted import check_predicted
 from lagjax.fitting.search import in_turn
 from lagjax.mechanics.compiled import compiled
@@ -121,7 +121,7 @@ def begun(task: Task) -> State:
         problem, own = task.problem, jnp.asarray(task.problem.start.local)
         y, (windows, k), zero = problem.found.free(problem.found.start), own.shape, jnp.zeros((), int)
         # From starts that are off, slopes are so large that optimisers that remember them, as Adam does, hardly move.
-        own, at = settled(problem, problem.found.natural(y), own, JUDGING)
+        own, at = fit_starts(problem, problem.found.natural(y), own, JUDGING)
         held, score = jnp.zeros((0, k), own.dtype), jnp.sum(at.sums) / jnp.maximum(jnp.sum(task.known), 1)
         if task.held is not None:
             held, score = _judged(task, y, jnp.asarray(task.held.start.local), ENDING)
@@ -172,7 +172,7 @@ def ended(task: Task, state: State) -> tuple[Ended, Ended | None]:
 
 
 def _ended(problem, x, own) -> Ended:
-    u = Unknowns(x, settled(problem, x, own, ENDING, AT_REST)[0])
+    u = Unknowns(x, fit_starts(problem, x, own, ENDING, AT_REST)[0])
     values = equations(problem, u, WHOLE)
     return Ended(u, 0.5 * sum(jnp.sum(r**2) for r in values), misfit(problem, values))
 
@@ -205,7 +205,7 @@ def _judged(task: Task, y, held, most):
     """The starts of what is held back, and its mean squared residual, at free numbers."""
     problem: Any = task.held
     fixed = with_params(problem, task.problem, task.problem.found.natural(y))
-    held, at = settled(fixed, y[:0], held, most)
+    held, at = fit_starts(fixed, y[:0], held, most)
     known = sum(jnp.sum(jnp.isfinite(a) & jnp.isfinite(b)) for a, b in zip(*map(jax.tree.leaves, problem.data)))
     return held, jnp.sum(at.sums) / jnp.maximum(known, 1)
 
@@ -223,7 +223,7 @@ def _step(task: Task, state: State):
     def cost(y, own):
         x = found.natural(y)
         sums, well = _sums(problem, x, own, chosen)
-        mean, weight = known_before(problem, WHOLE)
+        mean, weight = prior_and_hold(problem, WHOLE)
         before = jnp.sum((weight * (x - mean)) ** 2)
         return 0.5 * (count / task.batch * jnp.sum(sums) + before) / total, (jnp.sum(sums), well)
 
@@ -248,7 +248,7 @@ def _sums(problem, x, own, chosen):
     """The sum of squares of each chosen window, and which motions ended well. All lanes share the parameters."""
 
     def one(s, w):
-        found, well = of_window(problem, x, s, w, WHOLE, loss="squares")
+        found, well = window_part(problem, x, s, w, WHOLE, loss="squares")
         # Where a motion fails, what it misses is a constant cost.
         return jnp.where(well, found.rows, lax.stop_gradient(found.rows)), well
 

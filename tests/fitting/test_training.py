@@ -13,7 +13,7 @@ from scipy.optimize import least_squares
 import lagjax as lj
 from lagjax.fitting import trained
 from lagjax.fitting.optimisers import Optimiser, as_params, as_vector, is_of_optax
-from lagjax.fitting.own_starts import settled
+from lagjax.fitting.own_starts import fit_starts
 from lagjax.fitting.parameters import find
 from lagjax.fitting.problem import problem_of
 from lagjax.fitting.trained import parted_records
@@ -99,7 +99,7 @@ def test_starts_of_their_own():
     records = [record(i, known=False, amplitude=a) for i, a in enumerate((1.0, 0.5))]
     problem = problem_with(records)
     problem = jax.tree.map(lambda x: jnp.asarray(x) if isinstance(x, np.ndarray) else x, problem)
-    own, at = jax.jit(lambda x, own: settled(problem, x, own, 20, 1e-14))(
+    own, at = jax.jit(lambda x, own: fit_starts(problem, x, own, 20, 1e-14))(
         jnp.array([3.0]), jnp.asarray(problem.start.local)
     )
     w = np.sqrt(3.0)
