@@ -45,7 +45,7 @@ def _training_caveat(fit):
     return (
         f"in training {int(training.failed)} of {int(training.motions)} motions stopped early, and "
         f"{int(training.skipped)} of {int(training.steps)} steps had no finite gradient. "
-        "These did not change the parameters.\n"
+        "These changed nothing.\n"
         "Usual cause: steps that are too long, a nearly singular mass matrix, windows that are too long.\n"
         "Fix: a smaller learning rate, optax.clip_by_global_norm, a shorter window=; lj.learned.positive_definite."
     )

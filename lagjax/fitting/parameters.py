@@ -59,7 +59,7 @@ class Found:
             size = old.size if places is None else len(places)
             new = x[at : at + size].astype(old.dtype)
             if places is not None:
-                new = _replaced(old, np.array(places), new)
+                new = _replace_entries(old, np.array(places), new)
             leaves[number] = new.reshape(old.shape)
             at += size
         return jtu.tree_unflatten(structure, leaves)
@@ -83,7 +83,7 @@ class Found:
         return jnp.where(high & low, jax.scipy.special.logit(jnp.where(high & low, share, 0.5)), z)
 
 
-def _replaced(old, places, new):
+def _replace_entries(old, places, new):
     """All entries of `old` as a vector, some of them replaced."""
     if coordinates.is_traced((old, new)):
         return jnp.ravel(old).at[places].set(new)

@@ -101,7 +101,7 @@ def _overrides(records, windows, found):
             raise ValueError(f"a record sets '{name}', which is not in params: {listed(list(known))}.")
         if name in fitted:
             raise ValueError(
-                f"a record sets '{name}', which is also to be fitted.\nFix: leave it out of free=, or out of the record."
+                f"a record sets '{name}', which the fit is to find.\nFix: leave it out of free=, or out of the record."
             )
         given = [record.params.get(name, known[name]) for record in records]
         xp = coordinates.numpy_of(given)
@@ -187,7 +187,7 @@ def _broadcast(record, kind):
             xp = coordinates.numpy_of(s)
             given = xp.asarray(s, x.dtype)
             if xp is np and not np.all(given > 0):
-                raise ValueError("sigma must be positive.\nFix: to leave a value out, sigma=jnp.inf or NaN in its place.")
+                raise ValueError("sigma must be positive.\nFix: sigma=jnp.inf, or NaN in the data, leaves a value out.")
             if 0 < given.ndim < x.ndim and given.shape == x.shape[: given.ndim]:
                 given = given.reshape(given.shape + (1,) * (x.ndim - given.ndim))
             return xp.broadcast_to(given, x.shape)

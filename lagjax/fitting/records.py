@@ -28,7 +28,7 @@ class Record(eqx.Module):
     >>> Record(t, q={"theta": 0.1 * jnp.cos(3.0 * t)}, v0={"theta": 0.0}, hold_v=True, sigma=0.001)
     Record(50 times from 0 to 1, q: theta)
 
-    **Arguments:** T times, and one or more kinds of measurement, each leaf (T, ...), NaN where a value is missing:
+    **Arguments,** T times and one or more kinds of measurement, each leaf (T, ...), NaN where a value is missing:
 
     - `t` (T,): increasing times, `[t]`. The run starts at `t[0]`, from a state that is an unknown of the fit.
     - `q`, `v`: coordinates and velocities, in the structure of the state; a dictionary may have only some of the names.
@@ -105,9 +105,9 @@ class Record(eqx.Module):
         return channels(self.measured)
 
     def __repr__(self):
-        names_of = {kind: ", ".join(jtu.keystr(p, simple=True, separator=".") for p, _ in jtu.tree_leaves_with_path(tree))
-                    for kind, tree in self.measured.items()}  # fmt: skip
-        kinds = "; ".join(f"{kind}: {names}" if names else kind for kind, names in names_of.items())
+        names = {kind: ", ".join(jtu.keystr(p, simple=True, separator=".") for p, _ in jtu.tree_leaves_with_path(tree))
+                 for kind, tree in self.measured.items()}  # fmt: skip
+        kinds = "; ".join(f"{kind}: {of_kind}" if of_kind else kind for kind, of_kind in names.items())
         return f"Record({len(self.t)} times from {self.t[0]:.6g} to {self.t[-1]:.6g}, {kinds})"
 
 
@@ -230,7 +230,7 @@ def cut(records: Sequence[Record], window: float | None, dtype) -> Windows:
             raise ValueError(f"window must be a positive length of time, not {window}.")
         if window is not None and window < 2 * np.max(np.diff(t)):
             raise ValueError(
-                f"window = {window:.6g} is shorter than two intervals of a record, which are up to {np.max(np.diff(t)):.6g}.\n"
+                f"window = {window:.6g} is shorter than two intervals of a record, of {np.max(np.diff(t)):.6g}.\n"
                 f"Fix: a window with several samples, such as window={20 * np.median(np.diff(t)):.3g}."
             )
         count = 1 if window is None else max(1, math.ceil(span / window * (1 - 1e-9)))

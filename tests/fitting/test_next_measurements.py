@@ -9,7 +9,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import lagjax as lj
-from lagjax.fitting.candidates import judged, sd_after_each, sd_of, without
+from lagjax.fitting.candidates import assess, eliminate_unknowns, sd_after_each, sd_of
 from tests.counting import compiles
 from tests.fitting.cases import CASES, HUNG, PENDULUM, hung, pendulum
 
@@ -66,7 +66,7 @@ def test_unknowns_of_no_interest_are_eliminated():
     """What is left of the equations says as much of the others as all of them do; a column of zeros is no unknown."""
     random = np.random.default_rng(0)
     of, others = random.normal(size=(20, 2)), random.normal(size=(20, 3))
-    left = without(of, np.concatenate([others, np.zeros((20, 1)), others[:, :1]], axis=1))
+    left = eliminate_unknowns(of, np.concatenate([others, np.zeros((20, 1)), others[:, :1]], axis=1))
     both = np.concatenate([of, others], axis=1)
     np.testing.assert_allclose(sds(left), sds(both)[:2], rtol=1e-10)
     # Twin: with the others known.
@@ -80,7 +80,7 @@ def test_best_times_against_all_choices(count):
     random = np.random.default_rng(1)
     cases = [parabola(np.linspace(0.0, 2.0, 11)), *(random.normal(size=(11, 3)) for _ in range(6))]
     for i, rows in enumerate(cases):
-        candidate = judged(
+        candidate = assess(
             "a run", np.linspace(0.0, 2.0, 11), rows[:, None], np.zeros((1, 3)), along, np.ones(3), {}, LEAST
         )
         times, sd = candidate.at_best(count)

@@ -9,7 +9,7 @@ from scipy.stats import chi2
 import lagjax as lj
 from lagjax.fitting import engine
 from lagjax.fitting.equations import dampened
-from lagjax.fitting.misfit import CHANCE, _beyond, _undampened, misfit
+from lagjax.fitting.misfit import CHANCE, _exceeded_by_chance, _undampened, misfit
 from lagjax.fitting.problem import problem_of
 from lagjax.numerics.chained import Equations
 
@@ -47,7 +47,7 @@ def test_a_stage_does_not_move_what_it_cannot_see(clean, monkeypatch):
     assert np.all(np.abs(found.values - VALUES) < 4 * found.sd) and np.max(found.sd) < 0.05
     assert np.isfinite(found.costs[0]) and np.all(np.isnan(found.costs[1:]))
     # Twin: without a hold it is lost; then the whole record, from the guess itself, is searched and is right.
-    monkeypatch.setattr(engine, "REACH", 1e9)
+    monkeypatch.setattr(engine, "HOLD_REACH", 1e9)
     again = lj.fit(driven, record, GUESS)
     assert float(again.costs[0]) > 10 * float(found.cost) and np.all(np.isnan(again.costs[2:]))
     np.testing.assert_allclose(again.costs[1], found.cost, rtol=1e-6)
@@ -75,7 +75,7 @@ def test_what_only_round_off_sees_keeps_its_guess(monkeypatch):
     np.testing.assert_allclose(found.params["g"], alone.params["g"], rtol=1e-8)
     np.testing.assert_allclose(found.sd[found.names.index("g")], alone.sd[0], rtol=1e-3)
     # Twin: where nothing holds it at the end it goes anywhere.
-    monkeypatch.setattr(engine, "BARELY", 0.0)
+    monkeypatch.setattr(engine, "FINAL_HOLD", 0.0)
     with pytest.warns(lj.FitWarning, match="went astray"):
         assert not abs(float(fitted().params["m"]) - 2.0) < 10.0
 
@@ -148,7 +148,7 @@ def test_quantiles_and_inverses():
     """Chance is that of SciPy's chi-squared distribution; what a loss makes of a residual is undone."""
     for n in (1.0, 4.0, 10.0, 300.0):
         exact = chi2.isf(2.87e-7, n) / n
-        assert abs(float(_beyond(n, CHANCE)) / exact - 1) < 0.2
+        assert abs(float(_exceeded_by_chance(n, CHANCE)) / exact - 1) < 0.2
     r = np.geomspace(1e-6, 1e4, 50)
     for loss in ("huber", "soft_l1", "cauchy"):
         np.testing.assert_allclose(_undampened(dampened(r, loss), loss), r, rtol=1e-6)

@@ -16,8 +16,8 @@ from lagjax.fitting.optimisers import Optimiser, as_params, as_vector, is_of_opt
 from lagjax.fitting.own_starts import fit_starts
 from lagjax.fitting.parameters import find
 from lagjax.fitting.problem import problem_of
-from lagjax.fitting.trained import parted_records
-from lagjax.fitting.training import Task, begun, round_of
+from lagjax.fitting.trained import split_records
+from lagjax.fitting.training import Task, initial_state, round_of
 from tests.counting import compiles
 
 T = np.linspace(0.0, 3.0, 31)
@@ -60,17 +60,17 @@ def test_optimisers_see_params():
 def test_which_records_are_held_back():
     """A part by seed, at least one, never all; given ones; none."""
     records = [record(i) for i in range(5)]
-    kept, held = parted_records(records, 0.4, 0)
+    kept, held = split_records(records, 0.4, 0)
     assert len(kept) == 3 and len(held) == 2 and all(any(r is s for s in records) for r in kept + held)
-    assert [len(x) for x in parted_records(records, 0.99, 0)] == [4, 1] or len(parted_records(records, 0.99, 0)[0]) >= 1
-    assert [len(x) for x in parted_records(records, [], 0)] == [5, 0]
-    assert [len(x) for x in parted_records(records, None, 0)] == [5, 0]
-    assert parted_records(records[0], records[1], 0)[1] == [records[1]]
+    assert [len(x) for x in split_records(records, 0.99, 0)] == [4, 1] or len(split_records(records, 0.99, 0)[0]) >= 1
+    assert [len(x) for x in split_records(records, [], 0)] == [5, 0]
+    assert [len(x) for x in split_records(records, None, 0)] == [5, 0]
+    assert split_records(records[0], records[1], 0)[1] == [records[1]]
     for wrong, words in ((1.5, "between 0 and 1"), (-0.1, "between 0 and 1")):
         with pytest.raises(ValueError, match=words):
-            parted_records(records, wrong, 0)
+            split_records(records, wrong, 0)
     with pytest.raises(ValueError, match="one record cannot be divided"):
-        parted_records(records[0], 0.5, 0)
+        split_records(records[0], 0.5, 0)
 
 
 def test_what_does_not_go_together():
@@ -132,7 +132,7 @@ def test_only_what_is_in_a_batch_moves():
     numbers = (np.asarray(x) for x in (0, 10, 10))
     task = Task(problem, None, Optimiser(optax.adam(0.1)), 1, 1, *numbers)
     # Starts that are off, so that there is somewhere to go.
-    state = begun(task)
+    state = initial_state(task)
     state = state._replace(local=np.asarray(state.local) + 0.01)
     seen = []
     for _ in range(4):
