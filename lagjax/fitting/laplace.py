@@ -153,7 +153,7 @@ class Laplace:
         width = max(map(len, self.names), default=0)
         gauss_newton = np.sqrt(np.diag(self.gauss_newton))
         for name, mean, sd, other in list(zip(self.names, self.mean, self.sd, gauss_newton))[:40]:
-            lines.append(f"  {name:<{width}}  {mean:.6g} ± {sd:.3g}, Gauss-Newton ± {other:.3g}")
+            lines.append(f"  {name:<{width}}  {mean:.6g} ± {sd:.3g}, by Gauss and Newton ± {other:.3g}")
         return "\n".join([*lines, *(f"  {words}" for words in self.caveats)])
 
 
@@ -285,7 +285,7 @@ def _caveats(names, eigenvalues, directions, unseen, off):
     peaks = [i for i, value in enumerate(eigenvalues) if value > FLAT_BELOW and abs(1 / np.sqrt(value) - 1) > DIFFERS]
     for i in sorted(peaks, key=lambda i: -abs(np.log(eigenvalues[i])))[:3]:
         times = 1 / np.sqrt(eigenvalues[i])
-        words.append(f"along {_direction(names, directions[i])} the ± is {times:.2g} times that of Gauss-Newton.")
+        words.append(f"along {_direction(names, directions[i])} the ± is {times:.2g} times that of Gauss and Newton.")
     return words
 
 

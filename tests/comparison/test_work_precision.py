@@ -70,7 +70,7 @@ def test_evaluations_are_steps_times_stages(found):
 
 
 def test_errors_are_those_against_the_closed_form(found):
-    """Errors against Jacobi's functions, relative to each leaf's largest value, are those against the computed reference."""
+    """Errors relative to each leaf's largest value agree with those against Jacobi's functions."""
     largest = np.pi / 2, np.sqrt(2) * RATE
     for point in found["Tsit5"].points:
         got = point.trajectory.q, point.trajectory.v
@@ -117,7 +117,7 @@ def test_table_and_picture(found):
 
 @pytest.mark.parametrize("off", [0.0, 1e-5])
 def test_a_wrong_reference_is_found_out(off):
-    """If solves agree with each other but not with the reference, this gets that error; twin: the right one does not."""
+    """If solves agree with each other but not with the reference, its error is reported; twin: the right reference."""
     wrong = lambda ts: swing(ts, (1 + off) * RATE)
     found = compared(methods=[lj.Dopri8()], tolerances=(1e-6, 1e-9, 1e-10), reference=wrong)
     if off:
@@ -154,7 +154,7 @@ def test_errors_of_an_event_are_those_of_its_time_and_state():
 
 
 def test_a_failing_point_keeps_its_reason_and_the_others_go_on():
-    """Too few steps for tight tolerances, or a failure of another tool, give failed points; twin: none at loose ones."""
+    """Too few steps at tight tolerances, or a failing other tool, give failed points; twin: loose tolerances."""
     other = lambda tolerance: (*swing(TS), 77) if tolerance > 1e-7 else (np.full(3, np.nan), np.zeros(3), None)
     found = compared(
         methods={"fifth": lj.Tsit5()}, tolerances=(1e-3, 1e-11), reference=swing, max_steps=500, others={"exact": other}
