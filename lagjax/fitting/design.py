@@ -229,8 +229,8 @@ def _further_measurements(problem, records, at, known, direction, least) -> list
     best: dict[str, Candidate] = {}
     for w, r in enumerate(longer.windows.record):
         others = known.without_window(w)
-        window_part = np.concatenate([slopes.rows_by_shared[w], slopes.rows_by_local[w]], axis=1)
-        here = np.concatenate([np.concatenate([others, np.zeros((len(others), k))], axis=1), window_part])
+        of_window = np.concatenate([slopes.rows_by_shared[w], slopes.rows_by_local[w]], axis=1)
+        here = np.concatenate([np.concatenate([others, np.zeros((len(others), k))], axis=1), of_window])
         both = np.concatenate([further.rows_by_shared[w], further.rows_by_local[w]], axis=1)
         part = _one_window(longer, w)
         _, rows = _by_time(part, both)

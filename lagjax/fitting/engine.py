@@ -20,7 +20,7 @@ from lagjax.fitting.problem import problem_of
 from lagjax.fitting.records import Record
 from lagjax.fitting.result import Fit, FitWarning
 from lagjax.fitting.search import Course, evaluate, listening, search
-from lagjax.fitting.trained import held_problem, parted_records, train
+from lagjax.fitting.trained import held_problem, split_records, train
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.diagnosis import listed
 from lagjax.mechanics.hybrid import Hybrid
@@ -154,7 +154,7 @@ def fit(
     apart = None
     if is_of_optax(optimiser):
         _check_training(window is not None and joined, restarts)
-        records, apart = parted_records(records, held_back, seed)
+        records, apart = split_records(records, held_back, seed)
     else:
         _check_optimiser(optimiser, {"batch": batch, "held_back": held_back, "patience": patience})
     problem = problem_of(system, records, params, free, observe, bounds, priors, loss, window, dict(options))
