@@ -268,8 +268,3 @@ def _newton_steps(problem, chosen, inverses, slopes):
     moved = [jnp.einsum("bij,bj->bi", chart.along[chosen], steps) for chart in problem.starts]
     far = jnp.max(jnp.abs(jnp.concatenate(moved, axis=1)) / problem.unit[None], axis=1, initial=0.0)
     return steps * jnp.minimum(1.0, FARTHEST / jnp.maximum(far, FARTHEST))[:, None]
-
-
-def steps_of_a_round(windows: int, batch: int, limit: int) -> int:
-    """The number of steps in a round: enough that evaluating costs little by comparison, and equal in all rounds."""
-    return int(np.ceil(limit / np.ceil(limit / max(10, int(np.ceil(4 * windows / batch))))))
