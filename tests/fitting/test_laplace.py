@@ -88,7 +88,7 @@ def rough():
     return data, lj.fit(swing, lj.Record(FAR, q=data, q0=2.0, v0=0.0, sigma=0.6), {"w2": 4.2})
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_large_residuals_against_scipy(rough):
     """The inverse covariance agrees with second differences of SciPy's motion, and with JAX's Hessian."""
     data, found = rough

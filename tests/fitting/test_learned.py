@@ -64,7 +64,7 @@ def test_a_learned_potential():
     assert "31 numbers" in repr(found.identifiability)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_learned_friction():
     """A force -v f(v²) other than viscous friction is learned for the velocities of the motions."""
     restoring = lambda t, q, v, params: 0.5 * v**2 + 9.0 * jnp.cos(q)

@@ -195,7 +195,7 @@ def test_a_pendulum_in_air_against_scipy():
     )
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_it_comes_true():
     """Repeated fits with the best candidate measured have the predicted spread of friction."""
     ts, late = np.linspace(0.0, 3.0, 30), np.linspace(0.0, 8.0, 30)
@@ -227,7 +227,7 @@ def test_it_comes_true():
     assert told.candidates[1].sd > 1.3 * told.best.sd
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_constraints_forces_and_observations():
     """On a rod only its force determines the mass; the system in the angle gives the same errors of g."""
     case = CASES["pendulum on a rod"]

@@ -22,7 +22,7 @@ def bounced(g, e):
     return q
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_what_a_bounce_leaves():
     """A fit to heights finds gravity, restitution and the start through three impacts."""
     found = lj.fit(ball, lj.Record(TS, q=bounced(9.81, 0.8)), {"g": 9.5, "e": 0.75}, progress=False)

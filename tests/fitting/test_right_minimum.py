@@ -55,7 +55,7 @@ def test_a_stage_does_not_move_what_it_cannot_see(clean, monkeypatch):
     assert bool(again.converged) and "1 of 2 starts ended here" in repr(again)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_what_only_round_off_sees_keeps_its_guess(monkeypatch):
     """Positions do not determine the mass of a pendulum on a rod: it stays near its guess and affects nothing else."""
     free = lambda t, q, v, p: p["m"] * (0.5 * (v["x"] ** 2 + v["y"] ** 2) - p["g"] * q["y"])

@@ -63,7 +63,7 @@ def test_saved_and_loaded(tmp_path):
         lj.load_trajectory(path)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_constraints_and_options(tmp_path):
     """Starts on constraints are available without the system; options with functions are passed again."""
     rod = lj.System(

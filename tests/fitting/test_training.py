@@ -93,7 +93,7 @@ def problem_with(records, **options):
     return problem_of(spring, records, {"k": 3.0}, None, None, None, None, "squares", options.get("window"), settings)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_starts_of_their_own():
     """Each window's start, for a wrong k, is that of SciPy's least squares with cos and sin."""
     records = [record(i, known=False, amplitude=a) for i, a in enumerate((1.0, 0.5))]
@@ -125,7 +125,7 @@ def test_a_step_is_the_formula():
     assert abs(np.sum(off * slope) / 0.01**2 / len(T) - exact) > 1e-3 * abs(exact)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_only_what_is_in_a_batch_moves():
     """A round of one step moves the start of one window, and leaves the others unchanged bit for bit."""
     problem = problem_with([record(i, known=False) for i in range(4)])
@@ -144,7 +144,7 @@ def test_only_what_is_in_a_batch_moves():
     assert sorted(seen) == [0, 1, 2, 3]
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_what_fails_moves_nothing():
     """A motion with NaN is counted and reported, and the others are still fitted."""
     system = lj.System(lambda t, q, v, p: 0.5 * v**2 - 0.5 * (p["k"] + 0.0 * jnp.sqrt(p["sane"])) * q**2)
@@ -177,7 +177,7 @@ def records_of_well():
         yield lj.Record(ts, q=q + 0.002 * rng.normal(size=len(ts)), sigma=0.002)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_potential_is_learned(monkeypatch):
     """With batches, held-back residuals fall to sigma and the best parameters count; a seed is reproducible; nothing is
     compiled a second time, even after an interrupt.
@@ -217,7 +217,7 @@ def test_a_potential_is_learned(monkeypatch):
     assert np.any(train(1).values != found.values)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_patience():
     """Training with too large a rate ends early, with the guess; twin: with more patience it continues."""
     options = dict(optimiser=optax.sgd(10.0), iterations=200, held_back=[record(5)])
@@ -246,7 +246,7 @@ def test_inside_of_a_program():
     np.testing.assert_allclose(scores, np.stack([s for _, s in alone]), rtol=1e-6)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_bounds_forgiveness_and_modules():
     """Bounds hold, a Huber loss tolerates outliers, and a module in params can be fitted by name."""
     rng = np.random.default_rng(1)

@@ -316,7 +316,7 @@ def on_a_table(leave, **options):
     return in_phases(hybrid, 0.0, 0.6, SHAKEN, ts=np.array([0.0, 0.1, 0.2]), estimate_error=False, **options)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_what_lets_go_may_touch_again():
     """A body leaves a shaken table at a² = g, flies, and lands. Twin: one that closes by 1e-9 never does."""
     traj = on_a_table(lj.Switch("lies", to="flies", when=lj.releases("table")), rtol=1e-11)

@@ -162,7 +162,7 @@ def test_impacts():
     assert (ledger.impact_total[1] == 0) == (at_impact.v[1] < 0) and "2 switches" in repr(ledger)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_friction_on_a_multiplier():
     """A sphere that slides and then rolls loses two sevenths of its energy; twin: friction of the opposite sign."""
     traj = throw(0.25, estimate_error=False)

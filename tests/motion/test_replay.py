@@ -71,7 +71,7 @@ def test_a_cotangent_that_is_dropped_is_seen(monkeypatch):
         modes_agree(lambda p: end(system, 0.75, 0.25, p), PARAMS)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("room", exhaustive_but(((4, 2),), ((16, 64), (16, 4), (4, 2))))
 def test_more_steps_than_there_is_room_for(monkeypatch, room):
     """Steps run again from checkpoints, from all of them or from every other one, are the same steps."""
@@ -97,7 +97,7 @@ def test_lanes_that_fail_have_no_part():
     np.testing.assert_allclose(by_m, m, rtol=1e-12)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("kind", exhaustive_but(((8, 3), (72, 1)), ((8, 3), (72, 1), (72, 3), (8, 1))))
 def test_networks_as_matrices(kind):
     """Stages in a loop and as copies; two coordinates of different masses; by the weights, the masses and the start."""
@@ -191,7 +191,7 @@ def test_an_event():
     np.testing.assert_allclose(found["g"], by_g, rtol=1e-9)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_two_switches():
     """The modes agree on a ball that bounces twice."""
     bounce = lj.Switch("up", to="up", when=lambda t, q, v, p: q, reset=lambda t, q, v, p: -p["e"] * v)

@@ -52,7 +52,7 @@ def modes_agree(system, q0, v0, params, ts, lanes=0, **options):
     np.testing.assert_allclose(terms.sum(), along, rtol=1e-8, atol=1e-8 * np.max(np.abs(terms)))
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("name", exhaustive_but(SHOWN[:2], tuple(RUNS)))
 def test_scenes(name):
     """The modes agree over a fifth of a run's time, or up to the event that ends the run."""

@@ -159,7 +159,7 @@ def test_methods_and_controllers(tmp_path):
         np.testing.assert_array_equal(again.at(0.3).q["x"], traj.at(0.3).q["x"])
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_many_motions(tmp_path):
     """Batches, the values of sweeps (NumPy arrays), and motions in phases come back."""
     check(jax.vmap(swing)(jnp.array([1.0, 9.81])), rod, tmp_path / "x.npz")

@@ -93,7 +93,7 @@ def bounced_by_formula(p):
     return -p[1] * v * (TS[-1] - t) - 0.5 * p[0] * (TS[-1] - t) ** 2
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.parametrize(
     "found, exact",
     [

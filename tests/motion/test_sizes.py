@@ -39,7 +39,7 @@ def survives(script):
     assert ended.returncode == 0, f"{ended.stdout[-300:]}\n{ended.stderr[-2000:]}"
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("how", exhaustive_but(("closed over",), TRANSFORMED))
 def test_any_number_of_outputs(how):
     """From 2 times (one output after the start) to 100,000; XLA ended the process for constants above 10 kB."""
