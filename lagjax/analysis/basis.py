@@ -1,8 +1,8 @@
-"""Among which motions symmetries are looked for: translations, rotations, shifts, time, boosts, scalings.
+"""The motions among which symmetries are searched: translations, rotations, shifts, time, boosts, scalings.
 
-All are affine, ξ = a + B x + t c and τ = α + β t, and so they are a few arrays. Those of all points together come
-before those of one: the first of several that depend on each other is kept. Boosts, and what else has t in it, come
-last. L may change by the total derivative of a gauge function, of which a polynomial is tried.
+All motions are affine, ξ = a + B x + t c and τ = α + β t, so a few arrays hold them. Motions of all points together
+come before those of a single point, because the first of several dependent ones is kept. Boosts and other motions that
+contain t come last. L may change by the total derivative of a gauge function; polynomials are tried for it.
 """
 
 from itertools import combinations_with_replacement
@@ -15,13 +15,14 @@ from lagjax.analysis.rates import Affine
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.cartesian import AXES, points, turned
 
-# Points that are turned one by one, coordinates of which each is boosted and scaled, and that have products as gauge.
+# Largest numbers of points rotated one by one, of coordinates boosted and scaled one by one, and of coordinates whose
+# products are tried as gauge functions.
 EACH_POINT_UP_TO, EACH_UP_TO, PRODUCTS_UP_TO = 8, 24, 6
 TIME = "Jacobi integral"
 
 
 class Element(NamedTuple):
-    """One motion; `kind`: "space", "time", "boost" or "scaling"."""
+    """One motion of the basis; `kind` is "space", "time", "boost" or "scaling"."""
 
     name: str
     kind: str
@@ -33,7 +34,7 @@ class Element(NamedTuple):
 
 
 class Basis(NamedTuple):
-    """What is looked among: affine motions, their names and kinds."""
+    """The motions of the search: affine maps, their names and kinds."""
 
     affine: Affine
     names: tuple[str, ...]
@@ -41,7 +42,7 @@ class Basis(NamedTuple):
 
 
 def motions(q) -> Basis:
-    """The motions that are tried for coordinates like these."""
+    """The motions that are tried for coordinates with the structure of q."""
     found, n = points(q), len(coordinates.names(q))
     elements = [*_shifts(q, found, n), _moved(TIME, "time", n, clock=-1.0), *_turns(found, n)]
     elements += [_moved(f"t {e.name}", "boost", n, drift=e.shift) for e in elements if e.kind == "space" and _pushes(e)]
@@ -110,7 +111,7 @@ def _turning(pairs, n):
 
 
 class Gauge(NamedTuple):
-    """Gauge functions: t^power times a product of coordinates, none, one or two of them; names, and which have a t."""
+    """Gauge functions: t^power times a product of up to two coordinates; their names, and which of them contain t."""
 
     powers: tuple[int, ...]
     factors: tuple[tuple[int, ...], ...]
@@ -118,7 +119,7 @@ class Gauge(NamedTuple):
     timed: np.ndarray
 
     def rates(self, t, x, u) -> np.ndarray:
-        """dF/dt of each at states (N,), (N, n), (N, n): (N, G)."""
+        """dF/dt of each gauge function at states (N,), (N, n), (N, n): (N, G)."""
         columns = []
         for power, factors in zip(self.powers, self.factors):
             product = np.prod(x[:, list(factors)], axis=1)
@@ -128,13 +129,13 @@ class Gauge(NamedTuple):
         return np.stack(columns, axis=1)
 
     def combined(self, weights) -> "Polynomial":
-        """Their sum with these weights."""
+        """The weighted sum of the gauge functions."""
         kept = np.flatnonzero(weights)
         return Polynomial(tuple(self.powers[k] for k in kept), tuple(self.factors[k] for k in kept), weights[kept])
 
 
 def gauges(q) -> Gauge:
-    """The gauge functions that are tried."""
+    """The gauge functions that are tried for coordinates with the structure of q."""
     names = coordinates.names(q)
     n, found = len(names), []
     found += [(0, (i,)) for i in range(n)]
@@ -153,14 +154,14 @@ def _named(power, factors, names):
 
 
 class Polynomial(NamedTuple):
-    """A gauge function: a combination of those that were tried."""
+    """A gauge function: a linear combination of monomials."""
 
     powers: tuple[int, ...]
     factors: tuple[tuple[int, ...], ...]
     weights: np.ndarray
 
     def __call__(self, t, q, params):
-        """F at a place."""
+        """The value of F."""
         x, _ = coordinates.flatten(q)
         total = jnp.zeros_like(x[0])
         for weight, power, factors in zip(self.weights, self.powers, self.factors):
@@ -176,7 +177,7 @@ class Combination(NamedTuple):
     drift: np.ndarray
 
     def __call__(self, t, q, params):
-        """ξ, like q."""
+        """ξ, with the structure of q."""
         x, unflatten = coordinates.flatten(q)
         to = lambda y: jnp.asarray(y, x.dtype)
         return unflatten(to(self.shift) + to(self.matrix) @ x + t * to(self.drift))
@@ -189,5 +190,5 @@ class Clock(NamedTuple):
     rate: float
 
     def __call__(self, t, q, params):
-        """τ."""
+        """The value of τ."""
         return self.start + self.rate * t
