@@ -1,21 +1,21 @@
-"""Newton's method for motions that close.
+"""Newton's method for periodic orbits: motions that return to their start.
 
-The unknowns are the states z_j at K equal parts of the period T and, where it is free, T itself; a motion closes where
+The unknowns are the states z_j at K equal parts of the period T and, where it is free, T itself. A motion closes if
 
     Φ(z_j, T/K) - z_{j+1} = 0,        z_K = z_0 + turns + shifts.
 
-In tangent coordinates w_j, z_j + B_j w_j, and with θ = log T, the linear equations of a step are
+With tangent coordinates w_j, so that z_j moves to z_j + B_j w_j, and θ = log T, the linear equations of a step are
 
     Y_j w_j - B_{j+1} w_{j+1} + f(z_{j+1}) (T/K) θ = -residual
 
-with the frames Y_j that the flow makes of B_j. They do not fix where on the orbit it begins, and of a family of orbits
-not which one it is. The first is settled by a step that is orthogonal to the motion, f·w = 0, the second by what is
-held (an energy, a coordinate), one row each; of what is then left free, as a rotation of the whole, the shortest step
-is taken.
+where the flow maps the frames B_j to Y_j. These equations fix neither where on the orbit it starts nor, in a family of
+orbits, which member it is. A step orthogonal to the motion, f·w = 0, settles the first, and held quantities (an energy,
+a coordinate) settle the second, with one row each. For directions that are still free, such as a rotation of the whole
+system, the shortest step is taken.
 
-The step is Levenberg's and Marquardt's with a damping that shrinks with the residual: it converges quadratically also
-to orbits that are not isolated (Yamashita & Fukushima, *Computing Suppl.* 15 (2001) 239). One that makes the residual
-no smaller is tried again with more of it.
+The step is that of Levenberg and Marquardt with a damping proportional to the residual, which converges quadratically
+also to orbits that are not isolated (Yamashita & Fukushima, *Computing Suppl.* 15 (2001) 239). A step that does not
+reduce the residual is repeated with more damping.
 
 Source: Seydel, *Practical Bifurcation and Stability Analysis*, §7.4-7.5; Muñoz-Almaraz et al., *Physica D* 181 (2003) 1
 (families of conservative systems); Stoer & Bulirsch, §7.3.5 (multiple shooting).
@@ -35,34 +35,35 @@ from lagjax.mechanics import coordinates
 from lagjax.mechanics.compiled import compiled
 
 MOST = 40
-# The damping in units of the residual: least, at first, more where a step failed, and where to give up.
+# The damping in units of the residual: its least and first values, its growth after a failed step, where to give up.
 LEAST, FIRST_DAMPING, MORE, TOO_MUCH = 0.01, 0.03, 8.0, 1e4
-# Residuals, in tolerances: where to stop at once, and what counts as an orbit.
+# Residuals in units of the tolerance: the search stops at once at the first; the second still counts as an orbit.
 AIM, ENOUGH = 1.0, 1e3
-# Singular values below this many tolerances, and so small at least, do not count.
+# Singular values below this many tolerances, or below the second number if that is larger, count as zero.
 NOTHING, SMALL = 1e4, 1e-8
-# Of the terms of a sum that is held.
+# A held integral counts as met when it is off by at most this many round-offs of its terms.
 ROUND_OFFS = 16.0
-# A step that leaves no more than this part of the motion is none.
+# A step that shrinks the motion below this fraction of the first one is rejected.
 SHRUNK = 0.1
 # No step changes the logarithm of the period, or the state in units of its size, by more than this.
 FARTHEST = 0.5
-# The weight of what is held beside coming back: far away both cannot be had.
+# The weight of held quantities relative to closing the orbit: far from a solution both cannot be satisfied.
 FIRST = 100.0
 
 
 class Place(NamedTuple):
-    """States (K, 2n) and a period."""
+    """A candidate orbit: its states (K, 2n) and its period."""
 
     nodes: Float[Array, "K 2n"]
     period: Float[Array, ""]
 
 
 class Seen(NamedTuple):
-    """What the flow says at a place: the residual, its size, the matrix of a Newton step, and how far it has gone.
+    """The flow evaluated at a candidate: the residual, its root mean square `size`, and the matrix of a Newton step.
 
-    The columns of `matrix` are along the `bases`. `moves`: how far the state would go in a period at its rate, but for
-    what is relative.
+    The columns of `matrix` are coordinates along the `bases`. `amplified`: the largest entry of a tangent frame.
+    `gone`: the state at the end minus that at the start. `moves`: how far the state would go in a period at its initial
+    rate, without relative coordinates.
     """
 
     size: Float[Array, ""]
@@ -75,7 +76,7 @@ class Seen(NamedTuple):
 
 
 class Found(NamedTuple):
-    """The best place, and how it went; `apart`: how much the system of a driven orbit changed from period to period."""
+    """The best candidate and how the search went; `apart`: how much a driven system changes from period to period."""
 
     place: Place
     guess: Guess
@@ -86,9 +87,9 @@ class Found(NamedTuple):
 
 
 class Search(NamedTuple):
-    """The state of the iteration: the best place so far with what was seen, and the damping to try next.
+    """The state of the iteration: the best candidate so far, its evaluation, and the damping to try next.
 
-    `moves`: how far the guess moved in its period.
+    `moves`: how far the guess moves in its period.
     """
 
     best: Place
@@ -99,7 +100,7 @@ class Search(NamedTuple):
 
 
 class Step(NamedTuple):
-    """A step of the nodes, in units of the state, of the logarithm of the period, and of how far the end then is."""
+    """A step of the nodes, in units of the state, and of the logarithm of the period; the change of `gone` with it."""
 
     moves: Float[Array, "K 2n"]
     log_period: Float[Array, ""]
@@ -107,7 +108,7 @@ class Step(NamedTuple):
 
 
 class Goal(NamedTuple):
-    """What is held: the Jacobi integral and the state of the guess."""
+    """The values that may be held: the Jacobi integral and the state of the guess."""
 
     integral: Float[Array, ""]
     z: Float[Array, " 2n"]
@@ -115,7 +116,7 @@ class Goal(NamedTuple):
 
 @compiled
 def closed(system, t, q, v, params, period, rtol, asked: Asked, rows, parts, turns, most) -> Found:
-    """Search for an orbit near a state; `turns` (n,) of the angles, or None for those of the guess."""
+    """Search for an orbit near a state; `turns` (n,): the turns of the angles, or None for those of the guess."""
     flow = flow_of(system, t, q, v, params, rtol, rows)
     guess = guessed(flow, t, flow.vector(q, v), period, asked, parts, turns)
     goal = Goal(integral_at(flow, t, guess.z), guess.z)
@@ -134,7 +135,7 @@ def closed(system, t, q, v, params, period, rtol, asked: Asked, rows, parts, tur
     def iterate(search):
         place = _moved(flow, t, search, asked, guess.scale)
         seen = _seen(flow, t, place, asked, goal, guess)
-        # What shrinks to a state of rest, which comes back after any time, comes no nearer.
+        # Shrinking towards a state of rest is no progress, although a state of rest comes back after any time.
         better = (seen.size < search.seen.size) & ~(seen.moves < SHRUNK * search.moves)
         pick = lambda new, old: jax.tree.map(lambda a, b: jnp.where(better, a, b), new, old)
         damping = jnp.where(better, jnp.maximum(LEAST, search.damping / MORE), MORE * search.damping)
@@ -152,7 +153,7 @@ def closed(system, t, q, v, params, period, rtol, asked: Asked, rows, parts, tur
 
 
 def implicit(system, t, q, v, params, rtol, asked: Asked, rows, found: Found) -> Found:
-    """The same orbit with its derivatives by the system, the parameters and what is held: one Newton step more."""
+    """The same orbit with its derivatives by the system, parameters and held quantities, from one more Newton step."""
     flow = flow_of(system, t, q, v, params, rtol, rows)
     found = lax.stop_gradient(found)
     seen, scale = found.seen, found.guess.scale
@@ -178,7 +179,7 @@ def _times(t, place):
 
 
 def _moved(flow, t, search, asked, scale):
-    """Where the next step leads."""
+    """The candidate to which the next step leads."""
     seen, best = search.seen, search.best
     damping = jnp.where(search.iterations == 0, 0.0, search.damping * seen.size)
     moves, log_period, _ = _step(seen.matrix, seen.residual, seen.bases, asked, flow.rtol, damping)
@@ -190,7 +191,7 @@ def _moved(flow, t, search, asked, scale):
 
 
 def _seen(flow, t, place, asked, goal, guess) -> Seen:
-    """Follow the nodes to their ends, with the tangent spaces at them."""
+    """Follow the flow from each node to the next, with the tangent spaces."""
     times, span, scale = _times(t, place), place.period / len(place.nodes), guess.scale
     bases = jax.vmap(lambda t, z: flow.tangent_space(t, z, scale))(times, place.nodes)
     part = lambda t, z, basis: flow.passage(t, z, span, basis, scale)
@@ -201,7 +202,7 @@ def _seen(flow, t, place, asked, goal, guess) -> Seen:
     gone = passed.z[-1] - place.nodes[0]
     residual = _residual(flow, t, place, passed.z, asked, goal, guess)
     matrix, moves = _equations(flow, t, place, passed, bases, scale, asked)
-    # Not the largest entry: a step lessens the sum of squares.
+    # Root mean square rather than the largest entry, because a step reduces the sum of squares.
     size = jnp.sqrt(jnp.mean(residual**2))
     good = jnp.all(passed.ended) & jnp.isfinite(size) & jnp.all(jnp.isfinite(matrix))
     clean = lambda x: jnp.where(good, x, 0.0)
@@ -210,7 +211,7 @@ def _seen(flow, t, place, asked, goal, guess) -> Seen:
 
 
 def _equations(flow, t, place, passed, bases, scale, asked):
-    """The matrix (rows, K k + 1) of a Newton step, in units of `scale`, and how far the state moves."""
+    """The matrix (rows, K k + 1) of a Newton step, in units of `scale`, and how far the state moves in a period."""
     count, size, k = len(place.nodes), 2 * flow.size, bases.shape[2]
     comes_back = _comes_back(asked, t.dtype)
     times = _times(t, place)
@@ -228,13 +229,13 @@ def _equations(flow, t, place, passed, bases, scale, asked):
     own = lambda gradient: jnp.append(gradient @ bases[0], jnp.zeros((count - 1) * k + 1, t.dtype))[None]
     if asked.moves:
         blocks.append(own(here / jnp.where(jnp.any(here != 0), jnp.linalg.norm(here), 1.0)))
-    # What is held comes before what is to be made small.
+    # Held quantities have priority over the closing residual.
     blocks += [FIRST * own(row) for row in _held_slopes(flow, t, place, scale, asked)]
     return jnp.concatenate(blocks), jnp.max(jnp.abs(here * comes_back))
 
 
 def _residual(flow, t, place, ends, asked, goal, guess):
-    """What is left, in the order of the rows."""
+    """The residual, in the order of the matrix rows."""
     scale, turns = guess.scale, guess.turns
     first = place.nodes[0] + jnp.concatenate([TURN * turns, jnp.zeros_like(turns)])
     left = (ends - jnp.concatenate([place.nodes[1:], first[None]])) / scale[None]
@@ -246,7 +247,7 @@ def _residual(flow, t, place, ends, asked, goal, guess):
         slope = jax.grad(lambda z: integral_at(flow, t, z))(lax.stop_gradient(place.nodes[0])) * scale
         size = lax.stop_gradient(jnp.linalg.norm(slope))
         off = integral_at(flow, t, place.nodes[0]) - goal.integral
-        # Less than the round-off of its terms is nothing, but for its derivative.
+        # A value below the round-off of its terms is set to zero, but keeps its derivative.
         terms = jnp.abs(goal.integral) + jnp.abs(flow.system.lagrangian(t, *flow.state(goal.z), flow.params))
         noise = lax.stop_gradient(jnp.abs(off) <= ROUND_OFFS * jnp.finfo(off.dtype).eps * terms)
         off = jnp.where(noise, off - lax.stop_gradient(off), off)
@@ -256,12 +257,12 @@ def _residual(flow, t, place, ends, asked, goal, guess):
 
 
 def _comes_back(asked, dtype):
-    """One for what of (q, v) has to come back."""
+    """A mask of (q, v): 1 for the entries that have to come back, 0 for relative coordinates."""
     return jnp.asarray(np.concatenate([1.0 - np.array(asked.relative), np.ones(len(asked.relative))]), dtype)
 
 
 def _held_slopes(flow, t, place, scale, asked):
-    """The gradients of what is held, of size one, in units of `scale`."""
+    """The gradients of the held quantities, normalised, in units of `scale`."""
     if asked.energy:
         slope = jax.grad(lambda z: integral_at(flow, t, z))(place.nodes[0]) * scale
         size = jnp.linalg.norm(slope)
@@ -271,7 +272,7 @@ def _held_slopes(flow, t, place, scale, asked):
 
 
 def _step(matrix, residual, bases, asked, rtol, damping):
-    """The step that lessens the residual."""
+    """The Levenberg-Marquardt step."""
     count, size = bases.shape[:2]
     last = slice((count - 1) * size, count * size)
     asked_for = matrix.at[last].multiply(_comes_back(asked, matrix.dtype)[:, None])
@@ -292,7 +293,7 @@ def integral_at(flow, t, z):
 
 
 def _changed(flow: Flow, t, place, scale):
-    """How much the accelerations at one state differ a period later, at some times, relative to what a period makes."""
+    """The largest change of the rate of one state over a period, at some times, in units of `scale` per period."""
     times = t + place.period * jnp.asarray([0.0, 0.137, 0.291, 0.443, 0.618, 0.787, 0.912], t.dtype)
     rate = jax.vmap(lambda t: flow.rate(t, place.nodes[0]) / scale)
     return jnp.max(jnp.abs(rate(times) - rate(times + place.period))) * place.period

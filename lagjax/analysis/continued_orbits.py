@@ -32,11 +32,12 @@ from lagjax.mechanics import coordinates
 from lagjax.mechanics.compiled import compiled
 from lagjax.mechanics.packed import pack
 
-# Singular values of the equations below this part of the largest do not count.
+# Singular values of the equations below this fraction of the largest count as zero.
 DEPENDENT = 1e-7
-# A change of the logarithm of a drive's period that is none.
+# The period of a drive counts as constant if its logarithm changes by less.
 CONSTANT = 1e-9
-# The motion has shrunk to rest where so little of it is left; periods so many times the first one grow without end.
+# Fractions of the largest motion: the branch ends at rest below the first; below the second, a start that passes an
+# equilibrium is a state of rest too. A period of so many times the first one grows without end.
 AT_REST, HALF, ENDLESS = 1e-3, 0.5, 1e3
 
 
@@ -55,27 +56,27 @@ def continue_orbits(
 
     **Arguments:**
 
-    - `orbit`: what `lj.periodic_orbit` returned: where the branch begins.
-    - `along`: what changes, by its name in the orbit's parameters: `"omega"`, `"spring.k"`, `"k[1]"`. Of a system that
-      does not depend on time also `"period"`, and a coordinate or velocity of the start, `"theta"`, `"v.theta"`; where
-      it is conserved, `"energy"` (the Jacobi integral). With a number in the parameters the orbit holds what it was
-      found with. The period of a drive follows its parameters.
+    - `orbit`: the result of `lj.periodic_orbit` at which the branch begins.
+    - `along`: what changes, by its name in the orbit's parameters: `"omega"`, `"spring.k"`, `"k[1]"`. For a system that
+      does not depend on time also `"period"`, or a coordinate or velocity of the start, `"theta"`, `"v.theta"`; where
+      it is conserved, `"energy"` (the Jacobi integral). Along a number in the parameters the orbits hold what `orbit`
+      was found with. The period of a drive follows its parameters.
     - `to`: its last value; the first is that of the orbit. The branch is followed within this range.
-    - `rtol`: as in `lj.periodic_orbit`. `most_points`: of the branch.
+    - `rtol`: as in `lj.periodic_orbit`. `most_points`: the largest number of points of the branch.
 
-    **Returns:** an `OrbitBranch`. What was found before a branch ends is there, and its `status` says why it does.
+    **Returns:** an `OrbitBranch`, with all points found before the branch ended; its `status` says why it ended.
 
     **Raises:**
 
-    - `TypeError` for what is no periodic orbit, and inside of `jax.jit`, `vmap` or `grad`: how many points there are
-      depends on values.
-    - `ValueError` for an orbit that did not converge, and an `along` that names nothing, or what is held.
+    - `TypeError` for an `orbit` that is not a periodic orbit, and inside `jax.jit`, `vmap` or `grad`, because the
+      number of points depends on values.
+    - `ValueError` for an orbit that did not converge, and for an `along` that names nothing or a held quantity.
 
     Source: Seydel, *Practical Bifurcation and Stability Analysis*, ch. 7; Doedel, Keller & Kernévez, Int. J.
     Bifurcation Chaos 1 (1991) 745.
     """
     _check(orbit)
-    # A whole number in the parameters may be followed like any other.
+    # Integers in the parameters become floats, so that a branch may follow them too.
     system, s = checked(orbit.system, orbit.t, orbit.q, orbit.v, orbit.params)
     problem = problem_of(system, *s)
     place, asked = _along(along, orbit, problem)
@@ -95,24 +96,24 @@ def _check(orbit):
         )
     if not is_eager() or coordinates.is_traced(orbit):
         raise TypeError(
-            "lj.continue_orbits decides by values how it goes on, and JAX is tracing.\n"
-            "Fix: call it outside of jit, vmap and grad; lj.periodic_orbit works inside."
+            "lj.continue_orbits needs values to choose its steps, but JAX is tracing.\n"
+            "Fix: call it outside jit, vmap and grad; lj.periodic_orbit works inside."
         )
     if np.ndim(orbit.period):
         raise ValueError(
-            f"these are orbits, a batch of shape {np.shape(orbit.period)}: a branch begins at one of them.\n"
+            f"this is a batch of orbits, of shape {np.shape(orbit.period)}: a branch begins at a single orbit.\n"
             "Fix: orbit = jax.tree.map(lambda x: x[0], orbit)."
         )
     if not bool(orbit.converged):
         raise ValueError(
-            f"this orbit is none yet: its end is {float(orbit.residual):.2g} of its size from its start.\n"
-            "Usual cause: lj.periodic_orbit did not converge, as it said.\n"
+            f"this orbit does not close: its end is {float(orbit.residual):.2g} of its size away from its start.\n"
+            "Usual cause: lj.periodic_orbit did not converge, and warned about it.\n"
             "Fix: another start or period, until orbit.converged."
         )
 
 
 def _along(along, orbit: PeriodicOrbit, problem: Problem) -> tuple[Along, Asked]:
-    """What changes, and what is still held of the orbit then."""
+    """What changes along the branch, and what the orbits still hold."""
     asked, reasons, names = orbit.asked, problem.reasons, coordinates.names(orbit.q)
     numbers = numbers_in(problem.state.params)
     if along in numbers:
@@ -123,13 +124,13 @@ def _along(along, orbit: PeriodicOrbit, problem: Problem) -> tuple[Along, Asked]
         raise no_such_number(along, problem.state.params, more)
     if not reasons.autonomous:
         raise ValueError(
-            f"along={along!r}: the system depends on time, so its orbits come one by one, and its period is that of "
-            f"the drive.\nFix: a number in the parameters, along={next(iter(numbers), 'omega')!r}."
+            f"along={along!r}: the system depends on time, so its orbits are isolated, with the period of the drive.\n"
+            f"Fix: a number in the parameters, along={next(iter(numbers), 'omega')!r}."
         )
     if along != PERIOD and not reasons.energy:
         raise ValueError(
-            f"along={along!r}: the Jacobi integral is not conserved here, so orbits of the same parameters come one by "
-            "one.\nUsual cause: a force or dissipation.\n"
+            f"along={along!r}: the Jacobi integral is not conserved here, so the orbits at given parameters are "
+            "isolated.\nUsual cause: a force or dissipation.\n"
             f"Fix: a number in the parameters, along={next(iter(numbers), 'omega')!r}."
         )
     free = asked._replace(free=True, energy=False, held=())
@@ -138,7 +139,7 @@ def _along(along, orbit: PeriodicOrbit, problem: Problem) -> tuple[Along, Asked]
     if along == PERIOD:
         if not reasons.energy:
             raise ValueError(
-                "along='period': a cycle of this system has a period of its own.\n"
+                "along='period': the system itself determines the period of its cycles.\n"
                 f"Fix: a number in the parameters, along={next(iter(numbers), 'mu')!r}."
             )
         return Along(along, PERIOD), free._replace(free=False)
@@ -151,7 +152,7 @@ def _guess(flow, t, z, period, asked):
 
 
 def _frame(orbit, problem, place: Along, asked, rtol, to) -> tuple[OrbitFrame, np.ndarray]:
-    """Units, what is held, and the point at which the branch begins."""
+    """The units, the held quantities, and the point at which the branch begins."""
     s, system = problem.state, problem.system
     flow = flow_of(system, *s, rtol, problem.rows)
     flow = replace(flow, params=jax.tree.map(lambda x: jnp.asarray(x) if isinstance(x, np.ndarray) else x, s.params))
@@ -165,7 +166,7 @@ def _frame(orbit, problem, place: Along, asked, rtol, to) -> tuple[OrbitFrame, n
     first, last = float(first), float(to)
     if not np.isfinite(last) or first == last:
         raise ValueError(
-            f"to={to} gives the parameter {place.name!r} no way to go from {first:.6g}.\n"
+            f"to={to} leaves the parameter {place.name!r} no range: it starts at {first:.6g}.\n"
             f"Fix: to={2 * first or 1.0:.6g}, and the first value in that of the orbit."
         )
     unit = np.asarray(abs(last - first), s.t.dtype)
@@ -184,21 +185,21 @@ def _frame(orbit, problem, place: Along, asked, rtol, to) -> tuple[OrbitFrame, n
 
 
 def _traced(frame, z, low, high, towards, most) -> tuple[OrbitTracer, Path, list[FoundOrbit]]:
-    """The branch from its start."""
+    """Trace the branch from its start."""
     size = frame.scale.size
     guide = Guide(z[:size], np.zeros(size, z.dtype))
     tracer = OrbitTracer(frame, low, high, guide, True)
     tracer.guide = tracer.evaluated(z).guide
     free = _left_free(tracer, z)
     if len(free):
-        # What is free where the branch begins leads to other orbits of the same parameter: one of them is followed.
+        # Directions that are free at the start lead to other orbits at the same parameter; holding them selects one.
         frame = replace(frame, free=jnp.asarray(free, frame.t.dtype))
         tracer = OrbitTracer(frame, low, high, tracer.guide, _explained(frame, len(free)))
     row = np.eye(z.size)[-1]
     corrected = tracer.corrected(z, row)
     begin = tracer.point(z if corrected is None else corrected, towards * row)
     if isinstance(begin, str):
-        raise ValueError(f"the orbit is no start of a branch: {begin}.\nFix: find it again with a smaller rtol.")
+        raise ValueError(f"a branch cannot begin at this orbit: {begin}.\nFix: find it again with a smaller rtol.")
     tracer.moved_to(begin)
     follower = _Follower(tracer)
     path = tracer.trace(begin, most, follower.step)
@@ -208,34 +209,34 @@ def _traced(frame, z, low, high, towards, most) -> tuple[OrbitTracer, Path, list
 
 
 def _left_free(tracer, z):
-    """Directions in which orbits of the same parameter lie beside the start, (d, N)."""
+    """Directions from the start to neighbouring orbits at the same parameter, (d, N)."""
     _, jacobian, _ = tracer.at(z)
     _, sizes, right = np.linalg.svd(jacobian)
     rank = int(np.sum(sizes > max(DEPENDENT, 1e2 * tracer.noise) * sizes[0]))
     kernel = right[rank:]
     if len(kernel) < 2:
         return np.zeros((0, z.size - 1))
-    # One direction of the kernel leads on along the parameter, the others across it.
+    # One direction of the kernel changes the parameter, the others do not.
     lead = kernel[:, -1] / max(np.linalg.norm(kernel[:, -1]), 1e-300)
     across = np.linalg.svd(lead[None])[2][1:] @ kernel
     return across[:, :-1]
 
 
 def _explained(frame, count):
-    """Whether all that is free belongs to multipliers that are known to be trivial."""
+    """Whether all free directions belong to multipliers that are known to be trivial."""
     shifts = sum(frame.reasons.ignorable)
     known = frame.reasons.energy + shifts * (1 + frame.reasons.momenta)
     return count <= known
 
 
 class _Follower:
-    """What is found from point to point."""
+    """Inspects each step of a branch, and collects its critical points."""
 
     def __init__(self, tracer: OrbitTracer):
         self.tracer, self.found = tracer, []
 
     def step(self, before: Point, after: Point, path: Path) -> str | None:
-        """What lies between two points, put into the path; why it ends, where it does."""
+        """Put the critical points between two points into the path; return why the branch ends, or None."""
         tracer, name = self.tracer, self.tracer.frame.along.name
         if tracer.frame.asked.moves:
             largest = max(point.seen.moves for point in path.points)
@@ -243,7 +244,7 @@ class _Follower:
             if shrinks or tracer.guide.rate @ tracer.evaluated(after.z).guide.rate < 0:
                 if before.seen.moves < HALF * largest:
                     return f"a state of rest, near {name} = {self._at_rest(path.points):.6g}"
-                # It begins and ends where the system rests.
+                # The orbit now begins and ends at an equilibrium, which takes infinitely long.
                 return f"a period that grows without end, near {name} = {before.seen.parameter:.6g}"
         if after.seen.period > ENDLESS * float(tracer.frame.period):
             return f"a period that grows without end, near {name} = {after.seen.parameter:.6g}"
@@ -254,14 +255,14 @@ class _Follower:
         return None
 
     def _put(self, path, all_found, before, after):
-        """Points between the last ones into the path, each in its place."""
+        """Insert points into the path, each before or after its last point."""
         place = len(path.points) - 1
         along = self.tracer.weights * (after.z - before.z)
         for found in all_found:
             point = found.point if isinstance(found, FoundOrbit) else found
             if isinstance(found, FoundOrbit):
                 point.critical = len(self.found)
-                # Multipliers are 1 in size there: what is beside it counts.
+                # A multiplier has size 1 there, so the nearest other point decides the stability.
                 point.growing = None
                 self.found.append(found)
             if along @ (point.z - before.z) < 0:
@@ -271,9 +272,10 @@ class _Follower:
                 path.points.append(point)
 
     def _at_rest(self, points):
-        """The parameter at which the motion has no size, in whose square it changes; a coordinate with the size itself.
+        """The parameter, extrapolated to a motion of size zero.
 
-        What is nothing beside the range is round-off.
+        It is linear in the square of the size; a coordinate of the start, in the size. A value that is negligible
+        compared with the range is round-off.
         """
         frame, b = self.tracer.frame, points[-1].seen
         found, power = b.parameter, 1 if frame.along.kind == ENTRY else 2
@@ -285,7 +287,7 @@ class _Follower:
 
 
 def _result(orbit, problem, place, tracer, path, found, along, first, last) -> OrbitBranch:
-    """All of it in the user's structure."""
+    """The result in the user's structure."""
     seen = [p.seen for p in path.points]
     trees = lambda rows: coordinates.like(orbit.q, np.asarray(np.stack(rows), tracer.dtype))
     n = len(coordinates.names(orbit.q))
@@ -309,6 +311,6 @@ def _result(orbit, problem, place, tracer, path, found, along, first, last) -> O
 
 
 def _with_floats(orbit, problem) -> PeriodicOrbit:
-    """The orbit with the parameters as the branch has them."""
+    """The orbit with its parameters as floats, as the branch has them."""
     arrays, static = pack((problem.system, coordinates.state(*problem.state).params))
     return replace(orbit, arrays=arrays, static=static)

@@ -1,11 +1,12 @@
-"""Critical points between two points of a branch: found by Newton's method, named, with derivatives by all parameters.
+"""Critical points between two points of a branch: solved by Newton's method, classified, with their derivatives.
 
-The larger systems are those of `branch_equations.py`. At a branch point the two directions are the roots of the
+The extended systems are those of `branch_equations.py`. At a branch point the two directions are the roots of the
 algebraic bifurcation equation: with b₁, b₂ a basis of the null space of `(E_y, E_μ)`, and τ = α b₁ + β b₂,
 
     ψ·D²E[τ, τ] = a α² + 2 b α β + c β² = 0
 
-One of them across the parameter (τ_μ = 0) makes it a pitchfork, or a line of equilibria; else it is transcritical.
+If one of them leaves the parameter constant (τ_μ = 0), the point is a pitchfork or a line of equilibria; otherwise it
+is transcritical.
 
 Source: Keller, *Lectures on Numerical Methods in Bifurcation Problems* (1987), §5.20-5.26; Govaerts, ch. 3.
 """
@@ -34,17 +35,17 @@ from lagjax.analysis.steady_tracer import SteadyTracer
 from lagjax.analysis.tracing import Point
 
 NEWTON = 12
-# Directions whose share of the parameter is less run across it.
+# A direction whose component along the parameter is smaller leaves the parameter constant.
 ACROSS = 1e-5
-# Changes of the parameter, of its range, that are none.
+# Changes of the parameter below this fraction of its range count as none.
 CONSTANT = 1e-9
-# The unfolding β of a branch point, beside equations of the size of one, below which branches really meet.
+# Branches meet where the unfolding β of a branch point is smaller; the equations are scaled to order one.
 MEETS = 1e-8
 
 
 @dataclass
 class Found:
-    """A critical point: its kind, z, the directions that cross there, a frequency, the derivatives of the parameter."""
+    """A critical point: its kind, z, the tangents of crossing branches, a frequency, the parameter's derivatives."""
 
     kind: str
     z: np.ndarray
@@ -56,10 +57,10 @@ class Found:
 
 
 def between(tracer: SteadyTracer, a: Point, b: Point) -> list[Found]:
-    """All that is critical between two neighbouring points of a branch."""
+    """All critical points between two neighbouring points of a branch."""
     found = []
     if max(abs(b.z[-1] - a.z[-1]), abs(a.tangent[-1]), abs(b.tangent[-1])) < CONSTANT:
-        # On a line of equilibria nothing but round-off changes.
+        # On a line of equilibria only round-off changes.
         return []
     crosses, folds = a.sign * b.sign < 0, a.tangent[-1] * b.tangent[-1] < 0
     if crosses and (point := _branch_point(tracer, a, b)):
@@ -76,7 +77,7 @@ def between(tracer: SteadyTracer, a: Point, b: Point) -> list[Found]:
 
 
 def _halved(tracer, a, b, of):
-    """Two points of a branch much nearer to where a count changes that changes between a and b."""
+    """Bisect a branch between a and b, where a count changes: two points much nearer to the change."""
     low, high, left, right = 0.0, 1.0, a, b
     for _ in range(14):
         share = 0.5 * (low + high)
@@ -91,20 +92,20 @@ def _halved(tracer, a, b, of):
 
 
 def _null_vectors(jacobian):
-    """The left null vector of E_y, nearly."""
+    """Approximate left and right null vectors of E_y."""
     u, _, vt = np.linalg.svd(jacobian[:, :-1])
     return u[:, -1], vt[-1]
 
 
 def _middle(tracer, a, b, share):
-    """A guess between two points."""
+    """A first guess for z between two points."""
     share = float(np.clip(share, 0.02, 0.98))
     point = tracer.between(a, b, share)
     return point.z if point else a.z + share * (b.z - a.z)
 
 
 def _inside(tracer, a, b, z):
-    """Whether a solution lies between the points, or as good as."""
+    """Whether a solution lies between the points, or nearly so."""
     step = b.z - a.z
     length = np.sqrt(tracer.weights @ step**2)
     share = (tracer.weights * step) @ (z - a.z) / length**2
@@ -141,7 +142,7 @@ def _directions(tracer, big):
     disc, size = b * b - a * c, max(abs(a), abs(b), abs(c))
     if not np.isfinite(size) or size == 0 or disc <= 1e-9 * size**2:
         return []
-    # Both roots without cancellation.
+    # This form gives both roots without cancellation.
     root = -(b + np.copysign(np.sqrt(disc), b))
     pairs = [(root, a), (c, root)]
     found = []
@@ -168,11 +169,11 @@ def _fold(tracer, a, b):
 
 
 def escape(tracer: SteadyTracer, point: Point) -> Found | None:
-    """The parameter at which the solution of linear equations is at infinity, from a point far out."""
+    """The critical point where the solution of linear equations goes to infinity, from a point far out."""
     n = tracer.frame.columns.size
     half, here = point.z.copy(), tracer.at(point.z)[1][:, :-1]
     half[:n] *= 0.5
-    # Elsewhere on the way the Jacobian is the same: the equations are linear.
+    # The equations are linear if the Jacobian is the same halfway.
     if np.max(np.abs(tracer.at(half)[1][:, :-1] - here)) > 1e-9 * np.max(np.abs(here)):
         return None
     psi = np.linalg.svd(here)[0][:, -1]
@@ -198,10 +199,10 @@ def _loses_stability(tracer, a, b):
 
 
 def _leaving(few, many):
-    """The root that grows after and did not before."""
+    """The root that grows at `many` but not at `few`."""
     known = many.seen[-1][np.isfinite(many.seen[-1])]
     grows = known[np.argsort(-known.real)][: many.growing]
-    # Of several the slowest is the one that has just begun to.
+    # Of several growing roots the slowest is the one that has just begun to grow.
     root = grows[np.argmin(grows.real)]
     return complex(root.real, abs(root.imag))
 
@@ -218,10 +219,11 @@ def _multiple_zero(tracer, few, many):
 
 
 def _divergence(tracer, a, b, few, many):
-    """Where a root leaves zero, among others that are always zero.
+    """Where a root leaves zero while other roots are always zero.
 
-    The characteristic polynomial begins with `c s^k` for k such roots, and c changes its sign. Of computed roots all
-    coefficients are those of a matrix that is off by round-off, although zeros of multiplicity k are off by its root.
+    With k roots that are always zero the characteristic polynomial begins with `c s^k`, and c changes its sign. Its
+    coefficients, computed from the roots, are accurate to round-off, although a zero of multiplicity k is off by the
+    k-th root of round-off.
     """
     fastest = tracer.fastest
     tiny = lambda point: int(np.sum(np.abs(point.seen[-1]) < 1e-5 * fastest))
@@ -280,11 +282,11 @@ def _near(tracer, a, b, z):
 
 
 def _flutter(tracer, few, many, root):
-    """The start of flutter: a pair of roots that crosses the axis, or two pairs that meet on it."""
+    """The onset of flutter: a pair of roots that crosses the imaginary axis, or two pairs that meet on it."""
     n = tracer.frame.columns.size
     roots = many.seen[-1][np.isfinite(many.seen[-1])]
     omega = abs(root.imag)
-    # Without damping the mirror image of a growing root decays: there are two beside this place on the axis.
+    # Without damping the mirror image of a growing root decays, so two roots are near this point of the axis.
     beside = np.sum(np.abs(roots - 1j * omega) < max(4 * abs(root.real), 1e-9 * omega))
     kind = COLLISION if beside > 1 else FLUTTER
     stiffness, damping, mass = (np.asarray(x, float) for x in dynamic_at(tracer.frame, few.z.astype(tracer.dtype)))
@@ -309,7 +311,7 @@ def _flutter(tracer, few, many, root):
 
 
 def _solved(tracer, kind, big, guide):
-    """The larger system by Newton's method, shortest steps where it leaves some freedom; and its last step."""
+    """Solve the extended system by Newton's method with steps of least norm; also returns the parameter's last step."""
     cast = lambda x: np.asarray(x, tracer.dtype)
     last, n, step, length = np.inf, tracer.frame.columns.size, big, np.inf
     for i in range(NEWTON):
@@ -329,7 +331,7 @@ def _solved(tracer, kind, big, guide):
 
 
 def _least(matrix, known):
-    """The shortest least-squares solution, columns in units of their own."""
+    """The least-squares solution of least norm, with rows and columns scaled to one."""
     columns = np.max(np.abs(matrix), axis=0)
     columns = np.where(columns > 0, columns, 1.0)
     rows = np.max(np.abs(matrix / columns), axis=1)
@@ -340,7 +342,7 @@ def _least(matrix, known):
 
 
 def _derivative(tracer, kind, big, guide):
-    """The derivatives of the critical parameter by every number in `params`, like these."""
+    """The derivatives of the critical parameter by every number in `params`, a tree like `params`."""
     cast = lambda x: np.asarray(x, tracer.dtype)
     _, jacobian = extended_at(kind, tracer.frame, cast(big), cast(guide))
     by_params = extended_by_params(kind, tracer.frame, cast(big), cast(guide))
@@ -356,5 +358,5 @@ def _derivative(tracer, kind, big, guide):
 
 
 def big_rows(x) -> int:
-    """How many equations a derivative is of."""
+    """The number of equations of a derivative."""
     return np.shape(x)[0]
