@@ -64,10 +64,10 @@ def periodic_orbit(
     - `period`: the approximate period, `[t]`. If the system depends on time, the period is kept, and must be a multiple
       of that of the drive; otherwise it is found with the orbit.
     - `t`: the time of the start, `[t]`, for a system that depends on it.
-    - `hold`: what the orbit keeps of the guess, where orbits form a family: `"energy"` (the Jacobi integral; the default
-      where it is conserved), `"period"`, or coordinates and velocities of the start by name: `"theta"`, `"r[0]"`,
-      `"v.theta"`; `"q"` and `"v"` for a single coordinate. Give several as a tuple. `()` holds nothing and finds the
-      orbit nearest to the guess.
+    - `hold`: what the orbit keeps of the guess, where orbits form a family: `"energy"` (the Jacobi integral; the
+      default where it is conserved), `"period"`, or coordinates and velocities of the start by name: `"theta"`,
+      `"r[0]"`, `"v.theta"`; `"q"` and `"v"` for a single coordinate. Give several as a tuple. `()` holds nothing and
+      finds the orbit nearest to the guess.
 
     **Other arguments:**
 

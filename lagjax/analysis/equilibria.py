@@ -1,8 +1,7 @@
 """Where a system rests, and how it moves steadily: equilibria and relative equilibria.
 
-The equations are those of `balance.py`; `numerics/roots.py` solves them from several starts at once. The end of a search
-counts as an equilibrium if its imbalance is negligible compared with the effect of a displacement as large as the
-coordinates,
+The equations are those of `balance.py`; `numerics/roots.py` solves them from several starts at once. A solution counts
+as an equilibrium if its imbalance is negligible compared with the effect of a displacement as large as the coordinates,
 
     |r_i| <= ε Σ_j |∂r_i/∂y_j| Y_j
 
@@ -95,8 +94,8 @@ def equilibria(
     - `t`: the time of the balance; a balance that does not last is reported.
 
     **Returns:** `Equilibria`: the equilibria found, with duplicates merged (also angles that differ by whole turns),
-    differentiable by `params`; and the outcome of each start. Under `jit`, `vmap` and `grad` nothing is merged: there is
-    one row for each start, and `found` says which of them are equilibria.
+    differentiable by `params`; and the outcome of each start. Under `jit`, `vmap` and `grad` nothing is merged: there
+    is one row for each start, and `found` says which of them are equilibria.
 
     **Raises:** `TypeError`, `ValueError` for starts of the wrong structure, for an L that depends on a coordinate named
     in `cyclic`, and what `lj.accelerations` raises about functions that cannot be called.

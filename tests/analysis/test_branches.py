@@ -296,7 +296,7 @@ def test_what_is_drawn():
     "change, words",
     [
         ({"along": "speed"}, "along='speed' is no number in params; there are 'a', 'g', 'm' and 'omega'"),
-        ({"to": 6.0}, "no way to go from 6"),
+        ({"to": 6.0}, "leaves the parameter 'omega' no range: it starts at 6"),
         ({"velocity": 1.0}, "L depends on 'q'"),
     ],
 )
