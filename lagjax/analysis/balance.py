@@ -101,8 +101,8 @@ class Steady(eqx.Module):
 
     def momenta(self, x, u) -> Float[Array, " k"]:
         """The conserved momenta `p·G_k`, one for each symmetry."""
-        of = lambda u: self.system.lagrangian(self.t, self.unflatten(x), self.unflatten(u), self.params)
-        return self.fields(x) @ jax.grad(of)(u)
+        lagrangian_of = lambda u: self.system.lagrangian(self.t, self.unflatten(x), self.unflatten(u), self.params)
+        return self.fields(x) @ jax.grad(lagrangian_of)(u)
 
 
 # Jitted so that a Lagrangian is traced only once, however often its balance is evaluated.
@@ -111,10 +111,10 @@ def imbalance(s: Steady, t, x, u, a, multipliers):
     """The residual `M a - F - Aᵀ λ - B λ` for any velocity and acceleration."""
     state = s.system, t, x, u, s.params, s.unflatten
     forcing, inertia = forcing_and_inertia(*state)
-    left = inertia(a) - forcing
+    residual = inertia(a) - forcing
     if multipliers.size:
-        left = left - multipliers @ forces(s, t, x, u)
-    return left.astype(x.dtype)
+        residual = residual - multipliers @ forces(s, t, x, u)
+    return residual.astype(x.dtype)
 
 
 @eqx.filter_jit
@@ -126,11 +126,13 @@ def forces(s: Steady, t, x, u) -> Float[Array, "m n"]:
 
 
 @eqx.filter_jit
-def restrictions(s: Steady, t, x, u):
+def constraint_residuals(s: Steady, t, x, u):
     """The residuals `g` or `phi` of all constraints, stacked in the order of their names."""
     q, v = s.unflatten(x), s.unflatten(u)
-    found = [constraints.evaluate(c, t, q, v, s.params) for c in s.system.constraints.values()]
-    return jnp.concatenate([jnp.atleast_1d(r).astype(x.dtype) for r in found]) if found else jnp.zeros(0, x.dtype)
+    residuals = [constraints.evaluate(c, t, q, v, s.params) for c in s.system.constraints.values()]
+    return (
+        jnp.concatenate([jnp.atleast_1d(r).astype(x.dtype) for r in residuals]) if residuals else jnp.zeros(0, x.dtype)
+    )
 
 
 def holonomic(s: Steady) -> np.ndarray:
@@ -138,41 +140,45 @@ def holonomic(s: Steady) -> np.ndarray:
     return constraints.holonomic_equations(s.system, s.t, s.like, s.like, s.params)
 
 
-def holding(s: Steady, x, rates):
+def held_residual(s: Steady, x, rates):
     """The residual of the held rates or momenta: their values minus those at which they are held."""
     if s.symmetries.hold is None or not s.symmetries.count:
         return jnp.zeros(0, x.dtype)
-    kept = rates if s.symmetries.hold == VELOCITY else s.momenta(x, s.velocity(x, rates))
-    return (kept - s.held).astype(x.dtype)
+    values = rates if s.symmetries.hold == VELOCITY else s.momenta(x, s.velocity(x, rates))
+    return (values - s.held).astype(x.dtype)
 
 
 def balance(s: Steady, y):
     """All equations of a steady motion as one residual; there are more than unknowns where some are redundant."""
     x, rates, multipliers = s.parts(y)
     u, a = s.velocity_and_acceleration(x, rates)
-    found = [imbalance(s, s.t, x, u, a, multipliers), restrictions(s, s.t, x, u), holding(s, x, rates)]
+    residuals = [
+        imbalance(s, s.t, x, u, a, multipliers),
+        constraint_residuals(s, s.t, x, u),
+        held_residual(s, x, rates),
+    ]
     if s.symmetries.hold is None and s.symmetries.count:
         # A moving constraint may determine rates that are free.
-        found.append(moving(s, x, u))
-    return jnp.concatenate(found)
+        residuals.append(holonomic_rates(s, x, u))
+    return jnp.concatenate(residuals)
 
 
-def moving(s: Steady, x, u):
+def holonomic_rates(s: Steady, x, u):
     """The residual `dg/dt` of the holonomic constraints, which a velocity must satisfy as well; 0 for the others."""
     rates = constraints.velocity_residual(s.system, s.t, x, u, s.params, s.unflatten)
     return jnp.where(holonomic(s), rates, 0.0)
 
 
-def passing(s: Steady, y):
+def drift_rates(s: Steady, y):
     """The rates at which the balance and each constraint change along the steady motion; zero if the motion lasts."""
     x, rates, multipliers = s.parts(y)
     u, a = s.velocity_and_acceleration(x, rates)
     if s.symmetries.fields:
         # Force components rotate with the motion as the symmetry prescribes, so only the constraints are checked.
-        return jnp.concatenate([jnp.zeros_like(x), moving(s, x, u)])
+        return jnp.concatenate([jnp.zeros_like(x), holonomic_rates(s, x, u)])
 
     def along(t, x):
-        return jnp.concatenate([imbalance(s, t, x, u, a, multipliers), restrictions(s, t, x, u)])
+        return jnp.concatenate([imbalance(s, t, x, u, a, multipliers), constraint_residuals(s, t, x, u)])
 
     return jax.jvp(along, (s.t, x), (jnp.ones_like(s.t), u))[1]
 
@@ -205,11 +211,11 @@ def departures(s: Steady, y, jacobian) -> Departures:
         return imbalance(s, s.t, x, u + rate, total, multipliers)
 
     damping, mass = jax.jacfwd(residual, argnums=(0, 1))(jnp.zeros_like(x), jnp.zeros_like(x))
-    by_positions, is_holonomic = jacobian[n : n + m, :n], holonomic(s)[:, None]
-    rows = by_positions
+    by_position, is_holonomic = jacobian[n : n + m, :n], holonomic(s)[:, None]
+    rows = by_position
     if not holonomic(s).all():
         rows = constraints.jacobian(s.system, s.t, x, u, s.params, s.unflatten)
-    slopes = jnp.where(is_holonomic, 0.0, by_positions)
+    slopes = jnp.where(is_holonomic, 0.0, by_position)
     return Departures(jacobian[:n, :n], damping, mass, rows, slopes, -jacobian[:n, n + k : n + k + m].T)
 
 
@@ -219,13 +225,13 @@ def directions(s: Steady, d: Departures, y):
     zero = jnp.zeros_like(rows)
     of_positions = jnp.where(restricts_positions[:, None], rows, 0.0)
     along = s.fields(s.parts(y)[0])
-    barred = [jnp.concatenate([of_positions, zero], axis=1), jnp.concatenate([d.slopes, rows], axis=1)]
-    barred.append(jnp.concatenate([along, jnp.zeros_like(along)], axis=1))
-    barred = jnp.concatenate(barred)
-    if not barred.shape[0]:
+    excluded = [jnp.concatenate([of_positions, zero], axis=1), jnp.concatenate([d.slopes, rows], axis=1)]
+    excluded.append(jnp.concatenate([along, jnp.zeros_like(along)], axis=1))
+    excluded = jnp.concatenate(excluded)
+    if not excluded.shape[0]:
         return jnp.eye(2 * n, dtype=rows.dtype), jnp.asarray(2 * n)
-    kept = independent_rows(barred) & jnp.any(barred != 0, axis=1)
-    used = jnp.where(kept[:, None], barred, 0.0)
+    kept = independent_rows(excluded) & jnp.any(excluded != 0, axis=1)
+    used = jnp.where(kept[:, None], excluded, 0.0)
     gram = used @ used.T + jnp.diag(jnp.where(kept, 0.0, 1.0))
     return jnp.eye(2 * n, dtype=rows.dtype) - used.T @ _solved(gram, used), 2 * n - jnp.sum(kept)
 
@@ -252,9 +258,9 @@ def characteristic_roots(s: Steady, y, jacobian, derivatives=True):
     known = jnp.block([[-d.stiffness, -d.damping], [jnp.zeros_like(rows), -slopes]])
     # A coordinate without inertia, such as an azimuth at the pole, has no equation for its small motions.
     sizes = jnp.maximum(jnp.max(jnp.abs(d.mass), axis=1), jnp.max(jnp.abs(rows), axis=0, initial=0.0))
-    sound = reciprocal_condition(matrix) > SINGULAR_BELOW[np.dtype(matrix.dtype)]
-    sound = sound & (jnp.min(sizes) > jnp.finfo(sizes.dtype).eps ** 1.3 * jnp.max(sizes))
-    accelerations = _solved(jnp.where(sound, matrix, jnp.eye(n + m, dtype=matrix.dtype)), known)[:n]
+    regular = reciprocal_condition(matrix) > SINGULAR_BELOW[np.dtype(matrix.dtype)]
+    regular = regular & (jnp.min(sizes) > jnp.finfo(sizes.dtype).eps ** 1.3 * jnp.max(sizes))
+    accelerations = _solved(jnp.where(regular, matrix, jnp.eye(n + m, dtype=matrix.dtype)), known)[:n]
     unit = jnp.eye(n, dtype=rows.dtype)
     whole = jnp.concatenate([jnp.concatenate([jnp.zeros_like(unit), unit], axis=1), accelerations])
     unit = jnp.eye(2 * n, dtype=rows.dtype)
@@ -262,10 +268,10 @@ def characteristic_roots(s: Steady, y, jacobian, derivatives=True):
     # Ranked by comparisons because sorting is slow to compile; the roots nearest to zero belong to removed directions.
     size, order = lax.stop_gradient(jnp.abs(roots)), np.arange(2 * n)
     before = (size[None, :] < size[:, None]) | (size[None, :] == size[:, None]) & (order[None, :] < order[:, None])
-    return jnp.where(sound & (jnp.sum(before, axis=1) >= 2 * n - count), roots, jnp.nan)
+    return jnp.where(regular & (jnp.sum(before, axis=1) >= 2 * n - count), roots, jnp.nan)
 
 
-def shortest(pushes, known):
+def shortest_multipliers(pushes, known):
     """The shortest λ with `Wᵀ λ = known`, W (m, n) of any rank; differentiable where the rank does not change."""
     if not pushes.shape[0]:
         return jnp.zeros(0, pushes.dtype)

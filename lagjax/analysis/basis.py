@@ -43,9 +43,11 @@ class Basis(NamedTuple):
 
 def motions(q) -> Basis:
     """The motions that are tried for coordinates with the structure of q."""
-    found, n = points(q), len(coordinates.names(q))
-    elements = [*_shifts(q, found, n), _moved(TIME, "time", n, clock=-1.0), *_turns(found, n)]
-    elements += [_moved(f"t {e.name}", "boost", n, drift=e.shift) for e in elements if e.kind == "space" and _pushes(e)]
+    all_points, n = points(q), len(coordinates.names(q))
+    elements = [*_shifts(q, all_points, n), _element(TIME, "time", n, clock=-1.0), *_rotations(all_points, n)]
+    elements += [
+        _element(f"t {e.name}", "boost", n, drift=e.shift) for e in elements if e.kind == "space" and _is_shift(e)
+    ]
     if n > EACH_UP_TO:
         elements = [e for e in elements if e.kind != "boost" or e.name.startswith("t P_")]
     elements += _scalings(q, n)
@@ -53,57 +55,65 @@ def motions(q) -> Basis:
     return Basis(Affine(*stacked), tuple(e.name for e in elements), tuple(e.kind for e in elements))
 
 
-def _shifts(q, found, n):
+def _shifts(q, all_points, n):
     elements = []
     for k, axis in enumerate(AXES):
-        moved = [point.places[k] for point in found if point.places[k] is not None]
+        moved = [point.places[k] for point in all_points if point.places[k] is not None]
         if len(moved) > 1:
-            elements.append(_moved(f"P_{axis}", "space", n, shift=_at(moved, n)))
-    return elements + [_moved(f"p_{x}", "space", n, shift=_at([i], n)) for i, x in enumerate(coordinates.names(q))]
+            elements.append(_element(f"P_{axis}", "space", n, shift=_ones_at(moved, n)))
+    return elements + [
+        _element(f"p_{x}", "space", n, shift=_ones_at([i], n)) for i, x in enumerate(coordinates.names(q))
+    ]
 
 
-def _turns(found, n):
+def _rotations(all_points, n):
     elements = []
     for axis in AXES:
-        pairs = [(point.label, pair) for point in found if (pair := turned(point, axis))]
+        pairs = [(point.label, pair) for point in all_points if (pair := turned(point, axis))]
         if pairs:
-            elements.append(_moved(f"L_{axis}", "space", n, matrix=_turning([pair for _, pair in pairs], n)))
-    if 1 < len(found) <= EACH_POINT_UP_TO:
+            elements.append(_element(f"L_{axis}", "space", n, matrix=_rotation([pair for _, pair in pairs], n)))
+    if 1 < len(all_points) <= EACH_POINT_UP_TO:
         for axis in AXES:
-            for point in found:
+            for point in all_points:
                 if pair := turned(point, axis):
                     name = f"L_{axis}({point.label})"
-                    elements.append(_moved(name, "space", n, matrix=_turning([pair], n)))
+                    elements.append(_element(name, "space", n, matrix=_rotation([pair], n)))
     return elements
 
 
 def _scalings(q, n):
-    elements = [_moved("q·p", "scaling", n, matrix=np.eye(n))]
+    elements = [_element("q·p", "scaling", n, matrix=np.eye(n))]
     if 1 < n <= EACH_UP_TO:
         for i, name in enumerate(coordinates.names(q)):
-            elements.append(_moved(f"{name} p_{name}", "scaling", n, matrix=np.diag(_at([i], n))))
-    return [*elements, _moved(f"t ({TIME})", "scaling", n, clock_rate=-1.0)]
+            elements.append(_element(f"{name} p_{name}", "scaling", n, matrix=np.diag(_ones_at([i], n))))
+    return [*elements, _element(f"t ({TIME})", "scaling", n, clock_rate=-1.0)]
 
 
-def _moved(name, kind, n, shift=None, matrix=None, drift=None, clock=0.0, clock_rate=0.0):
+def _element(name, kind, n, shift=None, matrix=None, drift=None, clock=0.0, clock_rate=0.0):
     zero = np.zeros(n)
-    given = lambda x, nothing: nothing if x is None else x
+    or_default = lambda x, default: default if x is None else x
     return Element(
-        name, kind, given(shift, zero), given(matrix, np.zeros((n, n))), given(drift, zero), clock, clock_rate
+        name,
+        kind,
+        or_default(shift, zero),
+        or_default(matrix, np.zeros((n, n))),
+        or_default(drift, zero),
+        clock,
+        clock_rate,
     )
 
 
-def _pushes(element):
+def _is_shift(element):
     return bool(np.any(element.shift != 0))
 
 
-def _at(places, n):
-    found = np.zeros(n)
-    found[places] = 1.0
-    return found
+def _ones_at(places, n):
+    vector = np.zeros(n)
+    vector[places] = 1.0
+    return vector
 
 
-def _turning(pairs, n):
+def _rotation(pairs, n):
     matrix = np.zeros((n, n))
     for first, second in pairs:
         matrix[first, second], matrix[second, first] = -1.0, 1.0
@@ -137,13 +147,13 @@ class Gauge(NamedTuple):
 def gauges(q) -> Gauge:
     """The gauge functions that are tried for coordinates with the structure of q."""
     names = coordinates.names(q)
-    n, found = len(names), []
-    found += [(0, (i,)) for i in range(n)]
+    n, monomials = len(names), []
+    monomials += [(0, (i,)) for i in range(n)]
     if n <= PRODUCTS_UP_TO:
-        found += [(0, pair) for pair in combinations_with_replacement(range(n), 2)]
-    found += [(1, ()), (2, ()), *((1, (i,)) for i in range(n))]
-    powers, factors = zip(*found)
-    return Gauge(powers, factors, tuple(_named(p, f, names) for p, f in found), np.asarray(powers) > 0)
+        monomials += [(0, pair) for pair in combinations_with_replacement(range(n), 2)]
+    monomials += [(1, ()), (2, ()), *((1, (i,)) for i in range(n))]
+    powers, factors = zip(*monomials)
+    return Gauge(powers, factors, tuple(_named(p, f, names) for p, f in monomials), np.asarray(powers) > 0)
 
 
 def _named(power, factors, names):
@@ -179,8 +189,8 @@ class Combination(NamedTuple):
     def __call__(self, t, q, params):
         """ξ, with the structure of q."""
         x, unflatten = coordinates.flatten(q)
-        to = lambda y: jnp.asarray(y, x.dtype)
-        return unflatten(to(self.shift) + to(self.matrix) @ x + t * to(self.drift))
+        cast = lambda y: jnp.asarray(y, x.dtype)
+        return unflatten(cast(self.shift) + cast(self.matrix) @ x + t * cast(self.drift))
 
 
 class Clock(NamedTuple):

@@ -90,15 +90,15 @@ def place_of(steady: Steady, along: str) -> Place:
     """Find a parameter by name, `"omega"`, `"spring.k"`, `"k[1]"`; or a held rate `"v.psi"` or momentum `"p.psi"`."""
     names = coordinates.names(steady.like)
     for kind, hold in (("v", equations.VELOCITY), ("p", equations.MOMENTUM)):
-        of = [f"{kind}.{names[i]}" if names[i] != "q" else kind for i in steady.symmetries.places]
-        of = of or [f"{kind}[{i}]" for i in range(steady.symmetries.count)]
-        if along in of and steady.symmetries.hold == hold:
-            return Place(along, None, of.index(along))
-    found = numbers_in(steady.params)
-    if along not in found:
+        held_names = [f"{kind}.{names[i]}" if names[i] != "q" else kind for i in steady.symmetries.places]
+        held_names = held_names or [f"{kind}[{i}]" for i in range(steady.symmetries.count)]
+        if along in held_names and steady.symmetries.hold == hold:
+            return Place(along, None, held_names.index(along))
+    numbers = numbers_in(steady.params)
+    if along not in numbers:
         more = 'and "v.psi" for the velocity of a cyclic coordinate psi that is held (with hold="momentum": "p.psi")'
         raise no_such_number(along, steady.params, more)
-    return Place(along, found[along])
+    return Place(along, numbers[along])
 
 
 @compiled
@@ -117,14 +117,14 @@ def full_jacobian(steady: Steady, y):
 
 
 @compiled
-def seen_at(frame: Frame, z):
+def outputs_at(frame: Frame, z):
     """The outputs of a point: parameter, q, v, multipliers, and the characteristic roots of its small motions."""
     s, y = frame.split(z)
     x, rates, multipliers = s.parts(y)
     u = s.velocity(x, rates)
     if s.m > 1:
         pushes = equations.forces(s, s.t, x, u)
-        multipliers = equations.shortest(pushes, multipliers @ pushes)
+        multipliers = equations.shortest_multipliers(pushes, multipliers @ pushes)
     by_name = equations.constraints.split(s.system, multipliers, s.t, s.like, s.like, s.params) if s.m else {}
     jacobian = jax.jacfwd(lambda y: equations.balance(s, y))(y)
     roots = equations.characteristic_roots(s, y, jacobian, derivatives=False)
@@ -187,20 +187,20 @@ def extended(kind: str, frame: Frame, big, guide):
     real, imaginary = (stiffness - omega**2 * mass) / rows[:, None], omega * damping / rows[:, None]
     times = lambda a, b: (real @ a - imaginary @ b, real @ b + imaginary @ a)
     unit = lambda a, b, one: jnp.stack([guide[:size] @ a + guide[size:] @ b - one, guide[:size] @ b - guide[size:] @ a])
-    found = [value, *times(re, im), unit(re, im, 1.0)]
+    parts = [value, *times(re, im), unit(re, im, 1.0)]
     if kind == COLLISION:
         # ω D'(iω), with D' = C + 2 i ω M.
         slope, turn = omega * damping / rows[:, None], 2 * omega**2 * mass / rows[:, None]
         first, second = times(re2, im2)
-        found += [first + slope @ re - turn @ im, second + slope @ im + turn @ re, unit(re2, im2, 0.0)]
-    return jnp.concatenate(found)
+        parts += [first + slope @ re - turn @ im, second + slope @ im + turn @ re, unit(re2, im2, 0.0)]
+    return jnp.concatenate(parts)
 
 
 @compiled
 def extended_at(kind: str, frame: Frame, big, guide):
     """The extended system and its Jacobian."""
-    of = lambda big: extended(kind, frame, big, guide)
-    return of(big), jax.jacfwd(of)(big)
+    residual = lambda big: extended(kind, frame, big, guide)
+    return residual(big), jax.jacfwd(residual)(big)
 
 
 @compiled
@@ -208,8 +208,8 @@ def extended_by_params(kind: str, frame: Frame, big, guide):
     """The derivative of the extended system by each number in `params`, a tree like `params` of (rows, ...)."""
     floats, rest = eqx.partition(frame.steady.params, eqx.is_inexact_array)
 
-    def of(floats):
+    def residual(floats):
         steady = replace(frame.steady, params=eqx.combine(floats, rest))
         return extended(kind, replace(frame, steady=steady), big, guide)
 
-    return jax.jacfwd(of)(floats)
+    return jax.jacfwd(residual)(floats)

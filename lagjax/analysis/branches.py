@@ -149,7 +149,7 @@ class Branches(eqx.Module):
         )  # fmt: skip
         return fig
 
-    def _not_far(self, branch):
+    def _in_view(self, branch):
         """Which points determine the limits of the plot: not those of a branch on its way to infinity."""
         ends = np.concatenate([branch.parameter[:1], branch.parameter[-1:]])
         off = np.min(np.abs(branch.parameter[:, None] - ends), axis=1)
@@ -157,8 +157,8 @@ class Branches(eqx.Module):
         return (off > 0.03 * abs(self.last - self.first)) | (not far)
 
     def _varying(self, curves):
-        all_of = np.concatenate(curves)
-        spread = np.ptp(all_of, axis=0)
+        values = np.concatenate(curves)
+        spread = np.ptp(values, axis=0)
         largest = np.max(spread, initial=0.0)
         return [name for name, x in zip(self.names, spread) if x > 1e-9 * largest][:6] or list(self.names[:1])
 
@@ -185,7 +185,7 @@ class Branches(eqx.Module):
                 markersize=7, linestyle="", label=c.kind, zorder=4,
             )  # fmt: skip
         if any("infinity" in b.status for b in self.branches):
-            near = np.concatenate([x[self._not_far(b)] for b, x in zip(self.branches, inner)])
+            near = np.concatenate([x[self._in_view(b)] for b, x in zip(self.branches, inner)])
             middle, half = 0.5 * (near.min() + near.max()), 0.55 * np.ptp(near)
             axis.set_ylim(middle - max(half, 1e-12), middle + max(half, 1e-12))
         axis.set(xlabel=self.along, ylabel=self.names[j])
@@ -194,9 +194,9 @@ class Branches(eqx.Module):
 def _all_handles(axes):
     handles, labels = [], []
     for axis in axes:
-        found = axis.get_legend_handles_labels()
-        handles += found[0]
-        labels += found[1]
+        new_handles, new_labels = axis.get_legend_handles_labels()
+        handles += new_handles
+        labels += new_labels
     return handles, labels
 
 

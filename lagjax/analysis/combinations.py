@@ -32,15 +32,15 @@ def null_space(columns: np.ndarray, precision: Precision) -> NullSpace:
         return NullSpace(np.zeros((0, 0)), np.zeros(0), np.inf)
     if len(columns) > count:
         columns = np.asarray(np.linalg.qr(columns, mode="r"))
-    _, found, directions = np.linalg.svd(columns)
+    _, nonzero, directions = np.linalg.svd(columns)
     sizes = np.zeros(count)
-    sizes[: len(found)] = found
+    sizes[: len(nonzero)] = nonzero
     rank = int(np.sum(sizes > precision.null))
     least = max(float(sizes[rank]) if rank < count else 0.0, precision.exact / 1e3)
     gap = float(sizes[rank - 1]) / least if rank else np.inf
     vectors = reduced(directions[rank:], precision)
     return NullSpace(
-        np.stack([_again(columns, v, precision.null) for v in vectors]) if len(vectors) else vectors, sizes, gap
+        np.stack([_from_support(columns, v, precision.null) for v in vectors]) if len(vectors) else vectors, sizes, gap
     )
 
 
@@ -98,7 +98,7 @@ def independent(columns: np.ndarray, precision: Precision) -> np.ndarray:
     return kept
 
 
-def _again(columns, vector, tolerance):
+def _from_support(columns, vector, tolerance):
     """The vector computed again from the columns of its nonzero entries, if their null space has one dimension."""
     support = np.flatnonzero(vector)
     if len(support) == 1:
@@ -106,9 +106,9 @@ def _again(columns, vector, tolerance):
     _, sizes, directions = np.linalg.svd(columns[:, support])
     if len(sizes) < len(support) or (len(sizes) > 1 and sizes[-2] <= tolerance):
         return vector
-    found = np.zeros_like(vector)
-    found[support] = directions[-1] / directions[-1][0] * vector[support[0]]
-    return found
+    result = np.zeros_like(vector)
+    result[support] = directions[-1] / directions[-1][0] * vector[support[0]]
+    return result
 
 
 def _cleaned(row, zero_below):

@@ -14,7 +14,7 @@ from jaxtyping import ArrayLike, PyTree
 from lagjax.analysis.balance import VELOCITY, Steady
 from lagjax.analysis.branch_equations import Frame, Place, full_jacobian, place_of
 from lagjax.analysis.branches import Branch, Branches, Critical
-from lagjax.analysis.critical_points import Found, between, escape
+from lagjax.analysis.critical_points import CriticalPoint, between, escape
 from lagjax.analysis.equilibria import held_at, searched
 from lagjax.analysis.found_equilibria import OK, WORDS
 from lagjax.analysis.starts import checked, stacked, stacked_one, symmetries_of
@@ -171,16 +171,16 @@ def _frame(steady: Steady, place: Place, first: float, last: float, v, units) ->
     rank = int(np.sum(sizes > DEPENDENT * sizes[0]))
     # More equations are dependent at a critical point than elsewhere, so the rank is computed again close by.
     x = coordinates.like(steady.like, np.asarray(y[:n], steady.t.dtype))
-    beside = Steady(steady.system, steady.t, steady.params, steady.held, x, steady.symmetries)
-    beside = place.put(beside, first + NEARBY * (last - first))
-    other = _solution(beside, v)
-    if not isinstance(other, str):
-        _, _, *those = _parts(beside, other, positions, (rows, columns))
-        if int(np.sum(those[1] > DEPENDENT * those[1][0])) > rank:
-            u, sizes, vt = those
+    nearby = Steady(steady.system, steady.t, steady.params, steady.held, x, steady.symmetries)
+    nearby = place.put(nearby, first + NEARBY * (last - first))
+    nearby_y = _solution(nearby, v)
+    if not isinstance(nearby_y, str):
+        _, _, *nearby_svd = _parts(nearby, nearby_y, positions, (rows, columns))
+        if int(np.sum(nearby_svd[1] > DEPENDENT * nearby_svd[1][0])) > rank:
+            u, sizes, vt = nearby_svd
             rank = int(np.sum(sizes > DEPENDENT * sizes[0]))
             before = first - NEARBY * (last - first)
-            earlier = _solution(place.put(beside, before), v)
+            earlier = _solution(place.put(nearby, before), v)
             first, y = (first, y) if isinstance(earlier, str) else (before, earlier)
     dtype = steady.t.dtype
     arrays = [np.asarray(a, dtype) for a in (u[:, :rank].T, vt[rank:], y / columns, rows, columns, unit)]
@@ -224,8 +224,8 @@ class _Run:
     def __init__(self, tracer: SteadyTracer, most: int, crossings: bool):
         self.tracer, self.most, self.crossings = tracer, most, crossings
         self.paths: list[Path] = []
-        self.found: list[Found] = []
-        self.on: list[set[int]] = []
+        self.found: list[CriticalPoint] = []
+        self.branches_at: list[set[int]] = []
         self.waiting: list[_Launch] = []
 
     def main(self, z, towards):
@@ -244,29 +244,29 @@ class _Run:
             if whole.points[1:]:
                 self.paths.append(whole)
             else:
-                for on in self.on:
-                    on.discard(len(self.paths))
+                for branches_at in self.branches_at:
+                    branches_at.discard(len(self.paths))
 
     def _follow(self, begin: Point):
         path = self.tracer.trace(begin, self.most, self._step)
-        self._far(path)
+        self._describe_infinity(path)
         self.paths.append(path)
 
     def _from(self, launch: _Launch, sign: float) -> Path:
         """Trace one half of a branch that crosses another."""
         critical = self.found[launch.critical]
         jacobian = self.tracer.at(critical.z)[1]
-        seen = self.tracer.point(critical.z, sign * launch.direction)
-        if isinstance(seen, str):
-            return Path([], seen)
+        point = self.tracer.point(critical.z, sign * launch.direction)
+        if isinstance(point, str):
+            return Path([], point)
         begin = Point(
-            critical.z, jacobian, sign * launch.direction, 0.0, seen.seen, None, seen.negative, launch.critical
+            critical.z, jacobian, sign * launch.direction, 0.0, point.outputs, None, point.negative, launch.critical
         )
         path = self.tracer.trace(begin, self.most, self._step, FIRST)
-        self._far(path)
+        self._describe_infinity(path)
         return path
 
-    def _far(self, path):
+    def _describe_infinity(self, path):
         """State where a branch goes to infinity, with a critical point if the parameter there can be solved for."""
         if path.status != "infinity":
             return
@@ -276,7 +276,7 @@ class _Run:
         if found:
             path.status = f"infinity, at {name} = {found.z[-1] * self.tracer.unit:.10g}"
             self.found.append(found)
-            self.on.append({len(self.paths)})
+            self.branches_at.append({len(self.paths)})
 
     def _step(self, before: Point, after: Point, path: Path) -> str | None:
         """Put the critical points between two points into the path; return why the branch ends, or None."""
@@ -287,24 +287,24 @@ class _Run:
                 self.found[points[0].critical].kind = "line of equilibria"
                 return "a line of equilibria, which goes on"
         ended = None
-        all_found = between(self.tracer, before, after)
-        if before.sign * after.sign < 0 and not any(found.directions for found in all_found):
+        all_critical = between(self.tracer, before, after)
+        if before.sign * after.sign < 0 and not any(critical.directions for critical in all_critical):
             return AGAIN
-        for found in all_found:
-            number, known = self._number(found)
+        for critical in all_critical:
+            number, known = self._number(critical)
             kept = self.found[number]
             along = (self.tracer.weights * (after.z - before.z)) / np.linalg.norm(after.z - before.z)
-            self.on[number].add(len(self.paths))
+            self.branches_at[number].add(len(self.paths))
             if known and any(abs(_cosine(self.tracer, d, after.z - before.z)) > 0.95 for d in kept.used):
                 if kept.directions:
                     ended = f"a known crossing, at {self._value(kept)}"
-            own = max(kept.directions, key=lambda d: abs(d @ along)) if kept.directions else None
-            if own is not None:
-                kept.used.append(own)
+            followed = max(kept.directions, key=lambda d: abs(d @ along)) if kept.directions else None
+            if followed is not None:
+                kept.used.append(followed)
                 self.waiting = [w for w in self.waiting if w.critical != number or abs(w.direction @ along) <
                                 0.95 * np.sqrt(along @ along)]  # fmt: skip
                 if not known and self.crossings:
-                    others = [d for d in kept.directions if d is not own]
+                    others = [d for d in kept.directions if d is not followed]
                     self.waiting += [_Launch(number, d) for d in others]
                     kept.used += others
             path.points.append(self._point(kept, number, after))
@@ -318,15 +318,15 @@ class _Run:
         point = self.tracer.point(found.z, after.tangent)
         if isinstance(point, str):
             point = after
-        return Point(found.z, point.jacobian, after.tangent, after.sign, point.seen, None, after.negative, number)
+        return Point(found.z, point.jacobian, after.tangent, after.sign, point.outputs, None, after.negative, number)
 
-    def _number(self, found: Found) -> tuple[int, bool]:
+    def _number(self, found: CriticalPoint) -> tuple[int, bool]:
         """The number of a critical point among those found, and whether it was known already."""
         for i, other in enumerate(self.found):
             if np.max(np.abs(self.tracer.weights * (other.z - found.z))) < SAME * self.tracer.size(found.z):
                 return i, True
         self.found.append(found)
-        self.on.append(set())
+        self.branches_at.append(set())
         return len(self.found) - 1, False
 
     def result(self, along, first, last, s) -> Branches:
@@ -343,21 +343,21 @@ class _Run:
 
     def _critical(self, i) -> Critical:
         found = self.found[i]
-        on = {k for k in self.on[i] if k < len(self.paths)}
-        on |= {k for k, path in enumerate(self.paths) if any(p.critical == i for p in path.points)}
-        point = self.tracer.point(found.z, self._any(found))
-        seen = point.seen if not isinstance(point, str) else None
-        seen = seen or jax.tree.map(lambda x: x * np.nan, self.paths[0].points[0].seen)
+        branches_at = {k for k in self.branches_at[i] if k < len(self.paths)}
+        branches_at |= {k for k, path in enumerate(self.paths) if any(p.critical == i for p in path.points)}
+        point = self.tracer.point(found.z, self._some_direction(found))
+        outputs = point.outputs if not isinstance(point, str) else None
+        outputs = outputs or jax.tree.map(lambda x: x * np.nan, self.paths[0].points[0].outputs)
         value = found.z[-1] * self.tracer.unit
-        _, q, v, multipliers, _ = seen
+        _, q, v, multipliers, _ = outputs
         if found.kind == "escape":
             q = jax.tree.map(lambda x: np.full_like(x, np.inf), q)
         return Critical(
             found.kind, np.asarray(value), q, v, multipliers, found.derivative, np.asarray(found.frequency),
-            np.asarray(found.accuracy * self.tracer.unit), tuple(sorted(on)),
+            np.asarray(found.accuracy * self.tracer.unit), tuple(sorted(branches_at)),
         )  # fmt: skip
 
-    def _any(self, found):
+    def _some_direction(self, found):
         return found.directions[0] if found.directions else np.ones_like(found.z)
 
 
@@ -377,8 +377,8 @@ def _joined(halves: list[Path]) -> Path:
 
 
 def _branch(path: Path, tracer: SteadyTracer) -> Branch:
-    seen = [p.seen for p in path.points]
-    parameter, q, v, multipliers, roots = jax.tree.map(lambda *x: np.stack(x), *seen)
+    outputs = [p.outputs for p in path.points]
+    parameter, q, v, multipliers, roots = jax.tree.map(lambda *x: np.stack(x), *outputs)
     stable = np.array([p.growing for p in path.points], object)
     # At a critical point a root is zero up to round-off, so the nearest other point decides the stability.
     known = [i for i, n in enumerate(stable) if n is not None]

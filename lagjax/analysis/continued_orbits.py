@@ -171,10 +171,10 @@ def _frame(orbit, problem, place: Along, asked, rtol, to) -> tuple[OrbitFrame, n
         )
     unit = np.asarray(abs(last - first), s.t.dtype)
     y = np.append((nodes / np.asarray(scale)).reshape(-1), 0.0)
-    none = jnp.zeros((0, y.size), s.t.dtype)
+    no_rows = jnp.zeros((0, y.size), s.t.dtype)
     frame = OrbitFrame(
         flow, jnp.asarray(s.t), scale, period, unit, jnp.asarray(flat(orbit.turns), s.t.dtype), integral, nodes[0],
-        slope, sizes, None, none, y, place, asked, problem.reasons, len(nodes),
+        slope, sizes, None, no_rows, y, place, asked, problem.reasons, len(nodes),
     )  # fmt: skip
     z = np.append(y, first / unit)
     if not problem.reasons.autonomous and place.kind == NUMBER:
@@ -190,11 +190,11 @@ def _traced(frame, z, low, high, towards, most) -> tuple[OrbitTracer, Path, list
     guide = Guide(z[:size], np.zeros(size, z.dtype))
     tracer = OrbitTracer(frame, low, high, guide, True)
     tracer.guide = tracer.evaluated(z).guide
-    free = _left_free(tracer, z)
+    free = _free_directions(tracer, z)
     if len(free):
         # Directions that are free at the start lead to other orbits at the same parameter; holding them selects one.
         frame = replace(frame, free=jnp.asarray(free, frame.t.dtype))
-        tracer = OrbitTracer(frame, low, high, tracer.guide, _explained(frame, len(free)))
+        tracer = OrbitTracer(frame, low, high, tracer.guide, _free_are_trivial(frame, len(free)))
     row = np.eye(z.size)[-1]
     corrected = tracer.corrected(z, row)
     begin = tracer.point(z if corrected is None else corrected, towards * row)
@@ -204,11 +204,11 @@ def _traced(frame, z, low, high, towards, most) -> tuple[OrbitTracer, Path, list
     follower = _Follower(tracer)
     path = tracer.trace(begin, most, follower.step)
     if path.status == "infinity":
-        path.status = f"infinity, near {frame.along.name} = {path.points[-1].seen.parameter:.6g}"
+        path.status = f"infinity, near {frame.along.name} = {path.points[-1].outputs.parameter:.6g}"
     return tracer, path, follower.found
 
 
-def _left_free(tracer, z):
+def _free_directions(tracer, z):
     """Directions from the start to neighbouring orbits at the same parameter, (d, N)."""
     _, jacobian, _ = tracer.at(z)
     _, sizes, right = np.linalg.svd(jacobian)
@@ -222,7 +222,7 @@ def _left_free(tracer, z):
     return across[:, :-1]
 
 
-def _explained(frame, count):
+def _free_are_trivial(frame, count):
     """Whether all free directions belong to multipliers that are known to be trivial."""
     shifts = sum(frame.reasons.ignorable)
     known = frame.reasons.energy + shifts * (1 + frame.reasons.momenta)
@@ -239,32 +239,32 @@ class _Follower:
         """Put the critical points between two points into the path; return why the branch ends, or None."""
         tracer, name = self.tracer, self.tracer.frame.along.name
         if tracer.frame.asked.moves:
-            largest = max(point.seen.moves for point in path.points)
-            shrinks = after.seen.moves < AT_REST * largest
+            largest = max(point.outputs.moves for point in path.points)
+            shrinks = after.outputs.moves < AT_REST * largest
             if shrinks or tracer.guide.rate @ tracer.evaluated(after.z).guide.rate < 0:
-                if before.seen.moves < HALF * largest:
+                if before.outputs.moves < HALF * largest:
                     return f"a state of rest, near {name} = {self._at_rest(path.points):.6g}"
                 # The orbit now begins and ends at an equilibrium, which takes infinitely long.
-                return f"a period that grows without end, near {name} = {before.seen.parameter:.6g}"
-        if after.seen.period > ENDLESS * float(tracer.frame.period):
-            return f"a period that grows without end, near {name} = {after.seen.parameter:.6g}"
-        all_found, earlier = between(tracer, before, after), path.points[-2:-1]
-        self._put(path, all_found, before, after)
-        if not all_found and earlier and earlier[0].critical is None and before.critical is None:
-            self._put(path, dips(tracer, earlier[0], before, after), before, after)
+                return f"a period that grows without end, near {name} = {before.outputs.parameter:.6g}"
+        if after.outputs.period > ENDLESS * float(tracer.frame.period):
+            return f"a period that grows without end, near {name} = {after.outputs.parameter:.6g}"
+        all_critical, earlier = between(tracer, before, after), path.points[-2:-1]
+        self._insert(path, all_critical, before, after)
+        if not all_critical and earlier and earlier[0].critical is None and before.critical is None:
+            self._insert(path, dips(tracer, earlier[0], before, after), before, after)
         return None
 
-    def _put(self, path, all_found, before, after):
+    def _insert(self, path, all_critical, before, after):
         """Insert points into the path, each before or after its last point."""
         place = len(path.points) - 1
         along = self.tracer.weights * (after.z - before.z)
-        for found in all_found:
-            point = found.point if isinstance(found, FoundOrbit) else found
-            if isinstance(found, FoundOrbit):
+        for critical in all_critical:
+            point = critical.point if isinstance(critical, FoundOrbit) else critical
+            if isinstance(critical, FoundOrbit):
                 point.critical = len(self.found)
                 # A multiplier has size 1 there, so the nearest other point decides the stability.
                 point.growing = None
-                self.found.append(found)
+                self.found.append(critical)
             if along @ (point.z - before.z) < 0:
                 path.points.insert(place, point)
                 place += 1
@@ -277,35 +277,36 @@ class _Follower:
         It is linear in the square of the size; a coordinate of the start, in the size. A value that is negligible
         compared with the range is round-off.
         """
-        frame, b = self.tracer.frame, points[-1].seen
-        found, power = b.parameter, 1 if frame.along.kind == ENTRY else 2
+        frame, b = self.tracer.frame, points[-1].outputs
+        parameter, power = b.parameter, 1 if frame.along.kind == ENTRY else 2
         if len(points) > 1:
-            a = points[-2].seen
+            a = points[-2].outputs
             m, n = a.moves**power, b.moves**power
-            found = b.parameter + (b.parameter - a.parameter) * n / (m - n) if m > n else found
-        return 0.0 if abs(found) < 1e-9 * float(frame.unit) else found
+            parameter = b.parameter + (b.parameter - a.parameter) * n / (m - n) if m > n else parameter
+        return 0.0 if abs(parameter) < 1e-9 * float(frame.unit) else parameter
 
 
 def _result(orbit, problem, place, tracer, path, found, along, first, last) -> OrbitBranch:
     """The result in the user's structure."""
-    seen = [p.seen for p in path.points]
+    outputs = [p.outputs for p in path.points]
     trees = lambda rows: coordinates.like(orbit.q, np.asarray(np.stack(rows), tracer.dtype))
     n = len(coordinates.names(orbit.q))
     known = [i for i, p in enumerate(path.points) if p.growing is not None]
-    nearest = [min(known, key=lambda j: (abs(j - i), -j)) for i in range(len(seen)) if known]
-    stable = np.array([path.points[j].growing == 0 for j in nearest] or [False] * len(seen))
+    nearest = [min(known, key=lambda j: (abs(j - i), -j)) for i in range(len(outputs)) if known]
+    stable = np.array([path.points[j].growing == 0 for j in nearest] or [False] * len(outputs))
     critical = [
         CriticalOrbit(
-            found[p.critical].kind, np.asarray(p.seen.parameter), np.asarray(found[p.critical].accuracy), i,
-            p.seen.multipliers,
+            found[p.critical].kind, np.asarray(p.outputs.parameter), np.asarray(found[p.critical].accuracy), i,
+            p.outputs.multipliers,
         ) for i, p in enumerate(path.points) if p.critical is not None
     ]  # fmt: skip
     cast = lambda x: np.asarray(x, tracer.dtype)
     return OrbitBranch(
-        cast([s.parameter for s in seen]), cast([s.period for s in seen]), trees([s.nodes[0][:n] for s in seen]),
-        trees([s.nodes[0][n:] for s in seen]), trees([s.low for s in seen]), trees([s.high for s in seen]),
-        stable, np.stack([s.multipliers for s in seen]),
-        np.stack([cast(s.nodes) for s in seen]), critical, _with_floats(orbit, problem), place, along, first, last,
+        cast([s.parameter for s in outputs]), cast([s.period for s in outputs]),
+        trees([s.nodes[0][:n] for s in outputs]), trees([s.nodes[0][n:] for s in outputs]),
+        trees([s.low for s in outputs]), trees([s.high for s in outputs]), stable,
+        np.stack([s.multipliers for s in outputs]),
+        np.stack([cast(s.nodes) for s in outputs]), critical, _with_floats(orbit, problem), place, along, first, last,
         path.status,
     )  # fmt: skip
 

@@ -98,27 +98,35 @@ def periodic_orbit(
     rtol, period = tolerance_of(rtol, dtype), coordinates.numpy_of(period).asarray(period, dtype)
     if not coordinates.is_traced(period) and not (np.ndim(period) == 0 and float(period) > 0):
         raise ValueError(f"period must be one positive number, not {period}.\nFix: about the time of one swing.")
-    given = None if turns is None else _turns(turns, names, dtype)
+    given_turns = None if turns is None else _turns(turns, names, dtype)
     eager = is_eager() and not coordinates.is_traced((s, period))
     search = lambda state, period: closing.closed(
-        problem.system, *state, period, rtol, asked, problem.rows, parts, given, most
+        problem.system, *state, period, rtol, asked, problem.rows, parts, given_turns, most
     )
     if eager:
         found = search(s, period)
-        _complain(found, float(period), problem)
+        _raise_or_warn(found, float(period), problem)
     else:
-        live = coordinates.state(*s)
-        still = stopped((live, jnp.asarray(period)))
+        state = coordinates.state(*s)
+        stopped_inputs = stopped((state, jnp.asarray(period)))
         found = closing.closed(
-            stopped(problem.system), *still[0], still[1], rtol, asked, problem.rows, parts, given, most
+            stopped(problem.system),
+            *stopped_inputs[0],
+            stopped_inputs[1],
+            rtol,
+            asked,
+            problem.rows,
+            parts,
+            given_turns,
+            most,
         )
-        found = closing.implicit(problem.system, *live, rtol, asked, problem.rows, found)
+        found = closing.implicit(problem.system, *state, rtol, asked, problem.rows, found)
     orbit = _orbit(problem, found, asked)
-    told = lambda orbit: Report(
+    report_of = lambda orbit: Report(
         jnp.where(orbit.converged, RESULTS.successful._value, RESULTS.not_converged._value),
         orbit.iterations, jnp.zeros((), dtype), orbit.residual,
     )  # fmt: skip
-    return reported(orbit, told)
+    return reported(orbit, report_of)
 
 
 def _pair(start):
@@ -137,10 +145,10 @@ def _asked(problem, names, hold, relative) -> Asked:
     unknown = sorted(wanted - set(names))
     if unknown:
         raise ValueError(_no_such("relative", unknown[0], names))
-    seen = [name for name, free in zip(names, problem.reasons.ignorable) if name in wanted and not free]
-    if seen:
+    depended_on = [name for name, free in zip(names, problem.reasons.ignorable) if name in wanted and not free]
+    if depended_on:
         raise ValueError(
-            f"'{seen[0]}' is named in relative, but the system depends on it: the motion changes with its value.\n"
+            f"'{depended_on[0]}' is named in relative, but the system depends on it: its value changes the motion.\n"
             "Fix: leave it out; whole turns of an angle are counted anyway."
         )
     mask = tuple(name in wanted for name in names)
@@ -186,20 +194,20 @@ def _turns(turns, names, dtype):
     return np.array([turns.get(name, 0) for name in names], dtype)
 
 
-def _complain(found, period, problem):
+def _raise_or_warn(found, period, problem):
     if float(found.apart) > SAME:
         raise ValueError(
             f"the system is not the same after period = {period:.9g}: its accelerations change.\n"
             "Usual cause: a rounded period, or one that is not a period of the drive.\n"
             'Fix: period=2 * jnp.pi / params["omega"] for a drive cos(ωt), or a multiple of it.'
         )
-    if not np.isfinite(float(found.seen.size)):
+    if not np.isfinite(float(found.evaluation.size)):
         refuse_singular(problem)
     if not bool(found.converged):
         warnings.warn(
             f"no periodic orbit was found near this start: after {int(found.iterations)} flows the motion comes back "
-            f"to {float(found.seen.size):.2g} of its size, with the period {float(found.place.period):.9g}. The best "
-            "candidate is returned.\n"
+            f"to {float(found.evaluation.size):.2g} of its size, with the period {float(found.candidate.period):.9g}. "
+            "The best candidate is returned.\n"
             "Usual cause: a guess too far away, a family that does not reach the held energy or coordinate, a state of "
             "rest, or an orbit so unstable that the guess leaves it.\n"
             "Fix: another start or period; hold=...; parts=8 for an unstable one.",
@@ -213,11 +221,11 @@ def _orbit(problem, found, asked) -> PeriodicOrbit:
     if xp is np:
         found = jax.tree.map(np.asarray, found)
     like = lambda x: coordinates.like(s.q, x)
-    z, n = found.place.nodes[0], found.guess.turns.shape[0]
-    shift = xp.where(np.array(asked.relative), found.seen.gone[:n], xp.zeros_like(z[:n]))
+    z, n = found.candidate.nodes[0], found.guess.turns.shape[0]
+    shift = xp.where(np.array(asked.relative), found.evaluation.displacement[:n], xp.zeros_like(z[:n]))
     arrays, static = pack((problem.system, coordinates.state(*s).params))
     return PeriodicOrbit(
-        xp.asarray(s.t), like(z[:n]), like(z[n:]), found.place.period, like(found.guess.turns),
-        like(shift), found.seen.size, found.converged, found.iterations, found.place.nodes, arrays, static,
+        xp.asarray(s.t), like(z[:n]), like(z[n:]), found.candidate.period, like(found.guess.turns),
+        like(shift), found.evaluation.size, found.converged, found.iterations, found.candidate.nodes, arrays, static,
         asked,
     )  # fmt: skip

@@ -22,9 +22,9 @@ from lagjax.analysis import balance as equations
 from lagjax.analysis.balance import MOMENTUM, VELOCITY, Steady
 from lagjax.analysis.found_equilibria import (
     CONSTRAINED,
-    LASTS_NOT,
     NO_BALANCE,
     NOT_FINITE,
+    NOT_LASTING,
     OK,
     UNFINISHED,
     Equilibria,
@@ -126,10 +126,10 @@ def equilibria(
     steady = Steady(lift(system, s), s.t, s.params, np.zeros(symmetries.count, s.t.dtype), s.q, symmetries)
     q, v = jax.tree.map(lambda x: x.astype(s.t.dtype), (q, v))
     lasting = not symmetries.count and is_autonomous(system, *s)
-    plain = is_eager() and not coordinates.is_traced((steady, q, v))
-    rows = searched(steady, q, v, lasting, plain)
+    concrete = is_eager() and not coordinates.is_traced((steady, q, v))
+    rows = searched(steady, q, v, lasting, concrete)
     found = Equilibria(t=s.t, params=s.params, symmetries=symmetries, starts=q, **rows._asdict())
-    if not plain:
+    if not concrete:
         return found
     return merged(found, angles(system, *s))
 
@@ -162,9 +162,9 @@ def _moving(v, count):
 
 
 @partial(compiled, in_numpy=True)
-def searched(steady: Steady, q, v, lasting, plain) -> Row:
+def searched(steady: Steady, q, v, lasting, concrete) -> Row:
     """Search from each start; one row each."""
-    return jax.vmap(lambda q, v: _settled(steady, q, v, lasting, plain))(q, v)
+    return jax.vmap(lambda q, v: _search(steady, q, v, lasting, concrete))(q, v)
 
 
 def held_at(steady: Steady, x, u):
@@ -177,39 +177,39 @@ def held_at(steady: Steady, x, u):
     return rates, steady.momenta(x, steady.velocity(x, rates)) if steady.symmetries.hold == MOMENTUM and k else rates
 
 
-def _settled(steady: Steady, q, v, lasting, plain) -> Row:
+def _search(steady: Steady, q, v, lasting, concrete) -> Row:
     x0, u0 = coordinates.flatten(q)[0], coordinates.flatten(v)[0]
     rates, held = held_at(steady, x0, u0)
     steady = Steady(steady.system, steady.t, steady.params, held, steady.like, steady.symmetries)
     y0 = jnp.concatenate([x0, rates, jnp.zeros(steady.m, x0.dtype)])
     fixed, linear = stopped(steady), np.arange(y0.size) >= steady.n + steady.symmetries.count
     root = least_squares_root(lambda y: equations.balance(fixed, y), lax.stop_gradient(y0), linear)
-    y = root.y if plain else differentiable(lambda y: equations.balance(steady, y), root)
-    return described(steady, y, root, y0, lasting, plain)
+    y = root.y if concrete else differentiable(lambda y: equations.balance(steady, y), root)
+    return _row(steady, y, root, y0, lasting, concrete)
 
 
-def described(steady: Steady, y, root, y0, lasting, plain) -> Row:
+def _row(steady: Steady, y, root, y0, lasting, concrete) -> Row:
     """The row of a root: the solution in the user's structure, its stability and its status."""
     x, rates, multipliers = steady.parts(y)
     u, a = steady.velocity_and_acceleration(x, rates)
     by_name: dict[str, Any] = {}
     if steady.m > 1:
         pushes = equations.forces(steady, steady.t, x, u)
-        multipliers = equations.shortest(pushes, multipliers @ pushes)
+        multipliers = equations.shortest_multipliers(pushes, multipliers @ pushes)
     if steady.m:
-        of_names = steady.system, multipliers, steady.t, steady.like, steady.like, steady.params
-        by_name = constraints.split(*of_names)
-    jacobian = root.jacobian if plain else jax.jacfwd(lambda y: equations.balance(steady, y))(y)
-    roots = equations.characteristic_roots(steady, y, jacobian, derivatives=not plain)
+        problem = steady.system, multipliers, steady.t, steady.like, steady.like, steady.params
+        by_name = constraints.split(*problem)
+    jacobian = root.jacobian if concrete else jax.jacfwd(lambda y: equations.balance(steady, y))(y)
+    roots = equations.characteristic_roots(steady, y, jacobian, derivatives=not concrete)
     status, imbalance, zero_modes = _verdict(steady, root, y0, lasting)
     grows = GROWS_ABOVE[np.dtype(x.dtype)] * jnp.nanmax(jnp.abs(roots))
     stable = ~jnp.any(roots.real > grows) & jnp.any(jnp.isfinite(roots)) & (status == OK)
     momenta = steady.momenta(x, u) if steady.symmetries.count else jnp.zeros(0, x.dtype)
-    there = status == OK
-    fill = lambda tree: jax.tree.map(lambda x: jnp.where(there, x, jnp.nan), tree)
+    is_found = status == OK
+    fill = lambda tree: jax.tree.map(lambda x: jnp.where(is_found, x, jnp.nan), tree)
     return Row(
         fill(steady.unflatten(x)), fill(steady.unflatten(u)), fill(by_name), fill(rates), fill(momenta),
-        stable, fill(roots), there, zero_modes, imbalance, status,
+        stable, fill(roots), is_found, zero_modes, imbalance, status,
         steady.unflatten(root.y[: steady.n]),
     )  # fmt: skip
 
@@ -222,15 +222,15 @@ def _verdict(steady: Steady, root, y0, lasting):
     # Coordinates of zero have no size of their own, so all take that of the largest.
     of_x, of_rates, of_multipliers = (jnp.max(part, initial=0.0) for part in steady.parts(larger))
     size = jnp.concatenate([jnp.full(n, of_x), jnp.full(k, of_rates), jnp.full(steady.m, of_multipliers)])
-    made = jnp.abs(root.jacobian) @ size
-    off = jnp.abs(root.r) / jnp.where(made > 0, made, 1.0)
+    effect = jnp.abs(root.jacobian) @ size
+    off = jnp.abs(root.r) / jnp.where(effect > 0, effect, 1.0)
     imbalance = jnp.max(off)
     at = slice(n, n + steady.m)
     status = jnp.asarray(OK)
     if not lasting:
-        lost = jnp.abs(equations.passing(steady, root.y))
-        scale = jnp.maximum(made[: n + steady.m], limit * jnp.max(lost))
-        status = jnp.where(jnp.all(lost <= limit * scale), OK, LASTS_NOT)
+        lost = jnp.abs(equations.drift_rates(steady, root.y))
+        scale = jnp.maximum(effect[: n + steady.m], limit * jnp.max(lost))
+        status = jnp.where(jnp.all(lost <= limit * scale), OK, NOT_LASTING)
     # Far away a fading force is almost zero, which is no equilibrium.
     far = of_x > FAR * jnp.max(jnp.abs(y0[:n])) if steady.n else False
     status = jnp.where((imbalance <= limit) & ~(far & (jnp.max(jnp.abs(y0[:n])) > 0)), status, NO_BALANCE)

@@ -105,10 +105,10 @@ class Formula:
         """The formula to a power; expanded if the power is a nonnegative integer."""
         exponent = Fraction(exponent).limit_denominator(64)
         if exponent.denominator == 1 and exponent >= 0:
-            found = number(1.0)
+            result = number(1.0)
             for _ in range(int(exponent)):
-                found = found * self
-            return found
+                result = result * self
+            return result
         if self.constant is not None:
             return number(float(self.constant) ** float(exponent))
         if len(self.terms) == 1 and exponent.denominator == 1:
@@ -181,10 +181,10 @@ def _product(one: Term, two: Term, c: float) -> Formula:
         powers[atom] = powers.get(atom, Fraction(0)) + power
     # A group with a positive integer power is expanded into a sum again.
     whole = {a: p for a, p in powers.items() if isinstance(a, Group) and p.denominator == 1 and p > 0}
-    found = Formula({frozenset((a, p) for a, p in powers.items() if p and a not in whole): c})
+    result = Formula({frozenset((a, p) for a, p in powers.items() if p and a not in whole): c})
     for group, power in whole.items():
-        found = found * group.inside.power(power)
-    return found
+        result = result * group.inside.power(power)
+    return result
 
 
 def _is_negative(formula):

@@ -27,7 +27,7 @@ from lagjax.mechanics import coordinates
 from lagjax.mechanics.system import System
 
 # Multipliers below so many errors of M may consist of these errors alone.
-UNKNOWN = 100.0
+UNKNOWN_BELOW = 100.0
 
 
 class Floquet(eqx.Module):
@@ -141,7 +141,7 @@ class Floquet(eqx.Module):
         rows.append(("product", f"{float(self.product):.9g}; by Liouville's formula {float(self.liouville):.9g}"
                      f" (apart by {off:.0e})"))  # fmt: skip
         rows.append(("error of M", f"{float(self.error):.0e} (estimated, in units of the state)"))
-        unknown = int(np.sum(np.abs(np.asarray(self.multipliers)) <= UNKNOWN * float(self.error)))
+        unknown = int(np.sum(np.abs(np.asarray(self.multipliers)) <= UNKNOWN_BELOW * float(self.error)))
         if unknown:
             are = "is" if unknown == 1 else "are"
             rows.append(("WARNING", f"{unknown} of the multipliers {are} not known: as small as the errors of M"))
@@ -186,17 +186,17 @@ def floquet(system, t=None, q=None, v=None, params=None, period=None, *, rtol=No
             )
     problem = problem_of(system, t, q, v, params)
     found, error = period_of(problem, period, rtol)
-    named = _named(problem, found, error, period)
+    result = _floquet_of(problem, found, error, period)
     if not coordinates.is_traced(found) and not bool(found.ended):
         refuse_singular(problem)
-    if not coordinates.is_traced(found) and bool(found.ended) and not bool(named.comes_back):
+    if not coordinates.is_traced(found) and bool(found.ended) and not bool(result.comes_back):
         raise ValueError(
             f"this state does not come back after period = {float(period):.9g}: it is off by {float(found.apart):.2g} "
             "of its size.\n"
             "Usual cause: a rounded start or period, or the period of a small motion used for a large one.\n"
             "Fix: orbit = lj.periodic_orbit(system, (q, v), period, params), and lj.floquet(orbit)."
         )
-    return named
+    return result
 
 
 def _of_orbit(orbit, rtol, given):
@@ -212,10 +212,10 @@ def _of_orbit(orbit, rtol, given):
         )
     problem = problem_of(orbit.system, orbit.t, orbit.q, orbit.v, orbit.params)
     found, error = period_of(problem, orbit.period, rtol, orbit.nodes)
-    return _named(problem, found, error, orbit.period)
+    return _floquet_of(problem, found, error, orbit.period)
 
 
-def _named(problem, found, error, period):
+def _floquet_of(problem, found, error, period):
     period = jnp.asarray(period, found.log_volume.dtype)
     names = problem.reasons.names(problem.state.q)
     return Floquet(

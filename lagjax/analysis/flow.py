@@ -108,8 +108,8 @@ class Flow(eqx.Module):
         """The state near z that satisfies the constraints, nearest in units of `scale`; differentiable."""
         if not self.rows:
             return z
-        nearer = lambda z, _: (z - scale * _shortest(self.normals(t, z, scale), self.residual(t, z)), None)
-        return lax.scan(nearer, z, None, length=ONTO_CONSTRAINTS)[0]
+        newton_step = lambda z, _: (z - scale * _shortest(self.normals(t, z, scale), self.residual(t, z)), None)
+        return lax.scan(newton_step, z, None, length=ONTO_CONSTRAINTS)[0]
 
     def tangent_space(self, t, z, scale) -> Float[Array, "2n k"]:
         """An orthonormal basis of the tangent space, in units of `scale`."""
@@ -132,9 +132,9 @@ class Flow(eqx.Module):
         x, fixed = eqx.partition(arrays, eqx.is_inexact_array)
 
         def solve(x, fixed, adjoint, _):
-            flow, *given = eqx.combine(x, fixed, static)
+            flow, *inputs = eqx.combine(x, fixed, static)
             forward = isinstance(adjoint, diffrax.ForwardMode)
-            return _passage(flow, *given, volume, adjoint if forward else diffrax.RecursiveCheckpointAdjoint()), None
+            return _passage(flow, *inputs, volume, adjoint if forward else diffrax.RecursiveCheckpointAdjoint()), None
 
         if not differentiable:
             return solve(x, fixed, diffrax.ForwardMode(), False)[0]
@@ -151,8 +151,8 @@ class Flow(eqx.Module):
                 rate = self.rate(t + c * h, z + c * h * rate)
                 return (rate, total + b * rate), None
 
-            nothing = jnp.zeros_like(z)
-            (_, total), _ = lax.scan(stage, (nothing, nothing), tuple(x.astype(z.dtype) for x in RUNGE_KUTTA))
+            zero_rate = jnp.zeros_like(z)
+            (_, total), _ = lax.scan(stage, (zero_rate, zero_rate), tuple(x.astype(z.dtype) for x in RUNGE_KUTTA))
             return z + h * total, z
 
         times = t0 + h * jnp.arange(count * substeps, dtype=z.dtype)
@@ -175,10 +175,10 @@ def scale_of(z, period):
     """
     rate = 2 * np.pi / period
     x, u = jnp.split(jnp.abs(lax.stop_gradient(z)), 2)
-    own = jnp.maximum(x, u / rate)
-    largest = jnp.max(own)
-    own = jnp.where(own > 1e-6 * largest, own, jnp.where(largest > 0, largest, 1.0))
-    return lax.stop_gradient(jnp.concatenate([own, own * rate]))
+    sizes = jnp.maximum(x, u / rate)
+    largest = jnp.max(sizes)
+    sizes = jnp.where(sizes > 1e-6 * largest, sizes, jnp.where(largest > 0, largest, 1.0))
+    return lax.stop_gradient(jnp.concatenate([sizes, sizes * rate]))
 
 
 def independent_rows_of(system, t, q, v, params) -> tuple[int, ...] | None:

@@ -12,7 +12,7 @@ from lagjax.analysis.balance import Symmetries
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.diagnosis import describe
 
-OK, NO_BALANCE, CONSTRAINED, NOT_FINITE, LASTS_NOT, UNFINISHED = range(6)
+OK, NO_BALANCE, CONSTRAINED, NOT_FINITE, NOT_LASTING, UNFINISHED = range(6)
 WORDS = (
     "found",
     "no equilibrium near it: the imbalance of forces has a nonzero minimum there, or fades far away",
@@ -97,14 +97,16 @@ class Equilibria(eqx.Module):
         if coordinates.is_traced((self.q, self.found)):
             return f"Equilibria, being traced, of {self.found.shape[-1]} starts"
         if self.found.ndim > 1:
-            of = " x ".join(map(str, self.found.shape[:-1]))
-            return f"Equilibria, {int(np.sum(self.found))} from a batch of {of} with {self.found.shape[-1]} starts each"
+            shape = " x ".join(map(str, self.found.shape[:-1]))
+            return (
+                f"Equilibria, {int(np.sum(self.found))} from a batch of {shape} with {self.found.shape[-1]} starts each"
+            )
         return "\n".join(_lines(self))
 
 
 def merged(rows: Equilibria, is_angle: PyTree[bool]) -> Equilibria:
     """Merge duplicates; equilibria keep the order in which starts led to them."""
-    there = np.flatnonzero(np.asarray(rows.found))
+    found_rows = np.flatnonzero(np.asarray(rows.found))
     first = jax.tree.map(lambda x: x[0], rows.q)
     angle = np.concatenate([np.full(np.size(x), yes) for yes, x in zip(*map(jax.tree.leaves, (is_angle, first)))])
     angle[list(rows.symmetries.places)] = False
@@ -114,7 +116,7 @@ def merged(rows: Equilibria, is_angle: PyTree[bool]) -> Equilibria:
     roots = np.asarray(rows.eigenvalues)
     kept: list[int] = []
     of_start = np.full(len(x), -1)
-    for i in there:
+    for i in found_rows:
         for place, j in enumerate(kept):
             off = x[i] - x[j]
             off = np.where(angle, off - 2 * np.pi * np.round(off / (2 * np.pi)), off)
@@ -128,8 +130,8 @@ def merged(rows: Equilibria, is_angle: PyTree[bool]) -> Equilibria:
             of_start[i] = len(kept)
             kept.append(i)
     pick = lambda tree: jax.tree.map(lambda x: x[np.array(kept, int)], tree)
-    of_rows = [name for name in Row._fields if name not in ("status", "last")]
-    return replace(rows, **{name: pick(getattr(rows, name)) for name in of_rows}, of_start=of_start)
+    row_fields = [name for name in Row._fields if name not in ("status", "last")]
+    return replace(rows, **{name: pick(getattr(rows, name)) for name in row_fields}, of_start=of_start)
 
 
 def _close(off, size, angle):

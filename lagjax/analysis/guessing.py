@@ -54,48 +54,51 @@ class Guess(NamedTuple):
 def guessed(flow: Flow, t, z, period, asked: Asked, parts: int, turns) -> Guess:
     """Follow a guess; `turns` (n,): the turns of the angles, or None to count those of the guess."""
     z = flow.onto_constraints(t, z, scale_of(z, period))
-    searched = asked.free and parts == 1
-    reach = REACH if searched else 1
+    find_period = asked.free and parts == 1
+    reach = REACH if find_period else 1
     path = lax.stop_gradient(flow.path(t, z, reach * period, reach * PIECES))
-    known = jnp.all(jnp.isfinite(path))
-    path = jnp.where(known, path, z[None])
+    finite = jnp.all(jnp.isfinite(path))
+    path = jnp.where(finite, path, z[None])
     scale = _extent(path, period, scale_of(z, period), np.array(asked.angles) | np.array(asked.relative))
-    at, (gone, _) = PIECES, jnp.split(path - z[None], 2, axis=1)
+    index, (displacement, _) = PIECES, jnp.split(path - z[None], 2, axis=1)
     around = np.array(asked.angles) & ~np.array(asked.relative)
-    own = jnp.where(around[None], jnp.round(gone / TURN), 0.0)
-    if searched:
-        at = _nearest(
-            path - z[None], TURN * (own if turns is None else jnp.asarray(turns)[None] + 0 * own), scale, asked
+    path_turns = jnp.where(around[None], jnp.round(displacement / TURN), 0.0)
+    if find_period:
+        index = _nearest(
+            path - z[None],
+            TURN * (path_turns if turns is None else jnp.asarray(turns)[None] + 0 * path_turns),
+            scale,
+            asked,
         )
     # In a driven system an unstable guess may go anywhere, so all parts begin at the given state.
     nodes = path[np.arange(parts) * PIECES // parts] if asked.moves else jnp.broadcast_to(z, (parts, z.size))
     onto = lambda node: flow.onto_constraints(t, node, scale)
     nodes = jnp.stack([z, *(onto(node) for node in nodes[1:])])
-    given = own[at] if turns is None else jnp.asarray(turns)
-    return Guess(z, nodes, period * jnp.asarray(at, z.dtype) / PIECES, scale, given)
+    chosen_turns = path_turns[index] if turns is None else jnp.asarray(turns)
+    return Guess(z, nodes, period * jnp.asarray(index, z.dtype) / PIECES, scale, chosen_turns)
 
 
-def _extent(path, period, otherwise, goes_on):
+def _extent(path, period, otherwise, advances):
     """Half the range of each coordinate and velocity; never zero.
 
     A coordinate that advances steadily, such as a turning angle, counts by its deviation from that advance.
     """
-    rate, x = TURN / period, path[:, : len(goes_on)]
+    rate, x = TURN / period, path[:, : len(advances)]
     steady = jnp.linspace(0.0, 1.0, len(path), dtype=x.dtype)[:, None] * (x[-1] - x[0])[None]
-    x = jnp.where(goes_on[None], x - steady, x)
-    x, u = (0.5 * jnp.ptp(y, axis=0) for y in (x, path[:, len(goes_on) :]))
+    x = jnp.where(advances[None], x - steady, x)
+    x, u = (0.5 * jnp.ptp(y, axis=0) for y in (x, path[:, len(advances) :]))
     both = jnp.stack([x, u / rate])
     # Each takes its own size; one that hardly moves, that of its partner, or else of the coordinate that moves most.
-    of_both, largest = jnp.max(both, axis=0), jnp.max(both)
-    of_both = jnp.where(of_both > STILL * largest, of_both, largest)[None]
-    x, u = jnp.where(both > STILL * of_both, both, of_both)
+    sizes, largest = jnp.max(both, axis=0), jnp.max(both)
+    sizes = jnp.where(sizes > STILL * largest, sizes, largest)[None]
+    x, u = jnp.where(both > STILL * sizes, both, sizes)
     return lax.stop_gradient(jnp.where(largest > 0, jnp.concatenate([x, u * rate]), otherwise))
 
 
-def _nearest(difference, turned, scale, asked):
+def _nearest(difference, turn_shifts, scale, asked):
     """The index of the point nearest to the start, if it is much nearer than that after the given period."""
-    mask = 1.0 - np.concatenate([np.array(asked.relative, float), np.zeros(turned.shape[1])])
-    difference = difference - jnp.concatenate([turned, jnp.zeros_like(turned)], axis=1)
+    mask = 1.0 - np.concatenate([np.array(asked.relative, float), np.zeros(turn_shifts.shape[1])])
+    difference = difference - jnp.concatenate([turn_shifts, jnp.zeros_like(turn_shifts)], axis=1)
     apart = jnp.sqrt(jnp.mean((difference / scale[None]) ** 2 * mask[None], axis=1))
     place = np.arange(len(difference))
     off = jnp.pad(apart, 1, constant_values=np.inf)

@@ -47,8 +47,8 @@ class Hamiltonian(eqx.Module):
                 "Fix: lj.accelerations(system, t, q, v, params) with v = H.velocity(t, q, p, params), or coordinates "
                 "that satisfy the constraints by themselves."
             )
-        _, v, pushed = self._at(t, q, p, params)
-        return v, pushed
+        _, v, momentum_rate = self._at(t, q, p, params)
+        return v, momentum_rate
 
     def _at(self, t, q, p, params):
         if jax.tree.structure(p) != jax.tree.structure(q):
@@ -59,13 +59,13 @@ class Hamiltonian(eqx.Module):
             )
         s = coordinates.state(t, q, p, params)
         system = looked_at(self.system, s)
-        value, v, pushed, mass, regular, reached = _hamiltonian(system, *s)
+        value, v, momentum_rate, mass, regular, reached = _hamiltonian(system, *s)
         if coordinates.is_traced((value, regular)):
             known = regular & reached
-            return jax.tree.map(lambda x: jnp.where(known, x, jnp.nan), (value, v, pushed))
+            return jax.tree.map(lambda x: jnp.where(known, x, jnp.nan), (value, v, momentum_rate))
         if not (regular and reached):
             raise ValueError(_no_velocity(s, np.asarray(mass), bool(regular)))
-        return value, v, pushed
+        return value, v, momentum_rate
 
     def __repr__(self):
         return f"Hamiltonian of {self.system}"
@@ -99,15 +99,15 @@ def hamiltonian(system: System) -> Hamiltonian:
 @compiled
 def _hamiltonian(system, t, q, p, params):
     x, unflatten = coordinates.flatten(q)
-    pressed, _ = coordinates.flatten(p)
-    of = lambda x, u: system.lagrangian(t, unflatten(x), unflatten(u), params)
-    found = velocity_of(lambda u: jax.grad(of, argnums=1)(x, u), pressed)
-    value, slope = jax.value_and_grad(of)(x, found.v)
+    momentum, _ = coordinates.flatten(p)
+    lagrangian_of = lambda x, u: system.lagrangian(t, unflatten(x), unflatten(u), params)
+    found = velocity_of(lambda u: jax.grad(lagrangian_of, argnums=1)(x, u), momentum)
+    value, slope = jax.value_and_grad(lagrangian_of)(x, found.v)
     q, v = unflatten(x), unflatten(found.v)
     # -∂H/∂q at constant p equals ∂L/∂q at constant v.
     if not system.constraints and not reacts(system):
         slope = slope + applied_force(system, t, q, v, params, jnp.zeros(0, x.dtype))
-    return pressed @ found.v - value, v, unflatten(slope), found.mass, found.regular, found.reached
+    return momentum @ found.v - value, v, unflatten(slope), found.mass, found.regular, found.reached
 
 
 def _no_velocity(s, mass, regular):

@@ -288,7 +288,7 @@ def test_what_is_drawn_and_refused():
         lj.continue_orbits(orbit, along="speed", to=1.0)
     with pytest.raises(ValueError, match="along='period': the system depends on time"):
         lj.continue_orbits(orbit, along="period", to=1.0)
-    with pytest.raises(ValueError, match="leaves the parameter '.*' no range: it starts at 0.5"):
+    with pytest.raises(ValueError, match="leaves the parameter 'omega' no range: it starts at 0.5"):
         lj.continue_orbits(orbit, along="omega", to=0.5)
     with pytest.raises(TypeError, match="JAX is tracing"):
         jax.jit(lambda orbit: lj.continue_orbits(orbit, along="omega", to=1.0).period)(orbit)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import lagjax as lj
-from lagjax.analysis.found_equilibria import LASTS_NOT, NO_BALANCE, NOT_FINITE
+from lagjax.analysis.found_equilibria import NO_BALANCE, NOT_FINITE, NOT_LASTING
 from lagjax.mechanisms import governor
 from lagjax.scenes import bead_on_hoop, cross_rails
 from tests.analysis.steady_systems import (
@@ -144,7 +144,7 @@ def test_the_driven_hoop():
         np.testing.assert_allclose(steady.multipliers["motor"], 0.0, atol=1e-13)
         assert steady.stable.tolist() == [True]
     resting = lj.equilibria(bead_on_hoop.driven_system, BEAD, starts=[start])
-    assert len(resting) == 0 and resting.status.tolist() == [LASTS_NOT]
+    assert len(resting) == 0 and resting.status.tolist() == [NOT_LASTING]
 
 
 @pytest.mark.slow
