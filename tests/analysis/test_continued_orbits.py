@@ -109,9 +109,9 @@ def duffing_rate(omega):
 
 @pytest.mark.slow
 def test_resonance_curve():
-    """Both folds, every orbit, stability: by SciPy's shooting; amplitudes about those of harmonic balance.
+    """Both folds, every orbit and its stability agree with SciPy's shooting; amplitudes are near harmonic balance.
 
-    Twin: off by a millionth an orbit is not SciPy's, and beyond the folds there is only one.
+    Twin: a state off by a millionth is not SciPy's orbit, and beyond the folds there is only one orbit.
     """
     orbit = lj.periodic_orbit(duffing, (0.4, 0.0), 2 * np.pi / DRIVEN["omega"], DRIVEN)
     branch = lj.continue_orbits(orbit, along="omega", to=3.0)
@@ -159,7 +159,7 @@ def mathieu_lagrangian(t, q, v, p):
 def test_tongues_of_a_parametric_pendulum():
     """At rest its multiplier passes -1 and 1 at Mathieu's characteristic values, also at a tongue of width 5e-4.
 
-    Twin: those of another q are others.
+    Twin: the characteristic values of another q differ.
     """
     system, q = lj.System(mathieu_lagrangian), 0.25
     orbit = lj.periodic_orbit(system, (0.0, 0.0), np.pi, {"a": 0.1, "q": q})

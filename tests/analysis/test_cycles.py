@@ -184,7 +184,7 @@ def inverted_lagrangian(t, q, v, p):
 def test_unstable_orbit_by_parts():
     """A pushed pendulum stays up for two periods of the push, in which neighbours leave it e^(4π)-fold.
 
-    Small pushes f make q = -f cos(t)/(1 + k) up to f³; a guess of zero leaves it at once.
+    For small pushes f, q = -f cos(t)/(1 + k) up to f³; the motion from a guess of zero leaves it at once.
     """
     inverted, f = lj.System(inverted_lagrangian), 0.01
     orbit = lj.periodic_orbit(inverted, (0.0, 0.0), 4 * np.pi, {"k": 1.0, "f": f}, parts=8)

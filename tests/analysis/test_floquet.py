@@ -178,8 +178,8 @@ def on_a_sphere(t, q, v, p):
 def test_conical_pendulum():
     """Circling at an angle θ it swings about that √(1 + 3 cos² θ) times in a turn, with a constraint given twice.
 
-    Landau & Lifshitz, *Mechanics*, §14, problem 1: by the effective potential. The turn is a symmetry that is not known
-    from the coordinates, and here the motion itself.
+    Landau & Lifshitz, *Mechanics*, §14, problem 1: by the effective potential. The rotation is a symmetry that the
+    coordinates do not show, and here it is the motion itself.
     """
     rod = lj.Holonomic(lambda t, q, p: q @ q - p["l"] ** 2)
     again = lj.Holonomic(lambda t, q, p: 1.0 - q @ q / p["l"] ** 2)
