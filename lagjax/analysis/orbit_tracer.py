@@ -25,7 +25,7 @@ SAME = 1e-5
 ON_CIRCLE = 3.0
 
 
-class OrbitSeen(NamedTuple):
+class OrbitOutputs(NamedTuple):
     """What a user sees of a point, and what is watched: χ₊ and χ₋, and whether a pair is about to leave the circle.
 
     - `multipliers` (k,): the trivial ones first.
@@ -93,11 +93,11 @@ class OrbitTracer(Tracer):
         below = int(np.sum((np.imag(left) == 0) & (np.real(left) < -1)))
         period = float(self.frame.period) * np.exp(z[-2])
         nodes = z[:-2].reshape(self.frame.parts, -1) * np.asarray(self.frame.scale)
-        seen = OrbitSeen(
+        outputs = OrbitOutputs(
             z[-1] * self.unit, period, nodes, multipliers, low, high, plus if self.crosses else 1.0, minus,
             self._pairs(left), float(np.max((high - low) / np.asarray(self.frame.scale)[: len(low)])),
         )  # fmt: skip
-        return Point(z, jacobian, tangent, float(np.sign(seen.plus)), seen, growing, below)
+        return Point(z, jacobian, tangent, float(np.sign(outputs.plus)), outputs, growing, below)
 
     def _multipliers(self, found: Evaluated) -> tuple[np.ndarray, np.ndarray]:
         """All of them, those that are trivial first as 1; and those that are not, by falling size."""
