@@ -29,9 +29,9 @@ def between(tracer: OrbitTracer, a: Point, b: Point) -> list[FoundOrbit]:
         kind = "fold" if crosses or not tracer.crosses else "branch point"
         found.append(_zero(tracer, a, b, kind, lambda p: p.tangent[-1]))
     elif crosses:
-        found.append(_zero(tracer, a, b, "branch point", lambda p: p.seen.plus))
-    if a.seen.minus * b.seen.minus < 0:
-        found.append(_zero(tracer, a, b, "period doubling", lambda p: p.seen.minus))
+        found.append(_zero(tracer, a, b, "branch point", lambda p: p.outputs.plus))
+    if a.outputs.minus * b.outputs.minus < 0:
+        found.append(_zero(tracer, a, b, "period doubling", lambda p: p.outputs.minus))
     if a.growing is not None and b.growing is not None and a.growing != b.growing and not found:
         found.append(_torus(tracer, a, b))
     return [one for one in found if one is not None]
@@ -39,7 +39,7 @@ def between(tracer: OrbitTracer, a: Point, b: Point) -> list[FoundOrbit]:
 
 def dips(tracer: OrbitTracer, a: Point, b: Point, c: Point) -> list[FoundOrbit | Point]:
     """The two edges of a narrow resonance tongue that lies within two steps, and a point in the tongue."""
-    for kind, of in (("branch point", lambda p: p.seen.plus), ("period doubling", lambda p: p.seen.minus)):
+    for kind, of in (("branch point", lambda p: p.outputs.plus), ("period doubling", lambda p: p.outputs.minus)):
         left, middle, right = of(a), of(b), of(c)
         same = left * middle > 0 and middle * right > 0
         if not (same and abs(middle) < DIPS * min(abs(left), abs(right))):
@@ -86,11 +86,11 @@ def _zero(tracer, a, b, kind, of) -> FoundOrbit | None:
 def _torus(tracer, a, b) -> FoundOrbit | None:
     """The point where a pair leaves the unit circle; None if what begins to grow is not a pair."""
     many = a if a.growing > b.growing else b
-    outside = [x for x in many.seen.multipliers if abs(x) > 1]
+    outside = [x for x in many.outputs.multipliers if abs(x) > 1]
     slowest = min(outside, key=abs, default=1.0)
     if abs(np.imag(slowest)) < 1e-3 * abs(slowest):
         return None
-    found = _zero(tracer, a, b, "torus", lambda p: p.seen.pairs)
+    found = _zero(tracer, a, b, "torus", lambda p: p.outputs.pairs)
     if found is not None:
         return found
     low, high, point = 0.0, 1.0, None

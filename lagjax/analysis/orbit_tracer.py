@@ -26,7 +26,7 @@ SAME = 1e-5
 ON_CIRCLE = 3.0
 
 
-class OrbitSeen(NamedTuple):
+class OrbitOutputs(NamedTuple):
     """The outputs of a point, and the monitored functions: χ₊, χ₋, and `pairs`, which is zero where a pair leaves.
 
     - `multipliers` (k,): the trivial ones first.
@@ -94,11 +94,11 @@ class OrbitTracer(Tracer):
         below = int(np.sum((np.imag(left) == 0) & (np.real(left) < -1)))
         period = float(self.frame.period) * np.exp(z[-2])
         nodes = z[:-2].reshape(self.frame.parts, -1) * np.asarray(self.frame.scale)
-        seen = OrbitSeen(
+        outputs = OrbitOutputs(
             z[-1] * self.unit, period, nodes, multipliers, low, high, plus if self.crosses else 1.0, minus,
             self._pairs(left), float(np.max((high - low) / np.asarray(self.frame.scale)[: len(low)])),
         )  # fmt: skip
-        return Point(z, jacobian, tangent, float(np.sign(seen.plus)), seen, growing, below)
+        return Point(z, jacobian, tangent, float(np.sign(outputs.plus)), outputs, growing, below)
 
     def _multipliers(self, evaluation: Evaluated) -> tuple[np.ndarray, np.ndarray]:
         """All multipliers, the trivial ones first as exactly 1; and the nontrivial ones alone, by falling size."""

@@ -11,7 +11,7 @@ Source: Allgower & Georg, *Introduction to Numerical Continuation Methods*, §8.
 import jax
 import numpy as np
 
-from lagjax.analysis.branch_equations import Frame, evaluated, seen_at
+from lagjax.analysis.branch_equations import Frame, evaluated, outputs_at
 from lagjax.analysis.equilibria import GROWS_ABOVE
 from lagjax.analysis.tracing import Point, Tracer
 
@@ -34,10 +34,10 @@ class SteadyTracer(Tracer):
         return value, jacobian, float(largest)
 
     def described(self, z, jacobian, tangent) -> Point:
-        seen = jax.tree.map(np.asarray, seen_at(self.frame, z.astype(self.dtype)))
+        outputs = jax.tree.map(np.asarray, outputs_at(self.frame, z.astype(self.dtype)))
         sign = np.linalg.slogdet(np.concatenate([jacobian, (self.weights * tangent)[None]]))[0]
         negative = int(np.sum(np.linalg.eigvals(jacobian[:, :-1]).real < 0))
-        return Point(z, jacobian, tangent, float(sign), seen, self._growing(seen[-1]), negative)
+        return Point(z, jacobian, tangent, float(sign), outputs, self._growing(outputs[-1]), negative)
 
     def _growing(self, roots) -> int | None:
         """The number of growing roots; None if the roots are not known."""

@@ -50,7 +50,7 @@ class Point:
     jacobian: np.ndarray
     tangent: np.ndarray
     sign: float
-    seen: Any
+    outputs: Any
     growing: int | None
     negative: int
     critical: int | None = None
