@@ -100,20 +100,20 @@ def rates(system, affine: Affine, generators: tuple[Generator, ...], s, places) 
     raw = _StateRates(*(xp.asarray(y) for y in raw))
     finite = xp.isfinite(raw.energy) & xp.all(xp.isfinite(raw.by_lagrangian + raw.by_force), axis=1)
     found = states.found & finite
-    seen = lambda y: xp.where(found.reshape(-1, *[1] * (y.ndim - 1)), y, xp.zeros_like(y))
+    kept = lambda y: xp.where(found.reshape(-1, *[1] * (y.ndim - 1)), y, xp.zeros_like(y))
     count = xp.maximum(xp.sum(found), 1).astype(raw.energy.dtype)
-    size = xp.sqrt(xp.sum(seen(raw.size) ** 2, axis=0) / count)
+    size = xp.sqrt(xp.sum(kept(raw.size) ** 2, axis=0) / count)
     size = xp.where(size > 0, size, xp.ones_like(size))
     # A state where nothing moves and no force acts has no scale of its own.
-    energy = seen(raw.energy) + raw.energy.dtype.type(1e-12) * xp.max(seen(raw.energy))
+    energy = kept(raw.energy) + raw.energy.dtype.type(1e-12) * xp.max(kept(raw.energy))
     energy = xp.where(found & (energy > 0), energy, xp.ones_like(energy))
-    relative = lambda y: seen(y) / (energy[:, None] * size[None])
+    relative = lambda y: kept(y) / (energy[:, None] * size[None])
     slope = xp.where(raw.slope > 0, raw.slope, xp.ones_like(raw.slope))[:, :, None] * size[None, None]
     return Rates(
         states._replace(found=found),
         relative(raw.by_lagrangian + raw.by_force), relative(raw.by_lagrangian), relative(raw.by_force),
-        seen(raw.forbidden) / slope, seen(raw.changed) * scales.t / slope, seen(raw.value) / energy,
-        size, energy, seen(raw.xi), seen(raw.tau), raw.charges, (raw.by_lagrangian + raw.by_force)[0], raw.forbidden[0],
+        kept(raw.forbidden) / slope, kept(raw.changed) * scales.t / slope, kept(raw.value) / energy,
+        size, energy, kept(raw.xi), kept(raw.tau), raw.charges, (raw.by_lagrangian + raw.by_force)[0], raw.forbidden[0],
     )  # fmt: skip
 
 

@@ -228,7 +228,7 @@ def _verified(program, formulas, names, scalarised, s) -> float:
     leaves = [np.asarray(x) for x in jtu.tree_leaves(eqx.filter((s.t, *s[1:]), eqx.is_array))]
     flat = np.concatenate([np.ravel(x) for x in leaves])
     run = jax.jit(lambda *inputs: eval_jaxpr(program.jaxpr, program.consts, *inputs))
-    worst, seen = 0.0, 0
+    worst, count = 0.0, 0
     random = np.random.default_rng(4)
     for _ in range(4 * STATES):
         at = flat * (1 + 0.25 * random.standard_normal(flat.size)) + 0.25 * random.standard_normal(flat.size) * (
@@ -244,11 +244,11 @@ def _verified(program, formulas, names, scalarised, s) -> float:
         with np.errstate(all="ignore"):
             values = np.asarray([formula.value(by_name) for formula in formulas])
         if np.all(np.isfinite(exact)):
-            seen += 1
+            count += 1
             worst = max(worst, float(np.max(np.abs(values - exact) / (1e-3 * np.max(np.abs(exact)) + np.abs(exact)))))
-        if seen == STATES:
+        if count == STATES:
             break
-    if seen < STATES or not worst <= (AGREE if flat.dtype == np.float64 else 1e-3):
+    if count < STATES or not worst <= (AGREE if flat.dtype == np.float64 else 1e-3):
         raise ValueError(
             f"the formulas differ from the program by {worst:.0e} and are not shown.\n"
             "Usual cause: a root or power of an expression that changes sign.\nFix: write it so that it does not."

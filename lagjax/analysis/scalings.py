@@ -18,20 +18,22 @@ from lagjax.analysis.rates import Rates
 from lagjax.mechanics import constraints, coordinates
 
 
-def scalings_of(system, s, tried: Basis, seen: Rates, precision: Precision) -> tuple[Scaling, ...]:
+def scalings_of(system, s, tried: Basis, sampled: Rates, precision: Precision) -> tuple[Scaling, ...]:
     """The scalings that multiply L by a factor."""
     if system.force is not None or system.dissipation is not None:
         return ()
     chosen = np.flatnonzero(np.array(tried.kinds) == "scaling")
     flat = lambda i: np.append(tried.affine.matrix[i].ravel(), tried.affine.clock_rate[i])
     chosen = chosen[independent(np.stack([flat(i) for i in chosen], axis=1), precision)]
-    size = seen.size[chosen]
+    size = sampled.size[chosen]
     holonomic = constraints.holonomic_equations(system, *s)
-    root = np.sqrt(len(seen.value))
+    root = np.sqrt(len(sampled.value))
     rows = lambda y: y.reshape(-1, y.shape[-1])
     # The set g = 0 and the velocity constraints must be preserved.
-    kept = np.concatenate([rows(seen.displacement[:, holonomic]), rows(seen.invariance[:, ~holonomic])])[:, chosen]
-    changed = np.concatenate([seen.charge[:, chosen], -seen.value[:, None]], axis=1)
+    kept = np.concatenate([rows(sampled.displacement[:, holonomic]), rows(sampled.invariance[:, ~holonomic])])[
+        :, chosen
+    ]
+    changed = np.concatenate([sampled.charge[:, chosen], -sampled.value[:, None]], axis=1)
     kept = np.concatenate([kept, np.zeros((len(kept), 1))], axis=1)
     found = null_space(np.concatenate([changed, kept]) / root, precision)
     scalings = []

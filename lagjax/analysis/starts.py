@@ -110,10 +110,10 @@ def _names_in(names, given: Iterable):
 
 def _check_cyclic(system, s, chosen):
     known = structure(system, *s) if chosen else None
-    seen = [name for name in chosen if known is not None and name not in known.cyclic]
-    if seen:
+    not_cyclic = [name for name in chosen if known is not None and name not in known.cyclic]
+    if not_cyclic:
         raise ValueError(
-            f"L depends on {listed(seen)}, which moves at a constant rate: there is no steady motion along it.\n"
+            f"L depends on {listed(not_cyclic)}, which moves at a constant rate: there is no steady motion along it.\n"
             "Usual cause: a start gives a velocity to a coordinate that is not cyclic, or the motion is a rotation of "
             "several coordinates.\n"
             "Fix: velocities of zero; or the symmetry as a function, cyclic=lambda q, params: {...}, which returns the "

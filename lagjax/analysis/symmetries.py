@@ -76,11 +76,11 @@ def symmetries(system, q, v, params=None, *, basis: Iterable | Mapping | None = 
     tried = motions(s.q)
     gauge = gauges(s.q)
     count = filled_up(max(STATES, 4 * (len(tried.names) + len(own)) + 2 * len(gauge.names)))
-    seen = rates(system, tried.affine, own, s, draws(count, coordinates.flatten(s.q)[0].size))
-    seen = _those_found(seen)
-    if len(seen.value) < AT_LEAST:
-        raise ValueError(too_few(system, s, len(seen.value)))
-    return _found(system, s, tried, own, gauge, seen)
+    sampled = rates(system, tried.affine, own, s, draws(count, coordinates.flatten(s.q)[0].size))
+    sampled = _those_found(sampled)
+    if len(sampled.value) < AT_LEAST:
+        raise ValueError(too_few(system, s, len(sampled.value)))
+    return _found(system, s, tried, own, gauge, sampled)
 
 
 def _given(basis, s) -> tuple[Generator, ...]:
@@ -97,11 +97,11 @@ def _given(basis, s) -> tuple[Generator, ...]:
     return tuple(own)
 
 
-def _those_found(seen: Rates) -> Rates:
+def _those_found(sampled: Rates) -> Rates:
     """The entries of the states that are on the constraints and finite, in NumPy."""
-    kept = np.asarray(seen.states.found)
-    of_states = seen._asdict()
-    states = type(seen.states)(*(np.asarray(y)[kept] for y in of_states.pop("states")))
+    kept = np.asarray(sampled.states.found)
+    of_states = sampled._asdict()
+    states = type(sampled.states)(*(np.asarray(y)[kept] for y in of_states.pop("states")))
     stateless = {"size", "first", "pushed"}
     return Rates(states, **{name: y if name in stateless else y[kept] for name, y in of_states.items()})
 
@@ -138,9 +138,9 @@ class _Spaces(NamedTuple):
     gap: float
 
 
-def _found(system, s, tried: Basis, own, gauge: Gauge, seen: Rates) -> Symmetries:
+def _found(system, s, tried: Basis, own, gauge: Gauge, sampled: Rates) -> Symmetries:
     precision = precision_of(s.t.dtype)
-    columns = _columns(tried, own, gauge, seen)
+    columns = _columns(tried, own, gauge, sampled)
     spaces = _spaces(columns, gauge, precision)
     parameters = named_parameters(s.params)
     shown = remembered(system, (conserved_momenta, system.read, kinds(s)), lambda: conserved_momenta(system, *s))
@@ -163,26 +163,27 @@ def _found(system, s, tried: Basis, own, gauge: Gauge, seen: Rates) -> Symmetrie
         is_cyclic = single and columns.names[int(np.flatnonzero(whole)[0])] in cyclic
         details[words.text] = Found(NoetherCharge(system, generator), residual, timed, physical, is_cyclic)
     return Symmetries(
-        details, scalings_of(system, s, tried, seen, precision), columns.names, len(seen.value),
-        spaces.singular_values, spaces.gap if len(seen.value) > len(columns.names) + len(gauge.names) else 0.0,
+        details, scalings_of(system, s, tried, sampled, precision), columns.names, len(sampled.value),
+        spaces.singular_values, spaces.gap if len(sampled.value) > len(columns.names) + len(gauge.names) else 0.0,
         f"t = {float(s.t):.6g}, q = {describe(s.q)}, v = {describe(s.v)}", repr(system),
     )  # fmt: skip
 
 
-def _columns(tried: Basis, own, gauge: Gauge, seen: Rates) -> _Columns:
-    count, n_own, states = len(tried.names), len(own), len(seen.value)
+def _columns(tried: Basis, own, gauge: Gauge, sampled: Rates) -> _Columns:
+    count, n_own, states = len(tried.names), len(own), len(sampled.value)
     order = np.concatenate([np.arange(count, count + n_own), np.arange(count)]).astype(int)
     rows = lambda y: y.reshape(-1, y.shape[-1])[:, order] / np.sqrt(states)
-    of_gauge = gauge.rates(*map(np.asarray, seen.states[:3])) / seen.energy[:, None]
+    of_gauge = gauge.rates(*map(np.asarray, sampled.states[:3])) / sampled.energy[:, None]
     unit = lambda y: y / np.maximum(np.std(y, axis=(0, 1)), np.finfo(float).tiny)
     # A few states are enough to tell motions apart.
-    few = slice(0, 16 + 4 * (count + n_own) // seen.xi.shape[2])
+    few = slice(0, 16 + 4 * (count + n_own) // sampled.xi.shape[2])
     moves = np.concatenate(
-        [np.moveaxis(unit(seen.xi[few]), 1, 0).reshape(count + n_own, -1), unit(seen.tau[few]).T], axis=1
+        [np.moveaxis(unit(sampled.xi[few]), 1, 0).reshape(count + n_own, -1), unit(sampled.tau[few]).T], axis=1
     )
     return _Columns(
         (*(generator.name for generator in own), *tried.names), (*("own" for _ in own), *tried.kinds),
-        order, seen.size[order], rows(seen.charge), rows(seen.displacement), of_gauge / np.sqrt(states), moves[order].T,
+        order, sampled.size[order], rows(sampled.charge), rows(sampled.displacement), of_gauge / np.sqrt(states),
+        moves[order].T,
     )  # fmt: skip
 
 
