@@ -1,1 +1,1 @@
-"""What a system is like: its symmetries, equilibria and branches, small motions, cycles, and other forms of it."""
+"""The analysis of a system: symmetries, equilibria, branches, small motions, cycles, other forms of its equations."""

@@ -1,15 +1,15 @@
-"""The balance of forces in a steady motion, and what becomes of small departures from it.
+"""The balance of forces in a steady motion, and the linear equations of small departures from it.
 
-A steady motion goes along a symmetry at constant rates Ω: its velocity is `u = V(x) = Σ Ω_k G_k(x)`, with one field G_k
-a symmetry. For a cyclic coordinate G_k is the unit vector of that coordinate, and for Ω = 0 there is rest. Its
+A steady motion follows a symmetry at constant rates Ω: its velocity is `u = V(x) = Σ Ω_k G_k(x)`, with one field G_k
+for each symmetry. For a cyclic coordinate G_k is the unit vector of that coordinate, and Ω = 0 means rest. The
 acceleration is `a = (∂V/∂x) u`, zero for cyclic coordinates, so Lagrange's equations become a balance,
 
     r(x, Ω, λ) = M a - F(t, x, u) - Aᵀ λ - B λ = 0,    g(t, x) = 0,    phi(t, x, u) = 0
 
-(B λ: what of a force depends on multipliers). The rates are held at their values, or through the momenta `p·G_k`.
+(B λ: the part of a force that depends on multipliers). Either the rates or the momenta `p·G_k` are held fixed.
 
-Seen from the symmetry's moving frame a neighbouring motion is `x + ξ(t)`, with the velocity `V + ξ'` and the
-acceleration `(∂V/∂x) V + 2 (∂V/∂x) ξ' + ξ''`. Put into r, and differentiated, that is
+In the frame that moves along the symmetry a neighbouring motion is `x + ξ(t)`, with the velocity `V + ξ'` and the
+acceleration `(∂V/∂x) V + 2 (∂V/∂x) ξ' + ξ''`. Substituting this into r and linearising gives
 
     K ξ + C ξ' + M ξ'' = Aᵀ δλ + B δλ
 
@@ -37,14 +37,14 @@ from lagjax.numerics import dense, lapack
 from lagjax.numerics.dense import reciprocal_condition
 from lagjax.numerics.rank import independent_rows
 
-# Reciprocal condition of the equations of motion below which they have no solution.
+# The equations of motion count as singular below this reciprocal condition number.
 SINGULAR_BELOW = {np.dtype("float64"): 1e-13, np.dtype("float32"): 1e-6}
-# What is held of each symmetry.
+# The quantity held fixed for each symmetry.
 VELOCITY, MOMENTUM = "velocity", "momentum"
 
 
 class Symmetries(eqx.Module):
-    """Along what a motion is steady: cyclic coordinates by their places, or fields `field(q, params)` like v."""
+    """The symmetries of a steady motion: cyclic coordinates by index, or fields `field(q, params)` shaped like v."""
 
     places: tuple[int, ...] = eqx.field(static=True, default=())
     fields: tuple[Callable, ...] = eqx.field(static=True, default=())
@@ -56,7 +56,7 @@ class Symmetries(eqx.Module):
 
 
 class Steady(eqx.Module):
-    """The equations of steady motion; `like` has the structure of q, `held` (k,) the rates or momenta that are held."""
+    """The equations of steady motion; `like` has the structure of q, `held` (k,) are the held rates or momenta."""
 
     system: System
     t: Float[Array, ""]
@@ -78,12 +78,12 @@ class Steady(eqx.Module):
         return coordinates.flatten(self.like)[1]
 
     def parts(self, y):
-        """Positions, rates and multipliers of a vector of unknowns."""
+        """Split a vector of unknowns into positions, rates and multipliers."""
         k = self.symmetries.count
         return y[: self.n], y[self.n : self.n + k], y[self.n + k : self.n + k + self.m]
 
     def fields(self, x) -> Float[Array, "k n"]:
-        """The velocity along each symmetry at a unit rate."""
+        """The velocity along each symmetry at unit rate."""
         rows = [jnp.asarray(np.eye(self.n)[i], x.dtype) for i in self.symmetries.places]
         q = self.unflatten(x)
         rows += [coordinates.flatten(field(q, self.params))[0].astype(x.dtype) for field in self.symmetries.fields]
@@ -93,86 +93,92 @@ class Steady(eqx.Module):
         return rates @ self.fields(x)
 
     def velocity_and_acceleration(self, x, rates):
-        """u and a of the steady motion through x."""
+        """The velocity u and acceleration a of the steady motion through x."""
         u = self.velocity(x, rates)
         if not self.symmetries.fields:
             return u, jnp.zeros_like(u)
         return jax.jvp(lambda x: self.velocity(x, rates), (x,), (u,))
 
     def momenta(self, x, u) -> Float[Array, " k"]:
-        """`p·G_k`, what is conserved of each symmetry."""
-        of = lambda u: self.system.lagrangian(self.t, self.unflatten(x), self.unflatten(u), self.params)
-        return self.fields(x) @ jax.grad(of)(u)
+        """The conserved momenta `p·G_k`, one for each symmetry."""
+        lagrangian_of = lambda u: self.system.lagrangian(self.t, self.unflatten(x), self.unflatten(u), self.params)
+        return self.fields(x) @ jax.grad(lagrangian_of)(u)
 
 
-# Jitted, so that a Lagrangian is traced once wherever its balance is asked for.
+# Jitted so that a Lagrangian is traced only once, however often its balance is evaluated.
 @eqx.filter_jit
 def imbalance(s: Steady, t, x, u, a, multipliers):
-    """`M a - F - Aᵀ λ - B λ`, for any velocity and acceleration."""
+    """The residual `M a - F - Aᵀ λ - B λ` for any velocity and acceleration."""
     state = s.system, t, x, u, s.params, s.unflatten
     forcing, inertia = forcing_and_inertia(*state)
-    left = inertia(a) - forcing
+    residual = inertia(a) - forcing
     if multipliers.size:
-        left = left - multipliers @ forces(s, t, x, u)
-    return left.astype(x.dtype)
+        residual = residual - multipliers @ forces(s, t, x, u)
+    return residual.astype(x.dtype)
 
 
 @eqx.filter_jit
 def forces(s: Steady, t, x, u) -> Float[Array, "m n"]:
-    """The force of each multiplier: the rows of A, and what a force makes of it."""
+    """The force per unit of each multiplier: the rows of A, plus the response of forces that depend on multipliers."""
     state = s.system, t, x, u, s.params, s.unflatten
     rows, reaction = constraints.jacobian(*state), response(*state)
     return rows if reaction is None else rows + reaction.T
 
 
 @eqx.filter_jit
-def restrictions(s: Steady, t, x, u):
-    """`g` or `phi` of each constraint, stacked in the order of their names."""
+def constraint_residuals(s: Steady, t, x, u):
+    """The residuals `g` or `phi` of all constraints, stacked in the order of their names."""
     q, v = s.unflatten(x), s.unflatten(u)
-    found = [constraints.evaluate(c, t, q, v, s.params) for c in s.system.constraints.values()]
-    return jnp.concatenate([jnp.atleast_1d(r).astype(x.dtype) for r in found]) if found else jnp.zeros(0, x.dtype)
+    residuals = [constraints.evaluate(c, t, q, v, s.params) for c in s.system.constraints.values()]
+    return (
+        jnp.concatenate([jnp.atleast_1d(r).astype(x.dtype) for r in residuals]) if residuals else jnp.zeros(0, x.dtype)
+    )
 
 
 def holonomic(s: Steady) -> np.ndarray:
-    """Which of the stacked constraint equations restrict positions, (m,)."""
+    """Which of the stacked constraint equations are holonomic, (m,)."""
     return constraints.holonomic_equations(s.system, s.t, s.like, s.like, s.params)
 
 
-def holding(s: Steady, x, rates):
-    """What is held of the symmetries, less the values at which it is held."""
+def held_residual(s: Steady, x, rates):
+    """The residual of the held rates or momenta: their values minus those at which they are held."""
     if s.symmetries.hold is None or not s.symmetries.count:
         return jnp.zeros(0, x.dtype)
-    kept = rates if s.symmetries.hold == VELOCITY else s.momenta(x, s.velocity(x, rates))
-    return (kept - s.held).astype(x.dtype)
+    values = rates if s.symmetries.hold == VELOCITY else s.momenta(x, s.velocity(x, rates))
+    return (values - s.held).astype(x.dtype)
 
 
 def balance(s: Steady, y):
-    """All equations of a steady motion, as one residual; more than unknowns where some follow from the others."""
+    """All equations of a steady motion as one residual; there are more than unknowns where some are redundant."""
     x, rates, multipliers = s.parts(y)
     u, a = s.velocity_and_acceleration(x, rates)
-    found = [imbalance(s, s.t, x, u, a, multipliers), restrictions(s, s.t, x, u), holding(s, x, rates)]
+    residuals = [
+        imbalance(s, s.t, x, u, a, multipliers),
+        constraint_residuals(s, s.t, x, u),
+        held_residual(s, x, rates),
+    ]
     if s.symmetries.hold is None and s.symmetries.count:
-        # Rates that are free may be what a moving constraint asks for.
-        found.append(moving(s, x, u))
-    return jnp.concatenate(found)
+        # A moving constraint may determine rates that are free.
+        residuals.append(holonomic_rates(s, x, u))
+    return jnp.concatenate(residuals)
 
 
-def moving(s: Steady, x, u):
-    """`dg/dt` of the constraints of positions, which a velocity must satisfy besides; 0 for the others."""
+def holonomic_rates(s: Steady, x, u):
+    """The residual `dg/dt` of the holonomic constraints, which a velocity must satisfy as well; 0 for the others."""
     rates = constraints.velocity_residual(s.system, s.t, x, u, s.params, s.unflatten)
     return jnp.where(holonomic(s), rates, 0.0)
 
 
-def passing(s: Steady, y):
-    """How fast the balance is lost along the steady motion, and how fast each constraint: zero if it lasts."""
+def drift_rates(s: Steady, y):
+    """The rates at which the balance and each constraint change along the steady motion; zero if the motion lasts."""
     x, rates, multipliers = s.parts(y)
     u, a = s.velocity_and_acceleration(x, rates)
     if s.symmetries.fields:
-        # Forces turn with the motion, in a way that only the symmetry knows; their sizes are compared instead.
-        return jnp.concatenate([jnp.zeros_like(x), moving(s, x, u)])
+        # Force components rotate with the motion as the symmetry prescribes, so only the constraints are checked.
+        return jnp.concatenate([jnp.zeros_like(x), holonomic_rates(s, x, u)])
 
     def along(t, x):
-        return jnp.concatenate([imbalance(s, t, x, u, a, multipliers), restrictions(s, t, x, u)])
+        return jnp.concatenate([imbalance(s, t, x, u, a, multipliers), constraint_residuals(s, t, x, u)])
 
     return jax.jvp(along, (s.t, x), (jnp.ones_like(s.t), u))[1]
 
@@ -180,7 +186,7 @@ def passing(s: Steady, y):
 class Departures(NamedTuple):
     """`K ξ + C ξ' + M ξ'' = Wᵀ δλ`, with `g_x ξ = 0` and `phi_x ξ + phi_v ξ' = 0`: `rows` (m, n) and `slopes` (m, n).
 
-    `rows` is A; `slopes` is `∂phi/∂x` in the moving frame, and zero of constraints of positions. `pushes` (m, n) is W.
+    `rows` is A; `slopes` is `∂phi/∂x` in the moving frame, and zero for holonomic constraints. `pushes` (m, n) is W.
     """
 
     stiffness: Float[Array, "n n"]
@@ -192,12 +198,12 @@ class Departures(NamedTuple):
 
 
 def departures(s: Steady, y, jacobian) -> Departures:
-    """The linear equations of small departures from a steady motion; `jacobian` is that of `balance` at y."""
+    """The linear equations of small departures from a steady motion; `jacobian` is the Jacobian of `balance` at y."""
     x, rates, multipliers = s.parts(y)
     n, k, m = s.n, s.symmetries.count, s.m
     u, a = s.velocity_and_acceleration(x, rates)
 
-    # What moves positions alone is in the Jacobian already.
+    # The dependence on positions is in the Jacobian already; only ξ' and ξ'' are missing.
     def residual(rate, acceleration):
         total = a + acceleration
         if s.symmetries.fields:
@@ -205,42 +211,42 @@ def departures(s: Steady, y, jacobian) -> Departures:
         return imbalance(s, s.t, x, u + rate, total, multipliers)
 
     damping, mass = jax.jacfwd(residual, argnums=(0, 1))(jnp.zeros_like(x), jnp.zeros_like(x))
-    by_positions, is_holonomic = jacobian[n : n + m, :n], holonomic(s)[:, None]
-    rows = by_positions
+    by_position, is_holonomic = jacobian[n : n + m, :n], holonomic(s)[:, None]
+    rows = by_position
     if not holonomic(s).all():
         rows = constraints.jacobian(s.system, s.t, x, u, s.params, s.unflatten)
-    slopes = jnp.where(is_holonomic, 0.0, by_positions)
+    slopes = jnp.where(is_holonomic, 0.0, by_position)
     return Departures(jacobian[:n, :n], damping, mass, rows, slopes, -jacobian[:n, n + k : n + k + m].T)
 
 
 def directions(s: Steady, d: Departures, y):
-    """The projector (2n, 2n) on the departures (ξ, ξ') that are allowed and lead off the motion; how many it has."""
+    """The projector (2n, 2n) onto allowed departures (ξ, ξ') that leave the steady motion; and its rank."""
     n, rows, restricts_positions = s.n, d.rows, holonomic(s)
     zero = jnp.zeros_like(rows)
     of_positions = jnp.where(restricts_positions[:, None], rows, 0.0)
     along = s.fields(s.parts(y)[0])
-    barred = [jnp.concatenate([of_positions, zero], axis=1), jnp.concatenate([d.slopes, rows], axis=1)]
-    barred.append(jnp.concatenate([along, jnp.zeros_like(along)], axis=1))
-    barred = jnp.concatenate(barred)
-    if not barred.shape[0]:
+    excluded = [jnp.concatenate([of_positions, zero], axis=1), jnp.concatenate([d.slopes, rows], axis=1)]
+    excluded.append(jnp.concatenate([along, jnp.zeros_like(along)], axis=1))
+    excluded = jnp.concatenate(excluded)
+    if not excluded.shape[0]:
         return jnp.eye(2 * n, dtype=rows.dtype), jnp.asarray(2 * n)
-    kept = independent_rows(barred) & jnp.any(barred != 0, axis=1)
-    used = jnp.where(kept[:, None], barred, 0.0)
+    kept = independent_rows(excluded) & jnp.any(excluded != 0, axis=1)
+    used = jnp.where(kept[:, None], excluded, 0.0)
     gram = used @ used.T + jnp.diag(jnp.where(kept, 0.0, 1.0))
     return jnp.eye(2 * n, dtype=rows.dtype) - used.T @ _solved(gram, used), 2 * n - jnp.sum(kept)
 
 
 def _solved(matrix, rhs):
-    """`matrix⁻¹ rhs` by LAPACK, refined once, which has the derivatives."""
+    """`matrix⁻¹ rhs` by LAPACK, refined once; the refinement carries the derivatives."""
     return dense.refined(lapack.solve(matrix, jnp.eye(matrix.shape[0], dtype=matrix.dtype)), matrix, rhs)
 
 
 def characteristic_roots(s: Steady, y, jacobian, derivatives=True):
-    """All roots s of departures e^(st), (2n,), NaN in place of those that constraints leave no room for.
+    """All roots s of departures e^(st), (2n,), with NaN in place of the roots that constraints remove.
 
-    Departures along the symmetry, which lead to the same motion, are left out. All NaN where the equations of motion
-    are singular. Their derivatives are those of `roots.py`, as of `lj.normal_modes`, which says more of one state; this
-    is for many, in programs and along any symmetry.
+    Departures along the symmetry are left out: they lead to the same motion. All roots are NaN where the equations of
+    motion are singular. Derivatives follow `roots.py`, as for `lj.normal_modes`, which reports more about one state;
+    this function serves many states inside compiled programs, and any symmetry.
     """
     d, n = departures(s, y, jacobian), s.n
     project, count = directions(s, d, y)
@@ -250,22 +256,22 @@ def characteristic_roots(s: Steady, y, jacobian, derivatives=True):
     matrix = jnp.block([[d.mass, -pushes.T], [rows, jnp.diag(jnp.where(kept, 0.0, 1.0))]])
     slopes = jnp.where(kept[:, None], d.slopes, 0.0)
     known = jnp.block([[-d.stiffness, -d.damping], [jnp.zeros_like(rows), -slopes]])
-    # Where a coordinate has no inertia, as an azimuth at the pole, its small motions have no equation.
+    # A coordinate without inertia, such as an azimuth at the pole, has no equation for its small motions.
     sizes = jnp.maximum(jnp.max(jnp.abs(d.mass), axis=1), jnp.max(jnp.abs(rows), axis=0, initial=0.0))
-    sound = reciprocal_condition(matrix) > SINGULAR_BELOW[np.dtype(matrix.dtype)]
-    sound = sound & (jnp.min(sizes) > jnp.finfo(sizes.dtype).eps ** 1.3 * jnp.max(sizes))
-    accelerations = _solved(jnp.where(sound, matrix, jnp.eye(n + m, dtype=matrix.dtype)), known)[:n]
+    regular = reciprocal_condition(matrix) > SINGULAR_BELOW[np.dtype(matrix.dtype)]
+    regular = regular & (jnp.min(sizes) > jnp.finfo(sizes.dtype).eps ** 1.3 * jnp.max(sizes))
+    accelerations = _solved(jnp.where(regular, matrix, jnp.eye(n + m, dtype=matrix.dtype)), known)[:n]
     unit = jnp.eye(n, dtype=rows.dtype)
     whole = jnp.concatenate([jnp.concatenate([jnp.zeros_like(unit), unit], axis=1), accelerations])
     unit = jnp.eye(2 * n, dtype=rows.dtype)
     roots = roots_beside_zeros(project @ whole @ project, unit, derivatives)[0].values
-    # Ranked by comparisons, as sorting takes long to compile; the nearest to zero belong to what is left out.
+    # Ranked by comparisons because sorting is slow to compile; the roots nearest to zero belong to removed directions.
     size, order = lax.stop_gradient(jnp.abs(roots)), np.arange(2 * n)
     before = (size[None, :] < size[:, None]) | (size[None, :] == size[:, None]) & (order[None, :] < order[:, None])
-    return jnp.where(sound & (jnp.sum(before, axis=1) >= 2 * n - count), roots, jnp.nan)
+    return jnp.where(regular & (jnp.sum(before, axis=1) >= 2 * n - count), roots, jnp.nan)
 
 
-def shortest(pushes, known):
+def shortest_multipliers(pushes, known):
     """The shortest λ with `Wᵀ λ = known`, W (m, n) of any rank; differentiable where the rank does not change."""
     if not pushes.shape[0]:
         return jnp.zeros(0, pushes.dtype)
@@ -273,7 +279,7 @@ def shortest(pushes, known):
     base = jnp.where(kept[:, None], pushes, 0.0)
     unit = jnp.diag(jnp.where(kept, 0.0, 1.0)).astype(pushes.dtype)
     inverted = jnp.linalg.inv(base @ base.T + unit)
-    # W = T W_kept, and of all λ with Tᵀ λ = c the shortest is T (TᵀT)⁻¹ c.
+    # W = T W_kept, and the shortest λ with Tᵀ λ = c is T (TᵀT)⁻¹ c.
     shares = pushes @ base.T @ inverted
     shares = jnp.where(kept[None, :], shares, 0.0)
     c = jnp.where(kept, inverted @ (base @ known), 0.0)

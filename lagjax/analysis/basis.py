@@ -1,8 +1,8 @@
-"""Among which motions symmetries are looked for: translations, rotations, shifts, time, boosts, scalings.
+"""The motions among which symmetries are searched: translations, rotations, shifts, time, boosts, scalings.
 
-All are affine, ξ = a + B x + t c and τ = α + β t, and so they are a few arrays. Those of all points together come
-before those of one: the first of several that depend on each other is kept. Boosts, and what else has t in it, come
-last. L may change by the total derivative of a gauge function, of which a polynomial is tried.
+All motions are affine, ξ = a + B x + t c and τ = α + β t, so a few arrays hold them. Motions of all points together
+come before those of a single point, because the first of several dependent ones is kept. Boosts and other motions that
+contain t come last. L may change by the total derivative of a gauge function; polynomials are tried for it.
 """
 
 from itertools import combinations_with_replacement
@@ -15,13 +15,14 @@ from lagjax.analysis.rates import Affine
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.cartesian import AXES, points, turned
 
-# Points that are turned one by one, coordinates of which each is boosted and scaled, and that have products as gauge.
+# Largest numbers of points rotated one by one, of coordinates boosted and scaled one by one, and of coordinates whose
+# products are tried as gauge functions.
 EACH_POINT_UP_TO, EACH_UP_TO, PRODUCTS_UP_TO = 8, 24, 6
 TIME = "Jacobi integral"
 
 
 class Element(NamedTuple):
-    """One motion; `kind`: "space", "time", "boost" or "scaling"."""
+    """One motion of the basis; `kind` is "space", "time", "boost" or "scaling"."""
 
     name: str
     kind: str
@@ -33,7 +34,7 @@ class Element(NamedTuple):
 
 
 class Basis(NamedTuple):
-    """What is looked among: affine motions, their names and kinds."""
+    """The motions of the search: affine maps, their names and kinds."""
 
     affine: Affine
     names: tuple[str, ...]
@@ -41,10 +42,12 @@ class Basis(NamedTuple):
 
 
 def motions(q) -> Basis:
-    """The motions that are tried for coordinates like these."""
-    found, n = points(q), len(coordinates.names(q))
-    elements = [*_shifts(q, found, n), _moved(TIME, "time", n, clock=-1.0), *_turns(found, n)]
-    elements += [_moved(f"t {e.name}", "boost", n, drift=e.shift) for e in elements if e.kind == "space" and _pushes(e)]
+    """The motions that are tried for coordinates with the structure of q."""
+    all_points, n = points(q), len(coordinates.names(q))
+    elements = [*_shifts(q, all_points, n), _element(TIME, "time", n, clock=-1.0), *_rotations(all_points, n)]
+    elements += [
+        _element(f"t {e.name}", "boost", n, drift=e.shift) for e in elements if e.kind == "space" and _is_shift(e)
+    ]
     if n > EACH_UP_TO:
         elements = [e for e in elements if e.kind != "boost" or e.name.startswith("t P_")]
     elements += _scalings(q, n)
@@ -52,57 +55,65 @@ def motions(q) -> Basis:
     return Basis(Affine(*stacked), tuple(e.name for e in elements), tuple(e.kind for e in elements))
 
 
-def _shifts(q, found, n):
+def _shifts(q, all_points, n):
     elements = []
     for k, axis in enumerate(AXES):
-        moved = [point.places[k] for point in found if point.places[k] is not None]
+        moved = [point.places[k] for point in all_points if point.places[k] is not None]
         if len(moved) > 1:
-            elements.append(_moved(f"P_{axis}", "space", n, shift=_at(moved, n)))
-    return elements + [_moved(f"p_{x}", "space", n, shift=_at([i], n)) for i, x in enumerate(coordinates.names(q))]
+            elements.append(_element(f"P_{axis}", "space", n, shift=_ones_at(moved, n)))
+    return elements + [
+        _element(f"p_{x}", "space", n, shift=_ones_at([i], n)) for i, x in enumerate(coordinates.names(q))
+    ]
 
 
-def _turns(found, n):
+def _rotations(all_points, n):
     elements = []
     for axis in AXES:
-        pairs = [(point.label, pair) for point in found if (pair := turned(point, axis))]
+        pairs = [(point.label, pair) for point in all_points if (pair := turned(point, axis))]
         if pairs:
-            elements.append(_moved(f"L_{axis}", "space", n, matrix=_turning([pair for _, pair in pairs], n)))
-    if 1 < len(found) <= EACH_POINT_UP_TO:
+            elements.append(_element(f"L_{axis}", "space", n, matrix=_rotation([pair for _, pair in pairs], n)))
+    if 1 < len(all_points) <= EACH_POINT_UP_TO:
         for axis in AXES:
-            for point in found:
+            for point in all_points:
                 if pair := turned(point, axis):
                     name = f"L_{axis}({point.label})"
-                    elements.append(_moved(name, "space", n, matrix=_turning([pair], n)))
+                    elements.append(_element(name, "space", n, matrix=_rotation([pair], n)))
     return elements
 
 
 def _scalings(q, n):
-    elements = [_moved("q·p", "scaling", n, matrix=np.eye(n))]
+    elements = [_element("q·p", "scaling", n, matrix=np.eye(n))]
     if 1 < n <= EACH_UP_TO:
         for i, name in enumerate(coordinates.names(q)):
-            elements.append(_moved(f"{name} p_{name}", "scaling", n, matrix=np.diag(_at([i], n))))
-    return [*elements, _moved(f"t ({TIME})", "scaling", n, clock_rate=-1.0)]
+            elements.append(_element(f"{name} p_{name}", "scaling", n, matrix=np.diag(_ones_at([i], n))))
+    return [*elements, _element(f"t ({TIME})", "scaling", n, clock_rate=-1.0)]
 
 
-def _moved(name, kind, n, shift=None, matrix=None, drift=None, clock=0.0, clock_rate=0.0):
+def _element(name, kind, n, shift=None, matrix=None, drift=None, clock=0.0, clock_rate=0.0):
     zero = np.zeros(n)
-    given = lambda x, nothing: nothing if x is None else x
+    or_default = lambda x, default: default if x is None else x
     return Element(
-        name, kind, given(shift, zero), given(matrix, np.zeros((n, n))), given(drift, zero), clock, clock_rate
+        name,
+        kind,
+        or_default(shift, zero),
+        or_default(matrix, np.zeros((n, n))),
+        or_default(drift, zero),
+        clock,
+        clock_rate,
     )
 
 
-def _pushes(element):
+def _is_shift(element):
     return bool(np.any(element.shift != 0))
 
 
-def _at(places, n):
-    found = np.zeros(n)
-    found[places] = 1.0
-    return found
+def _ones_at(places, n):
+    vector = np.zeros(n)
+    vector[places] = 1.0
+    return vector
 
 
-def _turning(pairs, n):
+def _rotation(pairs, n):
     matrix = np.zeros((n, n))
     for first, second in pairs:
         matrix[first, second], matrix[second, first] = -1.0, 1.0
@@ -110,7 +121,7 @@ def _turning(pairs, n):
 
 
 class Gauge(NamedTuple):
-    """Gauge functions: t^power times a product of coordinates, none, one or two of them; names, and which have a t."""
+    """Gauge functions: t^power times a product of up to two coordinates; their names, and which of them contain t."""
 
     powers: tuple[int, ...]
     factors: tuple[tuple[int, ...], ...]
@@ -118,7 +129,7 @@ class Gauge(NamedTuple):
     timed: np.ndarray
 
     def rates(self, t, x, u) -> np.ndarray:
-        """dF/dt of each at states (N,), (N, n), (N, n): (N, G)."""
+        """dF/dt of each gauge function at states (N,), (N, n), (N, n): (N, G)."""
         columns = []
         for power, factors in zip(self.powers, self.factors):
             product = np.prod(x[:, list(factors)], axis=1)
@@ -128,21 +139,21 @@ class Gauge(NamedTuple):
         return np.stack(columns, axis=1)
 
     def combined(self, weights) -> "Polynomial":
-        """Their sum with these weights."""
+        """The weighted sum of the gauge functions."""
         kept = np.flatnonzero(weights)
         return Polynomial(tuple(self.powers[k] for k in kept), tuple(self.factors[k] for k in kept), weights[kept])
 
 
 def gauges(q) -> Gauge:
-    """The gauge functions that are tried."""
+    """The gauge functions that are tried for coordinates with the structure of q."""
     names = coordinates.names(q)
-    n, found = len(names), []
-    found += [(0, (i,)) for i in range(n)]
+    n, monomials = len(names), []
+    monomials += [(0, (i,)) for i in range(n)]
     if n <= PRODUCTS_UP_TO:
-        found += [(0, pair) for pair in combinations_with_replacement(range(n), 2)]
-    found += [(1, ()), (2, ()), *((1, (i,)) for i in range(n))]
-    powers, factors = zip(*found)
-    return Gauge(powers, factors, tuple(_named(p, f, names) for p, f in found), np.asarray(powers) > 0)
+        monomials += [(0, pair) for pair in combinations_with_replacement(range(n), 2)]
+    monomials += [(1, ()), (2, ()), *((1, (i,)) for i in range(n))]
+    powers, factors = zip(*monomials)
+    return Gauge(powers, factors, tuple(_named(p, f, names) for p, f in monomials), np.asarray(powers) > 0)
 
 
 def _named(power, factors, names):
@@ -153,14 +164,14 @@ def _named(power, factors, names):
 
 
 class Polynomial(NamedTuple):
-    """A gauge function: a combination of those that were tried."""
+    """A gauge function: a linear combination of monomials."""
 
     powers: tuple[int, ...]
     factors: tuple[tuple[int, ...], ...]
     weights: np.ndarray
 
     def __call__(self, t, q, params):
-        """F at a place."""
+        """The value of F."""
         x, _ = coordinates.flatten(q)
         total = jnp.zeros_like(x[0])
         for weight, power, factors in zip(self.weights, self.powers, self.factors):
@@ -176,10 +187,10 @@ class Combination(NamedTuple):
     drift: np.ndarray
 
     def __call__(self, t, q, params):
-        """ξ, like q."""
+        """ξ, with the structure of q."""
         x, unflatten = coordinates.flatten(q)
-        to = lambda y: jnp.asarray(y, x.dtype)
-        return unflatten(to(self.shift) + to(self.matrix) @ x + t * to(self.drift))
+        cast = lambda y: jnp.asarray(y, x.dtype)
+        return unflatten(cast(self.shift) + cast(self.matrix) @ x + t * cast(self.drift))
 
 
 class Clock(NamedTuple):
@@ -189,5 +200,5 @@ class Clock(NamedTuple):
     rate: float
 
     def __call__(self, t, q, params):
-        """τ."""
+        """The value of τ."""
         return self.start + self.rate * t

@@ -1,23 +1,23 @@
-"""The equations of a branch: those of steady motion with one parameter free, made square and of the size of one.
+"""The equations of a branch: those of steady motion with one parameter free, made square and scaled to order one.
 
-`balance.py` gives more equations than unknowns where some follow from others (of redundant constraints, along a
-symmetry), and fewer independent ones where there is a family. At a start with Jacobian `J = U Σ Vᵀ` of rank r, the r
-combinations `U_rᵀ r(y)` are kept, and the n - r directions in which V leaves y free are held:
+`balance.py` gives more equations than unknowns where some are redundant (redundant constraints, a symmetry), and fewer
+independent ones where the solutions form a family. At a start with Jacobian `J = U Σ Vᵀ` of rank r, the r combinations
+`U_rᵀ r(y)` are kept, and the n - r directions V_0 of the null space, in which y is free, are held fixed:
 
     E(y, μ) = (U_rᵀ r(y, μ), V_0ᵀ (y - y_0)) = 0,    as many equations as unknowns
 
-z = (y, μ) is measured in units in which entries of the Jacobian and the range of μ are one.
+z = (y, μ) is measured in units in which the entries of the Jacobian and the range of μ are of order one.
 
-Critical points are regular solutions of larger systems. With ψ, the left null vector of E_y,
+Critical points are regular solutions of extended systems. With ψ, the left null vector of E_y,
 
     fold            E = 0,         E_yᵀ ψ = 0,                ψ·ψ = 1
-    branch point    E + β ψ = 0,   E_yᵀ ψ = 0,   E_μ·ψ = 0,   ψ·ψ = 1          (β = 0 where branches really meet)
+    branch point    E + β ψ = 0,   E_yᵀ ψ = 0,   E_μ·ψ = 0,   ψ·ψ = 1          (β = 0 where the branches do meet)
     multiple zero   E = 0,         E_y φ = 0,                 φ·φ₀ = 1
     flutter         E = 0,         D(iω) w = 0,               w₀*·w = 1
-    collision       the same, and  D(iω) w₂ + D'(iω) w = 0,   w₀*·w₂ = 0
+    collision       flutter, and   D(iω) w₂ + D'(iω) w = 0,   w₀*·w₂ = 0
 
-with `D(s) = K + s C + s² M`, bordered by the constraints, of departures e^(st). A collision, of two frequencies without
-damping, has two equations more than unknowns, which symmetry of D makes consistent.
+where `D(s) = K + s C + s² M`, bordered by the constraints, is the matrix of departures e^(st). A collision of two
+frequencies without damping has two more equations than unknowns; they are consistent because D is symmetric.
 
 Source: Moore & Spence, SIAM J. Numer. Anal. 17 (1980) 567 (folds); Moore, *Numer. Funct. Anal. Optim.* 2 (1980) 441
 (branch points); Govaerts, *Numerical Methods for Bifurcations of Dynamical Equilibria*, ch. 3-5.
@@ -42,28 +42,28 @@ FOLD, BRANCH, MULTIPLE, FLUTTER, COLLISION, ESCAPE = "fold", "branch", "multiple
 
 
 class Place(eqx.Module):
-    """Where the parameter of a branch is: a number in `params`, or (`of_params` is None) what is held of a symmetry."""
+    """The location of a branch's parameter: a number in `params`, or a held rate or momentum (`of_params` is None)."""
 
     name: str = eqx.field(static=True)
     of_params: Number | None
     entry: int = eqx.field(static=True, default=0)
 
     def put(self, s: Steady, value) -> Steady:
-        """The problem at this value of the parameter."""
+        """The problem with this value of the parameter."""
         if self.of_params is None:
             return replace(s, held=s.held.at[self.entry].set(value))
         return replace(s, params=self.of_params.put(s.params, value))
 
     def get(self, s: Steady):
-        """Its value in the problem."""
+        """The value of the parameter in the problem."""
         return s.held[self.entry] if self.of_params is None else self.of_params.get(s.params)
 
 
 class Frame(eqx.Module):
-    """What stays along all branches: the problem, its units and which combinations are solved.
+    """What is constant along all branches: the problem, its units, and the combinations of equations that are solved.
 
-    `combinations` (r, R), `free` (N - r, N), `reference` (N,); `rows` (R,) and `columns` (N,) are units, `unit` that of
-    the parameter.
+    `combinations` (r, R) is U_rᵀ, `free` (N - r, N) is V_0ᵀ, `reference` (N,) is y_0; `rows` (R,) and `columns` (N,)
+    are the units of equations and unknowns, `unit` that of the parameter.
     """
 
     steady: Steady
@@ -76,7 +76,7 @@ class Frame(eqx.Module):
     place: Place
 
     def split(self, z):
-        """The problem at a point, and its unknowns in their own units."""
+        """The problem at a point, and its unknowns in the user's units."""
         return self.place.put(self.steady, z[-1] * self.unit), z[:-1] * self.columns
 
     def residual(self, z):
@@ -87,23 +87,23 @@ class Frame(eqx.Module):
 
 
 def place_of(steady: Steady, along: str) -> Place:
-    """Find a parameter by its name, `"omega"`, `"spring.k"`, `"k[1]"`; or what is held, `"v.psi"` or `"p.psi"`."""
+    """Find a parameter by name, `"omega"`, `"spring.k"`, `"k[1]"`; or a held rate `"v.psi"` or momentum `"p.psi"`."""
     names = coordinates.names(steady.like)
     for kind, hold in (("v", equations.VELOCITY), ("p", equations.MOMENTUM)):
-        of = [f"{kind}.{names[i]}" if names[i] != "q" else kind for i in steady.symmetries.places]
-        of = of or [f"{kind}[{i}]" for i in range(steady.symmetries.count)]
-        if along in of and steady.symmetries.hold == hold:
-            return Place(along, None, of.index(along))
-    found = numbers_in(steady.params)
-    if along not in found:
+        held_names = [f"{kind}.{names[i]}" if names[i] != "q" else kind for i in steady.symmetries.places]
+        held_names = held_names or [f"{kind}[{i}]" for i in range(steady.symmetries.count)]
+        if along in held_names and steady.symmetries.hold == hold:
+            return Place(along, None, held_names.index(along))
+    numbers = numbers_in(steady.params)
+    if along not in numbers:
         more = 'and "v.psi" for the velocity of a cyclic coordinate psi that is held (with hold="momentum": "p.psi")'
         raise no_such_number(along, steady.params, more)
-    return Place(along, found[along])
+    return Place(along, numbers[along])
 
 
 @compiled
 def evaluated(frame: Frame, z):
-    """E, its Jacobian by z, and the largest of all equations in their units."""
+    """E, its Jacobian with respect to z, and the largest scaled residual of all equations."""
     jacobian = jax.jacfwd(frame.residual)(z)
     s, y = frame.split(z)
     full = equations.balance(s, y) / frame.rows
@@ -112,19 +112,19 @@ def evaluated(frame: Frame, z):
 
 @compiled
 def full_jacobian(steady: Steady, y):
-    """All equations at a point, and their Jacobian."""
+    """The residuals of all equations at a point, and their Jacobian."""
     return equations.balance(steady, y), jax.jacfwd(lambda y: equations.balance(steady, y))(y)
 
 
 @compiled
-def seen_at(frame: Frame, z):
-    """What a user sees of a point: parameter, q, v, multipliers, and the roots of its small motions."""
+def outputs_at(frame: Frame, z):
+    """The outputs of a point: parameter, q, v, multipliers, and the characteristic roots of its small motions."""
     s, y = frame.split(z)
     x, rates, multipliers = s.parts(y)
     u = s.velocity(x, rates)
     if s.m > 1:
         pushes = equations.forces(s, s.t, x, u)
-        multipliers = equations.shortest(pushes, multipliers @ pushes)
+        multipliers = equations.shortest_multipliers(pushes, multipliers @ pushes)
     by_name = equations.constraints.split(s.system, multipliers, s.t, s.like, s.like, s.params) if s.m else {}
     jacobian = jax.jacfwd(lambda y: equations.balance(s, y))(y)
     roots = equations.characteristic_roots(s, y, jacobian, derivatives=False)
@@ -133,7 +133,7 @@ def seen_at(frame: Frame, z):
 
 @compiled
 def curvature(frame: Frame, z, a, b):
-    """`D²E[a, b]`."""
+    """The second derivative `D²E[a, b]`."""
     along = lambda direction: lambda z: jax.jvp(frame.residual, (z,), (direction,))[1]
     return jax.jvp(along(a), (z,), (b,))[1]
 
@@ -156,12 +156,12 @@ def dynamic(frame: Frame, z):
 
 @compiled
 def dynamic_at(frame: Frame, z):
-    """The same, as a program."""
+    """`dynamic`, compiled."""
     return dynamic(frame, z)
 
 
 def extended(kind: str, frame: Frame, big, guide):
-    """The larger system whose regular solution is a critical point; `guide` fixes what is free of null vectors."""
+    """The extended system whose regular solution is a critical point; `guide` normalises its null vectors."""
     n = frame.columns.size
     z, rest = big[: n + 1], big[n + 1 :]
     if kind in (FOLD, BRANCH, ESCAPE):
@@ -172,7 +172,7 @@ def extended(kind: str, frame: Frame, big, guide):
         if kind == FOLD:
             return jnp.concatenate([value, slopes[:n], norm[None]])
         if kind == ESCAPE:
-            # The equations are linear, and their solution far away: only its direction counts.
+            # The equations are linear and their solution is at infinity, so only its direction matters.
             return jnp.concatenate([z[:-1] - guide[:n], slopes[:n], norm[None]])
         return jnp.concatenate([value + rest[n] * psi, slopes, norm[None]])
     if kind == MULTIPLE:
@@ -187,29 +187,29 @@ def extended(kind: str, frame: Frame, big, guide):
     real, imaginary = (stiffness - omega**2 * mass) / rows[:, None], omega * damping / rows[:, None]
     times = lambda a, b: (real @ a - imaginary @ b, real @ b + imaginary @ a)
     unit = lambda a, b, one: jnp.stack([guide[:size] @ a + guide[size:] @ b - one, guide[:size] @ b - guide[size:] @ a])
-    found = [value, *times(re, im), unit(re, im, 1.0)]
+    parts = [value, *times(re, im), unit(re, im, 1.0)]
     if kind == COLLISION:
         # ω D'(iω), with D' = C + 2 i ω M.
         slope, turn = omega * damping / rows[:, None], 2 * omega**2 * mass / rows[:, None]
         first, second = times(re2, im2)
-        found += [first + slope @ re - turn @ im, second + slope @ im + turn @ re, unit(re2, im2, 0.0)]
-    return jnp.concatenate(found)
+        parts += [first + slope @ re - turn @ im, second + slope @ im + turn @ re, unit(re2, im2, 0.0)]
+    return jnp.concatenate(parts)
 
 
 @compiled
 def extended_at(kind: str, frame: Frame, big, guide):
-    """The larger system and its Jacobian."""
-    of = lambda big: extended(kind, frame, big, guide)
-    return of(big), jax.jacfwd(of)(big)
+    """The extended system and its Jacobian."""
+    residual = lambda big: extended(kind, frame, big, guide)
+    return residual(big), jax.jacfwd(residual)(big)
 
 
 @compiled
 def extended_by_params(kind: str, frame: Frame, big, guide):
-    """How the larger system changes with each number in `params`: a tree like these, of (rows, ...)."""
+    """The derivative of the extended system by each number in `params`, a tree like `params` of (rows, ...)."""
     floats, rest = eqx.partition(frame.steady.params, eqx.is_inexact_array)
 
-    def of(floats):
+    def residual(floats):
         steady = replace(frame.steady, params=eqx.combine(floats, rest))
         return extended(kind, replace(frame, steady=steady), big, guide)
 
-    return jax.jacfwd(of)(floats)
+    return jax.jacfwd(residual)(floats)

@@ -1,4 +1,4 @@
-"""Branches of equilibria and their critical points: results that print and draw themselves."""
+"""Branches of equilibria and their critical points: the results, with their printing and plotting."""
 
 from typing import Any
 
@@ -15,18 +15,19 @@ OTHER_MARK = ("X", 6)
 
 
 class Critical(eqx.Module):
-    """Where a branch folds, where branches cross, or where stability is lost.
+    """A critical point: a branch folds, branches cross, or stability is lost.
 
-    - `kind`: `"fold"`; `"pitchfork"` and `"transcritical"`, where branches cross; `"line of equilibria"`, where one of
-      these exists at this parameter alone; `"flutter"`, where a pair of roots leaves the imaginary axis, by itself
-      (Hopf) or as two frequencies meet (without damping); `"multiple zero"`, where the stiffness vanishes in several
-      directions together, as by symmetry (the branches that leave it are not followed); `"divergence"`, where a root
-      becomes positive and no branch crosses; `"escape"`, where the solution of linear equations is at infinity.
-    - `parameter`: its value, and `accuracy`, the last step of Newton's method for it.
-    - `q`, `v`, `multipliers`: the state there. `frequency` of flutter, `1/[t]`.
-    - `derivative`: of `parameter` by every number in `params`, a tree like these; 0 of itself. None where the place is
-      known by bisection alone.
-    - `branches`: on which it lies.
+    - `kind`: `"fold"`; `"pitchfork"` and `"transcritical"`, where branches cross; `"line of equilibria"`, where the
+      crossing branch exists at this parameter value only; `"flutter"`, where a pair of roots leaves the imaginary axis,
+      alone (Hopf) or as two frequencies meet (without damping); `"multiple zero"`, where the stiffness vanishes in
+      several directions at once, for example by symmetry (the branches that leave it are not followed);
+      `"divergence"`, where a root becomes positive and no branch crosses; `"escape"`, where the solution of linear
+      equations goes to infinity.
+    - `parameter`: its value; `accuracy`: the last step of Newton's method for it.
+    - `q`, `v`, `multipliers`: the state there. `frequency`: that of flutter, `1/[t]`.
+    - `derivative`: the derivative of `parameter` by every number in `params`, a tree like `params`; 0 for the parameter
+      itself. None where the point is located by bisection only.
+    - `branches`: the indices of the branches through it.
     """
 
     kind: str = eqx.field(static=True)
@@ -44,11 +45,11 @@ class Critical(eqx.Module):
 
 
 class Branch(eqx.Module):
-    """One curve of equilibria, P points in their order along it.
+    """One curve of equilibria with P points, in order along it.
 
     - `parameter` (P,); `q`, `v`, `multipliers`: each leaf with a leading axis P.
-    - `stable` (P,): no small departure grows; `eigenvalues` (P, 2n), `1/[t]`: their roots, NaN beyond the last one.
-    - `status`: where it ends, and why.
+    - `stable` (P,): no small departure grows; `eigenvalues` (P, 2n), `1/[t]`: their roots, padded with NaN.
+    - `status`: where the branch ends, and why.
     """
 
     parameter: Float[Array, " P"]
@@ -68,7 +69,7 @@ class Branch(eqx.Module):
 
 
 class Branches(eqx.Module):
-    """All branches that were found from a start, and their critical points. It prints and draws itself.
+    """All branches found from a start, and their critical points; print it for a table.
 
     - `branches`: a list of `Branch`, the one through the start first. `critical`: a list of `Critical`, the nearest
       to the start first.
@@ -91,7 +92,7 @@ class Branches(eqx.Module):
         return self.branches[i]
 
     def of_kind(self, kind: str) -> list[Critical]:
-        """The critical points of one kind, `"fold"`, `"pitchfork"`, ..."""
+        """The critical points of one kind: `"fold"`, `"pitchfork"`, ..."""
         return [c for c in self.critical if c.kind == kind]
 
     def __repr__(self):
@@ -120,17 +121,17 @@ class Branches(eqx.Module):
         return "\n".join(lines)
 
     def _number(self, x, digits=10):
-        # What is nothing beside the range is round-off.
+        # A value that is negligible compared with the range is round-off.
         return f"{0.0 if abs(x) < 1e-13 * abs(self.last - self.first) else float(x):.{digits}g}"
 
     def plot(self, *names: str):
         """Draw coordinates against the parameter: stable branches solid, unstable dashed, critical points marked.
 
-        **Arguments:** `names` of coordinates, a panel each; by default those that vary, six at most.
+        **Arguments:** `names` of coordinates, one panel each; by default those that vary, at most six.
 
         **Returns:** a matplotlib `Figure`.
 
-        **Raises:** `ValueError` for a name that is no coordinate; `ImportError` without matplotlib.
+        **Raises:** `ValueError` for a name that is not a coordinate; `ImportError` without matplotlib.
         """
         if unknown := [name for name in names if name not in self.names]:
             raise ValueError(
@@ -148,16 +149,16 @@ class Branches(eqx.Module):
         )  # fmt: skip
         return fig
 
-    def _not_far(self, branch):
-        """Which points are shown: a branch that goes to infinity leaves the picture."""
+    def _in_view(self, branch):
+        """Which points determine the limits of the plot: not those of a branch on its way to infinity."""
         ends = np.concatenate([branch.parameter[:1], branch.parameter[-1:]])
         off = np.min(np.abs(branch.parameter[:, None] - ends), axis=1)
         far = "infinity" in branch.status
         return (off > 0.03 * abs(self.last - self.first)) | (not far)
 
     def _varying(self, curves):
-        all_of = np.concatenate(curves)
-        spread = np.ptp(all_of, axis=0)
+        values = np.concatenate(curves)
+        spread = np.ptp(values, axis=0)
         largest = np.max(spread, initial=0.0)
         return [name for name, x in zip(self.names, spread) if x > 1e-9 * largest][:6] or list(self.names[:1])
 
@@ -165,7 +166,7 @@ class Branches(eqx.Module):
         return [_columns(b.q, len(b)) for b in self.branches]
 
     def draw(self, axis, name: str | None = None):
-        """Draw one coordinate, by default the first, on axes of matplotlib, as `plot` does."""
+        """Draw one coordinate, by default the first, on matplotlib axes, as `plot` does."""
         j, curves = 0 if name is None else self.names.index(name), self._curves()
         inner = []
         for i, (branch, x) in enumerate(zip(self.branches, curves)):
@@ -184,7 +185,7 @@ class Branches(eqx.Module):
                 markersize=7, linestyle="", label=c.kind, zorder=4,
             )  # fmt: skip
         if any("infinity" in b.status for b in self.branches):
-            near = np.concatenate([x[self._not_far(b)] for b, x in zip(self.branches, inner)])
+            near = np.concatenate([x[self._in_view(b)] for b, x in zip(self.branches, inner)])
             middle, half = 0.5 * (near.min() + near.max()), 0.55 * np.ptp(near)
             axis.set_ylim(middle - max(half, 1e-12), middle + max(half, 1e-12))
         axis.set(xlabel=self.along, ylabel=self.names[j])
@@ -193,9 +194,9 @@ class Branches(eqx.Module):
 def _all_handles(axes):
     handles, labels = [], []
     for axis in axes:
-        found = axis.get_legend_handles_labels()
-        handles += found[0]
-        labels += found[1]
+        new_handles, new_labels = axis.get_legend_handles_labels()
+        handles += new_handles
+        labels += new_labels
     return handles, labels
 
 
@@ -210,34 +211,34 @@ LOOKS = {
 
 
 def _verdicts(branch):
-    """Of each point whether it is stable, as a number."""
+    """The stability of each point: STABLE, UNSTABLE or UNKNOWN."""
     known = np.any(np.isfinite(branch.eigenvalues), axis=1)
     return np.where(known, np.asarray(branch.stable).astype(int), UNKNOWN)
 
 
 def runs(verdicts):
-    """Runs of points alike, each with the first of the next: (slice, verdict)."""
+    """Runs of points with the same verdict, each including the first point of the next run: (slice, verdict)."""
     edges = [0, *(np.flatnonzero(np.diff(verdicts)) + 1), len(verdicts)]
     for start, end in zip(edges, edges[1:]):
         yield slice(start, min(end + 1, len(verdicts))), int(verdicts[start])
 
 
 def draw_by_stability(axis, x, y, verdicts, colour):
-    """Draw a curve whose stable parts are solid and whose unstable ones are dashed."""
+    """Draw a curve with its stable parts solid and its unstable parts dashed."""
     for where, verdict in runs(verdicts):
         _, dash, width = LOOKS[verdict]
         axis.plot(x[where], y[where], dash, color=colour, linewidth=width, zorder=2)
 
 
 def name_stability(axis, verdicts):
-    """Put what these lines mean into the legend, those that there are."""
+    """Add the line styles that occur to the legend."""
     for verdict, (label, dash, _) in LOOKS.items():
         if any(np.any(of_one == verdict) for of_one in verdicts):
             axis.plot([], [], dash, color="0.2", label=label)
 
 
 def stability_in_words(verdicts):
-    """Stability along a branch, from its first point to its last."""
+    """The stability along a branch in words, from its first point to its last."""
     kinds = [LOOKS[verdict][0] for _, verdict in runs(verdicts)]
     if len(kinds) > 4:
         return f"stable and unstable in turn ({len(kinds)} times)"

@@ -1,6 +1,6 @@
 """How equilibria change with a parameter: branches, where they fold and cross, and where they become unstable.
 
-A branch is traced (`tracing.py`), what is critical between two of its points is found exactly (`critical_points.py`),
+A branch is traced (`tracing.py`), the critical points between two of its points are solved for (`critical_points.py`),
 and the branches that cross there are traced in turn, each once.
 """
 
@@ -14,7 +14,7 @@ from jaxtyping import ArrayLike, PyTree
 from lagjax.analysis.balance import VELOCITY, Steady
 from lagjax.analysis.branch_equations import Frame, Place, full_jacobian, place_of
 from lagjax.analysis.branches import Branch, Branches, Critical
-from lagjax.analysis.critical_points import Found, between, escape
+from lagjax.analysis.critical_points import CriticalPoint, between, escape
 from lagjax.analysis.equilibria import held_at, searched
 from lagjax.analysis.found_equilibria import OK, WORDS
 from lagjax.analysis.starts import checked, stacked, stacked_one, symmetries_of
@@ -28,15 +28,16 @@ from lagjax.mechanics.diagnosis import describe
 from lagjax.mechanics.refusals import by_name, check_system
 from lagjax.mechanics.structure import angles, is_autonomous
 
-# Points at which a branch begins and critical points are the same within so much.
+# Critical points closer than this are the same.
 SAME = 1e-5
 MOST_BRANCHES = 24
-# How far along the parameter the rank of the equations is asked again, in parts of its range.
+# The rank of the equations is computed again this far along the parameter, as a fraction of its range.
 NEARBY = 1.234e-3
 DEPENDENT = 1e-9
-# A start that is next to nothing says nothing of the size of coordinates: what is far for it is asked in larger units.
+# A start near zero does not show the size of the coordinates: a branch that goes to infinity in small units is traced
+# again in larger ones, until a unit of the positions exceeds the second number.
 UNITS, NOTHING = (1.0, 1e3, 1e6, 1e9, 1e12), 1e-2
-# Points beyond which a branch at one value of the parameter is a line of equilibria.
+# A branch whose last so many points agree in the parameter to this accuracy is a line of equilibria.
 LINE, LINE_WITHIN = 40, 1e-9
 
 
@@ -55,7 +56,7 @@ def continue_equilibria(
     crossings: bool = True,
     most_points: int = 1000,
 ) -> Branches:
-    """Follow an equilibrium as a parameter changes, through folds, and onto the branches that cross.
+    """Follow an equilibrium as a parameter changes, through folds and onto crossing branches.
 
     >>> import jax.numpy as jnp
     >>> import lagjax as lj
@@ -72,18 +73,18 @@ def continue_equilibria(
 
     **Arguments:**
 
-    - `params`, `start`: where the branch begins: near an equilibrium for `params`; a position like q.
-    - `along`: which number changes, by its name in `params`: `"omega"`, `"spring.k"`, `"k[1]"`. `"v.psi"` for the held
-      velocity of a cyclic coordinate psi, `"p.psi"` for its momentum (with `hold="momentum"`).
+    - `params`, `start`: where the branch begins: a position like q, near an equilibrium for `params`.
+    - `along`: the number that changes, by its name in `params`: `"omega"`, `"spring.k"`, `"k[1]"`. `"v.psi"` for the
+      held velocity of a cyclic coordinate psi, `"p.psi"` for its momentum (with `hold="momentum"`).
     - `to`: its last value; the first is that in `params`. Branches are followed within this range.
     - `velocity`, `cyclic`, `hold`, `t`: as in `lj.equilibria`.
-    - `crossings`: whether branches that cross are followed, too. `most_points`: of a branch.
+    - `crossings`: whether crossing branches are followed, too. `most_points`: the largest number of points of a branch.
 
-    **Returns:** `Branches`. What was found before a branch ends is there, and its `status` says why it does.
+    **Returns:** `Branches`, with all points found before each branch ended; its `status` says why it ended.
 
-    **Raises:** `ValueError` where no equilibrium is near the start, for an `along` that is no number in `params`, and
-    what `lj.equilibria` raises. `TypeError` inside of `jax.jit`, `vmap` or `grad`: how many points there are depends on
-    values. Derivatives of critical parameters are in the result.
+    **Raises:** `ValueError` where no equilibrium is near the start, for an `along` that is not a number in `params`,
+    and everything that `lj.equilibria` raises. `TypeError` inside `jax.jit`, `vmap` or `grad`, because the number of
+    points depends on values; the result contains the derivatives of critical parameters.
 
     Source: Keller, in *Applications of Bifurcation Theory* (1977) 359; Govaerts, *Numerical Methods for Bifurcations of
     Dynamical Equilibria*, ch. 2-4.
@@ -94,8 +95,8 @@ def continue_equilibria(
         v = jax.tree.map(lambda x: x[0], stacked([velocity], "velocity"))
     if not is_eager() or coordinates.is_traced((q, v, params, t, to)):
         raise TypeError(
-            "lj.continue_equilibria decides by values how it goes on, and JAX is tracing.\n"
-            "Fix: call it outside of jit, vmap and grad; critical points carry their derivatives, "
+            "lj.continue_equilibria needs values to choose its steps, but JAX is tracing.\n"
+            "Fix: call it outside jit, vmap and grad; critical points carry their derivatives, "
             "branches.critical[0].derivative, and lj.equilibria works inside."
         )
     system, s = checked(system, t, q, v, params)
@@ -108,13 +109,13 @@ def continue_equilibria(
     first, last = float(place.get(steady)), float(to)
     if not np.isfinite(last) or first == last:
         raise ValueError(
-            f"to={to} gives the parameter {along!r} no way to go from {first:.6g}.\n"
+            f"to={to} leaves the parameter {along!r} no range: it starts at {first:.6g}.\n"
             f"Fix: to={2 * first or 1.0:.6g}, and the first value in params."
         )
     runs = []
     for units in UNITS:
         frame, z = _frame(steady, place, first, last, s.v, units)
-        # Where the start is a critical point, the branch begins a little before it.
+        # If the start is a critical point, the branch begins a little before it.
         low, high = sorted((float(z[-1]), last / abs(last - first)))
         runs.append(_Run(SteadyTracer(frame, low, high), most_points, crossings))
         runs[-1].main(z, np.sign(last - first))
@@ -136,7 +137,7 @@ def _velocity(steady, x):
 
 
 def _solution(steady: Steady, v) -> np.ndarray | str:
-    """The unknowns of the equilibrium near `steady.like`, or in words why there is none."""
+    """The unknowns of the equilibrium near `steady.like`, or a message that says why there is none."""
     if steady.symmetries.count and steady.symmetries.hold == VELOCITY:
         v = coordinates.like(v, np.asarray(_velocity(steady, coordinates.vector(steady.like))))
     one = lambda tree: jax.tree.map(lambda x: np.asarray(x)[None], tree)
@@ -150,13 +151,13 @@ def _solution(steady: Steady, v) -> np.ndarray | str:
 
 
 def _frame(steady: Steady, place: Place, first: float, last: float, v, units) -> tuple[Frame, np.ndarray]:
-    """Units, and which combinations of equations are solved; and the point at which the branch begins."""
+    """The units and the combinations of equations that are solved; and the point at which the branch begins."""
     y = _solution(steady, v)
     if isinstance(y, str):
         raise ValueError(
             f"no equilibrium was found from the start {describe(steady.like)}, {place.name} = {first:.6g}: {y}.\n"
-            "Usual cause: a start that is far from one, or a parameter at which there is none.\n"
-            "Fix: found = lj.equilibria(system, params, starts=[...]) from several starts shows what there is; "
+            "Usual cause: a start far from an equilibrium, or a parameter at which there is none.\n"
+            "Fix: found = lj.equilibria(system, params, starts=[...]) from several starts lists the equilibria; "
             "start from one of them."
         )
     unit = abs(last - first)
@@ -168,18 +169,18 @@ def _frame(steady: Steady, place: Place, first: float, last: float, v, units) ->
     positions = np.where(angle, 1.0, units * length if length > 0 else 1.0)
     rows, columns, u, sizes, vt = _parts(steady, y, positions)
     rank = int(np.sum(sizes > DEPENDENT * sizes[0]))
-    # At a critical point more is dependent than elsewhere: the rank is asked once more close by.
+    # More equations are dependent at a critical point than elsewhere, so the rank is computed again close by.
     x = coordinates.like(steady.like, np.asarray(y[:n], steady.t.dtype))
-    beside = Steady(steady.system, steady.t, steady.params, steady.held, x, steady.symmetries)
-    beside = place.put(beside, first + NEARBY * (last - first))
-    other = _solution(beside, v)
-    if not isinstance(other, str):
-        _, _, *those = _parts(beside, other, positions, (rows, columns))
-        if int(np.sum(those[1] > DEPENDENT * those[1][0])) > rank:
-            u, sizes, vt = those
+    nearby = Steady(steady.system, steady.t, steady.params, steady.held, x, steady.symmetries)
+    nearby = place.put(nearby, first + NEARBY * (last - first))
+    nearby_y = _solution(nearby, v)
+    if not isinstance(nearby_y, str):
+        _, _, *nearby_svd = _parts(nearby, nearby_y, positions, (rows, columns))
+        if int(np.sum(nearby_svd[1] > DEPENDENT * nearby_svd[1][0])) > rank:
+            u, sizes, vt = nearby_svd
             rank = int(np.sum(sizes > DEPENDENT * sizes[0]))
             before = first - NEARBY * (last - first)
-            earlier = _solution(place.put(beside, before), v)
+            earlier = _solution(place.put(nearby, before), v)
             first, y = (first, y) if isinstance(earlier, str) else (before, earlier)
     dtype = steady.t.dtype
     arrays = [np.asarray(a, dtype) for a in (u[:, :rank].T, vt[rank:], y / columns, rows, columns, unit)]
@@ -188,14 +189,14 @@ def _frame(steady: Steady, place: Place, first: float, last: float, v, units) ->
 
 
 def _parts(steady, y, positions, units=None):
-    """Units of equations and unknowns, and the singular values of the Jacobian in these."""
+    """The units of equations and unknowns, and the singular value decomposition of the Jacobian in these units."""
     jacobian = np.asarray(full_jacobian(steady, np.asarray(y, steady.t.dtype))[1], float)
     if units is None:
         n = steady.n
         positive = lambda x: np.where(x > 0, x, 1.0)
         rows = np.max(np.abs(jacobian[:, :n] * positions), axis=1)
         rows = positive(np.where(rows > 0, rows, np.max(np.abs(jacobian), axis=1)))
-        # A row that is small where the branch begins need not be elsewhere.
+        # A row that is small where the branch begins may be large elsewhere.
         rows[:n] = np.maximum(rows[:n], 1e-6 * np.max(rows[:n]))
         columns = positive(np.max(np.abs(jacobian / rows[:, None]), axis=0))
         columns = np.concatenate([positions, 1 / columns[n:]])
@@ -211,30 +212,30 @@ def _angles(steady):
 
 
 class _Launch(NamedTuple):
-    """A branch that is to be traced: from a critical point in a direction."""
+    """A branch still to be traced, from a critical point in a direction."""
 
     critical: int
     direction: np.ndarray
 
 
 class _Run:
-    """The branches and critical points found so far, and those that are to be traced."""
+    """The branches and critical points found so far, and the branches still to be traced."""
 
     def __init__(self, tracer: SteadyTracer, most: int, crossings: bool):
         self.tracer, self.most, self.crossings = tracer, most, crossings
         self.paths: list[Path] = []
-        self.found: list[Found] = []
-        self.on: list[set[int]] = []
+        self.found: list[CriticalPoint] = []
+        self.branches_at: list[set[int]] = []
         self.waiting: list[_Launch] = []
 
     def main(self, z, towards):
-        """The first branch, and all that cross."""
+        """Trace the first branch, and all that cross."""
         start = np.zeros_like(z)
         start[-1] = towards
         corrected = self.tracer.corrected(z, np.eye(z.size)[-1])
         begin = self.tracer.point(z if corrected is None else corrected, start)
         if isinstance(begin, str):
-            raise ValueError(f"the equations at the start are no guide: {begin}.")
+            raise ValueError(f"the branch cannot begin at the start: {begin}.")
         self._follow(begin)
         while self.waiting and len(self.paths) < MOST_BRANCHES:
             launch = self.waiting.pop(0)
@@ -243,30 +244,30 @@ class _Run:
             if whole.points[1:]:
                 self.paths.append(whole)
             else:
-                for on in self.on:
-                    on.discard(len(self.paths))
+                for branches_at in self.branches_at:
+                    branches_at.discard(len(self.paths))
 
     def _follow(self, begin: Point):
         path = self.tracer.trace(begin, self.most, self._step)
-        self._far(path)
+        self._describe_infinity(path)
         self.paths.append(path)
 
     def _from(self, launch: _Launch, sign: float) -> Path:
-        """One half of a branch that crosses another."""
+        """Trace one half of a branch that crosses another."""
         critical = self.found[launch.critical]
         jacobian = self.tracer.at(critical.z)[1]
-        seen = self.tracer.point(critical.z, sign * launch.direction)
-        if isinstance(seen, str):
-            return Path([], seen)
+        point = self.tracer.point(critical.z, sign * launch.direction)
+        if isinstance(point, str):
+            return Path([], point)
         begin = Point(
-            critical.z, jacobian, sign * launch.direction, 0.0, seen.seen, None, seen.negative, launch.critical
+            critical.z, jacobian, sign * launch.direction, 0.0, point.outputs, None, point.negative, launch.critical
         )
         path = self.tracer.trace(begin, self.most, self._step, FIRST)
-        self._far(path)
+        self._describe_infinity(path)
         return path
 
-    def _far(self, path):
-        """What becomes of a branch that goes to infinity."""
+    def _describe_infinity(self, path):
+        """State where a branch goes to infinity, with a critical point if the parameter there can be solved for."""
         if path.status != "infinity":
             return
         point, name = path.points[-1], self.tracer.frame.place.name
@@ -275,10 +276,10 @@ class _Run:
         if found:
             path.status = f"infinity, at {name} = {found.z[-1] * self.tracer.unit:.10g}"
             self.found.append(found)
-            self.on.append({len(self.paths)})
+            self.branches_at.append({len(self.paths)})
 
     def _step(self, before: Point, after: Point, path: Path) -> str | None:
-        """What lies between two points, put into the path; why it ends, where it does."""
+        """Put the critical points between two points into the path; return why the branch ends, or None."""
         points = path.points
         if len(points) >= LINE and points[0].critical is not None:
             last = np.array([p.z[-1] for p in points[-LINE:]])
@@ -286,24 +287,24 @@ class _Run:
                 self.found[points[0].critical].kind = "line of equilibria"
                 return "a line of equilibria, which goes on"
         ended = None
-        all_found = between(self.tracer, before, after)
-        if before.sign * after.sign < 0 and not any(found.directions for found in all_found):
+        all_critical = between(self.tracer, before, after)
+        if before.sign * after.sign < 0 and not any(critical.directions for critical in all_critical):
             return AGAIN
-        for found in all_found:
-            number, known = self._number(found)
+        for critical in all_critical:
+            number, known = self._number(critical)
             kept = self.found[number]
             along = (self.tracer.weights * (after.z - before.z)) / np.linalg.norm(after.z - before.z)
-            self.on[number].add(len(self.paths))
+            self.branches_at[number].add(len(self.paths))
             if known and any(abs(_cosine(self.tracer, d, after.z - before.z)) > 0.95 for d in kept.used):
                 if kept.directions:
-                    ended = f"a crossing that is known, at {self._value(kept)}"
-            own = max(kept.directions, key=lambda d: abs(d @ along)) if kept.directions else None
-            if own is not None:
-                kept.used.append(own)
+                    ended = f"a known crossing, at {self._value(kept)}"
+            followed = max(kept.directions, key=lambda d: abs(d @ along)) if kept.directions else None
+            if followed is not None:
+                kept.used.append(followed)
                 self.waiting = [w for w in self.waiting if w.critical != number or abs(w.direction @ along) <
                                 0.95 * np.sqrt(along @ along)]  # fmt: skip
                 if not known and self.crossings:
-                    others = [d for d in kept.directions if d is not own]
+                    others = [d for d in kept.directions if d is not followed]
                     self.waiting += [_Launch(number, d) for d in others]
                     kept.used += others
             path.points.append(self._point(kept, number, after))
@@ -313,23 +314,23 @@ class _Run:
         return f"{self.tracer.frame.place.name} = {found.z[-1] * self.tracer.unit:.6g}"
 
     def _point(self, found, number, after):
-        """A critical point as a point of a branch."""
+        """The point of a branch at a critical point."""
         point = self.tracer.point(found.z, after.tangent)
         if isinstance(point, str):
             point = after
-        return Point(found.z, point.jacobian, after.tangent, after.sign, point.seen, None, after.negative, number)
+        return Point(found.z, point.jacobian, after.tangent, after.sign, point.outputs, None, after.negative, number)
 
-    def _number(self, found: Found) -> tuple[int, bool]:
-        """Its number among those found, and whether it was known."""
+    def _number(self, found: CriticalPoint) -> tuple[int, bool]:
+        """The number of a critical point among those found, and whether it was known already."""
         for i, other in enumerate(self.found):
             if np.max(np.abs(self.tracer.weights * (other.z - found.z))) < SAME * self.tracer.size(found.z):
                 return i, True
         self.found.append(found)
-        self.on.append(set())
+        self.branches_at.append(set())
         return len(self.found) - 1, False
 
     def result(self, along, first, last, s) -> Branches:
-        """All of it in the user's structure."""
+        """The result in the user's structure."""
         branches = [_branch(path, self.tracer) for path in self.paths]
         critical = [self._critical(i) for i in range(len(self.found))]
         order = sorted(range(len(critical)), key=lambda i: abs(critical[i].parameter - first))
@@ -342,21 +343,21 @@ class _Run:
 
     def _critical(self, i) -> Critical:
         found = self.found[i]
-        on = {k for k in self.on[i] if k < len(self.paths)}
-        on |= {k for k, path in enumerate(self.paths) if any(p.critical == i for p in path.points)}
-        point = self.tracer.point(found.z, self._any(found))
-        seen = point.seen if not isinstance(point, str) else None
-        seen = seen or jax.tree.map(lambda x: x * np.nan, self.paths[0].points[0].seen)
+        branches_at = {k for k in self.branches_at[i] if k < len(self.paths)}
+        branches_at |= {k for k, path in enumerate(self.paths) if any(p.critical == i for p in path.points)}
+        point = self.tracer.point(found.z, self._some_direction(found))
+        outputs = point.outputs if not isinstance(point, str) else None
+        outputs = outputs or jax.tree.map(lambda x: x * np.nan, self.paths[0].points[0].outputs)
         value = found.z[-1] * self.tracer.unit
-        _, q, v, multipliers, _ = seen
+        _, q, v, multipliers, _ = outputs
         if found.kind == "escape":
             q = jax.tree.map(lambda x: np.full_like(x, np.inf), q)
         return Critical(
             found.kind, np.asarray(value), q, v, multipliers, found.derivative, np.asarray(found.frequency),
-            np.asarray(found.accuracy * self.tracer.unit), tuple(sorted(on)),
+            np.asarray(found.accuracy * self.tracer.unit), tuple(sorted(branches_at)),
         )  # fmt: skip
 
-    def _any(self, found):
+    def _some_direction(self, found):
         return found.directions[0] if found.directions else np.ones_like(found.z)
 
 
@@ -366,7 +367,7 @@ def _cosine(tracer, a, b):
 
 
 def _joined(halves: list[Path]) -> Path:
-    """Both halves of a branch from its end, through the critical point, to the other end."""
+    """Join both halves of a branch, from one end through the critical point to the other end."""
     first, second = halves
     points = [*second.points[:0:-1], *first.points]
     status = first.status if not second.points[1:] else f"{second.status}, and {first.status}"
@@ -376,10 +377,10 @@ def _joined(halves: list[Path]) -> Path:
 
 
 def _branch(path: Path, tracer: SteadyTracer) -> Branch:
-    seen = [p.seen for p in path.points]
-    parameter, q, v, multipliers, roots = jax.tree.map(lambda *x: np.stack(x), *seen)
+    outputs = [p.outputs for p in path.points]
+    parameter, q, v, multipliers, roots = jax.tree.map(lambda *x: np.stack(x), *outputs)
     stable = np.array([p.growing for p in path.points], object)
-    # At a critical point itself roots are zero to round-off alone: what is beside it counts.
+    # At a critical point a root is zero up to round-off, so the nearest other point decides the stability.
     known = [i for i, n in enumerate(stable) if n is not None]
     filled = [stable[min(known, key=lambda j: (abs(j - i), -j))] if known else 0 for i in range(len(stable))]
     critical = tuple(sorted({p.critical for p in path.points if p.critical is not None}))

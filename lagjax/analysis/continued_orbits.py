@@ -32,11 +32,12 @@ from lagjax.mechanics import coordinates
 from lagjax.mechanics.compiled import compiled
 from lagjax.mechanics.packed import pack
 
-# Singular values of the equations below this part of the largest do not count.
+# Singular values of the equations below this fraction of the largest count as zero.
 DEPENDENT = 1e-7
-# A change of the logarithm of a drive's period that is none.
+# The period of a drive counts as constant if its logarithm changes by less.
 CONSTANT = 1e-9
-# The motion has shrunk to rest where so little of it is left; periods so many times the first one grow without end.
+# Fractions of the largest motion: the branch ends at rest below the first; below the second, a start that passes an
+# equilibrium is a state of rest too. A period of so many times the first one grows without end.
 AT_REST, HALF, ENDLESS = 1e-3, 0.5, 1e3
 
 
@@ -55,27 +56,27 @@ def continue_orbits(
 
     **Arguments:**
 
-    - `orbit`: what `lj.periodic_orbit` returned: where the branch begins.
-    - `along`: what changes, by its name in the orbit's parameters: `"omega"`, `"spring.k"`, `"k[1]"`. Of a system that
-      does not depend on time also `"period"`, and a coordinate or velocity of the start, `"theta"`, `"v.theta"`; where
-      it is conserved, `"energy"` (the Jacobi integral). With a number in the parameters the orbit holds what it was
-      found with. The period of a drive follows its parameters.
+    - `orbit`: the result of `lj.periodic_orbit` at which the branch begins.
+    - `along`: what changes, by its name in the orbit's parameters: `"omega"`, `"spring.k"`, `"k[1]"`. For a system that
+      does not depend on time also `"period"`, or a coordinate or velocity of the start, `"theta"`, `"v.theta"`; where
+      it is conserved, `"energy"` (the Jacobi integral). Along a number in the parameters the orbits hold what `orbit`
+      was found with. The period of a drive follows its parameters.
     - `to`: its last value; the first is that of the orbit. The branch is followed within this range.
-    - `rtol`: as in `lj.periodic_orbit`. `most_points`: of the branch.
+    - `rtol`: as in `lj.periodic_orbit`. `most_points`: the largest number of points of the branch.
 
-    **Returns:** an `OrbitBranch`. What was found before a branch ends is there, and its `status` says why it does.
+    **Returns:** an `OrbitBranch`, with all points found before the branch ended; its `status` says why it ended.
 
     **Raises:**
 
-    - `TypeError` for what is no periodic orbit, and inside of `jax.jit`, `vmap` or `grad`: how many points there are
-      depends on values.
-    - `ValueError` for an orbit that did not converge, and an `along` that names nothing, or what is held.
+    - `TypeError` for an `orbit` that is not a periodic orbit, and inside `jax.jit`, `vmap` or `grad`, because the
+      number of points depends on values.
+    - `ValueError` for an orbit that did not converge, and for an `along` that names nothing or a held quantity.
 
     Source: Seydel, *Practical Bifurcation and Stability Analysis*, ch. 7; Doedel, Keller & Kernévez, Int. J.
     Bifurcation Chaos 1 (1991) 745.
     """
     _check(orbit)
-    # A whole number in the parameters may be followed like any other.
+    # Integers in the parameters become floats, so that a branch may follow them too.
     system, s = checked(orbit.system, orbit.t, orbit.q, orbit.v, orbit.params)
     problem = problem_of(system, *s)
     place, asked = _along(along, orbit, problem)
@@ -95,24 +96,24 @@ def _check(orbit):
         )
     if not is_eager() or coordinates.is_traced(orbit):
         raise TypeError(
-            "lj.continue_orbits decides by values how it goes on, and JAX is tracing.\n"
-            "Fix: call it outside of jit, vmap and grad; lj.periodic_orbit works inside."
+            "lj.continue_orbits needs values to choose its steps, but JAX is tracing.\n"
+            "Fix: call it outside jit, vmap and grad; lj.periodic_orbit works inside."
         )
     if np.ndim(orbit.period):
         raise ValueError(
-            f"these are orbits, a batch of shape {np.shape(orbit.period)}: a branch begins at one of them.\n"
+            f"this is a batch of orbits, of shape {np.shape(orbit.period)}: a branch begins at a single orbit.\n"
             "Fix: orbit = jax.tree.map(lambda x: x[0], orbit)."
         )
     if not bool(orbit.converged):
         raise ValueError(
-            f"this orbit is none yet: its end is {float(orbit.residual):.2g} of its size from its start.\n"
-            "Usual cause: lj.periodic_orbit did not converge, as it said.\n"
+            f"this orbit does not close: its end is {float(orbit.residual):.2g} of its size away from its start.\n"
+            "Usual cause: lj.periodic_orbit did not converge, and warned about it.\n"
             "Fix: another start or period, until orbit.converged."
         )
 
 
 def _along(along, orbit: PeriodicOrbit, problem: Problem) -> tuple[Along, Asked]:
-    """What changes, and what is still held of the orbit then."""
+    """What changes along the branch, and what the orbits still hold."""
     asked, reasons, names = orbit.asked, problem.reasons, coordinates.names(orbit.q)
     numbers = numbers_in(problem.state.params)
     if along in numbers:
@@ -123,13 +124,13 @@ def _along(along, orbit: PeriodicOrbit, problem: Problem) -> tuple[Along, Asked]
         raise no_such_number(along, problem.state.params, more)
     if not reasons.autonomous:
         raise ValueError(
-            f"along={along!r}: the system depends on time, so its orbits come one by one, and its period is that of "
-            f"the drive.\nFix: a number in the parameters, along={next(iter(numbers), 'omega')!r}."
+            f"along={along!r}: the system depends on time, so its orbits are isolated, with the period of the drive.\n"
+            f"Fix: a number in the parameters, along={next(iter(numbers), 'omega')!r}."
         )
     if along != PERIOD and not reasons.energy:
         raise ValueError(
-            f"along={along!r}: the Jacobi integral is not conserved here, so orbits of the same parameters come one by "
-            "one.\nUsual cause: a force or dissipation.\n"
+            f"along={along!r}: the Jacobi integral is not conserved here, so the orbits at given parameters are "
+            "isolated.\nUsual cause: a force or dissipation.\n"
             f"Fix: a number in the parameters, along={next(iter(numbers), 'omega')!r}."
         )
     free = asked._replace(free=True, energy=False, held=())
@@ -138,7 +139,7 @@ def _along(along, orbit: PeriodicOrbit, problem: Problem) -> tuple[Along, Asked]
     if along == PERIOD:
         if not reasons.energy:
             raise ValueError(
-                "along='period': a cycle of this system has a period of its own.\n"
+                "along='period': the system itself determines the period of its cycles.\n"
                 f"Fix: a number in the parameters, along={next(iter(numbers), 'mu')!r}."
             )
         return Along(along, PERIOD), free._replace(free=False)
@@ -151,7 +152,7 @@ def _guess(flow, t, z, period, asked):
 
 
 def _frame(orbit, problem, place: Along, asked, rtol, to) -> tuple[OrbitFrame, np.ndarray]:
-    """Units, what is held, and the point at which the branch begins."""
+    """The units, the held quantities, and the point at which the branch begins."""
     s, system = problem.state, problem.system
     flow = flow_of(system, *s, rtol, problem.rows)
     flow = replace(flow, params=jax.tree.map(lambda x: jnp.asarray(x) if isinstance(x, np.ndarray) else x, s.params))
@@ -165,15 +166,15 @@ def _frame(orbit, problem, place: Along, asked, rtol, to) -> tuple[OrbitFrame, n
     first, last = float(first), float(to)
     if not np.isfinite(last) or first == last:
         raise ValueError(
-            f"to={to} gives the parameter {place.name!r} no way to go from {first:.6g}.\n"
+            f"to={to} leaves the parameter {place.name!r} no range: it starts at {first:.6g}.\n"
             f"Fix: to={2 * first or 1.0:.6g}, and the first value in that of the orbit."
         )
     unit = np.asarray(abs(last - first), s.t.dtype)
     y = np.append((nodes / np.asarray(scale)).reshape(-1), 0.0)
-    none = jnp.zeros((0, y.size), s.t.dtype)
+    no_rows = jnp.zeros((0, y.size), s.t.dtype)
     frame = OrbitFrame(
         flow, jnp.asarray(s.t), scale, period, unit, jnp.asarray(flat(orbit.turns), s.t.dtype), integral, nodes[0],
-        slope, sizes, None, none, y, place, asked, problem.reasons, len(nodes),
+        slope, sizes, None, no_rows, y, place, asked, problem.reasons, len(nodes),
     )  # fmt: skip
     z = np.append(y, first / unit)
     if not problem.reasons.autonomous and place.kind == NUMBER:
@@ -184,86 +185,86 @@ def _frame(orbit, problem, place: Along, asked, rtol, to) -> tuple[OrbitFrame, n
 
 
 def _traced(frame, z, low, high, towards, most) -> tuple[OrbitTracer, Path, list[FoundOrbit]]:
-    """The branch from its start."""
+    """Trace the branch from its start."""
     size = frame.scale.size
     guide = Guide(z[:size], np.zeros(size, z.dtype))
     tracer = OrbitTracer(frame, low, high, guide, True)
     tracer.guide = tracer.evaluated(z).guide
-    free = _left_free(tracer, z)
+    free = _free_directions(tracer, z)
     if len(free):
-        # What is free where the branch begins leads to other orbits of the same parameter: one of them is followed.
+        # Directions that are free at the start lead to other orbits at the same parameter; holding them selects one.
         frame = replace(frame, free=jnp.asarray(free, frame.t.dtype))
-        tracer = OrbitTracer(frame, low, high, tracer.guide, _explained(frame, len(free)))
+        tracer = OrbitTracer(frame, low, high, tracer.guide, _free_are_trivial(frame, len(free)))
     row = np.eye(z.size)[-1]
     corrected = tracer.corrected(z, row)
     begin = tracer.point(z if corrected is None else corrected, towards * row)
     if isinstance(begin, str):
-        raise ValueError(f"the orbit is no start of a branch: {begin}.\nFix: find it again with a smaller rtol.")
+        raise ValueError(f"a branch cannot begin at this orbit: {begin}.\nFix: find it again with a smaller rtol.")
     tracer.moved_to(begin)
     follower = _Follower(tracer)
     path = tracer.trace(begin, most, follower.step)
     if path.status == "infinity":
-        path.status = f"infinity, near {frame.along.name} = {path.points[-1].seen.parameter:.6g}"
+        path.status = f"infinity, near {frame.along.name} = {path.points[-1].outputs.parameter:.6g}"
     return tracer, path, follower.found
 
 
-def _left_free(tracer, z):
-    """Directions in which orbits of the same parameter lie beside the start, (d, N)."""
+def _free_directions(tracer, z):
+    """Directions from the start to neighbouring orbits at the same parameter, (d, N)."""
     _, jacobian, _ = tracer.at(z)
     _, sizes, right = np.linalg.svd(jacobian)
     rank = int(np.sum(sizes > max(DEPENDENT, 1e2 * tracer.noise) * sizes[0]))
     kernel = right[rank:]
     if len(kernel) < 2:
         return np.zeros((0, z.size - 1))
-    # One direction of the kernel leads on along the parameter, the others across it.
+    # One direction of the kernel changes the parameter, the others do not.
     lead = kernel[:, -1] / max(np.linalg.norm(kernel[:, -1]), 1e-300)
     across = np.linalg.svd(lead[None])[2][1:] @ kernel
     return across[:, :-1]
 
 
-def _explained(frame, count):
-    """Whether all that is free belongs to multipliers that are known to be trivial."""
+def _free_are_trivial(frame, count):
+    """Whether all free directions belong to multipliers that are known to be trivial."""
     shifts = sum(frame.reasons.ignorable)
     known = frame.reasons.energy + shifts * (1 + frame.reasons.momenta)
     return count <= known
 
 
 class _Follower:
-    """What is found from point to point."""
+    """Inspects each step of a branch, and collects its critical points."""
 
     def __init__(self, tracer: OrbitTracer):
         self.tracer, self.found = tracer, []
 
     def step(self, before: Point, after: Point, path: Path) -> str | None:
-        """What lies between two points, put into the path; why it ends, where it does."""
+        """Put the critical points between two points into the path; return why the branch ends, or None."""
         tracer, name = self.tracer, self.tracer.frame.along.name
         if tracer.frame.asked.moves:
-            largest = max(point.seen.moves for point in path.points)
-            shrinks = after.seen.moves < AT_REST * largest
+            largest = max(point.outputs.moves for point in path.points)
+            shrinks = after.outputs.moves < AT_REST * largest
             if shrinks or tracer.guide.rate @ tracer.evaluated(after.z).guide.rate < 0:
-                if before.seen.moves < HALF * largest:
+                if before.outputs.moves < HALF * largest:
                     return f"a state of rest, near {name} = {self._at_rest(path.points):.6g}"
-                # It begins and ends where the system rests.
-                return f"a period that grows without end, near {name} = {before.seen.parameter:.6g}"
-        if after.seen.period > ENDLESS * float(tracer.frame.period):
-            return f"a period that grows without end, near {name} = {after.seen.parameter:.6g}"
-        all_found, earlier = between(tracer, before, after), path.points[-2:-1]
-        self._put(path, all_found, before, after)
-        if not all_found and earlier and earlier[0].critical is None and before.critical is None:
-            self._put(path, dips(tracer, earlier[0], before, after), before, after)
+                # The orbit now begins and ends at an equilibrium, which takes infinitely long.
+                return f"a period that grows without end, near {name} = {before.outputs.parameter:.6g}"
+        if after.outputs.period > ENDLESS * float(tracer.frame.period):
+            return f"a period that grows without end, near {name} = {after.outputs.parameter:.6g}"
+        all_critical, earlier = between(tracer, before, after), path.points[-2:-1]
+        self._insert(path, all_critical, before, after)
+        if not all_critical and earlier and earlier[0].critical is None and before.critical is None:
+            self._insert(path, dips(tracer, earlier[0], before, after), before, after)
         return None
 
-    def _put(self, path, all_found, before, after):
-        """Points between the last ones into the path, each in its place."""
+    def _insert(self, path, all_critical, before, after):
+        """Insert points into the path, each before or after its last point."""
         place = len(path.points) - 1
         along = self.tracer.weights * (after.z - before.z)
-        for found in all_found:
-            point = found.point if isinstance(found, FoundOrbit) else found
-            if isinstance(found, FoundOrbit):
+        for critical in all_critical:
+            point = critical.point if isinstance(critical, FoundOrbit) else critical
+            if isinstance(critical, FoundOrbit):
                 point.critical = len(self.found)
-                # Multipliers are 1 in size there: what is beside it counts.
+                # A multiplier has size 1 there, so the nearest other point decides the stability.
                 point.growing = None
-                self.found.append(found)
+                self.found.append(critical)
             if along @ (point.z - before.z) < 0:
                 path.points.insert(place, point)
                 place += 1
@@ -271,44 +272,46 @@ class _Follower:
                 path.points.append(point)
 
     def _at_rest(self, points):
-        """The parameter at which the motion has no size, in whose square it changes; a coordinate with the size itself.
+        """The parameter, extrapolated to a motion of size zero.
 
-        What is nothing beside the range is round-off.
+        It is linear in the square of the size; a coordinate of the start, in the size. A value that is negligible
+        compared with the range is round-off.
         """
-        frame, b = self.tracer.frame, points[-1].seen
-        found, power = b.parameter, 1 if frame.along.kind == ENTRY else 2
+        frame, b = self.tracer.frame, points[-1].outputs
+        parameter, power = b.parameter, 1 if frame.along.kind == ENTRY else 2
         if len(points) > 1:
-            a = points[-2].seen
+            a = points[-2].outputs
             m, n = a.moves**power, b.moves**power
-            found = b.parameter + (b.parameter - a.parameter) * n / (m - n) if m > n else found
-        return 0.0 if abs(found) < 1e-9 * float(frame.unit) else found
+            parameter = b.parameter + (b.parameter - a.parameter) * n / (m - n) if m > n else parameter
+        return 0.0 if abs(parameter) < 1e-9 * float(frame.unit) else parameter
 
 
 def _result(orbit, problem, place, tracer, path, found, along, first, last) -> OrbitBranch:
-    """All of it in the user's structure."""
-    seen = [p.seen for p in path.points]
+    """The result in the user's structure."""
+    outputs = [p.outputs for p in path.points]
     trees = lambda rows: coordinates.like(orbit.q, np.asarray(np.stack(rows), tracer.dtype))
     n = len(coordinates.names(orbit.q))
     known = [i for i, p in enumerate(path.points) if p.growing is not None]
-    nearest = [min(known, key=lambda j: (abs(j - i), -j)) for i in range(len(seen)) if known]
-    stable = np.array([path.points[j].growing == 0 for j in nearest] or [False] * len(seen))
+    nearest = [min(known, key=lambda j: (abs(j - i), -j)) for i in range(len(outputs)) if known]
+    stable = np.array([path.points[j].growing == 0 for j in nearest] or [False] * len(outputs))
     critical = [
         CriticalOrbit(
-            found[p.critical].kind, np.asarray(p.seen.parameter), np.asarray(found[p.critical].accuracy), i,
-            p.seen.multipliers,
+            found[p.critical].kind, np.asarray(p.outputs.parameter), np.asarray(found[p.critical].accuracy), i,
+            p.outputs.multipliers,
         ) for i, p in enumerate(path.points) if p.critical is not None
     ]  # fmt: skip
     cast = lambda x: np.asarray(x, tracer.dtype)
     return OrbitBranch(
-        cast([s.parameter for s in seen]), cast([s.period for s in seen]), trees([s.nodes[0][:n] for s in seen]),
-        trees([s.nodes[0][n:] for s in seen]), trees([s.low for s in seen]), trees([s.high for s in seen]),
-        stable, np.stack([s.multipliers for s in seen]),
-        np.stack([cast(s.nodes) for s in seen]), critical, _with_floats(orbit, problem), place, along, first, last,
+        cast([s.parameter for s in outputs]), cast([s.period for s in outputs]),
+        trees([s.nodes[0][:n] for s in outputs]), trees([s.nodes[0][n:] for s in outputs]),
+        trees([s.low for s in outputs]), trees([s.high for s in outputs]), stable,
+        np.stack([s.multipliers for s in outputs]),
+        np.stack([cast(s.nodes) for s in outputs]), critical, _with_floats(orbit, problem), place, along, first, last,
         path.status,
     )  # fmt: skip
 
 
 def _with_floats(orbit, problem) -> PeriodicOrbit:
-    """The orbit with the parameters as the branch has them."""
+    """The orbit with its parameters as floats, as the branch has them."""
     arrays, static = pack((problem.system, coordinates.state(*problem.state).params))
     return replace(orbit, arrays=arrays, static=static)

@@ -1,6 +1,6 @@
-"""`periodic_orbit`: a motion that comes back, from a guess.
+"""`periodic_orbit`: a motion that comes back to its start, from a guess.
 
-look at the system  ->  one compiled search (`closing.py`)  ->  say what went wrong, if anything did
+analyse the system  ->  one compiled search (`closing.py`)  ->  raise or warn about what went wrong
 """
 
 import difflib
@@ -25,12 +25,12 @@ from lagjax.motion.consistency import stopped
 from lagjax.motion.reported import Report, reported
 from lagjax.motion.results import RESULTS
 
-# A driven system must be the same after a period to this part of what it does in one.
+# A driven system may change from one period to the next by this fraction of what it does in one.
 SAME = 1e-5
 
 
 class OrbitWarning(UserWarning):
-    """A search for a periodic orbit did not converge; the best that was found is returned."""
+    """A search for a periodic orbit did not converge; its best candidate is returned."""
 
 
 def periodic_orbit(
@@ -59,33 +59,34 @@ def periodic_orbit(
     **Main arguments:**
 
     - `system`, `params`: a `System`, with or without constraints, and its parameters.
-    - `start`: (q, v), a state near the orbit; `[q]`, `[q]/[t]`. On constraints the nearest state that satisfies them is
-      taken.
-    - `period`: about its period, `[t]`. Where the system depends on time it is kept, and must be a multiple of that of
-      the drive; else it is found with the orbit.
+    - `start`: (q, v), a state near the orbit; `[q]`, `[q]/[t]`. With constraints it is replaced by the nearest state
+      that satisfies them.
+    - `period`: the approximate period, `[t]`. If the system depends on time, the period is kept, and must be a multiple
+      of that of the drive; otherwise it is found with the orbit.
     - `t`: the time of the start, `[t]`, for a system that depends on it.
-    - `hold`: what of the guess the orbit keeps, where there is a family of them: `"energy"` (the Jacobi integral; the
+    - `hold`: what the orbit keeps of the guess, where orbits form a family: `"energy"` (the Jacobi integral; the
       default where it is conserved), `"period"`, or coordinates and velocities of the start by name: `"theta"`,
-      `"r[0]"`, `"v.theta"`; `"q"` and `"v"` of a single one. Several are given as a tuple. `()` holds nothing: the
-      orbit nearest to the guess.
+      `"r[0]"`, `"v.theta"`; `"q"` and `"v"` for a single coordinate. Give several as a tuple. `()` holds nothing and
+      finds the orbit nearest to the guess.
 
     **Other arguments:**
 
-    - `turns`: by how many whole turns angles go around in a period, by name. By default as the guess says, rounded. (A
-      coordinate is an angle if it is seen through sines and cosines alone.)
-    - `relative`: coordinates that need not come back, on which nothing may depend: relative periodic orbits.
-    - `parts`: into how many parts a period is divided, whose ends are all unknown (multiple shooting): for orbits so
-      unstable that a guess does not come near its start again.
-    - `rtol`: the tolerance of the steps; 1e-12 by default in float64, 1e-5 in float32. `most`: flows to try.
+    - `turns`: the whole turns that angles make in a period, by name. By default those of the guess, rounded. (A
+      coordinate is an angle if it appears only in sines and cosines.)
+    - `relative`: coordinates that need not come back, for relative periodic orbits; the system must not depend on them.
+    - `parts`: into how many parts the period is divided, with unknown states at all their ends (multiple shooting); for
+      orbits so unstable that a guess does not come near its start again.
+    - `rtol`: the tolerance of the steps; 1e-12 by default in float64, 1e-5 in float32. `most`: the largest number of
+      flows to try.
 
-    **Returns:** a `PeriodicOrbit`; what was found so far where the search did not converge. Both modes differentiate
-    `q`, `v`, `period` and `nodes` in `params` and what is held.
+    **Returns:** a `PeriodicOrbit`; the best candidate where the search did not converge. Both modes differentiate `q`,
+    `v`, `period` and `nodes` by `params` and by what is held.
 
     **Raises:**
 
-    - `TypeError`, `ValueError` for a state of the wrong shape or dtype, for names that there are not, for what cannot
+    - `TypeError`, `ValueError` for a state of the wrong shape or dtype, for unknown names, for quantities that cannot
       be held, and where a driven system is not the same after `period`.
-    - Warns (`lj.OrbitWarning`) where the search did not converge; under `jit` and in lanes look at `converged`.
+    - Warns (`lj.OrbitWarning`) where the search did not converge; under `jit` and `vmap` check `converged`.
 
     Source: Seydel, *Practical Bifurcation and Stability Analysis*, §7.4 (shooting, phase condition); Meyer & Offin, §9.
     """
@@ -97,27 +98,35 @@ def periodic_orbit(
     rtol, period = tolerance_of(rtol, dtype), coordinates.numpy_of(period).asarray(period, dtype)
     if not coordinates.is_traced(period) and not (np.ndim(period) == 0 and float(period) > 0):
         raise ValueError(f"period must be one positive number, not {period}.\nFix: about the time of one swing.")
-    given = None if turns is None else _turns(turns, names, dtype)
+    given_turns = None if turns is None else _turns(turns, names, dtype)
     eager = is_eager() and not coordinates.is_traced((s, period))
     search = lambda state, period: closing.closed(
-        problem.system, *state, period, rtol, asked, problem.rows, parts, given, most
+        problem.system, *state, period, rtol, asked, problem.rows, parts, given_turns, most
     )
     if eager:
         found = search(s, period)
-        _complain(found, float(period), problem)
+        _raise_or_warn(found, float(period), problem)
     else:
-        live = coordinates.state(*s)
-        still = stopped((live, jnp.asarray(period)))
+        state = coordinates.state(*s)
+        stopped_inputs = stopped((state, jnp.asarray(period)))
         found = closing.closed(
-            stopped(problem.system), *still[0], still[1], rtol, asked, problem.rows, parts, given, most
+            stopped(problem.system),
+            *stopped_inputs[0],
+            stopped_inputs[1],
+            rtol,
+            asked,
+            problem.rows,
+            parts,
+            given_turns,
+            most,
         )
-        found = closing.implicit(problem.system, *live, rtol, asked, problem.rows, found)
+        found = closing.implicit(problem.system, *state, rtol, asked, problem.rows, found)
     orbit = _orbit(problem, found, asked)
-    told = lambda orbit: Report(
+    report_of = lambda orbit: Report(
         jnp.where(orbit.converged, RESULTS.successful._value, RESULTS.not_converged._value),
         orbit.iterations, jnp.zeros((), dtype), orbit.residual,
     )  # fmt: skip
-    return reported(orbit, told)
+    return reported(orbit, report_of)
 
 
 def _pair(start):
@@ -136,17 +145,17 @@ def _asked(problem, names, hold, relative) -> Asked:
     unknown = sorted(wanted - set(names))
     if unknown:
         raise ValueError(_no_such("relative", unknown[0], names))
-    seen = [name for name, free in zip(names, problem.reasons.ignorable) if name in wanted and not free]
-    if seen:
+    depended_on = [name for name, free in zip(names, problem.reasons.ignorable) if name in wanted and not free]
+    if depended_on:
         raise ValueError(
-            f"'{seen[0]}' is named in relative, and the system depends on it: the motion is another one with another "
-            "value of it.\nFix: leave it out; whole turns of an angle are counted without it."
+            f"'{depended_on[0]}' is named in relative, but the system depends on it: its value changes the motion.\n"
+            "Fix: leave it out; whole turns of an angle are counted anyway."
         )
     mask = tuple(name in wanted for name in names)
     if driven:
         if hold is not None and hold != "period" and tuple(hold) not in ((), ("period",)):
             raise ValueError(
-                f"the system depends on time, so its period is that of the drive, and hold={hold!r} is too much.\n"
+                f"the system depends on time, so the orbit has the period of the drive and cannot also hold={hold!r}.\n"
                 "Fix: leave hold out."
             )
         return Asked(False, False, False, (), mask, problem.is_angle)
@@ -161,8 +170,8 @@ def _asked(problem, names, hold, relative) -> Asked:
             raise ValueError(_no_such("hold", name, ["energy", "period", *all_names]))
     if "energy" in hold and not problem.reasons.energy:
         raise ValueError(
-            "the Jacobi integral is not conserved here, so an orbit need not have that of the guess.\n"
-            "Usual cause: a force or dissipation: its cycles do not come in families.\n"
+            "the Jacobi integral is not conserved here, so the orbit cannot hold that of the guess.\n"
+            "Usual cause: a force or dissipation; cycles are then isolated.\n"
             "Fix: hold=(), or leave hold out."
         )
     held = tuple(all_names.index(name) for name in entries)
@@ -185,21 +194,21 @@ def _turns(turns, names, dtype):
     return np.array([turns.get(name, 0) for name in names], dtype)
 
 
-def _complain(found, period, problem):
+def _raise_or_warn(found, period, problem):
     if float(found.apart) > SAME:
         raise ValueError(
             f"the system is not the same after period = {period:.9g}: its accelerations change.\n"
-            "Usual cause: a period that is rounded, or none of the drive.\n"
+            "Usual cause: a rounded period, or one that is not a period of the drive.\n"
             'Fix: period=2 * jnp.pi / params["omega"] for a drive cos(ωt), or a multiple of it.'
         )
-    if not np.isfinite(float(found.seen.size)):
+    if not np.isfinite(float(found.evaluation.size)):
         refuse_singular(problem)
     if not bool(found.converged):
         warnings.warn(
             f"no periodic orbit was found near this start: after {int(found.iterations)} flows the motion comes back "
-            f"to {float(found.seen.size):.2g} of its size, with the period {float(found.place.period):.9g}. The best "
-            "that was found is returned.\n"
-            "Usual cause: a guess too far away, a family without the energy or coordinate that is held, a state of "
+            f"to {float(found.evaluation.size):.2g} of its size, with the period {float(found.candidate.period):.9g}. "
+            "The best candidate is returned.\n"
+            "Usual cause: a guess too far away, a family that does not reach the held energy or coordinate, a state of "
             "rest, or an orbit so unstable that the guess leaves it.\n"
             "Fix: another start or period; hold=...; parts=8 for an unstable one.",
             OrbitWarning,
@@ -212,11 +221,11 @@ def _orbit(problem, found, asked) -> PeriodicOrbit:
     if xp is np:
         found = jax.tree.map(np.asarray, found)
     like = lambda x: coordinates.like(s.q, x)
-    z, n = found.place.nodes[0], found.guess.turns.shape[0]
-    shift = xp.where(np.array(asked.relative), found.seen.gone[:n], xp.zeros_like(z[:n]))
+    z, n = found.candidate.nodes[0], found.guess.turns.shape[0]
+    shift = xp.where(np.array(asked.relative), found.evaluation.displacement[:n], xp.zeros_like(z[:n]))
     arrays, static = pack((problem.system, coordinates.state(*s).params))
     return PeriodicOrbit(
-        xp.asarray(s.t), like(z[:n]), like(z[n:]), found.place.period, like(found.guess.turns),
-        like(shift), found.seen.size, found.converged, found.iterations, found.place.nodes, arrays, static,
+        xp.asarray(s.t), like(z[:n]), like(z[n:]), found.candidate.period, like(found.guess.turns),
+        like(shift), found.evaluation.size, found.converged, found.iterations, found.candidate.nodes, arrays, static,
         asked,
     )  # fmt: skip

@@ -1,4 +1,4 @@
-"""Pictures of modes: their roots in the plane of growth and frequency, their shapes, and themselves as films."""
+"""Pictures of modes: their roots in the plane of growth and frequency, their shapes, and films of their motion."""
 
 from collections.abc import Callable
 
@@ -11,12 +11,12 @@ from lagjax.mechanics import coordinates
 from lagjax.mechanics.in_words import Call, check_arguments
 from lagjax.motion.frames import drawn
 
-# How many periods, or times in which it grows by e, a film shows.
+# The length of a film in periods, or in times of growth by a factor e.
 PERIODS, GROWTHS = 3.0, 3.0
 
 
 def drawn_roots(roots: np.ndarray, growing: np.ndarray, zero: np.ndarray):
-    """Draw roots in the complex plane, numbered; returns a matplotlib `Figure`."""
+    """Draw numbered roots in the complex plane; returns a matplotlib `Figure`."""
     fig, axes = plot.figure(size=(5.6, 3.6))
     axis = axes[0, 0]
     axis.axvline(0.0, color="black", linewidth=0.8)
@@ -43,7 +43,7 @@ def drawn_roots(roots: np.ndarray, growing: np.ndarray, zero: np.ndarray):
 
 
 def drawn_mode(mode):
-    """Draw how much each coordinate moves, and when; returns a matplotlib `Figure`."""
+    """Draw the amplitude and the motion of each coordinate; returns a matplotlib `Figure`."""
     names = mode.linearisation.names
     shape = np.concatenate([np.ravel(np.asarray(x)) for x in jax.tree.leaves(mode.shape)])
     root = complex(mode.root)
@@ -79,7 +79,7 @@ def _in_words(root):
 
 
 def _span(root):
-    """How long to look at a mode."""
+    """The time for which a mode is shown."""
     if abs(root.imag) > 0:
         periods = PERIODS * 2 * np.pi / abs(root.imag)
         return min(periods, GROWTHS / abs(root.real)) if abs(root.real) * periods > 2 * GROWTHS else periods
@@ -87,7 +87,7 @@ def _span(root):
 
 
 def animated(mode, positions: Callable, amplitude: float, seconds: float, rate: float, trail: float) -> Animation:
-    """The motion itself with that much of a mode, as a film."""
+    """A film of the motion with a mode of this amplitude added."""
     check_arguments(Call("positions", positions, ("t", "q", "params")), "an argument left out that is not needed")
     count = round(seconds * rate) + 1 if np.isfinite(seconds * rate) else 0
     if count < 3 or not trail >= 0:
@@ -102,7 +102,7 @@ def animated(mode, positions: Callable, amplitude: float, seconds: float, rate: 
     growing = np.exp(complex(mode.root) * t)
     growing = amplitude * growing / np.max(np.abs(growing))
     if complex(mode.root) == 0:
-        # A shift, there and back.
+        # A shift is shown as one oscillation.
         growing = amplitude * np.sin(2 * np.pi * t / t[-1]).astype(complex)
     path = flat(s.q) + t[:, None] * flat(s.v) + np.real(growing[:, None] * flat(mode.shape))
     q = jax.tree.map(lambda *rows: np.stack(rows), *[jax.tree.map(np.asarray, unflatten(row)) for row in path])

@@ -1,11 +1,11 @@
 """Where a system rests, and how it moves steadily: equilibria and relative equilibria.
 
-The equations are those of `balance.py`; `numerics/roots.py` solves them from several starts at once. What a start leads
-to is an equilibrium where the imbalance is nothing beside what a displacement as large as the coordinates would make,
+The equations are those of `balance.py`; `numerics/roots.py` solves them from several starts at once. A solution counts
+as an equilibrium if its imbalance is negligible compared with the effect of a displacement as large as the coordinates,
 
     |r_i| <= ε Σ_j |∂r_i/∂y_j| Y_j
 
-so that a minimum of |r| which is no root, and a flight to where forces only fade, are not taken for one.
+so that neither a minimum of |r| that is not a root nor a far point where forces have merely faded is taken for one.
 """
 
 from collections.abc import Callable, Iterable
@@ -22,9 +22,9 @@ from lagjax.analysis import balance as equations
 from lagjax.analysis.balance import MOMENTUM, VELOCITY, Steady
 from lagjax.analysis.found_equilibria import (
     CONSTRAINED,
-    LASTS_NOT,
     NO_BALANCE,
     NOT_FINITE,
+    NOT_LASTING,
     OK,
     UNFINISHED,
     Equilibria,
@@ -42,11 +42,11 @@ from lagjax.motion.consistency import stopped
 from lagjax.numerics import lapack
 from lagjax.numerics.roots import MOST, differentiable, least_squares_root, zero_below
 
-# Of the imbalance, in units of what a displacement as large as the coordinates makes.
+# The largest imbalance of an equilibrium, relative to the effect of a displacement as large as the coordinates.
 BALANCED = {np.dtype("float64"): 1e-7, np.dtype("float32"): 1e-3}
-# A start that leads so many times as far as it was is lost: there is only a force that fades.
+# A search that moves this many times farther out than its start has failed: forces only fade there.
 FAR = 1e9
-# A growth rate below this part of the fastest root is round-off: roots of multiplicity two are known to its root.
+# A growth rate below this fraction of the fastest root is round-off: double roots are off by the root of round-off.
 GROWS_ABOVE = {np.dtype("float64"): 1e-7, np.dtype("float32"): 2e-3}
 
 
@@ -82,22 +82,23 @@ def equilibria(
     **Arguments:**
 
     - `params`: as the system takes it.
-    - `starts`: a list of positions like q, `[q]` for one; or one tree like q whose leaves have a leading axis, one
-      entry a start.
-    - `velocities`: like v, one for all starts or as many; zero by default. Coordinates that move in them move steadily.
+    - `starts`: a list of positions like q, `[q]` for one; or one tree like q whose leaves have a leading axis, with one
+      entry for each start.
+    - `velocities`: like v, one for all starts or one for each; zero by default. Coordinates with a nonzero velocity
+      move steadily.
     - `cyclic`: what moves steadily: names of cyclic coordinates; or functions `motion(q, params)` -> like v, the
-      velocity along a symmetry at a unit rate, as `{"x": -q["y"], "y": q["x"]}` of a rotation. By default the
-      coordinates that move in `velocities`; while JAX traces these they must be named.
-    - `hold`: `"velocity"`: the rate of each cyclic motion is that of the start. `"momentum"`: its momentum is. `None`:
-      neither, where a constraint, or a force that depends on velocities, determines the rate.
-    - `t`: the time at which the balance is asked for; one that does not last is reported.
+      velocity along a symmetry at unit rate, as `{"x": -q["y"], "y": q["x"]}` for a rotation. By default the
+      coordinates with a nonzero velocity; while JAX traces `velocities` they must be named.
+    - `hold`: `"velocity"` holds the rate of each cyclic motion at that of the start, `"momentum"` its momentum. `None`
+      holds neither, where a constraint, or a force that depends on velocities, determines the rate.
+    - `t`: the time of the balance; a balance that does not last is reported.
 
-    **Returns:** `Equilibria`: what was found, those that are the same merged (angles by whole turns), differentiable in
-    `params`; and what became of each start. Under `jit`, `vmap` and `grad` nothing is merged: there is one row a start,
-    and `found` says which are there.
+    **Returns:** `Equilibria`: the equilibria found, with duplicates merged (also angles that differ by whole turns),
+    differentiable by `params`; and the outcome of each start. Under `jit`, `vmap` and `grad` nothing is merged: there
+    is one row for each start, and `found` says which of them are equilibria.
 
-    **Raises:** `TypeError`, `ValueError` for starts of the wrong structure, an L that depends on a coordinate that is
-    said to be cyclic, and what `lj.accelerations` raises of functions that cannot be called.
+    **Raises:** `TypeError`, `ValueError` for starts of the wrong structure, for an L that depends on a coordinate named
+    in `cyclic`, and what `lj.accelerations` raises about functions that cannot be called.
 
     Source: Marsden & Ratiu, *Introduction to Mechanics and Symmetry*, §8.9; Goldstein, Eq. (6.1); Nocedal & Wright,
     *Numerical Optimization*, §10.3.
@@ -117,24 +118,24 @@ def equilibria(
     moving = None if velocities is None or coordinates.is_traced(v) else _moving(v, count)
     if cyclic is None and velocities is not None and moving is None:
         raise ValueError(
-            "the velocities are traced by JAX, and which coordinates move in them cannot be seen.\n"
+            "JAX is tracing the velocities, so it is not known which coordinates move.\n"
             'Fix: name them, lj.equilibria(..., cyclic=["psi"]).'
         )
     symmetries = symmetries_of(system, s, cyclic, hold, moving)
-    # What a function closes over may be traced where nothing that is passed is.
+    # A function may close over traced values although no argument is traced.
     steady = Steady(lift(system, s), s.t, s.params, np.zeros(symmetries.count, s.t.dtype), s.q, symmetries)
     q, v = jax.tree.map(lambda x: x.astype(s.t.dtype), (q, v))
     lasting = not symmetries.count and is_autonomous(system, *s)
-    plain = is_eager() and not coordinates.is_traced((steady, q, v))
-    rows = searched(steady, q, v, lasting, plain)
+    concrete = is_eager() and not coordinates.is_traced((steady, q, v))
+    rows = searched(steady, q, v, lasting, concrete)
     found = Equilibria(t=s.t, params=s.params, symmetries=symmetries, starts=q, **rows._asdict())
-    if not plain:
+    if not concrete:
         return found
     return merged(found, angles(system, *s))
 
 
 def _is_a_state(system, t, q, params) -> bool:
-    """Whether what was given as several starts is one."""
+    """Whether the argument `starts` is a single start."""
     try:
         checked(system, t, *stacked_one(q), params)
     except (TypeError, ValueError, IndexError):
@@ -143,7 +144,7 @@ def _is_a_state(system, t, q, params) -> bool:
 
 
 def _velocities(velocities, q, count):
-    """One velocity a start."""
+    """One velocity for each start."""
     v = stacked([velocities] if _is_one(velocities, q) else velocities, "velocities")
     if jax.tree.structure(v) != jax.tree.structure(q):
         coordinates.state(0.0, jax.tree.map(lambda x: x[0], q), jax.tree.map(lambda x: x[0], v), None)
@@ -161,13 +162,13 @@ def _moving(v, count):
 
 
 @partial(compiled, in_numpy=True)
-def searched(steady: Steady, q, v, lasting, plain) -> Row:
-    """What each start leads to, one row each."""
-    return jax.vmap(lambda q, v: _settled(steady, q, v, lasting, plain))(q, v)
+def searched(steady: Steady, q, v, lasting, concrete) -> Row:
+    """Search from each start; one row each."""
+    return jax.vmap(lambda q, v: _search(steady, q, v, lasting, concrete))(q, v)
 
 
 def held_at(steady: Steady, x, u):
-    """The rates of a velocity, and what is held of them."""
+    """The rates of a velocity, and the held rates or momenta."""
     fields, k = steady.fields(x), steady.symmetries.count
     if steady.symmetries.places:
         rates = u[np.array(steady.symmetries.places)]
@@ -176,61 +177,61 @@ def held_at(steady: Steady, x, u):
     return rates, steady.momenta(x, steady.velocity(x, rates)) if steady.symmetries.hold == MOMENTUM and k else rates
 
 
-def _settled(steady: Steady, q, v, lasting, plain) -> Row:
+def _search(steady: Steady, q, v, lasting, concrete) -> Row:
     x0, u0 = coordinates.flatten(q)[0], coordinates.flatten(v)[0]
     rates, held = held_at(steady, x0, u0)
     steady = Steady(steady.system, steady.t, steady.params, held, steady.like, steady.symmetries)
     y0 = jnp.concatenate([x0, rates, jnp.zeros(steady.m, x0.dtype)])
     fixed, linear = stopped(steady), np.arange(y0.size) >= steady.n + steady.symmetries.count
     root = least_squares_root(lambda y: equations.balance(fixed, y), lax.stop_gradient(y0), linear)
-    y = root.y if plain else differentiable(lambda y: equations.balance(steady, y), root)
-    return described(steady, y, root, y0, lasting, plain)
+    y = root.y if concrete else differentiable(lambda y: equations.balance(steady, y), root)
+    return _row(steady, y, root, y0, lasting, concrete)
 
 
-def described(steady: Steady, y, root, y0, lasting, plain) -> Row:
-    """A root in the user's structure, with what is to be known of it."""
+def _row(steady: Steady, y, root, y0, lasting, concrete) -> Row:
+    """The row of a root: the solution in the user's structure, its stability and its status."""
     x, rates, multipliers = steady.parts(y)
     u, a = steady.velocity_and_acceleration(x, rates)
     by_name: dict[str, Any] = {}
     if steady.m > 1:
         pushes = equations.forces(steady, steady.t, x, u)
-        multipliers = equations.shortest(pushes, multipliers @ pushes)
+        multipliers = equations.shortest_multipliers(pushes, multipliers @ pushes)
     if steady.m:
-        of_names = steady.system, multipliers, steady.t, steady.like, steady.like, steady.params
-        by_name = constraints.split(*of_names)
-    jacobian = root.jacobian if plain else jax.jacfwd(lambda y: equations.balance(steady, y))(y)
-    roots = equations.characteristic_roots(steady, y, jacobian, derivatives=not plain)
+        problem = steady.system, multipliers, steady.t, steady.like, steady.like, steady.params
+        by_name = constraints.split(*problem)
+    jacobian = root.jacobian if concrete else jax.jacfwd(lambda y: equations.balance(steady, y))(y)
+    roots = equations.characteristic_roots(steady, y, jacobian, derivatives=not concrete)
     status, imbalance, zero_modes = _verdict(steady, root, y0, lasting)
     grows = GROWS_ABOVE[np.dtype(x.dtype)] * jnp.nanmax(jnp.abs(roots))
     stable = ~jnp.any(roots.real > grows) & jnp.any(jnp.isfinite(roots)) & (status == OK)
     momenta = steady.momenta(x, u) if steady.symmetries.count else jnp.zeros(0, x.dtype)
-    there = status == OK
-    fill = lambda tree: jax.tree.map(lambda x: jnp.where(there, x, jnp.nan), tree)
+    is_found = status == OK
+    fill = lambda tree: jax.tree.map(lambda x: jnp.where(is_found, x, jnp.nan), tree)
     return Row(
         fill(steady.unflatten(x)), fill(steady.unflatten(u)), fill(by_name), fill(rates), fill(momenta),
-        stable, fill(roots), there, zero_modes, imbalance, status,
+        stable, fill(roots), is_found, zero_modes, imbalance, status,
         steady.unflatten(root.y[: steady.n]),
     )  # fmt: skip
 
 
 def _verdict(steady: Steady, root, y0, lasting):
-    """Whether a root is one, how far from it, and how many directions of a family lead on from it."""
+    """The status of a root, its imbalance, and the number of its zero modes."""
     n, k = steady.n, steady.symmetries.count
     limit = BALANCED[np.dtype(y0.dtype)]
     larger = jnp.maximum(jnp.abs(root.y), jnp.abs(lax.stop_gradient(y0)))
-    # Coordinates of zero have no size of their own: that of the largest counts.
+    # Coordinates of zero have no size of their own, so all take that of the largest.
     of_x, of_rates, of_multipliers = (jnp.max(part, initial=0.0) for part in steady.parts(larger))
     size = jnp.concatenate([jnp.full(n, of_x), jnp.full(k, of_rates), jnp.full(steady.m, of_multipliers)])
-    made = jnp.abs(root.jacobian) @ size
-    off = jnp.abs(root.r) / jnp.where(made > 0, made, 1.0)
+    effect = jnp.abs(root.jacobian) @ size
+    off = jnp.abs(root.r) / jnp.where(effect > 0, effect, 1.0)
     imbalance = jnp.max(off)
     at = slice(n, n + steady.m)
     status = jnp.asarray(OK)
     if not lasting:
-        lost = jnp.abs(equations.passing(steady, root.y))
-        scale = jnp.maximum(made[: n + steady.m], limit * jnp.max(lost))
-        status = jnp.where(jnp.all(lost <= limit * scale), OK, LASTS_NOT)
-    # A force that fades is next to nothing far away.
+        lost = jnp.abs(equations.drift_rates(steady, root.y))
+        scale = jnp.maximum(effect[: n + steady.m], limit * jnp.max(lost))
+        status = jnp.where(jnp.all(lost <= limit * scale), OK, NOT_LASTING)
+    # Far away a fading force is almost zero, which is no equilibrium.
     far = of_x > FAR * jnp.max(jnp.abs(y0[:n])) if steady.n else False
     status = jnp.where((imbalance <= limit) & ~(far & (jnp.max(jnp.abs(y0[:n])) > 0)), status, NO_BALANCE)
     if steady.m:
@@ -242,13 +243,13 @@ def _verdict(steady: Steady, root, y0, lasting):
 
 
 def _zero_modes(steady: Steady, root):
-    """How many directions of positions, but along the symmetries, keep the balance to first order."""
+    """In how many directions of positions, apart from the symmetries, the balance holds to first order."""
     n, k, least = steady.n, steady.symmetries.count, 1e3 * zero_below(root.y.dtype)
     matrix = root.jacobian[: n + steady.m]
     along = jnp.concatenate([steady.fields(root.y[:n]), jnp.zeros((k, steady.m), matrix.dtype)], axis=1)
     matrix = jnp.concatenate([jnp.concatenate([matrix[:, :n], matrix[:, n + k :]], axis=1), along])
     positive = lambda x: jnp.where(x > 0, x, 1.0)
-    # Beside what the rows were where the search began: a single number has no other size.
+    # Rows are compared with those at the start of the search too: a single number has no other scale.
     of_rows = jnp.max(jnp.abs(matrix), axis=1).at[: n + steady.m].max(root.rows[: n + steady.m])
     matrix = matrix / positive(of_rows)[:, None]
     columns = jnp.max(jnp.abs(matrix), axis=0)

@@ -1,8 +1,8 @@
-"""Formulas of numbers: sums of products of powers, multiplied out, with sines and cosines brought together.
+"""Formulas with numerical coefficients: sums of products of powers, expanded, with sin² + cos² simplified.
 
-A `Formula` is a sum of terms, each a number times atoms to powers. An atom is a symbol, a function of a formula, or a
-formula itself where it stands under a fraction line or a root. What is computed with formulas is multiplied out and
-cancels; that is all the algebra that a Lagrangian's program needs to be read again.
+A `Formula` is a sum of terms, each a number times powers of atoms. An atom is a symbol, a function of a formula, or a
+formula in a denominator or under a root. Results of arithmetic are expanded, and terms cancel; no more algebra is
+needed to read a Lagrangian back from its program.
 """
 
 from collections.abc import Mapping
@@ -12,9 +12,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-# A coefficient up to this part of the largest that was added is what round-off left.
+# A coefficient up to this fraction of the largest addend is round-off.
 ROUND_OFF = 1e-13
-# So many terms are no formula to read any more.
+# A formula with more terms is not readable.
 LONG = 400
 FUNCTIONS = {
     "sin": np.sin, "cos": np.cos, "tan": np.tan, "exp": np.exp, "log": np.log, "sinh": np.sinh, "cosh": np.cosh,
@@ -24,11 +24,11 @@ FUNCTIONS = {
 
 
 class TooLong(Exception):
-    """A formula has become longer than anyone reads."""
+    """A formula has more terms than anyone reads."""
 
 
 class Symbol(NamedTuple):
-    """A parameter, a coordinate, a velocity: its name, and how it is written."""
+    """A parameter, a coordinate or a velocity: its name, its LaTeX, and its rank in the order of factors."""
 
     name: str
     latex: str
@@ -43,7 +43,7 @@ class Function(NamedTuple):
 
 
 class Group(NamedTuple):
-    """A formula as a factor, with a power that is no positive whole number."""
+    """A formula as a factor, with a power that is not a positive integer."""
 
     inside: "Formula"
 
@@ -53,7 +53,7 @@ Term = frozenset
 
 
 class Formula:
-    """A sum of terms, each the set of its (atom, power), with a number."""
+    """A sum of terms: each is a set of (atom, power) pairs with a coefficient."""
 
     def __init__(self, terms: Mapping[Term, float]):
         if len(terms) > LONG:
@@ -63,7 +63,7 @@ class Formula:
 
     @cached_property
     def key(self):
-        """What equal formulas have in common."""
+        """A key that is the same for equal formulas."""
         return frozenset((term, float(f"{c:.12g}")) for term, c in self.terms.items())
 
     def __eq__(self, other):
@@ -96,19 +96,19 @@ class Formula:
 
     @property
     def constant(self) -> float | None:
-        """Its value, if it is a number."""
+        """The value of the formula if it is a number, else None."""
         if not self.terms:
             return 0.0
         return self.terms[frozenset()] if set(self.terms) == {frozenset()} else None
 
     def power(self, exponent) -> "Formula":
-        """Raised to a power; multiplied out where that is a positive whole number."""
+        """The formula to a power; expanded if the power is a nonnegative integer."""
         exponent = Fraction(exponent).limit_denominator(64)
         if exponent.denominator == 1 and exponent >= 0:
-            found = number(1.0)
+            result = number(1.0)
             for _ in range(int(exponent)):
-                found = found * self
-            return found
+                result = result * self
+            return result
         if self.constant is not None:
             return number(float(self.constant) ** float(exponent))
         if len(self.terms) == 1 and exponent.denominator == 1:
@@ -117,7 +117,7 @@ class Formula:
         return Formula({frozenset({(Group(tidy(self)), exponent)}): 1.0})
 
     def value(self, at: Mapping[str, float]) -> float:
-        """Its value with numbers in place of symbols."""
+        """The value of the formula with numbers in place of symbols."""
         return sum(c * float(np.prod([_value(a, at) ** float(p) for a, p in term])) for term, c in self.terms.items())
 
 
@@ -132,7 +132,7 @@ def symbol(name: str, latex: str, order: int) -> Formula:
 
 
 def function(name: str, argument: Formula) -> Formula:
-    """A function of a formula; the sign of a sum goes in front where that is the same."""
+    """A function of a formula; the sign of the argument of an odd or even function is moved in front."""
     if argument.constant is not None:
         return number(float(FUNCTIONS[name](argument.constant)))
     sign = 1.0
@@ -142,7 +142,7 @@ def function(name: str, argument: Formula) -> Formula:
 
 
 def tidy(formula: Formula) -> Formula:
-    """The same with sin² + cos² = 1, wherever both have the same factors and coefficient."""
+    """Replace sin² + cos² by 1 wherever both have the same factors and coefficient."""
     changed = True
     while changed:
         changed = False
@@ -179,12 +179,12 @@ def _product(one: Term, two: Term, c: float) -> Formula:
     powers = dict(one)
     for atom, power in two:
         powers[atom] = powers.get(atom, Fraction(0)) + power
-    # A group that lost its root or its fraction line is a sum again.
+    # A group with a positive integer power is expanded into a sum again.
     whole = {a: p for a, p in powers.items() if isinstance(a, Group) and p.denominator == 1 and p > 0}
-    found = Formula({frozenset((a, p) for a, p in powers.items() if p and a not in whole): c})
+    result = Formula({frozenset((a, p) for a, p in powers.items() if p and a not in whole): c})
     for group, power in whole.items():
-        found = found * group.inside.power(power)
-    return found
+        result = result * group.inside.power(power)
+    return result
 
 
 def _is_negative(formula):
@@ -193,7 +193,7 @@ def _is_negative(formula):
 
 
 def order_of(term: Term):
-    """Where a term stands in a sum, and an atom in a product."""
+    """The sort key of a term in a sum."""
     return sorted(((_order(atom), -power) for atom, power in term), reverse=True)
 
 
@@ -206,7 +206,7 @@ def _order(atom: Atom):
 
 
 def atoms_in_order(term: Term) -> list[tuple[Atom, Fraction]]:
-    """The factors of a term as they are written."""
+    """The factors of a term in the order in which they are written."""
     return sorted(term, key=lambda pair: _order(pair[0]))
 
 

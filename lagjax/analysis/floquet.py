@@ -1,16 +1,16 @@
-"""Floquet multipliers: what a period of a motion makes of the states beside it.
+"""Floquet multipliers: how small departures from a periodic motion grow or decay in a period.
 
-Where a motion comes back after a period T, its tangents have gone through the monodromy matrix M, and after k periods
-through M^k. The eigenvalues μ of M are the multipliers, σ = log(μ)/T the exponents. In coordinates of the tangent space
-of the constraints their product is known without M, by Liouville's formula,
+When a motion comes back after a period T, its tangents have been multiplied by the monodromy matrix M, and after k
+periods by M^k. The eigenvalues μ of M are the multipliers, σ = log(μ)/T the exponents. In coordinates of the tangent
+space of the constraints their product is known without M, by Liouville's formula,
 
     ∏ μ = exp ∮ tr P J dt,
 
-1 for a Lagrangian without damping, e^(-cT) for damping -c v of unit masses; the two are computed independently of each
-other, and their difference is told. Linearly stable is what has no |μ| above 1.
+which is 1 for a Lagrangian without damping, and e^(-cT) for damping -c v of unit masses. The two are computed
+independently, and their difference is reported. A motion is linearly stable if no |μ| is above 1.
 
-A loss of stability has a name by where a multiplier leaves the unit circle: at +1 (a fold, a loss of symmetry), at -1
-(a motion of twice the period begins), or as a pair between.
+A loss of stability is classified by where a multiplier leaves the unit circle: at +1 (a fold, a loss of symmetry), at
+-1 (a motion of twice the period begins), or as a complex pair between.
 
 Source: Coddington & Levinson, *Theory of ODEs*, §3.5; Guckenheimer & Holmes, *Nonlinear Oscillations*, §1.5 and §3.5.
 """
@@ -26,23 +26,24 @@ from lagjax.analysis.unit_circle import unit_circle
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.system import System
 
-# Multipliers up to so many errors of M may be made of these.
-UNKNOWN = 100.0
+# Multipliers below so many errors of M may consist of these errors alone.
+UNKNOWN_BELOW = 100.0
 
 
 class Floquet(eqx.Module):
-    """The multipliers of a cycle, and what they say of its stability. It prints and plots itself.
+    """The multipliers of a cycle, and its stability; print it for a summary, `plot` draws it.
 
-    - `multipliers` (k,): complex, those that are 1 for a reason first, then by falling size. k is twice the number of
-      coordinates, less the independent equations of constraints (of positions twice: the velocity is constrained, too).
-    - `trivial` (k,): whether it is 1 for a reason: `reasons` (r,) says which of those in `words` there are.
-    - `monodromy` (2n, 2n): M on pushes (q, v) in the order of their names, zero on those off the constraints.
+    - `multipliers` (k,): complex; first those that are 1 for a known reason, then by falling size. k is twice the
+      number of coordinates minus the number of independent constraint equations (a holonomic one counts twice, because
+      it constrains the velocity too).
+    - `trivial` (k,): whether a multiplier is 1 for a known reason; `reasons` (r,) says which of those in `words` apply.
+    - `monodromy` (2n, 2n): M for displacements (q, v) in the order of their names, zero for those off the constraints.
     - `log_volume`: the logarithm of Liouville's product, ∮ tr P J dt.
-    - `error`: how far the entries of M may be off, in units in which the state has size 1; by a second run of less
-      accuracy where nothing is traced, else by Liouville's formula. Multipliers that are not much larger than this are
-      not known.
+    - `error`: the estimated error of the entries of M, in units in which the state has size 1; from a second, less
+      accurate run if nothing is traced, else from Liouville's formula. Multipliers that are not much larger than this
+      are unknown.
     - `period`; `ended`: whether the motion could be followed through it; `apart`: how far it then is from its start, in
-      units of the state, but for whole turns and for what nothing depends on.
+      units of the state, apart from whole turns and coordinates on which nothing depends.
 
     Under `vmap` every array has the batch's axes in front.
     """
@@ -80,12 +81,12 @@ class Floquet(eqx.Module):
 
     @property
     def within(self) -> Float[Array, ""]:
-        """How far from 1 a size may be for 1: a double root on the circle is off by the root of the error."""
+        """The tolerance of |μ| = 1: a double root on the circle is off by the square root of the error."""
         return jnp.sqrt(jnp.maximum(self.error, 10 * jnp.finfo(self.period.dtype).eps))
 
     @property
     def comes_back(self) -> Bool[Array, ""]:
-        """Whether the motion is at its start again after the period: else these are no multipliers."""
+        """Whether the motion is back at its start after the period; else M's eigenvalues are not multipliers."""
         return self.ended & (self.apart <= jnp.finfo(self.period.dtype).eps ** (1 / 3))
 
     @property
@@ -95,12 +96,12 @@ class Floquet(eqx.Module):
 
     @property
     def attracts(self) -> Bool[Array, ""]:
-        """Whether all that are not trivial are inside: the cycle is asymptotically stable."""
+        """Whether all nontrivial multipliers are inside the unit circle: the cycle is asymptotically stable."""
         return self.comes_back & (self.largest < 1 - self.within)
 
     @property
     def verdict(self) -> str:
-        """What the multipliers say, in words. Not for a batch."""
+        """The stability in words; not for a batch."""
         if not bool(self.ended):
             return "not known: the motion could not be followed through a period"
         if not bool(self.comes_back):
@@ -140,17 +141,17 @@ class Floquet(eqx.Module):
         rows.append(("product", f"{float(self.product):.9g}; by Liouville's formula {float(self.liouville):.9g}"
                      f" (apart by {off:.0e})"))  # fmt: skip
         rows.append(("error of M", f"{float(self.error):.0e} (estimated, in units of the state)"))
-        unknown = int(np.sum(np.abs(np.asarray(self.multipliers)) <= UNKNOWN * float(self.error)))
+        unknown = int(np.sum(np.abs(np.asarray(self.multipliers)) <= UNKNOWN_BELOW * float(self.error)))
         if unknown:
             are = "is" if unknown == 1 else "are"
-            rows.append(("WARNING", f"of the multipliers {unknown} {are} not known: as small as what errors of M make"))
+            rows.append(("WARNING", f"{unknown} of the multipliers {are} not known: as small as the errors of M"))
         return "\n".join(["Floquet multipliers", *(f"  {label:<11}  {value}" for label, value in rows)])
 
 
 def floquet(system, t=None, q=None, v=None, params=None, period=None, *, rtol=None) -> Floquet:
     """Return the Floquet multipliers of a motion that comes back after a period.
 
-    Of a periodic orbit, or of a state that is known to come back, as that of rest in a system that is driven:
+    The motion is a periodic orbit, or a state known to come back, such as rest in a driven system:
 
     >>> import jax.numpy as jnp
     >>> import lagjax as lj
@@ -162,17 +163,16 @@ def floquet(system, t=None, q=None, v=None, params=None, period=None, *, rtol=No
 
     **Arguments:**
 
-    - `system`: what `lj.periodic_orbit` returned, alone; or a `System`, and
-    - `t`, `q`, `v`, `params`: its state at the start; `period`, after which it comes back, `[t]`. Of angles that go
-      around, and of coordinates on which nothing depends, velocities alone have to come back.
-    - `rtol`: the tolerance of the steps, of the motion and of its tangents; 1e-12 by default in float64, 1e-5 in
-      float32.
+    - `system`: the result of `lj.periodic_orbit`, alone; or a `System`, and
+    - `t`, `q`, `v`, `params`: its state at the start; `period`, after which it comes back, `[t]`. Angles that go
+      around, and coordinates on which nothing depends, need not come back, only their velocities.
+    - `rtol`: the tolerance of the steps, for the motion and its tangents; 1e-12 by default in float64, 1e-5 in float32.
 
-    **Returns:** a `Floquet`, differentiable in both modes in the state and `params`; a double multiplier has no
+    **Returns:** a `Floquet`, differentiable in both modes by the state and `params`; a double multiplier has no
     derivative.
 
-    **Raises:** `TypeError`, `ValueError` for a state of the wrong shape or dtype, for what is left out, and for a state
-    that does not come back (not while JAX is tracing).
+    **Raises:** `TypeError`, `ValueError` for a state of the wrong shape or dtype, for missing arguments, and for a
+    state that does not come back (not while JAX is tracing).
 
     Source: Coddington & Levinson, *Theory of Ordinary Differential Equations*, §3.5.
     """
@@ -186,17 +186,17 @@ def floquet(system, t=None, q=None, v=None, params=None, period=None, *, rtol=No
             )
     problem = problem_of(system, t, q, v, params)
     found, error = period_of(problem, period, rtol)
-    named = _named(problem, found, error, period)
+    result = _floquet_of(problem, found, error, period)
     if not coordinates.is_traced(found) and not bool(found.ended):
         refuse_singular(problem)
-    if not coordinates.is_traced(found) and bool(found.ended) and not bool(named.comes_back):
+    if not coordinates.is_traced(found) and bool(found.ended) and not bool(result.comes_back):
         raise ValueError(
             f"this state does not come back after period = {float(period):.9g}: it is off by {float(found.apart):.2g} "
             "of its size.\n"
-            "Usual cause: a start or a period that is rounded, or that of a small motion for a large one.\n"
+            "Usual cause: a rounded start or period, or the period of a small motion used for a large one.\n"
             "Fix: orbit = lj.periodic_orbit(system, (q, v), period, params), and lj.floquet(orbit)."
         )
-    return named
+    return result
 
 
 def _of_orbit(orbit, rtol, given):
@@ -207,15 +207,15 @@ def _of_orbit(orbit, rtol, given):
         )
     if any(x is not None for x in given):
         raise TypeError(
-            "a periodic orbit has its state, its parameters and its period.\n"
+            "a periodic orbit already contains its state, parameters and period.\n"
             "Fix: lj.floquet(orbit) alone; for other parameters find their orbit first."
         )
     problem = problem_of(orbit.system, orbit.t, orbit.q, orbit.v, orbit.params)
     found, error = period_of(problem, orbit.period, rtol, orbit.nodes)
-    return _named(problem, found, error, orbit.period)
+    return _floquet_of(problem, found, error, orbit.period)
 
 
-def _named(problem, found, error, period):
+def _floquet_of(problem, found, error, period):
     period = jnp.asarray(period, found.log_volume.dtype)
     names = problem.reasons.names(problem.state.q)
     return Floquet(
@@ -229,7 +229,7 @@ def _number(x):
 
 
 def _listed(found):
-    """The multipliers one by one, those with a reason with it; pairs once."""
+    """The multipliers one by one in words, trivial ones with their reason, conjugate pairs once."""
     words = iter([word for word, there in zip(found.words, np.asarray(found.reasons)) if there])
     for x, trivial in zip(np.asarray(found.multipliers), np.asarray(found.trivial)):
         if trivial:

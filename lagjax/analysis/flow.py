@@ -1,15 +1,15 @@
-"""The flow of a system with its tangents: where a state goes, and where all states beside it go.
+"""The flow of a system with its tangents: where a state goes, and where neighbouring states go.
 
 With z = (q, v) in vector form and f its rate, a tangent δ of the flow z(t) obeys the variational equation
 
     z' = f(t, z),        δ' = J δ,        J = ∂f/∂z,
 
-and a frame of tangents, one a column, is carried along. The whole of it is one state to the method, so that steps are
-also short enough for the tangents: at rest in a driven system nothing else moves.
+and a frame of tangents, one in each column, is integrated along with z. Both together are one state for the method, so
+that step sizes suit the tangents too: at rest in a driven system only the tangents move.
 
-On constraints c(t, z) = 0 of positions and velocities the equations are those of reduced index, under which the
-manifold is invariant; tangents that begin in its tangent space, C δ = 0 with C = ∂c/∂z, stay there. A frame that spans
-it has a volume, which grows as Liouville's formula says, with P the orthogonal projection onto the tangent space:
+With constraints c(t, z) = 0 on positions and velocities the equations have reduced index, and the constraint manifold
+is invariant; tangents that begin in its tangent space, C δ = 0 with C = ∂c/∂z, stay there. The volume of a frame that
+spans it grows by Liouville's formula, with P the orthogonal projection onto the tangent space:
 
     d/dt log volume = tr P J,        without constraints tr J
 
@@ -36,24 +36,24 @@ from lagjax.mechanics.system import System
 from lagjax.motion.both_modes import solve_in_both_modes
 from lagjax.numerics.runge_kutta import Dopri8
 
-# Tight: what is said of a cycle is read off differences of what a whole period makes.
+# Tight tolerances, because results about a cycle are differences after a whole period.
 TOLERANCE = {np.dtype("float64"): 1e-12, np.dtype("float32"): 1e-5}
 MAX_STEPS = 200_000
-# Of a sketch: steps from one point to the next, and the nodes and weights of the classical method of order 4.
+# For `Flow.path`: steps between output points, and the nodes and weights of the classical method of order 4.
 SUBSTEPS, RUNGE_KUTTA = 16, (np.array([0.0, 0.5, 0.5, 1.0]), np.array([1.0, 2.0, 2.0, 1.0]) / 6)
-# Steps that are shorter, as a part of the span, lead nowhere: the motion is singular there, or not a number.
+# A step shorter than this fraction of the span means that the motion is singular there, or NaN.
 SHORTEST = 1e-10
-# The first step, as a part of the span; a step that is too long is taken again.
+# The first step as a fraction of the span; the step-size control rejects it if it is too long.
 FIRST = 0.02
-# A row of constraints depends on others where no more than this part of it is left beside them.
+# A constraint row is dependent if at most this fraction of it is independent of the others.
 DEPENDENT_BELOW = 1e-6
 ONTO_CONSTRAINTS = 4
 
 
 class Passage(NamedTuple):
-    """Where a state z (2n,) and a frame of tangents (2n, k) have come, and how.
+    """The end of a state z (2n,) and of a frame of tangents (2n, k) after a time.
 
-    `growth`: the logarithm of the change of a whole frame's volume by Liouville's formula; 0 where it is not asked for.
+    `growth`: the logarithm of the growth of a complete frame's volume by Liouville's formula; 0 if not requested.
     """
 
     z: Float[Array, " 2n"]
@@ -64,7 +64,7 @@ class Passage(NamedTuple):
 
 
 class Changes(NamedTuple):
-    """By how much parameters (a tree like their floats, None elsewhere), the start and the span change, (k, ...)."""
+    """The change of parameters (a tree of their floats, None elsewhere), start and span with each column, (k, ...)."""
 
     params: PyTree
     t0: Float[Array, " k"]
@@ -72,7 +72,7 @@ class Changes(NamedTuple):
 
 
 class Flow(eqx.Module):
-    """The motion of a system in vector form; `rows` are the constraint equations that are independent."""
+    """The motion of a system in vector form; `rows` are the indices of independent constraint equations."""
 
     system: System
     params: PyTree
@@ -87,29 +87,29 @@ class Flow(eqx.Module):
         return self.unflatten(z[: self.size]), self.unflatten(z[self.size :])
 
     def vector(self, q, v):
-        """The same back."""
+        """The vector z of (q, v)."""
         return jnp.concatenate([coordinates.flatten(q)[0], coordinates.flatten(v)[0]])
 
     def rate(self, t, z):
-        """f(t, z), the velocities and accelerations."""
+        """f(t, z): the velocities and accelerations."""
         q, v = self.state(z)
         a, _ = equations_of(self.system, t, q, v, self.params).accelerations(t, q, v)
         return jnp.concatenate([z[self.size :], coordinates.flatten(a)[0]])
 
     def residual(self, t, z):
-        """c(t, z): of positions and of velocities, the independent ones."""
+        """c(t, z): the independent constraint equations of positions and velocities."""
         return _residual(self.system, t, z, self.params, self.unflatten)[np.array(self.rows, int)]
 
     def normals(self, t, z, scale):
-        """C, with z in units of `scale`."""
+        """C = ∂c/∂z, with z in units of `scale`."""
         return jax.jacfwd(lambda z: self.residual(t, z))(z) * scale[None]
 
     def onto_constraints(self, t, z, scale):
         """The state near z that satisfies the constraints, nearest in units of `scale`; differentiable."""
         if not self.rows:
             return z
-        nearer = lambda z, _: (z - scale * _shortest(self.normals(t, z, scale), self.residual(t, z)), None)
-        return lax.scan(nearer, z, None, length=ONTO_CONSTRAINTS)[0]
+        newton_step = lambda z, _: (z - scale * _shortest(self.normals(t, z, scale), self.residual(t, z)), None)
+        return lax.scan(newton_step, z, None, length=ONTO_CONSTRAINTS)[0]
 
     def tangent_space(self, t, z, scale) -> Float[Array, "2n k"]:
         """An orthonormal basis of the tangent space, in units of `scale`."""
@@ -117,31 +117,31 @@ class Flow(eqx.Module):
             return jnp.eye(z.size, dtype=z.dtype)
         normals = self.normals(t, z, scale)
         basis = jnp.linalg.svd(lax.stop_gradient(normals))[2][len(self.rows) :].T
-        # The derivative of a basis that turns as little as it can.
+        # This gives the derivative of the basis that rotates as little as possible.
         return basis - _shortest(normals, normals @ basis)
 
     def passage(
         self, t0, z, span, frame, scale, volume=False, differentiable=False, changes: Changes | None = None
     ) -> Passage:
-        """The state and the frame after a time; errors, and the frame, count in units of `scale`, (2n,).
+        """The state and the frame after a time; errors and the frame are in units of `scale`, (2n,).
 
-        `volume`: whether to ask for its growth. In both modes derivatives flow through it where it is `differentiable`.
+        `volume`: whether to compute its growth. `differentiable`: whether to allow derivatives in both modes.
         `changes`: what else changes with each column of the frame.
         """
         arrays, static = eqx.partition((self, t0, z, span, frame, lax.stop_gradient(scale), changes), eqx.is_array)
         x, fixed = eqx.partition(arrays, eqx.is_inexact_array)
 
         def solve(x, fixed, adjoint, _):
-            flow, *given = eqx.combine(x, fixed, static)
+            flow, *inputs = eqx.combine(x, fixed, static)
             forward = isinstance(adjoint, diffrax.ForwardMode)
-            return _passage(flow, *given, volume, adjoint if forward else diffrax.RecursiveCheckpointAdjoint()), None
+            return _passage(flow, *inputs, volume, adjoint if forward else diffrax.RecursiveCheckpointAdjoint()), None
 
         if not differentiable:
             return solve(x, fixed, diffrax.ForwardMode(), False)[0]
         return solve_in_both_modes(solve, x, fixed, recorded=False)
 
     def path(self, t0, z, span, count, substeps=SUBSTEPS) -> Float[Array, "count+1 2n"]:
-        """States at equal parts of a time, by short steps of Runge and Kutta: a sketch, that is compiled in no time."""
+        """States at equal time intervals, by short Runge-Kutta steps: of low accuracy, but quick to compile."""
         h = span / (count * substeps)
 
         def step(z, t):
@@ -151,8 +151,8 @@ class Flow(eqx.Module):
                 rate = self.rate(t + c * h, z + c * h * rate)
                 return (rate, total + b * rate), None
 
-            nothing = jnp.zeros_like(z)
-            (_, total), _ = lax.scan(stage, (nothing, nothing), tuple(x.astype(z.dtype) for x in RUNGE_KUTTA))
+            zero_rate = jnp.zeros_like(z)
+            (_, total), _ = lax.scan(stage, (zero_rate, zero_rate), tuple(x.astype(z.dtype) for x in RUNGE_KUTTA))
             return z + h * total, z
 
         times = t0 + h * jnp.arange(count * substeps, dtype=z.dtype)
@@ -161,7 +161,7 @@ class Flow(eqx.Module):
 
 
 def flow_of(system, t, q, v, params, rtol, rows=None, in_a_loop=True) -> Flow:
-    """The flow of a system, for states like this one; `rows` from `independent_rows_of`, by default all."""
+    """The flow of a system for states like this one; `rows` come from `independent_rows_of`, by default all."""
     x, unflatten = coordinates.flatten(q)
     if rows is None:
         rows = all_rows(system, t, q, v, params)
@@ -169,20 +169,20 @@ def flow_of(system, t, q, v, params, rtol, rows=None, in_a_loop=True) -> Flow:
 
 
 def scale_of(z, period):
-    """The size of each coordinate and velocity that a motion of this period shows at z; never zero.
+    """The size of each coordinate and velocity at z for a motion of this period; never zero.
 
-    Of what is zero, with its velocity, the largest of the others tells it; of a state that is all zero the user's unit.
+    A coordinate that is zero with its velocity takes the largest size of the others; if all are zero, the user's unit.
     """
     rate = 2 * np.pi / period
     x, u = jnp.split(jnp.abs(lax.stop_gradient(z)), 2)
-    own = jnp.maximum(x, u / rate)
-    largest = jnp.max(own)
-    own = jnp.where(own > 1e-6 * largest, own, jnp.where(largest > 0, largest, 1.0))
-    return lax.stop_gradient(jnp.concatenate([own, own * rate]))
+    sizes = jnp.maximum(x, u / rate)
+    largest = jnp.max(sizes)
+    sizes = jnp.where(sizes > 1e-6 * largest, sizes, jnp.where(largest > 0, largest, 1.0))
+    return lax.stop_gradient(jnp.concatenate([sizes, sizes * rate]))
 
 
 def independent_rows_of(system, t, q, v, params) -> tuple[int, ...] | None:
-    """Which constraint equations are independent near a state; None, for all, where JAX is tracing."""
+    """The indices of independent constraint equations near a state; None, for all, where JAX is tracing."""
     if not system.constraints:
         return ()
     if not is_eager() or coordinates.is_traced((t, q, v, params)):
@@ -205,7 +205,7 @@ def _normals(system, t, q, v, params):
 
 
 def all_rows(system, t, q, v, params) -> tuple[int, ...]:
-    """All constraint equations, of positions and of velocities."""
+    """The indices of all constraint equations, of positions and of velocities."""
     holonomic = constraints.holonomic_equations(system, t, q, v, params)
     return tuple(range(int(holonomic.sum()) + len(holonomic)))
 
@@ -223,7 +223,7 @@ def _shortest(rows, residual):
 
 def _passage(flow, t0, z, span, frame, scale, changes, volume, adjoint) -> Passage:
 
-    # Jitted, so that it is traced once: diffrax traces the body of its loop three times.
+    # Jitted so that it is traced only once, although diffrax traces the body of its loop three times.
     @eqx.filter_jit
     def field(part, y, args):
         flow, t0, span, scale, changes = args
@@ -244,7 +244,7 @@ def _passage(flow, t0, z, span, frame, scale, changes, volume, adjoint) -> Passa
             growth = growth - jnp.sum(normal * (jacobian @ normal))
         return {"z": motion, "frame": jacobian @ y["frame"], "growth": growth}
 
-    # As a function of the part of the span that has passed: the span is differentiated like a parameter.
+    # The variable is the elapsed fraction of the span, so that the span is differentiated like a parameter.
     y0 = {"z": z / scale, "frame": frame, "growth": jnp.zeros_like(span)}
     zero, one, first = (jnp.asarray(x, z.dtype) for x in (0.0, 1.0, FIRST))
     solution = diffrax.diffeqsolve(
@@ -266,7 +266,7 @@ def _passage(flow, t0, z, span, frame, scale, changes, volume, adjoint) -> Passa
 
 
 def _with_changes(flow, part, y, t0, span, scale, changes):
-    """The rates of the state and of its frame, where parameters and times change with its columns."""
+    """The rates of the state and its frame if parameters and times change with the columns."""
     floats, rest = eqx.partition(flow.params, eqx.is_inexact_array)
 
     def rate(z, floats, t0, span):

@@ -1,4 +1,4 @@
-"""The symmetries that were found: a mapping of names to charges that prints itself."""
+"""The result of a search for symmetries: a mapping of names to charges, with a printed summary."""
 
 from collections.abc import Iterator
 from fractions import Fraction
@@ -9,14 +9,15 @@ import numpy as np
 
 from lagjax.mechanics.noether import NoetherCharge
 
-# A gap smaller than this leaves it open what is zero.
+# With a smaller gap it is unclear which singular values are zero.
 CLEAR_GAP = 1e3
 
 
 class Found(NamedTuple):
-    """A symmetry: its charge, by how much that fails to stay, relative to its terms, and whether it has a t in it.
+    """A symmetry: its charge, the residual of its conservation relative to its terms, and whether it contains t.
 
-    `coefficients`: of the motions of the basis. `cyclic`: it is the momentum of a coordinate that L does not contain.
+    `coefficients`: those of the motions of the basis. `cyclic`: the charge is the momentum of a coordinate that L does
+    not contain.
     """
 
     charge: NoetherCharge
@@ -27,7 +28,7 @@ class Found(NamedTuple):
 
 
 class Scaling(NamedTuple):
-    """x goes to s^a x, t to s^b t, and L is multiplied by s^factor: exponents by name, 0 left out."""
+    """x → s^a x and t → s^b t multiply L by s^factor; exponents by name, without zeros."""
 
     exponents: dict[str, float]
     factor: float
@@ -43,16 +44,16 @@ class Scaling(NamedTuple):
 
 
 class Symmetries(eqx.Module):
-    """The symmetries of a system within a basis: a mapping of names to charges. It prints itself.
+    """The symmetries of a system within a basis: a mapping of names to charges; print it for a summary.
 
     `found["L_z"]` is a function of (t, q, v, params); `traj.plot(charges=found)` draws them all.
 
-    - `details`: by name, a `Found`; those whose charge has a t in it (boosts, uniform forces) are `timed`.
-    - `scalings`: what multiplies L by a factor, and conserves nothing.
-    - `basis`: the names of the motions that were looked among; `states`: at how many states.
-    - `singular_values`: of the motions without t, and of all of them; `gap`: between what counts as zero and the
-      smallest that does not. Below 1000 it is left open where the line is, and the symmetries are to be doubted; 0
-      where too few states were found for so many motions.
+    - `details`: a `Found` for each name; those whose charge contains t (boosts, uniform forces) are `timed`.
+    - `scalings`: motions that multiply L by a factor; they conserve nothing.
+    - `basis`: the names of the motions of the search; `states`: the number of states at which they were tried.
+    - `singular_values`: those of the motions without t, and those of all motions; `gap`: the ratio of the smallest
+      nonzero one to the largest that counts as zero. Below 1000 it is unclear which are zero, and the symmetries are
+      unreliable; 0 where too few states were found for so many motions.
     """
 
     details: dict[str, Found]
@@ -88,12 +89,12 @@ class Symmetries(eqx.Module):
 
     @property
     def steady(self) -> tuple[str, ...]:
-        """The names of those without t in them."""
+        """The names of the charges without t."""
         return tuple(name for name, found in self.details.items() if not found.timed)
 
     @property
     def timed(self) -> tuple[str, ...]:
-        """The names of those with t in them."""
+        """The names of the charges that contain t."""
         return tuple(name for name, found in self.details.items() if found.timed)
 
     def __repr__(self):

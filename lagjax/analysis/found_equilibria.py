@@ -1,4 +1,4 @@
-"""What a search for steady motions found: a table that prints itself, and what became of each start."""
+"""The result of a search for steady motions: a table of equilibria, and the outcome of each start."""
 
 from dataclasses import replace
 from typing import NamedTuple
@@ -12,21 +12,21 @@ from lagjax.analysis.balance import Symmetries
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.diagnosis import describe
 
-OK, NO_BALANCE, CONSTRAINED, NOT_FINITE, LASTS_NOT, UNFINISHED = range(6)
+OK, NO_BALANCE, CONSTRAINED, NOT_FINITE, NOT_LASTING, UNFINISHED = range(6)
 WORDS = (
     "found",
-    "no equilibrium near it: the imbalance of forces has a least value there that is not zero, or fades far away",
-    "the constraints cannot be met there: they contradict each other, or the velocity that is held",
-    "L, a force or a constraint is not finite on the way, or the way leads to infinity",
-    "a balance at this instant alone: it depends on t, or moves off its place",
-    "the search is still on its way: start again from where it is, `last`",
+    "no equilibrium near it: the imbalance of forces has a nonzero minimum there, or fades far away",
+    "the constraints cannot be met there: they contradict each other, or the held velocity",
+    "L, a force or a constraint is not finite on the way, or the search goes to infinity",
+    "a balance at this instant only: it depends on t, or the motion leaves it",
+    "the search has not finished: start again from where it stopped, `last`",
 )
-# Coordinates that agree to this part of the largest are the same.
+# Coordinates that agree to this fraction of the largest are the same.
 SAME = 1e-6
 
 
 class Row(NamedTuple):
-    """What a start leads to; the names are those of `Equilibria`."""
+    """The result of one start; the names are those of `Equilibria`."""
 
     q: PyTree[Float[Array, "..."]]
     v: PyTree[Float[Array, "..."]]
@@ -43,23 +43,24 @@ class Row(NamedTuple):
 
 
 class Equilibria(eqx.Module):
-    """States of rest and of steady motion, one row each (E,), and what became of each start (S,). It prints itself.
+    """States of rest and of steady motion, one row each (E,), and the outcome of each start (S,); print it for a table.
 
     - `t`; `q`, `v`: the states, each leaf with a leading axis E, `[q]`, `[q]/[t]`.
-    - `multipliers`: by constraint name, (E, ...), `[L]/[g]`; where constraints depend on each other the shortest.
-    - `rates`, `momenta` (E, k): of each cyclic motion, `1/[t]` (`[q]/[t]` for a coordinate) and `[L][t]`.
-    - `stable` (E,): no small departure grows. (Where none decays either, as without friction, of the linear equations:
-      roots on the imaginary axis are their border.)
-    - `eigenvalues` (E, 2n): the roots s of departures e^(st), `1/[t]`, NaN beyond the last one; of double ones
-      the derivative is that of their mean.
-    - `zero_modes` (E,): along how many directions, besides the cyclic ones, the balance is kept to first order: it is
-      one of a family, the one nearest to its start, or a critical point where branches meet.
-    - `imbalance` (E,): the imbalance, relative to what a displacement as large as the coordinates makes.
-    - `found` (E,), `status` (S,): 0 where a start led to one; `describe(status)` says what another number means.
-    - `of_start` (S,): to which row each start led, -1 for none. `starts`, `last`: leaves with a leading axis S, where
-      each search began and ended, also of those that found nothing.
+    - `multipliers`: by constraint name, (E, ...), `[L]/[g]`; with dependent constraints those of least norm.
+    - `rates`, `momenta` (E, k): those of each cyclic motion, `1/[t]` (`[q]/[t]` for a coordinate) and `[L][t]`.
+    - `stable` (E,): no small departure grows. (If none decays either, as without friction, this holds for the linear
+      equations only, because roots on the imaginary axis are the limit of stability.)
+    - `eigenvalues` (E, 2n): the roots s of departures e^(st), `1/[t]`, padded with NaN; the derivative of a double root
+      is that of the mean.
+    - `zero_modes` (E,): in how many directions, besides the cyclic ones, the balance holds to first order: the
+      equilibrium is the member of a family nearest to its start, or a critical point where branches meet.
+    - `imbalance` (E,): the imbalance, relative to the effect of a displacement as large as the coordinates.
+    - `found` (E,): whether the row is an equilibrium; `status` (S,): 0 where a start led to one, and
+      `describe(status)` says what another number means.
+    - `of_start` (S,): the row to which each start led, -1 for none. `starts`, `last`: leaves with a leading axis S,
+      where each search began and ended, including those that found nothing.
 
-    While JAX traces, E is S and what was not found is NaN.
+    While JAX traces, E is S and rows that are not equilibria are NaN.
     """
 
     t: Float[Array, ""]
@@ -84,7 +85,7 @@ class Equilibria(eqx.Module):
         return self.found.shape[0]
 
     def describe(self, status: int) -> str:
-        """What a status means, in words."""
+        """The meaning of a status in words."""
         return WORDS[int(status)]
 
     def __getitem__(self, i: int) -> tuple:
@@ -96,14 +97,16 @@ class Equilibria(eqx.Module):
         if coordinates.is_traced((self.q, self.found)):
             return f"Equilibria, being traced, of {self.found.shape[-1]} starts"
         if self.found.ndim > 1:
-            of = " x ".join(map(str, self.found.shape[:-1]))
-            return f"Equilibria, {int(np.sum(self.found))} from a batch of {of} with {self.found.shape[-1]} starts each"
+            shape = " x ".join(map(str, self.found.shape[:-1]))
+            return (
+                f"Equilibria, {int(np.sum(self.found))} from a batch of {shape} with {self.found.shape[-1]} starts each"
+            )
         return "\n".join(_lines(self))
 
 
 def merged(rows: Equilibria, is_angle: PyTree[bool]) -> Equilibria:
-    """Each equilibrium once, in the order in which starts led to them."""
-    there = np.flatnonzero(np.asarray(rows.found))
+    """Merge duplicates; equilibria keep the order in which starts led to them."""
+    found_rows = np.flatnonzero(np.asarray(rows.found))
     first = jax.tree.map(lambda x: x[0], rows.q)
     angle = np.concatenate([np.full(np.size(x), yes) for yes, x in zip(*map(jax.tree.leaves, (is_angle, first)))])
     angle[list(rows.symmetries.places)] = False
@@ -113,12 +116,12 @@ def merged(rows: Equilibria, is_angle: PyTree[bool]) -> Equilibria:
     roots = np.asarray(rows.eigenvalues)
     kept: list[int] = []
     of_start = np.full(len(x), -1)
-    for i in there:
+    for i in found_rows:
         for place, j in enumerate(kept):
             off = x[i] - x[j]
             off = np.where(angle, off - 2 * np.pi * np.round(off / (2 * np.pi)), off)
             same = _close(off, np.maximum(np.abs(x[i]), np.abs(x[j])), angle)
-            # An angle that counts twice or half is not the same a turn later.
+            # With half an angle in L, for example, states a whole turn apart can differ.
             alike = _close(other[i] - other[j], np.abs(other[i]), np.zeros(other.shape[1], bool))
             if same and alike and rows.stable[i] == rows.stable[j] and _same_roots(roots[i], roots[j]):
                 of_start[i] = place
@@ -127,8 +130,8 @@ def merged(rows: Equilibria, is_angle: PyTree[bool]) -> Equilibria:
             of_start[i] = len(kept)
             kept.append(i)
     pick = lambda tree: jax.tree.map(lambda x: x[np.array(kept, int)], tree)
-    of_rows = [name for name in Row._fields if name not in ("status", "last")]
-    return replace(rows, **{name: pick(getattr(rows, name)) for name in of_rows}, of_start=of_start)
+    row_fields = [name for name in Row._fields if name not in ("status", "last")]
+    return replace(rows, **{name: pick(getattr(rows, name)) for name in row_fields}, of_start=of_start)
 
 
 def _close(off, size, angle):
@@ -158,7 +161,7 @@ def _lines(found: Equilibria):
         for row in rows:
             yield "  " + "  ".join(row[head].rjust(width) for head, width in zip(heads, widths)).rstrip()
     if any(found.zero_modes[i] for i in range(len(found)) if found.found[i]):
-        yield "  A zero mode: equilibria lie beside it, and it is the nearest to its start; or branches meet there."
+        yield "  A zero mode: one of a family of equilibria, the nearest to its start; or branches meet there."
     status = np.asarray(found.status)
     for code in range(1, len(WORDS)):
         lost = np.flatnonzero(status == code)
@@ -172,7 +175,7 @@ def _lines(found: Equilibria):
 
 
 def _row(found, i):
-    """One equilibrium, by the heads of the table."""
+    """One row of the table, by the heads of its columns."""
     pick = lambda tree: jax.tree.map(lambda x: x[i], tree)
     q, v = pick(found.q), pick(found.v)
     x = np.asarray(coordinates.flatten(q)[0])
@@ -196,5 +199,5 @@ def _row(found, i):
 
 
 def _number(x, largest=0.0):
-    # What is nothing beside the others, and beside a radian, is round-off.
+    # A value that is negligible compared with the others, and with one radian, is round-off.
     return "0" if abs(x) < 1e-12 * max(largest, 1.0) else f"{float(x):.6g}"

@@ -1,9 +1,9 @@
-"""Hamilton's function of any regular Lagrangian, by the Legendre transform, and his equations.
+"""The Hamiltonian of any regular Lagrangian, by the Legendre transform, and Hamilton's equations.
 
     H(t, q, p) = p·v - L(t, q, v)        with v from p = ∂L/∂v
     q̇ = ∂H/∂p,    ṗ = -∂H/∂q + Q - ∂R/∂v
 
-`legendre.py` solves for v. H is the Jacobi integral, as a function of momenta.
+`legendre.py` solves for v. H is the Jacobi integral as a function of momenta.
 
 Source: Goldstein, *Classical Mechanics*, Eq. (8.15), (8.18).
 """
@@ -26,12 +26,12 @@ from lagjax.mechanics.system import System
 
 
 class Hamiltonian(eqx.Module):
-    """Hamilton's function `H(t, q, p, params)` of a system; `lj.hamiltonian` makes it."""
+    """The Hamiltonian `H(t, q, p, params)` of a system, returned by `lj.hamiltonian`."""
 
     system: System
 
     def __call__(self, t, q, p, params) -> Float[Array, ""]:
-        """H at a place and a momentum, `[L]`."""
+        """H at a position and a momentum, `[L]`."""
         return self._at(t, q, p, params)[0]
 
     def velocity(self, t, q, p, params) -> PyTree[Float[Array, "..."]]:
@@ -39,16 +39,16 @@ class Hamiltonian(eqx.Module):
         return self._at(t, q, p, params)[1]
 
     def rates(self, t, q, p, params) -> tuple[PyTree[Array], PyTree[Array]]:
-        """Hamilton's equations: `(q̇, ṗ)`, each like q, with the forces that L does not contain."""
+        """Hamilton's equations: `(q̇, ṗ)`, each like q, including the forces that L does not contain."""
         if self.system.constraints:
             raise ValueError(
-                f"Hamilton's equations are those of free coordinates, and {self.system} has constraints, whose forces "
+                f"Hamilton's equations need free coordinates, but {self.system} has constraints, whose forces "
                 "H does not contain.\n"
                 "Fix: lj.accelerations(system, t, q, v, params) with v = H.velocity(t, q, p, params), or coordinates "
                 "that satisfy the constraints by themselves."
             )
-        _, v, pushed = self._at(t, q, p, params)
-        return v, pushed
+        _, v, momentum_rate = self._at(t, q, p, params)
+        return v, momentum_rate
 
     def _at(self, t, q, p, params):
         if jax.tree.structure(p) != jax.tree.structure(q):
@@ -59,20 +59,20 @@ class Hamiltonian(eqx.Module):
             )
         s = coordinates.state(t, q, p, params)
         system = looked_at(self.system, s)
-        value, v, pushed, mass, regular, reached = _hamiltonian(system, *s)
+        value, v, momentum_rate, mass, regular, reached = _hamiltonian(system, *s)
         if coordinates.is_traced((value, regular)):
             known = regular & reached
-            return jax.tree.map(lambda x: jnp.where(known, x, jnp.nan), (value, v, pushed))
+            return jax.tree.map(lambda x: jnp.where(known, x, jnp.nan), (value, v, momentum_rate))
         if not (regular and reached):
             raise ValueError(_no_velocity(s, np.asarray(mass), bool(regular)))
-        return value, v, pushed
+        return value, v, momentum_rate
 
     def __repr__(self):
         return f"Hamiltonian of {self.system}"
 
 
 def hamiltonian(system: System) -> Hamiltonian:
-    """Return Hamilton's function of a system, by a numerical Legendre transform of any regular L.
+    """Return the Hamiltonian of a system, by a numerical Legendre transform of any regular L.
 
     >>> import lagjax as lj
     >>> pendulum = lj.System(lambda t, q, v, params: 0.5 * params["m"] * v**2 - params["k"] * q**2 / 2)
@@ -80,15 +80,15 @@ def hamiltonian(system: System) -> Hamiltonian:
     >>> print(H(0.0, 1.0, 6.0, {"m": 2.0, "k": 10.0}), H.velocity(0.0, 1.0, 6.0, {"m": 2.0, "k": 10.0}))
     14.0 3.0
 
-    **Arguments:** `system`, of whose L is taken the transform. Constraints and forces are no part of H.
+    **Arguments:** `system`, whose L is transformed. Constraints and forces are not part of H.
 
-    **Returns:** `H(t, q, p, params)` -> scalar, `[L]`, with p like q, `[L] [t]/[q]`. `H.velocity` of the same arguments
-    gives v, and `H.rates` the pair (q̇, ṗ) of Hamilton's equations. All of them have derivatives of any order, in both
-    modes, and may be batched. One linear solve where L is quadratic in v, else Newton's method.
+    **Returns:** `H(t, q, p, params)` -> scalar, `[L]`, with p like q, `[L] [t]/[q]`. `H.velocity` with the same
+    arguments gives v, and `H.rates` the pair (q̇, ṗ) of Hamilton's equations. All three have derivatives of any order
+    in both modes, and work in batches. They take one linear solve where L is quadratic in v, else Newton's method.
 
-    **Raises:** when it is called: `ValueError` where L is degenerate, with the coordinate whose velocity the momenta do
-    not tell, or where no velocity has this momentum (while JAX is tracing the values are NaN instead); `TypeError`,
-    `ValueError` for a state of the wrong dtype or shape.
+    **Raises:** when H is called: `ValueError` where L is degenerate, naming the coordinate whose velocity the momenta
+    do not determine, or where no velocity has this momentum (while JAX is tracing the values are NaN instead);
+    `TypeError`, `ValueError` for a state of the wrong dtype or shape.
 
     Source: Goldstein, Eq. (8.15), (8.18).
     """
@@ -99,15 +99,15 @@ def hamiltonian(system: System) -> Hamiltonian:
 @compiled
 def _hamiltonian(system, t, q, p, params):
     x, unflatten = coordinates.flatten(q)
-    pressed, _ = coordinates.flatten(p)
-    of = lambda x, u: system.lagrangian(t, unflatten(x), unflatten(u), params)
-    found = velocity_of(lambda u: jax.grad(of, argnums=1)(x, u), pressed)
-    value, slope = jax.value_and_grad(of)(x, found.v)
+    momentum, _ = coordinates.flatten(p)
+    lagrangian_of = lambda x, u: system.lagrangian(t, unflatten(x), unflatten(u), params)
+    found = velocity_of(lambda u: jax.grad(lagrangian_of, argnums=1)(x, u), momentum)
+    value, slope = jax.value_and_grad(lagrangian_of)(x, found.v)
     q, v = unflatten(x), unflatten(found.v)
-    # -∂H/∂q at p held is ∂L/∂q at v held.
+    # -∂H/∂q at constant p equals ∂L/∂q at constant v.
     if not system.constraints and not reacts(system):
         slope = slope + applied_force(system, t, q, v, params, jnp.zeros(0, x.dtype))
-    return pressed @ found.v - value, v, unflatten(slope), found.mass, found.regular, found.reached
+    return momentum @ found.v - value, v, unflatten(slope), found.mass, found.regular, found.reached
 
 
 def _no_velocity(s, mass, regular):
@@ -116,13 +116,13 @@ def _no_velocity(s, mass, regular):
     if regular:
         return (
             f"no velocity was found that has this momentum, {at}.\n"
-            "Usual cause: a momentum that L cannot have, as where ∂L/∂v is bounded, or L that is not finite at rest.\n"
+            "Usual cause: a momentum outside the range of ∂L/∂v, or an L that is not finite at rest.\n"
             "Fix: take p from a velocity, p = lj.momentum(system, t, q, v, params)."
         )
     name = names[degenerate(mass)] if np.all(np.isfinite(mass)) else names[0]
     return (
-        f"L is degenerate in '{name}', {at}: the momenta do not tell its velocity, and there is no Hamiltonian.\n"
-        "Usual cause: a coordinate whose velocity is missing from L, or stands in it linearly alone; a zero mass; a "
+        f"L is degenerate in '{name}', {at}: the momenta do not determine its velocity, so there is no Hamiltonian.\n"
+        "Usual cause: a coordinate whose velocity is missing from L, or enters it only linearly; a zero mass; a "
         "coordinate singularity (an azimuth at the pole).\n"
         f"Fix: give '{name}' a kinetic energy, or leave it out of q; lj.explain(system, t, q, v, params) shows the "
         "masses."
@@ -130,7 +130,7 @@ def _no_velocity(s, mass, regular):
 
 
 def degenerate(mass: np.ndarray) -> int:
-    """Which coordinate has the largest part in the direction in which a mass matrix is singular."""
+    """The coordinate with the largest component in the null direction of a singular mass matrix."""
     scale = np.sqrt(np.max(np.abs(mass), axis=1))
     if not np.all(scale):
         return int(np.argmin(scale))

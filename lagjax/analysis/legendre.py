@@ -1,8 +1,9 @@
 """Velocities from momenta: p = ∂L/∂v solved for v, numerically, for any regular L.
 
-Where L is quadratic in the velocities p is linear in them, and one solve with M = ∂²L/∂v∂v is exact; whether it is, is
-read off its program. Elsewhere Newton's method finds v, each step cut to where L is finite and the residual falls. Its
-derivatives, of any order and in both modes, are those of the implicit function: dv = M⁻¹ (dp - d(∂L/∂v) at v held).
+If L is quadratic in the velocities, p is linear in them and one solve with M = ∂²L/∂v∂v is exact; the program of L
+shows whether this is so. Otherwise Newton's method finds v, with steps shortened until L is finite and the residual
+falls. The derivatives of v, of any order and in both modes, are those of the implicit function:
+dv = M⁻¹ (dp - d(∂L/∂v) at fixed v).
 
 Source: Goldstein, *Classical Mechanics*, Eq. (8.15)-(8.18); Arnold, *Mathematical Methods of Classical Mechanics*, §14.
 """
@@ -21,14 +22,14 @@ from lagjax.mechanics.saddle_point import SINGULAR_BELOW
 from lagjax.numerics import dense
 
 ITERATIONS = 60
-# The best of these parts of a step is taken.
+# The line search takes the best of these fractions of a Newton step.
 FRACTIONS = 0.5 ** np.arange(16.0)
-# Round-offs of the terms of a momentum up to which it counts as reached.
+# The momentum counts as reached if the residual is below this many round-offs of its terms.
 ROUND_OFFS = 1e3
 
 
 class Velocity(NamedTuple):
-    """A velocity with the momentum asked for; whether M is regular there, and whether the momentum was reached."""
+    """The velocity for a given momentum, whether M is regular there, and whether the momentum was reached."""
 
     v: Float[Array, " n"]
     mass: Float[Array, "n n"]
@@ -69,7 +70,7 @@ def _newton(residual, start):
 
     def unfinished(state):
         i, _, before, now = state
-        # Quadratic convergence ends where a step changes nothing any more.
+        # Round-off ends the quadratic convergence: the residual no longer falls.
         return (i < ITERATIONS) & (now > 0) & (now < before)
 
     def step(state):

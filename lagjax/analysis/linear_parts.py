@@ -1,22 +1,22 @@
 """The linear equations of small motions about a steady one, as matrices on the constraint surface.
 
-With `x = x₀ + u₀ t + ξ` and f = F + (A + B)ᵀ λ, the force with that of the constraints at their multipliers,
+With `x = x₀ + u₀ t + ξ` and f = F + (A + B)ᵀ λ, the total force with constraint forces for fixed multipliers,
 
-    M ξ̈ + C ξ̇ + K ξ = Aᵀ δλ,    C = -∂f/∂u,    K = -∂f/∂x        (λ·∂²g is in K)
+    M ξ̈ + C ξ̇ + K ξ = Aᵀ δλ,    C = -∂f/∂u,    K = -∂f/∂x        (K contains λ·∂²g)
 
-Holonomic constraints leave the positions ξ = P η, with A_h P = 0. Velocity constraints, A_v ξ̇ + B_v ξ = 0 with
-B_v = ∂phi/∂q, leave fewer velocities, which need not be zero where a position is not:
+Holonomic constraints allow the positions ξ = P η, with A_h P = 0. Velocity constraints, A_v ξ̇ + B_v ξ = 0 with
+B_v = ∂phi/∂q, allow fewer velocities, and a displacement ξ may require a nonzero one:
 
-    ξ̇ = V w + W ξ,    A V = 0,    A W = -B_v (and zero of what is holonomic)
+    ξ̇ = V w + W ξ,    A V = 0,    A W = -B_v (zero in the rows of holonomic constraints)
 
-Multiplied from the left with what no constraint force reaches, Lᵀ Aᵀ = 0 (L = V, but for friction), the equations are
+Multiplying from the left by Lᵀ with Lᵀ Aᵀ = 0 eliminates the constraint forces (L = V unless there is friction):
 
     (Lᵀ M V) ẇ + Lᵀ (M W + C) V w + Lᵀ ((M W + C) W + K) P η = 0,    η̇ = P⁺ (V w + W P η)
 
-A coordinate that nothing depends on has no part in them: it is found from ξ̇ afterwards, and is left out of η.
+A coordinate that nothing depends on does not appear in these equations: it follows from ξ̇ and is left out of η.
 
-Null spaces are found without derivatives, and then moved to where A takes them to zero: `N = (1 - A⁺ A) N₀` is a smooth
-basis, whose derivatives are those of what is computed with it.
+A null space basis N₀ is computed without derivatives and then projected onto the null space of A: `N = (1 - A⁺ A) N₀`
+is a smooth function of A with correct derivatives.
 
 Source: Goldstein, *Classical Mechanics*, §6.1-6.2; Neimark & Fufaev, *Dynamics of Nonholonomic Systems*, ch. V;
 Meijaard, Papadopoulos, Ruina & Schwab, *Proc. R. Soc. A* 463 (2007) 1955, Appendix B (linearised velocity constraints).
@@ -36,17 +36,17 @@ from lagjax.mechanics.reactions import response
 from lagjax.numerics import dense, lapack
 from lagjax.numerics.rank import independent_rows
 
-# Reciprocal condition, after scaling, below which the reduced mass matrix has no inverse.
+# The reduced mass matrix is singular if its reciprocal condition, after scaling, is below this.
 SINGULAR_BELOW = {np.dtype("float64"): 1e-13, np.dtype("float32"): 1e-6}
 
 
 class Kind(NamedTuple):
-    """What of a linearisation is known before any number is: hashable.
+    """The static part of a linearisation, known before its numbers are; hashable.
 
-    - `unseen` (n,): coordinates that nothing depends on. `holonomic` (m,): which constraint equations are.
-    - `independent` (m,): which of them to work with.
-    - `conservative`: no force, no dissipation and no velocity constraint; `at_rest`: no velocity, no term linear in
-      velocities.
+    - `unseen` (n,): coordinates that nothing depends on. `holonomic` (m,): which constraint equations are holonomic.
+    - `independent` (m,): which constraint equations are used.
+    - `conservative`: there is no force, no dissipation and no velocity constraint; `at_rest`: velocities are zero and L
+      has no terms linear in them.
     - `timeless`: nothing depends on time.
     """
 
@@ -59,7 +59,7 @@ class Kind(NamedTuple):
 
 
 class Raw(NamedTuple):
-    """All matrices in the coordinates themselves: they must not change along a steady motion."""
+    """The matrices in the original coordinates, which must not change along a steady motion."""
 
     mass: Float[Array, "n n"]
     velocity: Float[Array, "n n"]
@@ -71,11 +71,11 @@ class Raw(NamedTuple):
 class Parts(NamedTuple):
     """The reduced equations, `mass ẇ + velocity w + position η = 0` and `η̇ = drift η + transfer w`.
 
-    - `positions` (n, n_p): P of the coordinates that something depends on, zero in the others; `velocities`: V;
-      `turning`: W P.
-    - `a`: the accelerations at the state itself, zero of a steady motion; `off`: residuals of the constraints, of
-      positions and velocities; `forces`: the size of what balances in each coordinate over its inertia.
-    - `sound`: the reduced mass matrix is regular and everything finite; `independent` (m,): the constraint equations.
+    - `positions` (n, n_p): P, with zero rows for coordinates that nothing depends on; `velocities`: V; `turning`: W P.
+    - `a`: the accelerations at the state itself, zero in a steady motion; `off`: the residuals of the constraints on
+      positions and velocities; `forces`: the size of the balancing forces in each coordinate, divided by its inertia.
+    - `sound`: the reduced mass matrix is regular and all entries are finite; `independent` (m,): which constraint
+      equations are independent.
     """
 
     mass: Float[Array, "k k"]
@@ -119,27 +119,27 @@ def parts_of(kind: Kind, system, t, q, v, params) -> Parts:
     kept, _ = _null_space(positions_live, all_independent[chosen & holonomic])
     positions = jnp.zeros((n, kept.shape[1]), x.dtype).at[~unseen].set(kept)
     if holonomic.all():
-        # The same directions for both, first the coordinates that nothing depends on.
+        # Positions and velocities share their directions; coordinates that nothing depends on come first.
         velocities = jnp.concatenate([jnp.eye(n, dtype=x.dtype)[:, unseen], positions], axis=1)
     left = velocities if friction is None else _null_space(pushing.T[chosen], all_independent[chosen])[0]
 
-    # What balances the force at a steady motion, a = 0.
+    # The multipliers that balance the force in a steady motion, a = 0.
     stacked = _spread(rows, live, lift, chosen, -_least_squares(pushing[:, chosen], forcing))
 
     if m:
-        held = lambda x, u: jax.grad(
+        constraint_force = lambda x, u: jax.grad(
             lambda u: stacked @ constraints.velocity_residual(system, t, x, u, params, unflatten)
         )(u)
-        by_position, by_velocity = jax.jacfwd(held, argnums=(0, 1))(x, u)
+        by_position, by_velocity = jax.jacfwd(constraint_force, argnums=(0, 1))(x, u)
         velocity, position = velocity - by_velocity.astype(x.dtype), position - by_position.astype(x.dtype)
     if friction is not None:
 
-        def rubbing(x, u):
-            found = response(system, t, x, u, params, unflatten)
-            assert found is not None
-            return found @ stacked
+        def friction_force(x, u):
+            by_multipliers = response(system, t, x, u, params, unflatten)
+            assert by_multipliers is not None
+            return by_multipliers @ stacked
 
-        by_position, by_velocity = jax.jacfwd(rubbing, argnums=(0, 1))(x, u)
+        by_position, by_velocity = jax.jacfwd(friction_force, argnums=(0, 1))(x, u)
         velocity, position = velocity - by_velocity.astype(x.dtype), position - by_position.astype(x.dtype)
     if kind.at_rest:
         velocity = jnp.zeros_like(velocity)
@@ -158,7 +158,7 @@ def parts_of(kind: Kind, system, t, q, v, params) -> Parts:
         )
     else:
         turning = -lift @ slopes[chosen]
-        # P⁺ of an all but orthonormal P, of which only rows that something depends on count.
+        # P⁺ of the nearly orthonormal P, without the rows of coordinates that nothing depends on.
         back = _left_inverse(kept)
         drift, transfer = back @ (turning @ positions)[~unseen], back @ velocities[~unseen]
     moved = mass @ turning + velocity
@@ -178,9 +178,9 @@ def parts_of(kind: Kind, system, t, q, v, params) -> Parts:
     a = onto + velocities @ lapack.solve(safe, (left.T @ (forcing - mass @ onto))[:, None])[:, 0]
     off = [constraints.position_residual(system, t, x, params, unflatten)] if holonomic.any() else []
     off += [constraints.velocity_residual(*problem)] if m else []
-    held = pushing @ stacked if m else jnp.zeros_like(x)
+    constraint_force = pushing @ stacked if m else jnp.zeros_like(x)
     diagonal = jnp.abs(jnp.diag(mass))
-    forces = (jnp.abs(forcing) + jnp.abs(held)) / jnp.where(diagonal > 0, diagonal, 1.0)
+    forces = (jnp.abs(forcing) + jnp.abs(constraint_force)) / jnp.where(diagonal > 0, diagonal, 1.0)
     return Parts(
         *parts, positions, velocities, turning @ positions,
         constraints.split(system, stacked, t, q, v, params), a,
@@ -194,28 +194,28 @@ def _momentum(system, t, x, u, params, unflatten):
 
 
 def _forces(kind: Kind, problem):
-    """-∂F/∂u, -∂F/∂x and F itself, without constraint forces."""
+    """-∂F/∂u, -∂F/∂x and F, without constraint forces."""
     system, t, x, u, params, unflatten = problem
     if kind.at_rest:
-        # No momentum at rest: the force is that of the potential.
+        # At rest there is no momentum, so the force is that of the potential.
         slope = jax.grad(lambda x: system.lagrangian(t, unflatten(x), unflatten(jnp.zeros_like(u)), params))
         position, forcing = jax.jacfwd(lambda x: 2 * (slope(x),), has_aux=True)(x)
         return jnp.zeros((x.size, x.size), x.dtype), -position.astype(x.dtype), forcing.astype(x.dtype)
 
     def force(x, u):
-        found, _ = forcing_and_inertia(system, t, x, u, params, unflatten)
-        return found, found
+        forcing, _ = forcing_and_inertia(system, t, x, u, params, unflatten)
+        return forcing, forcing
 
     (position, velocity), forcing = jax.jacfwd(force, argnums=(0, 1), has_aux=True)(x, u)
     return -velocity.astype(x.dtype), -position.astype(x.dtype), forcing
 
 
 def _null_space(rows, independent):
-    """A basis (n, n - r) of what rows (r, n) take to zero, and their right inverse (n, r); smooth in the rows."""
+    """A basis (n, n - r) of the null space of rows (r, n), and their right inverse (n, r); smooth in the rows."""
     r, n = rows.shape
     if r == 0:
         return jnp.eye(n, dtype=rows.dtype), jnp.zeros((n, 0), rows.dtype)
-    # What depends on others is left out, so that nothing here is NaN; who asks is told.
+    # Dependent rows are left out to avoid NaN here; `Parts.independent` reports them to the caller.
     rows = jnp.where(independent[:, None], rows, 0.0)
     start = lapack.complement(rows.T)
     gram = rows @ rows.T + jnp.diag(jnp.where(independent, 0.0, 1.0).astype(rows.dtype))
@@ -228,7 +228,7 @@ def _left_inverse(basis):
 
 
 def _least_squares(columns, target):
-    """The y for which `columns y` is nearest to the target, of independent columns."""
+    """The least-squares solution y of `columns y = target`, for independent columns."""
     if columns.shape[1] == 0:
         return jnp.zeros(0, target.dtype)
     gram = columns.T @ columns
@@ -237,16 +237,16 @@ def _least_squares(columns, target):
 
 
 def _spread(rows, live, lift, chosen, multipliers):
-    """The shortest multipliers of all equations that push as those of the chosen ones do."""
+    """The shortest multipliers of all equations that exert the same force as the chosen ones."""
     if chosen.all():
         return multipliers
-    # Each row as a combination of the chosen ones.
+    # Each row is a combination of the chosen ones.
     combination = rows @ lift
     return combination @ dense.solved(combination.T @ combination, multipliers)
 
 
 def _reciprocal_condition(matrix):
-    """Of a matrix whose rows and columns are scaled by their largest entries."""
+    """The reciprocal condition of a matrix after its rows and columns are scaled by their largest entries."""
     matrix = jnp.where(jnp.isfinite(matrix), lax.stop_gradient(matrix), 0.0)
     largest = jnp.sqrt(jnp.maximum(jnp.max(jnp.abs(matrix), axis=0), jnp.max(jnp.abs(matrix), axis=1)))
     scale = jnp.where(largest > 0, largest, 1.0)

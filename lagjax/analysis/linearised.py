@@ -1,8 +1,8 @@
 """Small motions about an equilibrium or a steady motion: the linear equations, on the constraint surface.
 
-`linear_parts.py` has the derivation. Of the matrix that multiplies velocities the antisymmetric part is gyroscopic and
-does no work, the symmetric one damps; of that which multiplies positions the symmetric part is stiffness, and the
-antisymmetric one circulatory, which is neither: a force of it can feed energy in without end.
+`linear_parts.py` has the derivation. The matrix that multiplies velocities has an antisymmetric part, which is
+gyroscopic and does no work, and a symmetric part, which damps. The matrix that multiplies positions has a symmetric
+part, the stiffness, and an antisymmetric part, the circulatory one, whose forces can feed in energy without limit.
 """
 
 import equinox as eqx
@@ -25,24 +25,26 @@ from lagjax.mechanics.structure import structure, unseen_coordinates
 from lagjax.numerics import dense
 from lagjax.numerics.rank import DEPENDENT_BELOW
 
-# Matrices of more freedoms are not printed.
-SHOWN = 6
+# Matrices with more rows than this are not printed.
+PRINTED_ROWS = 6
 
 
 class Linearisation(eqx.Module):
     """The linear equations of small motions, `mass ẇ + (gyroscopic + damping) w + (stiffness + circulatory) η = 0`.
 
-    w (n,) are the velocities that all constraints leave, along the columns of `velocities`, and η the positions along
-    the same directions. Where there are velocity constraints, positions have more freedom than velocities:
+    w (n,) are the velocities that all constraints allow, along the columns of `velocities`, and η the positions along
+    the same directions. With velocity constraints, positions have more freedoms than velocities:
 
     - `mass`, `gyroscopic`, `damping`, `circulatory`, `stiffness` (n, n).
-    - `positions` (N, p): a basis of what holonomic constraints leave of the N coordinates; `velocities` (N, n): of what
-      all constraints leave of their velocities.
-    - `multipliers`: by constraint name, at the state itself; their force bends with the surface, and is in `stiffness`.
-    - `residual`: by how much the state is no steady motion: accelerations over what small motions of its own size
-      have, or the violation of a constraint. `lj.linearise` raises where it is large, but not while JAX is tracing.
-    - `state`: (t, q, v, params), about which this is. `sound`: whether the mass matrix is regular and all constraint
-      equations are independent; if not, nothing else here means anything.
+    - `positions` (N, p): a basis of the displacements of the N coordinates that holonomic constraints allow;
+      `velocities` (N, n): a basis of the velocities that all constraints allow.
+    - `multipliers`: by constraint name, at the state itself; `stiffness` contains the change of the constraint forces'
+      directions along the surface.
+    - `residual`: how far the state is from a steady motion: its accelerations, relative to those of small motions of
+      its own size, or the violation of a constraint. `lj.linearise` raises if it is large, but not while JAX is
+      tracing.
+    - `state`: the linearised state, (t, q, v, params). `sound`: whether the mass matrix is regular and all constraint
+      equations are independent; if not, everything else here is meaningless.
     """
 
     mass: Float[Array, "n n"]
@@ -62,11 +64,11 @@ class Linearisation(eqx.Module):
 
     @property
     def shifts(self) -> tuple[str, ...]:
-        """The coordinates that nothing depends on: each value of them is as good as another."""
+        """The coordinates that nothing depends on: shifting them changes nothing."""
         return tuple(name for name, unseen in zip(self.names, self.kind.unseen) if unseen)
 
     def first_order(self) -> tuple[Float[Array, "k k"], Float[Array, "k k"]]:
-        """Return E and A of `E ẏ = A y`, y = (positions, velocities); without positions that nothing depends on."""
+        """Return E and A of `E ẏ = A y`, y = (positions, velocities), without positions that nothing depends on."""
         p = self.parts
         eye, corner = jnp.eye(p.drift.shape[0], dtype=p.mass.dtype), jnp.zeros_like(p.transfer)
         return (
@@ -79,8 +81,8 @@ class Linearisation(eqx.Module):
         E, A = self.first_order()
         safe = jnp.where(self.sound, E, jnp.eye(E.shape[0], dtype=E.dtype))
         A = jnp.where(self.sound, dense.solved(safe, A), 0.0)
-        found = jnp.linalg.eigvals(A)
-        return jnp.concatenate([found, jnp.zeros(len(self.shifts), found.dtype)])
+        roots = jnp.linalg.eigvals(A)
+        return jnp.concatenate([roots, jnp.zeros(len(self.shifts), roots.dtype)])
 
     def __repr__(self):
         n, p = self.mass.shape[-1], self.positions.shape[-1]
@@ -93,7 +95,7 @@ class Linearisation(eqx.Module):
             matrix = np.asarray(getattr(self, name))
             if not np.any(np.abs(matrix) > 1e-14 * scale):
                 rows.append(f"  {name:<12}0")
-            elif n <= SHOWN:
+            elif n <= PRINTED_ROWS:
                 lines = np.array2string(matrix + 0.0, precision=6, suppress_small=True).split("\n")
                 rows += [f"  {name:<12}{lines[0]}", *(f"  {'':<12}{line}" for line in lines[1:])]
             else:
@@ -116,16 +118,17 @@ def linearise(system, t, q, v, params) -> Linearisation:
     >>> print(small.mass, small.stiffness)
     [[1.]] [[5.]]
 
-    **Arguments:** `t` scalar, `q`, `v` alike, `params` as L takes it: a state of rest, or of a motion that goes on with
-    these velocities while nothing else changes, as in coordinates that L does not contain.
+    **Arguments:** `t` scalar, `q` and `v` of the same structure, `params` as L takes it: an equilibrium, or a state of
+    a motion that continues with these velocities while nothing else changes, as along coordinates that L does not
+    contain.
 
-    **Returns:** a `Linearisation`, with derivatives by the state and `params`.
+    **Returns:** a `Linearisation`, differentiable with respect to the state and `params`.
 
     **Raises:**
 
-    - `ValueError` where the state is no equilibrium and no steady motion, with the coordinate that accelerates or the
-      constraint that is violated; where the equations change along the motion; where a mass matrix is singular. Not
-      while JAX is tracing: `residual` and `sound` tell.
+    - `ValueError` if the state is neither an equilibrium nor a steady motion, naming the coordinate that accelerates or
+      the constraint that is violated; if the equations change along the motion; if a mass matrix is singular. While JAX
+      is tracing nothing is raised: see `residual` and `sound`.
     - `TypeError`, `ValueError` for a state of the wrong shape or dtype.
 
     Source: Goldstein, *Classical Mechanics*, §6.1-6.2; Meijaard et al., *Proc. R. Soc. A* 463 (2007) 1955, Appendix B.
@@ -139,48 +142,48 @@ def linearise(system, t, q, v, params) -> Linearisation:
     kind = _kind(system, s)
     n, m = len(kind.unseen), len(kind.holonomic)
     if m >= n:
-        # Of so many equations some depend on others: which, only numbers tell.
+        # With so many equations some may depend on others, and only their values show which.
         kind = kind._replace(independent=_chosen(kind, system, s, traced))
     if sum(kind.independent) >= n:
         raise ValueError(
             f"{sum(kind.independent)} independent constraint equations on {n} coordinates leave no motion at all.\n"
             "Usual cause: a constraint on every coordinate, or one given in two forms.\n"
-            "Fix: leave out the constraint of what is to move; print(lj.explain(system, t, q, v, params)) lists them."
+            "Fix: leave out the constraint on what should move; print(lj.explain(system, t, q, v, params)) lists them."
         )
     if traced:
         return _linearised(kind, system, *s)[0]
-    found, steadiness = _linearised(kind, system, *s)
-    if not np.all(np.asarray(found.parts.independent)[list(kind.independent)]):
+    linearisation, steadiness = _linearised(kind, system, *s)
+    if not np.all(np.asarray(linearisation.parts.independent)[list(kind.independent)]):
         kind = kind._replace(independent=_chosen(kind, system, s, traced))
-        found, steadiness = _linearised(kind, system, *s)
-    check_steady(system, found, steadiness, lambda *later: linearised(kind, system, State(*later)))
-    return found
+        linearisation, steadiness = _linearised(kind, system, *s)
+    check_steady(system, linearisation, steadiness, lambda *later: linearised(kind, system, State(*later)))
+    return linearisation
 
 
 def _kind(system, s: State) -> Kind:
-    """What is known of the linearisation before any number is."""
+    """The static part of the linearisation."""
     holonomic = tuple(bool(x) for x in constraints.holonomic_equations(system, *s))
-    alike = (_kind, system.read, kinds(s))
-    unseen, linear_terms, timeless = remembered(system, alike, lambda: _read_off(system, s))
+    key = (_kind, system.read, kinds(s))
+    unseen, linear_terms, timeless = remembered(system, key, lambda: _structure_facts(system, s))
     at_rest = not coordinates.is_traced(s.v) and not any(np.any(x) for x in jax.tree.leaves(s.v))
     conservative = system.force is None and system.dissipation is None and all(holonomic)
     at_rest = conservative and at_rest and not linear_terms
     return Kind(unseen, holonomic, (True,) * len(holonomic), conservative, at_rest, timeless)
 
 
-def _read_off(system, s):
-    found = structure(system, *s)
+def _structure_facts(system, s):
+    known = structure(system, *s)
     unseen = tuple(bool(x) for x in unseen_coordinates(system, *s))
-    return unseen, found is None or bool(found.linear_terms), found is not None and not found.explicit_time
+    return unseen, known is None or bool(known.linear_terms), known is not None and not known.explicit_time
 
 
 def _chosen(kind, system, s, traced) -> tuple[bool, ...]:
-    """A largest set of independent constraint equations, those of positions first."""
+    """A largest set of independent constraint equations, preferring those on positions."""
     if traced:
         raise ValueError(
             f"{len(kind.holonomic)} constraint equations on {len(kind.unseen)} coordinates: some depend on others, and "
-            "while JAX is tracing it cannot be seen which.\n"
-            "Fix: leave out what depends on others; print(lj.explain(system, t, q, v, params)) names it."
+            "which ones cannot be determined while JAX is tracing.\n"
+            "Fix: leave out the dependent ones; print(lj.explain(system, t, q, v, params)) names them."
         )
     x, unflatten = coordinates.flatten(s.q)
     u, _ = coordinates.flatten(s.v)
@@ -201,16 +204,16 @@ def _chosen(kind, system, s, traced) -> tuple[bool, ...]:
 
 
 def linearised(kind: Kind, system, s: State) -> Linearisation:
-    """The linear equations at another state of the same kind, whether it is steady or not."""
+    """The linear equations at another state of the same kind, steady or not."""
     return _linearised(kind, system, *s)[0]
 
 
 @compiled
 def _linearised(kind: Kind, system, t, q, v, params) -> tuple[Linearisation, Steadiness]:
-    """The matrices by what they do, and how far the state is from a steady motion."""
+    """The linearisation, and how far the state is from a steady motion."""
     s = State(t, q, v, params)
     parts = parts_of(kind, system, *s)
-    # P⁺ V: the positions of displacements along the velocities.
+    # `transfer` is P⁺ V: the positions η of displacements along the velocity directions.
     along = parts.position @ parts.transfer
     half = lambda matrix, sign: (matrix + sign * matrix.T) / 2
     n, _ = coordinates.flatten(q)
@@ -219,7 +222,7 @@ def _linearised(kind: Kind, system, t, q, v, params) -> tuple[Linearisation, Ste
     sound = parts.sound
     if all(kind.independent) and kind.independent:
         sound = sound & jnp.all(parts.independent)
-    found = Linearisation(
+    linearisation = Linearisation(
         mass=parts.mass,
         gyroscopic=half(parts.velocity, -1),
         damping=half(parts.velocity, 1),
@@ -235,4 +238,4 @@ def _linearised(kind: Kind, system, t, q, v, params) -> tuple[Linearisation, Ste
         kind=kind,
         names=tuple(coordinates.names(q)),
     )
-    return found, steadiness
+    return linearisation, steadiness

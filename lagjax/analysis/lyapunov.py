@@ -1,15 +1,16 @@
-"""Lyapunov exponents: how fast neighbouring motions part in the long run.
+"""Lyapunov exponents: how fast neighbouring motions separate in the long run.
 
-A frame of tangents is carried along by the flow and made orthonormal again and again, Y = Q R. The logarithms of the
-diagonal of R, over the time they took, are the rates at which tangents, areas, volumes grow, and their means the
-exponents λ_1 ≥ λ_2 ≥ ...  On constraints the tangents are those of the manifold.
+The flow carries a frame of tangents, which is repeatedly made orthonormal, Y = Q R. The logarithms of the diagonal of
+R, divided by the elapsed time, are the rates at which tangents, areas, volumes grow; their means are the exponents λ_1
+≥ λ_2 ≥ ...  With constraints the tangents are those of the constraint manifold.
 
-All of them together sum to the mean of tr P J (`flow.py`): zero without damping, and in pairs ±λ; a damping force -c v
-of unit masses makes each pair sum to -c.
+The sum of all exponents is the mean of tr P J (`flow.py`). Without damping it is zero and exponents come in pairs ±λ; a
+damping force -c v on unit masses makes each pair sum to -c.
 
-A motion of finite length T does not have an exponent but an estimate of it. Its spread is that of the means over ten
-parts of the motion. And a growth that is no exponential one, as between regular motions of different periods, whose
-distance grows like t, cannot be told from an exponent of about log(t)/t: a factor of ten counts as uncertain.
+A motion of finite length T gives only an estimate of an exponent. The spread of the means over ten parts of the motion
+measures its uncertainty. Growth that is not exponential, such as the distance between regular motions of different
+periods, which grows like t, cannot be distinguished from an exponent of about log(t)/t. The uncertainty therefore
+includes one growth by a factor of ten.
 
 Source: Benettin, Galgani, Giorgilli & Strelcyn, *Meccanica* 15 (1980) 9 and 21; Eckmann & Ruelle, *Rev. Mod. Phys.* 57
 (1985) 617, §IV.
@@ -29,26 +30,28 @@ from lagjax.mechanics.compiled import compiled
 from lagjax.mechanics.refusals import by_name
 from lagjax.mechanics.system import System
 
-# Less than for a cycle: what follows from a motion that forgets its start does not depend on all its digits.
+# Looser than for a cycle: averages over a motion that forgets its start do not depend on all its digits.
 TOLERANCE = {np.dtype("float64"): 1e-9, np.dtype("float32"): 1e-5}
-# The part of a motion in which the frame finds its directions, and the parts of the rest by which the spread is known.
+# The fraction of a motion in which the frame settles, the number of parts of the rest from which the spread is
+# computed, and the smallest number of times.
 SETTLING, BLOCKS, FEWEST = 0.25, 10, 24
-# Twice the standard deviation of the mean.
-SURE = 2.0
-# What may have grown once.
-ONCE = np.log(10.0)
+# The uncertainty in standard deviations of the mean.
+DEVIATIONS = 2.0
+# The logarithm of the growth that may have happened once without being exponential.
+SINGLE_GROWTH = np.log(10.0)
 
 
 class LyapunovExponents(eqx.Module):
     """The largest Lyapunov exponents of a motion, and how uncertain they are. It prints and plots itself.
 
-    - `exponents` (count,), `1/[t]`, in falling order but for their uncertainty.
-    - `uncertainty` (count,), likewise: twice the standard deviation of the mean, what the later half of it would
-      change alone, and what a growth by a factor of ten would make that comes once, together.
-    - `t` (T,): the times, `[t]`. `growth` (T-1, count): the logarithms of the growth from each to the next.
-    - `volume` (T-1,): those of the volume by Liouville's formula where all exponents were asked for; else 0.
-    - `settled`: from which time on growth counts.
-    - `ended`: whether the motion could be followed to its end; the exponents are NaN if not.
+    - `exponents` (count,), `1/[t]`, in falling order to within their uncertainty.
+    - `uncertainty` (count,), `1/[t]`: the root sum of squares of twice the standard deviation of the mean, the change
+      if only the later half is used, and the effect of one growth by a factor of ten.
+    - `t` (T,): the times, `[t]`. `growth` (T-1, count): the logarithm of the growth from each time to the next.
+    - `volume` (T-1,): the logarithm of the growth of the volume by Liouville's formula if all exponents were requested,
+      else 0.
+    - `settled`: the time from which growth is counted.
+    - `ended`: whether the motion could be followed to its end; if not, the exponents are NaN.
 
     Under `vmap` every array has the batch's axes in front.
     """
@@ -64,18 +67,18 @@ class LyapunovExponents(eqx.Module):
 
     @property
     def sensitive(self) -> Bool[Array, ""]:
-        """Whether neighbours part exponentially: the largest exponent is above zero by more than its uncertainty."""
+        """Whether neighbours separate exponentially: the largest exponent exceeds zero by more than its uncertainty."""
         return self.exponents[..., 0] > self.uncertainty[..., 0]
 
     @property
     def liouville(self) -> Float[Array, ""]:
-        """What all of them sum to by Liouville's formula; NaN where not all were asked for."""
-        first = _first(self.t.shape[-1])
+        """The sum of all exponents by Liouville's formula; NaN unless all were requested."""
+        first = _first_counted(self.t.shape[-1])
         mean = jnp.sum(self.volume[..., first:], axis=-1) / (self.t[..., -1] - self.t[..., first])
         return mean if self.all_of_them else jnp.full_like(mean, jnp.nan)
 
     def running(self) -> Float[Array, "T-1 count"]:
-        """The mean growth from the first time to each of the others, by which one sees whether it settles."""
+        """The mean growth from the first time to each of the others, which shows whether the exponents settle."""
         return jnp.cumsum(self.growth, axis=-2) / (self.t[..., 1:] - self.t[..., :1])[..., None]
 
     def plot(self):
@@ -85,7 +88,7 @@ class LyapunovExponents(eqx.Module):
         """
         if np.ndim(self.settled):
             raise ValueError(
-                f"these are of a batch of shape {np.shape(self.settled)}: draw one lane of it.\n"
+                f"these are exponents of a batch of shape {np.shape(self.settled)}: draw one lane of it.\n"
                 "Fix: jax.tree.map(lambda x: x[0], found).plot()"
             )
         curves = {f"λ{i + 1}": curve for i, curve in enumerate(np.asarray(self.running()).T)}
@@ -131,10 +134,11 @@ def lyapunov_exponents(
 
     **Arguments:**
 
-    - `system`, `q`, `v`, `params`: as in `lj.integrate`. On constraints the nearest state that satisfies them is taken.
-    - `ts` (T,): increasing times, `[t]`, at which the tangents are made orthonormal again: often enough for them not to
-      grow beyond 1e6 or so in between. The first quarter of them serves for finding the directions.
-    - `count`: how many; at most twice the coordinates, less what constraints take away.
+    - `system`, `q`, `v`, `params`: as in `lj.integrate`. The state is moved to the nearest one that satisfies the
+      constraints.
+    - `ts` (T,): increasing times, `[t]`, at which the tangents are made orthonormal again, close enough that they do
+      not grow by more than about 1e6 in between. In the first quarter of them the directions settle.
+    - `count`: how many exponents; at most twice the number of coordinates, minus what constraints take away.
     - `rtol`: the tolerance of the steps; 1e-9 by default in float64, 1e-5 in float32.
 
     **Returns:** a `LyapunovExponents`.
@@ -152,12 +156,12 @@ def lyapunov_exponents(
     most = 2 * flow.size - len(flow.rows)
     if not (isinstance(count, int) and 1 <= count <= most):
         raise ValueError(
-            f"count must be between 1 and {most}, not {count!r}: so many directions there are to part in.\n"
+            f"count must be between 1 and {most}, not {count!r}: the state space has {most} directions.\n"
             f"Fix: count={most} for all of them."
         )
     rtol = np.asarray(TOLERANCE.get(np.dtype(s.t.dtype), 1e-5) if rtol is None else rtol, s.t.dtype)
-    found = _grown(problem.system, *s, ts.astype(s.t.dtype), rtol, problem.rows, count)
-    exponents = LyapunovExponents(*found, count == most)
+    estimates = _followed(problem.system, *s, ts.astype(s.t.dtype), rtol, problem.rows, count)
+    exponents = LyapunovExponents(*estimates, count == most)
     if not coordinates.is_traced(exponents) and not bool(exponents.ended):
         refuse_singular(problem)
     return exponents
@@ -167,7 +171,7 @@ def _check(ts):
     if ts.ndim != 1 or len(ts) < FEWEST:
         raise ValueError(
             f"ts must be a vector of at least {FEWEST} times, and has shape {ts.shape}.\n"
-            "Usual cause: the end alone; between two times tangents would grow until nothing is left of the others.\n"
+            "Usual cause: only the end time; between two distant times the fastest-growing tangent hides all others.\n"
             "Fix: ts=jnp.linspace(0.0, 1000.0, 1001)."
         )
     if not coordinates.is_traced(ts) and not np.all(np.asarray(ts[1:] > ts[:-1])):
@@ -175,13 +179,13 @@ def _check(ts):
 
 
 @compiled
-def _grown(system, t, q, v, params, ts, rtol, rows, count):
+def _followed(system, t, q, v, params, ts, rtol, rows, count):
     flow = flow_of(system, t, q, v, params, rtol, rows)
     z = flow.vector(q, v)
     scale = _scale(flow, t, z)
     z = flow.onto_constraints(t, z, scale)
     basis = flow.tangent_space(t, z, scale)
-    # Of no special direction, and the same each time.
+    # Generic directions, the same at each call.
     chosen = np.random.default_rng(0).normal(size=(basis.shape[1], count)).astype(basis.dtype)
     frame, _ = _orthonormal(basis @ chosen)
 
@@ -201,41 +205,41 @@ def _grown(system, t, q, v, params, ts, rtol, rows, count):
     exponents, uncertainty = _estimates(ts, growth)
     ended = ended & jnp.all(jnp.isfinite(growth))
     exponents, uncertainty = (jnp.where(ended, x, jnp.nan) for x in (exponents, uncertainty))
-    return exponents, uncertainty, ts, growth, volume, ts[_first(len(ts))], ended
+    return exponents, uncertainty, ts, growth, volume, ts[_first_counted(len(ts))], ended
 
 
 def _orthonormal(frame):
-    """Q of Y = Q R, and the logarithms of the diagonal of R."""
+    """Q of Y = Q R, and the logarithms of the diagonal entries of R."""
     q, r = jnp.linalg.qr(frame)
     return q, jnp.log(jnp.abs(jnp.diagonal(r)))
 
 
-def _first(times):
-    """From which of the times on growth counts."""
-    return int(SETTLING * (times - 1))
+def _first_counted(count):
+    """The index of the time from which growth is counted."""
+    return int(SETTLING * (count - 1))
 
 
 def _estimates(ts, growth):
-    first = _first(len(ts))
+    first = _first_counted(len(ts))
     mean = lambda a, b: jnp.sum(growth[a:b], axis=0) / (ts[b] - ts[a])
     edges = np.linspace(first, len(ts) - 1, BLOCKS + 1).astype(int)
     blocks = jnp.stack([mean(a, b) for a, b in zip(edges[:-1], edges[1:])])
-    spread = SURE * jnp.std(blocks, axis=0, ddof=1) / np.sqrt(BLOCKS)
+    spread = DEVIATIONS * jnp.std(blocks, axis=0, ddof=1) / np.sqrt(BLOCKS)
     middle, last = edges[BLOCKS // 2], len(ts) - 1
     later = mean(middle, last) - mean(first, last)
-    once = ONCE / (ts[last] - ts[first])
-    return mean(first, last), jnp.sqrt(spread**2 + later**2 + once**2)
+    single = SINGLE_GROWTH / (ts[last] - ts[first])
+    return mean(first, last), jnp.sqrt(spread**2 + later**2 + single**2)
 
 
 def _scale(flow, t, z):
-    """Sizes of coordinates and velocities, by the state and how fast it changes; never zero."""
+    """Sizes of coordinates and velocities, from the state and how fast it changes; never zero."""
     x, u = jnp.split(jnp.abs(lax.stop_gradient(z)), 2)
     a = jnp.abs(lax.stop_gradient(flow.rate(t, z)))[flow.size :]
     of_x, of_u, of_a = (jnp.max(y) for y in (x, u, a))
     of_x = jnp.where(of_x > 0, of_x, 1.0)
     rate = jnp.maximum(of_u / of_x, jnp.sqrt(of_a / of_x))
     rate = jnp.where(rate > 0, rate, 1.0)
-    own = jnp.maximum(x, u / rate)
-    largest = jnp.max(own)
-    own = jnp.where(own > 1e-3 * largest, own, jnp.where(largest > 0, largest, 1.0))
-    return jnp.concatenate([own, own * rate])
+    size = jnp.maximum(x, u / rate)
+    largest = jnp.max(size)
+    size = jnp.where(size > 1e-3 * largest, size, jnp.where(largest > 0, largest, 1.0))
+    return jnp.concatenate([size, size * rate])

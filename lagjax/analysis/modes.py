@@ -19,10 +19,10 @@ from lagjax.mechanics.compiled import compiled
 
 
 class Mode(eqx.Module):
-    """One small motion, `Re(shape · exp(root · t))` times any size.
+    """One small motion, `Re(shape · exp(root · t))` times an arbitrary factor.
 
-    - `root`: growth + i frequency, `[1/t]`. `shape`: like q, complex, its largest entry one.
-    - `energy`: its sign, 0 where it does not oscillate steadily or the system is not conservative.
+    - `root`: growth + i frequency, `[1/t]`. `shape`: like q, complex, its largest entry is one.
+    - `energy`: its sign, 0 if the mode does not oscillate steadily or the system is not conservative.
     - `double`: another mode has the same root.
     """
 
@@ -35,16 +35,16 @@ class Mode(eqx.Module):
 
     @property
     def frequency(self) -> Float[Array, ""]:
-        """Radians a unit of time."""
+        """The frequency in radians per unit of time."""
         return jnp.imag(self.root)
 
     @property
     def growth(self) -> Float[Array, ""]:
-        """By how much the logarithm of its size grows in a unit of time."""
+        """The rate at which the logarithm of the amplitude grows, per unit of time."""
         return jnp.real(self.root)
 
     def plot(self):
-        """Plot how much each coordinate moves, with its phase, and the motion; returns a matplotlib `Figure`.
+        """Plot the amplitude and phase of each coordinate, and the motion; returns a matplotlib `Figure`.
 
         **Raises:** `ImportError` without matplotlib.
         """
@@ -53,13 +53,13 @@ class Mode(eqx.Module):
     def animate(self, positions, *, amplitude=0.2, seconds: float = 6.0, rate: float = 25.0, trail: float = 0.0):
         """Play the mode: points in the plane, as `Trajectory.animate` draws them.
 
-        **Arguments:** `positions(t, q, params)` -> points, see `lj.Trajectory.animate`; `amplitude`: how far the
-        coordinate moves that moves farthest, `[q]`; `seconds`, `rate`, `trail`: of the film.
+        **Arguments:** `positions(t, q, params)` -> points, see `lj.Trajectory.animate`; `amplitude`: the
+        amplitude of the coordinate that moves most, `[q]`; `seconds`, `rate`, `trail`: of the film.
 
-        **Returns:** an `Animation` of some periods on top of the steady motion; of a mode that grows or decays, of a
-        few times in which it does by a factor e.
+        **Returns:** an `Animation` of a few periods on top of the steady motion; for a mode that grows or decays, of a
+        few times the time in which it does so by a factor e.
 
-        **Raises:** `ValueError` for positions that are no points of the plane.
+        **Raises:** `ValueError` for positions that are not points of the plane.
         """
         return animated(self, positions, amplitude, seconds, rate, trail)
 
@@ -70,19 +70,19 @@ class Mode(eqx.Module):
 class NormalModes(eqx.Module):
     """The small motions about a steady one, by ascending frequency. They print and plot themselves; `modes[i]` is one.
 
-    - `roots` (k,): growth + i frequency of each, `[1/t]`; `frequency`, `growth`: its parts. Of two roots that are one
-      motion (conjugates; in a conservative system also λ and -λ) there is one; while JAX is tracing, all roots of a
-      system that is not conservative are here, those of negative frequency last.
+    - `roots` (k,): growth + i frequency of each, `[1/t]`; `frequency`, `growth`: their parts. Two roots that describe
+      the same motion (conjugates; in a conservative system also λ and -λ) are listed once. While JAX is tracing, all
+      roots of a non-conservative system are listed, those of negative frequency last.
     - `shapes`: like q, complex, with a leading axis k; the largest entry of each is one.
-    - `energy` (k,): the sign of the energy of what oscillates; 0 for all else.
-    - `zero` (k,): roots that are zero. `growing` (k,): those that grow. `double` (k,): another one is the same: then
-      derivatives are of the mean of both, or zero where both share their shape.
-    - `code`, `stable`: the `verdict` as a number (its place in `lj.NormalModes.VERDICTS`), and whether nothing grows.
-    - `unexplained`: how many zeros may be those of a critical point; outside of compiled programs it has been tried
-      whether they lead to other equilibria.
-    - `linearisation`: the `Linearisation` that this is of.
+    - `energy` (k,): the sign of the energy of each steadily oscillating mode; 0 for the others.
+    - `zero` (k,): whether the root is zero. `growing` (k,): whether the mode grows. `double` (k,): whether another root
+      is the same; its derivatives are then those of the mean of both, or zero if both share their shape.
+    - `code`, `stable`: the `verdict` as a number (its index in `lj.NormalModes.VERDICTS`), and whether nothing grows.
+    - `unexplained`: how many zero roots may be those of a critical point. Outside of compiled programs, those that lead
+      to other equilibria are not counted.
+    - `linearisation`: the `Linearisation` that has these modes.
 
-    Derivatives flow to `roots`, of first and second order, and to `shapes`, of first.
+    `roots` have first and second derivatives, `shapes` first derivatives.
     """
 
     roots: Complex[Array, " k"]
@@ -100,17 +100,17 @@ class NormalModes(eqx.Module):
 
     @property
     def frequency(self) -> Float[Array, " k"]:
-        """Radians a unit of time, of each mode."""
+        """The frequency of each mode in radians per unit of time."""
         return jnp.imag(self.roots)
 
     @property
     def growth(self) -> Float[Array, " k"]:
-        """By how much the logarithm of each mode grows in a unit of time."""
+        """The rate at which the logarithm of each mode's amplitude grows, per unit of time."""
         return jnp.real(self.roots)
 
     @property
     def stable(self) -> Bool[Array, ""]:
-        """Whether no small motion grows, but for zero modes, along which a shift lasts."""
+        """Whether no small motion grows; along zero modes a shift persists."""
         return self.code <= GYROSCOPIC
 
     @property
@@ -120,7 +120,7 @@ class NormalModes(eqx.Module):
 
     @property
     def reason(self) -> str:
-        """Why."""
+        """The reason for the verdict, in one sentence."""
         return reason_of(self)
 
     def __len__(self):
@@ -155,10 +155,10 @@ class NormalModes(eqx.Module):
             rows.append("  double roots: their derivatives are those of the mean, or zero where they share a shape")
         if self.roots.dtype == np.complex64 and len(self):
             known = 1e2 * np.finfo(np.float32).eps * float(np.max(np.abs(self.roots)))
-            rows.append(f"  in float32: what is smaller than {known:.1e} is not told from zero")
+            rows.append(f"  in float32: values below {known:.1e} cannot be distinguished from zero")
         residual = float(self.linearisation.residual)
         if residual > 1e-10:
-            rows.append(f"  the state is steady to {residual:.1e} of its size: roots are known to as much")
+            rows.append(f"  the state is steady to {residual:.1e} of its size: the roots are as accurate")
         return "\n".join(rows)
 
 
@@ -187,58 +187,60 @@ def normal_modes(system, t=None, q=None, v=None, params=None) -> NormalModes:
     Source: Goldstein, *Classical Mechanics*, §6.2-6.3; Meirovitch, *Methods of Analytical Dynamics*, §6 and §9;
     Kirillov, *Nonconservative Stability Problems of Modern Physics*, ch. 3 and 5.
     """
-    found = system if isinstance(system, Linearisation) else linearise(system, t, q, v, params)
-    motions = _motions(found, True)
+    linearisation = system if isinstance(system, Linearisation) else linearise(system, t, q, v, params)
+    motions = _motions(linearisation, True)
     if not is_eager() or coordinates.is_traced(motions):
-        return _collected(found, motions)
+        return _collected(linearisation, motions)
     if not np.all(np.isfinite(motions.roots)):
-        # A mass matrix that is regular and not positive definite.
-        motions = _motions(found, False)
+        # The mass matrix is regular but not positive definite.
+        motions = _motions(linearisation, False)
     kept = ~np.asarray(motions.mirrored)
     of_modes = jax.tree.map(lambda x: np.asarray(x)[kept] if np.ndim(x) else np.asarray(x), motions)
     words = []
-    if not found.kind.conservative:
-        shapes, words = with_neutral(found, of_modes.shapes, of_modes.zero)
+    if not linearisation.kind.conservative:
+        shapes, words = with_neutral(linearisation, of_modes.shapes, of_modes.zero)
         of_modes = of_modes._replace(shapes=shapes)
     if int(of_modes.code) == UNDECIDED and int(of_modes.unexplained) and not isinstance(system, Linearisation):
-        of_modes = _with_symmetries(system, found, of_modes)
-    return _collected(found, of_modes, tuple(words))
+        of_modes = _with_symmetries(system, linearisation, of_modes)
+    return _collected(linearisation, of_modes, tuple(words))
 
 
-def _with_symmetries(system, found, motions: Motions) -> Motions:
-    """The motions, stable where what is zero leads to other equilibria."""
-    unseen = np.array(found.kind.unseen, bool)
+def _with_symmetries(system, linearisation, motions: Motions) -> Motions:
+    """The motions, with a stable verdict if the zero modes lead to other equilibria."""
+    unseen = np.array(linearisation.kind.unseen, bool)
     explained = np.all(np.abs(motions.shapes[:, ~unseen]) <= 1e-6, axis=1)
-    _, unflatten = coordinates.flatten(found.state.q)
-    at = lambda x: linearised(found.kind, system, found.state._replace(q=unflatten(jnp.asarray(x, found.mass.dtype))))
-    if not leads_to_others(found, motions.shapes[motions.zero & ~explained], at):
+    _, unflatten = coordinates.flatten(linearisation.state.q)
+    at = lambda x: linearised(
+        linearisation.kind, system, linearisation.state._replace(q=unflatten(jnp.asarray(x, linearisation.mass.dtype)))
+    )
+    if not leads_to_others(linearisation, motions.shapes[motions.zero & ~explained], at):
         return motions
     lasting = ~motions.zero
-    decays = not found.kind.conservative and bool(np.all(motions.roots.real[lasting] < 0))
+    decays = not linearisation.kind.conservative and bool(np.all(motions.roots.real[lasting] < 0))
     code = ASYMPTOTIC if decays else GYROSCOPIC if np.any(motions.energies < 0) else STABLE
     return motions._replace(code=np.asarray(code, motions.code.dtype), unexplained=np.zeros_like(motions.unexplained))
 
 
 @compiled
-def _motions(found: Linearisation, definite: bool) -> Motions:
-    return motions_of(found, definite)
+def _motions(linearisation: Linearisation, definite: bool) -> Motions:
+    return motions_of(linearisation, definite)
 
 
-def _collected(found, motions: Motions, zero_words=()) -> NormalModes:
+def _collected(linearisation, motions: Motions, zero_words=()) -> NormalModes:
     shapes, start = [], 0
-    for leaf in jax.tree.leaves(found.state.q):
+    for leaf in jax.tree.leaves(linearisation.state.q):
         size = int(np.size(leaf))
         shapes.append(motions.shapes[:, start : start + size].reshape(-1, *np.shape(leaf)))
         start += size
     return NormalModes(
         roots=motions.roots,
-        shapes=jax.tree.unflatten(jax.tree.structure(found.state.q), shapes),
+        shapes=jax.tree.unflatten(jax.tree.structure(linearisation.state.q), shapes),
         energy=motions.energies,
         zero=motions.zero,
         growing=motions.growing,
         double=motions.double,
         code=motions.code,
         unexplained=motions.unexplained,
-        linearisation=found,
+        linearisation=linearisation,
         zero_words=zero_words,
     )

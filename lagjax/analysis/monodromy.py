@@ -1,12 +1,12 @@
-"""The monodromy matrix of a motion, and its eigenvalues with those taken out that are 1 for a reason.
+"""The monodromy matrix of a motion, and its eigenvalues, with the trivial ones (1 for a known reason) deflated.
 
-With an orthonormal basis B of the tangent space of the constraints, and the rows Q of what is trivial made orthonormal
-(`trivial.py`), the motion takes B w to B N w, and
+With an orthonormal basis B of the tangent space of the constraints, and orthonormal rows Q of the trivial directions
+(`trivial.py`), the motion takes B w to B N w. The eigenvalues of
 
     (1 - QᵀQ) N (1 - QᵀQ) + QᵀQ
 
-has the multipliers that are not trivial, and 1 exactly for each row of Q. A motion in several parts, from node to node,
-has the product of their matrices.
+are the nontrivial multipliers, and exactly 1 for each row of Q. For a motion in several parts, from node to node, N is
+the product of their matrices.
 """
 
 from typing import NamedTuple
@@ -29,16 +29,16 @@ from lagjax.mechanics.first_call import looked_at
 from lagjax.mechanics.refusals import check_system
 from lagjax.mechanics.structure import angles
 
-# The second run's tolerance, by which the first is judged.
+# The factor on the tolerance of the second run, which measures the error of the first.
 LOOSER = 10.0
 TURN = 2 * np.pi
 
 
 class Period(NamedTuple):
-    """What a period of a motion says, before it is put in words.
+    """The numerical results of following a motion for a period.
 
-    `multipliers` are sorted, the `trivial` ones first; `reasons` (r,) are those of `trivial.py` that there are.
-    `apart`: how far the end is from the start, in units of the state.
+    `multipliers` are sorted, the `trivial` ones first; `reasons` (r,): which reasons of `trivial.py` apply. `reduced`:
+    N. `apart`: how far the end is from the start, in units of the state.
     """
 
     multipliers: Complex[Array, " k"]
@@ -52,7 +52,7 @@ class Period(NamedTuple):
 
 
 class Problem(NamedTuple):
-    """A system that was looked at, and what its programs tell, all static but for the first two."""
+    """A checked system and its state, and what its programs show; all but these two are static."""
 
     system: object
     state: State
@@ -62,7 +62,7 @@ class Problem(NamedTuple):
 
 
 def problem_of(system, t, q, v, params) -> Problem:
-    """Look at a system at a state; where JAX traces nothing, dependent constraints are found and left out."""
+    """Check a system at a state; unless JAX is tracing, dependent constraints are found and left out."""
     check_system(system, q, v, params)
     s = coordinates.prepared(t, q, v, params)
     system = lift(looked_at(system, s), s)
@@ -73,7 +73,7 @@ def problem_of(system, t, q, v, params) -> Problem:
 
 
 def refuse_singular(problem: Problem):
-    """Raise in the user's words where the equations fail at the state; for what could not be followed."""
+    """After a motion could not be followed: raise, in the user's names, if the equations fail at its start."""
     words = explain_failure(problem.system, coordinates.state(*problem.state))
     if words is not None:
         raise ValueError(words)
@@ -93,32 +93,32 @@ def _check_freedom(system, state, rows):
 
 
 def angle_entries(system, t, q, v, params) -> tuple[bool, ...]:
-    """Which coordinates are angles, one by one."""
-    found = zip(*map(jax.tree.leaves, (angles(system, t, q, v, params), q)))
-    return tuple(bool(yes) for yes, x in found for _ in range(np.size(x)))
+    """For each coordinate, whether it is an angle."""
+    leaves = zip(*map(jax.tree.leaves, (angles(system, t, q, v, params), q)))
+    return tuple(bool(yes) for yes, x in leaves for _ in range(np.size(x)))
 
 
 def tolerance_of(rtol, dtype):
-    """The tolerance of the steps, by default the tightest that costs little."""
+    """The tolerance of the steps; the default is the tightest that costs little."""
     return np.asarray(TOLERANCE.get(np.dtype(dtype), 1e-5) if rtol is None else rtol, dtype)
 
 
 def period_of(problem: Problem, period, rtol, nodes=None) -> tuple[Period, Float[Array, ""]]:
-    """What a period says, and how far the entries of the matrix may be off; by a second run where nothing is traced."""
+    """The results of a period, and the error of the entries of N; measured by a second run unless JAX is tracing."""
     system, s, reasons, rows, is_angle = problem
     eager = is_eager() and not coordinates.is_traced((s, period, nodes))
-    # Written out, the stages run in a third of the time and take three times as long to compile: for sweeps.
+    # Unrolled stages run in a third of the time but take three times as long to compile, which pays off in sweeps.
     in_a_loop = not WATCHED.value or sum(np.size(x) for x in jax.tree.leaves(s.q)) > 1
     rtol, period = tolerance_of(rtol, s.t.dtype), coordinates.numpy_of(period).asarray(period, s.t.dtype)
     run = lambda rtol: _period(system, *s, nodes, period, rtol, reasons, rows, is_angle, in_a_loop, not eager)
-    found = run(rtol)
+    first = run(rtol)
     if eager:
-        looser = run(LOOSER * rtol)
-        error = np.max(np.abs(np.asarray(found.reduced) - np.asarray(looser.reduced)))
-        return found, jnp.asarray(error)
-    # Of the product alone, and no less than what the steps are asked for.
-    off = jnp.abs(jnp.linalg.det(lax.stop_gradient(found.reduced)) * jnp.exp(-lax.stop_gradient(found.log_volume)) - 1)
-    return found, jnp.maximum(off, LOOSER * rtol) * jnp.maximum(1.0, jnp.max(jnp.abs(lax.stop_gradient(found.reduced))))
+        second = run(LOOSER * rtol)
+        error = np.max(np.abs(np.asarray(first.reduced) - np.asarray(second.reduced)))
+        return first, jnp.asarray(error)
+    # Only the product of the multipliers is known independently; the error is at least the tolerance of the steps.
+    off = jnp.abs(jnp.linalg.det(lax.stop_gradient(first.reduced)) * jnp.exp(-lax.stop_gradient(first.log_volume)) - 1)
+    return first, jnp.maximum(off, LOOSER * rtol) * jnp.maximum(1.0, jnp.max(jnp.abs(lax.stop_gradient(first.reduced))))
 
 
 @compiled
@@ -149,28 +149,28 @@ def _period(system, t, q, v, params, nodes, period, rtol, reasons, rows, is_angl
 
 
 def _without(rows, matrix):
-    """The matrix with what is trivial taken out, and ones in its place."""
+    """The matrix with eigenvalue 1 in the directions of `rows`, which are decoupled from the rest."""
     rest = jnp.eye(matrix.shape[0], dtype=matrix.dtype) - rows.T @ rows
     return rest @ matrix @ rest + rows.T @ rows
 
 
 def _sorted(matrix, trivial):
-    """The eigenvalues: those nearest to 1, of which `trivial` are exactly that, and then by size."""
+    """The eigenvalues: first the `trivial` ones, which are exactly 1, then the others by falling size."""
     finite = jnp.all(jnp.isfinite(matrix))
-    # LAPACK need not return from what is not finite.
-    found = jnp.linalg.eigvals(jnp.where(finite, matrix, jnp.eye(len(matrix), dtype=matrix.dtype)))
-    found = jnp.where(finite, found, jnp.nan)
-    near = jnp.argsort(jnp.argsort(jnp.abs(lax.stop_gradient(found) - 1)))
+    # LAPACK may not return if the matrix is not finite.
+    eigenvalues = jnp.linalg.eigvals(jnp.where(finite, matrix, jnp.eye(len(matrix), dtype=matrix.dtype)))
+    eigenvalues = jnp.where(finite, eigenvalues, jnp.nan)
+    near = jnp.argsort(jnp.argsort(jnp.abs(lax.stop_gradient(eigenvalues) - 1)))
     first = near < trivial
-    size = jnp.abs(lax.stop_gradient(found))
-    # Of a conjugate pair, whose sizes round differently, the upper one comes first.
-    size = jnp.round(size / jnp.max(size), 9) + 1e-12 * jnp.sign(jnp.imag(lax.stop_gradient(found)))
+    size = jnp.abs(lax.stop_gradient(eigenvalues))
+    # Rounded because the sizes of a conjugate pair differ by round-off; the one in the upper half plane comes first.
+    size = jnp.round(size / jnp.max(size), 9) + 1e-12 * jnp.sign(jnp.imag(lax.stop_gradient(eigenvalues)))
     order = jnp.argsort(jnp.where(first, -jnp.inf, -size))
-    return found[order], first[order]
+    return eigenvalues[order], first[order]
 
 
 def _apart(flow, reasons, is_angle, difference, scale):
-    """How far a state is from where it began, but for whole turns and what nothing depends on."""
+    """How far a state is from its start, ignoring whole turns and coordinates that nothing depends on."""
     x, u = jnp.split(lax.stop_gradient(difference), 2)
     x = jnp.where(np.array(is_angle), x - TURN * jnp.round(x / TURN), x)
     x = jnp.where(np.array(reasons.ignorable), 0.0, x)

@@ -1,13 +1,13 @@
-"""From the linear equations to their modes: roots, shapes, energies, and what they mean together.
+"""From the linear equations to their modes: roots, shapes, energies, and the verdict on stability.
 
-A coordinate that nothing depends on has a momentum; without force it is conserved, and at its value of the steady
-motion the others have equations of their own (Routh's),
+In a conservative system the momentum of a coordinate that nothing depends on is conserved. With this momentum fixed at
+its value in the steady motion, the other coordinates have equations of their own (Routh's),
 
     M_e = M - M_c m⁻¹ M_cᵀ,    G_e = G - M_c m⁻¹ g - (..)ᵀ,    K_e = K + gᵀ m⁻¹ g
 
-with m, M_c, g the parts of M and G of these coordinates. So a conservative system has no roots of zero but those of a
-singular K_e. Of at most quadratic energy E₂ = ½ ξ̇ᵀ M ξ̇ + ½ ξᵀ K ξ a mode that oscillates with ω has the sign of
-xᴴ (ω² M + K) x: where it is negative, damping makes it grow.
+where m, M_c, g are the blocks of M and G of the eliminated coordinates. A conservative system then has zero roots only
+if K_e is singular. A mode that oscillates with ω contributes to the quadratic energy E₂ = ½ ξ̇ᵀ M ξ̇ + ½ ξᵀ K ξ with
+the sign of xᴴ (ω² M + K) x; if this is negative, damping makes the mode grow.
 
 Source: Goldstein, *Classical Mechanics*, §8.3 (Routh); Krein's signature and Kelvin-Tait-Chetaev's theorem: Kirillov,
 *Nonconservative Stability Problems of Modern Physics*, ch. 3 and 5; Merkin, *Introduction to the Theory of Stability*,
@@ -30,12 +30,12 @@ STEADY_BELOW = 1e-5
 
 
 class Motions(NamedTuple):
-    """All that is computed of small motions, sorted; k of them.
+    """The k small motions, sorted.
 
-    - `roots`, `shapes` (k, N): of all coordinates. `mirrored`: of each two roots that are one motion, the second.
+    - `roots` (k,); `shapes` (k, N): in all coordinates. `mirrored`: the second of two roots that describe one motion.
     - `energies`: -1, 0 or 1. `double`: derivatives are those of the mean of a double root, or dropped.
-    - `zero`: roots that are zero; `growing`: those that grow by more than round-off.
-    - `unexplained`: how many roots of zero no coordinate and no velocity constraint explains.
+    - `zero`: roots that are zero; `growing`: roots that grow by more than round-off.
+    - `unexplained`: the number of zero roots that no ignorable coordinate and no velocity constraint explains.
     """
 
     roots: Complex[Array, " k"]
@@ -50,7 +50,7 @@ class Motions(NamedTuple):
 
 
 class _Reduced(NamedTuple):
-    """Routh's equations of the coordinates that something depends on; `follow`, `with_rate`: what the others do."""
+    """Routh's equations in d coordinates; the rates of the c others are `follow` x + `with_rate` ẋ."""
 
     mass: Float[Array, "d d"]
     velocity: Float[Array, "d d"]
@@ -59,19 +59,19 @@ class _Reduced(NamedTuple):
     with_rate: Float[Array, "c d"]
 
 
-def motions_of(found: Linearisation, definite: bool = True) -> Motions:
-    """The motions of a linearisation; `definite`: take the mass matrix for positive definite."""
-    if not found.kind.conservative:
-        return _judged(found, _of_first_order(found))
-    if definite and (found.kind.at_rest or found.parts.positions.shape[1] < 2):
-        return _judged(found, _at_rest(found))
-    return _judged(found, _gyroscopic(found))
+def motions_of(linear: Linearisation, definite: bool = True) -> Motions:
+    """The motions of a linearisation; `definite`: assume that the mass matrix is positive definite."""
+    if not linear.kind.conservative:
+        return _judged(linear, _general(linear))
+    if definite and (linear.kind.at_rest or linear.parts.positions.shape[1] < 2):
+        return _judged(linear, _at_rest(linear))
+    return _judged(linear, _gyroscopic(linear))
 
 
-def _routh(found) -> _Reduced:
-    c = len(found.shifts)
-    mass = jnp.where(found.sound, found.parts.mass, jnp.eye(found.parts.mass.shape[0], dtype=found.mass.dtype))
-    velocity, position = (jnp.where(found.sound, x, 0.0) for x in (found.parts.velocity, found.parts.position))
+def _routh(linear) -> _Reduced:
+    c = len(linear.shifts)
+    mass = jnp.where(linear.sound, linear.parts.mass, jnp.eye(linear.parts.mass.shape[0], dtype=linear.mass.dtype))
+    velocity, position = (jnp.where(linear.sound, x, 0.0) for x in (linear.parts.velocity, linear.parts.position))
     M, G, K = mass[c:, c:], velocity[c:, c:], position[c:]
     if not c:
         return _Reduced(M, G, K, M[:0], M[:0])
@@ -84,16 +84,16 @@ def _routh(found) -> _Reduced:
     )
 
 
-def _at_rest(found) -> Motions:
-    """No gyroscopic forces: squares of frequencies."""
-    reduced = _routh(found)
+def _at_rest(linear) -> Motions:
+    """Without gyroscopic forces: the eigenvalues are the squares of the frequencies."""
+    reduced = _routh(linear)
     if reduced.mass.shape[0]:
         roots = symmetric_roots(reduced.position, reduced.mass)
     else:
-        none = jnp.zeros(0, found.mass.dtype)
-        roots = Roots(none, jnp.zeros((0, 0), found.mass.dtype), none, none > 0, none > 0)
+        empty = jnp.zeros(0, linear.mass.dtype)
+        roots = Roots(empty, jnp.zeros((0, 0), linear.mass.dtype), empty, empty > 0, empty > 0)
     squares = roots.values
-    # What is left of terms that cancel.
+    # The round-off that remains when terms cancel.
     x = lax.stop_gradient(jnp.abs(roots.vectors))
     noise = jnp.sum(x * (jnp.abs(lax.stop_gradient(reduced.position)) @ x), axis=0)
     zero = jnp.abs(squares) <= 1e2 * jnp.finfo(squares.dtype).eps * noise
@@ -104,13 +104,13 @@ def _at_rest(found) -> Motions:
     x = roots.vectors.astype(values.dtype)
     energies = jnp.where(positive, 1, 0)
     return _with_shifts(
-        found, reduced, values, x, jnp.zeros_like(zero), energies, roots.double, zero, ~positive & ~zero
+        linear, reduced, values, x, jnp.zeros_like(zero), energies, roots.double, zero, ~positive & ~zero
     )
 
 
-def _gyroscopic(found) -> Motions:
-    """Roots in pairs of λ and -λ: one of each is kept."""
-    reduced = _routh(found)
+def _gyroscopic(linear) -> Motions:
+    """With gyroscopic forces: roots come in pairs λ and -λ, of which one is kept."""
+    reduced = _routh(linear)
     d = reduced.mass.shape[0]
     scale = _units(reduced.mass)
     M, G, K = (scale[:, None] * m * scale[None, :] for m in reduced[:3])
@@ -120,7 +120,7 @@ def _gyroscopic(found) -> Motions:
     A, E = jnp.block([[nil, eye], [-K, -G]]), jnp.block([[eye, nil], [nil, M]])
     roots = general_roots(A, E)
     values, zero = _cleaned(roots, zero_count(A, E, roots.values))
-    # On the imaginary axis or off it, what round-off cannot decide is on it.
+    # A root within round-off of the imaginary axis is taken to be on it.
     real = jnp.where(jnp.abs(values.real) <= roots.round_off, 0.0, values.real)
     values = lax.complex(real, values.imag)
     x = roots.vectors[:d]
@@ -130,25 +130,25 @@ def _gyroscopic(found) -> Motions:
     noise = 1e-9 * (values.imag**2 * size(M) + size(K))
     swings = (values.imag != 0) & (values.real == 0) & ~zero & (jnp.abs(energy) > noise)
     energies = jnp.where(swings, jnp.sign(energy), 0).astype(int)
-    # Of two roots of zero the second is the other's mirror image.
+    # Of two zero roots, the second counts as the mirror image of the first.
     parity = jnp.cumsum(zero) % 2 == 0
     mirrored = jnp.where(zero, parity, (values.imag < 0) | ((values.imag == 0) & (values.real < 0)))
     growing = values.real > 0
     order = _order(values, mirrored)[:d]
     pick = lambda y: y[order]
     return _with_shifts(
-        found, reduced, pick(values) * rate, (scale[:, None] * x)[:, order], pick(mirrored), pick(energies),
+        linear, reduced, pick(values) * rate, (scale[:, None] * x)[:, order], pick(mirrored), pick(energies),
         pick(roots.double), pick(zero), pick(growing), pick(roots.defective),
     )  # fmt: skip
 
 
-def _of_first_order(found) -> Motions:
-    """All roots: forces, dissipation, velocity constraints."""
-    p = found.parts
+def _general(linear) -> Motions:
+    """Systems with forces, dissipation or velocity constraints: all roots."""
+    p = linear.parts
     eye = jnp.eye(p.mass.shape[0], dtype=p.mass.dtype)
-    mass = jnp.where(found.sound, p.mass, eye)
-    velocity, position, drift = (jnp.where(found.sound, x, 0.0) for x in (p.velocity, p.position, p.drift))
-    transfer = jnp.where(found.sound, p.transfer, 0.0)
+    mass = jnp.where(linear.sound, p.mass, eye)
+    velocity, position, drift = (jnp.where(linear.sound, x, 0.0) for x in (p.velocity, p.position, p.drift))
+    transfer = jnp.where(linear.sound, p.transfer, 0.0)
     count = drift.shape[0]
     of_w, of_q = _units(mass), _units(p.positions.T @ p.raw.mass @ p.positions)
     M, C = (of_w[:, None] * m * of_w[None, :] for m in (mass, velocity))
@@ -161,37 +161,37 @@ def _of_first_order(found) -> Motions:
     E = jnp.block([[jnp.eye(count, dtype=M.dtype), nil], [nil.T, M]])
     roots, zero = roots_beside_zeros(A, E)
     values = jnp.where(zero, 0.0, roots.values)
-    # Other speeds of what nothing depends on: no position has a part in them.
+    # Velocity directions that change no position η and cause no force are other speeds of a steady motion.
     columns = lapack.singular_values(jnp.concatenate([transfer, C]))
     speeds = jnp.sum(columns <= 1e-12 * jnp.max(columns, initial=0.0))
-    unexplained = jnp.where(all(found.kind.holonomic), jnp.maximum(jnp.sum(zero) - speeds, 0), 0)
+    unexplained = jnp.where(all(linear.kind.holonomic), jnp.maximum(jnp.sum(zero) - speeds, 0), 0)
     rho, w = of_q[:, None] * roots.vectors[:count], of_w[:, None] * roots.vectors[count:] * rate
     moving = p.velocities @ w + p.turning @ rho
     still = p.positions @ rho
     nonzero = jnp.where(zero, 1.0, values * rate)
     size = lambda y: jnp.max(jnp.abs(y), axis=0, initial=0.0)
-    # A motion with other speeds is drawn by its speeds, a shift by its positions.
+    # The shape of a zero mode is its velocities if it only changes speeds, and its positions if it is a shift.
     only_speed = size(roots.vectors[:count]) <= 1e-6 * size(roots.vectors)
-    unseen = np.array(found.kind.unseen, bool)[:, None]
+    unseen = np.array(linear.kind.unseen, bool)[:, None]
     drifting = jnp.where(only_speed[None, :], moving, still)
     full = jnp.where(zero[None, :], drifting, jnp.where(unseen, moving / nonzero[None, :], still))
     grow = roots.round_off * rate
     values = values * rate
-    # Round-off is no growth; what its derivative is, stays.
+    # Growth within round-off is set to zero, but keeps its derivative.
     real = values.real
-    nothing = (jnp.abs(real) <= grow) & (values.imag != 0)
-    values = lax.complex(jnp.where(nothing, real - lax.stop_gradient(real), real), values.imag)
+    negligible = (jnp.abs(real) <= grow) & (values.imag != 0)
+    values = lax.complex(jnp.where(negligible, real - lax.stop_gradient(real), real), values.imag)
     mirrored = values.imag < 0
     order = _order(values, mirrored)
-    code = _unstable_or(values, grow, zero, roots, unexplained)
+    code = _verdict_of_roots(values, grow, zero, roots, unexplained)
     return Motions(
         values[order], _normalised(full.T[order]), mirrored[order], jnp.zeros(values.size, int), roots.double[order],
         zero[order], ((values.real > grow) & ~zero)[order], unexplained, code,
     )  # fmt: skip
 
 
-def _unstable_or(values, allowed, zero, roots: Roots, unexplained):
-    """The verdict of roots as they are, without energies."""
+def _verdict_of_roots(values, allowed, zero, roots: Roots, unexplained):
+    """The verdict from the roots alone, without energies."""
     growth = jnp.where(zero, -jnp.inf, values.real - allowed)
     worst = jnp.argmax(growth)
     flutters = jnp.abs(values.imag[worst]) > 0
@@ -202,35 +202,35 @@ def _unstable_or(values, allowed, zero, roots: Roots, unexplained):
 
 
 def _units(mass):
-    """Units of coordinates in which their masses are one."""
+    """Units of the coordinates in which the diagonal of the mass matrix is one."""
     diagonal = jnp.abs(jnp.diag(lax.stop_gradient(mass)))
     return 1 / jnp.sqrt(jnp.where(diagonal > 0, diagonal, 1.0))
 
 
 def _rate(position, velocity, drift=0.0):
-    """The rate, as unit of one over time, by which nothing is larger than one."""
+    """The unit of inverse time in which no entry is larger than one."""
     largest = lambda y: jnp.max(jnp.abs(lax.stop_gradient(y)), initial=0.0)
     rate = jnp.maximum(jnp.sqrt(largest(position)), jnp.maximum(largest(velocity), largest(drift)))
     return jnp.where(rate > 0, rate, 1.0)
 
 
 def _cleaned(roots: Roots, zeros):
-    """The roots with the smallest so many of them zero, and which these are."""
+    """The roots with the `zeros` smallest of them set to zero, and which these are."""
     zero = _rank((jnp.abs(roots.values),)) < zeros
     values = jnp.where(zero, 0.0, roots.values)
     return values, zero
 
 
 def _order(values, mirrored):
-    """By frequency, of equal ones the fastest growing first; mirror images last."""
+    """The order by frequency, at equal frequency by falling growth; mirror images last."""
     rank = _rank((mirrored, values.imag, -values.real))
     return jnp.zeros_like(rank).at[rank].set(jnp.arange(rank.size))
 
 
 def _rank(keys):
-    """The place of each in ascending order, by the first key, and where it is the same by the next ones.
+    """The place of each entry in ascending order, by the first key; ties are decided by the next keys.
 
-    By comparing all with each other: a sort takes longer to compile than the rest.
+    All entries are compared with each other, because a sort takes longer to compile than everything else here.
     """
     place = jnp.arange(keys[0].size)
     before = jnp.zeros((place.size, place.size), bool)
@@ -242,18 +242,18 @@ def _rank(keys):
     return jnp.sum(before, axis=0)
 
 
-def _with_shifts(found, reduced, values, x, mirrored, energies, double, zero, growing, defective=None) -> Motions:
-    """The motions of the reduced equations, and those in which what nothing depends on is shifted."""
-    c, names = len(found.shifts), np.array(found.kind.unseen, bool)
+def _with_shifts(linear, reduced, values, x, mirrored, energies, double, zero, growing, defective=None) -> Motions:
+    """The motions of the reduced equations, preceded by the shifts of coordinates that nothing depends on."""
+    c, names = len(linear.shifts), np.array(linear.kind.unseen, bool)
     n = names.size
-    full = found.parts.positions.astype(x.dtype) @ x
+    full = linear.parts.positions.astype(x.dtype) @ x
     if c:
         nonzero = jnp.where(zero, 1.0, values)
         rest = reduced.with_rate.astype(x.dtype) @ x + (reduced.follow.astype(x.dtype) @ x) / nonzero[None, :]
         full = full.at[names].set(jnp.where(zero[None, :], 0.0, rest))
     shapes = jnp.concatenate([jnp.eye(n, dtype=x.dtype)[names], full.T])
     before = lambda fill, y: jnp.concatenate([jnp.full(c, fill, y.dtype), y])
-    code = _conservative(values, energies, zero, growing, defective)
+    code = _conservative_verdict(values, energies, zero, growing, defective)
     all_values, all_zero = before(0.0, values), before(True, zero)
     order = _order(all_values, before(False, mirrored))
     pick = lambda y: y[order]
@@ -263,7 +263,7 @@ def _with_shifts(found, reduced, values, x, mirrored, energies, double, zero, gr
     )  # fmt: skip
 
 
-def _conservative(values, energies, zero, growing, defective):
+def _conservative_verdict(values, energies, zero, growing, defective):
     if not values.size:
         return jnp.asarray(STABLE)
     growth = jnp.where(growing, values.real, -jnp.inf)
@@ -279,13 +279,13 @@ def _normalised(shapes):
     if not shapes.size:
         return shapes
     shapes = shapes.astype(jnp.result_type(shapes.dtype, np.complex64))
-    # The first of those that are as large but for round-off.
+    # The first of the entries that are the largest to within round-off.
     size = lax.stop_gradient(jnp.abs(shapes))
     first = jnp.argmax(size >= (1 - 1e-6) * jnp.max(size, axis=1, keepdims=True), axis=1)
     at = jnp.take_along_axis(shapes, first[:, None], axis=1)
     return shapes / jnp.where(at != 0, at, 1.0)
 
 
-def _judged(found, motions: Motions) -> Motions:
-    steady = found.sound & (found.residual <= STEADY_BELOW)
+def _judged(linear, motions: Motions) -> Motions:
+    steady = linear.sound & (linear.residual <= STEADY_BELOW)
     return motions._replace(code=jnp.where(steady, motions.code, UNSTEADY).astype(jnp.int32))

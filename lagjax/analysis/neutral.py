@@ -1,7 +1,7 @@
-"""Directions in which nothing changes: shifts to another equilibrium, and other speeds of a steady motion.
+"""Neutral directions: shifts to another equilibrium, and other speeds of a steady motion.
 
-They are the vectors y = (positions, velocities) with A y = 0. LAPACK gives any basis of them; here it is reduced until
-each has an entry that the others do not have, other speeds first.
+They are the vectors y = (positions, velocities) with A y = 0. LAPACK returns an arbitrary basis of them. Here it is
+reduced until each vector has an entry that is zero in all others.
 """
 
 import jax
@@ -13,22 +13,23 @@ ZERO_BELOW = 1e-9
 NEWTON_STEPS, STEADY_AFTER = 8, 1e-9
 
 
-def with_neutral(found, shapes, zero):
-    """The shapes (k, N), those of zero roots replaced by a reduced basis; and what each zero root is, in words.
+def with_neutral(linearisation, shapes, zero):
+    """The shapes (k, N), with those of zero roots replaced by a reduced basis; and a description of each zero root.
 
-    There may be fewer such directions than zero roots: the rest grow with time, along them.
+    There may be fewer neutral directions than zero roots; the remaining roots are motions along them that grow with
+    time.
     """
     words = [""] * len(zero)
     if not np.any(zero):
         return shapes, words
-    p, kind = found.parts, found.kind
+    p, kind = linearisation.parts, linearisation.kind
     drift, transfer, position, velocity = (np.asarray(x) for x in (p.drift, p.transfer, p.position, p.velocity))
     A = np.block([[drift, transfer], [-position, -velocity]])
-    # Rows of different units.
+    # Rows have different units, so each is scaled by its largest entry.
     size = np.max(np.abs(A), axis=1, keepdims=True)
     basis = null_space(A / np.where(size > 0, size, 1.0), ZERO_BELOW).T
     count = drift.shape[0]
-    # Velocities of coordinates, where no position is displaced; positions, where one is.
+    # A direction with a displacement is described by it, one without a displacement by its velocities.
     still = basis[:, :count] @ np.asarray(p.positions).T
     moving = basis[:, count:] @ np.asarray(p.velocities).T + basis[:, :count] @ np.asarray(p.turning).T
     reduced = _reduced(np.concatenate([still, moving], axis=1))
@@ -37,7 +38,7 @@ def with_neutral(found, shapes, zero):
         shifts = np.max(np.abs(row[:n])) > 1e-6
         row = row[:n] if shifts else row[n:]
         shapes[i] = row / row[np.argmax(np.abs(row))]
-        moved = _listed(found.names, shapes[i])
+        moved = _listed(linearisation.names, shapes[i])
         if not shifts:
             words[i] = f"other speeds in {moved}"
         elif all(kind.holonomic):
@@ -49,14 +50,14 @@ def with_neutral(found, shapes, zero):
     return shapes, words
 
 
-def leads_to_others(found, shapes, linearised_at) -> bool:
-    """Whether further equilibria lie along each of the zero `shapes` (k, N): a symmetry, and no critical point.
+def leads_to_others(linearisation, shapes, linearised_at) -> bool:
+    """Whether other equilibria lie along each of the zero `shapes` (k, N): a symmetry, not a critical point.
 
-    Some way along one, Newton's method looks for an equilibrium across all of them. `linearised_at(x)`: the
-    `Linearisation` at other positions.
+    From points displaced along each shape, Newton's method looks for an equilibrium in the directions across all
+    shapes. `linearised_at(x)`: the `Linearisation` at other positions.
     """
-    start = np.concatenate([np.ravel(x) for x in jax.tree.leaves(found.state.q)])
-    P = np.asarray(found.parts.positions)
+    start = np.concatenate([np.ravel(x) for x in jax.tree.leaves(linearisation.state.q)])
+    P = np.asarray(linearisation.parts.positions)
     along = np.linalg.qr(np.linalg.pinv(P) @ np.real(shapes).T)[0]
     across = null_space(along.T)
     size = np.max(np.abs(start)) or 1.0
@@ -74,7 +75,7 @@ def leads_to_others(found, shapes, linearised_at) -> bool:
 
 
 def _step(now, across):
-    """To an equilibrium on the constraints, in as far as that is across what is to be kept."""
+    """The Newton step to an equilibrium on the constraints, restricted to the directions `across`."""
     p, holonomic = now.parts, np.array(now.kind.holonomic, bool)
     P, V, mass, K = (np.asarray(x) for x in (p.positions, p.velocities, p.mass, p.position))
     force = mass @ np.linalg.pinv(V) @ np.asarray(p.a)
@@ -89,7 +90,7 @@ def _listed(names, shape):
 
 
 def _reduced(rows):
-    """Gauss-Jordan with full pivoting."""
+    """Gauss-Jordan elimination with full pivoting."""
     rows, done = np.array(rows), []
     for i in range(len(rows)):
         left = np.abs(rows)

@@ -1,4 +1,4 @@
-"""The numbers in `params` by their names, `"omega"`, `"spring.k"`, `"k[1]"`: along which a branch is followed."""
+"""The numbers in `params` by name, `"omega"`, `"spring.k"`, `"k[1]"`: one of them is the parameter of a branch."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -11,14 +11,14 @@ from lagjax.mechanics.diagnosis import listed
 
 
 class Number(eqx.Module):
-    """An entry of a leaf of `params`."""
+    """One entry of one leaf of `params`."""
 
     name: str = eqx.field(static=True)
     leaf: int = eqx.field(static=True)
     entry: int = eqx.field(static=True)
 
     def put(self, params: PyTree, value) -> PyTree:
-        """`params` with another value of it."""
+        """`params` with another value of this number."""
         leaves, structure = jtu.tree_flatten(params)
         if coordinates.is_traced((leaves[self.leaf], value)):
             leaf = jnp.asarray(leaves[self.leaf])
@@ -30,26 +30,26 @@ class Number(eqx.Module):
         return jtu.tree_unflatten(structure, leaves)
 
     def get(self, params: PyTree):
-        """Its value."""
+        """The value of this number."""
         leaf = jtu.tree_leaves(params)[self.leaf]
         return coordinates.numpy_of(leaf).ravel(leaf)[self.entry]
 
 
 def numbers_in(params: PyTree) -> dict[str, Number]:
-    """All floating numbers in `params`."""
-    found = {}
+    """All floating-point numbers in `params`, by name."""
+    numbers = {}
     for i, (path, leaf) in enumerate(jtu.tree_flatten_with_path(params)[0]):
         name = jtu.keystr(path, simple=True, separator=".") or "params"
         if not eqx.is_array_like(leaf) or not jnp.issubdtype(jnp.result_type(leaf), jnp.floating):
             continue
         for entry, index in enumerate(np.ndindex(jnp.shape(leaf))):
             suffix = "[" + ", ".join(map(str, index)) + "]" if index else ""
-            found[name + suffix] = Number(name + suffix, i, entry)
-    return found
+            numbers[name + suffix] = Number(name + suffix, i, entry)
+    return numbers
 
 
 def no_such_number(along: str, params: PyTree, more: str) -> ValueError:
-    """That there is no number of that name; `more`: what else there would be."""
+    """The error that no number has this name; `more`: what else `along` may be."""
     known = list(numbers_in(params))
     there = f"there {'are' if len(known) != 1 else 'is'} {listed(known) or 'none'}"
     return ValueError(

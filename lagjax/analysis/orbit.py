@@ -1,4 +1,4 @@
-"""A periodic orbit: the answer of `lj.periodic_orbit`."""
+"""A periodic orbit, the result of `lj.periodic_orbit`."""
 
 import equinox as eqx
 import numpy as np
@@ -18,12 +18,13 @@ POINTS = 401
 class PeriodicOrbit(eqx.Module):
     """A motion that comes back to its start. It prints and plots itself.
 
-    - `t`, `q`, `v`: a state of it; `period`, `[t]`.
-    - `turns`: by how many whole turns each angle has gone around, in the structure of `q`.
-    - `shift`: by how much the coordinates named in `relative` have moved on, in the structure of `q`; 0 elsewhere.
-    - `residual`: how far the end is from the start, and what is held from its value, in units of the motion's size.
-    - `converged`: whether that is what the tolerance leaves; if not, this is the best that was found.
-    - `iterations`: of Newton's method.
+    - `t`, `q`, `v`: a state on the orbit; `period`, `[t]`.
+    - `turns`: the number of whole turns of each angle in a period, in the structure of `q`.
+    - `shift`: how far the coordinates named in `relative` move in a period, in the structure of `q`; 0 elsewhere.
+    - `residual`: how far the end is from the start, and held quantities from their values, in units of the motion's
+      size.
+    - `converged`: whether the residual is within the tolerance; if not, this is the best orbit that was found.
+    - `iterations`: the number of steps of Newton's method.
     - `nodes` (K, 2n): the states q and v, in the order of their names, at K equal parts of the period.
 
     Under `vmap` every array has the batch's axes in front.
@@ -56,13 +57,13 @@ class PeriodicOrbit(eqx.Module):
 
     @property
     def trajectory(self) -> Trajectory:
-        """The motion through one period, 401 states, by `lj.integrate`. Not for a batch."""
+        """The motion over one period, 401 states, by `lj.integrate`; not available for a batch."""
         self._check_alone("trajectory")
         ts = float(self.t) + float(self.period) * np.linspace(0.0, 1.0, POINTS)
         return integrate(self.system, self.q, self.v, self.params, ts=ts.astype(self.t.dtype))
 
     def plot(self):
-        """Plot velocities against coordinates, a panel a coordinate, with a dot at the start; a matplotlib `Figure`.
+        """Plot velocities against coordinates, one panel each, with a dot at the start; returns a matplotlib `Figure`.
 
         **Raises:** `ImportError` without matplotlib; `ValueError` for a batch.
         """
@@ -71,7 +72,7 @@ class PeriodicOrbit(eqx.Module):
     def _check_alone(self, what):
         if np.ndim(self.period):
             raise ValueError(
-                f"these are orbits, a batch of shape {np.shape(self.period)}: look at one of them.\n"
+                f"this is a batch of orbits of shape {np.shape(self.period)}: select one of them.\n"
                 f"Fix: jax.tree.map(lambda x: x[0], orbit).{what}"
             )
 
@@ -89,7 +90,7 @@ class PeriodicOrbit(eqx.Module):
         ]
         rows.append(("residual", f"{float(self.residual):.1e} (relative), after {int(self.iterations)} iterations"))
         if not bool(self.converged):
-            rows.append(("WARNING", "not converged: the best that was found"))
+            rows.append(("WARNING", "not converged: this is the best that was found"))
         return "\n".join(["Periodic orbit", *(f"  {label:<9}  {value}" for label, value in rows)])
 
 

@@ -1,4 +1,4 @@
-"""A branch of cycles and its critical points: results that print and draw themselves."""
+"""A branch of cycles and its critical points; they print and draw themselves."""
 
 from dataclasses import replace
 
@@ -26,13 +26,14 @@ MARKS = {"fold": ("s", 1), "branch point": ("o", 2), "period doubling": ("D", 3)
 
 
 class CriticalOrbit(eqx.Module):
-    """Where a branch of cycles folds, others branch off, or stability is lost.
+    """A point where a branch of cycles folds, where others branch off, or where stability is lost.
 
-    - `kind`: `"fold"`; `"branch point"`, where a multiplier passes 1 and the branch goes on; `"period doubling"`, where
-      one passes -1; `"torus"`, where a pair leaves the unit circle (Neimark-Sacker; without damping two pairs meet).
-    - `parameter`: its value, and `accuracy`, how far off it may be.
-    - `index`: its place on the branch, so that `branch[index]` is the cycle.
-    - `multipliers` (k,): those that are 1 for a reason first.
+    - `kind`: `"fold"`; `"branch point"`, where a multiplier passes 1 and the branch continues; `"period doubling"`,
+      where one passes -1; `"torus"`, where a pair leaves the unit circle (Neimark-Sacker; without damping two pairs
+      meet).
+    - `parameter`: its value; `accuracy`: how far off it may be.
+    - `index`: its index on the branch: `branch[index]` is the cycle.
+    - `multipliers` (k,): the trivial ones (1 for a known reason) first.
     """
 
     kind: str = eqx.field(static=True)
@@ -46,13 +47,13 @@ class CriticalOrbit(eqx.Module):
 
 
 class OrbitBranch(eqx.Module):
-    """One curve of cycles, P of them in their order along it: `branch[i]` is one, a `PeriodicOrbit`.
+    """One curve of P cycles, in their order along it: `branch[i]` is a `PeriodicOrbit`.
 
     - `parameter`, `period` (P,); `q`, `v`: the state at the start of each, with a leading axis P.
-    - `low`, `high`: the smallest and the largest value of each coordinate on the way, like `q`; to 1e-6, for pictures.
-    - `stable` (P,): no multiplier is outside the unit circle; `multipliers` (P, k): the trivial ones first.
+    - `low`, `high`: the smallest and the largest value of each coordinate over a period, like `q`; accurate to 1e-6.
+    - `stable` (P,): whether no multiplier is outside the unit circle; `multipliers` (P, k): the trivial ones first.
     - `critical`: a list of `CriticalOrbit`, in the order along the branch.
-    - `along`, `first`, `last`: the parameter and its range. `status`: where the branch ends, and why.
+    - `along`, `first`, `last`: the parameter and its range. `status`: where and why the branch ends.
     """
 
     parameter: Float[Array, " P"]
@@ -93,13 +94,13 @@ class OrbitBranch(eqx.Module):
         return [c for c in self.critical if c.kind == kind]
 
     def plot(self, *names: str):
-        """Draw the largest value of coordinates against the parameter: stable solid, unstable dashed, with marks.
+        """Draw the largest value of coordinates against the parameter: stable solid, unstable dashed, with markers.
 
-        **Arguments:** `names` of coordinates, or `"period"`, a panel each; by default the first six coordinates.
+        **Arguments:** `names` of coordinates, or `"period"`, one panel each; by default the first six coordinates.
 
         **Returns:** a matplotlib `Figure`.
 
-        **Raises:** `ValueError` for a name that is no coordinate; `ImportError` without matplotlib.
+        **Raises:** `ValueError` for an unknown name; `ImportError` without matplotlib.
         """
         known = self._names()
         if unknown := [name for name in names if name not in (*known, "period")]:
@@ -115,7 +116,7 @@ class OrbitBranch(eqx.Module):
         return fig
 
     def draw(self, axis, name: str | None = None):
-        """Draw the largest value of one coordinate, by default the first, or `"period"`, on axes of matplotlib."""
+        """Draw the largest value of one coordinate, by default the first, or `"period"`, on matplotlib axes."""
         name = self._names()[0] if name is None else name
         y, verdicts = self._values(name), self._verdicts()
         draw_by_stability(axis, np.asarray(self.parameter), y, verdicts, plot.COLOURS[0])
@@ -150,7 +151,7 @@ class OrbitBranch(eqx.Module):
             f"Branch of cycles along {self.along}, from {self.first:.6g} to {self.last:.6g}: {len(self)} of them, "
             f"with {points}"
         ]
-        lines += [f"  {c.kind:<16}{self.along} = {number(c.parameter):<14} {_of_multipliers(c)}" for c in self.critical]
+        lines += [f"  {c.kind:<16}{self.along} = {number(c.parameter):<14} {_torus_angle(c)}" for c in self.critical]
         low, high = np.min(self.period), np.max(self.period)
         lines.append(f"  {'periods':<16}{low:.6g}" + (f" to {high:.6g}" if high - low > 1e-9 * high else ""))
         lines.append(f"  {'stability':<16}{stability_in_words(self._verdicts())}")
@@ -158,8 +159,8 @@ class OrbitBranch(eqx.Module):
         return "\n".join(lines)
 
 
-def _of_multipliers(c: CriticalOrbit):
-    """Of a torus, by which angle its pair turns in a period."""
+def _torus_angle(c: CriticalOrbit):
+    """For a torus, the angle of its pair of multipliers; otherwise nothing."""
     if c.kind != "torus":
         return ""
     upper = np.asarray(c.multipliers)[np.imag(c.multipliers) > 1e-6]

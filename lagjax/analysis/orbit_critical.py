@@ -1,4 +1,4 @@
-"""What is critical between two points of a branch of cycles: where a multiplier passes 1 or -1, or a pair leaves."""
+"""Critical points between two points of a branch of cycles: a multiplier passes 1 or -1, or a pair leaves."""
 
 from typing import NamedTuple
 
@@ -8,7 +8,7 @@ from lagjax.analysis.orbit_tracer import OrbitTracer
 from lagjax.analysis.tracing import Point
 
 HALVINGS = 40
-# A function that is this small in the middle of three points, beside its ends, may be zero twice between them.
+# A function whose middle value at three points is below this fraction of the outer ones may be zero twice in between.
 DIPS, VERTICES = 0.3, 8
 
 
@@ -21,25 +21,25 @@ class FoundOrbit(NamedTuple):
 
 
 def between(tracer: OrbitTracer, a: Point, b: Point) -> list[FoundOrbit]:
-    """All that is critical between two neighbouring points."""
+    """All critical points between two neighbouring points."""
     found = []
     crosses, folds = a.sign * b.sign < 0, a.tangent[-1] * b.tangent[-1] < 0
     if folds:
-        # Along the side branch of a pitchfork the parameter turns, and the multiplier only touches 1.
+        # At a pitchfork the parameter turns along the side branch, where the multiplier only touches 1.
         kind = "fold" if crosses or not tracer.crosses else "branch point"
         found.append(_zero(tracer, a, b, kind, lambda p: p.tangent[-1]))
     elif crosses:
-        found.append(_zero(tracer, a, b, "branch point", lambda p: p.seen.plus))
-    if a.seen.minus * b.seen.minus < 0:
-        found.append(_zero(tracer, a, b, "period doubling", lambda p: p.seen.minus))
+        found.append(_zero(tracer, a, b, "branch point", lambda p: p.outputs.plus))
+    if a.outputs.minus * b.outputs.minus < 0:
+        found.append(_zero(tracer, a, b, "period doubling", lambda p: p.outputs.minus))
     if a.growing is not None and b.growing is not None and a.growing != b.growing and not found:
         found.append(_torus(tracer, a, b))
     return [one for one in found if one is not None]
 
 
 def dips(tracer: OrbitTracer, a: Point, b: Point, c: Point) -> list[FoundOrbit | Point]:
-    """What becomes critical and ceases to be within two steps: the sides of a narrow tongue, and a point in it."""
-    for kind, of in (("branch point", lambda p: p.seen.plus), ("period doubling", lambda p: p.seen.minus)):
+    """The two edges of a narrow resonance tongue that lies within two steps, and a point in the tongue."""
+    for kind, of in (("branch point", lambda p: p.outputs.plus), ("period doubling", lambda p: p.outputs.minus)):
         left, middle, right = of(a), of(b), of(c)
         same = left * middle > 0 and middle * right > 0
         if not (same and abs(middle) < DIPS * min(abs(left), abs(right))):
@@ -52,7 +52,7 @@ def dips(tracer: OrbitTracer, a: Point, b: Point, c: Point) -> list[FoundOrbit |
 
 
 def _beyond_zero(tracer, a, b, c, of):
-    """A point between a and c where a function has another sign, by parabolas; None where it only comes near zero."""
+    """A point between a and c where a function changes its sign, by parabolas; None if it only comes near zero."""
     length = lambda p, q: float(np.sqrt(tracer.weights @ (q.z - p.z) ** 2))
     whole = length(a, b) + length(b, c)
     x, f = [0.0, length(a, b) / whole, 1.0], [of(a), of(b), of(c)]
@@ -84,13 +84,13 @@ def _zero(tracer, a, b, kind, of) -> FoundOrbit | None:
 
 
 def _torus(tracer, a, b) -> FoundOrbit | None:
-    """Where a pair leaves the unit circle; None where what begins to grow is no pair."""
+    """The point where a pair leaves the unit circle; None if what begins to grow is not a pair."""
     many = a if a.growing > b.growing else b
-    outside = [x for x in many.seen.multipliers if abs(x) > 1]
+    outside = [x for x in many.outputs.multipliers if abs(x) > 1]
     slowest = min(outside, key=abs, default=1.0)
     if abs(np.imag(slowest)) < 1e-3 * abs(slowest):
         return None
-    found = _zero(tracer, a, b, "torus", lambda p: p.seen.pairs)
+    found = _zero(tracer, a, b, "torus", lambda p: p.outputs.pairs)
     if found is not None:
         return found
     low, high, point = 0.0, 1.0, None

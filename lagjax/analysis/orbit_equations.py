@@ -5,17 +5,17 @@ parameter μ. With the flow Φ of `flow.py`,
 
     Φ(z_j, T/K; μ) - z_{j+1} = 0,      z_K = z_0 + turns        the motion closes
     c(t_j, z_j; μ) = 0                                          its states satisfy the constraints
-    f·(z_0 - z_0') = 0                                          it begins beside where that of the last point did
-    H(z_0; μ) = H_0, or a coordinate, or T                      what is held of a family
-    V·(y - y_0) = 0                                             what is left free where the branch begins is held, too
+    f·(z_0 - z_0') = 0                                          the phase is that of the last point of the branch
+    H(z_0; μ) = H_0, or a coordinate, or T                      the held quantity selects a member of a family
+    V·(y - y_0) = 0                                             directions still free at the branch's start are fixed
 
-f and z_0' are those of the last point of the branch (Poincaré's condition). A drive sets the period: T is that after
-which the accelerations at some times and a state off the motion are what they were before,
+f and z_0' belong to the last point of the branch (Poincaré's condition). A drive sets the period: T is the time after
+which the accelerations at some times, for a state off the motion, repeat:
 
     Σ_i d_i·(a(t_i + T; μ) - a(t_i; μ)) = 0,       t_i = t_0 + c_i T,      d_i = ∂a/∂t at the start
 
-These are more equations than unknowns where a conserved quantity makes some follow from others. Tangents by μ and
-`log T` are carried along the motion beside those by the state.
+There are more equations than unknowns if a conserved quantity makes some of them redundant. The flow carries tangents
+with respect to μ and `log T` together with those with respect to the state.
 
 Source: Seydel, *Practical Bifurcation and Stability Analysis*, §7.4-7.5; Doedel, Keller & Kernévez, Int. J. Bifurcation
 Chaos 1 (1991) 745; Muñoz-Almaraz et al., *Physica D* 181 (2003) 1 (families of conservative systems).
@@ -37,15 +37,15 @@ from lagjax.analysis.numbers_in import Number
 from lagjax.analysis.trivial import Reasons, directions, orthonormal
 from lagjax.mechanics.compiled import compiled
 
-# Times, in periods, at which a drive is looked at.
-WATCHED_AT = (0.0, 0.137, 0.291, 0.443, 0.618, 0.787, 0.912)
-# Points between which the largest and smallest coordinates are looked for, and short steps to each.
+# Times, in periods, at which the accelerations of a driven system are compared.
+SAMPLED_AT = (0.0, 0.137, 0.291, 0.443, 0.618, 0.787, 0.912)
+# The number of points between which the extreme coordinates are interpolated, and of short steps to each point.
 POINTS, SUBSTEPS = 96, 8
 ENERGY, PERIOD, ENTRY, NUMBER = "energy", "period", "entry", "number"
 
 
 class Along(eqx.Module):
-    """What changes along a branch: a number in `params`, the energy, the period, or an entry of the first state."""
+    """The parameter of a branch: a number in `params`, the energy, the period, or an entry of the first state."""
 
     name: str = eqx.field(static=True)
     kind: str = eqx.field(static=True)
@@ -54,27 +54,27 @@ class Along(eqx.Module):
 
 
 class Drive(eqx.Module):
-    """Where a drive is looked at: at a state (2n,), where the rates change by `slopes` (i, n) at the start."""
+    """A state z at which accelerations are sampled, and their time derivatives `slopes` (i, n) at the start."""
 
     z: Float[Array, " 2n"]
     slopes: Float[Array, "i n"]
 
 
 class Guide(NamedTuple):
-    """The last point of the branch: the state at which its motion began, and its rate there, of size one."""
+    """The last point of the branch: the first state of its motion, and the direction of its rate there."""
 
     z: Float[Array, " 2n"]
     rate: Float[Array, " 2n"]
 
 
 class OrbitFrame(eqx.Module):
-    """What stays along a branch: the flow at its start, units, what is held, and what else is held to stay on it.
+    """The data that stay the same along a branch: the flow at its start, units, and held quantities.
 
-    - `scale` (2n,): the size of each coordinate and velocity; `period`; `unit` of the parameter.
-    - `turns` (n,); `integral`, `z` (2n,): the energy and the state at the start.
-    - `slope`: the size of the energy's gradient; `sizes` (c,): those of the gradients of constraints.
-    - `drive`: None where the period does not change with the parameter by a drive.
-    - `free` (d, N), `reference` (N,): combinations of unknowns and their values.
+    - `scale` (2n,): the size of each coordinate and velocity; `period`: its unit; `unit`: that of the parameter.
+    - `turns` (n,): whole turns of each coordinate; `integral`, `z` (2n,): the energy and the state at the start.
+    - `slope`: the size of the energy's gradient; `sizes` (c,): the sizes of the constraints' gradients.
+    - `drive`: None unless a drive sets the period and makes it change with the parameter.
+    - `free` (d, N), `reference` (N,): V and y_0, the fixed combinations of unknowns and the point they refer to.
     """
 
     flow: Flow
@@ -105,12 +105,12 @@ class OrbitFrame(eqx.Module):
 
 
 class Evaluated(NamedTuple):
-    """What the flow says at a point: E, its Jacobian, the largest of E, and how states beside the motion go on.
+    """The equations evaluated at a point: E, its Jacobian, the largest entry of E, and the monodromy matrix.
 
-    - `whole` (k, k): the monodromy matrix in tangent coordinates; `trivial` (r, k): orthonormal, what is 1 in it for
-      reasons, of which `there` (r,) are.
-    - `guide`: of the next point. `amplified`: the largest entry of a frame. `apart`: how much a driven system is
-      another one after the period.
+    - `whole` (k, k): the monodromy matrix in tangent coordinates; `trivial` (r, k): orthonormal rows of its trivial
+      directions; `there` (r,): which of these exist.
+    - `guide`: the guide for the next point. `amplified`: the largest entry of a tangent frame. `apart`: how much a
+      driven system has changed after the period.
     """
 
     value: Float[Array, " R"]
@@ -126,7 +126,7 @@ class Evaluated(NamedTuple):
 
 @compiled
 def orbit_at(frame: OrbitFrame, z, guide: Guide) -> Evaluated:
-    """Follow all parts with their tangents."""
+    """Follow the flow through all parts, with tangents."""
     flow, nodes, period = frame.split(z)
     count, size, scale = frame.parts, frame.scale.size, frame.scale
     times, span = _times(frame, period), period / count
@@ -160,7 +160,7 @@ def _times(frame, period):
 
 
 def _changes(frame, flow, z, j, span) -> Changes:
-    """What changes with the columns of a frame: nothing with the state, times with log T, a number with μ."""
+    """How parameters and times change with the frame columns: with μ, with log T, and not at all with the state."""
     last = jnp.eye(z.size, dtype=z.dtype)[-1]
     floats = lambda z: eqx.filter(frame.split(z)[0].params, eqx.is_inexact_array)
     if frame.along.number is None:
@@ -173,7 +173,7 @@ def _changes(frame, flow, z, j, span) -> Changes:
 
 
 def _closing(frame, nodes, passed):
-    """How far each part ends from the next one's start, and its Jacobian."""
+    """The distance from each part's end to the next part's start, and its Jacobian."""
     count, (size, n) = frame.parts, (frame.scale.size, frame.turns.size)
     comes_back = np.concatenate([1.0 - np.array(frame.asked.relative, float), np.ones(n)])
     first = nodes[0] + jnp.concatenate([TURN * frame.turns, jnp.zeros_like(frame.turns)])
@@ -190,33 +190,33 @@ def _closing(frame, nodes, passed):
 
 
 def _others(frame: OrbitFrame, z, guide):
-    """All equations but that the motion closes."""
+    """All equations except those that close the motion."""
     flow, nodes, period = frame.split(z)
     along, asked, value = frame.along, frame.asked, z[-1] * frame.unit
-    found = []
+    parts = []
     if flow.rows:
         off = jax.vmap(flow.residual)(_times(frame, period), nodes)
-        found.append((off / frame.sizes[None]).reshape(-1))
+        parts.append((off / frame.sizes[None]).reshape(-1))
     first = nodes[0] / frame.scale
     if asked.moves:
-        found.append((guide.rate @ (first - guide.z))[None])
+        parts.append((guide.rate @ (first - guide.z))[None])
     if along.kind == PERIOD:
-        found.append((period - value)[None] / frame.period)
+        parts.append((period - value)[None] / frame.period)
     elif frame.drive is not None:
-        found.append(drive_off(frame, flow, period)[None])
+        parts.append(drive_off(frame, flow, period)[None])
     elif not asked.free:
-        found.append(z[-2:-1])
+        parts.append(z[-2:-1])
     if asked.energy or along.kind == ENERGY:
         goal = value if along.kind == ENERGY else frame.integral
-        found.append((integral_at(flow, frame.t, nodes[0]) - goal)[None] / frame.slope)
-    found += [(first[i] - frame.z[i] / frame.scale[i])[None] for i in asked.held]
+        parts.append((integral_at(flow, frame.t, nodes[0]) - goal)[None] / frame.slope)
+    parts += [(first[i] - frame.z[i] / frame.scale[i])[None] for i in asked.held]
     if along.kind == ENTRY:
-        found.append((first[along.entry] - value / frame.scale[along.entry])[None])
-    return jnp.concatenate([*found, frame.free @ (z[:-1] - frame.reference)])
+        parts.append((first[along.entry] - value / frame.scale[along.entry])[None])
+    return jnp.concatenate([*parts, frame.free @ (z[:-1] - frame.reference)])
 
 
 def drive_off(frame: OrbitFrame, flow, period):
-    """By which part of the period the system is the same later or earlier than after it."""
+    """The mismatch between T and the time after which the driven system repeats, as a fraction of the period."""
     drive = frame.drive
     assert drive is not None
     square = jnp.sum(drive.slopes**2)
@@ -224,21 +224,21 @@ def drive_off(frame: OrbitFrame, flow, period):
 
 
 def _changed(frame, flow, period):
-    """By how much accelerations differ after a period, at the times of the drive."""
+    """The change of the accelerations after a period, at the sampled times."""
     drive = frame.drive
     at = lambda t: flow.rate(t, drive.z)[flow.size :] / frame.scale[flow.size :]
-    # At the same phases whatever the period is.
-    times = frame.t + period * jnp.asarray(WATCHED_AT, period.dtype)
+    # Sampled at the same phases for every period.
+    times = frame.t + period * jnp.asarray(SAMPLED_AT, period.dtype)
     return jax.vmap(at)(times + period) - jax.vmap(at)(times)
 
 
 def drive_of(flow: Flow, t, z, period, scale) -> Drive:
-    """A drive as it is at the start, off the motion: where a parametric one would not be seen."""
-    aside = z + scale * jnp.cos(jnp.arange(1.0, z.size + 1.0, dtype=z.dtype))
-    times = t + period * jnp.asarray(WATCHED_AT, t.dtype)
-    at = lambda t: flow.rate(t, aside)[flow.size :] / scale[flow.size :]
+    """The drive at the branch's start, at a state off the motion: on it a parametric drive may have no effect."""
+    displaced = z + scale * jnp.cos(jnp.arange(1.0, z.size + 1.0, dtype=z.dtype))
+    times = t + period * jnp.asarray(SAMPLED_AT, t.dtype)
+    at = lambda t: flow.rate(t, displaced)[flow.size :] / scale[flow.size :]
     slopes = jax.vmap(lambda t: jax.jvp(at, (t,), (jnp.ones_like(t),))[1])(times + period)
-    return Drive(aside, slopes)
+    return Drive(displaced, slopes)
 
 
 def _apart(frame, flow, period):
@@ -249,7 +249,7 @@ def _apart(frame, flow, period):
 
 
 def _monodromy(frame, flow, t, z, frames, rate):
-    """The matrix of a period in tangent coordinates, and the orthonormal rows of what is trivial in it."""
+    """The monodromy matrix in tangent coordinates, and the orthonormal rows of its trivial directions."""
     basis, whole = flow.tangent_space(t, z, frame.scale), jnp.eye(z.size, dtype=z.dtype)
     for part in frames:
         whole = part @ whole
@@ -260,7 +260,7 @@ def _monodromy(frame, flow, t, z, frames, rate):
 
 @compiled
 def path_at(frame: OrbitFrame, z):
-    """Times from the start, and the states of the motion then: a sketch, (P,) and (P, 2n)."""
+    """Times from the start (P,) and the states at them (P, 2n), computed with a few fixed steps for plots."""
     flow, nodes, period = frame.split(z)
     each, span = -(-POINTS // frame.parts), period / frame.parts
     states = jax.vmap(lambda t, node: flow.path(t, node, span, each, SUBSTEPS))(_times(frame, period), nodes)
@@ -270,7 +270,7 @@ def path_at(frame: OrbitFrame, z):
 
 @compiled
 def sizes_at(flow: Flow, t, z, period, scale):
-    """The energy, the size of its gradient and those of the constraints' gradients, in units of `scale`; the drive."""
+    """The energy, the sizes of its gradient and of the constraints' gradients, in units of `scale`; and the drive."""
     slope = jax.grad(lambda z: integral_at(flow, t, z))(z) * scale
     size = jnp.linalg.norm(slope)
     rows = jnp.zeros(0, z.dtype)
@@ -282,7 +282,7 @@ def sizes_at(flow: Flow, t, z, period, scale):
 
 @compiled
 def drive_by_parameter(frame: OrbitFrame, z):
-    """d log T/dμ of a drive: by how much its period changes over the range of the parameter."""
+    """d log T/dμ of a drive: the change of the logarithm of its period per unit of the scaled parameter."""
 
     def off(z):
         flow, _, period = frame.split(z)

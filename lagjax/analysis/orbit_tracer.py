@@ -1,11 +1,11 @@
-"""Branches of cycles, in the equations of `orbit_equations.py`: their points, with multipliers and stability.
+"""Branches of cycles, from the equations of `orbit_equations.py`: their points, with multipliers and stability.
 
-Of the monodromy matrix N, with the rows Q of what is trivial in it and P = 1 - QᵀQ, two functions are watched,
+Two functions of the monodromy matrix N are monitored. With the rows Q of its trivial directions and P = 1 - QᵀQ,
 
     χ₊ = det (P (N - 1) P + QᵀQ),      χ₋ = det (P (N + 1) P + QᵀQ)
 
-the products of μ - 1 and μ + 1 over the multipliers that are not trivial: χ₊ is zero at a fold and where other cycles
-branch off, χ₋ where those of twice the period do. They are as smooth as N where multipliers meet.
+are the products of μ - 1 and μ + 1 over the nontrivial multipliers. χ₊ is zero at a fold and where other cycles branch
+off, χ₋ where cycles of twice the period branch off. Where multipliers meet, both remain as smooth as N.
 
 Source: Seydel, *Practical Bifurcation and Stability Analysis*, §7.6; Kuznetsov, *Elements of Applied Bifurcation
 Theory*, §10.2.
@@ -19,17 +19,18 @@ import numpy as np
 from lagjax.analysis.orbit_equations import Evaluated, Guide, OrbitFrame, orbit_at, path_at
 from lagjax.analysis.tracing import Point, Tracer
 
-# Changes of a driven system from one period to the next that are none, relative to what a period makes.
+# A driven system repeats if it changes by less than this from one period to the next, relative to its change in a
+# period.
 SAME = 1e-5
-# Multipliers so near the unit circle, in roots of the error of M, are on it: a double one is off by that.
+# A multiplier within this many square roots of the error of N is on the unit circle: a double one is off by that much.
 ON_CIRCLE = 3.0
 
 
-class OrbitSeen(NamedTuple):
-    """What a user sees of a point, and what is watched: χ₊ and χ₋, and whether a pair is about to leave the circle.
+class OrbitOutputs(NamedTuple):
+    """The outputs of a point, and the monitored functions: χ₊, χ₋, and `pairs`, which is zero where a pair leaves.
 
     - `multipliers` (k,): the trivial ones first.
-    - `low`, `high` (n,): the smallest and largest of each coordinate; `moves`: the largest distance between these.
+    - `low`, `high` (n,): the smallest and largest value of each coordinate; `moves`: their largest distance, scaled.
     """
 
     parameter: float
@@ -56,35 +57,35 @@ class OrbitTracer(Tracer):
         self.dtype = np.dtype(frame.scale.dtype)
         self.unit = float(frame.unit)
         self.amplified = 1.0
-        self.kept: tuple[bytes, Evaluated] | None = None
+        self.cached: tuple[bytes, Evaluated] | None = None
 
     @property
     def noise(self) -> float:
         return max(self.eps, float(self.frame.flow.rtol) * max(1.0, self.amplified))
 
     def evaluated(self, z) -> Evaluated:
-        """What the flow says at a point; of the last one it is remembered."""
+        """The equations evaluated at a point; the result for the last point is cached."""
         z = z.astype(self.dtype)
         key = b"".join(np.asarray(x).tobytes() for x in (z, *self.guide))
-        if self.kept is None or self.kept[0] != key:
-            self.kept = key, jax.tree.map(np.asarray, orbit_at(self.frame, z, self.guide))
-        return self.kept[1]
+        if self.cached is None or self.cached[0] != key:
+            self.cached = key, jax.tree.map(np.asarray, orbit_at(self.frame, z, self.guide))
+        return self.cached[1]
 
     def at(self, z):
-        found = self.evaluated(z)
-        if np.isfinite(found.amplified):
-            self.amplified = float(found.amplified)
-        return found.value, found.jacobian, float(found.largest)
+        evaluation = self.evaluated(z)
+        if np.isfinite(evaluation.amplified):
+            self.amplified = float(evaluation.amplified)
+        return evaluation.value, evaluation.jacobian, float(evaluation.largest)
 
     def moved_to(self, point):
         self.guide = self.evaluated(point.z).guide
 
     def described(self, z, jacobian, tangent) -> Point | str:
-        found = self.evaluated(z)
-        if float(found.apart) > max(SAME, 1e3 * self.eps):
+        evaluation = self.evaluated(z)
+        if float(evaluation.apart) > max(SAME, 1e3 * self.eps):
             return "the system is not the same after any period near the last one: its drive has no common period"
-        multipliers, left = self._multipliers(found)
-        plus, minus = (self._product(found, shift) for shift in (-1.0, 1.0))
+        multipliers, left = self._multipliers(evaluation)
+        plus, minus = (self._product(evaluation, shift) for shift in (-1.0, 1.0))
         times, states = path_at(self.frame, z.astype(self.dtype))
         low, high = extent(np.asarray(times), np.asarray(states))
         size = np.abs(left)
@@ -93,16 +94,16 @@ class OrbitTracer(Tracer):
         below = int(np.sum((np.imag(left) == 0) & (np.real(left) < -1)))
         period = float(self.frame.period) * np.exp(z[-2])
         nodes = z[:-2].reshape(self.frame.parts, -1) * np.asarray(self.frame.scale)
-        seen = OrbitSeen(
+        outputs = OrbitOutputs(
             z[-1] * self.unit, period, nodes, multipliers, low, high, plus if self.crosses else 1.0, minus,
             self._pairs(left), float(np.max((high - low) / np.asarray(self.frame.scale)[: len(low)])),
         )  # fmt: skip
-        return Point(z, jacobian, tangent, float(np.sign(seen.plus)), seen, growing, below)
+        return Point(z, jacobian, tangent, float(np.sign(outputs.plus)), outputs, growing, below)
 
-    def _multipliers(self, found: Evaluated) -> tuple[np.ndarray, np.ndarray]:
-        """All of them, those that are trivial first as 1; and those that are not, by falling size."""
-        count = int(np.sum(found.there))
-        reduced = self._without(found, found.whole)
+    def _multipliers(self, evaluation: Evaluated) -> tuple[np.ndarray, np.ndarray]:
+        """All multipliers, the trivial ones first as exactly 1; and the nontrivial ones alone, by falling size."""
+        count = int(np.sum(evaluation.there))
+        reduced = self._without(evaluation, evaluation.whole)
         left = np.linalg.eigvals(reduced)
         left = left[np.argsort(np.abs(left - 1), kind="stable")][count:]
         left = left[
@@ -110,18 +111,18 @@ class OrbitTracer(Tracer):
         ]
         return np.concatenate([np.ones(count, complex), left.astype(complex)]), left.astype(complex)
 
-    def _without(self, found, matrix):
-        rest = np.eye(len(matrix)) - found.trivial.T @ found.trivial
-        return rest @ matrix @ rest + found.trivial.T @ found.trivial
+    def _without(self, evaluation, matrix):
+        rest = np.eye(len(matrix)) - evaluation.trivial.T @ evaluation.trivial
+        return rest @ matrix @ rest + evaluation.trivial.T @ evaluation.trivial
 
-    def _product(self, found, shift):
-        return float(np.linalg.det(self._without(found, found.whole + shift * np.eye(len(found.whole)))))
+    def _product(self, evaluation, shift):
+        return float(np.linalg.det(self._without(evaluation, evaluation.whole + shift * np.eye(len(evaluation.whole)))))
 
     def _pairs(self, left):
         """A function that changes its sign where a pair leaves the unit circle.
 
-        Without damping two pairs meet there: with ρ = μ + 1/μ, the product of (ρ_i - ρ_j)². Else the distance of the
-        slowest pair from the circle.
+        Without damping two pairs meet there, and the function is the product of (ρ_i - ρ_j)² with ρ = μ + 1/μ.
+        Otherwise it is the logarithm of the size of the pair nearest to the circle.
         """
         upper = left[left.imag > 0]
         if not self.frame.reasons.momenta:
@@ -131,7 +132,7 @@ class OrbitTracer(Tracer):
             return np.nan
         rho, rest = [], list(left + 1 / left)
         while len(rest) > 1:
-            # Each is there twice.
+            # μ and 1/μ have the same ρ, so each value occurs twice.
             rho.append(rest.pop())
             rest.pop(int(np.argmin(np.abs(np.array(rest) - rho[-1]))))
         apart = np.array([(a - b) ** 2 for i, a in enumerate(rho) for b in rho[i + 1 :]])
@@ -139,19 +140,19 @@ class OrbitTracer(Tracer):
 
 
 def extent(times, states):
-    """The smallest and largest of each coordinate on a path of positions and velocities, by cubics between points."""
+    """The smallest and largest value of each coordinate on a path, with cubic interpolation between its points."""
     x, u = np.split(states, 2, axis=1)
     h = np.diff(times)[:, None]
     x0, x1, m0, m1 = x[:-1], x[1:], h * u[:-1], h * u[1:]
     a, b, c = 2 * (x0 - x1) + m0 + m1, 3 * (x1 - x0) - 2 * m0 - m1, m0
-    # Where 3 a s² + 2 b s + c = 0.
+    # The extrema of a cubic: 3 a s² + 2 b s + c = 0.
     root = np.sqrt(np.maximum(b**2 - 3 * a * c, 0.0))
     q = -(b + np.copysign(root, b))
     with np.errstate(divide="ignore", invalid="ignore"):
-        places = [q / (3 * a), c / q]
-    found = [x0, x1]
-    for s in places:
+        roots = [q / (3 * a), c / q]
+    candidates = [x0, x1]
+    for s in roots:
         inside = np.isfinite(s) & (s > 0) & (s < 1)
         s = np.where(inside, s, 0.0)
-        found.append(((a * s + b) * s + c) * s + x0)
-    return np.min(found, axis=(0, 1)), np.max(found, axis=(0, 1))
+        candidates.append(((a * s + b) * s + c) * s + x0)
+    return np.min(candidates, axis=(0, 1)), np.max(candidates, axis=(0, 1))

@@ -1,4 +1,4 @@
-"""What counts as zero among numbers that were computed in a dtype."""
+"""Tolerances below which computed numbers count as zero, for each dtype."""
 
 from typing import NamedTuple
 
@@ -6,10 +6,10 @@ import numpy as np
 
 
 class Precision(NamedTuple):
-    """Up to which size, relative to what it could be, something is round-off.
+    """Values up to these, relative to the size that they could have, are round-off.
 
-    `null`: a rate of change; `zero`: an entry of a combination; `exact`: a rate that needs no gauge function; `agrees`:
-    what two numbers may differ by to be taken for the same.
+    `null`: of a rate of change; `zero`: of an entry of a combination; `exact`: of a rate that needs no gauge function;
+    `agrees`: of the difference of two numbers that are taken to be equal.
     """
 
     null: float
@@ -25,5 +25,5 @@ PRECISIONS = {
 
 
 def precision_of(dtype) -> Precision:
-    """That of a dtype."""
+    """The tolerances of a dtype."""
     return PRECISIONS[np.dtype(dtype)]

@@ -1,13 +1,14 @@
-"""At what rate the charge of each of many generators changes, at many states: one program for all.
+"""The rates of change of the charges of many generators at many states, computed by one program.
 
     dC/dt = ρ + (Q - ∂R/∂v)·(ξ - τ v) + λ·A (ξ - τ v)
 
-(`mechanics/noether.py`). The last part vanishes for every λ where the constraints allow the displacement ξ - τ v: these
-are kept apart, (m,) numbers a state. Rates are told in units of what they would be if nothing were conserved: of
+(`mechanics/noether.py`). The last part vanishes for every λ if the constraints allow the displacement ξ - τ v; its m
+numbers per state are kept separately. Rates are given in units of what they would be if nothing were conserved, e times
+the size of the generator:
 
-    e = |p|·|v| + |∂L/∂q|·ℓ + |Q - ∂R/∂v|·ℓ        times        |ξ|/ℓ + |τ|/T
+    e = |p|·|v| + |∂L/∂q|·ℓ + |Q - ∂R/∂v|·ℓ,        |ξ|/ℓ + |τ|/T
 
-with ℓ the size of each coordinate, and T the time in which velocities make such lengths.
+where ℓ is the size of each coordinate, and T the time in which the velocities cover such lengths.
 """
 
 from typing import NamedTuple
@@ -30,7 +31,7 @@ from lagjax.mechanics.reactions import reacts
 
 
 class Affine(eqx.Module):
-    """Many generators of the kind ξ = shift + matrix x + t drift, τ = clock + t clock_rate, K of each."""
+    """K generators of the form ξ = shift + matrix x + t drift, τ = clock + t clock_rate."""
 
     shift: np.ndarray
     matrix: np.ndarray
@@ -39,7 +40,7 @@ class Affine(eqx.Module):
     clock_rate: np.ndarray
 
     def at(self, t, x, u) -> Flow:
-        """What each of them does at a state."""
+        """The flow of each generator at a state."""
         to = lambda y: jnp.asarray(y, x.dtype)
         xi = to(self.shift) + to(self.matrix) @ x + t * to(self.drift)
         xi_rate = to(self.matrix) @ u + to(self.drift)
@@ -48,15 +49,15 @@ class Affine(eqx.Module):
 
 
 class Rates(NamedTuple):
-    """Of N states, m constraint equations and K generators, all in units of what they could be.
+    """The rates for N states, m constraint equations and K generators, relative to the size that they could have.
 
-    `charge` (N, K): the rate by L, force and dissipation together; of it `lagrangian` and `force`. `displacement`
-    (N, m, K): by how much each constraint equation forbids ξ - τ v. `invariance` (N, m, K): by how much a constraint of
-    velocities is changed by the motion. `value` (N,): L.
+    `charge` (N, K): the rate due to L, force and dissipation together; `lagrangian` and `force`: its two parts.
+    `displacement` (N, m, K): how much each constraint equation forbids ξ - τ v. `invariance` (N, m, K): how much the
+    motion changes a velocity constraint. `value` (N,): L.
 
-    In their own units: `size` (K,) of each generator; `energy` (N,), the e of each state; `xi` (N, K, n), `tau` (N, K);
-    `charges` (N, K), the charges themselves; `first` (K,) and `pushed` (m, K), of the first state, the rate without
-    constraints, and A (ξ - τ v).
+    Not relative: `size` (K,) of each generator; `energy` (N,), the e of each state; `xi` (N, K, n), `tau` (N, K);
+    `charges` (N, K), the charges themselves; `first` (K,) and `pushed` (m, K): the rate without constraints and
+    A (ξ - τ v), both at the first state.
     """
 
     states: States
@@ -75,8 +76,8 @@ class Rates(NamedTuple):
     pushed: Float[Array, "m K"]
 
 
-class _Of(NamedTuple):
-    """Of one state, in its own units."""
+class _StateRates(NamedTuple):
+    """The quantities at one state, not relative."""
 
     by_lagrangian: Array
     by_force: Array
@@ -94,30 +95,30 @@ class _Of(NamedTuple):
 def rates(system, affine: Affine, generators: tuple[Generator, ...], s, places) -> Rates:
     """The rates of change of all charges at states around the given one."""
     states, scales = around(system, s, places)
-    of = _rates(system, affine, generators, s, states, scales)
-    xp = coordinates.numpy_of(of)
-    of = _Of(*(xp.asarray(y) for y in of))
-    finite = xp.isfinite(of.energy) & xp.all(xp.isfinite(of.by_lagrangian + of.by_force), axis=1)
+    raw = _rates(system, affine, generators, s, states, scales)
+    xp = coordinates.numpy_of(raw)
+    raw = _StateRates(*(xp.asarray(y) for y in raw))
+    finite = xp.isfinite(raw.energy) & xp.all(xp.isfinite(raw.by_lagrangian + raw.by_force), axis=1)
     found = states.found & finite
-    seen = lambda y: xp.where(found.reshape(-1, *[1] * (y.ndim - 1)), y, xp.zeros_like(y))
-    count = xp.maximum(xp.sum(found), 1).astype(of.energy.dtype)
-    size = xp.sqrt(xp.sum(seen(of.size) ** 2, axis=0) / count)
+    kept = lambda y: xp.where(found.reshape(-1, *[1] * (y.ndim - 1)), y, xp.zeros_like(y))
+    count = xp.maximum(xp.sum(found), 1).astype(raw.energy.dtype)
+    size = xp.sqrt(xp.sum(kept(raw.size) ** 2, axis=0) / count)
     size = xp.where(size > 0, size, xp.ones_like(size))
-    # A state where nothing happens has no scale of its own.
-    energy = seen(of.energy) + of.energy.dtype.type(1e-12) * xp.max(seen(of.energy))
+    # A state where nothing moves and no force acts has no scale of its own.
+    energy = kept(raw.energy) + raw.energy.dtype.type(1e-12) * xp.max(kept(raw.energy))
     energy = xp.where(found & (energy > 0), energy, xp.ones_like(energy))
-    relative = lambda y: seen(y) / (energy[:, None] * size[None])
-    slope = xp.where(of.slope > 0, of.slope, xp.ones_like(of.slope))[:, :, None] * size[None, None]
+    relative = lambda y: kept(y) / (energy[:, None] * size[None])
+    slope = xp.where(raw.slope > 0, raw.slope, xp.ones_like(raw.slope))[:, :, None] * size[None, None]
     return Rates(
         states._replace(found=found),
-        relative(of.by_lagrangian + of.by_force), relative(of.by_lagrangian), relative(of.by_force),
-        seen(of.forbidden) / slope, seen(of.changed) * scales.t / slope, seen(of.value) / energy,
-        size, energy, seen(of.xi), seen(of.tau), of.charges, (of.by_lagrangian + of.by_force)[0], of.forbidden[0],
+        relative(raw.by_lagrangian + raw.by_force), relative(raw.by_lagrangian), relative(raw.by_force),
+        kept(raw.forbidden) / slope, kept(raw.changed) * scales.t / slope, kept(raw.value) / energy,
+        size, energy, kept(raw.xi), kept(raw.tau), raw.charges, (raw.by_lagrangian + raw.by_force)[0], raw.forbidden[0],
     )  # fmt: skip
 
 
 @compiled
-def _rates(system, affine, generators, s, states, scales) -> _Of:
+def _rates(system, affine, generators, s, states, scales) -> _StateRates:
     _, unflatten = coordinates.flatten(s.q)
     equations = equations_of(lift(system, s), *s) if reacts(system) else None
 
@@ -131,7 +132,7 @@ def _rates(system, affine, generators, s, states, scales) -> _Of:
         )
         turned = moved.xi_rate - jnp.outer(moved.tau_rate, u)
         displaced = moved.xi - jnp.outer(moved.tau, u)
-        # ρ and C, as `noether.py` has them.
+        # ρ and C of `noether.py`.
         of_L = moved.tau * slope_t + moved.xi @ slope + turned @ p + value * moved.tau_rate - moved.gauge_rate
         charges = displaced @ p + moved.tau * value - moved.gauge
         multipliers = jnp.zeros(constraints.count(system, t, q, v, s.params), x.dtype)
@@ -141,18 +142,18 @@ def _rates(system, affine, generators, s, states, scales) -> _Of:
         force = applied_force(system, t, q, v, s.params, multipliers)
         energy = jnp.abs(p) @ jnp.abs(u) + (jnp.abs(slope) + jnp.abs(force)) @ scales.x
         size = jnp.sqrt(moved.xi**2 @ (1 / scales.x**2)) + jnp.abs(moved.tau) / scales.t
-        rows = _of_constraints(system, s.params, unflatten, scales, (t, x, u), moved, turned, displaced)
-        return _Of(of_L, displaced @ force, *rows, size, energy, moved.xi, moved.tau, value, charges)
+        rows = _constraint_rates(system, s.params, unflatten, scales, (t, x, u), moved, turned, displaced)
+        return _StateRates(of_L, displaced @ force, *rows, size, energy, moved.xi, moved.tau, value, charges)
 
     return jax.vmap(at)(*states[:3])
 
 
-def _of_constraints(system, params, unflatten, scales, state, moved, turned, displaced):
-    """A (ξ - τ v), the size of each row of A, and the change of each constraint of velocities; (m, K)."""
+def _constraint_rates(system, params, unflatten, scales, state, moved, turned, displaced):
+    """A (ξ - τ v) (m, K), the size of each row of A (m,), and the change of each velocity constraint (m, K)."""
     t, x, u = state
     if not system.constraints:
-        none = jnp.zeros((0, moved.tau.size), x.dtype)
-        return none, jnp.zeros(0, x.dtype), none
+        empty = jnp.zeros((0, moved.tau.size), x.dtype)
+        return empty, jnp.zeros(0, x.dtype), empty
     residual = lambda t, x, u: constraints.velocity_residual(system, t, x, u, params, unflatten)
     of_t, of_x, rows = jax.jacfwd(residual, argnums=(0, 1, 2))(t, x, u)
     change = jnp.outer(of_t, moved.tau) + of_x @ moved.xi.T + rows @ turned.T

@@ -1,7 +1,7 @@
 """Lagrange's equations of a small system as formulas, read back from the program that computes them.
 
-The program of M, F and A is written out number by number (`in_numbers.py`) and run on formulas in place of numbers
-(`expressions.py`). What was read is then computed with numbers, at random states, and compared with the program.
+The program of M, F and A is expanded into scalar operations (`in_numbers.py`) and run on formulas in place of numbers
+(`expressions.py`). The resulting formulas are then evaluated at random states and compared with the program.
 
 Source: Goldstein, *Classical Mechanics*, Eq. (1.57), (2.26), whose equations these are.
 """
@@ -27,18 +27,18 @@ from lagjax.mechanics.lagrangian import mass_and_forcing
 from lagjax.mechanics.refusals import check_system
 from lagjax.numerics import scalars
 
-# Operations of a program, and coordinates, beyond which nobody reads the equations.
+# Beyond these numbers of operations and coordinates the equations are too long to read.
 OPERATIONS, COORDINATES = 2000, 8
-# Formulas and program agree to this, or are not shown.
+# Formulas that differ from the program by more than this are not shown.
 AGREE = 1e-9
 STATES = 16
 
 
 class EquationsOfMotion(eqx.Module):
-    """Lagrange's equations `M a = F + Aᵀ λ` in LaTeX: a notebook shows them, `print` writes their source.
+    """Lagrange's equations `M a = F + Aᵀ λ` in LaTeX: a notebook displays them, `print` shows the source.
 
     - `lines`: one for each coordinate, and one for each constraint.
-    - `error`: by how much the formulas differ from the program, relative, at random states.
+    - `error`: the largest relative difference of the formulas from the program at random states.
     """
 
     lines: tuple[str, ...] = eqx.field(static=True)
@@ -67,14 +67,14 @@ def latex(system, q, v, params=None, *, t=0.0) -> EquationsOfMotion:
     >>> print(lj.latex(lj.System(pendulum), {"theta": 0.1}, {"theta": 0.0}, params).lines[0])
     l^{2} m \ddot{\theta} = -g m \sin(\theta)
 
-    **Arguments:** `q` and `v` alike, `params` as the system takes it, `t` scalar: their names are the symbols; numbers
-    that the functions hold by themselves are written as they are.
+    **Arguments:** `q` and `v` of the same structure, `params` as the system takes it, `t` scalar: their names become
+    the symbols; numbers inside the functions are written as numbers.
 
-    **Returns:** an `EquationsOfMotion`: one equation a coordinate, `Σ M a = F + Aᵀ λ` with the multipliers λ by the
-    names of their constraints, and each constraint `g = 0` or `phi = 0`. Products are multiplied out.
+    **Returns:** an `EquationsOfMotion`: one equation per coordinate, `Σ M a = F + Aᵀ λ`, with multipliers λ named after
+    their constraints, and each constraint `g = 0` or `phi = 0`. Products are expanded.
 
     **Raises:** `ValueError` for a system that is not small, whose program has loops, branches or functions without a
-    formula, or where the formulas do not agree with the program; as `accelerations` for a state of the wrong kind.
+    formula, or if the formulas do not agree with the program; as `accelerations` for a state of the wrong kind.
 
     Source: Goldstein, *Classical Mechanics*, Eq. (1.57), (2.26).
     """
@@ -83,29 +83,29 @@ def latex(system, q, v, params=None, *, t=0.0) -> EquationsOfMotion:
     try:
         system = looked_at(system, s)
     except (TypeError, IndexError):
-        # A whole number that counts something has to stay one.
+        # An integer that is used as a count or an index must stay an integer.
         s = coordinates.state(t, q, v, params)
         system = looked_at(system, s)
     n = len(coordinates.names(s.q))
     if n > COORDINATES:
-        raise ValueError(f"the system has {n} coordinates, and equations are written of up to {COORDINATES}.")
+        raise ValueError(f"the system has {n} coordinates, but equations are written only for up to {COORDINATES}.")
     _, unflatten = coordinates.flatten(s.q)
-    alone = in_numbers(system, unflatten)
-    args = alone, s.t, coordinates.numbers(s.q), coordinates.numbers(s.v), s.params
+    scalarised = in_numbers(system, unflatten)
+    args = scalarised, s.t, coordinates.numbers(s.q), coordinates.numbers(s.v), s.params
     try:
         program = Numbers(_parts, args, most=OPERATIONS).program
-        formulas, names = _formulas(program, alone, s)
+        formulas, names = _formulas(program, scalarised, s)
     except (scalars.TooLong, expressions.TooLong):
         raise ValueError(
             "the equations are too long to be read.\n"
-            "Usual cause: an L with sums over many parts, or a quadrature.\nFix: print fewer parts of it."
+            "Usual cause: an L with sums over many parts, or a quadrature.\nFix: print a system with fewer parts."
         ) from None
-    error = _verified(program, formulas, names, alone, s)
+    error = _verified(program, formulas, names, scalarised, s)
     return EquationsOfMotion(tuple(_lines(system, s, formulas)), error, STATES)
 
 
 def _parts(system, t, q, v, params):
-    """M, F, A and what vanishes, number by number; of a force that depends on multipliers its slope by these."""
+    """The entries of M, F, A and the constraints; A includes the derivative of a force by the multipliers."""
     x, unflatten = coordinates.flatten(q)
     u, _ = coordinates.flatten(v)
     linear = mass_and_forcing(system, t, x, u, params, unflatten)
@@ -130,23 +130,23 @@ def _symbols(s) -> tuple[list[Formula], list[str]]:
         known = [name.replace("q", "params", 1) for name in known]
     position = lambda name: typeset.written(name)
     short = [name.split(".")[-1] for name in known]
-    # Of two masses of two bodies each gets its body as an index.
+    # Parameters with the same last name, such as the masses of two bodies, get the body as an index.
     letters = [x if short.count(x) == 1 else "_".join(reversed(name.split("."))) for x, name in zip(short, known)]
-    found = [("t", "t", 1)]
-    found += [(f"q:{name}", position(name), 2) for name in names]
-    found += [(f"v:{name}", rf"\dot{{{position(name)}}}", 3) for name in names]
-    found += [(f"p:{name}", typeset.written(letter), 0) for name, letter in zip(known, letters)]
-    return [symbol(*one) for one in found], [name for name, *_ in found]
+    entries = [("t", "t", 1)]
+    entries += [(f"q:{name}", position(name), 2) for name in names]
+    entries += [(f"v:{name}", rf"\dot{{{position(name)}}}", 3) for name in names]
+    entries += [(f"p:{name}", typeset.written(letter), 0) for name, letter in zip(known, letters)]
+    return [symbol(*one) for one in entries], [name for name, *_ in entries]
 
 
-def _formulas(program, alone, s) -> tuple[list[Formula], list[str]]:
+def _formulas(program, scalarised, s) -> tuple[list[Formula], list[str]]:
     jaxpr = program.jaxpr
     symbols, names = _symbols(s)
     values = dict(zip(jaxpr.constvars, map(_known, program.consts)))
-    inputs, given = iter(symbols), jtu.tree_leaves(eqx.filter(alone, eqx.is_array))
+    inputs, given = iter(symbols), jtu.tree_leaves(eqx.filter(scalarised, eqx.is_array))
     for i, variable in enumerate(jaxpr.invars):
         size, shape = int(np.prod(variable.aval.shape)), variable.aval.shape
-        # What the functions hold comes first, and has no names.
+        # Arrays inside the functions come first and have no names.
         entries = _known(given[i]) if i < len(given) else _filled([next(inputs) for _ in range(size)], shape)
         values[variable] = entries
     read = lambda x: _known(x.val) if isinstance(x, Literal) else values[x]
@@ -162,10 +162,10 @@ def _known(x) -> np.ndarray:
 
 
 def _filled(entries, shape) -> np.ndarray:
-    found = np.empty(len(entries), object)
+    array = np.empty(len(entries), object)
     for i, entry in enumerate(entries):
-        found[i] = entry
-    return found.reshape(shape)
+        array[i] = entry
+    return array.reshape(shape)
 
 
 def _applied(equation, operands) -> list[np.ndarray]:
@@ -192,11 +192,11 @@ def _applied(equation, operands) -> list[np.ndarray]:
 
 def _each(name, params, operands, shape) -> np.ndarray:
     rows = [np.broadcast_to(x, shape).reshape(-1) for x in operands]
-    return _filled([_of_numbers(name, params, *x) for x in zip(*rows)], shape)
+    return _filled([_apply_scalar(name, params, *x) for x in zip(*rows)], shape)
 
 
-def _of_numbers(name, params, *x: Formula) -> Formula:
-    """What a primitive makes of formulas."""
+def _apply_scalar(name, params, *x: Formula) -> Formula:
+    """The result of applying a primitive to formulas."""
     if name in ("add", "add_any"):
         return x[0] + x[1]
     if name == "sub":
@@ -222,13 +222,13 @@ def _of_numbers(name, params, *x: Formula) -> Formula:
     )
 
 
-def _verified(program, formulas, names, alone, s) -> float:
-    """The largest difference of formulas and program at random states, relative; raises where they do not agree."""
-    given = jtu.tree_leaves(eqx.filter(alone, eqx.is_array))
+def _verified(program, formulas, names, scalarised, s) -> float:
+    """The largest relative difference of formulas and program at random states; raises if they do not agree."""
+    given = jtu.tree_leaves(eqx.filter(scalarised, eqx.is_array))
     leaves = [np.asarray(x) for x in jtu.tree_leaves(eqx.filter((s.t, *s[1:]), eqx.is_array))]
     flat = np.concatenate([np.ravel(x) for x in leaves])
     run = jax.jit(lambda *inputs: eval_jaxpr(program.jaxpr, program.consts, *inputs))
-    worst, seen = 0.0, 0
+    worst, count = 0.0, 0
     random = np.random.default_rng(4)
     for _ in range(4 * STATES):
         at = flat * (1 + 0.25 * random.standard_normal(flat.size)) + 0.25 * random.standard_normal(flat.size) * (
@@ -242,16 +242,16 @@ def _verified(program, formulas, names, alone, s) -> float:
         exact = np.asarray([float(x) for x in run(*given, *inputs)])
         by_name = dict(zip(names, at))
         with np.errstate(all="ignore"):
-            found = np.asarray([formula.value(by_name) for formula in formulas])
+            values = np.asarray([formula.value(by_name) for formula in formulas])
         if np.all(np.isfinite(exact)):
-            seen += 1
-            worst = max(worst, float(np.max(np.abs(found - exact) / (1e-3 * np.max(np.abs(exact)) + np.abs(exact)))))
-        if seen == STATES:
+            count += 1
+            worst = max(worst, float(np.max(np.abs(values - exact) / (1e-3 * np.max(np.abs(exact)) + np.abs(exact)))))
+        if count == STATES:
             break
-    if seen < STATES or not worst <= (AGREE if flat.dtype == np.float64 else 1e-3):
+    if count < STATES or not worst <= (AGREE if flat.dtype == np.float64 else 1e-3):
         raise ValueError(
             f"the formulas differ from the program by {worst:.0e} and are not shown.\n"
-            "Usual cause: a root or power of what changes its sign.\nFix: write it so that it does not."
+            "Usual cause: a root or power of an expression that changes sign.\nFix: write it so that it does not."
         )
     return worst
 

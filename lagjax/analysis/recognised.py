@@ -1,7 +1,7 @@
 """Numbers in words: a ratio of two coefficients as a whole number, a parameter of the user's, or a pitch over 2π.
 
-`h p_z + 2π L_z with h = 0.5` says more than `0.0795774715 p_z + L_z`. A number is recognized where it agrees to
-round-off; that it is what it looks like is a guess, and so nothing is computed with it.
+`h p_z + 2π L_z with h = 0.5` says more than `0.0795774715 p_z + L_z`. A number is recognised if it agrees to round-off.
+The recognised form is only a guess, so it is displayed but never used in computations.
 """
 
 from fractions import Fraction
@@ -13,8 +13,8 @@ import numpy as np
 
 from lagjax.mechanics import coordinates
 
-# So many parameters are looked among, and so many terms are written.
-AT_MOST, LONG = 30, 8
+# Parameters are recognised among at most so many, and at most so many terms of a combination are written.
+MOST_PARAMETERS, MOST_TERMS = 30, 8
 WHOLE = [Fraction(n) for n in (1, 2, 3, 4)] + [Fraction(1, 2)]
 FRACTIONS = [Fraction(n, d) for d in range(1, 13) for n in range(1, 13)]
 
@@ -27,7 +27,7 @@ class Number(NamedTuple):
     params: tuple[tuple[str, int], ...] = ()
 
     def times(self, other: "Number") -> "Number":
-        """The product."""
+        """The product of two numbers."""
         powers = dict(self.params)
         for name, power in other.params:
             powers[name] = powers.get(name, 0) + power
@@ -46,29 +46,29 @@ class Number(NamedTuple):
 
 
 class Words(NamedTuple):
-    """A combination in words, and the factor that makes its first coefficients what they are there."""
+    """A combination in words, and the factor by which the original coefficients are multiplied there."""
 
     text: str
     factor: float
 
 
 def named_parameters(params) -> dict[str, float]:
-    """The parameters that are numbers, by name."""
+    """The numeric parameters, by name."""
     is_number = lambda x: isinstance(x, (float, int, np.number)) or np.issubdtype(getattr(x, "dtype", bool), np.number)
     leaves = jax.tree.map(lambda x: np.asarray(x) if is_number(x) else None, params)
     values = [float(x) for leaf in jax.tree.leaves(leaves) for x in np.ravel(leaf)]
     alone = jtu.treedef_is_leaf(jtu.tree_structure(leaves)) and len(values) == 1
     names = ["params"] if alone else coordinates.names(leaves)
-    return dict(zip(names, values)) if len(values) <= AT_MOST else {}
+    return dict(zip(names, values)) if len(values) <= MOST_PARAMETERS else {}
 
 
 def in_words(coefficients, names, params: dict[str, float], agrees: float, first=()) -> Words:
-    """A combination in words; `first`: which of the names are asked for their parameters before whole numbers."""
+    """A combination in words; `first`: the names whose coefficients are tried as parameters before whole numbers."""
     coefficients = np.asarray(coefficients, float)
     leading = coefficients[0]
-    found = [_recognized(c / leading, params, agrees, name in first) for c, name in zip(coefficients, names)]
+    found = [_recognised(c / leading, params, agrees, name in first) for c, name in zip(coefficients, names)]
     known = [number for number in found if number is not None]
-    # Multiplied by what is below the fraction lines.
+    # The combination is multiplied by its common denominator.
     below = {}
     for number in known:
         for name, power in number.params:
@@ -79,27 +79,27 @@ def in_words(coefficients, names, params: dict[str, float], agrees: float, first
     size = _value(factor, params)
     text, used = "", []
     for i, (c, name, number) in enumerate(zip(coefficients, names, found)):
-        if i == LONG and len(names) > LONG + 2:
+        if i == MOST_TERMS and len(names) > MOST_TERMS + 2:
             text += f" ... ({len(names)} terms)"
             break
         value = c / leading * size
         number = None if number is None else number.times(factor)
         word = f"{abs(value):.9g}" if number is None else str(number._replace(fraction=abs(number.fraction)))
-        # The sign is the number's own: a parameter may be negative.
+        # The sign shown is that of the fraction, because a parameter may be negative.
         negative = value < 0 if number is None else number.fraction < 0
         used += [] if number is None else [p for p, _ in number.params]
         sign = (" - " if negative else " + ") if text else ("-" if negative else "")
         text += sign + (f"{word} " if word != "1" else "") + name
-    with_them = ", ".join(f"{name} = {params[name]:.6g}" for name in dict.fromkeys(used))
-    return Words(text + (f" with {with_them}" if with_them else ""), size / leading)
+    values = ", ".join(f"{name} = {params[name]:.6g}" for name in dict.fromkeys(used))
+    return Words(text + (f" with {values}" if values else ""), size / leading)
 
 
 def _value(number: Number, params) -> float:
     return float(number.fraction) * np.pi**number.pi * float(np.prod([params[p] ** e for p, e in number.params]))
 
 
-def _recognized(value: float, params, agrees, parameters_first) -> Number | None:
-    """What a number looks like; None for nothing known."""
+def _recognised(value: float, params, agrees, parameters_first) -> Number | None:
+    """The form in which a number is recognised; None if there is none."""
     if abs(value - 1.0) <= agrees:
         return Number(Fraction(1))
     plain = [Number(fraction) for fraction in WHOLE]
@@ -116,16 +116,16 @@ def _recognized(value: float, params, agrees, parameters_first) -> Number | None
     else:
         order = [*plain, *single, *pitch, *pairs, *rest]
     alike = [found for number in order if (found := _agreeing(value, number, params, agrees)) is not None]
-    # Two parameters of the same value: it is open which of them is meant.
+    # If two parameters have the same value, it is ambiguous which one is meant.
     clear = [found for found in alike[:1] if not found.params or _only(found, alike)]
     return (clear or [found for found in alike if not found.params] or [None])[0]
 
 
 def _agreeing(value, number: Number, params, agrees):
-    of = _value(number, params) if all(params[p] for p, _ in number.params) else 0.0
-    if not of or abs(abs(value) - abs(of)) > agrees * abs(value):
+    recognised = _value(number, params) if all(params[p] for p, _ in number.params) else 0.0
+    if not recognised or abs(abs(value) - abs(recognised)) > agrees * abs(value):
         return None
-    return number._replace(fraction=number.fraction * int(np.sign(value * of)))
+    return number._replace(fraction=number.fraction * int(np.sign(value * recognised)))
 
 
 def _only(found: Number, alike):

@@ -1,16 +1,16 @@
 """Characteristic roots with their vectors and derivatives: of `K x = s M x`, and of `A x = λ E x`.
 
-LAPACK's roots of A are off by round-off of the largest of them, and so are its vectors. With left vectors z and right
-vectors x the quotient
+LAPACK's roots and vectors of A have errors of the round-off of the largest root. With left vectors z and right vectors
+x the error of the quotient
 
     λ = z A x / z E x
 
-is off by the product of the errors of z and x, which gives the small roots their digits. The same quotient has the
-derivatives: with `c_ij = z_i (A - λ_j E) x_j / (λ_j - λ_i)` the vectors X + X c and (1 - c) Z follow a change of the
-matrices to first order, and so the quotient to third.
+is the product of the errors of z and x, which makes small roots accurate. The same quotient gives the derivatives: with
+`c_ij = z_i (A - λ_j E) x_j / (λ_j - λ_i)` the vectors X + X c and (1 - c) Z follow a change of the matrices to first
+order, and hence the quotient to third.
 
-Where roots are double, c has no meaning and is left out; what is then left of a derivative is shared by those roots,
-the derivative of their mean. Where there are not enough vectors (a defective root), it is dropped. Both are told.
+For double roots c is undefined and left out; each of them then gets the derivative of their mean. A root with too few
+vectors (a defective root) gets no derivative. `Roots` reports both cases.
 
 Source: Golub & Van Loan, *Matrix Computations*, §7.2.2 (condition of a root), §8.7 (symmetric-definite problems);
 Magnus, Econometric Theory 1 (1985) 179 (derivatives).
@@ -25,20 +25,20 @@ from jaxtyping import Array, Bool, Float, Inexact
 
 from lagjax.numerics import lapack
 
-# Roots nearer to each other than this part of the largest are one double root.
+# Two roots are one double root if they differ by less than this fraction of the largest root.
 DOUBLE_BELOW = {np.dtype("float64"): 1e-8, np.dtype("float32"): 1e-4}
-# With a condition above this a root has not vectors enough.
+# A root with a condition above this is defective: it has too few vectors.
 DEFECTIVE_ABOVE = {np.dtype("float64"): 1e6, np.dtype("float32"): 1e3}
 
-# A double root of zero is found as the square root of round-off.
+# A double root of zero is computed only to the square root of round-off.
 NEARLY_ZERO = 1e-3
 
 
 class Roots(NamedTuple):
     """Roots (k,) with right vectors as columns (n, k).
 
-    - `round_off`: what each may be off by. `double`: another one is as near as that, or `defective`: and shares its
-      vector.
+    - `round_off`: the error bound of each. `double`: another root is the same, or the root is `defective`: it also
+      shares its vector.
     """
 
     values: Inexact[Array, " k"]
@@ -64,7 +64,7 @@ def general_roots(matrix, inertia) -> Roots:
 
 
 def roots_beside_zeros(matrix, inertia, derivatives=True) -> tuple[Roots, Bool[Array, " k"]]:
-    """The same, where A has directions that it takes to zero; and which roots are zero."""
+    """All λ of `A x = λ E x` for an A with a null space; and which roots are zero."""
     eps = jnp.finfo(matrix.dtype).eps
     values, beside, vectors, left, condition, null = lapack.eigen_without_null_space(matrix, inertia, eps)
     largest = jnp.max(jnp.abs(values), initial=0.0)
@@ -75,7 +75,7 @@ def roots_beside_zeros(matrix, inertia, derivatives=True) -> tuple[Roots, Bool[A
 def _followed(
     values, vectors, left, matrix, inertia, largest, condition, beside=None, null=None, derivatives=True
 ) -> Roots:
-    """The roots by their quotients, which follow the matrices; `left` (k, n) with `left @ inertia @ vectors` = 1."""
+    """The roots as quotients, differentiable by the matrices; `left` (k, n) with `left @ inertia @ vectors` = 1."""
     real = jnp.zeros(0, values.dtype).real.dtype
     condition = jnp.where(jnp.isfinite(condition), condition, jnp.inf)
     vectors, left = (jnp.where(jnp.isfinite(x), x, 0.0) for x in (vectors, left))
@@ -87,11 +87,11 @@ def _followed(
     double = (jnp.sum(alike, axis=1) > 1) | defective
     follows = ~alike & ~defective[None, :] & ~defective[:, None]
     if null is not None:
-        # What a mode shifts, of what may be shifted, is as 1/λ.
+        # The shift along the null space that a mode contains grows like 1/λ, so null vectors take no part in c.
         follows = follows & ~null[:, None] & ~null[None, :]
     start, new_vectors = values, vectors
-    # Twice: the first time for the digits of small roots, then for the derivatives alone. With an exact left vector any
-    # right one has the root: that without shifts, which are as 1/λ.
+    # Two passes: the first makes small roots accurate, the second adds only the derivatives. With an exact left vector
+    # any right vector gives the root, so the first pass uses one without shifts, which grow like 1/λ.
     for live in (False, True) if derivatives else (False,):
         A, E = (matrix, inertia) if live else lax.stop_gradient((matrix, inertia))
         left_of = left @ (A @ vectors - (E @ vectors) * start[None, :])
@@ -105,7 +105,7 @@ def _followed(
         correction = jnp.sum(over, axis=0) / jnp.where(under != 0, under, 1.0)
         correction = jnp.where(defective if null is None else defective | null, 0.0, correction)
         if jnp.iscomplexobj(values):
-            # A real root stays one: the others come in pairs.
+            # A real root stays real, because complex ones come in pairs.
             correction = jnp.where(values.imag == 0, correction.real, correction)
         shared = jnp.where(alike & double[:, None], 1.0, jnp.eye(values.size, dtype=real))
         shared = jnp.where(defective[None, :] & ~jnp.eye(values.size, dtype=bool), 0.0, shared)
@@ -117,7 +117,7 @@ def _followed(
 
 
 def zero_count(matrix, inertia, values):
-    """How often zero is a root of `A x = λ E x`: vectors that A takes to zero, and those that it takes to these."""
+    """The multiplicity of the root zero of `A x = λ E x`: null vectors n of A, and solutions of A x = E n."""
     least = jnp.min(jnp.abs(values)) if values.size else jnp.ones(())
     return _zero_count(matrix, inertia, least <= NEARLY_ZERO * jnp.max(jnp.abs(values), initial=0.0))
 
@@ -126,11 +126,11 @@ def zero_count(matrix, inertia, values):
 def _zero_count(A, E, possible):
     def counted():
         left, sizes, right = jnp.linalg.svd(A)
-        # Round-off of the largest, or of the terms that cancel.
+        # The bound is the round-off of the largest singular value, or of the terms that cancel.
         eps = jnp.finfo(A.dtype).eps
         terms = 1e2 * jnp.sum(jnp.abs(left) * (jnp.abs(A) @ jnp.abs(right.T)), axis=0)
         null = sizes <= eps * jnp.minimum(1e3 * sizes[0], jnp.maximum(terms, 4 * A.shape[0] * sizes[0]))
-        # A x = E n has a solution where E n has no part in what A does not reach.
+        # A x = E n has a solution if E n lies in the range of A.
         between = jnp.where(null[:, None] & null[None, :], left.T @ E @ right.T, 0.0)
         reached = jnp.linalg.svd(between, compute_uv=False)
         return (2 * jnp.sum(null) - jnp.sum(reached > 1e-9 * jnp.max(jnp.abs(E)))).astype(jnp.int32)

@@ -1,12 +1,12 @@
 """Routh's function: a system without its cyclic coordinates, whose momenta are parameters.
 
-With a cyclic coordinate c its momentum p_c = ∂L/∂v_c is constant. Solved for v_c (`legendre.py`), the function
+The momentum p_c = ∂L/∂v_c of a cyclic coordinate c is constant. With v_c found from it (`legendre.py`), the function
 
     R(t, q, v) = L(t, q, v, v_c) - p_c·v_c
 
-is a Lagrangian for the other coordinates: ∂R/∂q = ∂L/∂q and ∂R/∂v = ∂L/∂v with v_c taken from p_c, since what v_c
-changes cancels. (Goldstein's R has the other sign.) Forces on the others stay what they are, with v_c taken from p_c,
-where they do not depend on the cyclic coordinate; on it none may act.
+is a Lagrangian for the other coordinates: ∂R/∂q = ∂L/∂q and ∂R/∂v = ∂L/∂v at the v_c given by p_c, because the terms
+with dv_c cancel. (Goldstein's R has the opposite sign.) Forces on the other coordinates are unchanged, with v_c given
+by p_c, but must not depend on the cyclic coordinate; no force may act on the cyclic coordinate itself.
 
 Source: Goldstein, *Classical Mechanics*, §8.3; Landau & Lifshitz, *Mechanics*, §41.
 """
@@ -30,60 +30,60 @@ from lagjax.mechanics.system import System
 
 
 class Routhian(eqx.Module):
-    """Routh's function `R(t, q, v, params)` of the coordinates that are left: the Lagrangian of their system."""
+    """Routh's function `R(t, q, v, params)` of the remaining coordinates: the Lagrangian of their system."""
 
     system: System
     cyclic: tuple[str, ...] = eqx.field(static=True)
 
     def __call__(self, t, q, v, params):
-        """R at a state of the coordinates that are left, `[L]`."""
+        """R at a state of the remaining coordinates, `[L]`."""
         q, v = jax.tree.map(jnp.asarray, coordinates.as_floats((q, v)))
         return self._at(t, q, v, params)[0]
 
     def velocities(self, t, q, v, params) -> dict[str, Array]:
-        """The velocities of the cyclic coordinates, by name, `[q]/[t]`: integrated, these give the coordinates."""
+        """The velocities of the cyclic coordinates, by name, `[q]/[t]`; integrate them to get the coordinates."""
         s = coordinates.state(t, q, v, params)
         return dict(zip(self.cyclic, self._at(*s)[1]))
 
     def full(self, q, of_cyclic: Mapping):
-        """A position or a velocity of all coordinates, of one of those that are left and one by name of the others."""
+        """The positions or velocities of all coordinates, from those of the remaining and of the cyclic ones."""
         return _together(q, self.cyclic, [of_cyclic[name] for name in self.cyclic])
 
     def force(self, t, q, v, params):
-        """The generalized forces on the coordinates that are left, like these."""
+        """The generalised forces on the remaining coordinates, in the structure of `q`."""
         force = self.system.force
         assert force is not None
-        found = force(t, *self._state(t, q, v, params), self._parted(params)[0])
-        if isinstance(found, Mapping):
-            return {name: found[name] for name in q}
-        places = [_place(name) for name in self.cyclic]
-        return jnp.stack([x for i, x in enumerate(jnp.asarray(found)) if i not in places])
+        forces = force(t, *self._state(t, q, v, params), self._split(params)[0])
+        if isinstance(forces, Mapping):
+            return {name: forces[name] for name in q}
+        indices = [_index(name) for name in self.cyclic]
+        return jnp.stack([x for i, x in enumerate(jnp.asarray(forces)) if i not in indices])
 
     def dissipation(self, t, q, v, params):
-        """Rayleigh's function of the coordinates that are left."""
+        """Rayleigh's function of the remaining coordinates."""
         dissipation = self.system.dissipation
         assert dissipation is not None
-        return dissipation(t, *self._state(t, q, v, params), self._parted(params)[0])
+        return dissipation(t, *self._state(t, q, v, params), self._split(params)[0])
 
     def _state(self, t, q, v, params):
-        """Positions, cyclic ones zero, and velocities of all coordinates."""
+        """The positions (zero for cyclic coordinates) and velocities of all coordinates."""
         u = self._at(t, q, v, params)[1]
         return _together(q, self.cyclic, [jnp.zeros_like(x) for x in u]), _together(v, self.cyclic, list(u))
 
     def _at(self, t, q, v, params):
-        params, momenta = self._parted(params)
+        params, momenta = self._split(params)
         shaped = coordinates.flatten(v)[0]
         zeros = [jnp.zeros_like(shaped[0])] * len(self.cyclic)
         q = _together(q, self.cyclic, zeros)
-        known = (Routhian, self.cyclic, self.system.read, kinds((t, q, params)))
-        remembered(self.system, known, lambda: self._check(t, q, _together(v, self.cyclic, zeros), params))
+        key = (Routhian, self.cyclic, self.system.read, kinds((t, q, params)))
+        remembered(self.system, key, lambda: self._check(t, q, _together(v, self.cyclic, zeros), params))
         of = lambda u: self.system.lagrangian(t, q, _together(v, self.cyclic, list(u)), params)
         p = jnp.stack([jnp.asarray(momenta[name], shaped.dtype) for name in self.cyclic])
         found = velocity_of(jax.grad(of), p)
         u = jnp.where(found.regular & found.reached, found.v, jnp.nan)
         return of(u) - p @ u, u
 
-    def _parted(self, params):
+    def _split(self, params):
         if not isinstance(params, Mapping) or set(params) != {"params", "momenta"}:
             raise ValueError(
                 "the parameters of a Routhian are those of the system and the momenta.\n"
@@ -103,12 +103,12 @@ class Routhian(eqx.Module):
             depends = next(forced_by(self.system, name, t, q, v, params), None)
             if reason is None and depends is not None:
                 raise ValueError(
-                    f"'{name}' cannot be eliminated: {depends}, and the others then depend on where it is.\n"
+                    f"'{name}' cannot be eliminated: {depends}, so the motion of the others depends on where it is.\n"
                     f"Fix: leave '{name}' out of cyclic."
                 )
             if reason is not None:
                 raise ValueError(
-                    f"'{name}' is not cyclic: {reason}, and its momentum need not stay.\n"
+                    f"'{name}' is not cyclic: {reason}, so its momentum need not be constant.\n"
                     f"Fix: leave '{name}' out of cyclic; lj.explain(system, t, q, v, params).structure.cyclic lists "
                     "those that L does not contain."
                 )
@@ -116,7 +116,7 @@ class Routhian(eqx.Module):
 
 
 def routhian(system: System, cyclic: str | Iterable[str]) -> System:
-    """Return the system of the coordinates that are left when cyclic ones are eliminated by their momenta.
+    """Return the system of the coordinates that remain when cyclic ones are eliminated by their momenta.
 
     >>> import lagjax as lj
     >>> def kepler(t, q, v, params):
@@ -132,31 +132,31 @@ def routhian(system: System, cyclic: str | Iterable[str]) -> System:
     - `system`: with q a dict, or an array (n,).
     - `cyclic`: which coordinates to eliminate, by name: a key of the dict that is a number, or `"q[1]"`.
 
-    **Returns:** a `System` in the coordinates that are left, the dict without these keys, or the shorter array. Its
+    **Returns:** a `System` in the remaining coordinates, the dict without these keys, or the shorter array. Its
     parameters are `{"params": those of the system, "momenta": {name: p}}`, with p as `lj.momentum` gives it.
     Its constraints, forces and dissipation are those of the system. `routhian(...).lagrangian.velocities(t, q, v,
     params)` gives the cyclic velocities, by name.
 
-    **Raises:** `ValueError`, when L is called, for a coordinate that is not cyclic, is acted on by a force or a
-    constraint, or that forces on others depend on; for parameters without the momenta; NaN where the momenta do not
-    tell the cyclic velocities. At once where a force depends on multipliers.
+    **Raises:** `ValueError`, when L is called, for a coordinate that is not cyclic, on which a force or constraint
+    acts, or on which the forces on others depend; for parameters without the momenta. `ValueError`, at once, if a force
+    depends on multipliers. The values are NaN where the momenta do not determine the cyclic velocities.
 
-    Source: Goldstein, §8.3, with the other sign; Landau & Lifshitz, *Mechanics*, §41.
+    Source: Goldstein, §8.3, with the opposite sign; Landau & Lifshitz, *Mechanics*, §41.
     """
     check_system(system, cyclic)
     names = (cyclic,) if isinstance(cyclic, str) else tuple(cyclic)
     if not names or len(set(names)) < len(names):
-        raise ValueError('cyclic names each coordinate to eliminate once.\nFix: cyclic=["phi", "psi"].')
+        raise ValueError('cyclic must name at least one coordinate, and each only once.\nFix: cyclic=["phi", "psi"].')
     if reacts(system):
         raise ValueError(
-            "the force depends on multipliers, and those of the coordinates that are left are not asked for.\n"
+            "the force depends on multipliers, which a Routhian does not support.\n"
             "Fix: lj.routhian of a system whose force is a function of (t, q, v, params)."
         )
     reduced = Routhian(system, names)
 
     def constraint(g):
         def of_rest(t, q, params):
-            rest, _ = reduced._parted(params)
+            rest, _ = reduced._split(params)
             zero = jnp.zeros_like(coordinates.flatten(q)[0][0])
             return g(t, _together(q, names, [zero] * len(names)), rest)
 
@@ -170,25 +170,25 @@ def routhian(system: System, cyclic: str | Iterable[str]) -> System:
 
 
 def _together(rest, names, values):
-    """All coordinates, of those that are left and the others one by one."""
+    """All coordinates, from the remaining ones `rest` and the `values` of the cyclic ones `names`."""
     if isinstance(rest, Mapping):
-        twice = [name for name in names if name in rest]
-        if twice:
+        duplicates = [name for name in names if name in rest]
+        if duplicates:
             raise ValueError(
-                f"{listed(twice)} is eliminated, and among the coordinates still.\nFix: leave it out of q0 and v0."
+                f"{listed(duplicates)} is eliminated, but still among the coordinates.\nFix: leave it out of q0 and v0."
             )
         return {**rest, **dict(zip(names, values))}
     if jnp.ndim(rest) == 1:
-        places = dict(zip([_place(name) for name in names], values))
-        left, count = iter([rest[i] for i in range(len(rest))]), len(rest) + len(names)
-        return jnp.stack([places[i] if i in places else next(left) for i in range(count)])
+        cyclic = dict(zip([_index(name) for name in names], values))
+        remaining, count = iter([rest[i] for i in range(len(rest))]), len(rest) + len(names)
+        return jnp.stack([cyclic[i] if i in cyclic else next(remaining) for i in range(count)])
     raise ValueError(
-        'a Routhian needs coordinates by name, or in an array of one axis.\nFix: q = {"r": ..., "angle": ...}.'
+        'a Routhian needs coordinates by name, or in an array with one axis.\nFix: q = {"r": ..., "angle": ...}.'
     )
 
 
-def _place(name):
+def _index(name):
     start, _, number = name.rstrip("]").rpartition("[")
     if start != "q" or not number.isdigit():
-        raise ValueError(f"'{name}' is no entry of an array q.\nFix: \"q[1]\".")
+        raise ValueError(f"'{name}' is not an entry of an array q.\nFix: \"q[1]\".")
     return int(number)

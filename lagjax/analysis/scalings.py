@@ -1,7 +1,7 @@
-"""Scalings that multiply L by a factor, x to s^a x, t to s^b t: they take motions into motions, and conserve nothing.
+"""Scalings x to s^a x, t to s^b t that multiply L by a factor: they map motions to motions, and conserve nothing.
 
-Of all scalings together, L dt changes at a rate that is linear in their exponents. Where that is c L dt at every state,
-L is multiplied by s^(c - b); c = 0 is a symmetry of Noether's, and listed among these.
+Under a combined scaling, L dt changes at a rate that is linear in the exponents. If this rate is c L dt at every state,
+L is multiplied by s^(c - b). With c = 0 the scaling is a Noether symmetry and listed among these instead.
 
 Source: Landau & Lifshitz, *Mechanics*, §10.
 """
@@ -18,20 +18,22 @@ from lagjax.analysis.rates import Rates
 from lagjax.mechanics import constraints, coordinates
 
 
-def scalings_of(system, s, tried: Basis, seen: Rates, precision: Precision) -> tuple[Scaling, ...]:
-    """What multiplies L by a factor."""
+def scalings_of(system, s, tried: Basis, sampled: Rates, precision: Precision) -> tuple[Scaling, ...]:
+    """The scalings that multiply L by a factor."""
     if system.force is not None or system.dissipation is not None:
         return ()
     chosen = np.flatnonzero(np.array(tried.kinds) == "scaling")
     flat = lambda i: np.append(tried.affine.matrix[i].ravel(), tried.affine.clock_rate[i])
     chosen = chosen[independent(np.stack([flat(i) for i in chosen], axis=1), precision)]
-    size = seen.size[chosen]
+    size = sampled.size[chosen]
     holonomic = constraints.holonomic_equations(system, *s)
-    root = np.sqrt(len(seen.value))
+    root = np.sqrt(len(sampled.value))
     rows = lambda y: y.reshape(-1, y.shape[-1])
-    # The set g = 0 stays; so does what a constraint of velocities says.
-    kept = np.concatenate([rows(seen.displacement[:, holonomic]), rows(seen.invariance[:, ~holonomic])])[:, chosen]
-    changed = np.concatenate([seen.charge[:, chosen], -seen.value[:, None]], axis=1)
+    # The set g = 0 and the velocity constraints must be preserved.
+    kept = np.concatenate([rows(sampled.displacement[:, holonomic]), rows(sampled.invariance[:, ~holonomic])])[
+        :, chosen
+    ]
+    changed = np.concatenate([sampled.charge[:, chosen], -sampled.value[:, None]], axis=1)
     kept = np.concatenate([kept, np.zeros((len(kept), 1))], axis=1)
     found = null_space(np.concatenate([changed, kept]) / root, precision)
     scalings = []
@@ -42,7 +44,7 @@ def scalings_of(system, s, tried: Basis, seen: Rates, precision: Precision) -> t
         weights = vector[:-1] / size
         of_q = np.diagonal(np.tensordot(weights, tried.affine.matrix[chosen], 1))
         exponents = dict(zip(known, of_q)) | {"t": weights @ tried.affine.clock_rate[chosen]}
-        # L dt is multiplied by s^c, and so L by s^(c - b).
+        # L dt is multiplied by s^c, hence L by s^(c - b).
         scalings.append(_tidied(exponents, float(vector[-1]), _worst(changed, kept, vector), 10 * precision.null))
     return tuple(scalings)
 

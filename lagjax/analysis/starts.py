@@ -1,4 +1,4 @@
-"""What a search for steady motions begins with: starts, what moves in them, and numbers that are whole."""
+"""The inputs of a search for steady motions: starts, the coordinates that move in them, and integer parameters."""
 
 from collections.abc import Callable, Iterable
 
@@ -19,14 +19,14 @@ AS_STARTS = 'starts=[{"theta": 0.1}, {"theta": 3.0}], or starts={"theta": jnp.li
 
 
 def stacked(starts, what="starts") -> PyTree:
-    """Starts as one tree whose leaves have a leading axis: of a list of states, such a tree, or one state."""
+    """Starts as one tree whose leaves have a leading axis, from a list of states, such a tree, or one state."""
     if isinstance(starts, list):
         if not starts:
             raise ValueError(f"{what} is an empty list: a search needs a place to start from.\nFix: {AS_STARTS}.")
         structures = {jtu.tree_structure(start) for start in starts}
         if len(structures) > 1:
             raise ValueError(f"the {what} differ in structure: each must be like q.\nFix: {AS_STARTS}.")
-        # Known values stay with NumPy, which compiles nothing.
+        # Concrete values stay in NumPy, which compiles nothing.
         starts = coordinates.as_floats(starts)
         xp = coordinates.numpy_of(starts)
         return jtu.tree_map(lambda *x: xp.stack([xp.asarray(y) for y in x]), *starts)
@@ -46,7 +46,7 @@ def stacked(starts, what="starts") -> PyTree:
             f"Fix: a list of states, {what}=[q]."
         )
     if () in counts or min(counts)[0] == 0:
-        raise ValueError(f"{what} has no start in it.\nFix: {AS_STARTS}.")
+        raise ValueError(f"{what} contains no start.\nFix: {AS_STARTS}.")
     return starts
 
 
@@ -57,20 +57,20 @@ def stacked_one(q):
 
 
 def checked(system, t, q, v, params):
-    """The system and a state for it, with whole numbers in `params` as floats where the functions take floats."""
+    """The checked system and its state; integers in `params` become floats if the functions accept them."""
     floats = jtu.tree_map(lambda x: float(x) if type(x) is int else x, params)
     s = coordinates.state(t, q, v, floats)
     if any(type(x) is int for x in jtu.tree_leaves(params)):
         try:
             return looked_at(system, s), s
         except (TypeError, ValueError):
-            # A count or an index stays whole.
+            # A count or an index must stay an integer.
             s = coordinates.state(t, q, v, params)
     return looked_at(system, s), s
 
 
 def symmetries_of(system, s: State, cyclic, hold, moving: np.ndarray | None) -> Symmetries:
-    """Along what the motion is steady: what `cyclic` names, or the coordinates that move in the starts, (n,)."""
+    """The symmetries along which the motion is steady: those that `cyclic` names, or the `moving` (n,) coordinates."""
     if hold not in (VELOCITY, MOMENTUM, None):
         raise ValueError(f'hold must be "velocity", "momentum" or None, not {hold!r}.')
     names = coordinates.names(s.q)
@@ -87,35 +87,35 @@ def symmetries_of(system, s: State, cyclic, hold, moving: np.ndarray | None) -> 
         still = [name for name, moves in zip(names, moving if moving is not None else []) if moves]
         if others := [name for name in still if name not in chosen]:
             raise ValueError(
-                f"{listed(others)} moves in the starts and is not among the cyclic coordinates, {listed(chosen)}.\n"
-                f"Fix: a velocity of zero there, or cyclic={[*chosen, *others]}."
+                f"{listed(others)} moves in the starts but is not among the cyclic coordinates, {listed(chosen)}.\n"
+                f"Fix: give it a velocity of zero, or pass cyclic={[*chosen, *others]}."
             )
     _check_cyclic(system, s, chosen)
     return Symmetries(places=tuple(names.index(name) for name in chosen), hold=hold)
 
 
 def _names_in(names, given: Iterable):
-    """Coordinates by their names, or by that of the array they are in."""
-    found = []
+    """The coordinates with the given names; the name of an array means all its entries."""
+    chosen = []
     for name in given:
         entries = [x for x in names if x == name or isinstance(name, str) and x.split("[")[0] == name]
         if not entries:
             raise ValueError(
                 f"cyclic names {name!r}, and the coordinates are {listed(names)}.\n"
-                "Fix: these names, or functions motion(q, params) that return a velocity like v."
+                "Fix: use these names, or functions motion(q, params) that return a velocity like v."
             )
-        found += entries
-    return list(dict.fromkeys(found))
+        chosen += entries
+    return list(dict.fromkeys(chosen))
 
 
 def _check_cyclic(system, s, chosen):
     known = structure(system, *s) if chosen else None
-    seen = [name for name in chosen if known is not None and name not in known.cyclic]
-    if seen:
+    not_cyclic = [name for name in chosen if known is not None and name not in known.cyclic]
+    if not_cyclic:
         raise ValueError(
-            f"L depends on {listed(seen)}, which moves at a constant rate: there is no steady motion along it.\n"
-            "Usual cause: a velocity in the starts of a coordinate that is not cyclic, or a rotation that several "
-            "coordinates take part in.\n"
+            f"L depends on {listed(not_cyclic)}, which moves at a constant rate: there is no steady motion along it.\n"
+            "Usual cause: a start gives a velocity to a coordinate that is not cyclic, or the motion is a rotation of "
+            "several coordinates.\n"
             "Fix: velocities of zero; or the symmetry as a function, cyclic=lambda q, params: {...}, which returns the "
             'velocity of a motion at a unit rate, such as {"x": -q["y"], "y": q["x"]}.'
         )
@@ -128,7 +128,7 @@ def _check_fields(fields: list[Callable], s: State):
             jnp.shape, s.q
         ):
             raise ValueError(
-                "cyclic=motion(q, params) must return a velocity like v, one number a coordinate.\n"
+                "cyclic=motion(q, params) must return a velocity like v, one number per coordinate.\n"
                 f"  q has shapes {jtu.tree_map(jnp.shape, s.q)}\n  it has {jtu.tree_map(jnp.shape, value)}\n"
-                "Fix: return the structure of q, with 0.0 for what does not move (0.0 * q[...] for arrays)."
+                "Fix: return the structure of q, with 0.0 for coordinates that do not move (0.0 * q[...] for arrays)."
             )

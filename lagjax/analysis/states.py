@@ -1,9 +1,10 @@
-"""States around a given one that satisfy the constraints: where a claim about all states is tested.
+"""Random states around a given one that satisfy the constraints, at which claims about all states are tested.
 
-Positions lie around the given one in several widths, up to one and a half times its size, so that what is symmetric on
-one side of a plane alone is seen; times and velocities likewise, some of them zero, where a small force is not hidden
-by fast motion. The size of a coordinate is that of its array or point, 1 where that is at zero or the coordinate is an
-angle. States are moved onto the constraints by Newton's method, each step the shortest in units of these sizes.
+Positions lie around the given one within several widths, up to one and a half times its size, so that a symmetry that
+holds only on one side of a plane is detected. Times and velocities are drawn likewise; some velocities are zero, so
+that fast motion does not hide a small force. The size of a coordinate is that of its array or point; it is 1 if that is
+at zero, and at least 1 for an angle. Newton's method moves states onto the constraints by steps that are the shortest
+in units of these sizes.
 """
 
 from typing import NamedTuple
@@ -21,17 +22,18 @@ from lagjax.mechanics.memory import kinds, remembered
 from lagjax.mechanics.structure import angles
 
 WIDTHS = np.array([1.5, 1.0, 0.5, 0.1])
-OF_VELOCITIES = np.array([1.0, 0.3, 1.0, 0.0])
+VELOCITY_WIDTHS = np.array([1.0, 0.3, 1.0, 0.0])
 ITERATIONS = 30
+# States off the constraints are tried again, closer by these factors, until more than this fraction is on them.
 NEARER, ENOUGH = (0.3, 0.3, 0.3), 0.75
-# Singular values of the constraints' rows up to this part of the largest belong to dependent ones.
+# Constraint rows are dependent if a singular value is below this fraction of the largest.
 DEPENDENT_BELOW = 1e-6
-# A constraint holds where so many round-offs of its terms are left.
+# A constraint holds if its residual is below this many round-offs of its terms.
 ROUND_OFFS = 1e4
 
 
 class Scales(NamedTuple):
-    """The size of each coordinate and of each velocity, and the time in which one makes the other."""
+    """The size of each coordinate and of each velocity, and the time that relates them."""
 
     x: Float[Array, " n"]
     u: Float[Array, " n"]
@@ -39,7 +41,7 @@ class Scales(NamedTuple):
 
 
 class States(NamedTuple):
-    """States in vector form, (N,), (N, n), (N, n), and which of them are on the constraints."""
+    """States in vector form, and which of them were moved onto the constraints (`found`)."""
 
     t: Float[Array, " N"]
     x: Float[Array, "N n"]
@@ -48,19 +50,19 @@ class States(NamedTuple):
 
 
 def draws(count: int, n: int) -> np.ndarray:
-    """Where around a state to look, (count, 2 n + 1), the first of them the state itself; always the same."""
+    """Relative displacements (count, 2 n + 1) of t, q and v, the same at each call; the first is zero."""
     random = np.random.default_rng(20).standard_normal((count, 2 * n + 1))
     which = np.arange(count) % len(WIDTHS)
     random[:, : n + 1] *= WIDTHS[which, None]
-    # In another order, so that each width of positions meets each of the velocities.
-    random[:, n + 1 :] *= OF_VELOCITIES[(np.arange(count) // len(WIDTHS)) % len(WIDTHS), None]
+    # Velocity widths change more slowly, so that each width of positions is combined with each of velocities.
+    random[:, n + 1 :] *= VELOCITY_WIDTHS[(np.arange(count) // len(WIDTHS)) % len(WIDTHS), None]
     random[0] = 0.0
     return random
 
 
 def around(system, s: coordinates.State, places) -> tuple[States, Scales]:
-    """The states at `draws` around a given one, moved onto the constraints; of NumPy where values are known."""
-    # What is known compiles nothing here; the program that moves states serves all questions about a system.
+    """The states at the displacements `places` from a given one, moved onto the constraints."""
+    # With concrete values only the program that moves states is compiled, and all questions about a system share it.
     xp = coordinates.numpy_of((s, system))
     vector = lambda tree: xp.concatenate([xp.ravel(xp.asarray(x)) for x in jax.tree.leaves(tree)])
     x, u = vector(s.q), vector(s.v)
@@ -68,13 +70,13 @@ def around(system, s: coordinates.State, places) -> tuple[States, Scales]:
     places = places.astype(x.dtype)
     t = s.t + scales.t * places[:, 0]
     xs, us = x[None] + scales.x[None] * places[:, 1 : n + 1], u[None] + scales.u[None] * places[:, n + 1 :]
-    # Where velocities are drawn as zero they are so, and not those of the given state.
+    # A velocity width of zero means a state at rest, not the velocity of the given state.
     resting = np.all(places[:, n + 1 :] == 0, axis=1) & (np.arange(len(places)) > 0)
     us = xp.where(resting[:, None], xp.zeros_like(us), us)
     if not system.constraints:
         return States(t, xs, us, np.ones(len(places), bool)), scales
     states = States(t, *(xp.asarray(y) for y in _onto_constraints(system, s, scales, t, xs, us)))
-    # Those that are lost are looked for nearer, where values are known.
+    # With concrete values, states that failed to reach the constraints are tried again closer to the given one.
     for nearer in NEARER if xp is np else ():
         if np.mean(states.found) > ENOUGH:
             break
@@ -92,20 +94,20 @@ def sizes(system, s: coordinates.State, x, u) -> Scales:
     together = lambda y: xp.sqrt(same.astype(y.dtype) @ y**2)
     of_x = together(x)
     of_x = xp.where(of_x > 0, of_x, xp.ones_like(x))
-    # A small angle is no small motion: near zero a pendulum would look like any oscillator.
+    # Angles are at least 1: with small angles only, a pendulum would look like a harmonic oscillator.
     known = remembered(system, (angles, system.read, kinds(s)), lambda: angles(system, *s))
     leaves = zip(jax.tree.leaves(known), jax.tree.leaves(s.q))
     is_angle = np.concatenate([np.full(int(np.prod(np.shape(leaf))), angle) for angle, leaf in leaves])
     of_x = xp.where(is_angle, xp.maximum(of_x, 1.0).astype(of_x.dtype), of_x)
     of_u = together(u)
-    # A velocity of zero says nothing: then the pace of the others, or one length in one unit of time.
+    # A zero velocity has no size: it gets the pace of the others, or one length per unit of time.
     pace = xp.sqrt(xp.mean((of_u / of_x) ** 2))
     pace = xp.where(pace > 0, pace, xp.ones_like(pace))
     return Scales(of_x, xp.where(of_u > 0, of_u, pace * of_x), 1 / pace)
 
 
 def _groups(q) -> np.ndarray:
-    """Which coordinates are of one size, (n, n): those of an array, and those of a point."""
+    """Which coordinates share one size, (n, n): those of an array, and those of a point."""
     label = np.zeros(0, int)
     for i, leaf in enumerate(jax.tree.leaves(q)):
         label = np.concatenate([label, np.full(int(np.prod(np.shape(leaf))), i)])

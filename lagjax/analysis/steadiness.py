@@ -1,7 +1,7 @@
-"""Whether a state is at rest or in steady motion, and whether the linear equations there are those of all times.
+"""Whether a state is an equilibrium or in steady motion, and whether its linear equations hold at all times.
 
-In a steady motion x = x₀ + u₀ t with no acceleration, and what multiplies small motions does not depend on t. Both are
-asked of numbers: the accelerations at the state, and the matrices there and some way along the motion.
+In a steady motion x = x₀ + u₀ t without acceleration, and the matrices of small motions do not depend on t. Both are
+checked numerically: the accelerations at the state, and the matrices there and some way along the motion.
 """
 
 from collections.abc import Callable
@@ -18,22 +18,22 @@ from lagjax.mechanics.coordinates import State
 from lagjax.mechanics.diagnosis import equation_names, explain_failure, where
 from lagjax.numerics import lapack
 
-# A state that is typed with seven digits is near enough; frequencies are then known to as many.
+# A state given with seven digits is accepted; frequencies are then accurate to about as many.
 STEADY_BELOW = {np.dtype("float64"): 1e-6, np.dtype("float32"): 1e-3}
-# How far along the motion the equations are asked again, in units of the fastest coordinate, or of time.
+# The distances along the motion at which the matrices are compared, in units of the fastest coordinate, or of time.
 ALONG = (0.3719, 1.9173)
 SAME_BELOW = {np.dtype("float64"): 1e-7, np.dtype("float32"): 1e-3}
 
 
 class Steadiness(NamedTuple):
-    """By coordinate (n,) and then by constraint residual, how far off a state is; and the largest of it."""
+    """How far a state is from steady, by coordinate (n,) and then by constraint residual; and the largest of these."""
 
     relative: Float[Array, " k"]
     residual: Float[Array, ""]
 
 
 def steadiness_of(kind: Kind, s: State, parts: Parts) -> Steadiness:
-    """Accelerations and violated constraints, relative to what small motions of the state's own size have."""
+    """Accelerations and constraint residuals, relative to those of small motions of the state's own size."""
     x, u = coordinates.flatten(s.q)[0], coordinates.flatten(s.v)[0]
     eps = jnp.finfo(x.dtype).eps
     largest = lambda y: jnp.max(jnp.abs(y), initial=0.0)
@@ -43,26 +43,27 @@ def steadiness_of(kind: Kind, s: State, parts: Parts) -> Steadiness:
     mass = jnp.where(parts.sound, parts.mass, jnp.eye(parts.mass.shape[0], dtype=x.dtype))
     per_mass = lambda matrix: row_sum(lapack.solve(mass, jnp.nan_to_num(matrix)))
     rate = per_mass(parts.velocity) + row_sum(parts.drift)
-    own = (per_mass(parts.position) + rate**2) * size + rate * speed
+    typical = (per_mass(parts.position) + rate**2) * size + rate * speed
     left = jnp.maximum(jnp.abs(parts.a) - 1e4 * eps * (largest(parts.forces) + speed**2 / size), 0.0)
-    against = jnp.where(own > 0, own, 1.0)
-    relative = jnp.where(left > 0, jnp.where(own > 0, left / against, jnp.inf), 0.0)
+    positive = jnp.where(typical > 0, typical, 1.0)
+    relative = jnp.where(left > 0, jnp.where(typical > 0, left / positive, jnp.inf), 0.0)
     slopes = jnp.sum(jnp.abs(parts.raw.rows), axis=1)
     holonomic = slopes[np.array(kind.holonomic, bool)]
     allowed = jnp.concatenate([holonomic * size, slopes * jnp.where(speed > 0, speed, size)])
     off = jnp.abs(parts.off) / jnp.where(allowed > 0, allowed, 1.0)
-    # What is not finite counts as far off.
+    # Values that are not finite count as infinitely far off.
     relative = jax.lax.stop_gradient(jnp.concatenate([relative, off]))
     relative = jnp.where(jnp.isfinite(relative) & parts.sound, relative, jnp.inf)
     return Steadiness(relative, jnp.max(relative, initial=0.0))
 
 
-def check_steady(system, found, steadiness: Steadiness, linearised: Callable) -> None:
-    """Raise where a state is no steady motion, or its linear equations are singular or change with time.
+def check_steady(system, linearisation, steadiness: Steadiness, linearised: Callable) -> None:
+    """Raise if a state is not in steady motion, or its linear equations are singular or change with time.
 
-    `found`: a `Linearisation`; `linearised(t, q, v, params)`: that of another state.
+    `linearisation`: the `Linearisation` at the state; `linearised(t, q, v, params)`: the `Linearisation` at another
+    state.
     """
-    kind, s, parts = found.kind, found.state, found.parts
+    kind, s, parts = linearisation.kind, linearisation.state, linearisation.parts
     relative, a = np.asarray(steadiness.relative), np.asarray(parts.a)
     dtype, n = relative.dtype, len(kind.unseen)
     if not parts.sound:
@@ -74,9 +75,9 @@ def check_steady(system, found, steadiness: Steadiness, linearised: Callable) ->
     worst = int(np.argmax(relative[n:])) if len(labels) else 0
     if len(labels) and relative[n + worst] > STEADY_BELOW[dtype]:
         raise ValueError(
-            f"not a steady motion: constraint {labels[worst]} = {float(parts.off[worst]):.3g}, where 0 is asked, "
+            f"not a steady motion: constraint {labels[worst]} = {float(parts.off[worst]):.3g}, but must be 0, "
             f"{where(s)}.\n"
-            "Fix: q, v = lj.consistent_state(system, t, q, v, params), and the equilibrium on the constraints."
+            "Fix: q, v = lj.consistent_state(system, t, q, v, params), then find the equilibrium on the constraints."
         )
     worst = int(np.argmax(relative[:n]))
     if relative[worst] > STEADY_BELOW[dtype]:
@@ -86,15 +87,15 @@ def check_steady(system, found, steadiness: Steadiness, linearised: Callable) ->
             f"{what}: '{names[worst]}' accelerates by {a[worst]:.3g}, {relative[worst]:.2g} of what small motions of "
             f"the size of the state do, {where(s)}.\n"
             f"Usual cause: {'velocities that turn with the motion' if moving else 'a state near an equilibrium'}, or "
-            "one of other parameters.\n"
+            "a state for other parameters.\n"
             + (
-                "Fix: coordinates in which it goes on with the same velocities (polar ones for a circle), and the "
-                "values that balance it."
+                "Fix: coordinates in which the velocities are constant (polar ones for a circle), with the values at "
+                "which forces balance."
                 if moving
-                else "Fix: found = lj.equilibria(system, params, starts=q) gives the equilibrium near it."
+                else "Fix: found = lj.equilibria(system, params, starts=q) gives the equilibrium nearby."
             )
         )
-    _check_time(system, found, linearised)
+    _check_time(system, linearisation, linearised)
 
 
 def _singular(kind, parts, s):
@@ -108,15 +109,15 @@ def _singular(kind, parts, s):
     )
 
 
-def _check_time(system, found, linearised):
-    """Raise where the matrices are others further along the motion."""
-    kind, s, parts = found.kind, found.state, found.parts
+def _check_time(system, linearisation, linearised):
+    """Raise if the matrices differ further along the motion."""
+    kind, s, parts = linearisation.kind, linearisation.state, linearisation.parts
     u = np.concatenate([np.ravel(x) for x in jax.tree.leaves(s.v)])
     if kind.timeless and not np.any(u[~np.array(kind.unseen)]):
         return
     speed = float(np.max(np.abs(u)))
     for distance in ALONG:
-        # A time of the size of what the clock shows, or that in which the fastest coordinate moves so far.
+        # The time in which the fastest coordinate moves this far; if nothing moves, this many units of time.
         time = distance / speed if speed else distance
         q = jax.tree.map(lambda x, v: np.asarray(x + time * np.asarray(v), x.dtype), s.q, s.v)
         t = np.asarray(float(s.t) + time, s.t.dtype)
@@ -126,18 +127,18 @@ def _check_time(system, found, linearised):
             continue
         what, i, j, before, after = changed
         names, equations = coordinates.names(s.q), equation_names(system, s)
-        of = f"'{equations[i]}' by '{names[j]}'" if what.startswith("constraint") else f"'{names[i]}', '{names[j]}'"
+        entry = f"'{equations[i]}' by '{names[j]}'" if what.startswith("constraint") else f"'{names[i]}', '{names[j]}'"
         raise ValueError(
-            f"the linear equations change along the motion: {what} of {of} is {before:.6g}, and {time:.3g} later it is "
-            f"{after:.6g}. This is {where(s)}.\n"
+            f"the linear equations change along the motion: {what} of {entry} is {before:.6g}, and {time:.3g} later it "
+            f"is {after:.6g}. This is {where(s)}.\n"
             "Usual cause: explicit time, or velocities in coordinates that L contains.\n"
-            "Fix: coordinates that move along, in which the equations are the same at all times; of a periodic motion "
+            "Fix: coordinates that move along, in which the equations are the same at all times; for a periodic motion "
             "lj.floquet(...) gives the multipliers."
         )
 
 
 def _changed(parts, later):
-    """The first matrix that changes, where, from what to what; None where none does."""
+    """The first matrix that changes, the entry, and its values before and after; None if none changes."""
     largest = lambda x: float(np.max(np.abs(x), initial=0.0))
     mass, position = largest(parts.raw.mass), largest(parts.raw.position)
     scales = (mass, max(largest(parts.raw.velocity), np.sqrt(mass * position)), position, None, None)

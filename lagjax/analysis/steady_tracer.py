@@ -1,8 +1,8 @@
-"""Branches of steady motions, in the equations of `branch_equations.py`.
+"""Branches of steady motions, from the equations of `branch_equations.py`.
 
-What is watched from point to point: the sign of `det (J; τ)`, which changes where another branch crosses (also where
-this one only touches the critical parameter, as the side branch of a pitchfork does); that of τ_μ, which changes at a
-fold; the number of roots that grow; and that of negative eigenvalues of E_y, which changes by two where two are zero
+Monitored from point to point are the sign of `det (J; τ)`, which changes where another branch crosses (also where this
+one only touches the critical parameter, as the side branch of a pitchfork does); the sign of τ_μ, which changes at a
+fold; the number of growing roots; and the number of negative eigenvalues of E_y, which changes by two where two vanish
 together.
 
 Source: Allgower & Georg, *Introduction to Numerical Continuation Methods*, §8.1 (the determinant).
@@ -11,13 +11,13 @@ Source: Allgower & Georg, *Introduction to Numerical Continuation Methods*, §8.
 import jax
 import numpy as np
 
-from lagjax.analysis.branch_equations import Frame, evaluated, seen_at
+from lagjax.analysis.branch_equations import Frame, evaluated, outputs_at
 from lagjax.analysis.equilibria import GROWS_ABOVE
 from lagjax.analysis.tracing import Point, Tracer
 
 
 class SteadyTracer(Tracer):
-    """Steady motions of a `Frame`. `fastest`: the fastest root so far, beside which one is round-off."""
+    """Steady motions of a `Frame`. `fastest`: the size of the fastest root so far, the unit of the roots' round-off."""
 
     def __init__(self, frame: Frame, low: float, high: float):
         super().__init__(low, high)
@@ -34,13 +34,13 @@ class SteadyTracer(Tracer):
         return value, jacobian, float(largest)
 
     def described(self, z, jacobian, tangent) -> Point:
-        seen = jax.tree.map(np.asarray, seen_at(self.frame, z.astype(self.dtype)))
+        outputs = jax.tree.map(np.asarray, outputs_at(self.frame, z.astype(self.dtype)))
         sign = np.linalg.slogdet(np.concatenate([jacobian, (self.weights * tangent)[None]]))[0]
         negative = int(np.sum(np.linalg.eigvals(jacobian[:, :-1]).real < 0))
-        return Point(z, jacobian, tangent, float(sign), seen, self._growing(seen[-1]), negative)
+        return Point(z, jacobian, tangent, float(sign), outputs, self._growing(outputs[-1]), negative)
 
     def _growing(self, roots) -> int | None:
-        """How many roots grow; None where they are not known."""
+        """The number of growing roots; None if the roots are not known."""
         known = roots[np.isfinite(roots)]
         if not known.size:
             return None

@@ -1,11 +1,11 @@
-"""Which symmetries does a system have? All combinations within a basis, as a numerical null space.
+"""Find all symmetries of a system within a basis of motions, as a numerical null space.
 
-At every state each motion of the basis changes its charge at some rate, and the constraints forbid some displacement
-(`rates.py`): a row of numbers, one column a motion. Gauge functions add columns, of which only the span counts. A
-combination that vanishes in all rows is a symmetry of Noether's. Those without t in them are found first, so that a
-momentum across a uniform force is not hidden in two that grow with time.
+At each state every motion of the basis changes its charge at some rate, and the constraints forbid part of its
+displacement (`rates.py`). These numbers form rows with one column per motion. Gauge functions add columns, of which
+only the span matters; it is projected out. A combination that vanishes in all rows is a Noether symmetry. Symmetries
+without t are found first, so that a momentum across a uniform force is not hidden in two that grow with time.
 
-Scalings that multiply L by a factor are told apart (`scalings.py`).
+Scalings that multiply L by a factor are found separately (`scalings.py`).
 
 Source: Noether, Nachr. Ges. Wiss. Göttingen (1918) 235, §2; Olver, *Applications of Lie Groups to Differential
 Equations*, §4.4.
@@ -36,7 +36,7 @@ from lagjax.mechanics.structure import conserved_momenta
 
 
 def symmetries(system, q, v, params=None, *, basis: Iterable | Mapping | None = None, t=0.0) -> Symmetries:
-    """Find the symmetries of a system, within a basis of motions, and what they conserve.
+    """Find the symmetries of a system within a basis of motions, and what they conserve.
 
     >>> import lagjax as lj
     >>> def kepler(t, q, v, params):
@@ -49,18 +49,18 @@ def symmetries(system, q, v, params=None, *, basis: Iterable | Mapping | None = 
 
     **Arguments:**
 
-    - `system`, `q`, `v`, `params`, `t`: a state, around which others are drawn, always the same, on the constraints.
-      Its size sets theirs.
-    - `basis`: further generators, or functions `delta(t, q, params)`, in a list or by name. Looked among are these and
-      each coordinate's shift, translations, rotations and boosts of all points and of each (coordinates named x, y, z,
-      or arrays of 2 or 3), time, scalings, and all combinations, so screws too; each up to a gauge function that is a
-      polynomial of low degree.
+    - `system`, `q`, `v`, `params`, `t`: a state. Others, the same at each call, are drawn around it on the constraints,
+      on the scale of its size.
+    - `basis`: further generators, or functions `delta(t, q, params)`, in a list or by name. The search includes these,
+      the shift of each coordinate, translations, rotations and boosts of all points and of each point (coordinates
+      named x, y, z, or arrays of 2 or 3), time, scalings, and all combinations, such as screws; each up to a gauge
+      function that is a polynomial of low degree.
 
-    **Returns:** `Symmetries`: a mapping from names such as `"h p_z + 2π L_z with h = 0.5"` to charges. What is
-    conserved and belongs to no motion of points, as Runge and Lenz's vector, is not among them.
+    **Returns:** `Symmetries`: a mapping from names such as `"h p_z + 2π L_z with h = 0.5"` to charges. Conserved
+    quantities that belong to no motion of points, such as the Runge-Lenz vector, are not found.
 
-    **Raises:** `TypeError` while JAX is tracing; `ValueError` where no states are found that satisfy the constraints;
-    as `noether_charge` for a generator of the wrong structure.
+    **Raises:** `TypeError` while JAX is tracing; `ValueError` if no states are found that satisfy the constraints; as
+    `noether_charge` for a generator of the wrong structure.
 
     Source: Olver, *Applications of Lie Groups to Differential Equations*, §4.4.
     """
@@ -68,19 +68,19 @@ def symmetries(system, q, v, params=None, *, basis: Iterable | Mapping | None = 
     s = coordinates.state(t, q, v, params)
     if coordinates.is_traced(s):
         raise TypeError(
-            "symmetries are found from values, and JAX is tracing here.\n"
-            "Fix: outside of jax.jit, jax.vmap and sweeps; lj.is_symmetry(...).holds tests one inside."
+            "symmetries are found from values, but JAX is tracing here.\n"
+            "Fix: call it outside of jax.jit, jax.vmap and sweeps; lj.is_symmetry(...).holds tests one symmetry inside."
         )
     system = looked_at(system, s)
     own = _given(basis, s)
     tried = motions(s.q)
     gauge = gauges(s.q)
     count = filled_up(max(STATES, 4 * (len(tried.names) + len(own)) + 2 * len(gauge.names)))
-    seen = rates(system, tried.affine, own, s, draws(count, coordinates.flatten(s.q)[0].size))
-    seen = _those_found(seen)
-    if len(seen.value) < AT_LEAST:
-        raise ValueError(too_few(system, s, len(seen.value)))
-    return _found(system, s, tried, own, gauge, seen)
+    sampled = rates(system, tried.affine, own, s, draws(count, coordinates.flatten(s.q)[0].size))
+    sampled = _those_found(sampled)
+    if len(sampled.value) < AT_LEAST:
+        raise ValueError(too_few(system, s, len(sampled.value)))
+    return _found(system, s, tried, own, gauge, sampled)
 
 
 def _given(basis, s) -> tuple[Generator, ...]:
@@ -97,24 +97,25 @@ def _given(basis, s) -> tuple[Generator, ...]:
     return tuple(own)
 
 
-def _those_found(seen: Rates) -> Rates:
-    """The rows of states that are on the constraints and finite, in NumPy."""
-    kept = np.asarray(seen.states.found)
-    of_states = seen._asdict()
-    states = type(seen.states)(*(np.asarray(y)[kept] for y in of_states.pop("states")))
-    whole = {"size", "first", "pushed"}
-    return Rates(states, **{name: y if name in whole else y[kept] for name, y in of_states.items()})
+def _those_found(sampled: Rates) -> Rates:
+    """The entries of the states that are on the constraints and finite, in NumPy."""
+    kept = np.asarray(sampled.states.found)
+    of_states = sampled._asdict()
+    states = type(sampled.states)(*(np.asarray(y)[kept] for y in of_states.pop("states")))
+    stateless = {"size", "first", "pushed"}
+    return Rates(states, **{name: y if name in stateless else y[kept] for name, y in of_states.items()})
 
 
-# A combination that changes by so many times what counts as none was kept by round-off alone.
+# A combination whose residual exceeds this many times the null tolerance is an artefact of round-off.
 DOUBTFUL = 100.0
 
 
 class _Columns(NamedTuple):
-    """What the motions make of each state, one column a motion, in units of their sizes; the user's own come first.
+    """The rates of the motions, scaled to unit size: one column per motion, with the user's own generators first.
 
-    `charge`, `forbidden`: the rates, and by how much constraints forbid them; `gauge`: the rates of gauge functions.
-    `moves`: each motion as what it does at all states; `order`: where it is in `Rates`.
+    `charge`: the rates of the charges; `forbidden`: how much constraints forbid the displacements; `gauge`: the rates
+    of gauge functions. `moves`: the displacements of each motion at some states; `order`: the index of each motion in
+    `Rates`.
     """
 
     names: tuple[str, ...]
@@ -128,7 +129,7 @@ class _Columns(NamedTuple):
 
 
 class _Spaces(NamedTuple):
-    """The symmetries without t, and those with t beyond them, (d, K) in the columns `every`; and how clear that is."""
+    """The symmetries without t, and further ones with t, (d, K) in the columns `every`; `gap`: how clear this is."""
 
     every: np.ndarray
     steady: np.ndarray
@@ -137,21 +138,21 @@ class _Spaces(NamedTuple):
     gap: float
 
 
-def _found(system, s, tried: Basis, own, gauge: Gauge, seen: Rates) -> Symmetries:
+def _found(system, s, tried: Basis, own, gauge: Gauge, sampled: Rates) -> Symmetries:
     precision = precision_of(s.t.dtype)
-    columns = _columns(tried, own, gauge, seen)
+    columns = _columns(tried, own, gauge, sampled)
     spaces = _spaces(columns, gauge, precision)
     parameters = named_parameters(s.params)
     shown = remembered(system, (conserved_momenta, system.read, kinds(s)), lambda: conserved_momenta(system, *s))
     cyclic = {f"p_{name}" for name in shown}
-    # What moves in time comes last, as energies do in a list of constants.
+    # Motions in time come last, as energies do in a list of constants.
     clocks = [kind == "time" for kind in columns.kinds]
     steady = sorted(spaces.steady, key=lambda vector: bool(np.any(vector[np.array(clocks)[spaces.every]])))
     details: dict[str, Found] = {}
     for vector, timed in [*((v, False) for v in steady), *((v, True) for v in spaces.timed)]:
         whole = np.zeros(len(columns.order))
         whole[spaces.every] = vector
-        weights = _gauge_of(columns, whole, gauge, timed, _pushed(whole[len(own) :], tried.affine), precision)
+        weights = _gauge_of(columns, whole, gauge, timed, _shifted(whole[len(own) :], tried.affine), precision)
         residual = _residual(columns, whole, weights)
         if residual > DOUBTFUL * precision.null:
             continue
@@ -162,31 +163,32 @@ def _found(system, s, tried: Basis, own, gauge: Gauge, seen: Rates) -> Symmetrie
         is_cyclic = single and columns.names[int(np.flatnonzero(whole)[0])] in cyclic
         details[words.text] = Found(NoetherCharge(system, generator), residual, timed, physical, is_cyclic)
     return Symmetries(
-        details, scalings_of(system, s, tried, seen, precision), columns.names, len(seen.value),
-        spaces.singular_values, spaces.gap if len(seen.value) > len(columns.names) + len(gauge.names) else 0.0,
+        details, scalings_of(system, s, tried, sampled, precision), columns.names, len(sampled.value),
+        spaces.singular_values, spaces.gap if len(sampled.value) > len(columns.names) + len(gauge.names) else 0.0,
         f"t = {float(s.t):.6g}, q = {describe(s.q)}, v = {describe(s.v)}", repr(system),
     )  # fmt: skip
 
 
-def _columns(tried: Basis, own, gauge: Gauge, seen: Rates) -> _Columns:
-    count, n_own, states = len(tried.names), len(own), len(seen.value)
+def _columns(tried: Basis, own, gauge: Gauge, sampled: Rates) -> _Columns:
+    count, n_own, states = len(tried.names), len(own), len(sampled.value)
     order = np.concatenate([np.arange(count, count + n_own), np.arange(count)]).astype(int)
     rows = lambda y: y.reshape(-1, y.shape[-1])[:, order] / np.sqrt(states)
-    of_gauge = gauge.rates(*map(np.asarray, seen.states[:3])) / seen.energy[:, None]
+    of_gauge = gauge.rates(*map(np.asarray, sampled.states[:3])) / sampled.energy[:, None]
     unit = lambda y: y / np.maximum(np.std(y, axis=(0, 1)), np.finfo(float).tiny)
-    # A few states tell motions apart.
-    few = slice(0, 16 + 4 * (count + n_own) // seen.xi.shape[2])
+    # A few states are enough to tell motions apart.
+    few = slice(0, 16 + 4 * (count + n_own) // sampled.xi.shape[2])
     moves = np.concatenate(
-        [np.moveaxis(unit(seen.xi[few]), 1, 0).reshape(count + n_own, -1), unit(seen.tau[few]).T], axis=1
+        [np.moveaxis(unit(sampled.xi[few]), 1, 0).reshape(count + n_own, -1), unit(sampled.tau[few]).T], axis=1
     )
     return _Columns(
         (*(generator.name for generator in own), *tried.names), (*("own" for _ in own), *tried.kinds),
-        order, seen.size[order], rows(seen.charge), rows(seen.displacement), of_gauge / np.sqrt(states), moves[order].T,
+        order, sampled.size[order], rows(sampled.charge), rows(sampled.displacement), of_gauge / np.sqrt(states),
+        moves[order].T,
     )  # fmt: skip
 
 
 def _spaces(columns: _Columns, gauge: Gauge, precision: Precision) -> _Spaces:
-    """The null spaces, first of the motions without t, then of all."""
+    """The null spaces, first of the motions without t, then of all motions."""
     steady = np.array([kind in ("own", "space", "time") for kind in columns.kinds])
     first = np.flatnonzero(steady)
     first = first[independent(columns.moves[:, first], precision)]
@@ -196,7 +198,7 @@ def _spaces(columns: _Columns, gauge: Gauge, precision: Precision) -> _Spaces:
     with_t = null_space(_up_to(columns, every, np.ones(len(gauge.timed), bool)), precision)
     embedded = np.zeros((len(without_t.vectors), len(every)))
     embedded[:, _where(every, first)] = without_t.vectors
-    boosted = _boosted(embedded, every, columns.names, columns, gauge, precision.null)
+    boosted = _with_t(embedded, every, columns.names, columns, gauge, precision.null)
     later = beyond(with_t.vectors, np.concatenate([embedded, boosted]), precision)
     return _Spaces(
         every, embedded, np.concatenate([boosted, later]),
@@ -208,9 +210,9 @@ def _where(every, some):
     return np.array([int(np.flatnonzero(every == i)[0]) for i in some], int)
 
 
-def _boosted(steady, every, names, columns: _Columns, gauge: Gauge, tolerance):
-    """For each translation that is a symmetry the same with t, where that is one."""
-    found, places = [np.zeros((0, steady.shape[1]))], {names[i]: k for k, i in enumerate(every)}
+def _with_t(steady, every, names, columns: _Columns, gauge: Gauge, tolerance):
+    """For each symmetry, the same motion times t, if that is a symmetry too: a boost for a translation."""
+    boosts, places = [np.zeros((0, steady.shape[1]))], {names[i]: k for k, i in enumerate(every)}
     for vector in steady:
         moved = np.zeros_like(vector)
         for k in np.flatnonzero(vector):
@@ -219,12 +221,12 @@ def _boosted(steady, every, names, columns: _Columns, gauge: Gauge, tolerance):
             moved[with_t] = vector[k]
         else:
             left = _up_to(columns, every, np.ones(len(gauge.timed), bool)) @ moved
-            found += [moved[None]] if np.linalg.norm(left) <= tolerance * np.linalg.norm(moved) else []
-    return np.concatenate(found)
+            boosts += [moved[None]] if np.linalg.norm(left) <= tolerance * np.linalg.norm(moved) else []
+    return np.concatenate(boosts)
 
 
 def _up_to(columns: _Columns, chosen, of_gauge):
-    """The rows of the chosen motions, without what gauge functions can make up for."""
+    """The rows of the chosen motions, minus the part that gauge functions can compensate."""
     span = _span(columns.gauge[:, of_gauge])
     charge = columns.charge[:, chosen]
     charge = charge - span @ (span.T @ charge)
@@ -237,14 +239,14 @@ def _span(columns):
     return left[:, sizes > 1e-10 * max(1.0, float(sizes[0]))] if len(sizes) else left
 
 
-def _pushed(weights, affine: Affine) -> set[int]:
-    """Which coordinates are shifted."""
-    pushed = np.abs(weights) @ (np.abs(affine.shift) + np.abs(affine.drift))
-    return set(np.flatnonzero(pushed).tolist())
+def _shifted(weights, affine: Affine) -> set[int]:
+    """The coordinates that a motion shifts."""
+    amounts = np.abs(weights) @ (np.abs(affine.shift) + np.abs(affine.drift))
+    return set(np.flatnonzero(amounts).tolist())
 
 
-def _gauge_of(columns: _Columns, whole, gauge: Gauge, timed, pushed, precision: Precision):
-    """The weights of the gauge functions of a symmetry: few of them, and none where none is needed."""
+def _gauge_of(columns: _Columns, whole, gauge: Gauge, timed, shifted, precision: Precision):
+    """The weights of the gauge functions of a symmetry: as few nonzero ones as possible."""
     rate, weights = columns.charge @ whole, np.zeros(len(gauge.names))
     if np.max(np.abs(rate), initial=0.0) <= precision.exact * np.max(np.abs(whole)) / np.sqrt(len(rate)):
         return weights
@@ -252,14 +254,14 @@ def _gauge_of(columns: _Columns, whole, gauge: Gauge, timed, pushed, precision: 
     scaled = columns.gauge / np.where(size > 0, size, 1.0)
 
     def fitted(chosen):
-        found = np.linalg.lstsq(scaled[:, chosen], rate, rcond=precision.exact * 1e3)[0]
-        return found, np.linalg.norm(scaled[:, chosen] @ found - rate)
+        solution = np.linalg.lstsq(scaled[:, chosen], rate, rcond=precision.exact * 1e3)[0]
+        return solution, np.linalg.norm(scaled[:, chosen] @ solution - rate)
 
-    # On constraints some functions equal others: plain ones stay, of what is shifted, of low degree, without t.
+    # On constraints some functions are equal. Those of shifted coordinates, of low degree and without t are preferred.
     degree = lambda k: len(gauge.factors[k]) + gauge.powers[k]
-    plain = lambda k: (pushed.issuperset(gauge.factors[k]), -degree(k), not gauge.timed[k])
-    kept = sorted(np.flatnonzero((size > 0) & (timed | ~gauge.timed)), key=plain)
-    few = [k for k in kept if pushed.issuperset(gauge.factors[k]) and degree(k) == 1]
+    simplicity = lambda k: (shifted.issuperset(gauge.factors[k]), -degree(k), not gauge.timed[k])
+    kept = sorted(np.flatnonzero((size > 0) & (timed | ~gauge.timed)), key=simplicity)
+    few = [k for k in kept if shifted.issuperset(gauge.factors[k]) and degree(k) == 1]
     if few and fitted(few)[1] <= 1e3 * precision.exact * np.linalg.norm(rate):
         kept = few
     allowed = max(2 * fitted(kept)[1], 1e3 * precision.exact * np.linalg.norm(rate))

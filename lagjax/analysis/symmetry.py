@@ -1,10 +1,10 @@
-"""Is a claimed symmetry one? Tested on states that satisfy the constraints, and against these.
+"""A test of a claimed symmetry, at states that satisfy the constraints.
 
-A generator conserves its charge where L does not change by more than a total derivative, forces do no work along the
-displacement ξ - τ v, and every constraint allows it (`mechanics/noether.py`). The last is asked of the constraints
-alone and not of their forces, which may vanish by accident: for a holonomic one it says that the set g = 0 stays. A
-constraint of velocities may look the same from everywhere and still forbid the displacement: a rolling disk rolls alike
-on all of the table, and its momentum changes.
+A generator conserves its charge if L changes at most by a total derivative, forces do no work along the displacement
+ξ - τ v, and every constraint allows this displacement (`mechanics/noether.py`). The last condition is checked on the
+constraints and not on their forces, which may vanish by accident; for a holonomic one it means that the set g = 0 is
+preserved. A velocity constraint may be invariant and still forbid the displacement: a rolling disk rolls in the same
+way everywhere on the table, but its momentum changes.
 """
 
 import equinox as eqx
@@ -26,15 +26,16 @@ STATES, AT_LEAST = 64, 8
 
 
 class SymmetryTest(eqx.Module):
-    """Whether a generator is a symmetry that conserves its charge; true where it is. It prints itself.
+    """Whether a generator is a symmetry that conserves its charge; `bool(test)` is True if it is. It prints itself.
 
-    All residuals are the largest over `states` states, relative to what the terms could be: a broken symmetry has one
-    of about 1, or as small as what breaks it.
+    Each residual is the largest over `states` states, relative to the size that its terms could have. A broken symmetry
+    has a residual of about 1, or as small as the term that breaks it.
 
-    - `residual`: the largest of those below, but for `invariance`.
-    - `lagrangian`: by how much L changes, beyond the gauge term; `force`: the work of force and dissipation along it;
-      `charge_rate`: of both together, which may cancel; `displacement`: by constraint, how much of it is forbidden.
-    - `invariance`: by constraint of velocities, how much that itself is changed by the motion.
+    - `residual`: the largest of those below, without `invariance`.
+    - `lagrangian`: how much L changes, beyond the gauge term; `force`: the work of force and dissipation along the
+      displacement; `charge_rate`: both together, which may cancel; `displacement`: by constraint, how much of the
+      displacement is forbidden.
+    - `invariance`: by velocity constraint, how much the motion changes the constraint itself.
     - `charge`, `rate`: the charge at the given state, `[L] [t]`, and its predicted rate of change there, `[L]`.
     """
 
@@ -53,19 +54,19 @@ class SymmetryTest(eqx.Module):
 
     @property
     def tolerance(self) -> float:
-        """Up to which residual nothing counts as broken, of the dtype."""
+        """The residual up to which the symmetry counts as unbroken in this dtype."""
         return precision_of(self.residual.dtype).null
 
     @property
     def holds(self) -> Array:
-        """Whether it is a symmetry, as an array: NaN is none."""
+        """Whether it is a symmetry, as an array; False where the residual is NaN."""
         return self.residual <= self.tolerance
 
     def __bool__(self):
         return bool(self.holds)
 
     def broken_by(self) -> list[str]:
-        """What breaks the symmetry, in words."""
+        """The parts of the system that break the symmetry, in words."""
         parts = {"L": self.lagrangian, "the forces": self.force} if self.charge_rate > self.tolerance else {}
         forbidden = {f"constraint '{name}'": value for name, value in self.displacement.items()}
         return [name for name, value in (parts | forbidden).items() if not value <= self.tolerance]
@@ -109,14 +110,15 @@ def is_symmetry(system, generator, q, v, params=None, *, t=0.0) -> SymmetryTest:
       charge          0, at t = 0, q = (x = 0, y = 1), v = (x = 2, y = 0)
       its rate there  -10
 
-    **Arguments:** `generator` as for `noether_charge`; `q` and `v` alike, `params` as the system takes it, `t` scalar:
-    a state, around which others are drawn, always the same, on the constraints. Its size sets theirs.
+    **Arguments:** `generator` as for `noether_charge`; `q` and `v` of the same structure, `params` as the system takes
+    it, `t` scalar: a state. Others, the same at each call, are drawn around it on the constraints, on the scale of its
+    size.
 
-    **Returns:** a `SymmetryTest`, true where it is one, with the residual, what breaks it, and the rate of change of
-    the charge that this predicts; a charge that no symmetry keeps may still stay, where constraints happen not to push.
-    Inside `jit`, `vmap` or a sweep ask for `.holds` or `.residual`.
+    **Returns:** a `SymmetryTest`, true for a symmetry, with the residual, what breaks it, and the rate of change of the
+    charge that this predicts. A charge without a symmetry may still be constant, if the constraints happen to exert no
+    force. Inside `jit`, `vmap` or a sweep use `.holds` or `.residual`.
 
-    **Raises:** as `noether_charge`; `ValueError` where no states are found that satisfy the constraints and where L is
+    **Raises:** as `noether_charge`; `ValueError` if no states are found that satisfy the constraints and at which L is
     finite (while JAX is tracing the residual is NaN instead).
 
     Source: Goldstein, *Classical Mechanics*, §13.7; Neĭmark & Fufaev, *Dynamics of Nonholonomic Systems*, §III.6.
@@ -127,8 +129,8 @@ def is_symmetry(system, generator, q, v, params=None, *, t=0.0) -> SymmetryTest:
     system = looked_at(system, s)
     generator.check(s)
     n = len(coordinates.names(s.q))
-    none = np.zeros((0, n))
-    affine = Affine(none, np.zeros((0, n, n)), none, np.zeros(0), np.zeros(0))
+    empty = np.zeros((0, n))
+    affine = Affine(empty, np.zeros((0, n, n)), empty, np.zeros(0), np.zeros(0))
     found = rates(system, affine, (generator,), s, draws(STATES, n))
     xp = coordinates.numpy_of(found)
     count = xp.sum(found.states.found)
@@ -160,10 +162,11 @@ def is_symmetry(system, generator, q, v, params=None, *, t=0.0) -> SymmetryTest:
 
 
 def too_few(system, s, count) -> str:
-    """Why a claim could not be tested."""
+    """The message that a symmetry could not be tested."""
     cause = "constraints that the given state is far from" if system.constraints else "a state where L is not finite"
     return (
         f"only {count} states were found around q = {describe(s.q)} that satisfy the constraints and where L is finite."
-        f"\nUsual cause: {cause}, or a state at the edge of where L is defined.\n"
-        "Fix: a state amid the motion; lj.consistent_state(system, t, q, v, params) moves one onto the constraints."
+        f"\nUsual cause: {cause}, or a state at the edge of the domain of L.\n"
+        "Fix: a state from the middle of the motion; lj.consistent_state(system, t, q, v, params) moves one onto the "
+        "constraints."
     )

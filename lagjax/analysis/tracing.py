@@ -1,13 +1,13 @@
-"""A branch of solutions, point by point: pseudo-arclength continuation, which passes folds.
+"""Pseudo-arclength continuation of a branch of solutions, which passes folds.
 
-The solutions are steady motions (`steady_tracer.py`) or cycles (`orbit_tracer.py`), of equations E(z) = 0 of
-z = (y, μ), with the Jacobian `J = (E_y, E_μ)`. The next point is looked for one step along the tangent τ, `J τ = 0`,
-and, from there, across it,
+The solutions are steady motions (`steady_tracer.py`) or cycles (`orbit_tracer.py`): solutions z = (y, μ) of equations
+E(z) = 0 with the Jacobian `J = (E_y, E_μ)`. The next point is predicted one step along the tangent τ, `J τ = 0`, and
+corrected in the plane across it,
 
     E(z) = 0,      τ·(z - z_i - h τ) = 0
 
-There may be more equations than unknowns, of which some follow from the others: what solves them is a least-squares
-solution. Lengths are those of positions and of the parameter.
+There may be more equations than unknowns, some of them redundant; they are then solved by least squares. Lengths are
+measured in the positions and the parameter.
 
 Source: Keller, in *Applications of Bifurcation Theory* (1977) 359; Allgower & Georg, *Introduction to Numerical
 Continuation Methods*, ch. 6 (steps).
@@ -21,35 +21,36 @@ from typing import Any
 import numpy as np
 
 ITERATIONS = 10
-# Steps by length: the first, the longest (relative to how far it is from the origin) and the least.
+# Step lengths: the first, the longest (relative to the distance from the origin) and the smallest.
 FIRST, LONGEST, LEAST = 0.005, 0.03, 1e-7
-# How far a tangent may turn in a step, in radians, and how far it should.
+# The largest turn of the tangent in a step, in radians, and the desired one.
 MOST_TURN, TURN = 0.4, 0.12
-# The same of Newton's contraction, which is large where the branch is not what it seemed along the step.
+# The largest and the desired contraction rate of Newton's method, which is large if the prediction was poor.
 MOST_CONTRACTION, CONTRACTION = 0.3, 0.1
-# Positions so many times their unit are at infinity.
+# Positions larger than this, in their units, count as infinite.
 INFINITY = 1e4
 CLOSED_WITHIN = 1e-3
-# A crossing that is none shows that a step went from one branch to another; steps that short do not.
+# A spurious crossing means that a step jumped to another branch, and it is repeated (AGAIN) with a shorter one, unless
+# it is shorter than SHORT already.
 AGAIN, SHORT = "again", 1e-6
-# Values between which a zero is interpolated.
+# The number of values from which a zero is interpolated.
 INTERPOLATED = 6
-LOST = "the equations that followed from others where the branch starts do so no longer"
+LOST = "equations that are redundant at the start of the branch are no longer redundant"
 
 
 @dataclass
 class Point:
-    """A point of a branch: z, the Jacobian and the tangent there, and what a user sees.
+    """A point of a branch: z, the Jacobian and the tangent there, and the outputs for the user.
 
-    `sign` of a function that changes it where another branch crosses; how many small departures are `growing`, None
-    where that is not known; and how many of the numbers of which `sign` is a product are `negative`.
+    `sign`: of a function that changes sign where another branch crosses. `growing`: the number of small departures that
+    grow, None if unknown. `negative`: the number of negative factors in the product of which `sign` is the sign.
     """
 
     z: np.ndarray
     jacobian: np.ndarray
     tangent: np.ndarray
     sign: float
-    seen: Any
+    outputs: Any
     growing: int | None
     negative: int
     critical: int | None = None
@@ -57,7 +58,7 @@ class Point:
 
 @dataclass
 class Path:
-    """The points of a branch in their order, and why it ends, at either end."""
+    """The points of a branch in order, and why it ends."""
 
     points: list[Point] = field(default_factory=list)
     status: str = ""
@@ -65,10 +66,10 @@ class Path:
 
 
 class Tracer(abc.ABC):
-    """What is common to all branches of a run: the equations, what lengths are, the range of the parameter.
+    """The data common to all branches of a run: the equations, the measure of length, the range of the parameter.
 
-    Abstract: `at` and `described` say what is solved. `weights` (N + 1,) of z in lengths; the first `positions` entries
-    of z are at infinity where they are large; `unit` of the parameter.
+    Abstract: `at` and `described` define what is solved. `weights` (N + 1,): of the entries of z in a length. A branch
+    ends at infinity if one of the first `positions` entries of z is large. `unit`: of the parameter.
     """
 
     weights: np.ndarray
@@ -78,7 +79,7 @@ class Tracer(abc.ABC):
 
     def __init__(self, low: float, high: float):
         self.low, self.high = low, high
-        # What Newton's second step was of its first, the last time.
+        # The ratio of Newton's second step to its first in the last correction.
         self.contraction = 0.0
 
     @property
@@ -87,28 +88,28 @@ class Tracer(abc.ABC):
 
     @property
     def noise(self) -> float:
-        """The round-off of a step of Newton's method, relative to z."""
+        """The round-off of a Newton step, relative to z."""
         return self.eps
 
     @abc.abstractmethod
     def at(self, z) -> tuple[np.ndarray, np.ndarray, float]:
-        """E, J and the largest of all equations."""
+        """E, J and the largest residual of all equations."""
 
     @abc.abstractmethod
     def described(self, z, jacobian, tangent) -> Point | str:
-        """A point with all that is to be known of it; in words what is wrong with it."""
+        """A point with its outputs; or a message that says what is wrong with it."""
 
     def moved_to(self, point: Point):
-        """The branch has come to a point: equations may refer to it from now on."""
+        """Called when the branch has reached a point, to which the equations may refer from then on."""
 
     def tangent(self, jacobian, along):
-        """The unit tangent that leads on from `along`."""
+        """The unit tangent in the direction of `along`."""
         direction = np.linalg.svd(jacobian)[2][-1].astype(float)
         direction /= np.sqrt(max(self.weights @ direction**2, 1e-300))
         return direction if (self.weights * direction) @ along >= 0 else -direction
 
     def corrected(self, z, row, known=None):
-        """Newton's method from z across a `row`, which keeps its value; None where it fails."""
+        """Newton's method from z with `row @ z` held at `known` (by default its value at z); None if it fails."""
         known = row @ z if known is None else known
         z, last, self.contraction = z.copy(), np.inf, 0.0
         for i in range(ITERATIONS):
@@ -137,9 +138,9 @@ class Tracer(abc.ABC):
         return max(1.0, float(np.max(np.abs(z))))
 
     def point(self, z, along) -> Point | str:
-        """All about a point of a branch; in words what is wrong with it."""
+        """The point of a branch at z; or a message that says what is wrong with it."""
         _, jacobian, off = self.at(z)
-        # Compared with what is left of equations that are solved: these are of the size of one.
+        # The residual of all equations, also redundant ones; equations are scaled to order one.
         if off > self.noise**0.5 * self.size(z):
             return LOST
         return self.described(z, jacobian, self.tangent(jacobian, along))
@@ -147,8 +148,8 @@ class Tracer(abc.ABC):
     def trace(self, start: Point, most: int, on_step: Callable, first: float = FIRST) -> Path:
         """Follow a branch until it leaves the range of the parameter, ends or closes.
 
-        `on_step(before, after, path)` finds what lies between two points; it may return why the path ends, or `AGAIN`
-        where a shorter step would tell.
+        `on_step(before, after, path)` finds critical points between two points. It may return why the path ends, or
+        `AGAIN` to request a shorter step.
         """
         path, point, step = Path([start]), start, first
         while len(path.points) < most:
@@ -185,7 +186,7 @@ class Tracer(abc.ABC):
         return path
 
     def next_point(self, point: Point, step: float):
-        """The next point, the step after it, and why there is none."""
+        """The next point, the step to try after it, and, if there is no point, the reason."""
         longest = LONGEST * max(1.0, float(np.max(np.abs(point.z[: self.positions]))))
         why = "Newton's method does not converge, however short the step"
         while step > LEAST * self.size(point.z):
@@ -193,16 +194,16 @@ class Tracer(abc.ABC):
             row = self.weights * point.tangent
             z = self.corrected(point.z + step * point.tangent, row)
             contraction = self.contraction
-            found = self.point(z, point.tangent) if z is not None else None
-            if isinstance(found, Point):
-                turn = np.arccos(np.clip((self.weights * found.tangent) @ point.tangent, -1, 1))
-                moved = np.sqrt(self.weights @ (found.z - point.z) ** 2)
+            candidate = self.point(z, point.tangent) if z is not None else None
+            if isinstance(candidate, Point):
+                turn = np.arccos(np.clip((self.weights * candidate.tangent) @ point.tangent, -1, 1))
+                moved = np.sqrt(self.weights @ (candidate.z - point.z) ** 2)
                 if turn < MOST_TURN and moved < 1.2 * step and contraction < MOST_CONTRACTION:
                     grow = min(TURN / max(turn, 1e-3), CONTRACTION / max(contraction, 1e-3))
-                    return found, step * float(np.clip(grow, 0.5, 2.0)), ""
+                    return candidate, step * float(np.clip(grow, 0.5, 2.0)), ""
                 why = "the branch turns more sharply than steps can follow: a corner of L, or a cusp"
-            elif isinstance(found, str):
-                why = found
+            elif isinstance(candidate, str):
+                why = candidate
             step /= 3
         return None, step, why
 
@@ -211,11 +212,11 @@ class Tracer(abc.ABC):
         row = self.weights * a.tangent
         guess = a.z + share * (b.z - a.z)
         z = self.corrected(guess, row)
-        found = self.point(z, a.tangent) if z is not None else None
-        return found if isinstance(found, Point) else None
+        candidate = self.point(z, a.tangent) if z is not None else None
+        return candidate if isinstance(candidate, Point) else None
 
     def zero_between(self, a: Point, b: Point, of: Callable[[Point], float]) -> tuple[Point, float] | None:
-        """The point between two others at which a function of points changes its sign, and how far off it may be."""
+        """The point between two others where a function of points changes sign, and the error of its parameter."""
         low, high, left, right = 0.0, 1.0, of(a), of(b)
         best, off, last, side = b, np.inf, np.inf, 0
         if not left * right < 0:
@@ -223,7 +224,7 @@ class Tracer(abc.ABC):
         tried = [(left, a.z), (right, b.z)]
         for _ in range(60):
             share = low + (high - low) * (left / (left - right))
-            # Neither end may stay where it is: its value counts half (Illinois).
+            # If one end stays in place, its value is halved (the Illinois method).
             point = self.between(a, b, share) if low < share < high else None
             if point is None:
                 return self._interpolated(a, tried) or (best, off)
@@ -239,7 +240,7 @@ class Tracer(abc.ABC):
         return best, off
 
     def _interpolated(self, a: Point, tried: list[tuple[float, np.ndarray]]) -> tuple[Point, float] | None:
-        """The point where a function is zero, from its values beside it: very near a crossing Newton's method fails."""
+        """The zero of a function, interpolated from values nearby: Newton's method fails very near a crossing."""
         tried = sorted(tried, key=lambda one: abs(one[0]))[:INTERPOLATED]
         zs = [_at_zero(tried[:count]) for count in (len(tried) - 1, len(tried))]
         point = self.point(zs[-1], a.tangent)
@@ -247,17 +248,17 @@ class Tracer(abc.ABC):
         return (point, off) if isinstance(point, Point) else None
 
     def at_edge(self, a: Point, b: Point) -> Point | None:
-        """The point of the branch where the parameter is at the end of its range."""
+        """The point of the branch at the end of the parameter's range."""
         edge = self.low if b.z[-1] < self.low else self.high
         share = np.clip((edge - a.z[-1]) / (b.z[-1] - a.z[-1]), 0.0, 1.0) if b.z[-1] != a.z[-1] else 0.0
         row = np.zeros_like(a.z)
         row[-1] = 1.0
         z = self.corrected(a.z + share * (b.z - a.z), row, edge)
-        found = self.point(z, a.tangent) if z is not None else None
-        return found if isinstance(found, Point) else None
+        candidate = self.point(z, a.tangent) if z is not None else None
+        return candidate if isinstance(candidate, Point) else None
 
     def closes(self, path: Path, step: float) -> bool:
-        """Whether a path is back where it began."""
+        """Whether a path has returned to its start."""
         if len(path.points) < 10:
             return False
         first, last = path.points[0], path.points[-1]
@@ -266,7 +267,7 @@ class Tracer(abc.ABC):
 
 
 def _at_zero(tried):
-    """Neville's interpolation of z by the value of a function, at the value zero."""
+    """z where the function is zero, by Neville's interpolation of z as a polynomial of the function's value."""
     values, zs = [value for value, _ in tried], [z for _, z in tried]
     for gap in range(1, len(zs)):
         zs = [

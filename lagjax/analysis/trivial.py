@@ -1,13 +1,13 @@
-"""The multipliers of a cycle that are 1 for a reason, and which directions they belong to.
+"""The trivial multipliers of a cycle, which are 1 for a known reason, and their directions.
 
-A cycle of a system without explicit time can be entered anywhere: a push along the motion f comes back as it was. A
-coordinate c on which nothing depends can be shifted: so does a push along it. And where a function h of the state is
-conserved, dh of a push comes back as it was. With the monodromy matrix M that is
+A cycle of a system without explicit time can start at any of its states: a displacement along the motion f returns
+unchanged. A coordinate c on which nothing depends can be shifted: a displacement along it returns unchanged, too. If a
+function h of the state is conserved, dh of any displacement returns unchanged. For the monodromy matrix M this means
 
     M f = f,    M e_c = e_c,    dh M = dh.
 
-Two such directions together make 1 a double root, usually with one eigenvector, which round-off splits by its square
-root. They are therefore taken out first: M acts on the states of the same h, up to pushes along f and e_c.
+Two such directions make 1 a double root, usually with one eigenvector, and round-off splits it by the square root of
+its size. They are therefore removed first: M then acts on states of the same h, up to displacements along f and e_c.
 
 Source: Meyer & Offin, *Introduction to Hamiltonian Dynamical Systems*, §8.2-8.3 (multipliers 1 of integrals and flows).
 """
@@ -24,12 +24,12 @@ from lagjax.mechanics import coordinates
 from lagjax.mechanics.constraints import Holonomic
 from lagjax.mechanics.structure import conserves_jacobi_integral, is_autonomous, unseen_coordinates
 
-# What is shorter than this, relative to what it could be, is a direction of round-off.
+# A direction shorter than this, relative to its possible length, is round-off.
 NO_DIRECTION = 1e-7
 
 
 class Reasons(NamedTuple):
-    """Why a multiplier may be 1, as far as the system's functions tell: whether time, energy, and which coordinates.
+    """The reasons why multipliers are 1 that the programs of the system's functions show.
 
     - `autonomous`: nothing depends on t. `energy`: the Jacobi integral is conserved.
     - `ignorable` (n,): the coordinates on which nothing depends; `momenta`: whether their momenta are conserved.
@@ -41,7 +41,7 @@ class Reasons(NamedTuple):
     momenta: bool
 
     def names(self, q) -> tuple[str, ...]:
-        """A word for each direction, in the order of `directions`."""
+        """A description of each direction, in the order of `directions`."""
         shifted = [name for name, yes in zip(coordinates.names(q), self.ignorable) if yes]
         return (
             *(("along the motion",) if self.autonomous else ()),
@@ -52,7 +52,7 @@ class Reasons(NamedTuple):
 
 
 def reasons_of(system, t, q, v, params) -> Reasons:
-    """What the programs of a system tell; of whose state only shapes count."""
+    """The reasons that the programs of a system show; only the shapes of the state matter."""
     state = t, q, v, params
     autonomous = is_autonomous(system, *state)
     potential = system.force is None and system.dissipation is None
@@ -66,8 +66,8 @@ def reasons_of(system, t, q, v, params) -> Reasons:
 
 
 def directions(flow: Flow, reasons: Reasons, t, z, scale, basis) -> Float[Array, "r k"]:
-    """The directions of `reasons.names`, in coordinates of the tangent space; zero where there is none."""
-    n, found = flow.size, []
+    """The directions of `reasons.names`, in coordinates of the tangent space; zero if there is none."""
+    n, rows = flow.size, []
     shifts = [jnp.eye(2 * n, dtype=z.dtype)[i] for i in np.flatnonzero(reasons.ignorable)]
 
     def momentum(z):
@@ -75,45 +75,46 @@ def directions(flow: Flow, reasons: Reasons, t, z, scale, basis) -> Float[Array,
         return coordinates.flatten(jax.grad(flow.system.lagrangian, argnums=2)(t, q, v, flow.params))[0]
 
     if reasons.autonomous:
-        found.append(flow.rate(t, z) / scale)
+        rows.append(flow.rate(t, z) / scale)
     if reasons.energy:
         integral = lambda z: momentum(z) @ z[n:] - flow.system.lagrangian(t, *flow.state(z), flow.params)
-        found.append(jax.grad(integral)(z) * scale)
-    found += shifts
+        rows.append(jax.grad(integral)(z) * scale)
+    rows += shifts
     if reasons.momenta and shifts:
         slopes = jax.jacfwd(momentum)(z) * scale[None]
-        found += [slopes[i] for i in np.flatnonzero(reasons.ignorable)]
-    if not found:
+        rows += [slopes[i] for i in np.flatnonzero(reasons.ignorable)]
+    if not rows:
         return jnp.zeros((0, basis.shape[1]), z.dtype)
-    return jnp.stack(found) @ basis
+    return jnp.stack(rows) @ basis
 
 
 def orthonormal(reasons: Reasons, rows: Float[Array, "r k"], rate) -> tuple[Float[Array, "r k"], Bool[Array, " r"]]:
-    """The directions made orthonormal one after the other, zero where nothing new is left; and where something is.
+    """The directions orthonormalised one after the other, with zero for dependent ones; and which are independent.
 
-    `rate`: of the motion, by its period: next to nothing beside that, the state is one of rest.
+    `rate`: the typical rate of the motion, from its period; a state is at rest if its rate is negligible compared to
+    it.
     """
-    found, kept = [], []
+    basis, kept = [], []
     for i, row in enumerate(rows):
         length = _length(row)
         rest = row / jnp.where(length > 0, length, 1.0)
-        for other in found:
+        for other in basis:
             rest = rest - (other @ rest) * other
         left = _length(rest)
         is_new = (length > 0) & (left > NO_DIRECTION)
         if reasons.autonomous and i == 0:
             is_new = length > NO_DIRECTION * rate
         if reasons.energy and i == 1:
-            # At rest there is no slope of the energy either.
+            # At rest the energy has no slope either.
             is_new = is_new & kept[0]
-        found.append(jnp.where(is_new, rest / jnp.where(is_new, left, 1.0), 0.0))
+        basis.append(jnp.where(is_new, rest / jnp.where(is_new, left, 1.0), 0.0))
         kept.append(is_new)
-    if not found:
+    if not basis:
         return rows, jnp.zeros(0, bool)
-    return jnp.stack(found), jnp.stack(kept)
+    return jnp.stack(basis), jnp.stack(kept)
 
 
 def _length(row):
     squared = row @ row
-    # The root has no derivative at zero.
+    # The square root has no derivative at zero.
     return jnp.where(squared > 0, jnp.sqrt(jnp.where(squared > 0, squared, 1.0)), 0.0)

@@ -1,4 +1,4 @@
-"""Formulas in LaTeX, with names as they are written: `theta` is θ, `m1` is m with an index."""
+"""Formulas in LaTeX, with names typeset as usual: `theta` becomes θ, `m1` becomes m with an index."""
 
 import re
 from fractions import Fraction
@@ -40,22 +40,22 @@ def latex(formula: Formula) -> str:
 
 
 def combined(terms) -> str:
-    """A sum of formulas each times a symbol, those that are zero left out."""
+    """The sum of formulas, each multiplied by its symbol, without those that are zero."""
     words = ""
-    for formula, of in terms:
+    for formula, factor in terms:
         if not formula.terms:
             continue
         if len(formula.terms) > 1:
-            text = rf"\left({latex(formula)}\right) {of}"
+            text = rf"\left({latex(formula)}\right) {factor}"
         else:
             plain = latex(formula)
-            text = of if plain == "1" else f"-{of}" if plain == "-1" else f"{plain} {of}"
+            text = factor if plain == "1" else f"-{factor}" if plain == "-1" else f"{plain} {factor}"
         words += plus(text) if words else text
     return words
 
 
 def plus(text: str) -> str:
-    """What is added, with its sign between spaces."""
+    """A term to be added, with its sign between spaces."""
     return f" - {text[1:]}" if text.startswith("-") else f" + {text}"
 
 
@@ -89,7 +89,7 @@ def _power(atom, power: Fraction) -> str:
     if atom.name == "abs":
         return rf"\left|{argument}\right|{raised}"
     name = NAMED.get(atom.name, rf"\{atom.name}" if atom.name in PLAIN else rf"\operatorname{{{atom.name}}}")
-    # In brackets always: another factor may follow.
+    # The argument is always in brackets, because another factor may follow.
     simple = "frac" not in argument and "^" not in argument
     return f"{name}{raised}({argument})" if simple else rf"{name}{raised}\left({argument}\right)"
 

@@ -1,17 +1,17 @@
-"""Multipliers in the complex plane."""
+"""A picture of multipliers in the complex plane."""
 
 import numpy as np
 
 from lagjax import plot
 
-# Beyond this a linear picture shows nothing of the circle.
+# The largest extent of the axes: beyond this the circle would be too small to see.
 FAR = 4.0
 
 
 def unit_circle(multipliers: np.ndarray, trivial: np.ndarray):
-    """Draw multipliers (k,) as dots, trivial ones hollow, with the unit circle; a matplotlib `Figure`.
+    """Draw multipliers (k,) as dots, trivial ones hollow, with the unit circle; returns a matplotlib `Figure`.
 
-    Those that are far outside are drawn at the edge, with their values.
+    Multipliers far outside are drawn at the edge, with their values.
     """
     fig, axes = plot.figure(size=(4.2, 4.0))
     axis, turn = axes[0, 0], np.linspace(0.0, 2 * np.pi, 361)

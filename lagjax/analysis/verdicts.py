@@ -1,4 +1,4 @@
-"""What the roots say of a system, in words."""
+"""The stability verdict and the modes in words."""
 
 import jax
 import numpy as np
@@ -14,12 +14,12 @@ VERDICTS = {
     UNDECIDED: "undecided",
     UNSTEADY: "no steady motion",
 }
-# Entries of a shape below this part of the largest are not named.
+# Entries of a shape below this fraction of the largest are not named.
 NAMED_ABOVE = 1e-6
 
 
 def reason_of(modes) -> str:
-    """Why the verdict is what it is, in one sentence."""
+    """The reason for the verdict, in one sentence."""
     code, kind = int(modes.code), modes.linearisation.kind
     growth = np.asarray(modes.growth)
     worst = int(np.argmax(growth)) if growth.size else 0
@@ -54,7 +54,7 @@ def reason_of(modes) -> str:
 
 
 def label_of(i: int, modes) -> str:
-    """What one mode is, in a few words."""
+    """A mode in a few words."""
     linearisation, shape = modes.linearisation, np.abs(_flat(modes)[i])
     moved = [linearisation.names[j] for j in np.argsort(-shape.round(6), kind="stable") if shape[j] > NAMED_ABOVE]
     named = ", ".join(moved[:4]) + (", ..." if len(moved) > 4 else "")

@@ -1,7 +1,7 @@
-"""What of a motion is compared, and in which units: states at the outputs, or at the event that ended it, and times.
+"""What is compared of a motion, and in which units: states at the outputs or at the final event, and event times.
 
-Every leaf of the coordinates and of the velocities counts relative to its largest value on the way, every time of an
-event relative to the time span; the error is the largest of all.
+Each leaf of the coordinates and of the velocities counts relative to its largest value during the motion, each event
+time relative to the time span; the error is the largest of all.
 """
 
 from collections.abc import Mapping
@@ -18,8 +18,8 @@ from lagjax.motion.crossings import Crossing
 from lagjax.motion.results import ended_well
 from lagjax.motion.trajectory import Trajectory
 
-# Where a motion is looked at to find its largest values, at this tolerance.
-PLACES, ROUGHLY = 200, 1e-5
+# The number of times at which the largest values are sought, and the tolerance of that motion.
+SAMPLES, ROUGH_TOLERANCE = 200, 1e-5
 
 
 class States(NamedTuple):
@@ -39,8 +39,8 @@ class Compared(NamedTuple):
     times: dict[str, np.ndarray]
 
 
-def of(motion: States | Trajectory, events: Mapping[str, Crossing] | None) -> Compared:
-    """What is compared of a motion."""
+def compared_of(motion: States | Trajectory, events: Mapping[str, Crossing] | None) -> Compared:
+    """The compared states and event times of a motion."""
     q, v, times = motion.q, motion.v, {}
     if events and isinstance(motion, Trajectory):
         times = {name: np.asarray(found.found().t) for name, found in motion.events.items()}
@@ -51,7 +51,7 @@ def of(motion: States | Trajectory, events: Mapping[str, Crossing] | None) -> Co
 
 
 def in_words(events: Mapping[str, Crossing] | None, outputs: int) -> str:
-    """What is compared, in words."""
+    """A description of what is compared."""
     at = f"at {outputs} times"
     if events:
         ends = any(crossing.terminal for crossing in events.values())
@@ -67,7 +67,7 @@ class Scales(NamedTuple):
     time: float
 
     def error(self, found: Compared, right: Compared) -> float:
-        """The largest relative error; infinite where there are other events."""
+        """The largest relative error; infinite if the numbers of events differ."""
         errors = []
         for tree, exact, scale in ((found.q, right.q, self.q), (found.v, right.v, self.v)):
             leaves = zip(jax.tree.leaves(tree), jax.tree.leaves(exact), jax.tree.leaves(scale), strict=True)
@@ -81,7 +81,7 @@ class Scales(NamedTuple):
 
 
 def other_events(found: Compared, right: Compared) -> str:
-    """In words, which event came more or less often than it does; empty where none."""
+    """A message naming an event whose number differs from the reference; empty if there is none."""
     for name, times in right.times.items():
         if times.shape != found.times[name].shape:
             return f"{len(found.times[name])} crossings of '{name}' where the reference has {len(times)}"
@@ -89,25 +89,25 @@ def other_events(found: Compared, right: Compared) -> str:
 
 
 def scales_of(samples: Any, ts) -> Scales:
-    """The units from states (q, v) on the way, each leaf with a leading axis."""
+    """The units from states (q, v) during the motion, each leaf with a leading axis."""
     largest = lambda x: float(np.nanmax(np.abs(np.asarray(x)), initial=0.0)) or 1.0
     return Scales(*jax.tree.map(largest, tuple(samples)), time=abs(float(ts[-1] - ts[0])))
 
 
-def on_the_way(motion: Motion, program: Program):
-    """States (q, v) at many times: the compiled program goes from place to place, whatever the number of its outputs.
+def states_during(motion: Motion, program: Program):
+    """States (q, v) at many times; the compiled program runs from one short interval to the next, at its own outputs.
 
-    Backward in time its times are fixed, and another program is compiled.
+    Backward in time the program's times are fixed, so another program is compiled.
     """
-    ts, start, tolerance = motion.ts, motion.start, ROUGHLY
+    ts, start, tolerance = motion.ts, motion.start, ROUGH_TOLERANCE
     if runs_backward(ts):
-        found = Program(motion._replace(ts=np.linspace(ts[0], ts[-1], PLACES, dtype=ts.dtype)), None)(tolerance)
+        found = Program(motion._replace(ts=np.linspace(ts[0], ts[-1], SAMPLES, dtype=ts.dtype)), None)(tolerance)
         return found.q, found.v
     q, v, rows = start.q, start.v, []
-    for a, b in pairwise(np.linspace(ts[0], ts[-1], 1 + max(1, PLACES // (len(ts) - 1)))):
+    for a, b in pairwise(np.linspace(ts[0], ts[-1], 1 + max(1, SAMPLES // (len(ts) - 1)))):
         found = program(tolerance, np.linspace(a, b, len(ts), dtype=ts.dtype), q, v)
         rows.append((found.q, found.v))
-        # An event, or a failure.
+        # Stop at an event or a failure.
         if not bool(ended_well(found.result)) or float(found.end.t) < b:
             break
         q, v = found.end.q, found.end.v

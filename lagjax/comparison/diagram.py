@@ -1,4 +1,4 @@
-"""The answer of a comparison: a table, a diagram, and what to take."""
+"""The result of a comparison: a table, a diagram, and the best choice."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ from lagjax.plot import Drawn
 
 
 class Choice(NamedTuple):
-    """A method and the tolerance at which it comes within an error; `seconds` a solve, compiling apart."""
+    """A method and the tolerance at which it comes within an error; `seconds` per solve, without compiling."""
 
     name: str
     method: Any
@@ -27,7 +27,7 @@ class Choice(NamedTuple):
 
 
 class Choices(tuple):
-    """Choices, the fastest first; prints itself as a table, and as the call to make."""
+    """Choices, the fastest first; prints itself as a table and the call to make."""
 
     def __repr__(self):
         cells = [
@@ -48,9 +48,9 @@ class WorkPrecision:
 
     - `curves`: by name, the `Curve` of each method: its `points`, its measured `order`, seconds of compiling;
       `found["Dopri8"]` is one.
-    - `reference`: what errors are measured against, and what that may itself be off by; None where the error was given.
-      Points with less than twice that are marked: not to be trusted.
-    - `measured`: in words, what an error is. `call_seconds`: what a call takes that does nothing, and is taken off.
+    - `reference`: what errors are measured against, and its own possible error; None if a function `error` was given.
+      Points with an error below twice that are marked as not to be trusted.
+    - `measured`: the definition of an error, in words. `call_seconds`: the overhead of a call, which is subtracted.
     """
 
     curves: dict[str, Curve]
@@ -67,46 +67,46 @@ class WorkPrecision:
         return (point for curve in self.curves.values() for point in curve.points)
 
     def best(self, error: float) -> Choices:
-        """What to take for a relative error: of each method the fastest tolerance within it, fastest first.
+        """The best choices for a relative error: the fastest tolerance of each method within it, the fastest first.
 
-        A tolerance counts where all tighter ones are within the error, too: a lucky one does not.
+        A tolerance counts only if all tighter ones are within the error, too, which excludes lucky ones.
 
-        **Raises:** `ValueError` where no method comes so near, or the reference cannot tell.
+        **Raises:** `ValueError` if no method reaches this error, or it is below the error of the reference.
         """
         if self.reference is not None and error < self.reference.error:
             raise ValueError(
-                f"an error of {error:.0e} is less than the reference may itself be off, {self.reference.error:.0e}.\n"
+                f"an error of {error:.0e} is below the possible error of the reference, {self.reference.error:.0e}.\n"
                 "Usual cause: a long or unstable motion, which amplifies round-off.\n"
-                "Fix: ask for more, shorten ts, or give an exact reference=."
+                "Fix: allow a larger error, shorten ts, or give an exact reference=."
             )
-        found = []
+        choices = []
         for curve in self.curves.values():
             point = curve.within(error)
             if point is not None:
-                found.append(
+                choices.append(
                     Choice(
                         curve.method, curve.solver, point.tolerance, point.error, point.seconds, curve.compile_seconds
                     )
                 )
-        if not found:
+        if not choices:
             nearest = min(self.points, key=lambda point: point.error)
             raise ValueError(
                 f"no method stays within {error:.0e}: the nearest is {nearest.method} at {nearest.tolerance:.0e}, with "
-                f"{nearest.error:.1e}.\nFix: ask for more, or tighter tolerances=."
+                f"{nearest.error:.1e}.\nFix: allow a larger error, or give tighter tolerances=."
             )
-        return Choices(sorted(found, key=lambda choice: choice.seconds))
+        return Choices(sorted(choices, key=lambda choice: choice.seconds))
 
     def to_pandas(self):
-        """A `pandas.DataFrame` with a row a point: method, tolerance, error, seconds, steps, evaluations, how it ended.
+        """A `pandas.DataFrame`, one row per point: method, tolerance, error, seconds, steps, evaluations, how it ended.
 
-        `order` and `compile_seconds` are those of the method. Steps and evaluations that are not known are `<NA>`.
+        `order` and `compile_seconds` are those of the method. Unknown steps and evaluations are `<NA>`.
 
         **Raises:** `ImportError` without pandas.
         """
         return exported.frame(self)
 
     def to_xarray(self):
-        """An `xarray.Dataset` over `solver`, the methods by name, and `tolerance`, loose to tight; NaN where not tried.
+        """An `xarray.Dataset` over `solver` (the methods by name) and `tolerance`, loose to tight; NaN where not tried.
 
         **Raises:** `ImportError` without xarray.
         """
@@ -115,7 +115,7 @@ class WorkPrecision:
     def plot(self, title: str = ""):
         """Draw error against run time, and against evaluations of the accelerations; returns a matplotlib `Figure`.
 
-        The number beside a curve is its measured order; hollow points are not to be trusted.
+        The number next to a curve is its measured order; hollow points are not to be trusted.
 
         **Raises:** `ImportError` without matplotlib.
         """
@@ -147,13 +147,11 @@ class WorkPrecision:
         if self.reference is not None:
             lines.append(f"  reference  {self.reference.in_words()}")
             if not self.reference.agrees:
-                lines.append(f"  WARNING    {_why(self.reference)}")
-        lines.append(
-            f"  time       median of a compiled solve; a call's own {in_ms(self.call_seconds)} ms is taken off"
-        )
+                lines.append(f"  WARNING    {_reference_warning(self.reference)}")
+        lines.append(f"  time       median of a compiled solve, without the {in_ms(self.call_seconds)} ms of a call")
         header = ("method", "tolerance", "error", "steps", "evaluations", "ms", "order", "compile/s", "")
         cells = [
-            (*_of_curve(curve, i)[:1], *_of_point(point), *_of_curve(curve, i)[1:], _remark(point))
+            (*_curve_cells(curve, i)[:1], *_point_cells(point), *_curve_cells(curve, i)[1:], _remark(point))
             for curve in self.curves.values()
             for i, point in enumerate(curve.points)
         ]
@@ -170,14 +168,14 @@ def _in_seconds(seconds):
     return "-" if not np.isfinite(seconds) else f"{seconds:.1f}"
 
 
-def _of_curve(curve, i):
-    """Name, order and seconds of compiling, in the first row of each method."""
+def _curve_cells(curve, i):
+    """Name, order and seconds of compiling, only in the first row of a method."""
     if i:
         return "", "", ""
     return curve.method, f"{curve.order:.1f}" if np.isfinite(curve.order) else "-", _in_seconds(curve.compile_seconds)
 
 
-def _of_point(point):
+def _point_cells(point):
     known = lambda count: "-" if count is None else f"{count}"
     error = f"{point.error:.1e}" if point.ended_well else "-"
     return f"{point.tolerance:.0e}", error, known(point.steps), known(point.evaluations), in_ms(point.seconds)
@@ -189,8 +187,8 @@ def _remark(point):
     return "" if point.trusted else "not to be trusted"
 
 
-def _why(reference):
+def _reference_warning(reference):
     return (
-        f"errors below {reference.error:.0e} are not known. Usual cause: a motion that amplifies (chaos, a long span), "
+        f"errors below {reference.error:.0e} are unknown. Usual cause: amplified errors (chaos, a long span), "
         "a force that jumps or is narrow, a wrong reference. Fix: shorten ts, jump_ts=, max_step=, reference=."
     )

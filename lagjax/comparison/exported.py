@@ -1,15 +1,15 @@
-"""A comparison for others to read: as a `pandas.DataFrame`, as an `xarray.Dataset`."""
+"""Export a comparison as a `pandas.DataFrame` or an `xarray.Dataset`."""
 
 from typing import Any
 
 import numpy as np
 
-# What a point has of numbers, and in which dtype; those that are not known are NaN.
+# The numbers of a point; unknown ones are NaN.
 NUMBERS = ("error", "seconds", "least", "steps", "evaluations")
 
 
 def frame(found: Any):
-    """A row a point: `WorkPrecision.to_pandas`."""
+    """A table with one row per point: see `WorkPrecision.to_pandas`."""
     try:
         import pandas
     except ImportError as error:
@@ -17,7 +17,7 @@ def frame(found: Any):
     points = list(found.points)
     columns = {name: [getattr(point, name) for point in points] for name in ("method", "tolerance", "error", "trusted")}
     columns |= {name: [getattr(point, name) for point in points] for name in ("seconds", "least")}
-    # Whole numbers, some of which may not be known.
+    # Whole numbers, some of which may be unknown.
     columns |= {
         name: pandas.array([getattr(point, name) for point in points], "Int64") for name in ("steps", "evaluations")
     }
@@ -31,14 +31,14 @@ def frame(found: Any):
 
 
 def dataset(found: Any):
-    """Methods by tolerances: `WorkPrecision.to_xarray`."""
+    """Arrays of methods by tolerances: see `WorkPrecision.to_xarray`."""
     try:
         import xarray
     except ImportError as error:
         raise ImportError('this needs xarray, an optional extra.\nFix: pip install "lagjax[data]"') from error
     methods, points = list(found.curves), list(found.points)
     tolerances = sorted({point.tolerance for point in points}, reverse=True)
-    # Not `method`: that is an argument of xarray's `sel`.
+    # Not called `method`, which is an argument of xarray's `sel`.
     shape, dims = (len(methods), len(tolerances)), ("solver", "tolerance")
     numbers = {name: np.full(shape, np.nan) for name in NUMBERS}
     trusted, results = np.zeros(shape, bool), np.full(shape, "not tried", object)

@@ -1,8 +1,8 @@
-"""What one would take in place of lagjax: bare diffrax and SciPy, with accelerations derived by hand.
+"""Alternatives to lagjax: bare diffrax and SciPy, with accelerations derived by hand.
 
-Each function takes `acceleration(t, q, v, params)` and a motion, and returns a function of a tolerance that solves it
-and gives the states at `ts` and the number of evaluations: an entry of `others` of `lj.work_precision`. SciPy gets the
-compiled acceleration, which it calls from Python.
+Each function takes `acceleration(t, q, v, params)` and a motion, and returns a function of a tolerance that integrates
+the motion and returns the states at `ts` and the number of evaluations: an entry of `others` of `lj.work_precision`.
+SciPy calls the compiled acceleration from Python.
 """
 
 import warnings
@@ -16,11 +16,11 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from scipy import integrate
 
-MOST_STEPS = 2**20
+MAX_STEPS = 2**20
 
 
 def usual_others(acceleration: Callable, q0, v0, params, ts) -> dict[str, Callable]:
-    """All of them by name."""
+    """All alternatives by name."""
     motion = acceleration, q0, v0, params, np.asarray(ts)
     return {
         "diffrax, by hand": bare_diffrax(*motion),
@@ -30,7 +30,7 @@ def usual_others(acceleration: Callable, q0, v0, params, ts) -> dict[str, Callab
 
 
 def bare_diffrax(acceleration, q0, v0, params, ts):
-    """diffrax's Dopri8 and its loop, compiled once."""
+    """diffrax's Dopri8 and its own loop, compiled once."""
     start, params = jax.tree.map(lambda x: jnp.asarray(x, float), ((q0, v0), params))
     method = diffrax.Dopri8()
     stages = method.tableau.num_stages - method.tableau.fsal
@@ -47,7 +47,7 @@ def bare_diffrax(acceleration, q0, v0, params, ts):
             params,
             saveat=diffrax.SaveAt(ts=ts),
             stepsize_controller=diffrax.PIDController(rtol=tolerance, atol=tolerance),
-            max_steps=MOST_STEPS,
+            max_steps=MAX_STEPS,
             throw=False,
         )
         q, v = cast(tuple, solution.ys)
@@ -58,7 +58,7 @@ def bare_diffrax(acceleration, q0, v0, params, ts):
 
 def dop853(acceleration, q0, v0, params, ts):
     """`scipy.integrate.solve_ivp` with DOP853."""
-    field, y0, as_states = _in_numbers(acceleration, q0, v0, params)
+    field, y0, as_states = _flat_problem(acceleration, q0, v0, params)
 
     def solve(tolerance):
         solution = integrate.solve_ivp(
@@ -71,21 +71,21 @@ def dop853(acceleration, q0, v0, params, ts):
 
 def lsoda(acceleration, q0, v0, params, ts):
     """`scipy.integrate.odeint`, which is LSODA."""
-    field, y0, as_states = _in_numbers(acceleration, q0, v0, params)
+    field, y0, as_states = _flat_problem(acceleration, q0, v0, params)
 
     def solve(tolerance):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", integrate.ODEintWarning)
-            options = {"tfirst": True, "rtol": tolerance, "atol": tolerance, "mxstep": MOST_STEPS}
-            y, told = integrate.odeint(field, y0, ts, full_output=True, **options)
-        well = told["message"] == "Integration successful."
-        return *as_states(y if well else np.full_like(y, np.nan)), int(told["nfe"][-1])
+            options = {"tfirst": True, "rtol": tolerance, "atol": tolerance, "mxstep": MAX_STEPS}
+            y, info = integrate.odeint(field, y0, ts, full_output=True, **options)
+        well = info["message"] == "Integration successful."
+        return *as_states(y if well else np.full_like(y, np.nan)), int(info["nfe"][-1])
 
     return solve
 
 
-def _in_numbers(acceleration, q0, v0, params):
-    """The vector field of one vector, that vector at the start, and rows of such as (q, v)."""
+def _flat_problem(acceleration, q0, v0, params):
+    """The vector field for flat vectors, the start as a vector, and a function from rows of vectors to (q, v)."""
     y0, unravel = ravel_pytree(jax.tree.map(lambda x: jnp.asarray(x, float), (q0, v0)))
 
     @jax.jit

@@ -1,7 +1,7 @@
-"""A solve by one method as a compiled program, and how long calls take.
+"""A solve by one method as a compiled program, and the time that calls take.
 
-The program takes tolerance, times and start as arguments: one compilation serves a method at all tolerances. It is what
-`integrate` runs where it is called by itself, without the checks around it.
+The program takes tolerance, times and start as arguments, so one compilation serves a method at all tolerances. It is
+the program that a plain call of `integrate` runs, without the checks around it.
 """
 
 import time
@@ -22,16 +22,17 @@ from lagjax.motion.integrate import integrate
 from lagjax.motion.reported import reporting
 from lagjax.motion.trajectory import Trajectory
 
-# Seconds of measuring after which a call is not repeated; one that takes longer counts twice, unless it is very long.
+# Seconds of measuring after which a call is not repeated; a single call that takes longer is timed twice, unless it is
+# very long.
 ENOUGH, VERY_LONG = 0.05, 0.2
-# A call of less seconds is made once before it is timed: right after another program caches are cold.
+# A shorter call is made once before it is timed, since caches are cold after another program.
 SHORT = 0.02
-# Of a call of an empty program: a difference of less cannot be told from zero.
+# Times below this fraction of the call of an empty program cannot be distinguished from zero.
 RESOLVED = 0.1
 
 
 class Motion(NamedTuple):
-    """What is integrated: `start` has the first time; `options` are those of `integrate`, events included."""
+    """The motion to integrate: `start` has the first time; `options` are those of `integrate`, including events."""
 
     system: System
     start: State
@@ -40,10 +41,10 @@ class Motion(NamedTuple):
 
 
 class Program:
-    """The trajectory of a motion by one method, of (tolerance, ts, q, v); as many times as were given.
+    """The trajectory of a motion by one method, as a function of (tolerance, ts, q, v); the number of times is fixed.
 
-    `compile_seconds` are those of tracing and compiling. Equations are first taken for regular, as `integrate` does;
-    where that turns out wrong, the robust program is compiled too, and kept to.
+    `compile_seconds` is the time of tracing and compiling. Like `integrate`, the program first assumes that the
+    equations are regular; if they turn out singular, the robust program is compiled, too, and used from then on.
     """
 
     def __init__(self, motion: Motion, method: Any):
@@ -52,24 +53,24 @@ class Program:
         self._compiled = self._compile(robust=False)
 
     def __call__(self, tolerance, ts=None, q=None, v=None) -> Trajectory:
-        """Solve; by default from the start, with outputs at its own times."""
+        """Solve; by default from the motion's start, with outputs at its own times."""
         args = self._arguments(tolerance, ts, q, v)
-        found, settled = self._compiled(args)
-        if settled is not None and not bool(settled):
+        trajectory, regular = self._compiled(args)
+        if regular is not None and not bool(regular):
             self._compiled = self._compile(robust=True)
-            found, _ = self._compiled(args)
-        return jax.block_until_ready(found)
+            trajectory, _ = self._compiled(args)
+        return jax.block_until_ready(trajectory)
 
     def call(self, tolerance) -> Callable[[], Any]:
-        """The bare call, to be timed, and waited for."""
+        """The bare call, for timing; the caller has to wait for the result."""
         args = self._arguments(tolerance)
         return lambda: self._compiled(args)
 
     def call_seconds(self) -> float:
-        """The least time of a call of a program that takes and returns the same, and does nothing."""
+        """The least time of a call of an empty program with the same arguments and results."""
         args = self._arguments(1e-3)
-        nothing = lambda args: jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), self._returned)
-        idle = jax.jit(nothing).lower(args).compile()
+        zeros = lambda args: jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), self._returned)
+        idle = jax.jit(zeros).lower(args).compile()
         return min(seconds_of(lambda: idle(args)) for _ in range(50))
 
     def _arguments(self, tolerance, ts=None, q=None, v=None):
@@ -84,15 +85,15 @@ class Program:
 
         def solve(args):
             tolerance, ts, q, v, params = static.together(args)
-            # Times that decrease have to be known.
+            # Decreasing times must be known at compile time.
             ts = motion.ts if runs_backward(motion.ts) else ts
             return integrate(
                 motion.system, q, v, params, ts=ts, method=self._method, throw=False, rtol=tolerance, **motion.options
             )
 
         def program(args):
-            found, _, settled = reporting(solve)(args)
-            return found, settled
+            trajectory, _, regular = reporting(solve)(args)
+            return trajectory, regular
 
         started = time.perf_counter()
         with REGULAR_FIRST(not robust):
@@ -104,23 +105,23 @@ class Program:
 
 
 def seconds_of(call: Callable[[], Any]) -> float:
-    """The time of one call, its result waited for."""
+    """The time of one call, until its result is ready."""
     started = time.perf_counter()
     jax.block_until_ready(call())
     return time.perf_counter() - started
 
 
 class Times(NamedTuple):
-    """Seconds of a call: the median and the least."""
+    """Seconds of a call: the median and the minimum."""
 
     median: float
     least: float
 
 
-def in_turn(calls: Sequence[Callable[[], Any]], first: Sequence[float], repeats: int) -> list[Times]:
-    """Times of calls made in turn, so that whatever else the machine does falls on all of them.
+def interleaved_times(calls: Sequence[Callable[[], Any]], first: Sequence[float], repeats: int) -> list[Times]:
+    """Times of calls made in turn, so that other load on the machine affects all of them equally.
 
-    `first` are the seconds of a call before, of which those that take long are not called again.
+    `first` are the seconds of an earlier call of each; long ones are not called again.
     """
     turns: list[list[float]] = [[seconds] if seconds > ENOUGH else [] for seconds in first]
     for _ in range(repeats):
@@ -129,10 +130,10 @@ def in_turn(calls: Sequence[Callable[[], Any]], first: Sequence[float], repeats:
                 if not seconds or seconds[-1] < SHORT:
                     jax.block_until_ready(call())
                 seconds.append(seconds_of(call))
-    # Of two, the lower: what disturbs a call makes it longer.
+    # The lower of two medians: disturbances only make a call longer.
     return [Times(float(np.percentile(seconds, 50, method="lower")), min(seconds)) for seconds in turns]
 
 
-def less_the_call(seconds: float, call_seconds: float) -> float:
-    """What of a measured time the solve itself takes."""
+def without_overhead(seconds: float, call_seconds: float) -> float:
+    """The time of the solve itself: a measured time without the overhead of the call."""
     return max(seconds - call_seconds, RESOLVED * call_seconds)

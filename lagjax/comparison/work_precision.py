@@ -1,4 +1,4 @@
-"""Error against run time of several methods on a system of the user's: check, compile, solve, time, judge."""
+"""Error against run time of several methods on a user's system: check, compile, solve, time, compare."""
 
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -14,8 +14,8 @@ from lagjax.comparison.compared import Compared, States
 from lagjax.comparison.diagram import WorkPrecision
 from lagjax.comparison.methods import chosen, ladder
 from lagjax.comparison.points import Curve, Point
-from lagjax.comparison.programs import Motion, Program, Times, in_turn, less_the_call
-from lagjax.comparison.references import Known, Reference
+from lagjax.comparison.programs import Motion, Program, Times, interleaved_times, without_overhead
+from lagjax.comparison.references import KnownAnswer, Reference
 from lagjax.jax_internals.tracing import is_eager
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.refusals import by_name, check_system
@@ -27,10 +27,10 @@ from lagjax.motion.results import ended_well, message
 from lagjax.motion.trajectory import Trajectory
 from lagjax.numerics.evaluations import evaluations_a_step
 
-# What of `integrate` means the same for every method.
+# The options of `integrate` that mean the same for every method.
 OPTIONS = ("max_step", "jump_ts", "drift", "max_steps")
-# An error is known where it is so many times what the reference may itself be off by.
-KNOWN_BY = 2
+# An error is trusted if it is this many times the possible error of the reference.
+TRUSTED_FROM = 2
 UNTIMED = Times(float("nan"), float("nan"))
 
 
@@ -53,7 +53,7 @@ def work_precision(
     patience_with_others: float = 30.0,
     **options: Any,
 ) -> WorkPrecision:
-    """Compare methods on one motion: the error that each makes at each tolerance, and what it costs.
+    """Compare methods on one motion: the error of each at each tolerance, and its cost.
 
     >>> import jax.numpy as jnp
     >>> import lagjax as lj
@@ -63,45 +63,45 @@ def work_precision(
     >>> print(found.best(error=1e-6)[0].name, found.best(error=1e-6)[0].error < 1e-6, found.reference.agrees)
     Tsit5 True True
 
-    `print(found)` shows a table, `found.plot()` draws it, `found.best(error=1e-6)` says what to take.
+    `print(found)` shows a table, `found.plot()` draws it, `found.best(error=1e-6)` recommends methods and tolerances.
 
     **Main arguments:**
 
-    - `system`, `q0`, `v0`, `params`, `ts`: as `integrate` takes them. A motion that takes less than ten calls' time
-      says little of methods: make `ts` long.
-    - `methods`: solvers with an estimate of their error, lagjax's or diffrax's, in a sequence or by name in a dict. By
-      default the explicit ones that suit the system, the default of `integrate` first; for what is stiff add
+    - `system`, `q0`, `v0`, `params`, `ts`: as `integrate` takes them. A motion that takes less than ten times the
+      overhead of a call says little about methods: make `ts` long.
+    - `methods`: solvers with an error estimate, of lagjax or diffrax, in a sequence or by name in a dict. By default
+      the explicit ones that suit the system, starting with the default of `integrate`; for a stiff system add
       `lj.Radau5()`.
-    - `tolerances`: each used as rtol, by other tools as atol, too; by default decades from 1e-3 to 1e-12 in float64.
-    - `events`: as `integrate` takes them. With one that ends the motion, errors are those of its time and of the state
-      there; without, of the states at `ts`, and of the times of crossings.
+    - `tolerances`: each is used as rtol, by other tools also as atol; by default decades from 1e-3 to 1e-12 in float64.
+    - `events`: as `integrate` takes them. If one ends the motion, errors are those of its time and of the state there;
+      else those of the states at `ts`, and of the times of crossings.
     - `reference`: the right answer: a `Trajectory` at `ts`, states `(q, v)` with a row for each time, or a function
-      of times that returns these. By default two methods of different kind at 1e-13: where they do not agree, the
-      answer says to which digits it can be trusted.
+      of times that returns these. By default two methods of different kinds at 1e-13; if they do not agree, the result
+      says how many digits can be trusted.
 
     **Other arguments:**
 
-    - `error`: a function of a `Trajectory` (of `others`: of what has its `t`, `q`, `v`, `params`) that returns the
-      error as one number, in place of the comparison with a reference.
-    - `others`: by name, functions of a tolerance by which another tool solves the same problem, for comparison:
-      each returns `(q, v, evaluations)`, the states at `ts` and how often it evaluated the accelerations, or None.
-    - `repeats`: of each solve; the median is kept. One that takes long is repeated less.
-    - `patience`, `patience_with_others`: seconds of a solve after which tighter tolerances are not tried.
+    - `error`: a function of a `Trajectory` (for `others`, of an object with `t`, `q`, `v`, `params`) that returns the
+      error as one number, instead of the comparison with a reference.
+    - `others`: by name, functions of a tolerance that solve the same problem with another tool, for comparison: each
+      returns `(q, v, evaluations)`, the states at `ts` and the number of evaluations of the accelerations, or None.
+    - `repeats`: how often each solve is timed; the median is kept. A long solve is repeated less.
+    - `patience`, `patience_with_others`: if a solve takes more seconds than this, tighter tolerances are not tried.
     - `options`: `max_step`, `jump_ts`, `drift` and `max_steps` of `integrate`.
 
     **Returns:** a `WorkPrecision`.
 
     **Raises:**
 
-    - `TypeError`, `ValueError` for methods that no tolerance steers or that do not suit the system, tolerances below
-      round-off, a reference that does not fit; for all that `integrate` refuses.
-    - `RuntimeError` where no method came to the end of the motion.
+    - `TypeError`, `ValueError` for methods without an error estimate or that do not suit the system, tolerances below
+      round-off, a reference that does not fit; for everything that `integrate` refuses.
+    - `RuntimeError` if no method reaches the end of the motion.
 
-    Times are of the compiled solve; a call's own time and that of compiling stand apart. A point that failed stays in
-    the table with its reason.
+    Times are those of the compiled solve; the overhead of a call and the time of compiling are given separately. A
+    failed point stays in the table with its reason.
 
-    Source: Hairer, Nørsett & Wanner, *Solving ODEs I*, §II.10 (work-precision diagrams); `tests/comparison` measures
-    that orders and marks are right.
+    Source: Hairer, Nørsett & Wanner, *Solving ODEs I*, §II.10 (work-precision diagrams); `tests/comparison` checks
+    the orders and the marks.
     """
     motion = _motion(system, q0, v0, params, ts, events, options)
     solvers = chosen(methods, system, motion.start)
@@ -110,16 +110,16 @@ def work_precision(
     programs = {name: Program(motion, solver) for name, solver in solvers.items()}
     solved = []
     for name, program in programs.items():
-        solved += _by_program(name, program, tolerances, patience)
+        solved += _solves_of_program(name, program, tolerances, patience)
     if not any(solve.ended_well for solve in solved):
         raise _all_failed(motion, solved, tolerances)
     known = None
     if error is None and reference is None:
-        known = references.of_our_own(motion, programs, solvers)
+        known = references.computed_reference(motion, programs, solvers)
     elif error is None:
-        known = references.given(reference, motion, next(iter(programs.values())))
+        known = references.given_reference(reference, motion, next(iter(programs.values())))
     for name, solve in (others or {}).items():
-        solved += _by_other(motion, name, solve, tolerances, patience_with_others)
+        solved += _solves_of_other(motion, name, solve, tolerances, patience_with_others)
     judged = None if known is None else known.judged(_tightest(motion, solved))
     call_seconds = next(iter(programs.values())).call_seconds()
     points = _points(motion, solvers, solved, known, judged, error, call_seconds, repeats)
@@ -140,7 +140,7 @@ def work_precision(
 
 
 class Solve(NamedTuple):
-    """One solve: what it found (None where it was not tried), how often it evaluated, and the call to be timed."""
+    """One solve: its result (None if it was not tried), the number of evaluations, and the call to be timed."""
 
     method: str
     tolerance: float
@@ -158,7 +158,7 @@ class Solve(NamedTuple):
 
 
 def _motion(system, q0, v0, params, ts, events, options):
-    """The motion, with its start in arrays; raise where there is none."""
+    """The motion, with its start as arrays; raise if the arguments do not define one."""
     check_system(system, q0, v0, params)
     unknown = [name for name in options if name not in OPTIONS]
     if unknown:
@@ -167,7 +167,7 @@ def _motion(system, q0, v0, params, ts, events, options):
             f"Fix: of integrate's arguments it takes {', '.join(OPTIONS)}; rtol is its tolerances=."
         )
     if not is_eager() or coordinates.is_traced((q0, v0, params, ts)):
-        raise TypeError("work_precision measures times, and what is being traced has none.\nFix: call it outside jit.")
+        raise TypeError("work_precision measures times, but it is being traced.\nFix: call it outside jit.")
     ts = np.asarray(problem.vector_of_times(ts))
     start = coordinates.state(ts[0], q0, v0, params)
     return Motion(system, start, problem.times(ts, start.t.dtype), {**options, "events": events})
@@ -175,17 +175,17 @@ def _motion(system, q0, v0, params, ts, events, options):
 
 def _check(reference, error, others, events):
     if reference is not None and error is not None:
-        raise ValueError("reference and error are two ways to say the same.\nFix: leave one of them out.")
+        raise ValueError("reference and error are two ways to define the error.\nFix: leave one of them out.")
     if reference is not None and not isinstance(reference, (Trajectory, tuple, list)) and not callable(reference):
         raise TypeError(
-            f"reference is {type(reference).__name__}, which is no answer to compare with.\n"
+            f"reference is of type {type(reference).__name__}, which cannot be compared with.\n"
             f"Fix: {references.FIX_OF_FORM}."
         )
     if others and events:
         raise ValueError("others have no events to compare.\nFix: leave out events, or others.")
 
 
-def _by_program(name, program, tolerances, patience):
+def _solves_of_program(name, program, tolerances, patience):
     """The solves of a method, from loose to tight."""
     solves, slow = [], ""
     for tolerance in tolerances:
@@ -200,8 +200,8 @@ def _by_program(name, program, tolerances, patience):
     return solves
 
 
-def _by_other(motion, name, solve, tolerances, patience):
-    """The solves of another tool; once before, for what it compiles."""
+def _solves_of_other(motion, name, solve, tolerances, patience):
+    """The solves of another tool, after one call that lets it compile."""
     solves, slow = [], ""
     solve(tolerances[0])
     for tolerance in tolerances:
@@ -221,34 +221,34 @@ def _by_other(motion, name, solve, tolerances, patience):
 
 
 def _too_slow(seconds, patience):
-    return "" if seconds <= patience else f"not tried: before, {seconds:.1f} s"
+    return "" if seconds <= patience else f"not tried: the last took {seconds:.1f} s"
 
 
 def _all_failed(motion, solved, tolerances):
-    """What to raise where nothing came to its end: what `integrate` says of it, where it does."""
+    """The error to raise if every solve failed, with the message of `integrate` if that fails, too."""
     reasons = "; ".join(dict.fromkeys(f"{solve.method}: {solve.reason}" for solve in solved))
     cause = ""
     try:
         integrate(motion.system, *motion.start[1:], ts=motion.ts, rtol=tolerances[0], **motion.options)
     except (ValueError, RuntimeError) as error:
         cause = f"\nThe default method at {tolerances[0]:.0e}: {error}"
-    return RuntimeError(f"no method came to the end of this motion at any tolerance. {reasons}{cause}")
+    return RuntimeError(f"no method reached the end of this motion at any tolerance. {reasons}{cause}")
 
 
 def _tightest(motion, solved) -> list[Compared]:
-    """The tightest solves of two methods that came to the end; of a single one, its tightest two."""
+    """The tightest successful solves of two methods; the tightest two if there is only one method."""
     good = [solve for solve in solved if solve.ended_well and isinstance(solve.found, Trajectory)]
     good.sort(key=lambda solve: solve.tolerance)
     by_method = list({solve.method: solve for solve in reversed(good)}.values())
     by_method.sort(key=lambda solve: solve.tolerance)
     chosen = by_method if len(by_method) > 1 else good
-    return [compared.of(solve.found, motion.options["events"]) for solve in chosen[:2]]
+    return [compared.compared_of(solve.found, motion.options["events"]) for solve in chosen[:2]]
 
 
-def _points(motion, solvers, solved, known: Known | None, judged: Reference | None, error, call_seconds, repeats):
-    """What each solve amounts to; those that came to their end are timed, in turn."""
+def _points(motion, solvers, solved, known: KnownAnswer | None, judged: Reference | None, error, call_seconds, repeats):
+    """The point of each solve; the successful ones are timed, in turn."""
     good = [solve for solve in solved if solve.ended_well]
-    measured = in_turn([solve.call for solve in good], [solve.seconds for solve in good], repeats)
+    measured = interleaved_times([solve.call for solve in good], [solve.seconds for solve in good], repeats)
     times = {(solve.method, solve.tolerance): seconds for solve, seconds in zip(good, measured)}
     return [
         _point(motion, solve, times, solvers, known, judged, error, call_seconds) for solve in solved
@@ -257,25 +257,25 @@ def _points(motion, solvers, solved, known: Known | None, judged: Reference | No
 
 def _point(motion, solve, times, solvers, known, judged, error, call_seconds):
     events, found, reason = motion.options["events"], solve.found, solve.reason
-    ours, off = isinstance(found, Trajectory), float("inf")
+    ours, distance = isinstance(found, Trajectory), float("inf")
     if solve.ended_well and known is None:
-        off = float(error(found))
+        distance = float(error(found))
     elif solve.ended_well:
-        of_motion = compared.of(found, events)
-        off, reason = known.distance(of_motion), compared.other_events(of_motion, known.right) or reason
+        of_motion = compared.compared_of(found, events)
+        distance, reason = known.distance(of_motion), compared.other_events(of_motion, known.right) or reason
     steps, evaluations = None, solve.evaluations
     if ours:
         steps, stages = int(found.stats["num_steps"]), evaluations_a_step(solvers[solve.method])
         evaluations = None if stages is None else stages * steps
     seconds = times.get((solve.method, solve.tolerance), UNTIMED)
-    # What another tool's call costs is its own.
-    own = call_seconds if solve.method in solvers else 0.0
-    median, least = (less_the_call(x, own) for x in seconds)
+    # The overhead of another tool's call counts as its own cost.
+    overhead = call_seconds if solve.method in solvers else 0.0
+    median, least = (without_overhead(x, overhead) for x in seconds)
     return Point(
         method=solve.method,
         tolerance=solve.tolerance,
-        error=off,
-        trusted=judged is None or off > KNOWN_BY * judged.error,
+        error=distance,
+        trusted=judged is None or distance > TRUSTED_FROM * judged.error,
         seconds=median,
         least=least,
         steps=steps,

@@ -1,4 +1,4 @@
-"""The front door of fits: check, evaluate, search, say what was found and how well."""
+"""`fit`: check the arguments, search for the parameters, evaluate the result and warn about what is doubtful."""
 
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -20,7 +20,7 @@ from lagjax.fitting.problem import problem_of
 from lagjax.fitting.records import Record
 from lagjax.fitting.result import Fit, FitWarning
 from lagjax.fitting.search import Course, evaluate, listening, search
-from lagjax.fitting.trained import held_problem, parted_records, train
+from lagjax.fitting.trained import held_problem, split_records, train
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.diagnosis import listed
 from lagjax.mechanics.hybrid import Hybrid
@@ -28,25 +28,26 @@ from lagjax.mechanics.system import System
 from lagjax.meter import meter, waiting
 from lagjax.motion.reported import reported
 
-# The first part of a record has so many measurements an unknown, and each next stage twice as many.
-A_STAGE_HAS, STAGES = 4, 7
-# What a jump between joined windows costs, stage by stage, in units of what missing the data by as much costs.
-# (Farther up, the round-off of chaotic motions in the jumps keeps a search from coming to rest.)
-JOINED = (0.1, 1.0, 10.0, 100.0, 1e3)
-# With a loss that forgives outliers so many stages more, in which to learn the size of an ordinary error.
-SETTLING = 2
-# While only a part of a record counts, a change of a number by so much of it costs as much as an error of measurement;
-# without sigma that is so much of the data's spread.
-REACH, AN_ERROR = 0.3, 0.03
-# How much of a hold the whole record has, for few numbers: what only round-off sees keeps its guess. Of many, as of a
-# network, no single one is determined.
-BARELY = 1e-7
-# Further starts where the end is doubtful, for no more numbers than this.
-AGAIN, AGAIN_UP_TO = 8, 20
+# Measurements per unknown in the first part of a record, which doubles stage by stage; the largest number of stages.
+FIRST_PART, STAGES = 4, 7
+# The cost of a jump between joined windows, stage by stage, relative to the cost of an equal distance from the data.
+# (With larger weights the round-off of chaotic motions in the jumps keeps a search from converging.)
+JOINING = (0.1, 1.0, 10.0, 100.0, 1e3)
+# A robust loss takes this many more stages, which estimate the size of an ordinary error.
+SETTLING_STAGES = 2
+# While only a part of a record counts, a change of a number by this fraction costs as much as a measurement error;
+# without sigma, that error is assumed to be this fraction of the data's spread.
+HOLD_REACH, ASSUMED_ERROR = 0.3, 0.03
+# The hold on the whole record, as a fraction of that on a part, for few numbers: one that only round-off sees keeps its
+# guess. Of many numbers, as in a network, no single one is determined.
+FINAL_HOLD = 1e-7
+# Further starts if the end is doubtful, for at most this many numbers.
+RESTARTS, RESTARTS_UP_TO = 8, 20
 # Uncertainties of more numbers than this are not computed.
 COVARIANCE_UP_TO = 1000
-# In units of the data's spread: when a stage is done, and when the last one is; not below what the motion is good for.
-STAGE_DONE, DONE, OF_RTOL, ROUND_OFFS = 1e-4, 1e-9, 10.0, 100.0
+# Tolerances of a stage and of the last stage, in units of the data's spread; the last is at least this many times the
+# integration's rtol, and this many round-offs.
+STAGE_TOLERANCE, LAST_TOLERANCE, RTOL_FACTOR, ROUND_OFFS = 1e-4, 1e-9, 10.0, 100.0
 
 
 def fit(
@@ -74,7 +75,7 @@ def fit(
     progress: bool | None = None,
     **options,
 ) -> Fit:
-    """Find the parameters and initial states with which the motion is nearest to what was measured.
+    """Find the parameters and initial states whose motion is nearest to the measurements.
 
     >>> import jax.numpy as jnp
     >>> import lagjax as lj
@@ -88,57 +89,63 @@ def fit(
     **Main arguments:**
 
     - `system`: also a `Hybrid`, whose records start in one phase (`start=`, the first by default); without windows.
-    - `records`: one `Record` or several, each with its own initial state. Angles as they run on, not wrapped to a turn.
-    - `params`: what the Lagrangian takes, with guesses of what is to be found; all records share it.
-    - `free`: the names of what is found, `"g"`, `["m[1]", "arm.length"]`, or of a part, such as a network,
-      `"potential"`. By default every floating number in `params`.
-    - `observe(t, q, v, params)`: what `observed` in the records are measurements of: positions, for example.
-    - `bounds`: by name, `{"m": (0.0, None)}`. A number that is positive is searched by its logarithm.
+    - `records`: one `Record` or several, each with its own initial state. Angles must be continuous, not wrapped to one
+      turn.
+    - `params`: what the Lagrangian takes, with guesses of the numbers to be found; all records share it.
+    - `free`: the names of the numbers to be found, `"g"`, `["m[1]", "arm.length"]`, or of a part, such as a network,
+      `"potential"`. By default every floating-point number in `params`.
+    - `observe(t, q, v, params)`: the quantities that `observed` in the records measures: positions, for example.
+    - `bounds`: by name, `{"m": (0.0, None)}`. The search takes the logarithm of a positive number.
     - `priors`: by name (mean, standard deviation) of what is known already; needs `sigma` in the records.
     - `loss`: `"squares"`; or `"huber"`, `"soft_l1"`, `"cauchy"`, against outliers, which need `sigma`. Until the last
-      stage an ordinary error is the median of what the motion is off, since far from the truth all are large.
+      stage the median residual counts as an ordinary error, since far from the truth all residuals are large.
     - `units`: by name, for the table.
 
     **The search:**
 
-    - `window`: cut records into windows of this length, `[t]`, each from a state of its own: for chaotic motion and
-      long records. With `joined` (multiple shooting) the windows are drawn together in a few stages until each goes on
-      where the last one ended; else they stay on their own, which forgives what the system leaves out.
-    - `grow`: begin with the first part of each record or window and double it, stage by stage: a long record has many
-      wrong minima, whole periods off. What a part does not see stays near its guess. Where the end is doubtful, joined
-      windows grow along their record, and the whole record is searched at once from the guess, too.
+    - `window`: cut records into windows of this length, `[t]`, each with its own initial state: for chaotic motion and
+      long records. With `joined` (multiple shooting) the jumps between windows are weighted more and more in a few
+      stages until each window continues where the last one ended; else windows stay independent, which tolerates
+      effects that the system leaves out.
+    - `grow`: start with the first part of each record or window and double it, stage by stage: a long record has many
+      wrong minima, whole periods off. Parameters that a part does not determine stay near their guess. If the end is
+      doubtful, the search starts again from the guess: joined windows grow along their record, then the whole record
+      counts at once.
     - `restarts`: further starts of the search, with parameters `spread` (relative) away from their guess, or anywhere
-      between two bounds; `seed` says which. The best end counts. By default 8, of up to 20 numbers, and these only as
-      long as the best end is doubtful: not at rest, or with residuals that errors of measurement would hardly leave.
-    - `optimiser`: by default `optimistix.LevenbergMarquardt`, with derivatives taken forward. Any other of optimistix's
-      least-squares solvers; or a minimiser of it, with derivatives in reverse, such as `optimistix.BFGS(rtol, atol)`.
+      between two bounds, drawn with `seed`. The best end counts. By default 8, for up to 20 numbers, and only while the
+      best end is doubtful: not converged, or with residuals that are unlikely to be measurement errors.
+    - `optimiser`: by default `optimistix.LevenbergMarquardt`, with forward-mode derivatives. Any other least-squares
+      solver of optimistix; or one of its minimisers, with reverse-mode derivatives, such as
+      `optimistix.BFGS(rtol, atol)`.
     - `iterations`: the largest number in each stage, 100 by default.
 
-    **Training,** with an `optimiser` of optax, such as `optax.adam(1e-2)`, for thousands of parameters; its windows are
-    whole and on their own (`joined=False`), and it searches once:
+    **Training,** with an `optimiser` of optax, such as `optax.adam(1e-2)`, for thousands of parameters; its windows do
+    not grow and are independent (`joined=False`), and it searches once:
 
-    - `iterations`: how many steps there may be, 1000 by default. `batch`: how many windows a step sees, drawn anew by
-      `seed` in each round through all; by default all. Derivatives come in reverse, of all windows at once.
-    - `held_back`: records, or which part of those given, that are only to judge by, every so many steps, with starts
-      fitted to them. The best parameters count; without it those with the smallest residuals of all.
-    - `patience`: after how many judgements without improvement training stops; 10 where records are held back.
-    - Starts of windows are no matter of the optimiser: with each batch they go half of the way of Newton.
+    - `iterations`: the largest number of steps, 1000 by default. `batch`: the number of windows in a step, all by
+      default; `seed` draws a new order in each pass through all windows. Derivatives are taken in reverse mode, of all
+      windows of a batch at once.
+    - `held_back`: records, or the fraction of the given ones, that only serve to evaluate the parameters at intervals,
+      with starts fitted to them. The parameters with the smallest residuals of these count; without `held_back` those
+      with the smallest residuals of all records.
+    - `patience`: after how many evaluations without improvement training stops; 10 if records are held back.
+    - The optimiser does not move the starts of windows: with each batch they take half a Newton step.
 
     **Further:**
 
-    - `progress`: show stage, steps and cost (tqdm); by default where somebody may look.
+    - `progress`: show stage, steps and cost (tqdm); by default if the output is interactive.
     - `options` go to `lj.integrate`: `rtol`, `atol`, `method`, `event`, `max_steps`, ...
 
-    **Returns:** a `Fit`: estimates with their uncertainties, residuals, what the data do not determine. It is the best
-    point found also where it is no success (`converged`, and a `FitWarning`): where the search did not come to rest, or
-    the residuals contradict `sigma` or follow a curve. Inside `jax.vmap`, `jit` or `lj.sweep` measurements and guesses
-    may be traced, times not; a sweep's `status` says which fits are none.
+    **Returns:** a `Fit`: estimates with their uncertainties, residuals, and what the data do not determine. It is the
+    best point found, even if the fit is not a success (`converged` is false, with a `FitWarning`): the search did not
+    come to rest, or the residuals contradict `sigma` or follow a curve. Inside `jax.vmap`, `jit` or `lj.sweep`
+    measurements and guesses may be traced, but not times; a sweep's `status` says which fits failed.
 
     **Raises:**
 
     - `ValueError` for names, shapes and kinds that do not match; for a guess from which the motion fails at once.
-    - Warns (`lj.FitWarning`) where the search did not converge, a motion stops early, residuals are larger than `sigma`
-      says or follow a curve, an estimate is at its bound, or the data cannot see a parameter.
+    - Warns (`lj.FitWarning`) if the search did not converge, a motion stops early, residuals are larger than `sigma`
+      says or follow a curve, an estimate is at its bound, or the data do not determine a parameter.
 
     Source: Nocedal & Wright, *Numerical Optimization*, §10.3; Bock, in *Modelling of Chemical Reaction Systems* (1981)
     (multiple shooting); Huber, *Robust Statistics*, §7.8 (scale by the median); Bierman, *Factorization Methods for
@@ -147,7 +154,7 @@ def fit(
     apart = None
     if is_of_optax(optimiser):
         _check_training(window is not None and joined, restarts)
-        records, apart = parted_records(records, held_back, seed)
+        records, apart = split_records(records, held_back, seed)
     else:
         _check_optimiser(optimiser, {"batch": batch, "held_back": held_back, "patience": patience})
     problem = problem_of(system, records, params, free, observe, bounds, priors, loss, window, dict(options))
@@ -155,14 +162,14 @@ def fit(
         check = lambda: check_motion(problem, np.zeros(problem.windows.count, bool), problem.start)
         held = held_problem(problem, apart, system, params, observe, loss, window, options)
         trained = train(problem, held, optimiser, batch, iterations, patience, seed, progress, check)
-        return _told(Fit(problem, *trained.searched, trained.evaluation, _sorted(units), trained.course))
+        return _reported(Fit(problem, *trained.searched, trained.evaluation, _sorted(units), trained.course))
     further = restarts
     if restarts is None:
-        further = AGAIN if optimiser is None and 0 < problem.found.start.size <= AGAIN_UP_TO else 0
-    scattered = _scattered(problem.found, further, spread, seed)
+        further = RESTARTS if optimiser is None and 0 < problem.found.start.size <= RESTARTS_UP_TO else 0
+    scattered = _scattered_starts(problem.found, further, spread, seed)
     course = _course(problem, grow, joined and window is not None, scattered, bool(restarts))
     last = jax.tree.map(lambda x: x[-1], course.stages)
-    with _shown(problem, course, progress) as tell:
+    with _step_meter(problem, course, progress) as tell:
         searched, evaluation = search(problem, course, optimiser, 100 if iterations is None else iterations, tell)
     costs = coordinates.numpy_of(searched.costs).asarray(searched.costs)[: int(course.count)]
     searched = searched._replace(costs=costs)
@@ -172,13 +179,13 @@ def fit(
         check_motion(problem, evaluation.well, problem.start)
     found = Fit(problem, *searched, evaluation, _sorted(units))
     if evaluation is not None and not coordinates.is_traced(found.cost) and found.at_bounds():
-        # There the search's own slopes vanish.
+        # At a bound the slopes that the search keeps vanish.
         found = eqx.tree_at(lambda f: f.evaluation, found, evaluate(problem, searched.unknowns, last))
-    return _told(found)
+    return _reported(found)
 
 
-def _told(found: Fit) -> Fit:
-    """The fit, after it was reported to who runs it, and its caveats to who called."""
+def _reported(found: Fit) -> Fit:
+    """Report the fit to a surrounding sweep, warn of its caveats, and return it."""
     found = reported(found, Fit.report)
     if not coordinates.is_traced(found.cost):
         for words in caveats(found):
@@ -193,10 +200,10 @@ def _sorted(units):
 def _check_training(joined, restarts):
     if joined:
         raise ValueError(
-            "an optimiser of optax sees a batch of windows at a time, and does not join them.\nFix: joined=False."
+            "an optimiser of optax takes a batch of windows at a time, and cannot join them.\nFix: joined=False."
         )
     if restarts:
-        raise ValueError("restarts= is for a search, and an optimiser of optax trains once.\nFix: leave it out.")
+        raise ValueError("restarts= is for a search, but an optimiser of optax trains once.\nFix: leave it out.")
 
 
 def _check_optimiser(optimiser, of_training):
@@ -207,13 +214,13 @@ def _check_optimiser(optimiser, of_training):
         )
     if given := [name for name, value in of_training.items() if value is not None]:
         raise ValueError(
-            f"{listed(given)} is for training by an optimiser of optax.\n"
+            f"{listed(given)} is for training with an optimiser of optax.\n"
             "Fix: optimiser=optax.adam(1e-2), or leave it out."
         )
 
 
-def _course(problem: Problem, grow: bool, joined: bool, scattered, all_of_them: bool) -> Course:
-    """The stages of a search, with the starts from which it goes through them."""
+def _course(problem: Problem, grow: bool, joined: bool, scattered, try_all: bool) -> Course:
+    """The stages of a search, and the starts from which it runs through them."""
     windows = problem.windows
     unknowns = sum(x.shape[-1] for x in jax.tree.leaves(problem.start))
     measured = sum(
@@ -221,16 +228,16 @@ def _course(problem: Problem, grow: bool, joined: bool, scattered, all_of_them: 
         for kind, tree in problem.measured.items()
         for x in jax.tree.leaves(tree)
     )
-    growing = lambda measured: _doubled(measured / max(A_STAGE_HAS * unknowns, 1)) if grow else np.zeros(0)
+    growing = lambda measured: _doubled(measured / max(FIRST_PART * unknowns, 1)) if grow else np.zeros(0)
     alike = lambda parts: np.repeat(np.asarray(parts)[:, None], windows.count, axis=1)
     of_windows = alike(growing(measured))
-    # Windows that are joined are one record, which may grow as such.
+    # Joined windows form one record, which may grow as a whole.
     of_records = np.zeros((0, windows.count))
     if joined and windows.count > 1:
-        of_records = _of_records(windows, growing(measured * int(np.max(np.bincount(windows.record)))))
-    settling, joining = (0 if problem.loss == "squares" else SETTLING), (JOINED if joined else ())
+        of_records = _parts_of_windows(windows, growing(measured * int(np.max(np.bincount(windows.record)))))
+    settling, joining = (0 if problem.loss == "squares" else SETTLING_STAGES), (JOINING if joined else ())
     each = np.concatenate([of_records, of_windows, alike(np.ones(1 + settling + len(joining)))])
-    # Filled up in front, by stages that none begins with: a program is one for all numbers of them.
+    # Unused stages in front fill the array up to a fixed length, so that one program serves any number of stages.
     kinds = 0 if not grow else 2 if joined and windows.count > 1 else 1
     filled = kinds * (STAGES - 1) - len(of_records) - len(of_windows)
     each = np.concatenate([alike(np.ones(filled)), each])
@@ -238,46 +245,46 @@ def _course(problem: Problem, grow: bool, joined: bool, scattered, all_of_them: 
     weights = np.append(np.zeros(len(each) - len(joining)), joining)
     ratio = problem.spread_in_sigmas
     rtol = problem.options.get("rtol")
-    done = max(DONE, ROUND_OFFS * np.finfo(windows.ts.dtype).eps)
+    tolerance = max(LAST_TOLERANCE, ROUND_OFFS * np.finfo(windows.ts.dtype).eps)
     if rtol is not None:
         xp = coordinates.numpy_of(rtol)
-        done = xp.maximum(done, OF_RTOL * xp.max(xp.asarray(rtol)))
+        tolerance = xp.maximum(tolerance, RTOL_FACTOR * xp.max(xp.asarray(rtol)))
     last = np.arange(len(each)) == len(each) - 1
-    xp = coordinates.numpy_of((ratio, done, scattered, problem.found.start))
-    barely = BARELY if problem.found.start.size <= AGAIN_UP_TO else 0.0
-    held = np.where(partly, 1.0, barely) * (1.0 if problem.absolute else AN_ERROR) / REACH
+    xp = coordinates.numpy_of((ratio, tolerance, scattered, problem.found.start))
+    at_the_end = FINAL_HOLD if problem.found.start.size <= RESTARTS_UP_TO else 0.0
+    held = np.where(partly, 1.0, at_the_end) * (1.0 if problem.absolute else ASSUMED_ERROR) / HOLD_REACH
     stages = Stage(each, weights * ratio, np.ones(len(each)), held)
     # Round-off in the jumps between windows weighs as much as the jumps do.
-    tolerances = xp.where(last, done * (JOINED[-1] if joined else 1.0), STAGE_DONE) * ratio
-    # From the guess: growing windows, growing records, and the whole record at once, where these are not the same.
+    tolerances = xp.where(last, tolerance * (JOINING[-1] if joined else 1.0), STAGE_TOLERANCE) * ratio
+    # From the guess: growing windows, growing records, and the whole record at once, if these differ.
     begin = np.unique([len(of_records), 0, len(of_records) + len(of_windows)])
     begin = np.append(len(of_records), begin[begin != len(of_records)])
-    # From elsewhere the first two in turn.
+    # From the other starts: the first two of these, alternately.
     first = np.append(begin, np.resize(begin[:2] if len(of_records) else begin[:1], len(scattered))) + filled
     count, more = len(first), 1 + kinds - len(begin)
     guess = xp.asarray(problem.found.start)[None]
     starts = xp.concatenate([guess] * len(begin) + [scattered] + [guess] * more)
     first = np.append(first, np.full(more, filled))
-    return Course(stages, tolerances, starts, first, np.asarray(count), np.asarray(count if all_of_them else 1))
+    return Course(stages, tolerances, starts, first, np.asarray(count), np.asarray(count if try_all else 1))
 
 
 @contextmanager
-def _shown(problem, course, progress):
-    """A meter of the search's steps; whether there is one."""
+def _step_meter(problem, course, progress):
+    """Show a meter of the search's steps; yields whether there is one."""
     if coordinates.is_traced(problem):
         yield False
         return
-    before = int(np.min(course.first))
-    stages = len(course.tolerances) - before
+    unused = int(np.min(course.first))
+    stages = len(course.tolerances) - unused
     with meter(progress, unit=" steps", desc="fit") as shown:
         if shown.disable:
             yield False
             return
-        with waiting(progress, "compiling") as begun:
+        with waiting(progress, "compiling") as started:
 
             def step(stage, cost):
-                begun.set()
-                shown.set_postfix_str(f"stage {stage - before + 1} of {stages}, cost {cost:.4g}", refresh=False)
+                started.set()
+                shown.set_postfix_str(f"stage {stage - unused + 1} of {stages}, cost {cost:.4g}", refresh=False)
                 shown.update(1)
 
             with listening(step):
@@ -285,24 +292,24 @@ def _shown(problem, course, progress):
 
 
 def _doubled(times):
-    """Parts that are doubled until the whole, which is not among them, where it has so many times the first part."""
+    """Fractions that double up to the whole, which is not among them; the first is about 1/`times`."""
     return 2.0 ** -np.arange(np.clip(np.floor(np.log2(max(times, 1))), 0, STAGES - 1), 0, -1)
 
 
-def _of_records(windows, parts):
-    """The part of each window's time (S, W) that lies in some first parts (S,) of its record."""
+def _parts_of_windows(windows, parts):
+    """The fraction of each window's time (S, W) that lies in the first `parts` (S,) of its record."""
     begin, end = windows.ts[:, 0], np.take_along_axis(windows.ts, windows.last[:, None], axis=1)[:, 0]
     first, record = begin[windows.first][windows.record], windows.record
     whole = np.array([end[record == r].max() for r in record]) - first
     return np.clip((first + parts[:, None] * whole - begin) / (end - begin), 0.0, 1.0)
 
 
-def _scattered(found, count, spread, seed):
-    """Starts (count, p) around the guess, or between two bounds."""
+def _scattered_starts(found, count, spread, seed):
+    """Random starts (count, p) around the guess, or between two bounds."""
     xp = coordinates.numpy_of(found.start)
     start, low, high = (x[None] for x in (found.start, found.low, found.high))
-    here, share = _drawn(seed, (count, start.size))
-    x = start + xp.where(start != 0, start, 1.0) * np.expm1(spread * here)
+    normal, share = _random_numbers(seed, (count, start.size))
+    x = start + xp.where(start != 0, start, 1.0) * np.expm1(spread * normal)
     inside = (x > low) & (x < high)
     bounded = np.isfinite(low) & np.isfinite(high)
     anywhere = np.where(bounded, low, 0.0) + share * np.where(bounded, high, 1.0) - share * np.where(bounded, low, 0.0)
@@ -310,7 +317,7 @@ def _scattered(found, count, spread, seed):
 
 
 @lru_cache
-def _drawn(seed, shape):
-    """Normal numbers, and uniform ones between 0 and 1 but for the ends."""
+def _random_numbers(seed, shape):
+    """Normal numbers, and uniform ones between 0 and 1 without the ends."""
     random = np.random.default_rng(seed)
     return random.normal(size=shape), random.uniform(0.01, 0.99, shape)

@@ -1,10 +1,10 @@
-"""The equations that a fit solves: what the motion says against what was measured, window by window.
+"""The equations that a fit solves: the predicted against the measured values, window by window.
 
     r = (predicted - measured) / sigma        at each measured number,
     d = (end of window w - start of window w + 1) times a weight, where windows are joined,
-    h = (x - mean) / sd                       for what is known of the parameters before.
+    h = (x - mean) / sd                       for the priors of the parameters.
 
-Where a motion does not reach a sample its residual is a large constant, so that a bad guess still has a cost.
+If a motion does not reach a sample, the residual is a large constant, so that a bad guess still has a cost.
 """
 
 from collections.abc import Callable
@@ -28,11 +28,11 @@ from lagjax.motion.integrate import integrate
 from lagjax.motion.results import ended_well
 from lagjax.numerics.chained import Equations, Slopes, Unknowns
 
-# A sample that is not reached counts as missed by this many spreads of its data.
+# The residual of a sample that the motion does not reach, in spreads of its data.
 NOT_REACHED = 10.0
-# A wild guess may be stiff: steps that a motion may take, for each output and besides.
+# The largest number of steps of a motion, per output and in addition: a bad guess may make the motion stiff.
 STEPS_EACH, STEPS = 16, 10_000
-# The scale (in sigmas) for 95 % efficiency with normal errors, and the loss over the square of a scaled residual.
+# The scale (in sigmas) for 95 % efficiency with normal errors, and the loss divided by the squared scaled residual.
 LOSSES = {
     "squares": (1.0, lambda z2: jnp.ones_like(z2)),
     "soft_l1": (1.345, lambda z2: 2 / (1 + jnp.sqrt(1 + z2))),
@@ -42,11 +42,11 @@ LOSSES = {
 
 
 class Stage(NamedTuple):
-    """How a search takes the data: the part of each window's time that counts (W,), how tightly windows are joined, and
-    the size of an ordinary error, in sigmas, for a loss that forgives larger ones.
+    """A stage of a search: the fraction of each window's time that counts (W,), the weight of jumps between joined
+    windows, and the size of an ordinary error, in sigmas, for a robust loss.
 
-    While only a part counts, shared unknowns are held `around` (p,) the place where the search began: there a change
-    by all of a number costs `held`, in units of a residual.
+    While only a part counts, shared unknowns are held `around` (p,) the values where the search began: a change of a
+    number by its whole size costs `held`, in units of a residual.
     """
 
     part: Float[Array, "*W"]
@@ -56,22 +56,23 @@ class Stage(NamedTuple):
     around: Float[Array, " p"] | None = None
 
 
-# All of the record, windows on their own.
+# The whole record, with independent windows.
 WHOLE = Stage(np.asarray(1.0), np.asarray(0.0), np.asarray(1.0))
 
 
-# Modules of equinox take half a millisecond of each fit, by what they do when one is made or asked for a method.
+# Not an `eqx.Module`: creating one and looking up its methods would cost each fit half a millisecond.
 @jtu.register_dataclass
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """All that a fit is about, as arrays of one shape for all windows.
+    """The whole task of a fit, as arrays of one shape for all windows.
 
-    `measured` and `sigma` have leaves (W, T, ...), those of `end` (W, ...); `spread` has one number each, and
-    `spread_in_sigmas` is the largest over its sigma. `unit` is the spread of the starts. `absolute`: sigmas were given.
+    `measured` and `sigma` have leaves (W, T, ...), those of `end` (W, ...); `spread` has one number per leaf, and
+    `spread_in_sigmas` is the largest ratio of a spread to its sigma. `unit` is the spread of the starts. `absolute`:
+    sigmas were given.
     """
 
     system: Any
-    # What holds at the starts: of a motion in phases the first of them.
+    # The system at the starts: for a motion in phases, the first phase.
     first: Any
     found: Found
     overrides: dict[str, Array]
@@ -110,14 +111,14 @@ class Problem:
         return jnp.broadcast_to(stage.part, (self.windows.count,))[w]
 
     def setting(self, x, s, w, stage: Stage):
-        """Times, parameters, start and options of the motion of window w, at its times as far as they count."""
-        ts = _as_far_as(jnp.asarray(self.windows.ts)[w], jnp.asarray(self.windows.last)[w], self.part(w, stage))
+        """Times, parameters, start and options of the motion of window w; times that do not count are squeezed."""
+        ts = _squeezed(jnp.asarray(self.windows.ts)[w], jnp.asarray(self.windows.last)[w], self.part(w, stage))
         return ts, self.params(x, w), self.state(x, s, w), self.options
 
     def state(self, x, s, w):
         """(q, v) from which the motion of window w starts."""
-        of_window, t = jax.tree.map(lambda a: a[w], self.starts), jnp.asarray(self.windows.ts)[w, 0]
-        return of_window.state(s, self.first, t, self.params(x, w), self.unflatten)
+        starts, t = jax.tree.map(lambda a: a[w], self.starts), jnp.asarray(self.windows.ts)[w, 0]
+        return starts.state(s, self.first, t, self.params(x, w), self.unflatten)
 
     def motion(self, x, s, w, stage: Stage, adjoint=None):
         """The motion of window w, and the state it starts from."""
@@ -125,30 +126,30 @@ class Problem:
         options = {"max_steps": STEPS_EACH * ts.shape[0] + STEPS, "adjoint": adjoint} | options
         return integrate(self.system, q, v, params, ts=ts, throw=False, **options), (q, v)
 
-    def said(self, motion) -> dict[str, PyTree]:
-        """All that can be measured of a motion."""
-        said = {"q": motion.q, "v": motion.v, "multipliers": motion.multipliers, "end": motion.end._asdict()}
+    def measurable(self, motion) -> dict[str, PyTree]:
+        """Everything in a motion that can be measured."""
+        values = {"q": motion.q, "v": motion.v, "multipliers": motion.multipliers, "end": motion.end._asdict()}
         observe = self.observe
         if observe is not None:
             at = lambda t, q, v: observe(t, q, v, motion.params)
-            said["observed"] = jax.vmap(at)(motion.t, motion.q, motion.v)
-        return said
+            values["observed"] = jax.vmap(at)(motion.t, motion.q, motion.v)
+        return values
 
     def predicted(self, motion) -> dict[str, PyTree]:
-        """What of a motion was measured, in the structure of the measurements."""
-        return among(self.said(motion), self.measured)
+        """The measured quantities of a motion, in the structure of the measurements."""
+        return selected(self.measurable(motion), self.measured)
 
 
-def among(said: PyTree, wanted: PyTree) -> PyTree:
-    """The parts of `said` that `wanted` has: of dictionaries some of the keys."""
-    if isinstance(wanted, dict) and isinstance(said, dict):
-        return {name: among(said[name], part) for name, part in wanted.items()}
-    return said
+def selected(values: PyTree, wanted: PyTree) -> PyTree:
+    """The parts of `values` that `wanted` has: of dictionaries only its keys."""
+    if isinstance(wanted, dict) and isinstance(values, dict):
+        return {name: selected(values[name], part) for name, part in wanted.items()}
+    return values
 
 
 @partial(compiled, in_numpy=True)
 def starts_at(problem: Problem, u: Unknowns, windows: Int[Array, " R"]):
-    """(q, v) at the starts of some windows, and their slopes by the shared unknowns and those of each window."""
+    """(q, v) at the starts of some windows, and their slopes by the shared unknowns and by those of each window."""
     p = u.shared.size
 
     def at(w):
@@ -160,77 +161,77 @@ def starts_at(problem: Problem, u: Unknowns, windows: Int[Array, " R"]):
 
 
 def replace(params, values):
-    """`params` with some leaves replaced, by name; those of inner dictionaries by 'arm.length'."""
+    """`params` with some leaves replaced, by name; a leaf of an inner dictionary is called 'arm.length'."""
     return jtu.tree_map_with_path(lambda path, x: values.get(leaf_name(path), x), params)
 
 
-class OfWindow(NamedTuple):
-    """What one window contributes: residuals of its samples, the state it starts from, and the state it ends in."""
+class WindowPart(NamedTuple):
+    """The contribution of one window: residuals of its samples, the state it starts from, and the state it ends in."""
 
     rows: Float[Array, " m"]
     begin: Float[Array, " 2n"]
     end: Float[Array, " 2n"]
 
 
-def of_window(problem: Problem, x, s, w, stage: Stage, adjoint=None, loss: str | None = None):
-    """What window `w` contributes at shared and own unknowns in natural numbers, and whether its motion ended well."""
+def window_part(problem: Problem, x, s, w, stage: Stage, adjoint=None, loss: str | None = None):
+    """The contribution of window `w` at natural shared and local unknowns, and whether its motion ended well."""
     motion, start = problem.motion(x, s, w, stage, adjoint)
     rows = residuals(problem, motion, w, stage, problem.loss if loss is None else loss)
     well = ended_well(motion.result)
-    joined = lambda tree: jnp.concatenate([jnp.ravel(y) for y in jax.tree.leaves(tree)])
+    vector = lambda tree: jnp.concatenate([jnp.ravel(y) for y in jax.tree.leaves(tree)])
     if problem.windows.count == 1:
         nothing = jnp.zeros(0, rows.dtype)
-        return OfWindow(rows, nothing, nothing), well
+        return WindowPart(rows, nothing, nothing), well
     last = problem.windows.last[w]
-    end = joined(jax.tree.map(lambda y: y[last], (motion.q, motion.v)))
+    end = vector(jax.tree.map(lambda y: y[last], (motion.q, motion.v)))
     reached = jnp.isfinite(end)
-    return OfWindow(rows, joined(start) / problem.unit, jnp.where(reached, end, NOT_REACHED) / problem.unit), well
+    return WindowPart(rows, vector(start) / problem.unit, jnp.where(reached, end, NOT_REACHED) / problem.unit), well
 
 
-def together(problem: Problem, u: Unknowns, parts: OfWindow, stage: Stage) -> Equations:
-    """All equations, from what the windows contribute (leading axis W)."""
-    gap = jnp.where(_seamed(problem, stage) > 0, parts.end - jnp.roll(parts.begin, -1, axis=0), 0.0)
-    known, weight = known_before(problem, stage)
-    return Equations(parts.rows, _seamed(problem, stage) * gap, weight * (u.shared - known))
+def assemble(problem: Problem, u: Unknowns, parts: WindowPart, stage: Stage) -> Equations:
+    """All equations, from the contributions of the windows (leading axis W)."""
+    gap = jnp.where(_seam_weights(problem, stage) > 0, parts.end - jnp.roll(parts.begin, -1, axis=0), 0.0)
+    known, weight = prior_and_hold(problem, stage)
+    return Equations(parts.rows, _seam_weights(problem, stage) * gap, weight * (u.shared - known))
 
 
-def slopes_together(problem: Problem, by_shared: OfWindow, by_local: OfWindow, stage: Stage) -> Slopes:
-    """The slopes of all equations from those of the windows' contributions, (W, ..., p) and (W, ..., k)."""
-    seamed = _seamed(problem, stage)[:, :, None]
+def assemble_slopes(problem: Problem, by_shared: WindowPart, by_local: WindowPart, stage: Stage) -> Slopes:
+    """The slopes of all equations, from the slopes (W, ..., p) and (W, ..., k) of the windows' contributions."""
+    seam_weights = _seam_weights(problem, stage)[:, :, None]
     following = lambda x: jnp.roll(x, -1, axis=0)
     return Slopes(
         by_shared.rows,
         by_local.rows,
-        seamed * (by_shared.end - following(by_shared.begin)),
-        seamed * by_local.end,
-        -seamed * following(by_local.begin),
-        jnp.diag(known_before(problem, stage)[1]),
+        seam_weights * (by_shared.end - following(by_shared.begin)),
+        seam_weights * by_local.end,
+        -seam_weights * following(by_local.begin),
+        jnp.diag(prior_and_hold(problem, stage)[1]),
     )
 
 
-def known_before(problem, stage):
-    """What is known of the shared unknowns before the data: a mean, and the inverse of its standard deviation.
+def prior_and_hold(problem, stage):
+    """The prior and the hold on the shared unknowns together: a mean, and the inverse of its standard deviation.
 
-    A prior and a hold are two squares of one unknown, which are one square and a constant.
+    The sum of their two squares is one square and a constant.
     """
     found = problem.found
     if stage.around is None:
         return found.mean, 1 / found.sd
-    held = hold(problem, stage) ** 2
+    held = hold_weights(problem, stage) ** 2
     both = 1 / found.sd**2 + held
     mean = (found.mean / found.sd**2 + held * stage.around) / jnp.where(both > 0, both, 1.0)
     return mean, jnp.sqrt(both)
 
 
-def hold(problem, stage):
-    """What a change of each shared unknown costs by the hold; one guessed to be 0 has no size to be held by."""
+def hold_weights(problem, stage):
+    """The cost of a change of each shared unknown by the hold; 0 for a guess of 0, which has no size to be held by."""
     start = problem.found.start
     if stage.held is None:
         return jnp.zeros_like(start)
     return jnp.where(start != 0, stage.held / jnp.abs(jnp.where(start != 0, start, 1.0)), 0.0)
 
 
-def _seamed(problem, stage):
+def _seam_weights(problem, stage):
     return jnp.where(problem.windows.seam, stage.joined, 0.0)[:, None]
 
 
@@ -239,8 +240,8 @@ def equations(problem: Problem, u: Unknowns, stage: Stage) -> Equations:
     # NumPy's arrays cannot be indexed by a window's traced number.
     live, static = eqx.partition(problem, eqx.is_array)
     problem = eqx.combine(jax.tree.map(jnp.asarray, live), static)
-    parts = over_windows(lambda w, s: of_window(problem, u.shared, s, w, stage)[0], problem, u)
-    return together(problem, u, parts, stage)
+    parts = over_windows(lambda w, s: window_part(problem, u.shared, s, w, stage)[0], problem, u)
+    return assemble(problem, u, parts, stage)
 
 
 def over_windows(function: Callable, problem: Problem, u: Unknowns):
@@ -251,20 +252,20 @@ def over_windows(function: Callable, problem: Problem, u: Unknowns):
 
 
 def one_by_one(function: Callable, xs):
-    """`jax.vmap(function)(xs)`; on a CPU one after the other, which compiles and runs faster than lanes."""
+    """`jax.vmap(function)(xs)`; on a CPU a loop, which compiles and runs faster than lanes."""
     return lax.map(function, xs) if jax.default_backend() == "cpu" else jax.vmap(function)(xs)
 
 
 def residuals(problem, motion, w, stage, loss):
-    """The residuals of one window in one vector; zero where nothing was measured or does not count yet."""
+    """The residuals of one window in one vector; zero where nothing was measured or the sample does not count yet."""
     last = problem.windows.last[w]
     part = problem.part(w, stage)
     counts = _counts(problem.windows.ts[w], last, part)
     predicted = problem.predicted(motion)
     parts = []
     for kind, tree in problem.measured.items():
-        told = zip(*(jax.tree.leaves(part) for part in (tree, problem.sigma[kind], problem.spread[kind])))
-        for says, (measured, sigma, spread) in zip(jax.tree.leaves(predicted[kind]), told):
+        given = zip(*(jax.tree.leaves(part) for part in (tree, problem.sigma[kind], problem.spread[kind])))
+        for value, (measured, sigma, spread) in zip(jax.tree.leaves(predicted[kind]), given):
             measured, sigma = measured[w], sigma[w]
             known = jnp.isfinite(measured) & jnp.isfinite(sigma)
             if kind == "end":
@@ -272,25 +273,25 @@ def residuals(problem, motion, w, stage, loss):
             else:
                 known = known & counts.reshape(-1, *(1,) * (measured.ndim - 1))
             sigma = jnp.where(known, sigma, 1.0)
-            r = jnp.where(known, (says - jnp.where(known, measured, 0.0)) / sigma, 0.0)
+            r = jnp.where(known, (value - jnp.where(known, measured, 0.0)) / sigma, 0.0)
             r = jnp.where(jnp.isfinite(r), r, NOT_REACHED * spread / sigma)
             parts.append(jnp.ravel(dampened(r, loss, stage.ordinary)))
     return jnp.concatenate(parts)
 
 
 def dampened(r, loss, ordinary=1.0):
-    """A residual whose square is the loss, where an ordinary one has this size."""
+    """The residual whose square is the loss; `ordinary` is the size of an ordinary error."""
     constant, ratio = LOSSES[loss]
     return r * jnp.sqrt(ratio((r / (constant * ordinary)) ** 2))
 
 
 def _counts(t, last, part):
-    """Which times count; of the whole the last one does, too, which rounding might leave out."""
+    """Which times count; for the whole window the last one is compared exactly, since rounding might exclude it."""
     return t <= jnp.where(part < 1, t[0] + part * (t[last] - t[0]), t[last])
 
 
-def _as_far_as(t, last, part):
-    """Times of which those beyond a part of the window follow each other closely: they are not wanted."""
+def _squeezed(t, last, part):
+    """The times of a window; those beyond the part that counts are squeezed together, to cost next to nothing."""
     kept = jnp.sum(_counts(t, last, part))
     closest = jnp.maximum(PADDING * (t[1] - t[0]), 8 * jnp.finfo(t.dtype).eps * jnp.max(jnp.abs(t)))
     beyond = jnp.arange(t.shape[0]) - (kept - 1)

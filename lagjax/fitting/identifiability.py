@@ -1,8 +1,8 @@
-"""Which combinations of parameters the data can see: the singular values of the motion's sensitivity.
+"""Which combinations of parameters the data determine: the singular values of the motion's sensitivity.
 
 In relative changes δx/x the equations at a point are `R δx/x`, with the starts of the runs eliminated. A right singular
-vector n whose singular value vanishes is a change of the parameters that leaves no trace in the data: if m and M may
-grow by one factor and the motion stays as it is, only m/M is seen. A singular value s means that the combination is
+vector n whose singular value vanishes is a change of the parameters without effect on the data: if m and M can grow by
+one factor and the motion stays the same, the data determine only m/M. A singular value s means that the combination is
 known to the relative error 1/s, in units of the measurement error.
 
 Source: Brun, Reichert & Künsch, *Water Resources Research* 37 (2001) 1015, Eqs. (6)-(9); Belsley, *Regression
@@ -20,20 +20,21 @@ from lagjax.fitting.candidates import NextMeasurements
 from lagjax.mechanics.diagnosis import listed
 from lagjax.numerics.rank import null_space
 
-# A combination whose exponents are these, after scaling, is a power product: m/M, k/m², not m^0.37 M^-1.2.
+# A combination is written as a product of powers (m/M, k/m², but not m^0.37 M^-1.2) if its scaled exponents are
+# fractions with denominators up to the first number, to within the second.
 LARGEST_DENOMINATOR, EXPONENT_ERROR = 4, 1e-3
-# Among more parameters the simplest combinations are not looked for.
+# With more parameters than this the simplest combinations are not searched for.
 ENUMERATE_UP_TO = 10
 
 
 class Identifiability(eqx.Module):
-    """What of the parameters the data see. It says so in words.
+    """Which combinations of the parameters the data determine. It prints itself in words.
 
-    - `names`: of the numbers that are asked for. `values` (p,): where.
+    - `names`: the names of the parameters. `values` (p,): the point at which they were examined.
     - `singular_values` (p,): the largest first; the reciprocal of a relative error, in units of `noise`.
     - `combinations` (p, p): by row, the relative changes that belong to them.
-    - `noise`: the size of an error in sigmas: 1 where these were given; else estimated, and unknown before a fit.
-    - `next`: what to measure next, where it was asked for (`shrink=`): `next.best`, `next.candidates`, `next.now`.
+    - `noise`: the size of an error in sigmas: 1 if sigmas were given; else estimated by a fit, and unknown before it.
+    - `next`: what to measure next, if this was asked with `shrink=`: `next.best`, `next.candidates`, `next.now`.
     """
 
     names: tuple[str, ...] = eqx.field(static=True)
@@ -45,30 +46,30 @@ class Identifiability(eqx.Module):
 
     @property
     def rank(self) -> int:
-        """How many independent combinations the data see."""
+        """How many independent combinations the data determine."""
         return rank_of(np.asarray(self.singular_values))
 
     def combined(self) -> list[str]:
-        """The combinations that the data see, as products of powers where they are such."""
+        """The combinations that the data determine, as products of powers if possible."""
         return [_combination(self.names, row) for row in _simplest(np.asarray(self.combinations)[: self.rank])]
 
-    def _scaled(self) -> list[str]:
-        """The names of those that may all grow by one factor, where that is the last combination."""
+    def _common_factor(self) -> list[str]:
+        """The parameters that can all grow by one factor, if that is the last combination; else an empty list."""
         row = np.asarray(self.combinations)[-1]
         members = _members(row)
         return [self.names[i] for i in members] if np.ptp(row[members]) < EXPONENT_ERROR else []
 
     def unseen(self) -> list[str]:
-        """The names of what leaves no trace in the data, neither alone nor with others."""
+        """The names of the parameters without effect on the data, alone or together with others."""
         rows = np.asarray(self.combinations)[: self.rank]
         seen = np.sqrt(np.sum(rows**2, axis=0)) > EXPONENT_ERROR
         return [name for name, s in zip(self.names, seen) if not s]
 
     def __repr__(self):
         following = [] if self.next is None else [f"  {line}" for line in repr(self.next).splitlines()]
-        return "\n".join([self._of_now(), *following])
+        return "\n".join([self._own_lines(), *following])
 
-    def _of_now(self):
+    def _own_lines(self):
         names, rank = listed(list(self.names)), self.rank
         if not self.names:
             return "Identifiability: no parameter is asked for, only starts"
@@ -76,8 +77,8 @@ class Identifiability(eqx.Module):
             return f"Identifiability: of {len(self.names)} numbers the data see {rank} combinations"
         if rank == len(self.names):
             lines = [f"Identifiability: the data see {names}"]
-        elif rank == len(self.names) - 1 and len(self._scaled()) > 2:
-            which = "all" if len(self._scaled()) == len(self.names) else listed(self._scaled())
+        elif rank == len(self.names) - 1 and len(self._common_factor()) > 2:
+            which = "all" if len(self._common_factor()) == len(self.names) else listed(self._common_factor())
             lines = [f"Identifiability: the data see {names} but for one common factor of {which}"]
         else:
             lines = [f"Identifiability: of {names} the data see only", *(f"  {words}" for words in self.combined())]
@@ -91,13 +92,13 @@ class Identifiability(eqx.Module):
 
 
 def rank_of(singular_values: np.ndarray) -> int:
-    """How many of them are not of round-off."""
+    """How many of them are above round-off."""
     floor = np.sqrt(np.finfo(singular_values.dtype).eps)
     return int(np.sum(singular_values > floor * np.max(singular_values, initial=0.0)))
 
 
 def _simplest(rows):
-    """A basis of the space of some orthonormal rows, with as few entries each as can be."""
+    """A basis of the space of some orthonormal rows, each with as few entries as possible."""
     rank, p = rows.shape
     if rank in (0, p) or p > ENUMERATE_UP_TO:
         return np.eye(p) if rank == p else rows
@@ -105,14 +106,14 @@ def _simplest(rows):
     basis = np.zeros((0, p))
     for size in range(1, p + 1):
         for support in combinations(range(p), size):
-            # A vector on these entries alone that has no part along what is not seen.
+            # A vector with these entries alone that is orthogonal to the undetermined directions.
             _, s, vt = np.linalg.svd(unseen[list(support)].T)
             if len(s) == size and s[-1] > EXPONENT_ERROR:
                 continue
-            found = np.zeros(p)
-            found[list(support)] = vt[-1]
-            if np.linalg.matrix_rank(np.vstack([basis, found]), tol=EXPONENT_ERROR) > len(basis):
-                basis = np.vstack([basis, found])
+            row = np.zeros(p)
+            row[list(support)] = vt[-1]
+            if np.linalg.matrix_rank(np.vstack([basis, row]), tol=EXPONENT_ERROR) > len(basis):
+                basis = np.vstack([basis, row])
             if len(basis) == rank:
                 return basis
     return rows
@@ -123,7 +124,7 @@ def _members(row):
 
 
 def _exponents(row, members):
-    """The entries as small whole numbers, up to a factor; None where they are none."""
+    """The entries as small whole numbers, up to a common factor; None if there are none."""
     smallest = min((row[i] for i in members), key=abs)
     ratios = [Fraction(float(row[i] / smallest)).limit_denominator(LARGEST_DENOMINATOR) for i in members]
     if any(
@@ -152,7 +153,7 @@ def _power(e):
 
 
 def _mixture(names, row):
-    """A relative change of several, without those that hardly take part."""
+    """A relative change of several parameters, without those that hardly take part."""
     row = np.asarray(row)
     members = sorted(np.flatnonzero(np.abs(row) > 0.1 * np.max(np.abs(row))), key=lambda i: -abs(row[i]))[:4]
     if len(members) == 1:

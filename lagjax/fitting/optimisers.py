@@ -1,8 +1,8 @@
-"""Optimisers of optax, by what they are: a pair of functions, `init(params)` and `update(gradients, state, params)`.
+"""Optimisers of optax: pairs of functions, `init(params)` and `update(gradients, state, params)`.
 
-They see the numbers that are found in the structure of `params`, None in place of what is not found, so that what goes
-by names (`optax.multi_transform`, `optax.masked`) works; numbers with bounds as free ones. Of an array of which some
-entries are found they see these, in a row.
+They get the fitted numbers in the structure of `params`, with None in place of all others, so that transformations that
+go by names (`optax.multi_transform`, `optax.masked`) work. Numbers with bounds are passed as unbounded ones. If only
+some entries of an array are fitted, these are passed as a vector.
 """
 
 import inspect
@@ -23,15 +23,15 @@ def is_of_optax(optimiser: Any) -> bool:
 
 
 class Optimiser:
-    """A gradient transformation, equal to all that mean the same: `optax.adam(1e-2)` is another object each time."""
+    """A gradient transformation, equal to all that do the same: `optax.adam(1e-2)` is a new object in each call."""
 
     def __init__(self, given: Any):
         self.given = given
         meanings = meaning_of(given.init), meaning_of(given.update)
         self.meaning: Hashable = id(given) if None in meanings else meanings
-        # Some ask for the value, too, such as `optax.contrib.reduce_on_plateau`.
+        # Some take the value, too, such as `optax.contrib.reduce_on_plateau`.
         kinds = [p.kind for p in inspect.signature(given.update).parameters.values()]
-        self.asks_for_more = inspect.Parameter.VAR_KEYWORD in kinds
+        self.takes_value = inspect.Parameter.VAR_KEYWORD in kinds
 
     def __hash__(self):
         return hash(self.meaning)
@@ -46,15 +46,15 @@ class Optimiser:
     def step(self, found: Found, y, slopes, state, value, value_of):
         """Free numbers after a step, and the state; `value` is that of the function `value_of(y)` with these slopes."""
         more = {}
-        if self.asks_for_more:
-            of_tree = lambda tree: value_of(as_vector(tree, y))
-            more = {"value": value, "grad": as_params(found, slopes), "value_fn": of_tree}
+        if self.takes_value:
+            value_of_tree = lambda tree: value_of(as_vector(tree, y))
+            more = {"value": value, "grad": as_params(found, slopes), "value_fn": value_of_tree}
         changes, state = self.given.update(as_params(found, slopes), state, as_params(found, y), **more)
         return y + as_vector(changes, y), state
 
 
 def as_params(found: Found, y):
-    """Numbers (p,) in the structure of `params`, None in place of what is not found."""
+    """Numbers (p,) in the structure of `params`, with None in place of numbers that are not fitted."""
     leaves, structure = jtu.tree_flatten(found.params)
     chosen: list[Any] = [None] * len(leaves)
     at = 0
@@ -67,6 +67,6 @@ def as_params(found: Found, y):
 
 
 def as_vector(tree, like):
-    """All numbers of a tree in a row, with the dtype of `like`."""
+    """All numbers of a tree as a vector, with the dtype of `like`."""
     leaves = [jnp.ravel(x).astype(like.dtype) for x in jax.tree.leaves(tree)]
     return jnp.concatenate(leaves) if leaves else jnp.zeros_like(like)

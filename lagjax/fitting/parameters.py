@@ -1,6 +1,6 @@
-"""Which numbers among the parameters are found, within which bounds, and what is known of them before.
+"""Which numbers among the parameters are fitted, with their bounds and priors.
 
-A found number x is searched as a free one, z:
+A fitted number x is searched as an unbounded one, z:
 
     x = z                         without bounds
     x = low + exp z               above `low`      (positive numbers: z is the logarithm)
@@ -25,7 +25,7 @@ from lagjax.mechanics.diagnosis import listed
 
 
 class Leaf(NamedTuple):
-    """A leaf of `params` by its number, and which of its entries are found; None stands for all."""
+    """A leaf of `params` by its index, and the indices of its fitted entries; None stands for all."""
 
     number: int
     places: tuple[int, ...] | None
@@ -37,8 +37,8 @@ class Found:
     """The numbers among `params` that a fit finds.
 
     - `start` (p,): where the search starts. `low`, `high` (p,): bounds, infinite where there are none.
-    - `mean`, `sd` (p,): what is known before; `sd` is infinite where nothing is.
-    - `names`: of each number, as the user writes it.
+    - `mean`, `sd` (p,): the priors; `sd` is infinite where there is none.
+    - `names`: the name of each number, as the user writes it.
     """
 
     params: PyTree
@@ -51,7 +51,7 @@ class Found:
     leaves: tuple[Leaf, ...] = eqx.field(static=True)
 
     def into(self, x: Float[Array, " p"]) -> PyTree:
-        """`params` with the numbers `x` in place."""
+        """`params` with the numbers `x` inserted."""
         leaves, structure = jtu.tree_flatten(self.params)
         at = 0
         for number, places in self.leaves:
@@ -59,20 +59,20 @@ class Found:
             size = old.size if places is None else len(places)
             new = x[at : at + size].astype(old.dtype)
             if places is not None:
-                new = _with(old, np.array(places), new)
+                new = _replace_entries(old, np.array(places), new)
             leaves[number] = new.reshape(old.shape)
             at += size
         return jtu.tree_unflatten(structure, leaves)
 
     def natural(self, z):
-        """Numbers within their bounds from free ones."""
+        """Numbers within their bounds from unbounded ones."""
         low, high = jnp.isfinite(self.low), jnp.isfinite(self.high)
         below, above = jnp.where(low, self.low, 0.0), jnp.where(high, self.high, 0.0)
-        # Zeros where a branch is not taken: an overflow there would poison derivatives.
-        of = lambda taken: jnp.where(taken, z, 0.0)
-        x = jnp.where(low & ~high, below + jnp.exp(of(low & ~high)), z)
-        x = jnp.where(high & ~low, above - jnp.exp(-of(high & ~low)), x)
-        return jnp.where(high & low, below + (above - below) * jax.nn.sigmoid(of(high & low)), x)
+        # Zeros in branches that are not taken: an overflow there would make derivatives NaN.
+        z_if = lambda taken: jnp.where(taken, z, 0.0)
+        x = jnp.where(low & ~high, below + jnp.exp(z_if(low & ~high)), z)
+        x = jnp.where(high & ~low, above - jnp.exp(-z_if(high & ~low)), x)
+        return jnp.where(high & low, below + (above - below) * jax.nn.sigmoid(z_if(high & low)), x)
 
     def free(self, x):
         """The inverse of `natural`."""
@@ -83,8 +83,8 @@ class Found:
         return jnp.where(high & low, jax.scipy.special.logit(jnp.where(high & low, share, 0.5)), z)
 
 
-def _with(old, places, new):
-    """All entries of `old` in a row, some of them replaced."""
+def _replace_entries(old, places, new):
+    """All entries of `old` as a vector, some of them replaced."""
     if coordinates.is_traced((old, new)):
         return jnp.ravel(old).at[places].set(new)
     row = np.array(old).ravel()
@@ -99,7 +99,7 @@ def find(
     priors: Mapping[str, tuple[float, float]],
     dtype,
 ) -> Found:
-    """Read off `params`, names, bounds and priors what is to be found."""
+    """Determine the numbers to be fitted from `params`, names, bounds and priors."""
     if not coordinates.is_traced(params):
         with jax.ensure_compile_time_eval():
             params = coordinates.given_params(params, dtype)
@@ -143,7 +143,7 @@ def find(
 
 
 def leaf_name(path) -> str:
-    """The name of a leaf of `params` as a person writes it."""
+    """The name of a leaf of `params` as a user writes it."""
     return jtu.keystr(path, simple=True, separator=".") or "params"
 
 
@@ -152,7 +152,7 @@ def _entries(name, x):
 
 
 def _matching(name: Any, among: Mapping[str, Array], argument: str, chosen=None) -> dict[str, Any]:
-    """The leaves that a name stands for, each with the places in it: all of them, or that of an element, 'm[1]'."""
+    """The leaves that a name stands for, each with the places of its entries: all, or that of one element, 'm[1]'."""
     found: dict[str, Any] = {leaf: slice(None) for leaf in among if leaf == name or leaf.startswith(f"{name}.")}
     leaf = str(name).partition("[")[0]
     if not found and leaf in among:
@@ -160,9 +160,10 @@ def _matching(name: Any, among: Mapping[str, Array], argument: str, chosen=None)
         found = {leaf: [i] for i in places if chosen is None or chosen[leaf][i]}
     if not found:
         raise ValueError(
-            f"{argument} names {name!r}, which is no floating number of params that is found: {listed(list(among))}.\n"
-            'Usual cause: a misspelled name, or a whole number written without its point ("m": 1).\n'
-            "Fix: use the names that stand in params; leaves of a dict in a dict as 'arm.length', elements as 'm[1]'."
+            f"{argument} names {name!r}, which is not a floating-point number of params that can be fitted: "
+            f"{listed(list(among))}.\n"
+            'Usual cause: a misspelled name, or a whole number written without a decimal point ("m": 1).\n'
+            "Fix: use the names in params; leaves of a dict in a dict as 'arm.length', elements as 'm[1]'."
         )
     return found
 
@@ -186,6 +187,6 @@ def _check_start(found, low, high):
     if outside.any():
         i = int(np.argmax(outside))
         raise ValueError(
-            f"'{found.names[i]}' starts at {x[i]:.6g}, and must start inside its bounds, from {low[i]:.6g} to "
+            f"'{found.names[i]}' starts at {x[i]:.6g}, but must start inside its bounds, from {low[i]:.6g} to "
             f"{high[i]:.6g}.\nFix: start a positive number at its order of magnitude, such as 1e-3, not at 0."
         )

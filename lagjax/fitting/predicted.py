@@ -1,4 +1,4 @@
-"""Whether a motion goes through, and measurements have the shapes of what it says, or an error in the user's words."""
+"""Check that a motion reaches its end and that measurements have the shapes of its predictions, in the user's words."""
 
 from typing import Any
 
@@ -17,7 +17,7 @@ from lagjax.motion.integrate import integrate
 
 
 def check_predicted(problem: Problem):
-    """Raise where the measurements do not have the shape of what the motion says."""
+    """Raise if the measurements do not have the shapes of the motion's predictions."""
     begin = jax.tree.map(lambda x: x[0], (problem.starts.q.guess, problem.starts.v.guess))
     q, v = (jax.eval_shape(problem.unflatten, x) for x in begin)
     t, params = jax.ShapeDtypeStruct((), problem.windows.ts.dtype), problem.found.params
@@ -25,41 +25,41 @@ def check_predicted(problem: Problem):
     def one_time(t, q, v, params):
         shapes = [constraints.shapes(phase, t, q, v, params) for phase in phases_of(problem.system)]
         multipliers = {name: jnp.zeros(shape) for phase in shapes for name, shape in phase.items()}
-        said = {"q": q, "v": v, "multipliers": multipliers}
+        values = {"q": q, "v": v, "multipliers": multipliers}
         if problem.observe is not None:
-            said["observed"] = problem.observe(t, q, v, params)
-        return said | {"end": {"t": t, **said}}
+            values["observed"] = problem.observe(t, q, v, params)
+        return values | {"end": {"t": t, **values}}
 
-    said = eqx.filter_eval_shape(one_time, t, q, v, params)
+    predicted = eqx.filter_eval_shape(one_time, t, q, v, params)
     for kind, tree in problem.measured.items():
-        _match(kind, said[kind], tree, 1 if kind == "end" else 2)
+        _check_match(kind, predicted[kind], tree, 1 if kind == "end" else 2)
 
 
-def _match(kind: str, said: Any, measured: Any, axes: int, path=()):
-    if isinstance(measured, dict) and isinstance(said, dict):
+def _check_match(kind: str, predicted: Any, measured: Any, axes: int, path=()):
+    if isinstance(measured, dict) and isinstance(predicted, dict):
         for name, part in measured.items():
-            if name not in said:
+            if name not in predicted:
                 raise ValueError(
-                    f"'{name}' was measured as {kind}, and there {listed(list(said))}.\n"
-                    f"Fix: name what the motion has: {kind}={{{list(said)[0]!r}: ...}}."
+                    f"'{name}' was measured as {kind}, but the motion has no such name: {listed(list(predicted))}.\n"
+                    f"Fix: use the motion's names: {kind}={{{list(predicted)[0]!r}: ...}}."
                 )
-            _match(kind, said[name], part, axes, (*path, jtu.DictKey(name)))
+            _check_match(kind, predicted[name], part, axes, (*path, jtu.DictKey(name)))
         return
-    found, wanted = jtu.tree_structure(said), jtu.tree_structure(measured)
-    if found != wanted:
+    structure, wanted = jtu.tree_structure(predicted), jtu.tree_structure(measured)
+    if structure != wanted:
         raise ValueError(
-            f"{kind} was measured as {wanted}, and the motion has {found}.\nFix: give it in that structure."
+            f"{kind} was measured as {wanted}, but the motion has {structure}.\nFix: give it in that structure."
         )
-    for x, y in zip(jtu.tree_leaves(said), jtu.tree_leaves(measured)):
+    for x, y in zip(jtu.tree_leaves(predicted), jtu.tree_leaves(measured)):
         if x.shape != y.shape[axes:]:
             raise ValueError(
-                f"'{channel_name(kind, path)}' was measured with the shape {y.shape[axes:]} at each time, and the "
-                f"motion has {x.shape}.\nUsual cause: an array of one entry where a number is meant."
+                f"'{channel_name(kind, path)}' was measured with the shape {y.shape[axes:]} at each time, but the "
+                f"motion has {x.shape}.\nUsual cause: an array of one entry in place of a number."
             )
 
 
 def check_motion(problem, well, u):
-    """Raise, in the words of the integration, where a motion fails."""
+    """Raise if a motion fails, with the message of `integrate`."""
     failed = np.flatnonzero(~np.asarray(well))
     if not failed.size:
         return
@@ -72,5 +72,5 @@ def check_motion(problem, well, u):
         reason = str(error)
     raise ValueError(
         f"from the guess the motion of record {int(problem.windows.record[w])} fails: {reason}\n"
-        "Fix: guess params, q0 and v0 nearer to the truth; try them with lj.integrate first."
+        "Fix: better guesses of params, q0 and v0; try them with lj.integrate first."
     )

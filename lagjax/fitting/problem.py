@@ -1,4 +1,4 @@
-"""From what the user gives to the arrays of a fit, or an error in the user's words."""
+"""Turn the user's arguments into the arrays of a fit, with errors in the user's words."""
 
 import warnings
 from collections.abc import Mapping, Sequence
@@ -20,22 +20,22 @@ from lagjax.mechanics.outside import up_to_date
 from lagjax.mechanics.refusals import check_system
 from lagjax.motion.switching import each_phase, starting
 
-# What `integrate` takes and a fit sets itself.
-OURS = {"ts", "throw", "adjoint"}
+# Arguments of `integrate` that a fit sets itself.
+SET_BY_FIT = {"ts", "throw", "adjoint"}
 
 
 def problem_of(system, records, params, free, observe, bounds, priors, loss, window, options) -> Problem:
-    """Check everything and make arrays of it."""
+    """Check all arguments and make arrays of them."""
     check_system(system, records, params, phases=True)
-    system = _starting(system, window, options)
+    system = _system_at_start(system, window, options)
     first = first_phase(system)
     records = [records] if isinstance(records, Record) else list(records)
     if not records or not all(isinstance(record, Record) for record in records):
         raise TypeError("records must be a lj.Record or a list of them.\nFix: lj.Record(t, q=measured).")
     if loss not in LOSSES:
         raise ValueError(f"loss must be {listed(list(LOSSES))}, not {loss!r}.")
-    if OURS & set(options):
-        raise ValueError(f"{listed(sorted(OURS & set(options)))} cannot be given: a fit sets it itself.")
+    if SET_BY_FIT & set(options):
+        raise ValueError(f"{listed(sorted(SET_BY_FIT & set(options)))} cannot be given: a fit sets it itself.")
     _check_kinds(records, observe, options)
     absolute = _absolute(records, loss, priors)
     dtype = jnp.result_type(float)
@@ -52,30 +52,30 @@ def problem_of(system, records, params, free, observe, bounds, priors, loss, win
     per_window = {name: values[windows.record] for name, values in overrides.items()}
     xp = coordinates.numpy_of((guessed.q.guess, guessed.v.guess))
     unit = xp.std(xp.concatenate([guessed.q.guess, guessed.v.guess], axis=1), axis=0)
-    _warn_of_wrapped(records)
+    _warn_of_wrapped_angles(records)
     return Problem(
         system, first, found, per_window, windows, guessed, measured, sigma, spreads, ratio,
         xp.where(unit > 0, unit, 1.0), unflatten, observe, options, loss, absolute,
     )  # fmt: skip
 
 
-def _starting(system, window, options):
-    """The system as it is now, of a motion in phases in the phase that `start=` names; taken out of the options."""
+def _system_at_start(system, window, options):
+    """The up-to-date system; a motion in phases starts in that of `start=`, which is removed from the options."""
     system = starting(each_phase(system, up_to_date), options.pop("start", None))
     if isinstance(system, Hybrid) and window is not None:
         raise ValueError(
-            "window= cuts records into windows of their own, and of a lj.Hybrid nobody knows in which phase each would "
-            "start.\nFix: leave window out; or a lj.Record for each part, with start= the phase of all of them."
+            "window= cuts records into windows, but for a lj.Hybrid the phase in which each window would start is not "
+            "known.\nFix: leave window out; or a lj.Record for each part, with start= the phase of all of them."
         )
     return system
 
 
 def _absolute(records, loss, priors):
-    """Whether the sizes of the errors are known; raise where they must be and are not."""
+    """Whether the sizes of the errors are known; raise if they are needed and not given."""
     given = [record.sigma is not None for record in records]
     if any(given) and not all(given):
         raise ValueError(
-            f"record {given.index(False)} has no sigma and others have one.\nFix: give it to all, or none."
+            f"record {given.index(False)} has no sigma, but others have one.\nFix: give it to all, or none."
         )
     if all(given):
         return True
@@ -87,7 +87,7 @@ def _absolute(records, loss, priors):
     elif loss != "squares":
         why = f"loss={loss!r} must know how large an ordinary error is"
     if why:
-        raise ValueError(f"{why}, and the records have no sigma.\nFix: lj.Record(..., sigma=0.01).")
+        raise ValueError(f"{why}, but the records have no sigma.\nFix: lj.Record(..., sigma=0.01).")
     return False
 
 
@@ -101,7 +101,7 @@ def _overrides(records, windows, found):
             raise ValueError(f"a record sets '{name}', which is not in params: {listed(list(known))}.")
         if name in fitted:
             raise ValueError(
-                f"a record sets '{name}', which is also to be found.\nFix: leave it out of free=, or out of the record."
+                f"a record sets '{name}', which the fit is to find.\nFix: leave it out of free=, or out of the record."
             )
         given = [record.params.get(name, known[name]) for record in records]
         xp = coordinates.numpy_of(given)
@@ -115,18 +115,18 @@ def _check_kinds(records, observe, options):
         structures = [jax.tree.structure(x.measured) for x in (records[0], record)]
         if structures[0] != structures[1]:
             raise ValueError(
-                f"record {r} holds {listed([n for n, _ in record.channels()])}, and record 0 "
-                f"{listed([n for n, _ in records[0].channels()])}: they must hold the same.\n"
+                f"record {r} holds {listed([n for n, _ in record.channels()])}, but record 0 "
+                f"{listed([n for n, _ in records[0].channels()])}: they must hold the same quantities.\n"
                 "Fix: write NaN for what was not measured in a run."
             )
     if ("observed" in kinds) != (observe is not None):
         raise ValueError(
-            "observe= and the records' observed= belong together, and only one of them is given.\n"
+            "observe= and the records' observed= belong together, but only one of them is given.\n"
             'Fix: lj.Record(t, observed={"x": x}) and observe=lambda t, q, v, params: {"x": ...}.'
         )
     if "end" in kinds and not (options.get("event") or options.get("events")):
         raise ValueError(
-            "records have end=, and the fit no events= that end the motion.\n"
+            "records have end=, but the fit has no events= that end the motion.\n"
             'Fix: events={"down": lj.Crossing(lambda t, q, v, params: q["y"])}.'
         )
 
@@ -149,10 +149,10 @@ def _check_anything_measured(measured):
 
 
 def _sigmas(records, windows, measured, absolute):
-    """Sigmas like the measurements, the spread of each channel, and the typical spread in sigmas."""
+    """Sigmas in the shape of the measurements, the spread of each channel, and the largest spread in sigmas."""
     spreads = jax.tree.map(_spread, measured)
     if not absolute:
-        # One size for all: what is estimated is its multiple.
+        # One size for all; the fit estimates the errors as a multiple of it.
         xp = coordinates.numpy_of(spreads)
         common = xp.sqrt(xp.mean(xp.stack(jax.tree.leaves(spreads)) ** 2))
         return jax.tree.map(lambda x: xp.full(x.shape, common), measured), spreads, np.asarray(1.0)
@@ -165,11 +165,11 @@ def _sigmas(records, windows, measured, absolute):
 
 
 def _spread(x):
-    """The standard deviation of a channel; of one number its size; 1 where that is 0."""
-    xp, of = coordinates.numpy_of(x), spread(x)
+    """The standard deviation of a channel; its largest absolute value if that is 0; 1 if that is 0, too."""
+    xp, deviation = coordinates.numpy_of(x), spread(x)
     size = xp.max(xp.where(xp.isnan(x), 0.0, xp.abs(x)), initial=0.0)
-    of = xp.where(of > 0, of, size)
-    return xp.where(of > 0, of, 1.0)
+    deviation = xp.where(deviation > 0, deviation, size)
+    return xp.where(deviation > 0, deviation, 1.0)
 
 
 def _broadcast(record, kind):
@@ -187,7 +187,7 @@ def _broadcast(record, kind):
             xp = coordinates.numpy_of(s)
             given = xp.asarray(s, x.dtype)
             if xp is np and not np.all(given > 0):
-                raise ValueError("sigma must be positive.\nFix: sigma=jnp.inf leaves a value out; NaN data too.")
+                raise ValueError("sigma must be positive.\nFix: sigma=jnp.inf, or NaN in the data, leaves a value out.")
             if 0 < given.ndim < x.ndim and given.shape == x.shape[: given.ndim]:
                 given = given.reshape(given.shape + (1,) * (x.ndim - given.ndim))
             return xp.broadcast_to(given, x.shape)
@@ -202,7 +202,7 @@ def _broadcast(record, kind):
         raise ValueError(f"sigma of '{kind}' does not fit the measurements: {error}") from error
 
 
-def _warn_of_wrapped(records: Sequence[Record]):
+def _warn_of_wrapped_angles(records: Sequence[Record]):
     for r, record in enumerate(records):
         for name, x in channels(record.measured):
             if name.startswith("end") or "q" not in record.measured or coordinates.is_traced(x):

@@ -1,4 +1,4 @@
-"""What was measured in one run, and records cut into windows of one shape, so that one program serves them all."""
+"""The measurements of one run, and records cut into windows of equal shape, so that one program serves them all."""
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
@@ -14,41 +14,41 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.memory import filled_up
 
-# What of a motion can be measured; the last as numbers of a run, the others at each of its times.
+# The kinds of measurement: `end` once per run, the others at each of its times.
 KINDS = ("q", "v", "multipliers", "observed", "end")
-# Times of padding follow each other at this part of the shortest interval.
+# The interval between times of padding, relative to the shortest interval of a record.
 PADDING = 1e-3
 
 
 class Record(eqx.Module):
-    """What was measured in one run.
+    """The measurements of one run.
 
     >>> import jax.numpy as jnp
     >>> t = jnp.linspace(0.0, 1.0, 50)
     >>> Record(t, q={"theta": 0.1 * jnp.cos(3.0 * t)}, v0={"theta": 0.0}, hold_v=True, sigma=0.001)
     Record(50 times from 0 to 1, q: theta)
 
-    **Arguments,** T times and whatever of the following was measured, each leaf (T, ...), NaN where a value is missing:
+    **Arguments,** T times and one or more kinds of measurement, each leaf (T, ...), NaN where a value is missing:
 
     - `t` (T,): increasing times, `[t]`. The run starts at `t[0]`, from a state that is an unknown of the fit.
-    - `q`, `v`: coordinates and velocities, in the structure of the state; of a dictionary some of the names.
+    - `q`, `v`: coordinates and velocities, in the structure of the state; a dictionary may have only some of the names.
     - `multipliers`: by constraint name, some or all: a measured normal force, for example.
-    - `observed`: like what `observe(t, q, v, params)` of the fit returns.
-    - `end`: what was measured of the event that ended the motion, some of `{"t": ..., "q": ..., "v": ...,
-      "multipliers": ...}`, without a time axis. The fit's `events` say what ends it.
+    - `observed`: in the structure that `observe(t, q, v, params)` of the fit returns.
+    - `end`: measurements of the event that ended the motion, some of `{"t": ..., "q": ..., "v": ...,
+      "multipliers": ...}`, without a time axis. The fit's `events` define what ends it.
 
     **Of the run:**
 
-    - `q0`, `v0`: a guess of the state at `t[0]`. Left out, it is read off measured coordinates and velocities; where
-      some were not measured, `q0` has to be given, and their velocities are guessed to be zero.
-    - `hold_q`, `hold_v`: which of them are known, not guessed: `True` for all, or names of coordinates.
-    - `params`: parameters that are other ones in this run, by name: `{"omega": 3.0}`.
+    - `q0`, `v0`: a guess of the state at `t[0]`. By default it is read off measured coordinates and velocities; if some
+      were not measured, `q0` must be given, and their velocities are guessed to be zero.
+    - `hold_q`, `hold_v`: which of them are known exactly, not guessed: `True` for all, or names of coordinates.
+    - `params`: parameters that have another value in this run, by name: `{"omega": 3.0}`.
     - `sigma`: the standard deviation of the measurement errors, one number, or by kind, `{"q": 0.01, "end":
-      {"t": 1e-3}}`; also arrays like the measurements: an infinite one leaves a value out. Without it the errors are
-      taken to be alike, and their size is read off the residuals.
+      {"t": 1e-3}}`; also arrays like the measurements: an infinite entry leaves a value out. Without it all errors are
+      assumed to have the same size, which is estimated from the residuals.
 
-    **Raises:** `ValueError` for times that do not increase, measurements of another length, infinite numbers, what is
-    held and not given.
+    **Raises:** `ValueError` for times that do not increase, measurements of another length, infinite numbers, or a held
+    start that is not given.
     """
 
     t: np.ndarray
@@ -77,10 +77,10 @@ class Record(eqx.Module):
         sigma: PyTree = None,
     ):
         if coordinates.is_traced(t):
-            raise TypeError("the times of a record must be numbers, and these are traced: they give it its shape.")
+            raise TypeError("the times of a record must be numbers, not traced: they determine its shape.")
         self.t = _times(t)
         given = zip(KINDS, (q, v, multipliers, observed, end))
-        # Sorted as JAX sorts them: residuals stand in this order.
+        # Sorted as JAX sorts dictionaries: residuals are in this order.
         given = sorted(((kind, tree) for kind, tree in given if tree is not None), key=lambda pair: pair[0])
         self.measured = {kind: jax.tree.map(_as_floats, tree, is_leaf=_is_list_of_numbers) for kind, tree in given}
         if not jax.tree.leaves(self.measured):
@@ -95,30 +95,30 @@ class Record(eqx.Module):
         for which, held, known in (("q", self.hold_q, q0), ("v", self.hold_v, v0)):
             if held and known is None:
                 raise ValueError(
-                    f"hold_{which} says that {which}0 is known, and it is not given.\n"
+                    f"hold_{which} says that {which}0 is known, but it is not given.\n"
                     f"Fix: lj.Record(..., {which}0=..., hold_{which}=...)."
                 )
         self.params, self.sigma = dict(params or {}), sigma
 
     def channels(self) -> list[tuple[str, Array]]:
-        """What was measured, by name: `theta`, `v.theta`, `contact`, ..."""
+        """The measured quantities by name: `theta`, `v.theta`, `contact`, ..."""
         return channels(self.measured)
 
     def __repr__(self):
-        of = {kind: ", ".join(jtu.keystr(p, simple=True, separator=".") for p, _ in jtu.tree_leaves_with_path(tree))
-              for kind, tree in self.measured.items()}  # fmt: skip
-        told = "; ".join(f"{kind}: {names}" if names else kind for kind, names in of.items())
-        return f"Record({len(self.t)} times from {self.t[0]:.6g} to {self.t[-1]:.6g}, {told})"
+        names = {kind: ", ".join(jtu.keystr(p, simple=True, separator=".") for p, _ in jtu.tree_leaves_with_path(tree))
+                 for kind, tree in self.measured.items()}  # fmt: skip
+        kinds = "; ".join(f"{kind}: {of_kind}" if of_kind else kind for kind, of_kind in names.items())
+        return f"Record({len(self.t)} times from {self.t[0]:.6g} to {self.t[-1]:.6g}, {kinds})"
 
 
 def channels(measured: Mapping[str, PyTree]) -> list[tuple[str, Array]]:
-    """What was measured, by name."""
+    """The measured quantities by name."""
     leaves = [(kind, *leaf) for kind, tree in measured.items() for leaf in jtu.tree_leaves_with_path(tree)]
     return [(channel_name(kind, path), x) for kind, path, x in leaves]
 
 
 def channel_name(kind: str, path) -> str:
-    """The name of a measured quantity as a person writes it."""
+    """The name of a measured quantity as a user writes it."""
     name = jtu.keystr(path, simple=True, separator=".")
     if kind in ("q", "multipliers", "observed"):
         return name or kind
@@ -126,7 +126,7 @@ def channel_name(kind: str, path) -> str:
 
 
 def spread(x):
-    """The standard deviation of what is not missing; 0 where everything is."""
+    """The standard deviation of the values that are not missing; 0 if all are."""
     xp, known = coordinates.numpy_of(x), ~coordinates.numpy_of(x).isnan(x)
     mean = lambda y: xp.sum(xp.where(known, y, 0.0)) / xp.maximum(xp.sum(known), 1)
     return xp.sqrt(mean((x - mean(x)) ** 2))
@@ -149,15 +149,15 @@ def _held(hold):
 def _times(t):
     t = np.asarray(t, np.result_type(np.asarray(t).dtype, np.float32))
     if t.ndim != 1 or len(t) < 2:
-        raise ValueError(f"the times of a record must be a vector of two or more, and have the shape {t.shape}.")
+        raise ValueError(f"the times of a record must be a vector of two or more, not of shape {t.shape}.")
     if not np.all(np.isfinite(t)):
         raise ValueError("the times of a record contain NaN or infinity.\nFix: drop these samples.")
     late = np.flatnonzero(np.diff(t) <= 0)
     if late.size:
         i = int(late[0])
         raise ValueError(
-            f"the times of a record must increase, and t[{i + 1}] = {t[i + 1]:.9g} follows t[{i}] = {t[i]:.9g}.\n"
-            "Usual cause: two records in one file, or a time written twice.\n"
+            f"the times of a record must increase, but t[{i + 1}] = {t[i + 1]:.9g} follows t[{i}] = {t[i]:.9g}.\n"
+            "Usual cause: two records in one file, or a repeated time.\n"
             "Fix: order = np.argsort(t); sort the measurements with it; for several runs, one lj.Record each."
         )
     return t
@@ -166,7 +166,7 @@ def _times(t):
 def _check(name, x, count):
     if not name.startswith("end") and (x.ndim == 0 or len(x) != count):
         raise ValueError(
-            f"'{name}' has the shape {x.shape}, and the record has {count} times.\n"
+            f"'{name}' has the shape {x.shape}, but the record has {count} times.\n"
             "Usual cause: time as the second axis, or samples dropped from one of the two.\n"
             "Fix: the first axis is time; write NaN where a value is missing."
         )
@@ -175,13 +175,13 @@ def _check(name, x, count):
 
 
 class Windows(NamedTuple):
-    """All records, cut into windows of one number of times.
+    """All records, cut into windows with the same number of times.
 
-    - `ts` (W, T): times; a window that is seamed to the next has the next's first time as its last.
-    - `real` (W, T): which are times of the record, not padding and not the seam.
-    - `sample` (W, T): their places in their record.
-    - `last` (W,): the place of the last time that is not padding. `seam` (W,): whether the next window goes on there.
-    - `record` (W,): the record that a window is of.
+    - `ts` (W, T): times; a window that the next one continues ends with the next one's first time.
+    - `real` (W, T): which are times of the record, not padding and not that last time.
+    - `sample` (W, T): their indices in their record.
+    - `last` (W,): the index of the last time that is not padding. `seam` (W,): whether the next window continues there.
+    - `record` (W,): the record that a window belongs to.
     """
 
     ts: Float[np.ndarray, "W T"]
@@ -198,7 +198,7 @@ class Windows(NamedTuple):
 
     @property
     def longest(self) -> int:
-        """The times of the longest window, without padding."""
+        """The number of times in the longest window, without padding."""
         return int(np.max(self.last)) + 1
 
     @property
@@ -217,12 +217,12 @@ class Windows(NamedTuple):
 
 
 def padded(t: Float[np.ndarray, " n"], length: int, step: float) -> Float[np.ndarray, " length"]:
-    """Times that are filled up by others, which follow each other closely."""
+    """Times filled up to a length by others, at intervals of `step`."""
     return np.concatenate([t, t[-1] + step * (1 + np.arange(length - len(t)))])
 
 
 def cut(records: Sequence[Record], window: float | None, dtype) -> Windows:
-    """Cut records into windows of a length in time, or one each."""
+    """Cut records into windows of a given length in time, or into one window each."""
     pieces = []
     for r, record in enumerate(records):
         t, span = record.t, record.t[-1] - record.t[0]

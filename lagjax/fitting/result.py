@@ -1,4 +1,4 @@
-"""The answer of a fit: estimates, how certain they are, and whether the residuals look like measurement errors."""
+"""The result of a fit: estimates, their uncertainties, and whether the residuals look like measurement errors."""
 
 import os
 import warnings
@@ -33,16 +33,16 @@ from lagjax.motion.results import RESULTS
 from lagjax.motion.trajectory import Trajectory
 from lagjax.numerics.chained import Unknowns
 
-# A number that is closer to its bound than this, relative to the bound's size, or its start's, is at it.
+# A number is at its bound if it is closer to it than this, relative to its start value.
 AT_BOUND = 1e-6
 
 
 class FitWarning(UserWarning):
-    """A fit has an answer, and there is something to know about it."""
+    """A fit has a result, but with reservations that the message states."""
 
 
 class Channel(NamedTuple):
-    """A kind of measurement: its name, times (T,) (None for ends), what was measured and residuals, (T, ...)."""
+    """A measured quantity: its name, times (T,) (None for ends), measurements and residuals, (T, ...)."""
 
     name: str
     t: np.ndarray | None
@@ -50,27 +50,27 @@ class Channel(NamedTuple):
     residuals: np.ndarray
 
 
-# No module of equinox: that wraps a method each time it is looked up.
+# Not an `eqx.Module`, which wraps a method each time it is looked up.
 @jtu.register_dataclass
 @dataclass(frozen=True, eq=False, repr=False)
 class Fit:
     """Estimates from measured motion. It prints itself as a table and plots data, fit and residuals.
 
-    - `params`: with the estimates in place. `q0`, `v0`: the start of each record, a list.
-    - `names`, `values`, `sd` (p,): the numbers found, and their standard deviations; NaN where the data do not
-      determine one. With `sigma` given they follow from it, else from the residuals.
+    - `params`: the parameters, with the estimates inserted. `q0`, `v0`: the start of each record, a list.
+    - `names`, `values`, `sd` (p,): the fitted numbers and their standard deviations; NaN for numbers that the data do
+      not determine. With `sigma` given the standard deviations follow from it, else from the residuals.
     - `covariance`, `correlation` (p, p).
-    - `start_sd`: standard deviations of `q0` and `v0`, as two lists of pytrees; 0 of what was held, NaN of what the
-      data do not determine.
-    - `identifiability`: which combinations the data see. `laplace()`: a normal distribution by the true second
+    - `start_sd`: standard deviations of `q0` and `v0`, as two lists of pytrees; 0 where held, NaN where the data do not
+      determine the start.
+    - `identifiability`: which combinations the data determine. `laplace()`: a normal distribution with the true second
       derivatives. `log_likelihood`, `log_posterior`: for samplers.
-    - `chi2`, `freedom`: the sum of squared residuals in sigmas (of the unit that is estimated, without sigmas), and the
-      number of measurements less that of unknowns. `noise`: the estimated sigma, where none was given.
+    - `chi2`, `freedom`: the sum of squared residuals in sigmas (without sigmas, in units of the data's spread), and the
+      number of measurements minus that of unknowns. `noise`: the estimated sigma, if none was given.
     - `result`: a `RESULTS` item: `lj.RESULTS.successful`, `not_converged` or `misfit`. `converged`: whether it is the
       first: the search came to rest, and the residuals neither contradict `sigma` nor follow a curve.
-    - Arrays are NumPy's, but where the fit is part of a program.
-    - `steps`, `cost`: of the search. `costs`: from each start, the guess first; NaN where none was needed.
-    - `training`: how an optimiser of optax went, `found.training.plot()`, and what was held back.
+    - Arrays are NumPy arrays, unless the fit is part of a compiled program.
+    - `steps`, `cost`: of the search. `costs`: from each start, the guess first; NaN for starts that were not needed.
+    - `training`: the course of a training with optax, `found.training.plot()`, and the fit of the held-back records.
     """
 
     problem: Problem
@@ -122,11 +122,11 @@ class Fit:
 
     @property
     def _xp(self) -> Any:
-        """What to compute with: NumPy compiles nothing."""
+        """NumPy, which needs no compiling, or `jax.numpy` if the fit is traced."""
         return jnp if self._traced else np
 
     def report(self) -> Report:
-        """How it went, for a sweep's status."""
+        """The outcome, for the status of a sweep."""
         nothing = jnp.zeros_like(self.cost)
         return Report(self.result._value, self.steps, nothing, nothing)
 
@@ -150,16 +150,16 @@ class Fit:
 
     @property
     def variance(self) -> Float[Array, ""]:
-        """The variance of an error in sigmas: 1 where sigmas were given."""
+        """The variance of an error in sigmas: 1 if sigmas were given."""
         xp = self._xp
         if self.problem.absolute:
             return xp.ones_like(self.chi2)
-        # Of as many numbers as measurements nothing is left over to tell the size of an error by.
+        # With as many unknowns as measurements no residuals are left to estimate the errors from.
         return xp.where(self.freedom > 0, self.chi2 / xp.maximum(self.freedom, 1), np.nan)
 
     @property
     def noise(self) -> Float[Array, ""]:
-        """The size of a measurement error: 1, in sigmas, where these were given; else estimated, in the data's unit."""
+        """The size of a measurement error: 1, in sigmas, if these were given; else estimated, in the data's unit."""
         first = jax.tree.leaves(self.problem.sigma)[0]
         xp = self._xp
         return xp.sqrt(self.variance) * (1.0 if self.problem.absolute else xp.nanmax(first))
@@ -167,7 +167,7 @@ class Fit:
     @property
     def covariance(self) -> Float[Array, "p p"]:
         known = self.determined[:, None] & self.determined[None, :]
-        return self._xp.where(known, self._of_errors() * self._evaluated().covariance.shared, np.nan)
+        return self._xp.where(known, self._error_variance() * self._evaluated().covariance.shared, np.nan)
 
     @property
     def sd(self) -> Float[Array, " p"]:
@@ -181,11 +181,11 @@ class Fit:
 
     @property
     def start_sd(self) -> tuple[list[PyTree], list[PyTree]]:
-        # On constraints a start depends on the parameters too: that of a rod of unknown length, for example.
+        # On constraints a start also depends on the parameters, such as the unknown length of a rod.
         xp, evaluation, windows = self._xp, self._evaluated(), self.problem.windows.first
-        of, determined, of_errors = evaluation.covariance, evaluation.determined, self._of_errors()
+        of, determined, of_errors = evaluation.covariance, evaluation.determined, self._error_variance()
         _, slopes = self.known_starts()
-        found = []
+        sds = []
         for r, w in enumerate(windows):
             joint = of_errors * xp.block([[of.shared, of.local_shared[w].T], [of.local_shared[w], of.local[w]]])
             known = xp.concatenate([determined.shared, determined.local[w]])
@@ -196,8 +196,8 @@ class Fit:
                 unknown = xp.any(xp.where(known, 0.0, slopes[r]) != 0, axis=-1)
                 return xp.where(unknown, np.nan, xp.sqrt(xp.maximum(variance, 0.0)))
 
-            found.append(jax.tree.map(sd, slopes))
-        of_q, of_v = zip(*found)
+            sds.append(jax.tree.map(sd, slopes))
+        of_q, of_v = zip(*sds)
         return list(of_q), list(of_v)
 
     def _evaluated(self) -> Evaluation:
@@ -208,22 +208,22 @@ class Fit:
             )
         return self.evaluation
 
-    def _of_errors(self):
-        """The variance of an M-estimate of many measurements, in units of that of least squares with these sigmas."""
+    def _error_variance(self):
+        """The variance of an M-estimate, relative to that of least squares with these sigmas."""
         if self.problem.loss == "squares":
             return self.variance
-        return _of_forgiven_errors(self._evaluated().rows.reshape(-1), self.known(), self.problem.loss)
+        return _robust_variance(self._evaluated().rows.reshape(-1), self.known(), self.problem.loss)
 
     def known(self) -> Bool[Array, " windows*m"]:
-        """Which of the residuals `evaluation.rows`, in a row, belong to a measurement."""
+        """Which of the residuals `evaluation.rows`, flattened, belong to a measurement."""
         parts = []
         for kind, tree in self.problem.measured.items():
             for x, s in zip(jax.tree.leaves(tree), jax.tree.leaves(self.problem.sigma[kind])):
                 xp: Any = coordinates.numpy_of((x, s))
                 known = xp.isfinite(x) & xp.isfinite(s)
                 parts.append(known.reshape(known.shape[0], -1))
-        together: Any = coordinates.numpy_of(parts).concatenate(parts, axis=1)
-        return together.reshape(-1)
+        by_window: Any = coordinates.numpy_of(parts).concatenate(parts, axis=1)
+        return by_window.reshape(-1)
 
     def starts(self) -> list[tuple[PyTree, PyTree]]:
         """(q, v) at the start of each record."""
@@ -231,7 +231,7 @@ class Fit:
         return [jax.tree.map(lambda x, r=r: x[r], states) for r in range(len(self.problem.windows.first))]
 
     def known_starts(self) -> tuple[PyTree, PyTree]:
-        """The starts of all records together, and their slopes by the unknowns."""
+        """The starts of all records, and their slopes by the unknowns."""
         system = self.problem.system
         if isinstance(system, UnknownSystem):
             return system.starts
@@ -247,9 +247,9 @@ class Fit:
         return integrate(self.problem.system, q, v, params, ts=ts, **({"throw": False} | self.problem.options))
 
     def residuals(self, record: int | None = None) -> dict[str, np.ndarray]:
-        """Predicted less measured, by channel, (T, ...) in the data's unit, NaN where nothing was measured.
+        """Predicted minus measured values by channel, (T, ...) in the data's unit, NaN where nothing was measured.
 
-        Of all records one after the other, or of one.
+        Those of all records in sequence, or of one.
         """
         return {channel.name: channel.residuals for channel in self.channels(record)}
 
@@ -258,15 +258,15 @@ class Fit:
         return {name: float(np.sqrt(np.nanmean(r**2))) for name, r in self.residuals(record).items()}
 
     def whiteness(self) -> dict[str, float]:
-        """The correlation of each residual with the next by channel; of white ones it is 0 within 2/√(their number)."""
-        found = {}
+        """The correlation of each residual with the next, by channel; for n white residuals it is 0 to within 2/√n."""
+        correlations = {}
         for name, r in self.residuals().items():
             r = r.reshape(len(r), -1) / np.sqrt(np.nanmean(r**2))
-            found[name] = float(np.nanmean(r[1:] * r[:-1])) if len(r) > 1 else np.nan
-        return found
+            correlations[name] = float(np.nanmean(r[1:] * r[:-1])) if len(r) > 1 else np.nan
+        return correlations
 
     def channels(self, record: int | None = None) -> Iterator[Channel]:
-        """Each kind of measurement, of all records one after the other, or of one."""
+        """Each measured quantity, of all records in sequence, or of one."""
         windows, at = self.problem.windows, 0
         chosen = np.asarray(windows.record) == (np.asarray(windows.record) if record is None else record)
         real = np.asarray(windows.real)[chosen]
@@ -286,8 +286,8 @@ class Fit:
 
     @property
     def sampling(self) -> dict[str, Array]:
-        """The unknowns as `log_likelihood` takes them: parameters by name, and the starts' deviations, (W, k)."""
-        # JAX's arrays, for a sampler.
+        """The unknowns as `log_likelihood` takes them: parameters by name, and deviations of the starts, (W, k)."""
+        # A sampler needs JAX arrays.
         of_names = {name: jnp.asarray(self.unknowns.shared[i]) for i, name in enumerate(self.names)}
         return of_names | {"starts": jnp.asarray(self.unknowns.local)}
 
@@ -295,8 +295,8 @@ class Fit:
     def log_likelihood(self) -> Callable[[Mapping[str, Array]], Float[Array, ""]]:
         """A function: the logarithm of the probability density of the measurements, up to a constant; without priors.
 
-        For samplers: differentiable, and can be jitted. It takes unknowns as in `sampling`; what is left out stays at
-        its estimate. -inf outside the bounds, and where there is no motion.
+        For samplers: it is differentiable and can be jitted. It takes unknowns as in `sampling`; those left out stay at
+        their estimates. -inf outside the bounds, and where the motion fails.
         """
         found, variance = self.problem.found, self.variance
 
@@ -325,25 +325,25 @@ class Fit:
     def laplace(self) -> Laplace:
         """The normal distribution with the peak and the true second derivatives of `log_posterior`, and its evidence.
 
-        It says where these differ from those of `covariance`, and where there is no peak (with an `lj.FitWarning`).
+        It says where these differ from those behind `covariance`, and where there is no peak (with an `lj.FitWarning`).
 
-        **Raises:** `ValueError` for joined windows, whose starts are no unknowns; `TypeError` where the fit is traced.
+        **Raises:** `ValueError` for joined windows, whose starts are not free; `TypeError` if the fit is traced.
         """
         if self._traced:
-            raise TypeError("laplace() looks at numbers, and this fit is traced.\nFix: call it outside of the program.")
+            raise TypeError("laplace() needs numbers, but this fit is traced.\nFix: call it outside of the program.")
         evaluation = self._evaluated()
         priors = np.isfinite(self.problem.found.sd).sum()
-        apart = self.known().sum() + priors - sum(np.sum(d) for d in evaluation.determined)
-        # A seam takes away an unknown: it shows in the freedom.
-        if self.freedom > apart + 0.5:
+        without_seams = self.known().sum() + priors - sum(np.sum(d) for d in evaluation.determined)
+        # Each joined state removes an unknown, and so raises the freedom.
+        if self.freedom > without_seams + 0.5:
             raise ValueError(
-                "the windows of this fit are joined, and log_likelihood has each with a start of its own.\n"
-                "Fix: lj.fit(system, records, found.params), without window=, from what was found."
+                "the windows of this fit are joined, but log_likelihood gives each a start of its own.\n"
+                "Fix: lj.fit(system, records, found.params), without window=, from these estimates."
             )
-        found = laplace(self.problem, self.unknowns, float(self.variance))
-        if not found.positive_definite:
-            warnings.warn(f"Laplace: {found.caveats[0]}", FitWarning, stacklevel=2)
-        return found
+        approximation = laplace(self.problem, self.unknowns, float(self.variance))
+        if not approximation.positive_definite:
+            warnings.warn(f"Laplace: {approximation.caveats[0]}", FitWarning, stacklevel=2)
+        return approximation
 
     def at_bounds(self) -> list[str]:
         """The names of numbers that ended at a bound."""
@@ -354,17 +354,17 @@ class Fit:
         return [name for name, at in zip(self.names, near) if at]
 
     def save(self, path: str | os.PathLike) -> None:
-        """Write the fit into a file, an npz; `lj.load_fit(path, system)` reads it, bit for bit.
+        """Write the fit into an npz file; `lj.load_fit(path, system)` reads it, bit for bit.
 
-        Functions are not in it: the system, `observe`, and options that hold some. Whoever is stopped while it is
-        written leaves the file of before.
+        Functions are not saved: the system, `observe`, and options that contain functions. An interrupted write leaves
+        the previous file intact.
 
-        **Raises:** `TypeError` for what is no data in `params`, by name; `OSError` where there is no such folder.
+        **Raises:** `TypeError` for values in `params` that are not data, by name; `OSError` if there is no such folder.
         """
         save(self, path)
 
     def plot(self, record: int = 0):
-        """Draw data, fit and residuals of a record, a row each channel; returns a matplotlib `Figure`."""
+        """Draw data, fit and residuals of a record, one row per channel; returns a matplotlib `Figure`."""
         return plot.fits({name: rest for name, *rest in self.channels(record) if rest[0] is not None})
 
     def __repr__(self):
@@ -375,13 +375,13 @@ class Fit:
 
 @partial(compiled, in_numpy=True)
 def _rows(problem: Problem, u: Unknowns):
-    """The plain residuals of all windows."""
+    """The residuals of all windows, without a robust loss."""
     return equations(replace(problem, loss="squares"), u, WHOLE).rows
 
 
 @partial(compiled, in_numpy=True)
-def _of_forgiven_errors(r, known, loss):
-    """The variance of an M-estimate, Huber, Robust Statistics, Eq. (7.6.2)."""
+def _robust_variance(r, known, loss):
+    """The variance of an M-estimate: Huber, *Robust Statistics*, Eq. (7.6.2)."""
     constant, _ = LOSSES[loss]
     half = lambda r: 0.5 * dampened(r, loss) ** 2
     slope = jax.vmap(jax.grad(half))

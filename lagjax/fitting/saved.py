@@ -1,4 +1,4 @@
-"""Fits read from files, with the functions that the user gives again."""
+"""Read fits from files, with the functions that the user passes again."""
 
 import os
 from collections.abc import Callable
@@ -38,43 +38,42 @@ def load_fit(
     **Arguments:**
 
     - `path`: the file.
-    - `system`, `observe`: the system and the function that were fitted, which are not in the file; `options`: those of
-      `lj.fit` that hold functions, as `events=`. They are needed for what asks them: `motion()`, `log_likelihood`,
-      `laplace()`. Without them the estimates, their uncertainties and the residuals are there, and these say what they
-      miss.
+    - `system`, `observe`: the fitted system and function, which are not in the file; `options`: those of `lj.fit` that
+      contain functions, such as `events=`. `motion()`, `log_likelihood` and `laplace()` need them; without them these
+      raise an error that names what is missing, and the estimates, their uncertainties and the residuals are available.
 
     **Returns:** the `Fit`.
 
     **Raises:**
 
-    - `FileNotFoundError` where there is no such file.
-    - `ValueError` for a file that is damaged, of something else, of a newer lagjax, or of another version that keeps
-      fits in another form; for a `system` other than the one that was fitted; for a file in float64 where JAX works in
+    - `FileNotFoundError` if the file does not exist.
+    - `ValueError` for a file that is damaged, holds something else, or was written by a newer lagjax or a version that
+      stores fits in another form; for a `system` other than the fitted one; for a float64 file while JAX works in
       float32.
     - `TypeError` for functions that the fit did not have.
     """
-    said, arrays = files.read(path, "fit")
+    contents, arrays = files.read(path, "fit")
     known = {"system": system, "observe": observe} | {f"options.{name}": x for name, x in options.items()}
     known = {role: x for role, x in known.items() if x is not None}
-    if unknown := sorted(set(known) - set(said["functions"])):
+    if unknown := sorted(set(known) - set(contents["functions"])):
         raise TypeError(
-            f"this fit has no {', '.join(_short(role) for role in unknown)} that would have to be given again.\n"
-            f"It has {', '.join(_short(role) for role in said['functions'])}."
+            f"this fit has no {', '.join(_short(role) for role in unknown)} to be passed again.\n"
+            f"It has {', '.join(_short(role) for role in contents['functions'])}."
         )
     try:
-        placeholder: Any = UnknownSystem(**Reader(arrays).up(said["known"]))
+        placeholder: Any = UnknownSystem(**Reader(arrays).up(contents["known"]))
         if system is not None:
             alike = same_system(system, placeholder, path)
             phase = placeholder.phase
             placeholder = alike if phase is None else replace_fields(alike, first=np.asarray(phase, np.int32))
-        like = Reader(arrays).up(said["q"])
+        like = Reader(arrays).up(contents["q"])
         known |= {"system": placeholder, "unflatten": unflatten_of(kinds(like))}
         known["first"] = placeholder if system is None else first_phase(placeholder)
-        return Reader(arrays, lambda role: known[role] if role in known else NotGiven(_short(role))).up(said["fit"])
+        return Reader(arrays, lambda role: known[role] if role in known else NotGiven(_short(role))).up(contents["fit"])
     except (KeyError, AttributeError, TypeError, IndexError, StopIteration) as error:
         if isinstance(error, TypeError) and "lj.System" in str(error):
             raise
-        files.raise_damaged(path, f"what it says of itself is not whole ({error})", error)
+        files.raise_damaged(path, f"its description is incomplete ({error})", error)
 
 
 def _short(role):

@@ -1,4 +1,4 @@
-"""Fits written into files: all that they are but functions, of which the system's have a signature."""
+"""Write fits into files: everything except functions; a signature identifies those of the system."""
 
 import os
 from typing import Any
@@ -16,9 +16,9 @@ from lagjax.mechanics.written_trees import NotGiven, NotWritable, Writer
 def save(fit, path: str | os.PathLike) -> None:
     """Write a fit into a file: see `Fit.save`."""
     if coordinates.is_traced(fit):
-        raise TypeError("this fit is being traced, and has no numbers yet.\nFix: save it outside of the program.")
+        raise TypeError("this fit is being traced and has no numbers yet.\nFix: save it outside of the program.")
     problem = fit.problem
-    # Of a motion without phases the first system is the system.
+    # Without phases, `first` is the system itself.
     roles = {id(problem.first): "first", id(problem.system): "system", id(problem.unflatten): "unflatten"}
     if problem.observe is not None:
         roles[id(problem.observe)] = "observe"
@@ -26,10 +26,10 @@ def save(fit, path: str | os.PathLike) -> None:
         if isinstance(value, NotGiven) or not _is_data(value):
             roles[id(value)] = f"options.{name}"
     writer = Writer(lambda value: roles.get(id(value)))
-    told = {"fit": writer.down(fit, ""), "known": writer.down(_described(fit), "system")}
-    told["q"] = writer.down(jax.tree.map(np.asarray, problem.unflatten(problem.starts.q.guess[0])), "coordinates")
-    told["functions"] = sorted(set(roles.values()) - {"first", "unflatten"})
-    files.write(path, "fit", told, writer.arrays)
+    contents = {"fit": writer.down(fit, ""), "known": writer.down(_known_of_system(fit), "system")}
+    contents["q"] = writer.down(jax.tree.map(np.asarray, problem.unflatten(problem.starts.q.guess[0])), "coordinates")
+    contents["functions"] = sorted(set(roles.values()) - {"first", "unflatten"})
+    files.write(path, "fit", contents, writer.arrays)
 
 
 def _is_data(value):
@@ -40,7 +40,7 @@ def _is_data(value):
     return True
 
 
-def _described(fit) -> dict[str, Any]:
+def _known_of_system(fit) -> dict[str, Any]:
     system = fit.problem.system
     if isinstance(system, UnknownSystem):
         return {name: getattr(system, name) for name in system.__dataclass_fields__}

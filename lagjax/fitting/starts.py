@@ -1,12 +1,12 @@
-"""Where each run, or window of a run, starts: a guess, and the directions in which the guess may be wrong.
+"""The start of each run, or window of a run: a guess, and the directions in which the start may differ from it.
 
-Without constraints a start is the guess plus its unknown deviations. On constraints it is written in the coordinates of
-the tangent space at the guess,
+Without constraints a start is the guess plus unknown deviations. With constraints it is written in coordinates of the
+tangent space at the guess,
 
     q = q_guess + N s + C c(s, params),        g(t, q, params) = 0,
 
-with the columns of N along the constraints, those of C across them, and c found by Newton's method; neither touches a
-coordinate that is known. Velocities likewise, with `phi(t, q, v, params) = 0`.
+with the columns of N along the constraints, those of C across them, and c found by Newton's method; neither changes a
+known coordinate. Velocities likewise, with `phi(t, q, v, params) = 0`.
 
 Source: Hairer, Lubich & Wanner, *Geometric Numerical Integration*, §IV.5.3 (tangent space parametrization).
 """
@@ -35,20 +35,19 @@ from lagjax.motion.consistent_state import free_coordinates
 from lagjax.motion.integrate import integrate
 from lagjax.numerics.rank import null_space
 
-# Samples from whose parabola position and velocity are read.
+# Position and velocity are read off a parabola through this many samples.
 SAMPLES = 7
-# So many of them agree; what is off by so many times more than these, and by so much of the data's spread, is an
-# outlier.
-# (Samples far apart, along a curve that is no parabola, come to 30 times.)
+# This many of them must agree; a sample is an outlier if it deviates this many times more than these, and by this
+# fraction of the data's spread. (Samples far apart on a curve that is not a parabola reach 30 times.)
 MOST, FAR_OFF, OF_SPREAD = 5, 100.0, 0.3
-# Iterations for c, each with its own matrix; they end where the residual no longer falls.
+# The largest number of Newton iterations for c; they end when the residual no longer falls.
 ITERATIONS = 12
-# Of a guess, what is left of the constraints after that, in displacements relative to the state.
+# The largest violation of the constraints after that, in displacements relative to the state.
 OFF = 1e-6
 
 
 class Chart(NamedTuple):
-    """Directions at a guess: `along` the constraints (n, k), all unknowns of the start, and `across` them (n, r)."""
+    """Directions at a guess: `along` the constraints (n, k), one for each unknown, and `across` them (n, r)."""
 
     guess: Float[Array, " n"]
     along: Float[Array, "n k"]
@@ -61,7 +60,7 @@ class Chart(NamedTuple):
             return y
 
         def step(problem, y):
-            """Towards the constraints; of more equations than directions, the least squares."""
+            """A step towards the constraints; of least squares if there are more equations than directions."""
             rows = jax.jacfwd(lambda y: residual(problem, y))(y) @ self.across
             return -self.across @ jnp.linalg.solve(rows.T @ rows, rows.T @ residual(problem, y))
 
@@ -75,7 +74,7 @@ class Chart(NamedTuple):
 
         start = stopped(y)
         _, near, _ = lax.while_loop(lambda state: (state[0] < ITERATIONS) & state[2], iterate, (0, start, True))
-        # The value of `near`, and by one more step with its matrix kept the derivative of the solution.
+        # The value of `near`; one more step, with a constant matrix, gives the derivative of the solution.
         y = near + (y - start)
         rows = jax.jacfwd(lambda y: residual(fixed, y))(near) @ self.across
         return y - self.across @ jnp.linalg.solve(rows.T @ rows, rows.T @ residual(problem, y))
@@ -89,7 +88,7 @@ class Starts(NamedTuple):
 
     @property
     def unknowns(self) -> int:
-        """How many numbers a window's start has."""
+        """The number of unknowns in a window's start."""
         return self.q.along.shape[-1]
 
     def state(self, s: Float[Array, " k"], system, t, params, unflatten):
@@ -115,17 +114,17 @@ class Starts(NamedTuple):
 def starts(
     system, records: Sequence[Record], windows: Windows, params_of: Callable, options
 ) -> tuple[Starts, Callable]:
-    """The guessed starts of all windows, and the function that makes a pytree of a vector of coordinates."""
+    """The guessed starts of all windows, and the function that turns a vector of coordinates into a pytree."""
     guesses = []
     for r, record in enumerate(records):
         here = np.flatnonzero(windows.record == r)
         first = _guess(system, record, r, params_of(r))
         guesses.append(first)
-        read = [_read_off(record, windows.sample[w][windows.real[w]]) for w in here[1:]]
+        read = [_state_from_samples(record, windows.sample[w][windows.real[w]]) for w in here[1:]]
         structure = jax.tree.structure((first.q, first.v))
-        later = [found for found in read if jax.tree.structure(found) == structure]
+        later = [state for state in read if jax.tree.structure(state) == structure]
         if len(later) < len(read):
-            later = _along_the_motion(system, first, windows.ts[here, 0], options)
+            later = _states_along_motion(system, first, windows.ts[here, 0], options)
         for w, (q, v) in zip(here[1:], later):
             guesses.append(_state(windows.ts[w, 0], q, v, first.params))
     charts = []
@@ -138,7 +137,7 @@ def starts(
 
 
 def _stacked(charts: Sequence[Chart], before: int, k: int) -> Chart:
-    """Charts of one shape; the unknowns of this kind stand after `before` others."""
+    """Charts stacked to one shape; `before` other unknowns precede those of this kind."""
     guesses, n = [chart.guess for chart in charts], len(charts[0].guess)
     along = np.zeros((len(charts), n, k), charts[0].along.dtype)
     across = np.zeros((len(charts), n, max(chart.across.shape[1] for chart in charts)), along.dtype)
@@ -149,7 +148,7 @@ def _stacked(charts: Sequence[Chart], before: int, k: int) -> Chart:
 
 
 def _state(t, q, v, params) -> State:
-    """A state, of numbers where it is made of numbers, also while a program is traced."""
+    """A state; one made of numbers stays numbers, even while a program is traced."""
     if coordinates.is_traced((q, v, params)):
         return coordinates.given_state(t, q, v, params)
     with jax.ensure_compile_time_eval():
@@ -158,14 +157,14 @@ def _state(t, q, v, params) -> State:
 
 
 def _vector(tree):
-    """All coordinates in one vector, of NumPy where they can be looked at."""
+    """All coordinates in one vector, a NumPy array unless they are traced."""
     xp = coordinates.numpy_of(tree)
     return xp.concatenate([xp.ravel(x) for x in jax.tree.leaves(tree)])
 
 
 @lru_cache
 def unflatten_of(of_kinds) -> Callable:
-    """The function that makes coordinates of these `kinds` of a vector."""
+    """The function that turns a vector into coordinates of these `kinds`."""
     structure, *arrays = of_kinds
     with jax.ensure_compile_time_eval():
         return coordinates.flatten(jax.tree.unflatten(structure, [np.zeros(*array) for array in arrays]))[1]
@@ -174,19 +173,19 @@ def unflatten_of(of_kinds) -> Callable:
 def _guess(system, record, r, params) -> State:
     q, v = record.q0, record.v0
     if q is None or v is None:
-        read_q, read_v = _read_off(record, np.arange(len(record.t)))
+        read_q, read_v = _state_from_samples(record, np.arange(len(record.t)))
         q, v = (read_q if q is None else q), (read_v if v is None else v)
         if q is None or v is None:
             raise ValueError(
                 f"record {r} has no guess of its start, and no measured coordinates to read it from.\n"
-                "Fix: lj.Record(..., q0=..., v0=...), alike to the state of lj.integrate."
+                "Fix: lj.Record(..., q0=..., v0=...), in the structure that lj.integrate takes."
             )
         if record.v0 is None and isinstance(q, dict) and isinstance(v, dict):
             v = {name: np.zeros(np.shape(x), jnp.result_type(float)) for name, x in q.items()} | v
     if coordinates.is_traced((q, v, params)):
         if system.constraints:
             raise TypeError(
-                "the start of a constrained system is being traced, and its free directions are read off its values.\n"
+                "the start of a constrained system is being traced, but its free directions depend on its values.\n"
                 "Fix: give q0 and v0 of the record, and params, as numbers; measurements may be traced."
             )
         return _state(record.t[0], q, v, params)
@@ -196,14 +195,14 @@ def _guess(system, record, r, params) -> State:
             remembered(system, (check_functions, kinds(guess)), lambda: check_functions(system, *guess))
         except ValueError as error:
             raise ValueError(
-                f"{error}\nThe start of record {r} was read off what it measures, {listed(list(q))}; a guess of all "
-                "coordinates is lj.Record(..., q0=..., v0=...)."
+                f"{error}\nThe start of record {r} was read off what it measures, {listed(list(q))}; give "
+                "a guess of all coordinates with lj.Record(..., q0=..., v0=...)."
             ) from error
     return guess
 
 
-def _read_off(record, samples):
-    """(q, v) at the first of some samples, from the parabola through the first measured ones; None for what was not."""
+def _state_from_samples(record, samples):
+    """(q, v) at the first of some samples, from parabolas through the first measured ones; None if not measured."""
     t = record.t[samples] - record.t[samples[0]]
 
     def parabolas(kind):
@@ -220,8 +219,8 @@ def _read_off(record, samples):
 def _parabola(t, x, samples):
     """Value and slope at the first of some samples, at t = 0, of a parabola through the first that are not missing.
 
-    Wild values among them do not count: of the parabolas through three samples each, the one to which most others are
-    nearest tells which belong together, and these are fitted.
+    Outliers do not count: among the parabolas through three samples each, the one nearest to most other samples decides
+    which samples agree, and a parabola is fitted to these.
 
     Source: Rousseeuw, *J. Am. Stat. Assoc.* 79 (1984) 871 (least median of squares).
     """
@@ -238,30 +237,30 @@ def _parabola(t, x, samples):
         scale = xp.where(scale > 0, scale, 1.0)
         powers = (t[first] / scale)[:, None] ** np.arange(3)[None]
         near, y = known, xp.where(known, y, 0.0)
-        # Traced, it would be compiled for each window.
+        # Not while tracing, where it would be compiled for each window.
         if count == SAMPLES and xp is np:
             through = xp.linalg.solve(powers[threes], y[threes][..., None])
             off = xp.abs(y - (powers @ through)[..., 0])
             typical = xp.sort(off, axis=1)[:, MOST - 1]
             best = xp.argmin(typical)
             near = known & (~xp.all(known) | (off[best] <= xp.maximum(FAR_OFF * typical[best], far_off)))
-        found = xp.linalg.lstsq(powers * near[:, None], xp.where(near, y, 0.0))[0]
-        values.append(found[0])
-        slopes.append(found[1] / scale)
+        coefficients = xp.linalg.lstsq(powers * near[:, None], xp.where(near, y, 0.0))[0]
+        values.append(coefficients[0])
+        slopes.append(coefficients[1] / scale)
     return tuple(xp.stack(part).reshape(shape) for part in (values, slopes))
 
 
 @lru_cache
 def _threes(count):
-    """All choices of three among so many."""
+    """All choices of three among `count` samples."""
     return np.array(list(combinations(range(count), 3)))
 
 
-def _along_the_motion(system, first, ts, options):
+def _states_along_motion(system, first, ts, options):
     """The states at the starts of a record's later windows, along the motion from its guessed start."""
     known = {name: value for name, value in options.items() if name not in ("event", "events")}
     motion = integrate(system, first.q, first.v, first.params, ts=ts, **(known | {"throw": False}))
-    # Where the guess does not get so far, the start serves as well as anything.
+    # If the motion from the guess does not reach a window, the start replaces the missing state.
     xp = coordinates.numpy_of((motion.q, motion.v, first.q, first.v))
     fill = lambda x, x0: xp.where(xp.isfinite(x), x, x0[None])
     q, v = jax.tree.map(fill, (motion.q, motion.v), (first.q, first.v))
@@ -286,21 +285,21 @@ def _charts(system, s: State, free_q, free_v, r) -> Starts:
             return Starts(_chart(x, of_q, free_q), _chart(u, of_v, free_v))
 
         near = charts(x, u, *_rows(system, s.t, x, u, s.params, unflatten))
-        moved = _moved(near, system, s.t, s.params, unflatten)
+        moved = _move_onto_constraints(near, system, s.t, s.params, unflatten)
         if not moved.holds:
-            found = State(s.t, unflatten(moved.x), unflatten(moved.u), s.params)
+            nearest = State(s.t, unflatten(moved.x), unflatten(moved.u), s.params)
             raise ValueError(
-                f"the start of record {r} cannot be moved onto the constraints: at the best one "
-                f"{departures(system, found, OFF, OFF)}.\n"
-                "Usual cause: a guess too far off, or too much held.\n"
+                f"the start of record {r} cannot be moved onto the constraints: at the nearest state found, "
+                f"{departures(system, nearest, OFF, OFF)}.\n"
+                "Usual cause: a guess too far off, or too many coordinates held.\n"
                 "Fix: q0, v0 = lj.consistent_state(system, t[0], q0, v0, params), and hold less."
             )
-        # The directions are those of the guess after it was moved onto the constraints.
+        # The directions at the guess after it was moved onto the constraints.
         return charts(moved.x, moved.u, moved.of_q, moved.of_v)
 
 
 def _chart(y, rows, free):
-    """The chart at y of equations with these rows, in which only what is free moves."""
+    """The chart at y of equations with these rows; only free entries of y change."""
     rows = np.asarray(rows)[:, free]
     along, across = np.zeros((len(free), int(free.sum()))), np.zeros((len(free), 0))
     if len(rows) and free.any():
@@ -314,7 +313,7 @@ def _chart(y, rows, free):
 
 
 class Moved(NamedTuple):
-    """A guess moved onto the constraints, the rows of these there, and whether it holds them."""
+    """A guess moved onto the constraints, their rows there, and whether it satisfies them."""
 
     x: Float[np.ndarray, " n"]
     u: Float[np.ndarray, " n"]
@@ -324,7 +323,7 @@ class Moved(NamedTuple):
 
 
 @partial(compiled, in_numpy=True)
-def _moved(near: Starts, system, t, params, unflatten) -> Moved:
+def _move_onto_constraints(near: Starts, system, t, params, unflatten) -> Moved:
     nothing = (jnp.zeros(chart.along.shape[1], t.dtype) for chart in near)
     x, u = near.vectors(*nothing, system, t, params, unflatten)
     state = t, unflatten(x), unflatten(u)

@@ -1,4 +1,4 @@
-"""How a fit prints itself: estimates with their uncertainties, residuals, and what the data do not determine."""
+"""The printed table of a fit: estimates with their uncertainties, residuals, and what the data do not determine."""
 
 import jax
 import numpy as np
@@ -10,7 +10,7 @@ from lagjax.mechanics.diagnosis import listed
 def lines_of(fit) -> list[str]:
     """The lines of a fit's table."""
     how = "converged" if bool(fit.rested) else "NOT converged"
-    how += ", and the residuals are NO errors of measurement," if bool(fit.misfit.any) else ""
+    how += ", but the residuals are NOT measurement errors," if bool(fit.misfit.any) else ""
     windows = np.asarray(fit.problem.windows.record)
     lines = [f"Fit: {how} after {int(fit.steps)} steps"]
     tried = int(np.sum(np.isfinite(fit.costs)))
@@ -29,22 +29,22 @@ def lines_of(fit) -> list[str]:
     starts = fit.starts()
     for r, ((q, v), q_sd, v_sd) in enumerate(zip(starts, *fit.start_sd)):
         if r < 4:
-            of = f" of record {r}" if len(starts) > 1 else ""
+            suffix = f" of record {r}" if len(starts) > 1 else ""
             for label, x, sd in (("", q, q_sd), ("v.", v, v_sd)):
                 x, sd = (np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(y)]) for y in (x, sd))
-                told = zip(coordinates.names(q), x, sd)
-                rows += [(f"{label}{name}(0){of}", _plus_minus(a, b), "") for name, a, b in told if b != 0]
+                named = zip(coordinates.names(q), x, sd)
+                rows += [(f"{label}{name}(0){suffix}", _plus_minus(a, b), "") for name, a, b in named if b != 0]
     width, wide = max(len(row[0]) for row in rows) if rows else 0, max((len(row[1]) for row in rows), default=0)
     lines += [f"  {name:<{width}}  {value:<{wide}}  {unit}".rstrip() for name, value, unit in rows]
     if many:
         lines.append(f"  ... and {len(fit.names) - 40} more")
     if windows.max() + 1 < len(windows):
         lines.append(f"  {len(windows)} windows, each from a start of its own")
-    told = ", ".join(f"{name} {value:.3g}" for name, value in fit.rms().items())
+    rms = ", ".join(f"{name} {value:.3g}" for name, value in fit.rms().items())
     size = (
         f"chi2/freedom {float(fit.chi2 / fit.freedom):.3g}" if fit.problem.absolute else f"noise {float(fit.noise):.3g}"
     )
-    lines.append(f"  residuals: rms {told}; {size}, {int(fit.freedom)} degrees of freedom")
+    lines.append(f"  residuals: rms {rms}; {size}, {int(fit.freedom)} degrees of freedom")
     lines += _whiteness(fit)
     lines += ["  " + line for line in (repr(fit.identifiability) if fit.names else "").splitlines()[1:]]
     if at := fit.at_bounds():

@@ -1,6 +1,6 @@
-"""Failures raised at run time, also of a batch in which there is nobody.
+"""Failures raised at run time, including those of an empty batch.
 
-Equinox raises where any lane of a batch fails, with the largest of their codes, and an empty batch has none.
+Equinox raises the largest code of the lanes that fail, and an empty batch has no largest code.
 """
 
 import equinox as eqx
@@ -12,7 +12,7 @@ from lagjax.motion.trajectory import Trajectory
 
 
 def raise_at_run_time(trajectory: Trajectory) -> Trajectory:
-    """The trajectory; where it failed, the program that computes it ends with the message of its result."""
+    """Return the trajectory; if it failed, the program that computes it ends with the message of its result."""
     code = _code_p.bind(jnp.asarray(trajectory.result._value))
     result = eqx.tree_at(lambda result: result._value, trajectory.result, code)
     return result.error_if(trajectory, ~ended_well(result))

@@ -1,7 +1,7 @@
-"""One motion from its start to its end, event or failure: start, diffrax's loop, outputs, result.
+"""Integrate one motion from its start to its end, event or failure: start, diffrax's loop, outputs, result.
 
-Nothing here looks at values: a start that cannot be integrated is refused inside the program, which then ends
-within a few rejected steps, and the lane keeps the reason in its result.
+No Python code here branches on values: a start that cannot be integrated is refused inside the program, which then
+ends within a few rejected steps, and the lane keeps the reason in its result.
 """
 
 from dataclasses import replace
@@ -30,13 +30,13 @@ from lagjax.numerics.runge_kutta import ExplicitRungeKutta
 START_TOLERANCES = 100.0
 # A motion of a hundred periods changes the Jacobi integral by ten to a hundred tolerances.
 DRIFT_TOLERANCES = 1e3
-# The same change times the number of steps is about twenty times the phase that it shifts, in radians: a hundredth.
+# That change times the number of steps is about twenty times the phase shift in radians; 0.01 rad is allowed.
 PHASE_STEPS = 0.2
-# With fixed steps no tolerance says how much is expected.
+# With fixed steps no tolerance says what change to expect.
 FIXED_STEPS_ALLOW = 1e-5
-# What the robust way would say, too.
-THE_SAME = RESULTS.max_steps_reached, RESULTS.start_off_constraints, RESULTS.tolerance_too_small, RESULTS.unordered
-# What diffrax reports, in the words of a motion.
+# Results that the robust solve would give as well.
+UNAFFECTED = RESULTS.max_steps_reached, RESULTS.start_off_constraints, RESULTS.tolerance_too_small, RESULTS.unordered
+# diffrax's results and the names of ours that replace them.
 TRANSLATED = {
     "nonfinite_input": "not_finite",
     "nonlinear_divergence": "unsolved_step",
@@ -45,12 +45,12 @@ TRANSLATED = {
 
 
 def solved(system, q0, v0, params, ts, guards, settings, adjoint, sizes_so_far=None):
-    """The fields of the trajectory of one system, by name, and whether it is settled.
+    """Return the fields of the trajectory of one system by name, with `settled`: whether the robust solve would agree.
 
-    `seen` (2, n): how large coordinates and velocities have been before, where this is not the first leg of a motion.
+    `sizes_so_far` (2, n): the largest coordinates and velocities of the earlier legs, where this is not the first one.
     """
     ours = isinstance(settings.method, (ExplicitRungeKutta, Nystrom))
-    # A condition that asks diffrax evaluates the vector field at the state that it gets, the user's.
+    # A condition for diffrax evaluates the vector field at the state that it gets, which is the user's.
     fast = ours and settings.event is None
     equations = equations_of(system, ts[0], q0, v0, params, fast=fast, fallback=settings.robust)
     if guards is not None and equations.unflatten is not None:
@@ -74,9 +74,9 @@ def solved(system, q0, v0, params, ts, guards, settings, adjoint, sizes_so_far=N
 
 
 class Start(NamedTuple):
-    """The first state, moved onto the constraints, and what speaks against it, by names of `RESULTS`.
+    """The first state, moved onto the constraints; `against`: which reasons to refuse it hold, by names of `RESULTS`.
 
-    `scales`: of the motion, where tolerances are relative to its size.
+    `scales`: those of the motion, if tolerances are relative to its size.
     """
 
     q: PyTree[Float[Array, "..."]]
@@ -87,14 +87,14 @@ class Start(NamedTuple):
 
 
 class Outputs(NamedTuple):
-    """The motion at the outputs and, last, at its end, where nothing is NaN; and which outputs were reached."""
+    """The motion at the outputs and, as the last row, at its end, without any NaN; and which outputs were `reached`."""
 
     motion: Snapshot
     reached: Bool[Array, " T"]
 
 
 def _start(equations: Equations, q, v, ts, settings, sizes_so_far) -> Start:
-    """What speaks against a start comes in rising order: the last of what holds is the result."""
+    """Prepare the start; of the reasons to refuse it, the last one that holds becomes the result."""
     t, off_constraints, holds = ts[0], jnp.asarray(False), jnp.asarray(True)
     if equations.system.constraints:
         tolerances = START_TOLERANCES * settings.rtol, START_TOLERANCES * settings.atol
@@ -122,18 +122,18 @@ def _stepped(equations, start, ts, guards, settings, adjoint) -> Solution:
     y0 = jax.tree.map(lambda x: jnp.where(start.refused, 0.0, x), (start.q, start.v))
     first = State(ts[0], start.q, start.v, equations.params)
     if settings.dt0 is not None:
-        # Where it is not positive the motion is refused; diffrax's own check would end the program.
+        # A motion with dt0 <= 0 is refused; diffrax's own check would end the program.
         settings = replace(settings, dt0=jnp.where(settings.dt0 > 0, settings.dt0, 1.0))
     solution = solution_of(equations, first, y0, start.refused, start.scales, ts, guards, settings, adjoint)
     if solution.located is None:
         return solution
     end = end_of(guards, solution.located, *solution.end)
-    # The step in which the motion ended went on to its own end.
+    # The step in which the event ended the motion goes on beyond the event.
     return solution._replace(end=end, reached=jnp.where(ts <= end[0], solution.reached, jnp.inf))
 
 
 def _outputs(equations, start, solution, ts, settings) -> Outputs:
-    # What was not reached is evaluated at the start and masked afterwards: NaN times zero would poison gradients.
+    # Outputs not reached get the start state and are masked afterwards: NaN times zero would poison gradients.
     reached = jnp.isfinite(solution.reached) & ~start.refused
     states = jax.tree.map(lambda x, x0: jnp.where(_like(reached, x), x, x0[None]), solution.outputs, (start.q, start.v))
     if settings.jump_ts is not None:
@@ -144,12 +144,12 @@ def _outputs(equations, start, solution, ts, settings) -> Outputs:
 
 
 def _result(equations, start, solution, outputs, guards, settings):
-    """The fields of the trajectory: NaN where it did not come, and why."""
+    """The fields of the trajectory: NaN at outputs that it did not reach, and the reason."""
     (motion, reached), located = outputs, solution.located
     result = RESULTS.promote(solution.result)
     for reported, ours in TRANSLATED.items():
         result = RESULTS.where(result == getattr(RESULTS, reported), getattr(RESULTS, ours), result)
-    # An output is a step of its own, and can fail where the steps of the solve did not.
+    # An output is a step of its own, and can fail although the steps of the solve did not.
     known = jnp.all(jnp.isfinite(coordinates.flatten(jax.tree.map(lambda x: x[:-1], (motion.q, motion.v)))[0]))
     regular = equations.are_taken_for_regular
     if regular:
@@ -170,13 +170,13 @@ def _result(equations, start, solution, outputs, guards, settings):
         "tolerance": (settings.rtol, _absolute(stopped((motion.q, motion.v)), start.scales, settings)),
         "scaled_error": _scaled_error(stopped(equations), *stopped((motion.t, motion.q, motion.v)), stats, settings),
         "result": result,
-        "settled": ended_well(result) | _among(result, THE_SAME) if regular else jnp.asarray(True),
+        "settled": ended_well(result) | _among(result, UNAFFECTED) if regular else jnp.asarray(True),
         "events": {} if located is None else by_name(guards, located, motion.t[-1:], ~start.refused),
     }
 
 
 def _absolute(states, scales, settings):
-    """The `atol` that was given; by a motion's own size what was as good as zero on it, (2, n)."""
+    """The given `atol`; or, if tolerances follow the motion's own size, what was as good as zero on it, (2, n)."""
     if scales is None:
         return settings.atol
     sizes = [coordinates.flatten(jax.tree.map(lambda x: jnp.max(jnp.abs(x), axis=0), y))[0] for y in states]
@@ -184,10 +184,10 @@ def _absolute(states, scales, settings):
 
 
 def _scaled_error(equations, t, q, v, stats, settings):
-    """How far what must stay constant has changed at the outputs, in units of what the tolerance lets expect.
+    """The change of quantities that must stay constant, at the outputs, in units of what the tolerance lets expect.
 
-    An error of the Jacobi integral that grows steadily shifts the phase by about its size a radian, so that over very
-    many steps less of it is allowed. With steps that the tolerance does not choose it counts for itself.
+    An error of the Jacobi integral that grows steadily shifts the phase by about its size per radian, so over very
+    many steps less of it is allowed. If the tolerance does not choose the steps, only the change itself counts.
     """
     system, params, drift, residual = equations.system, equations.params, jnp.zeros_like(t[0]), jnp.zeros_like(t[0])
     if conserves_jacobi_integral(system, t[0], *jax.tree.map(lambda x: x[0], (q, v)), params):

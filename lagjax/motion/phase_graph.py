@@ -1,4 +1,4 @@
-"""What `lj.explain` says of a motion in phases: the graph of its phases, and each of them."""
+"""What `lj.explain` says of a motion in phases: the graph of the phases, and each phase."""
 
 from dataclasses import dataclass
 
@@ -10,12 +10,12 @@ from lagjax.mechanics.multipliers import accelerations
 
 @dataclass(frozen=True, repr=False)
 class HybridExplanation:
-    """What a hybrid amounts to at one state; it prints itself, and draws its graph.
+    """The explanation of a hybrid system at one state; it prints itself and draws its graph.
 
     - `phases`: by name, the `Explanation` of each phase.
-    - `switches`: of each switch the phase that it ends, those to which it leads, what its guard is called, and the
-      value of the guard at the state; None where the state is none of that phase.
-    - `unreachable`: phases to which no switch leads, but the first. `final`: phases that none leaves.
+    - `switches`: for each switch the phase that it ends, the phases to which it leads, the name of its guard, and the
+      value of the guard at the state; None if the state does not belong to that phase.
+    - `unreachable`: phases to which no switch leads, except the first. `final`: phases that no switch leaves.
 
     >>> import lagjax as lj
     >>> ball = lj.System(lambda t, q, v, params: 0.5 * v**2 - 10.0 * q)
@@ -57,7 +57,7 @@ class HybridExplanation:
 
 
 def explained(hybrid: Hybrid, phases: dict, state: State) -> HybridExplanation:
-    """The explanation of a hybrid from those of its phases at a state."""
+    """Build the explanation of a hybrid from the explanations of its phases at a state."""
     at = {name: _multipliers(system, phases[name], state) for name, system in zip(hybrid.names, hybrid.systems)}
     switches = []
     for switch in hybrid.switches:
@@ -74,7 +74,7 @@ def explained(hybrid: Hybrid, phases: dict, state: State) -> HybridExplanation:
 
 
 def _multipliers(system, explanation, state):
-    """The multipliers of a phase, where the state is one of it."""
+    """The multipliers of a phase; None if the state does not belong to it."""
     if explanation.problem or any(label == "off the constraints" for label, _ in explanation.rows):
         return None
     return accelerations(system, *state)[1] if system.constraints else {}

@@ -1,4 +1,4 @@
-"""What is known of guards: at a time, between two times at which the motion is known, and so far.
+"""What is known of the guards: at one time, between two times at which the motion is known, and since the start.
 
 See `watching.py` for how they are used, and for the source.
 """
@@ -10,14 +10,14 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-# Where an interval is parted. Not in the middle: half a period after an extremum there is another one.
+# Where an interval is divided; not in the middle, since half a period after an extremum there is another one.
 SHARES = (0.0, 0.45, 1.0)
 PIECES, INNER = len(SHARES) - 1, SHARES[1:-1]
-# What a cubic over the whole interval leaves out of a guard, times this, is what those over its pieces may leave out.
+# The cubics over the pieces may miss this part of what a cubic over the whole interval misses of a guard.
 BENT = 0.5
-# A start on a guard is flat if its rate alone makes less than this part of what the guard is at the next node.
+# A start on a guard is flat if the guard's rate there explains less than this part of its value at the next node.
 FLAT = 1e-3
-# The polynomials that weigh (q0, h v0, h² a0, h² a1, h v1, q1), and of a cubic (x0, h dx0, h dx1, x1).
+# Polynomials that multiply (q0, h v0, h² a0, h² a1, h v1, q1) and, in a cubic, (x0, h dx0, h dx1, x1).
 QUINTIC = np.array([
     [1, 0, 0, -10, 15, -6], [0, 1, 0, -6, 8, -3], [0, 0, 0.5, -1.5, 1.5, -0.5],
     [0, 0, 0, 0.5, -1, 0.5], [0, 0, 0, -4, 7, -3], [0, 0, 0, 10, -15, 6],
@@ -26,7 +26,7 @@ CUBIC = np.array([[1, 0, -3, 2], [0, 1, -2, 1], [0, 0, -1, 1], [0, 0, 3, -2]])
 
 
 class Value(NamedTuple):
-    """A guard at a time: its value, its rate, what of the value is rounding; whether it is known to turn there."""
+    """A guard at a time: its value, its rate, the round-off of its value, and whether it is known to turn there."""
 
     g: Float[Array, ""]
     rate: Float[Array, ""]
@@ -44,7 +44,7 @@ class Node(NamedTuple):
 
 
 class Followed(NamedTuple):
-    """What is known of one guard so far: its sign, 0 if not known yet; its crossings; whether some may be missing."""
+    """One guard so far: its sign (0 if not known yet), its number of crossings, and whether some may be missing."""
 
     sign: Float[Array, ""]
     count: Int[Array, ""]
@@ -52,8 +52,10 @@ class Followed(NamedTuple):
 
 
 class Root(NamedTuple):
-    """A crossing of a `guard` (-1: none) between two times, with the sign after it; where it may be; and, where a root
-    of another guard was found first that is not the first one, the time of that."""
+    """A crossing of a `guard` (-1: none) between `low` and `high`, with the sign `after` it and a `guess` of its time.
+
+    `before`: if the root of another guard was found, which is not the first root, the time of that one.
+    """
 
     guard: Int[Array, ""]
     low: Float[Array, ""]
@@ -64,12 +66,12 @@ class Root(NamedTuple):
 
 
 class Part(NamedTuple):
-    """The step under way, of which parts are taken where it is `parted`: its end, and what the wrapped controller said
-    comes then: the end of the next one, and whether there is a jump between the two.
+    """The step under way, which is taken in parts if it is `parted`.
 
-    `looks`: how often it was looked into. The guard `asked` (-1: none) is believed to have an extremum where the part
-    ends, with this `curvature`. `tries`: for it, or for the `root` that is sought; and how far the last one `moved`.
-    `turns`: the guards that are known to turn at the time `turns_at`.
+    `until`: its end; `following`: the end of the next step, as the wrapped controller chose it, and `jumps`: whether
+    there is a jump between the two. `looks`: how often the step was looked into. `asked`: the guard (-1: none) expected
+    to have an extremum where the part ends, with this `curvature`. `tries`: attempts to find that extremum or the
+    `root`; `moved`: how far the last one moved. `turns`: the guards that are known to turn at the time `turns_at`.
     """
 
     parted: Bool[Array, ""]
@@ -87,10 +89,10 @@ class Part(NamedTuple):
 
 
 class Watched(NamedTuple):
-    """What is known up to the end of the last part of a step; nothing yet where not `begun`.
+    """What is known up to the end of the last part of a step; nothing yet unless `begun`.
 
-    The acceleration and the guards there; each guard so far; the crossings, S in all: times, NaN where there is none
-    yet, and states; and the step under way.
+    `a`, `values`: the acceleration and the guards there; `followed`: each guard so far; `t`, `y`: the times and states
+    of the crossings, S in all, NaN for those still to come; `part`: the step under way.
     """
 
     begun: Bool[Array, ""]
@@ -104,7 +106,7 @@ class Watched(NamedTuple):
 
 class Pieces(NamedTuple):
     """One guard between two nodes: values and rates at all nodes, and whether the rates are `known`; the signs at all
-    nodes but the first, 0 where not known; which pieces are in `doubt`."""
+    nodes except the first, 0 if not known; which pieces are in `doubt`."""
 
     g: list
     rate: list
@@ -114,7 +116,7 @@ class Pieces(NamedTuple):
 
 
 def pieces_of(begin: Value, inner, off, end: Value, h, touches) -> Pieces:
-    """The pieces of an interval of length h, between exact ends; inner nodes (value, rate) are `off` by so much.
+    """The pieces of an interval of length h between exact ends; `off`: the errors of the inner nodes (value, rate).
 
     A piece that comes nearer to zero than `touches` is not clear.
     """
@@ -123,11 +125,11 @@ def pieces_of(begin: Value, inner, off, end: Value, h, touches) -> Pieces:
     rate = [jnp.where(v.turns, 0.0, v.rate) for v in (begin, end)]
     rate = [rate[0], *(x for _, x in inner), rate[1]]
     error = [zero, *(x for x, _ in off), zero]
-    # An end is known to all digits: where its rate is zero, it turns there.
+    # The ends are known to all digits: a guard whose rate is zero there turns there.
     known = [yes, *(jnp.abs(dx) > d for (_, dx), (_, d) in zip(inner, off)), yes]
     sign = [jnp.where(jnp.abs(x) > e, jnp.sign(x), 0.0) for x, e in zip(g, error)]
     sign[-1] = jnp.where(jnp.abs(end.g) > end.noise, sign[-1], 0.0)
-    way = [jnp.sign(x) for x in rate]
+    rate_sign = [jnp.sign(x) for x in rate]
     monotone, direction, doubt = [], [], []
     bent = BENT * _bend(g, rate, h)
     for i in range(PIECES):
@@ -137,17 +139,17 @@ def pieces_of(begin: Value, inner, off, end: Value, h, touches) -> Pieces:
         lowest = jnp.minimum(jnp.minimum(one, two), jnp.minimum(three, four))
         highest = jnp.maximum(jnp.maximum(one, two), jnp.maximum(three, four))
         clear = (lowest > largest) | (highest < -largest)
-        direction.append(jnp.sign(way[i] + way[i + 1]))
-        same = known[i] & known[i + 1] & (direction[i] != 0) & (way[i] * way[i + 1] >= 0)
+        direction.append(jnp.sign(rate_sign[i] + rate_sign[i + 1]))
+        same = known[i] & known[i + 1] & (direction[i] != 0) & (rate_sign[i] * rate_sign[i + 1] >= 0)
         rises = (three - two) * direction[i] >= bent
         if i == 0:
-            # From the guard itself without speed, as t³ does, no polygon rises.
+            # No polygon rises from a start on the guard at rate zero, as t³ has.
             flat = (jnp.abs(one) <= begin.noise) & (third * jnp.abs(rate[0]) <= FLAT * jnp.abs(four))
             rises = rises | (flat & (sign[1] == direction[0]))
         monotone.append(same & rises)
         doubt.append(~(clear | monotone[i]))
     for i in range(1, PIECES):
-        # Where one run ends and another begins, the sign must be known; not inside a run.
+        # The sign must be known where one monotone run ends and another begins, but not inside a run.
         inside = monotone[i - 1] & monotone[i] & (direction[i - 1] == direction[i])
         unknown = (sign[i] == 0) & ~inside
         doubt[i - 1], doubt[i] = doubt[i - 1] | unknown, doubt[i] | unknown
@@ -155,7 +157,7 @@ def pieces_of(begin: Value, inner, off, end: Value, h, touches) -> Pieces:
 
 
 def _bend(g, rate, h):
-    """How far a guard and its rate at the inner nodes are from the cubic through both ends: what that leaves out."""
+    """How far a guard and its rate at the inner nodes are from the cubic through both ends."""
     off = jnp.zeros_like(h)
     ends = g[0], h * rate[0], h * rate[-1], g[-1]
     for x, dx, share in zip(g[1:-1], rate[1:-1], INNER):
@@ -167,7 +169,7 @@ def _bend(g, rate, h):
 
 
 def between(left: Node, right: Node, h):
-    """(state, acceleration) at the inner nodes: by the quintic; and by the cubics through (q, v) and (v, a)."""
+    """(state, acceleration) at the inner nodes, by the quintic, and by the cubics through (q, v) and (v, a)."""
     (q0, v0), (q1, v1), a0, a1 = left.y, right.y, left.a, right.a
     inverse = 1 / jnp.where(h > 0, h, 1.0)
     scaled = lambda c, x: jtu.tree_map(lambda x: c * x, x)
@@ -189,7 +191,7 @@ def between(left: Node, right: Node, h):
 
 
 def first_root(kinds, times, of_guards, signs, crosses) -> Root:
-    """The first of the crossings that are wanted, of all guards; `crosses`: at which nodes each has another sign."""
+    """The first wanted crossing of all guards; `crosses`: the nodes at which the sign of each guard changes."""
     infinite = jnp.full_like(times[0], jnp.inf)
     start = times[0], of_guards[0].g[0], of_guards[0].rate[0]
     guard, at, begin, end, after = jnp.asarray(-1), infinite, start, start, jnp.zeros_like(infinite)
@@ -202,13 +204,13 @@ def first_root(kinds, times, of_guards, signs, crosses) -> Root:
             sooner = wanted & (secant < at)
             found, before = (jnp.asarray(i), secant, since, node, new), (guard, at, begin, end, after)
             guard, at, begin, end, after = jtu.tree_map(lambda x, y: jnp.where(sooner, x, y), found, before)
-            # From a node whose sign is known.
+            # Secants start from the last node whose sign is known.
             since = tuple(jnp.where(new != 0, x, y) for x, y in zip(node, since))
     return Root(guard, begin[0], end[0], after, root_of_cubic(begin, end), infinite)
 
 
 def root_of_cubic(begin, end):
-    """Where the cubic through two (t, g, dg/dt) is zero."""
+    """The time at which the cubic through two (t, g, dg/dt) is zero."""
     (t0, g0, rate0), (t1, g1, rate1) = begin, end
     h = t1 - t0
     c1, c2, c3 = h * rate0, 3 * (g1 - g0) - h * (2 * rate0 + rate1), 2 * (g0 - g1) + h * (rate0 + rate1)
@@ -220,12 +222,12 @@ def root_of_cubic(begin, end):
 
 
 def changes(sign, signs):
-    """At which nodes a known sign is another than the one known last, which is `sign` to begin with."""
-    found = []
+    """The nodes at which a known sign differs from the last known one, which is `sign` at first."""
+    changed = []
     for there in signs:
-        found.append((there != 0) & (sign != 0) & (there != sign))
+        changed.append((there != 0) & (sign != 0) & (there != sign))
         sign = jnp.where(there != 0, there, sign)
-    return found
+    return changed
 
 
 def last_known(sign, signs):
@@ -236,7 +238,7 @@ def last_known(sign, signs):
 
 
 class Next(NamedTuple):
-    """Where to look next, see `Search`; or which guards are found to turn at an end that is known."""
+    """Where to look `at` next, if `needed`, for which guard (`asked`); or which guards turn at an end that is known."""
 
     needed: Bool[Array, ""]
     at: Float[Array, ""]
@@ -247,7 +249,7 @@ class Next(NamedTuple):
 
 
 def next_node(left_end: Node, right_end: Node, times, of_guards, resolution) -> Next:
-    """Where to look for the first guard in doubt, in its first piece in doubt: at the extremum, or halfway."""
+    """Where to look next for the first guard in doubt, in its first piece in doubt: at the extremum, or halfway."""
     none, halfway = jnp.asarray(False), left_end.t + 0.5 * (right_end.t - left_end.t)
     found = Next(jnp.asarray(True), halfway, jnp.asarray(-1), jnp.ones_like(halfway), (), ())
     turns_left, turns_right = [none] * len(of_guards), [none] * len(of_guards)
@@ -258,7 +260,7 @@ def next_node(left_end: Node, right_end: Node, times, of_guards, resolution) -> 
             left, right, length = p.rate[j], p.rate[j + 1], times[j + 1] - times[j]
             turning = mine & p.known[j] & p.known[j + 1] & (left * right < 0)
             at = times[j] + length * left / jnp.where(turning, left - right, 1.0)
-            # An extremum at an end that is known is that end.
+            # An extremum within the resolution of a known end is that end.
             at_left = turning & (at - left_end.t <= resolution)
             at_right = turning & ~at_left & (right_end.t - at <= resolution)
             turns_left[i], turns_right[i] = turns_left[i] | at_left, turns_right[i] | at_right

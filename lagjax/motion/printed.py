@@ -1,4 +1,4 @@
-"""What a trajectory prints: its method, result, cost and error, and the shapes of its outputs."""
+"""The printed form of a trajectory: its method, result, cost and error, and the shapes of its outputs."""
 
 import jax
 import numpy as np
@@ -8,7 +8,7 @@ from lagjax.motion.results import ENDED_WELL, is_among, item, message
 
 
 def lines(traj) -> list[str]:
-    """The lines of one motion."""
+    """The printed lines of one motion."""
     rows = [
         ("method", f"{traj.static.method}, rtol {_pair(traj.tolerance[0])}, atol {_absolute(traj.tolerance[1])}"),
         ("result", message(traj.result) + _ended(traj)),
@@ -38,7 +38,7 @@ def _absolute(atol):
 
 
 def batch_lines(traj, lanes) -> list[str]:
-    """The lines of a batch of this shape."""
+    """The printed lines of a batch; `lanes`: its shape."""
     values, counts = np.unique(np.asarray(traj.result._value), return_counts=True)
     words = [f"{n} {message(item(traj.result, v))}" for v, n in zip(values, counts)]
     steps, drifted = np.asarray(traj.stats["num_steps"]), int(np.sum(np.asarray(traj.scaled_error) > 1))

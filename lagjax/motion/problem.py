@@ -1,4 +1,4 @@
-"""The questions that `integrate` asks of its arguments before it starts, in the user's words."""
+"""The checks that `integrate` makes of its arguments before it starts, with messages in the user's terms."""
 
 from functools import lru_cache
 from typing import Any
@@ -20,28 +20,28 @@ from lagjax.motion.replay import Replay
 from lagjax.motion.results import RESULTS
 from lagjax.motion.trajectory import AccuracyWarning
 
-# Tolerances that each dtype reaches with room to spare.
+# Tolerances that each dtype reaches with a margin.
 DEFAULT_TOLERANCE = {np.dtype("float64"): 1e-9, np.dtype("float32"): 1e-5}
-# How methods are called by where they come from.
+# The prefix with which a user writes a method, by the package that defines it.
 PACKAGES = {"diffrax": "diffrax.", "lagjax": "lj."}
-# Starts that cannot be integrated, whose reason is in the equations.
+# Results of starts that cannot be integrated for a reason in the equations.
 REFUSED = (RESULTS.start_not_finite, RESULTS.start_singular, RESULTS.contradictory)
 
 
 def check_method(method: Any):
-    """Raise where `method` is neither None nor an instance of a diffrax solver for a whole state."""
+    """Raise unless `method` is None or an instance of a diffrax solver for a whole state."""
     if method is None:
         return
     if isinstance(method, type) and issubclass(method, diffrax.AbstractSolver):
         raise TypeError(
             f"method must be a solver instance, and {method.__name__} is the class.\n"
-            "Usual cause: the brackets left out.\n"
+            "Usual cause: missing brackets.\n"
             f"Fix: method={PACKAGES.get(method.__module__.split('.')[0], '')}{method.__name__}()."
         )
     if not isinstance(method, diffrax.AbstractSolver):
         raise TypeError(
             f"method must be a diffrax solver, not {type(method).__name__}.\n"
-            "Usual cause: a method by its name, as in SciPy.\n"
+            "Usual cause: a method given by its name, as in SciPy.\n"
             "Fix: method=lj.Dopri8(), any of diffrax's, or leave it out."
         )
     if method.term_structure is not diffrax.AbstractTerm:
@@ -52,22 +52,22 @@ def check_method(method: Any):
 
 
 def check_adjoint(adjoint: Any, drift: str, jump_ts: Any, recorded: bool):
-    """Raise where an adjoint cannot follow the motion; `recorded`: whether its steps can be, by lagjax."""
+    """Raise if an adjoint cannot differentiate the motion; `recorded`: whether lagjax can record its steps."""
     if adjoint is not None and not isinstance(adjoint, diffrax.AbstractAdjoint | Replay):
         raise TypeError(
             f"adjoint must be lj.Replay() or an adjoint of diffrax, not {_kind(adjoint)}.\n"
-            "Usual cause: the brackets left out, or an adjoint by its name.\n"
+            "Usual cause: missing brackets, or an adjoint given by its name.\n"
             "Fix: leave adjoint out (both modes then work), or adjoint=diffrax.RecursiveCheckpointAdjoint()."
         )
     if isinstance(adjoint, Replay) and adjoint.memory is not None and not recorded:
         raise ValueError(
-            "the memory of lj.Replay is for a record of steps, which is not kept with a stepsize_controller, a "
-            "condition for diffrax in event, or progress: diffrax's own checkpoints are reverse mode there.\n"
+            "lj.Replay(memory=...) limits a record of steps, and none is kept with a stepsize_controller, a condition "
+            "for diffrax in event, or progress: reverse mode then uses diffrax's own checkpoints.\n"
             "Fix: leave these out; or adjoint=diffrax.RecursiveCheckpointAdjoint(checkpoints=100)."
         )
     if isinstance(adjoint, diffrax.BacksolveAdjoint) and jump_ts is not None:
         raise ValueError(
-            "BacksolveAdjoint goes back over the motion with steps of its own, which do not end at jump_ts.\n"
+            "BacksolveAdjoint integrates backwards with steps of its own, which do not end at jump_ts.\n"
             "Fix: leave adjoint out (both modes then work)."
         )
     if isinstance(adjoint, diffrax.BacksolveAdjoint) and drift == "project":
@@ -78,7 +78,7 @@ def check_adjoint(adjoint: Any, drift: str, jump_ts: Any, recorded: bool):
 
 
 def check_max_steps(max_steps: Any):
-    """Raise where the largest number of steps is none."""
+    """Raise unless max_steps is None or a positive whole number."""
     if max_steps is None or isinstance(max_steps, int | np.integer) and max_steps > 0:
         return
     raise ValueError(
@@ -93,7 +93,7 @@ def _kind(thing):
 
 
 def check_drift(drift: Any, system: System | Hybrid) -> str:
-    """The drift control to use; raise where it is unknown."""
+    """Return the drift control to use; raise if it is unknown."""
     constrained = any(phase.constraints for phase in phases_of(system))
     if drift is None:
         return "project" if constrained else "none"
@@ -105,13 +105,13 @@ def check_drift(drift: Any, system: System | Hybrid) -> str:
 
 
 def check_controller(controller: Any, max_step: Any, jump_ts: Any):
-    """Raise where steps are to be limited that a controller of the user's chooses."""
+    """Raise if the user's stepsize_controller is no controller, or max_step or jump_ts are given beside it."""
     if controller is None:
         return
     if not isinstance(controller, diffrax.AbstractStepSizeController):
         raise TypeError(
             f"stepsize_controller must be a controller of diffrax, not {_kind(controller)}.\n"
-            "Usual cause: the brackets left out, or a controller by its name.\n"
+            "Usual cause: missing brackets, or a controller given by its name.\n"
             "Fix: leave it out, or stepsize_controller=diffrax.PIDController(rtol=1e-9, atol=1e-9)."
         )
     for name, given, fix in (
@@ -120,13 +120,13 @@ def check_controller(controller: Any, max_step: Any, jump_ts: Any):
     ):
         if given is not None:
             raise ValueError(
-                f"{name} is for lagjax's own choice of steps, and stepsize_controller replaces that.\n"
+                f"{name} limits the steps that lagjax chooses, and stepsize_controller replaces that choice.\n"
                 f"Fix: leave stepsize_controller out, or {fix}."
             )
 
 
 def vector_of_times(ts: Any):
-    """`ts` as an array of two or more numbers, or an error."""
+    """Return `ts` as an array of two or more numbers, or raise."""
     given, ts = ts, coordinates.numpy_of(ts).asarray(ts)
     real = jnp.issubdtype(ts.dtype, jnp.floating) or jnp.issubdtype(ts.dtype, jnp.integer)
     if real and ts.ndim == 1 and not isinstance(ts.shape[0], int):
@@ -135,17 +135,17 @@ def vector_of_times(ts: Any):
             "Fix: as many times as are ever needed, jax.ShapeDtypeStruct((1000,), float)."
         )
     if not real or ts.ndim != 1 or len(ts) < 2:
-        of = f"has shape {ts.shape}" if real else f"is {given!r:.60}"
+        actual = f"has shape {ts.shape}" if real else f"is {given!r:.60}"
         raise ValueError(
-            f"ts must be a vector of at least two times, and {of}.\n"
-            "Usual cause: the last time alone; the motion starts at ts[0] with (q0, v0).\n"
+            f"ts must be a vector of at least two times, and {actual}.\n"
+            "Usual cause: only the last time was given; the motion starts at ts[0] with (q0, v0).\n"
             "Fix: ts=jnp.linspace(0.0, 10.0, 101)."
         )
     return ts
 
 
 def times(ts: Any, dtype):
-    """A vector of times as an increasing or decreasing one of `dtype`, or an error."""
+    """Return a vector of times in `dtype`; raise unless it increases or decreases throughout."""
     ts = ts.astype(dtype)
     if not coordinates.is_traced(ts):
         if not np.all(np.isfinite(ts)):
@@ -155,7 +155,7 @@ def times(ts: Any, dtype):
         if wrong.any():
             i = int(np.argmax(wrong))
             raise ValueError(
-                f"ts must {'decrease' if backward else 'increase'} throughout, as from its first time to its last, and "
+                f"ts must {'decrease' if backward else 'increase'} throughout, as from its first time to its last, but "
                 f"ts[{i + 1}] = {float(ts[i + 1]):.9g} follows ts[{i}] = {float(ts[i]):.9g}.\n"
                 "Usual cause: times out of order, a repeated time, or times closer than "
                 f"{dtype} can tell apart.\n"
@@ -165,28 +165,28 @@ def times(ts: Any, dtype):
 
 
 def step_length(value: Any, name: str, dtype):
-    """`dt0` or `max_step` as a number of `dtype`, or an error where it is not positive; None where it is not given."""
+    """Return `dt0` or `max_step` as a number of `dtype`, or None if not given; raise unless it is positive."""
     if value is None:
         return None
     if not coordinates.is_traced(value) and not (_is_number(value) and float(value) > 0):
         fixed = ", or with fixed steps dt0=1e-3 for example" if name == "dt0" else ", or max_step=0.1 for example"
         raise ValueError(
             f"{name} must be one positive number, not {value!r}.\n"
-            "Usual cause: a step against the time; it is a length also where ts decreases.\n"
+            "Usual cause: a negative step where ts decreases; it is a length in both directions.\n"
             f"Fix: leave {name} out{fixed}."
         )
     return coordinates.numpy_of(value).asarray(value, dtype)
 
 
 def jumps(jump_ts: Any, dtype):
-    """The times at which a force jumps, (J,) of `dtype`, or an error; None where there are none."""
+    """Return the times at which a force jumps, (J,) of `dtype`, or None without any; raise unless they are a vector."""
     if jump_ts is None:
         return None
     jump_ts = jnp.stack([*jump_ts]) if _holds_traced(jump_ts) else jump_ts
     kind, shape = (jump_ts if hasattr(jump_ts, "dtype") else np.asarray(jump_ts)).dtype, np.shape(jump_ts)
     if len(shape) > 1 or not np.issubdtype(kind, np.number) or np.issubdtype(kind, np.complexfloating):
         raise ValueError(
-            f"jump_ts must be a vector of times, and is of {kind} and shape {shape}.\n"
+            f"jump_ts must be a vector of times, and has dtype {kind} and shape {shape}.\n"
             "Fix: jump_ts=jnp.array([50.25, 50.35]), the times at which the force jumps or has a kink."
         )
     if not coordinates.is_traced(jump_ts) and not np.all(np.isfinite(jump_ts)):
@@ -203,16 +203,16 @@ def _holds_traced(times):
 
 
 def tolerance(value: Any, name: str, dtype):
-    """A tolerance for coordinates and one for velocities, (2,) of `dtype`, or an error where it cannot be reached."""
+    """Return the tolerances of coordinates and of velocities, (2,) of `dtype`; raise if `dtype` cannot reach them."""
     dtype = np.dtype(dtype)
     value = DEFAULT_TOLERANCE.get(dtype, 1e-2) if value is None else value
     if isinstance(value, (tuple, list)) and coordinates.is_traced(value):
         value = jnp.stack([jnp.asarray(x, dtype) for x in value])
     is_text = isinstance(value, str) or not isinstance(value, jax.Array) and np.asarray(value).dtype.kind not in "fiu"
     if is_text or np.ndim(value) and np.shape(value) != (2,):
-        of = f"is {value!r:.40}" if is_text else f"has shape {np.shape(value)}"
+        actual = f"is {value!r:.40}" if is_text else f"has shape {np.shape(value)}"
         raise ValueError(
-            f"{name} must be one number, or two: for coordinates and for velocities. It {of}.\n"
+            f"{name} must be one number, or two: for coordinates and for velocities. It {actual}.\n"
             f"Fix: {name}=1e-9, or {name}=(1e-9, 1e-6)."
         )
     if coordinates.is_traced(value):
@@ -241,14 +241,14 @@ def _check_tolerance(value, name, dtype):
 
 
 def check_finite(s: State):
-    """Raise where a coordinate or velocity of the initial state is not finite."""
+    """Raise if a coordinate or velocity of the initial state is not finite."""
     for which, tree in (("q0", s.q), ("v0", s.v)):
         values = np.asarray(coordinates.flatten(tree)[0])
         for name, value in zip(coordinates.names(tree), values):
             if not np.isfinite(value):
                 raise ValueError(
                     f"coordinate '{name}' of {which} is {value}.\n"
-                    "Usual cause: a division by zero, or a measurement that is missing.\n"
+                    "Usual cause: a division by zero, or a missing measurement.\n"
                     "Fix: start from finite numbers."
                 )
 
@@ -264,14 +264,14 @@ def off_constraints(system: System, s: State, rtol, atol) -> str:
             "Fix: look at lj.constraint_residual(system, ts[0], q0, v0, params), and at params."
         )
     return (
-        f"the initial state is off the constraints: {violated}, where 0 is asked.\n"
+        f"the initial state is off the constraints: {violated}, which must be 0.\n"
         "Usual cause: a coordinate or velocity computed for other parameters, or rounded.\n"
         "Fix: q0, v0 = lj.consistent_state(system, ts[0], q0, v0, params) for a consistent state near it."
     )
 
 
 def warn_of_inaccuracy(trajectory):
-    """Warn where the error, or the change of something that must stay, is more than the tolerance lets expect."""
+    """Warn if the error, or the change of a constant of the motion, exceeds what the tolerance lets expect."""
     if float(trajectory.scaled_error) <= 1:
         return
     estimated = trajectory.error is not None and account_of(trajectory) is not None
@@ -284,8 +284,8 @@ def _of_drift(trajectory):
     span, steps = abs(float(trajectory.end.t - trajectory.t[0])), int(trajectory.stats["num_accepted_steps"])
     off = f", and a constraint is off by {float(trajectory.residual()):.1g}" if trajectory.system.constraints else ""
     return (
-        f"over a time of {span:.6g} ({steps} steps) the Jacobi integral, which should stay, changed by {drift:.1g} of "
-        f"its size{off}, at rtol = {rtol:.1g}.\n"
+        f"over a time of {span:.6g} ({steps} steps) the Jacobi integral, which should stay constant, changed by "
+        f"{drift:.1g} of its size{off}, at rtol = {rtol:.1g}.\n"
         "Usual cause: a span of very many periods, over which small errors add up, an unstable motion, steps that are "
         "too long, or round-off (float32, or a tolerance near its limit).\n"
         "Fix: a tighter rtol and atol (in float64), a method of higher order, or a shorter span."

@@ -1,4 +1,4 @@
-"""Crossings that are recorded through all legs of a motion in phases."""
+"""The crossings recorded over all legs of a motion in phases."""
 
 import jax
 import jax.numpy as jnp
@@ -7,7 +7,7 @@ from lagjax.motion.crossings import Crossings, Guards
 
 
 def nothing(guards: Guards | None, names, q, v, multipliers) -> dict[str, Crossings]:
-    """The events of these names before there is any crossing; `multipliers`: NaN, of all phases."""
+    """The events of these names before any crossing; `multipliers`: those of all phases, NaN."""
     room = {kind.name: kind.most for kind in (() if guards is None else guards.kinds)}
 
     def none(most):
@@ -19,7 +19,7 @@ def nothing(guards: Guards | None, names, q, v, multipliers) -> dict[str, Crossi
 
 
 def with_those_of(leg: dict[str, Crossings], before: dict[str, Crossings]) -> dict[str, Crossings]:
-    """The crossings before a leg, and those of the leg after them."""
+    """Append the crossings of a leg to the earlier ones."""
     return {name: _joined(found, leg[name]) for name, found in before.items()}
 
 

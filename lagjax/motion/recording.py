@@ -1,14 +1,14 @@
-"""A loop over steps that keeps a record of those it accepts, in a room of fixed size.
+"""A loop over steps that records the accepted ones in arrays of fixed size.
 
-Reverse mode asks for the accepted steps from the last to the first. How many there are is known when the motion is
-over, and arrays have a size before that. So the last steps are kept in full, in so many rows, each by its two times and
-the state that it starts from; and of the first of every so many steps all that the loop depends on (a `Place`), from
-which the loop can be run again to fill the rows with the steps before the last. When the room for places is used up
-every other one is given up, and from then on they are kept half as often. The longest motions are so run again in
-pieces, some of them more than once (up to as many steps as rows times places: each once), and memory stays what it is.
+Reverse mode needs the accepted steps from the last to the first. Their number is known only when the motion is over,
+but arrays need their size before that. So the last steps are kept in full, one row each: its two times and the state
+that it starts from. In addition, before the first of every so many steps, all that the loop depends on is kept: a
+checkpoint (`Place`), from which the loop can run again to fill the rows with earlier steps. When the room for
+checkpoints is used up, every other one is dropped, and from then on they are kept half as often. A long motion is thus
+run again in pieces: each piece once up to rows times checkpoints steps, some pieces more often beyond; memory is fixed.
 
-It is diffrax's loop of an adaptive solve whose outputs are ends of steps, with diffrax's solvers and controllers. That
-one keeps a record too (`SaveAt(steps=True)`), of as many rows as there may be steps: a million.
+The loop is diffrax's loop of an adaptive solve whose outputs are ends of steps, with diffrax's solvers and controllers.
+diffrax's loop keeps a record too (`SaveAt(steps=True)`), with as many rows as there may be steps: a million.
 """
 
 import math
@@ -29,23 +29,23 @@ from lagjax.motion.stepping import OnManifold
 # A row of a pendulum takes 40 bytes: in a thousand lanes the rows take 20 MB.
 ROWS = 512
 PLACES = 64
-# The least of both, which takes long for long motions.
+# The least of both; long motions then take long.
 FEWEST_ROWS, FEWEST_PLACES = 16, 4
-# diffrax ends a solve from here on, in units of the last digit of its last time.
+# diffrax ends a solve this close to its last time, in units of the last digit of that time.
 CLIPPED = 100
 
 
 class Room(NamedTuple):
-    """How many rows and places there are."""
+    """The numbers of rows and of checkpoints."""
 
     rows: int
     places: int
 
 
 class Problem(NamedTuple):
-    """What a motion is stepped through with; the outputs `ts` increase, and begin and end with `t0` and `t1`.
+    """All that a motion is stepped with; the output times `ts` increase, and begin and end with `t0` and `t1`.
 
-    Of each output: `first`, the first of those at its time, and `after`, the first of those at a later one.
+    For each output: `first`, the first output at the same time, and `after`, the first output at a later time.
     """
 
     terms: PyTree[diffrax.AbstractTerm]
@@ -63,7 +63,7 @@ class Problem(NamedTuple):
 
 
 class Place(NamedTuple):
-    """Where the loop stands: all that the step from t to t1 and those after it depend on."""
+    """The position of the loop, and a checkpoint: all that the step from t to t1 and the later ones depend on."""
 
     t: Float[Array, ""]
     t1: Float[Array, ""]
@@ -73,7 +73,7 @@ class Place(NamedTuple):
 
 
 class Rows(NamedTuple):
-    """The last accepted steps, the k-th in row k modulo their number: their times and the states they start from."""
+    """The last accepted steps, step k in row k modulo the number of rows: their times and start states."""
 
     t0: Float[Array, " R"]
     t1: Float[Array, " R"]
@@ -81,10 +81,10 @@ class Rows(NamedTuple):
 
 
 class Record(NamedTuple):
-    """What reverse mode needs of a motion.
+    """All that reverse mode needs of a motion.
 
-    `count`: how many steps it has; `rows`: the last of them; `places`: where every (`ROWS * stride`)-th of them begins;
-    `saved`: the first output that was not reached.
+    `count`: the number of steps; `rows`: the last of them; `places`: the checkpoint at the start of every
+    (`ROWS * stride`)-th step; `saved`: the first output that was not reached.
     """
 
     count: Int[Array, ""]
@@ -95,7 +95,7 @@ class Record(NamedTuple):
 
 
 class Recorded(NamedTuple):
-    """What the loop came to, as diffrax says it, and the record."""
+    """The results of the loop, in diffrax's terms, and the record."""
 
     reached: Bool[Array, " T"]
     outputs: PyTree[Float[Array, "T ..."]]
@@ -107,7 +107,7 @@ class Recorded(NamedTuple):
 
 
 class _Run(NamedTuple):
-    """The state of the loop. `outputs` and `saved` are those of `Recorded`; None where it runs again."""
+    """The state of the loop. `outputs` and `saved`: as in `Recorded` and `Record`; None when the loop runs again."""
 
     place: Place
     rows: Rows
@@ -119,19 +119,19 @@ class _Run(NamedTuple):
 
 
 def with_room(problem: Problem, memory: float | None) -> Problem:
-    """The problem with room for a record of so many bytes, half of them for rows; None stands for the usual room."""
+    """The problem with room for a record of `memory` bytes, half of them for rows; None: the usual room."""
     if memory is None:
         return problem._replace(room=Room(ROWS, PLACES))
     size = lambda tree: sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(tree))
     place = jax.eval_shape(lambda: jax.tree.map(jnp.asarray, _first(problem)))
-    # On the way back a piece is run again, beside the one before it, and its ends corrected: XLA keeps four.
+    # On the way back a piece is run again while the later one is held, and its ends are corrected: XLA keeps four.
     of_row, of_place = 4 * size((problem.t0, problem.t1, problem.y0)), size(place)
     rows, places = int(memory / 2 / of_row), 2 * int(memory / 4 / of_place)
     if rows < FEWEST_ROWS or places < FEWEST_PLACES:
         least = 2 * max(FEWEST_ROWS * of_row, FEWEST_PLACES * of_place)
         raise ValueError(
             f"a record of this motion's steps in {memory:.3g} bytes has no room.\n"
-            "Usual cause: a budget in megabytes; it is in bytes, and for one motion, of which a batch has many.\n"
+            "Usual cause: a budget in megabytes, or for a whole batch; it is in bytes, and for one motion.\n"
             f"Fix: lj.Replay(memory={_rounded_up(least)}) or more."
         )
     return problem._replace(room=Room(rows, places))
@@ -142,29 +142,29 @@ def _rounded_up(number):
 
 
 def recorded(problem: Problem, max_steps: int | None) -> Recorded:
-    """Step through a motion, as `diffrax.diffeqsolve` does."""
+    """Step through a motion, as `diffrax.diffeqsolve` does, and record its steps."""
     p, zero, many = problem, jnp.asarray(0), problem.room.rows
     outputs = jax.tree.map(lambda x: jnp.broadcast_to(x, (p.ts.size, *x.shape)), p.y0)
     place = _first(p)
     places = jax.tree.map(lambda x: jnp.broadcast_to(x, (p.room.places, *jnp.shape(x))), place)
-    start = _Run(place, _no_rows(p), zero, zero, _well(), outputs, p.after[0])
-    on = lambda run: _is_on(p, run, max_steps)
+    start = _Run(place, _no_rows(p), zero, zero, _success(), outputs, p.after[0])
+    continues = lambda run: _continues(p, run, max_steps)
 
     def onward(state):
         run, places, stride = state
         number = run.accepted // many
-        full = on(run) & (number >= p.room.places * stride)
+        full = continues(run) & (number >= p.room.places * stride)
         places = lax.cond(eqxi.unvmap_any(full), lambda: _thinned(places, full), lambda: places)
         stride = jnp.where(full, 2 * stride, stride)
-        here = on(run) & (number % stride == 0)
+        here = continues(run) & (number % stride == 0)
         put = lambda all, x: _put(all, jnp.minimum(number // stride, p.room.places - 1), x, here)
         places = jax.tree.map(put, places, run.place)
         return _until(p, run, (number + 1) * many, max_steps), places, stride
 
     state = start, places, jnp.asarray(1)
-    run, places, stride = lax.while_loop(lambda state: eqxi.unvmap_any(on(state[0])), onward, state)
-    result = diffrax.RESULTS.where(on(run._replace(steps=zero)), diffrax.RESULTS.max_steps_reached, run.result)
-    # diffrax looks for outputs at the end of each accepted step; without time to go there is none.
+    run, places, stride = lax.while_loop(lambda state: eqxi.unvmap_any(continues(state[0])), onward, state)
+    result = diffrax.RESULTS.where(continues(run._replace(steps=zero)), diffrax.RESULTS.max_steps_reached, run.result)
+    # diffrax saves outputs only at the ends of accepted steps, of which a motion over no time has none.
     reached = (p.first < run.saved) & ((run.accepted > 0) | (p.t0 == p.t1))
     stats = {"num_steps": run.steps, "num_accepted_steps": run.accepted, "num_rejected_steps": run.steps - run.accepted}
     record = Record(run.accepted, run.rows, places, stride, run.saved)
@@ -173,15 +173,15 @@ def recorded(problem: Problem, max_steps: int | None) -> Recorded:
 
 
 def recorded_again(problem: Problem, record: Record, number, end) -> Rows:
-    """The rows of the steps of the piece `number`, which ends at a time, by running again from a place before them.
+    """The rows of the piece `number`, which ends at the time `end`, by running again from a checkpoint before it.
 
-    Compiled another time the same operations round otherwise, and a step may be chosen longer by a part in 1e8. Pieces
-    must meet all the same: the last step goes to the end, and what is missing of their number are steps of no length.
+    The same operations, compiled a second time, round differently, and a step may become longer by a part in 1e8.
+    Pieces must still meet: the last step goes to `end`, and missing steps are filled up with steps of no length.
     """
     slot, many = jnp.maximum(number, 0) // record.stride, problem.room.rows
     place, begun = jax.tree.map(lambda x: x[slot], record.places), slot * record.stride * many
     p = problem._replace(t1=jnp.minimum(end, problem.t1))
-    run = _Run(place._replace(t1=jnp.minimum(place.t1, p.t1)), record.rows, begun, begun, _well(), None, None)
+    run = _Run(place._replace(t1=jnp.minimum(place.t1, p.t1)), record.rows, begun, begun, _success(), None, None)
     count = jnp.minimum((number + 1) * many, record.count)
     run = _until(p, run, count, None)
     k = number * many + np.arange(many)
@@ -196,8 +196,8 @@ def like(mask, x):
     return mask.reshape(mask.shape + (1,) * (jnp.ndim(x) - jnp.ndim(mask)))
 
 
-def _well():
-    """That all went well so far, as a number that may change in a loop."""
+def _success():
+    """The successful result, as an array that may change in a loop."""
     return diffrax.RESULTS.where(jnp.asarray(True), diffrax.RESULTS.successful, diffrax.RESULTS.successful)
 
 
@@ -210,7 +210,7 @@ def _first(p: Problem) -> Place:
 
 
 def _no_rows(p: Problem) -> Rows:
-    # Where there is no step a row is the start: finite, for who looks at it in vain.
+    # Rows without a step hold the start: they may be evaluated, and must be finite although the result is unused.
     rows = lambda x: jnp.broadcast_to(x, (p.room.rows, *x.shape))
     return Rows(rows(p.t0), rows(p.t0), jax.tree.map(rows, p.y0))
 
@@ -220,22 +220,22 @@ def _thinned(places, full):
     return jax.tree.map(lambda x: jnp.where(full, half(x), x), places)
 
 
-def _is_on(p: Problem, run: _Run, max_steps):
-    on = (run.place.t < p.t1) & diffrax.is_successful(run.result)
-    return on if max_steps is None else on & (run.steps < max_steps)
+def _continues(p: Problem, run: _Run, max_steps):
+    continues = (run.place.t < p.t1) & diffrax.is_successful(run.result)
+    return continues if max_steps is None else continues & (run.steps < max_steps)
 
 
 def _until(p: Problem, run: _Run, limit, max_steps) -> _Run:
-    """The loop up to a number of accepted steps.
+    """Run the loop up to a number of accepted steps.
 
-    In a batch whole arrays would be selected in each turn for lanes that are done: here only the numbers that change.
+    Batched by JAX, a loop selects whole arrays in each turn for lanes that are done; here only changed entries are.
     """
-    on = lambda run: _is_on(p, run, max_steps) & (run.accepted < limit)
+    continues = lambda run: _continues(p, run, max_steps) & (run.accepted < limit)
 
     def turn(run: _Run) -> _Run:
-        here, place, row = on(run), run.place, run.accepted % p.room.rows
+        here, place, row = continues(run), run.place, run.accepted % p.room.rows
         further, keep, result = _step(p, place)
-        # A step that is rejected is written over by the one after it.
+        # A rejected step is overwritten by the next one.
         rows = jax.tree.map(lambda all, x: _put(all, row, x, here), run.rows, Rows(place.t, place.t1, place.y))
         outputs, saved = run.outputs, run.saved
         if outputs is not None:
@@ -246,11 +246,11 @@ def _until(p: Problem, run: _Run, limit, max_steps) -> _Run:
         place, result = _where(here, (further, result), (place, run.result))
         return _Run(place, rows, run.steps + here, run.accepted + (here & keep), result, outputs, saved)
 
-    return lax.while_loop(lambda run: eqxi.unvmap_any(on(run)), turn, run)
+    return lax.while_loop(lambda run: eqxi.unvmap_any(continues(run)), turn, run)
 
 
 def _step(p: Problem, place: Place):
-    """The place after one more attempt, whether it was accepted, and what went wrong."""
+    """One more attempt of a step: the next place, whether the step was accepted, and its result."""
     order, results = p.solver.error_order(p.terms), diffrax.RESULTS
     y, error, _, solver_state, solved = p.solver.step(
         p.terms, place.t, place.t1, place.y, p.args, place.solver_state, False

@@ -1,17 +1,17 @@
-"""Reverse mode by replay: the accepted steps from the last to the first, each pulled back by itself.
+"""Reverse mode by replay: the accepted steps are pulled back one by one, from the last to the first.
 
-A motion is a chain of steps, y_{i+1} = Phi(t_i, t_{i+1}, y_i, p). With the cotangents c_i of the states that are asked
-for, and l_N = c_N at its end,
+A motion is a chain of steps, y_{i+1} = Phi(t_i, t_{i+1}, y_i, p). With the cotangents c_i of the requested states, and
+l_N = c_N at its end,
 
     (dp_i, l_i) = (∂Phi/∂(p, y))ᵀ l_{i+1},    l_i += c_i,    dp = Σ dp_i
 
-takes one step at a time, from where it was taken: the step as it was, with its return to the constraints and with the
-constraint equations chosen at its start; what the method keeps from step to step is computed anew. The controller, the
-steps that it rejected and the search for events are not there. Where steps end is constant, as it is in a solve that is
-pushed forward; but outputs and jumps are ends of steps, and the cotangents of these times are theirs.
+differentiates one step at a time, at its start state: the same step, with its return to the constraints and with the
+constraint equations chosen at its start; what the method keeps from step to step is computed again. The controller, the
+steps that it rejected and the search for events do not take part. The ends of steps are constants, as in forward mode;
+but outputs and jumps are ends of steps, and the cotangents of these ends belong to the times of outputs and jumps.
 
-`recording.py` keeps the steps, `way_back.py` goes over them. Both loops, there and back, are one primitive and its
-linear derivative, with rules for lanes.
+`recording.py` records the steps, `way_back.py` goes back over them. The loop forward is a primitive, the loop back the
+transpose of its linear derivative; both have rules for lanes.
 """
 
 from dataclasses import dataclass
@@ -42,23 +42,23 @@ class Replay:
     >>> print(f"{1e3 * jax.grad(end)(jnp.full(30, 1 / 30))[0]:.3f}")
     -0.421
 
-    - `memory`: for one motion's record, in bytes, all of which is taken; without it as much as 512 steps and 64 places
-      to go on from need. What does not fit is stepped through again on the way back: with room for r steps and p
-      places a motion of up to r steps not at all, one of up to r p steps once. A batch has a record for each motion,
-      and a program other memory beside: outputs, and what a step itself takes.
+    - `memory`: the size of one motion's record in bytes, all of which is allocated; by default room for 512 steps and
+      64 checkpoints. Steps that do not fit are computed again on the way back: with room for r steps and p checkpoints,
+      a motion of up to r steps is not computed again, one of up to r p steps once. Each motion of a batch has its own
+      record, and a program needs other memory too: for outputs, and for a step itself.
 
-    It is what `adjoint=None` does. `record` and `bent` are for lagjax alone.
+    `adjoint=None` does the same. `record` and `bent` are for internal use.
 
-    **Raises:** `ValueError` where it is no positive number, where a motion is integrated for which it is too small, and
-    where steps are not recorded (a controller of one's own, a condition for diffrax, `progress`).
+    **Raises:** `ValueError` if `memory` is not a positive number or is too small for the motion, and where steps are
+    not recorded (a controller of one's own, a condition for diffrax, `progress`).
 
     Source: Griewank & Walther, *Evaluating Derivatives*, ch. 12 (reversal by checkpoints).
     """
 
     memory: float | None = None
-    # What an earlier call at the same point found; the motion is then not stepped through again.
+    # The record of an earlier call at the same point; the motion is then not integrated again.
     record: Recorded | None = None
-    # Whether this derivative is itself pushed forward.
+    # Whether this reverse derivative is itself differentiated in forward mode.
     bent: bool = False
 
     def __post_init__(self):
@@ -69,14 +69,14 @@ class Replay:
 
 
 def replayed(problem: Problem, max_steps: int | None, checked: bool, adjoint: Replay) -> Recorded:
-    """The motion, which is replayed where it is differentiated in reverse; its values, where they are known.
+    """Integrate a motion such that its reverse derivative replays it; return the values in `adjoint.record` if there.
 
-    Compiled another time a motion may take other steps. A derivative in reverse needs those of the record; pushed
-    forward it needs the tangents of their starts too, which then have to be of the same steps: of one run.
+    Compiled a second time, a motion may take other steps. Its reverse derivative needs the recorded steps; if that is
+    differentiated forward, it also needs the tangents of their start states, which must come from the same run.
     """
     arrays, static = eqx.partition(problem, eqx.is_array)
     given, structure = jtu.tree_flatten(arrays)
-    # What is passed twice, as by a solver and by the controller that asks it, is one operand.
+    # An array that occurs twice, as in a solver and in the controller that holds it, is one operand.
     leaves = list({id(x): x for x in given}.values())
     number = {id(x): i for i, x in enumerate(leaves)}
 
@@ -90,23 +90,23 @@ def replayed(problem: Problem, max_steps: int | None, checked: bool, adjoint: Re
     places = tuple(number[id(x)] for x in given)
     motion = Motion(structure, places, static, max_steps, checked, adjoint.bent, jax.jit(results), [])
     if adjoint.record is None or adjoint.bent:
-        return motion.recorded(_run_p.bind(*leaves, motion=motion, lanes=None, at_once=False))
+        return motion.recorded(_run_p.bind(*leaves, motion=motion, lanes=None, same_run=False))
     values, rest = eqx.partition(adjoint.record, eqx.is_array)
     values, structure = jtu.tree_flatten(values)
     motion.found.append((structure, rest))
     return motion.recorded(_known_p.bind(*leaves, *values, motion=motion, lanes=None))
 
 
-# The operands of the first primitive are the arrays of the problem, its results those of the record. `at_once`: values
-# and tangents are to be of one run. The operands of its derivative are both, and tangents of the arrays that are
-# `moved`; its results the tangents of the floating ones.
+# The operands of the first primitive are the arrays of the problem, its results the arrays of the record. `same_run`:
+# values and tangents must come from one run. The operands of its derivative are both, and the tangents of the arrays
+# with indices `moved`; its results are the tangents of the floating-point arrays of the record.
 
 
-def _run(*leaves, motion, lanes, at_once=False):
+def _run(*leaves, motion, lanes, same_run=False):
     return motion.results(*leaves) if lanes is None else lanes.each(motion.results)(*leaves)
 
 
-def _run_shapes(*leaves, motion, lanes, at_once):
+def _run_shapes(*leaves, motion, lanes, same_run):
     like = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in leaves]
     found = jax.eval_shape(lambda *leaves: _run(*leaves, motion=motion, lanes=lanes), *like)
     return [ShapedArray(x.shape, x.dtype) for x in found]
@@ -117,7 +117,7 @@ def _known(*operands, motion, lanes):
 
 
 def _known_jvp(primals, tangents, *, motion, lanes):
-    # The values are those at the arrays that are given, so that what these move by says it all.
+    # The known values belong to the given arrays, so only the tangents of these matter, not those of the values.
     values, leaves = _known_p.bind(*primals, motion=motion, lanes=lanes), primals[: motion.size]
     return values, _derivative(leaves, values, tangents[: motion.size], motion, lanes)
 
@@ -138,15 +138,15 @@ def _known_batched(operands, axes, *, motion, lanes):
     return found, [0] * len(found)
 
 
-def _run_jvp(primals, tangents, *, motion, lanes, at_once):
-    if at_once:
+def _run_jvp(primals, tangents, *, motion, lanes, same_run):
+    if same_run:
         return _pushed(primals, tangents, motion, lanes)
-    values = _run_p.bind(*primals, motion=motion, lanes=lanes, at_once=motion.bent)
+    values = _run_p.bind(*primals, motion=motion, lanes=lanes, same_run=motion.bent)
     return values, _derivative(primals, values, tangents, motion, lanes)
 
 
 def _pushed(leaves, tangents, motion, lanes):
-    """Values and tangents of one run: no linear map, which could be transposed."""
+    """Values and tangents of one run; it is no linear map, so it cannot be transposed."""
     moved, moving = _moving(tangents)
     of_moved = lambda *chosen: _run(*filled(leaves, moved, chosen), motion=motion, lanes=lanes)
     values, found = jax.jvp(of_moved, tuple(leaves[i] for i in moved), tuple(moving))
@@ -162,7 +162,7 @@ def _derivative(leaves, values, tangents, motion, lanes):
 
 
 def _moving(tangents):
-    """Which operands move, and along what."""
+    """The indices of the operands that have tangents, and these tangents."""
     moved = tuple(i for i, t in enumerate(tangents) if not isinstance(t, ad.Zero))
     return moved, [tangents[i] for i in moved]
 
@@ -171,20 +171,20 @@ def _zero(x):
     return ad.Zero(jax.typeof(x).to_tangent_aval())
 
 
-def _run_batched(operands, axes, *, motion, lanes, at_once):
+def _run_batched(operands, axes, *, motion, lanes, same_run):
     front = [x if axis is None else jnp.moveaxis(x, axis, 0) for x, axis in zip(operands, axes)]
     batched = tuple(axis is not None for axis in axes)
     count = next(x.shape[0] for x, b in zip(front, batched) if b)
     if lanes is None:
-        found = _run_p.bind(*front, motion=motion, lanes=Lanes(count, batched), at_once=at_once)
+        found = _run_p.bind(*front, motion=motion, lanes=Lanes(count, batched), same_run=same_run)
         return found, [0] * len(found)
     flat, both = _lanes_of_lanes(front, batched, lanes, count)
-    found = _run_p.bind(*flat, motion=motion, lanes=both, at_once=at_once)
+    found = _run_p.bind(*flat, motion=motion, lanes=both, same_run=same_run)
     return [x.reshape(count, lanes.count, *x.shape[1:]) for x in found], [0] * len(found)
 
 
 def _lanes_of_lanes(leaves, batched, lanes, count):
-    """Lanes of lanes are lanes."""
+    """Flatten a batch of batches into one batch."""
     flat = []
     for x, b, inner in zip(leaves, batched, lanes.batched):
         if b or inner:
@@ -196,7 +196,7 @@ def _lanes_of_lanes(leaves, batched, lanes, count):
 
 
 def _operands(operands, motion, moved):
-    """The arrays of the problem, those of the record, and the tangents."""
+    """Split the operands into the arrays of the problem, those of the record, and the tangents."""
     size = motion.size
     return operands[:size], operands[size : len(operands) - len(moved)], operands[len(operands) - len(moved) :]
 
@@ -216,13 +216,13 @@ def _moved_shapes(*operands, motion, lanes, moved):
 
 
 def _moved_jvp(primals, tangents, **params):
-    # Only forward: the derivative of what is pushed.
+    # Forward over forward: the result cannot be transposed.
     tangents = [ad.instantiate_zeros(t) for t in tangents]
     return jax.jvp(partial(_moved, **params), primals, tuple(tangents))
 
 
 def _moved_batched(operands, axes, **params):
-    # Many directions, pushed forward.
+    # Many directions at once, in forward mode.
     count = next(x.shape[axis] for x, axis in zip(operands, axes) if axis is not None)
     found = jax.vmap(lambda *x: _moved(*x, **params), axes, axis_size=count)(*operands)
     return found, [0] * len(found)
@@ -235,7 +235,7 @@ def _moved_transpose(cotangents, *operands, motion, lanes, moved):
     of_record = jtu.tree_leaves(given.record, is_leaf=_is_zero)
     if any(eqx.is_array(ct) for ct in of_record):
         raise NotImplementedError(
-            "a reverse derivative of the record of a motion's steps.\n"
+            "a reverse derivative of the record of a motion's steps is not available.\n"
             "Usual cause: reverse mode over a derivative that was itself taken in reverse.\n"
             "Fix: jax.jvp of it, along each direction that is wanted."
         )

@@ -1,7 +1,7 @@
-"""How each motion inside a program went, for those who run the program and not the motion.
+"""Reports on the integrations inside a program, for callers who run the program and do not see the trajectories.
 
-`reporting` turns a function that integrates, wherever in it, into one that says how its integrations went, too. While
-it traces the function, `integrate` passes every trajectory through a primitive that does nothing, `report`.
+`reporting` turns a function that integrates anywhere inside it into one that also returns how its integrations went.
+While it traces the function, `integrate` passes every trajectory through `report`, a primitive that does nothing.
 """
 
 from collections.abc import Callable
@@ -22,14 +22,14 @@ from lagjax.motion.consistency import stopped
 from lagjax.motion.results import RESULTS
 from lagjax.motion.trajectory import Trajectory
 
-# In a program for many lanes that wait for each other, the steps after which a motion is given up, to be run alone.
+# In a batch, whose lanes wait for each other: the number of steps after which a motion is given up, to be run alone.
 PATIENCE = jax.make_user_context(default_value=None)
 
 
 class Report(NamedTuple):
-    """How motions went: together the first result that was not good, all steps, the worst scaled_error and residual.
+    """How motions went, taken together: the first bad result, all steps, the worst scaled_error and residual.
 
-    `scaled_error` is that of a `Trajectory`; `residual` the worst of the constraints at the outputs, relative.
+    `scaled_error`: as in `Trajectory`; `residual`: the worst constraint residual at the outputs, relative.
     """
 
     result: Int[Array, ""]
@@ -39,13 +39,13 @@ class Report(NamedTuple):
 
 
 class Settled(NamedTuple):
-    """Whether a motion that was taken for regular would be the same with the robust way."""
+    """Whether the robust solve would give the same motion, for one whose equations were assumed regular."""
 
     settled: Bool[Array, ""]
 
 
 def report(trajectory: Trajectory) -> Trajectory:
-    """The trajectory, unchanged; where somebody watches, its report is put down in the program that is being traced."""
+    """Return the trajectory unchanged; under `reporting`, enter its report into the program that is being traced."""
 
     def of(trajectory):
         t = stopped(trajectory)
@@ -55,36 +55,36 @@ def report(trajectory: Trajectory) -> Trajectory:
 
 
 def report_settled(trajectory: Trajectory, settled: Bool[Array, ""]) -> Trajectory:
-    """The trajectory of what was taken for regular, unchanged; whether it is settled is put down in the program."""
+    """Return a trajectory of equations assumed regular unchanged; enter into the program whether it is settled."""
     return reported(trajectory, lambda _: Settled(settled))
 
 
 def reported(found: PyTree, of: Callable[[Any], Report | Settled]) -> PyTree:
-    """What was found, unchanged; where somebody watches, `of(found)` is put down in the program."""
+    """Return `found` unchanged; under `reporting`, enter `of(found)` into the program that is being traced."""
     if not WATCHED.value:
         return found
-    # NumPy arrays stay what they are: windows of a fit, for example.
+    # NumPy arrays stay NumPy arrays: windows of a fit, for example.
     arrays, rest = eqx.partition(found, lambda x: isinstance(x, jax.Array))
     leaves, structure = jtu.tree_flatten(arrays)
-    told = of(found)
-    kept = _report_p.bind(*map(jnp.asarray, (*leaves, *told)), kind=type(told))[: -len(told)]
+    mark = of(found)
+    kept = _report_p.bind(*map(jnp.asarray, (*leaves, *mark)), kind=type(mark))[: -len(mark)]
     return eqx.combine(jtu.tree_unflatten(structure, kept), rest)
 
 
 def patient(max_steps: int | None) -> int | None:
-    """The steps that a motion may take here and now."""
+    """The number of steps that a motion may take, within `PATIENCE`."""
     limits = [limit for limit in (max_steps, PATIENCE.value) if limit is not None]
     return min(limits, default=None)
 
 
 def reporting(function: Callable) -> Callable:
-    """`function`, returning what it returned, a `Report` of the integrations in it, and whether those are settled.
+    """Wrap `function` to return its result, a `Report` of the integrations in it, and whether those are settled.
 
-    The report is None where there are no integrations. With `REGULAR_FIRST` integrations are taken for regular; where
-    they are not settled, what was returned is not to be used. It is None where none was taken for regular: also where
-    one is inside a loop or a branch, from which nobody is told.
+    The report is None without integrations. With `REGULAR_FIRST` the equations of integrations are assumed regular; if
+    they are not settled, the result must not be used. `settled` is None if no equations were assumed regular; they are
+    not if an integration is inside a loop or a branch, whose inside `reporting` does not see.
 
-    A check of the user's that calls the host (equinox's `error_if`) gives NaN where it fails: one lane must not end the
+    A check of the user's that calls the host (equinox's `error_if`) gives NaN if it fails: one lane must not end the
     others.
     """
 
@@ -110,14 +110,14 @@ def reporting(function: Callable) -> Callable:
                     program = jax.make_jaxpr(of_leaves)(*leaves)
         program, marks = poisoned(program), []
 
-        def told(equation, operands):
+        def collect(equation, operands):
             if equation.primitive is _report_p:
                 kind = equation.params["kind"]
                 marks.append(kind(*operands[-len(kind._fields) :]))
                 return operands
             return applied(program.jaxpr, equation, operands)
 
-        found = interpreted(program, leaves, told, lambda x, _: x, _reports)
+        found = interpreted(program, leaves, collect, lambda x, _: x, _reports)
         reports = [x for x in marks if isinstance(x, Report)]
         settled = [jnp.all(x.settled) for x in marks if isinstance(x, Settled)]
         all_settled = jnp.all(jnp.stack(settled)) if settled else None
@@ -131,7 +131,7 @@ def _reports(equation):
 
 
 def _hides(jaxpr):
-    """Whether a motion that was taken for regular is in a part of a program that is not entered."""
+    """Whether a motion assumed regular is in a part of the program that the interpreter does not enter."""
     entered = [(equation, stands_for(equation)) for equation in jaxpr.eqns]
     return any(_reports_settled(equation) if inner is None else _hides(inner.jaxpr) for equation, inner in entered)
 
@@ -144,8 +144,8 @@ def _reports_settled(equation):
 def _together(reports):
     if not reports:
         return None
-    # A derivative inside has lanes of its own: the worst of them counts.
-    flat = [Report(*(jnp.ravel(x) for x in told)) for told in reports]
+    # The motions inside a derivative are batched: the worst lane counts.
+    flat = [Report(*(jnp.ravel(x) for x in report)) for report in reports]
     results, steps, scaled_errors, residuals = (jnp.concatenate(parts) for parts in zip(*flat))
     bad = (results != RESULTS.successful._value) & (results != RESULTS.event_occurred._value)
     scaled_error, worst = jnp.nanmax(scaled_errors), results[jnp.argmax(bad)]

@@ -1,4 +1,4 @@
-"""How a motion or a fit ended: the results, and what they mean in words."""
+"""The results of a motion or a fit, with their messages."""
 
 import diffrax
 import equinox as eqx
@@ -6,9 +6,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
 
-# For checkers equinox's enumerations are Python's, of which none can have more items than its parent.
+# Type checkers take equinox's enumerations for Python's, which cannot have more items than their parent.
 class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
-    """How an integration or a fit ended: diffrax's results, and what they have no word for.
+    """How an integration or a fit ended: diffrax's results, and those that diffrax does not have.
 
     >>> import lagjax as lj
     >>> print(lj.RESULTS[lj.RESULTS.event_occurred])
@@ -21,29 +21,29 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
     start_singular = "The accelerations are not determined at the initial state: the equations are singular there."
     not_finite = "The state became NaN or infinite."
     unsolved_step = (
-        "A step could not be solved, could not be returned to the constraints, or lost the state in its error."
+        "A step could not be solved, could not be returned to the constraints, or has an error comparable to the state."
     )
     tolerance_too_small = "The tolerance is below the round-off of the state's dtype."
     unordered = (
-        "The times do not increase throughout, or dt0 or max_step is not positive. (Times that decrease are taken "
-        "where they are known while JAX is tracing: a NumPy array.)"
+        "The times do not increase throughout, or dt0 or max_step is not positive. (Decreasing times are "
+        "accepted if they are known while JAX is tracing: a NumPy array.)"
     )
     drifted = (
         "The motion was computed, but its error, or the change of what must stay constant, is above what is allowed."
     )
     not_converged = "The search of a fit, or of a periodic orbit, did not converge."
     not_estimated = (
-        "The error was not estimated: it was not asked for, and the motion takes more than 20,000 steps; or how to "
-        "shorten the steps of its controller is not known."
+        "The error was not estimated: it was not asked for, and the motion takes more than 20,000 steps; or "
+        "lagjax does not know how to shorten the steps of its controller."
     )
-    misfit = "The residuals of a fit are no errors of measurement: they contradict sigma, or follow a curve."
+    misfit = "The residuals of a fit are not measurement errors: they contradict sigma, or follow a curve."
     too_many_switches = "There were more switches than most_switches."
-    guard_not_seen = "A guard is below zero, and was not seen to cross it: its phase began on it, and hardly left it."
+    guard_not_seen = "A guard is below zero, and was not seen to cross it: the phase began on it, and hardly left it."
     guard_below_zero = "A guard of the first phase is below zero at the start."
     reset_not_finite = "The state after a switch is NaN or infinite."
 
 
-# Diffrax has no words for a success, and equinox no other place for them.
+# diffrax has no message for a success, and equinox has no public way to set one.
 RESULTS._index_to_message[int(RESULTS.successful._value)] = "successful"
 ENDED_WELL = RESULTS.successful, RESULTS.event_occurred
 
@@ -54,23 +54,23 @@ def ended_well(result) -> Bool[Array, "..."]:
 
 
 def is_among(result, others) -> bool:
-    """Whether a result that is known is one of some others; without JAX, which takes ten times as long."""
+    """Whether a result with a known value is one of `others`; without JAX, which takes ten times as long."""
     return int(result._value) in [int(other._value) for other in others]
 
 
 def message(result) -> str:
-    """A result in words."""
+    """The message of a result."""
     if is_among(result, [RESULTS.event_occurred]):
         return "ended by its event"
-    # `RESULTS[result]` does not look up a NumPy number, as a lane of a sweep has it.
+    # `RESULTS[result]` cannot look up a NumPy number, which a lane of a sweep has.
     return RESULTS._index_to_message[int(result._value)]
 
 
 def in_words(code) -> str:
-    """A result's number in words."""
+    """The message of a result, from its number."""
     return message(item(RESULTS.successful, code))
 
 
 def item(result, value):
-    """The result of this number, like one that is known."""
+    """The result with the number `value`; `result`: any known one."""
     return eqx.tree_at(lambda r: r._value, result, jnp.asarray(value))

@@ -1,4 +1,4 @@
-"""Trajectories read from files, with the system that the user gives again, if it is the same."""
+"""Trajectories read from files, with the system that the user passes again, if it is the same."""
 
 import os
 
@@ -41,18 +41,18 @@ def load_trajectory(path: str | os.PathLike, system: System | Hybrid | None = No
 
     - `path`: the file.
     - `system`: the `System` or `Hybrid` that was integrated, whose functions are not in the file. It is needed for what
-      asks them: `at`, `drift()`, `residual()`, `jacobi_integral()`, `lj.energy_ledger(traj)`. Without it all that was
-      computed is there, and these say what they miss.
+      calls them: `at`, `drift()`, `residual()`, `jacobi_integral()`, `lj.energy_ledger(traj)`. Without it all computed
+      values are available, and these methods say what is missing.
 
     **Returns:** the `Trajectory`, or `HybridTrajectory`. Named tuples of a class that has not been imported come back
-    as others of the same fields.
+    as named tuples of another class with the same fields.
 
     **Raises:**
 
-    - `FileNotFoundError` where there is no such file.
-    - `ValueError` for a file that is damaged, of something else, or of a newer lagjax; for a `system` other than the
-      one that was integrated, by what its functions say in the midst of the motion; for a file in float64 where JAX
-      works in float32; and for objects of a class that has not been imported.
+    - `FileNotFoundError` if there is no such file.
+    - `ValueError` for a file that is damaged, does not hold a trajectory, or is from a newer lagjax; for a `system`
+      other than the integrated one, as told by the values of its functions at a state in the middle of the motion; for
+      a file in float64 if JAX works in float32; and for objects of a class that has not been imported.
     """
     said, arrays = files.read(path, "trajectory")
     reader = Reader(arrays)
@@ -61,14 +61,14 @@ def load_trajectory(path: str | os.PathLike, system: System | Hybrid | None = No
         known = UnknownSystem(**found["system"])
         trajectory = trajectory_of(found, known)
     except (KeyError, TypeError, IndexError, StopIteration) as error:
-        files.raise_damaged(path, f"what it says of itself is not whole ({error})", error)
+        files.raise_damaged(path, f"its description is incomplete ({error})", error)
     except ValueError as error:
         raise ValueError(f"{path} cannot be read: {error}") from error
     return trajectory if system is None else trajectory_of(found, same_system(system, known, path))
 
 
 def trajectory_of(found: dict, kept: System | Hybrid | UnknownSystem) -> Trajectory:
-    """The trajectory that has these parts (`saving.parts`), and this system."""
+    """The trajectory with these parts (see `saving.parts`) and the system `kept`."""
     fields = {name: found[name] for name in PLAIN}
     fields |= {"end": Snapshot(**found["end"]), "result": result_of_names(found["result"])}
     fields["events"] = {name: Crossings(**x) for name, x in found["events"].items()}
@@ -81,13 +81,13 @@ def trajectory_of(found: dict, kept: System | Hybrid | UnknownSystem) -> Traject
 
 
 def same_system(system, known: UnknownSystem, path) -> System | Hybrid:
-    """The system that was integrated, which the user gives again; raise where it is another."""
+    """Return the integrated system, which the user passes again; raise if it is another one."""
     check_same(system, known, path)
     return each_phase(system, lambda phase: first_alike(phase, up_to_date(phase)))
 
 
 def check_same(system, known: UnknownSystem, path) -> None:
-    """Raise where a system is not the one that a file knows of."""
+    """Raise if a system is not the one that a file describes."""
     if not isinstance(system, (System, Hybrid)):
         raise TypeError(
             f"system must be a lj.System, not {type(system).__name__}.\nFix: lj.load_trajectory(path, system=system)."
@@ -98,20 +98,20 @@ def check_same(system, known: UnknownSystem, path) -> None:
         here = signature(system, State(*known.state))
     except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
         raise ValueError(
-            f"this system is not the one of {path} ({known.words.splitlines()[0]}): it cannot be asked at a state of "
-            f"that motion.\nIt says: {error}"
+            f"this system is not the one of {path} ({known.words.splitlines()[0]}): it cannot be evaluated at a state "
+            f"of that motion.\nIts error: {error}"
         ) from error
     if found := differences(known.signature, here):
         lines = "".join(f"    {line}\n" for line in found)
         raise ValueError(
             f"this system is not the one of {path} ({known.words.splitlines()[0]}):\n{lines}"
             "Usual cause: a function that has changed since, or another file.\n"
-            "Fix: the system that was integrated; or leave system out, and read what was computed."
+            "Fix: pass the system that was integrated; or leave system out, and read the computed values alone."
         )
 
 
 def _made(cls, fields):
-    """A module of these fields."""
+    """A module with these fields."""
     found = object.__new__(cls)
     for name, x in fields.items():
         object.__setattr__(found, name, x)
@@ -119,7 +119,7 @@ def _made(cls, fields):
 
 
 def result_of_names(said) -> RESULTS:
-    """Results by their names, as they were written."""
+    """The results whose names were written."""
     codes, now = said["codes"], np.asarray(said["codes"]).copy()
     for code, name in said["names"].items():
         if name not in RESULTS._name_to_item:

@@ -1,4 +1,4 @@
-"""Trajectories written into files: all but the functions of their system, of which a signature is kept."""
+"""Trajectories written into files: everything except the functions of their system, of which a signature is kept."""
 
 import os
 from collections.abc import Callable
@@ -14,7 +14,7 @@ from lagjax.mechanics.written_trees import Writer
 from lagjax.motion.accuracy import angle_mask
 from lagjax.motion.results import RESULTS
 
-# Fields that are arrays, and trees of them, as they are in the trajectory and in the file.
+# Fields that are arrays or trees of arrays, the same in the trajectory and in the file.
 PLAIN = "t", "q", "v", "multipliers", "stats", "scaled_error", "tolerance"
 
 
@@ -28,7 +28,7 @@ def save(trajectory, path: str | os.PathLike) -> None:
 
 
 def parts(trajectory, of_result: Callable) -> dict[str, Any]:
-    """All that a trajectory is but its system, by name; `of_result(result)` is what stands for a result."""
+    """All parts of a trajectory except its system, by name; `of_result(result)` is written for a result."""
     tree: dict[str, Any] = {name: getattr(trajectory, name) for name in PLAIN}
     tree |= {"end": trajectory.end._asdict(), "events": {n: _fields(x) for n, x in trajectory.events.items()}}
     tree |= {"params": trajectory.params, "asked": trajectory.asked._asdict()}
@@ -41,7 +41,7 @@ def parts(trajectory, of_result: Callable) -> dict[str, Any]:
 
 
 def described(trajectory) -> UnknownSystem:
-    """What a file says of the system of a trajectory."""
+    """The description of a trajectory's system that a file keeps."""
     system = trajectory.any_system
     if isinstance(system, UnknownSystem):
         return system
@@ -61,7 +61,7 @@ def _check_known(trajectory):
     if any(isinstance(x, Tracer) for x in jax.tree.leaves(trajectory)):
         raise TypeError(
             "this trajectory is being traced, and has no numbers yet.\n"
-            "Fix: return it from the program, and save it then."
+            "Fix: return it from the traced function, and save it then."
         )
 
 
@@ -71,7 +71,7 @@ def _fields(module) -> dict:
 
 
 def result_in_names(result) -> dict[str, Any]:
-    """Results by their names, which stay; their numbers may be others in another version."""
+    """Results by their names, which are stable; their numbers may differ in another version."""
     codes = np.asarray(result._value)
     names = {int(x._value): name for name, x in RESULTS._name_to_item.items()}
     return {"codes": result._value, "names": {str(code): names[int(code)] for code in np.unique(codes)}}

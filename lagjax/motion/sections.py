@@ -1,15 +1,15 @@
-"""Poincaré sections, periods and turning points: what recorded crossings say of a motion.
+"""Poincaré sections, periods and turning points, from the recorded crossings of a motion.
 
-A section is a surface `s(t, q, v, params) = 0` of phase space that the motion keeps crossing. Where it does so upward,
-`ds/dt > 0`, are the points of the section. From one to the next is a map; a periodic motion is a fixed point of it or
-of its iterates, and the times between crossings are its periods,
+A section is a surface `s(t, q, v, params) = 0` of phase space that the motion keeps crossing. The points of the section
+are those where it crosses upward, `ds/dt > 0`. A map takes each point to the next; a periodic motion is a fixed point
+of that map or of its iterates, and the times between crossings are its periods,
 
     T[k] = t[k+1] - t[k].
 
-A turning point of a coordinate is where its velocity changes sign: for a central motion of unit mass where its energy
-is the effective potential, `E = U(r) + h²/(2r²)`.
+A coordinate has a turning point where its velocity changes sign: for a central motion of unit mass, where the energy
+equals the effective potential, `E = U(r) + h²/(2r²)`.
 
-All of it is read off the crossings that `lj.integrate` records; `crossing_times.py` has their derivatives.
+All of this comes from the crossings that `lj.integrate` records; `crossing_times.py` has their derivatives.
 """
 
 import difflib
@@ -33,22 +33,22 @@ from lagjax.motion.integrate import integrate
 from lagjax.motion.trajectory import Trajectory
 
 SECTION = "section"
-# The crossings that are kept of a section that is given as a function.
+# The number of crossings that are kept if the section is given as a function.
 ROOM = 500
 TURN = 2 * np.pi
-# A coordinate varies in a section if it does by more than this part of what it may move between two crossings.
+# A coordinate varies in a section if its range exceeds this part of what it can move between two crossings.
 VARIES = 1e-7
 AS_CROSSING = 'lj.Crossing(lambda t, q, v, params: q["x"], direction=1, terminal=False, most=1000)'
 
 
 class PoincareSection(eqx.Module):
-    """Where a motion crosses a section, in the order of time, and the motion. It prints and plots itself.
+    """The crossings of a section in the order of time, and the motion. It prints and plots itself.
 
-    - `trajectory`: the `Trajectory`; `event`: under which name the crossings are in its `events`. So any recorded event
-      of a motion is drawn by `lj.PoincareSection(traj, "apex").plot()`.
+    - `trajectory`: the `Trajectory`; `event`: the name of the crossings in its `events`. So
+      `lj.PoincareSection(traj, "apex").plot()` draws any recorded event of a motion.
     - `t` (C,): the times of the crossings, `[t]`; NaN beyond the last one. C is `most` of the `lj.Crossing`.
-    - `q`, `v`: the states there, each leaf with a leading axis C, likewise; `[q]`, `[q]/[t]`.
-    - `count`: how many there were, also of those that were not kept.
+    - `q`, `v`: the states there, each leaf with a leading axis C, padded in the same way; `[q]`, `[q]/[t]`.
+    - `count`: how many crossings there were, including those that were not kept.
     - `uncertain`: whether some may be missing; see `lj.Crossings`.
 
     Under `vmap` every array has the batch's axes in front.
@@ -93,41 +93,41 @@ class PoincareSection(eqx.Module):
         return self.crossings.uncertain
 
     def plot(self, x: str | None = None, y: str | None = None):
-        """Plot velocities against coordinates at the crossings, a panel a coordinate; returns a matplotlib `Figure`.
+        """Plot velocities against coordinates at the crossings, a panel per coordinate; returns a matplotlib `Figure`.
 
-        A coordinate that the section holds fixed has no panel where another one varies. An angle (a coordinate that is
-        seen through sines and cosines alone) that goes around is drawn between -π and π. Of a batch the lanes differ in
+        A coordinate that the section holds fixed has no panel if another one varies. An angle (a coordinate that enters
+        only through sines and cosines) that goes around is drawn between -π and π. The lanes of a batch differ in
         colour.
 
-        **Arguments:** `x`, `y`: for one panel alone, what is drawn to the right and what upward, by names such as
+        **Arguments:** `x`, `y`: for a single panel, what is drawn to the right and what upward, by names such as
         `"q.theta"`, `"v.theta"`, `"q[0]"` and `"t"`.
 
-        **Raises:** `ImportError` without matplotlib; `ValueError` where nothing was crossed, for names of nothing, and
-        for `x` without `y`.
+        **Raises:** `ImportError` without matplotlib; `ValueError` if nothing was crossed, for unknown names, and for
+        `x` without `y`.
         """
         lanes = self._lanes()
         drawn = {name: [lane[name] for lane in lanes] for name in lanes[0]}
         if not any(map(len, drawn["t"])):
             raise ValueError(
                 "there is nothing to plot: the motion did not cross the section.\n"
-                "Usual cause: times that end too soon, a level that is not reached, or the other direction.\n"
+                "Usual cause: times that end too soon, a level that is not reached, or the wrong direction.\n"
                 "Fix: a later ts[-1], or section=lj.Crossing(..., direction=0, terminal=False)."
             )
         if (x is None) != (y is None):
             raise ValueError(
-                'a panel is drawn of x and y, and one of them was given.\nFix: plot(x="q.theta", y="v.theta").'
+                'a panel needs both x and y, and only one of them was given.\nFix: plot(x="q.theta", y="v.theta").'
             )
         pairs, angles = self._pairs(lanes[0])
         asked = [(_among(list(drawn), x, "to plot"), _among(list(drawn), y, "to plot"))] if x is not None else None
         pairs = asked or _varying(drawn, pairs, angles)
-        # All lanes or none: they share the picture.
+        # All lanes are wrapped or none: they share the picture.
         around = [name for name in angles if np.ptp(np.concatenate(drawn[name])) > TURN]
         drawn |= {name: [_within_half_turns(values) for values in drawn[name]] for name in around}
         panels = {(a, b): (list(zip(drawn[a], drawn[b])), a in angles) for a, b in pairs}
         return plot.section(panels, self._not_kept())
 
     def _lanes(self):
-        """What there is to draw of each lane, by name, up to its last crossing."""
+        """The values of each lane that can be drawn, by name, up to its last crossing."""
         found = []
         for t, q, v in _lanes_of(self, (self.t, self.q, self.v)):
             of_rows = {"t": t} | {f"{kind}{_entry(name)}": x for kind, tree in (("q", q), ("v", v))
@@ -136,13 +136,13 @@ class PoincareSection(eqx.Module):
         return found
 
     def _pairs(self, names):
-        """The names of each coordinate with its velocity, and those of angles."""
+        """The names of each coordinate and its velocity, and the set of names of angles."""
         q, v = ([name for name in names if name[0] == kind] for kind in "qv")
         is_angle = angle_mask(_lanes_of(self, self.trajectory)[0])
         return list(zip(q, v)), {name for name, yes in zip(q, is_angle) if yes}
 
     def _not_kept(self):
-        """How many crossings there was no room for, in words."""
+        """A note on crossings for which there was no room, or an empty string."""
         room, counts = self.t.shape[-1], np.ravel(self.count)
         most, more = counts.max(initial=0), np.count_nonzero(counts > room)
         if not more:
@@ -180,23 +180,23 @@ def poincare(
     **Arguments:**
 
     - `system`, `q0`, `v0`, `params`: as in `lj.integrate`.
-    - `section`: `section(t, q, v, params)` -> a number, zero on the surface, of any unit. It counts where it comes from
-      below zero, and the first 500 are kept. Or an `lj.Crossing` with `terminal=False`, for another `direction` and for
-      more (`most`; in a batch each lane takes the time for all of them). A start on the surface is not a crossing.
-      Once a period of a drive cos(ωt): `lambda t, q, v, params: jnp.sin(params["omega"] * t)`, which comes from below
-      at ωt = 2π, 4π, ...
-    - `ts`: as in `lj.integrate`; `[0.0, 1000.0]` will do: crossings are found between outputs too.
-    - `events`: others, for instance one that ends the motion where it escapes.
-    - `settings`: what else `lj.integrate` takes, such as `rtol`.
+    - `section`: `section(t, q, v, params)` -> a number in any unit, zero on the surface. Crossings from below zero are
+      counted, and the first 500 kept. Or an `lj.Crossing` with `terminal=False`, for another `direction` and for more
+      crossings (`most`; in a batch each lane takes the time for all of them). A start on the surface is not a crossing.
+      For once per period of a drive cos(ωt): `lambda t, q, v, params: jnp.sin(params["omega"] * t)`, which comes from
+      below at ωt = 2π, 4π, ...
+    - `ts`: as in `lj.integrate`; `[0.0, 1000.0]` is enough: crossings are found between outputs too.
+    - `events`: other events, for instance one that ends the motion when it escapes.
+    - `settings`: other arguments of `lj.integrate`, such as `rtol`.
 
     **Returns:** a `PoincareSection`. Both modes differentiate its times and states, which stay on the surface.
 
     **Raises:**
 
-    - `TypeError` for a section that is no function; `ValueError` for a section that ends the motion, and in a motion in
-      phases for one that takes multipliers; and what `lj.integrate` raises.
-    - Warns (`lj.EventWarning`) where crossings may be missing, and where there were more than are kept. In lanes and
-      under `jit` look at `uncertain` and `count`, which are printed and drawn too.
+    - `TypeError` for a section that is not a function; `ValueError` for a section that ends the motion, and in a motion
+      in phases for one that takes multipliers; and what `lj.integrate` raises.
+    - Warns (`lj.EventWarning`) if crossings may be missing, and if there were more than are kept. In batches and under
+      `jit` look at `uncertain` and `count`, which are printed and drawn too.
 
     Source: Hénon & Heiles, *Astron. J.* 69 (1964) 73, §4; Hénon, *Physica D* 5 (1982) 412 (points that are exactly on
     the surface).
@@ -204,7 +204,7 @@ def poincare(
     others = crossings_of(events, None)
     if SECTION in others:
         raise ValueError(
-            f"an event of events= is named '{SECTION}', which is the name of the section itself.\n"
+            f"an event in events= is named '{SECTION}', which is the name of the section itself.\n"
             "Fix: another name in events=."
         )
     recorded = {SECTION: _recorded(section), **others}
@@ -220,26 +220,26 @@ def periods(crossings: Crossings | PoincareSection) -> Float[Array, " C-1"]:
     >>> print(periods(lj.Crossings(t, q=t, v=t, multipliers={}, count=3, uncertain=False)))
     [2.   2.25  nan]
 
-    **Arguments:** `crossings`: `traj.events["apex"]`, or what `lj.poincare` returns. Of crossings in both directions
+    **Arguments:** `crossings`: `traj.events["apex"]`, or what `lj.poincare` returns. For crossings in both directions
     (`direction=0`) the times between are parts of a period.
 
-    **Returns:** (C-1,), `[t]`, above zero also where the motion ran backward; NaN beyond the last one, which
-    `jnp.nanmean` leaves out, and which derivatives of the others, in both modes, do not see. Under `vmap` with the
-    batch's axes in front.
+    **Returns:** (C-1,), `[t]`, positive even if the motion ran backward; NaN beyond the last one, which `jnp.nanmean`
+    leaves out, and which does not affect derivatives of the others in either mode. Under `vmap` with the batch's axes
+    in front.
 
-    **Raises:** `TypeError` for what are no crossings; `ValueError` where one crossing alone is kept.
+    **Raises:** `TypeError` for arguments that are not crossings; `ValueError` if only one crossing is kept.
 
     Source: Landau & Lifshitz, *Mechanics*, §11.
     """
     if not isinstance(crossings, Crossings | PoincareSection):
         raise TypeError(
-            f"periods are those of crossings, not of a {type(crossings).__name__}.\n"
+            f"periods are computed from crossings, not from a {type(crossings).__name__}.\n"
             'Fix: lj.periods(traj.events["apex"]), with events={"apex": lj.turning_points(direction=-1)} in '
             "lj.integrate; or lj.periods(lj.poincare(...))."
         )
     if crossings.t.shape[-1] < 2:
         raise ValueError(
-            "one crossing alone was kept, and a period is from one to the next.\n"
+            "only one crossing was kept, and a period is the time from one to the next.\n"
             "Usual cause: a crossing that ends the motion, as lj.Crossing does by default.\n"
             f"Fix: {AS_CROSSING}."
         )
@@ -249,7 +249,7 @@ def periods(crossings: Crossings | PoincareSection) -> Float[Array, " C-1"]:
 def turning_points(
     coordinate: str | None = None, direction: int = 0, terminal: bool = False, most: int = 32
 ) -> Crossing:
-    """An event for `lj.integrate`: a coordinate turns, its velocity changes its sign.
+    """An event for `lj.integrate`: a coordinate turns, that is, its velocity changes sign.
 
     >>> import lagjax as lj
     >>> spring = lj.System(lambda t, q, v, params: 0.5 * v**2 - 0.5 * params["k"] * q**2)
@@ -261,14 +261,14 @@ def turning_points(
     **Arguments:**
 
     - `coordinate`: its name, as `lj.explain` and messages write it: `"theta"`, `"r[0]"`, `"body.x"`, and `"q[1]"` of a
-      vector. None where the system has one.
+      vector. None if the system has only one.
     - `direction`: -1 for the greatest values (an apex, an aphelion), 1 for the smallest, 0 for both.
-    - `terminal`, `most`: see `lj.Crossing`; this one goes on.
+    - `terminal`, `most`: see `lj.Crossing`; by default this event does not end the motion.
 
-    **Returns:** an `lj.Crossing`, of which `traj.events["top"].q` are the turning points. A start at rest is not one.
+    **Returns:** an `lj.Crossing`; `traj.events["top"].q` are then the turning points. A start at rest is not one.
 
-    **Raises:** `TypeError` for a coordinate that is no name; `ValueError`, from `lj.integrate`, for a name that there
-    is not, and for None where there are several.
+    **Raises:** `TypeError` for a coordinate that is not a name; `ValueError`, from `lj.integrate`, for an unknown name,
+    and for None if there are several coordinates.
 
     Source: Landau & Lifshitz, *Mechanics*, §11 and eq. (14.9).
     """
@@ -297,7 +297,7 @@ class Velocity(eqx.Module):
 
 
 def _recorded(section):
-    """The section as a crossing that is recorded."""
+    """Return the section as a crossing to be recorded."""
     if not isinstance(section, Crossing):
         if not callable(section):
             raise TypeError(
@@ -314,7 +314,7 @@ def _recorded(section):
 
 
 def _among(names, name, asked, fix="'{}'"):
-    """A name that there is."""
+    """Return `name`; raise unless it is one of `names`. `asked`: for what it was given."""
     if name not in names:
         near = (difflib.get_close_matches(str(name), names, 1) or names)[0]
         raise ValueError(f"{asked} '{name}': there is none; there are {', '.join(names)}.\nFix: {fix.format(near)}.")
@@ -322,24 +322,24 @@ def _among(names, name, asked, fix="'{}'"):
 
 
 def _entry(name):
-    """What follows the "q" or "v" of a coordinate's name: `theta` -> `.theta`, `q[0]` -> `[0]`."""
+    """The part of a coordinate's name after "q" or "v": `theta` -> `.theta`, `q[0]` -> `[0]`."""
     return name[1:] if name == "q" or name.startswith("q[") else f".{name}"
 
 
 def _lanes_of(section, tree):
-    """The lanes of a batch, in NumPy; of one motion it alone."""
+    """The lanes of a batch, in NumPy; one motion is a single lane."""
     axes = np.ndim(section.t) - 1
     flat = jax.tree.map(lambda x: np.asarray(x).reshape(-1, *np.shape(x)[axes:]), tree)
     return [jax.tree.map(lambda x: x[i], flat) for i in range(np.size(section.count))]
 
 
 def _varying(drawn, pairs, angles):
-    """The pairs whose coordinate the section does not hold fixed; all where it holds all."""
+    """The pairs whose coordinate the section does not hold fixed; all pairs if it holds all of them."""
     gaps = np.concatenate([np.abs(np.diff(t)) for t in drawn["t"]])
     gap, found = np.mean(gaps) if gaps.size else 0.0, []
     for x, y in pairs:
         q, v = np.concatenate(drawn[x]), np.concatenate(drawn[y])
-        # From the first one, so that angles are compared as angles.
+        # Relative to the first one, so that angles are compared as angles.
         off = _within_half_turns(q - q[0]) if x in angles else q
         if np.ptp(off) > VARIES * gap * np.max(np.abs(v)):
             found.append((x, y))
@@ -347,7 +347,7 @@ def _varying(drawn, pairs, angles):
 
 
 def _within_half_turns(angle):
-    # Half a turn itself, as on sin(q) = 0, is not to be torn apart by round-off.
+    # Round-off must not separate values at half a turn, as on sin(q) = 0.
     cut = np.pi + 1e-6
     return (angle + cut) % TURN - cut
 

@@ -1,6 +1,6 @@
-"""What guards are between two times at which the motion is known, and at one.
+"""The values of guards at one time, and between two times at which the motion is known.
 
-See `watching.py` for how it is used, and `pieces.py` for what is made of it.
+See `watching.py` for how they are used, and `pieces.py` for how they are judged.
 """
 
 import equinox as eqx
@@ -14,23 +14,23 @@ from lagjax.motion.crossings import Guards, Kind
 from lagjax.motion.pieces import INNER, Node, Pieces, Value, between, pieces_of
 from lagjax.motion.stepping import OnManifold
 
-# The distance of the two interpolants, times this, is taken for the error.
+# The error is taken to be this many times the distance of the two interpolants.
 SAFETY = 2.0
-# What rounding leaves of a guard, in units of the change that its arguments' last digit makes; and of a start on it.
+# Round-off of a guard, in units of the change that its arguments' last digit makes; and that of a start on the guard.
 ROUNDED, ON_GUARD = 8, 64
-# An extremum within so many tolerances of zero may be on either side of it.
+# An extremum within this many tolerances of zero may be on either side of it.
 TOUCHES = 10.0
 
 
 class Sight(eqx.Module):
-    """The guards along a motion; `resolution`: how near to each other two times can be told apart."""
+    """The guards along a motion; `resolution`: the smallest difference of two times that can be told apart."""
 
     guards: Guards
     motion: OnManifold
     resolution: Float[Array, ""]
 
     def value(self, t, y, args):
-        """Each guard at one state."""
+        """The value of each guard at one state."""
         multipliers = self.motion.rates(t, y)[1] if self.guards.take_multipliers else {}
         return self.guards(t, *y, multipliers, args)
 
@@ -42,7 +42,7 @@ class Sight(eqx.Module):
         one, (fine, coarse) = jnp.ones_like(h), between(left, right, h)
         states = [(right.t, right.y, right.a), *((t, *state) for t, state in zip(times[1:-1] * 2, fine + coarse))]
         places, along = [(t, y) for t, y, _ in states], [(one, (y[1], a)) for _, y, a in states]
-        # Along the state itself, to see what its last digit makes of the guards.
+        # Along the state itself, to see how its last digit changes the guards.
         places, along = [*places, places[0]], [*along, (right.t, uneven(right.y))]
         (g, rate), *found, (_, digits) = self._along(places, along, args)
         eps = ROUNDED * jnp.finfo(h.dtype).eps
@@ -53,7 +53,7 @@ class Sight(eqx.Module):
         return values, times, [[(x[i], dx[i]) for x, dx in found] for i in range(len(values))]
 
     def _along(self, places, directions, args):
-        """The guards at places (t, y), and their derivatives along a direction each: pairs of tuples."""
+        """The guards at places (t, y), and their derivatives along one direction for each place: pairs of tuples."""
         push = lambda place, direction: jax.jvp(lambda t, y: self.value(t, y, args), place, direction)
         if not self.guards.long:
             return [push(*x) for x in zip(places, directions)]
@@ -67,7 +67,7 @@ class Sight(eqx.Module):
         return Node(t, None, None, (Value(zero, zero, zero, jnp.asarray(False)),) * len(self.guards.kinds))
 
     def judged(self, left: Node, right: Node, inner) -> list[Pieces]:
-        """Each guard between two nodes, from what it is at the inner ones by the quintic and by the cubics."""
+        """Each guard between two nodes, from its values at the inner ones by the quintic and by the cubics."""
         found, h, count = [], right.t - left.t, len(INNER)
         for begin, end, by_both in zip(left.values, right.values, inner):
             pairs = zip(by_both[:count], by_both[count:])
@@ -77,24 +77,24 @@ class Sight(eqx.Module):
         return found
 
     def first_sign(self, value: Value, kind: Kind):
-        """The sign at the start of the motion: none where that is on the guard."""
+        """The sign at the start of the motion: 0 if the start is on the guard."""
         on_guard = self.is_on(value)
         if kind.holds:
             return jnp.where(on_guard & (value.rate > 0), 0.0, 1.0)
         return jnp.where(on_guard | ~jnp.isfinite(value.g), 0.0, jnp.sign(value.g))
 
     def is_on(self, value: Value):
-        """Whether a state is on a guard, but for round-off."""
+        """Whether a state is on a guard, within round-off."""
         return jnp.abs(value.g) <= ON_GUARD * (value.noise + jnp.abs(value.rate) * self.resolution)
 
     def touches(self, value: Value):
-        """Whether an extremum there may be on either side of zero."""
+        """Whether an extremum with this value may be on either side of zero."""
         eps = ROUNDED * jnp.finfo(value.g.dtype).eps
         return jnp.abs(value.g) <= value.noise * jnp.maximum(TOUCHES * self.motion.tolerances.rtol[0] / eps, 1.0)
 
 
 def uneven(y):
-    """The state, each number times another factor near one: sums of their parts should not cancel."""
+    """The state with each number times a different factor near one, so that sums of parts do not cancel."""
     leaves, structure = jtu.tree_flatten(y)
     scaled = []
     for i, x in enumerate(leaves):

@@ -1,9 +1,9 @@
-"""What is no error to the library and hardly ever meant: told where values can be seen, and integrated all the same.
+"""Warnings of input that the library can integrate but that is hardly ever meant; given where values are not traced.
 
 A force given in place of Rayleigh's function R is odd in the velocities, R(-v) = -R(v), as -c v is. The power that it
-takes, v·∂R/∂v, then changes its sign with v, so that it gives to one motion what it takes of the reversed one, which no
-dissipation does. That R is not even is not enough: in a medium that moves with w it is ½ c (v - w)², which has a part
-of each kind, and is right.
+takes, v·∂R/∂v, then changes its sign with v, so that it gives to one motion what it takes from the reversed one, which
+no dissipation does. An R that is merely not even may be right: in a medium that moves with w it is ½ c (v - w)², which
+has an even and an odd part.
 """
 
 import weakref
@@ -17,31 +17,31 @@ from lagjax.mechanics import coordinates
 from lagjax.mechanics.coordinates import State
 from lagjax.mechanics.warned import warn
 
-# Round-off of an R of some terms, in units of the last place.
+# Round-off of an R with several terms, in units of the last place.
 ROUND_OFFS = 100
-# Functions that were looked at and found in order: 1 ms a call is saved.
+# Functions already checked and found correct: this saves 1 ms a call.
 _in_order = weakref.WeakSet()
 
 
 def warn_of_odd_dissipation(dissipation, state: State) -> None:
-    """Warn where R changes its sign with the velocities. Nothing is looked at while JAX traces."""
+    """Warn if R changes its sign with the velocities. Nothing is checked if the values are traced."""
     known = isinstance(dissipation, FunctionType) and dissipation in _in_order
     if dissipation is None or known or coordinates.is_traced(state):
         return
     t, q, v, params = coordinates.as_arrays(state, state.t.dtype)
-    # While JAX traces something else, values that it does not trace can still be looked at.
+    # While JAX traces something else, values that it does not trace can still be checked.
     with jax.ensure_compile_time_eval():
-        v = _moving(v)
+        v = _without_zeros(v)
         both = [dissipation(t, q, jax.tree.map(lambda x: sign * x, v), params) for sign in (1, -1)]
     if coordinates.is_traced(both):
         return
-    there, back = map(float, both)
-    if there != 0 and abs(there + back) <= ROUND_OFFS * float(jnp.finfo(t.dtype).eps) * abs(there):
+    plus, minus = map(float, both)
+    if plus != 0 and abs(plus + minus) <= ROUND_OFFS * float(jnp.finfo(t.dtype).eps) * abs(plus):
         name = getattr(dissipation, "__name__", "f")
         name = "f" if name == "<lambda>" else name
         warn(
             "dissipation R(t, q, v, params) changes its sign with v, R(-v) = -R(v): it gives as much energy to one "
-            "motion as it takes of the reversed one.\n"
+            "motion as it takes from the reversed one.\n"
             "Usual cause: a force given in place of Rayleigh's function R, whose force is -∂R/∂v.\n"
             f"Fix: force={name}, if -c v is meant as a force; or R = 0.5 c v², whose force is -c v. Friction of "
             "constant size has R = c |v|.",
@@ -51,8 +51,8 @@ def warn_of_odd_dissipation(dissipation, state: State) -> None:
         _in_order.add(dissipation)
 
 
-def _moving(v):
-    """Velocities of which none is zero: where one is, a number that is none of the usual ones."""
+def _without_zeros(v):
+    """The velocities, each zero replaced by an irregular number."""
     flat, unflatten = coordinates.flatten(v)
     usual = np.max(np.abs(flat)) or 1.0
     irregular = usual * (0.5 + np.modf(0.6180339887 * np.arange(1, len(flat) + 1))[0])

@@ -1,6 +1,6 @@
-"""The compiled program behind `integrate`: which one, with which method, and what is kept of it.
+"""The compiled program behind `integrate`: the choice of the program and of the method, and the cache of programs.
 
-What it does is in `one_solve.py`, and for motions in phases in `legs.py`.
+The program itself is in `one_solve.py`, and for motions in phases in `legs.py`.
 """
 
 from collections.abc import Callable
@@ -35,16 +35,16 @@ from lagjax.numerics.evaluations import evaluations_a_step
 from lagjax.numerics.nystrom import Nystrom, Nystrom8, Nystrom12
 from lagjax.numerics.runge_kutta import Dopri8, in_our_form
 
-# The operations of a right-hand side that is copied to each of a method's stages; a longer one is compiled once, in a
-# loop. In lanes of a rod or a double pendulum copies are twice as fast. A step by itself is a fifth slower in a loop,
-# but the first answer of a rod comes an eighth sooner, that of eight coupled masses in half the time. Derivatives are
-# taken without copies: two thirds of the time to the first of them, a fifth more for each of the next ones.
+# A right-hand side of up to this many operations is copied to each of a method's stages; a longer one is compiled once,
+# in a loop. In batches of a rod or a double pendulum copies are twice as fast. A single motion's step is a fifth slower
+# in a loop, but a rod's first answer comes an eighth sooner, that of eight coupled masses in half the time. Derivatives
+# are taken without copies: the first takes two thirds of the time, each of the next ones a fifth more.
 UNROLL_UP_TO, UNROLL_AT_ONCE_UP_TO = 250, 30
-# What our methods can be differentiated by as diffrax's own can.
+# The adjoints that can differentiate our methods as they do diffrax's own.
 FOLLOWED = type(None), diffrax.ForwardMode, diffrax.RecursiveCheckpointAdjoint, diffrax.DirectAdjoint
 
 
-# A module of equinox takes longer to make than a short motion to compute.
+# Making an equinox module takes longer than computing a short motion.
 @jtu.register_dataclass
 @dataclass(frozen=True)
 class Settings:
@@ -57,42 +57,42 @@ class Settings:
     rtol: Float[Array, " 2"]
     atol: Float[Array, " 2"]
     dt0: Float[Array, ""] | None
-    # Infinite where steps are of any length.
+    # Infinite if the length of steps is not limited.
     max_step: Float[Array, ""]
     jump_ts: Float[Array, " J"] | None
-    # Of the first step, and of the time from one output to the next for all: see `Arriving`.
+    # Shares of the proposed first step, and of the time between outputs for the longest step: see `Arriving`.
     shares: Float[Array, " 2"]
-    # The most steps of a motion that is integrated again, for its error.
+    # Motions of up to this many steps are integrated again for an error estimate.
     repeated_up_to: Int[Array, ""]
-    # Whether `atol` is one of a motion's own size, and the one above only for want of it.
+    # Whether `atol` was not given and follows the motion's own size; the value above is then a placeholder.
     by_size: bool = eqx.field(static=True)
     apart: bool = eqx.field(static=True)
     max_steps: int | None = eqx.field(static=True)
     drift: str = eqx.field(static=True)
     progress: bool | None = eqx.field(static=True)
-    # Of the record for reverse mode, in bytes; None for the usual one.
+    # The size of the record for reverse mode, in bytes; None for the usual one.
     memory: float | None = eqx.field(static=True, default=None)
-    # False where the equations are taken for regular, until that turns out to be wrong.
+    # False if the equations are assumed regular, until that turns out to be wrong.
     robust: bool = eqx.field(static=True, default=True)
-    # The operations of a right-hand side that is copied to each of a method's stages.
+    # A right-hand side of up to this many operations is copied to each of a method's stages.
     unroll_up_to: int = eqx.field(static=True, default=UNROLL_UP_TO)
 
 
 def trajectory_of(*problem) -> Trajectory:
-    """The trajectory of a system, q0, v0, params, ts, guards, and settings; what went wrong is recorded in its result.
+    """Return the trajectory of (system, q0, v0, params, ts, guards, settings); a failure is recorded in its result.
 
-    Where nothing is traced, the equations are first taken for regular, which compiles in two thirds of the time and is
-    all that most systems need; where that fails, the robust way is compiled too, and kept to. Equinox's wrapper of
-    `jit` takes longer than a short motion; it has better words for the checks that it puts into a program.
+    If nothing is traced, the equations are first assumed regular, which compiles in two thirds of the time and is
+    enough for most systems; if that fails, the robust solve is compiled too and used from then on. Equinox's wrapper of
+    `jit` takes longer than a short motion, so it runs only if a check in the program fails: its message is better.
     """
     if not is_eager():
-        # A program of the user's, which is not kept here.
+        # We are inside a program of the user's, which is not cached here.
         share_used()
         return _inside(*problem)
     *motion, ts, guards, settings = problem
-    # Whether the compiler is told of makes no other program.
+    # Whether compiling is announced does not change the program.
     shown, settings = settings.progress, replace(settings, progress=bool(settings.progress))
-    # Filled up by its last time.
+    # Padded with the last time.
     many = np.append(ts, np.full(filled_up(len(ts)) - len(ts), ts[-1]))
     of = lambda settings: parted((*motion, many, guards, settings))
     static, arrays = of(settings)
@@ -106,9 +106,9 @@ def trajectory_of(*problem) -> Trajectory:
 
 
 def _inside(*problem):
-    """The trajectory in a program that is being traced; who takes it for regular there is told whether it is."""
+    """The trajectory in a program that is being traced, which reports `settled` if it assumes the equations regular."""
     *motion, settings = problem
-    # An adjoint that was asked for is there to be differentiated through.
+    # If the user gave an adjoint, the motion will be differentiated, which needs the robust solve.
     regular = takes_for_regular() and settings.adjoint is None
     settings = replace(settings, robust=not regular)
     found, settled = _trajectory_of(*motion, settings)
@@ -119,8 +119,8 @@ def _inside(*problem):
 
 
 class _Programs:
-    """The compiled programs of one kind of motion: of equations taken for regular (None where they are not), and with
-    the robust way. JAX keeps them as long as this object lives."""
+    """The compiled programs of one kind of motion: with the equations assumed regular (None once they turned out not to
+    be), and with the robust solve. JAX keeps them as long as this object lives."""
 
     def __init__(self, static, count):
         jit = partial(jax.jit, compiler_options=compiler_options())
@@ -129,17 +129,17 @@ class _Programs:
         self._count, self._compiled = count, set()
 
     def run(self, arrays, count, shown, settled=False):
-        """The trajectory with so many outputs; where it is not settled, by the robust way, but if `settled`."""
+        """The trajectory with `count` outputs, by the robust solve if it is not settled; unless `settled` is given."""
         if self.regular is not None:
-            found, rows, well = self._called(self.regular, arrays, shown)
+            found, rows, well = self._run_program(self.regular, arrays, shown)
             if settled or well:
                 return self._first_outputs(found, rows, count)
             self.regular = None
-        found, rows, _ = jax.block_until_ready(self._called(self.robust, arrays, shown))
+        found, rows, _ = jax.block_until_ready(self._run_program(self.robust, arrays, shown))
         return self._first_outputs(found, rows, count)
 
-    def _called(self, program, arrays, shown):
-        """What a program returns; the first time somebody is told that it compiles, as `shown` (see `waiting`) says."""
+    def _run_program(self, program, arrays, shown):
+        """Run a program; the first time announce that it compiles, as `shown` says (see `waiting`)."""
         if program in self._compiled:
             return program(arrays)
         with waiting(shown, "compiling"):
@@ -148,15 +148,15 @@ class _Programs:
         return found
 
     def _first_outputs(self, found, rows, count):
-        """The trajectory with so many outputs, of `rows` that were filled up."""
+        """The trajectory with `count` outputs, from padded `rows`."""
         if count == self._count:
             return found
-        # A program for each number of outputs would be compiled.
+        # In NumPy: JAX would compile a program for each number of outputs.
         return replace(found, **jax.device_put(jtu.tree_map(lambda x: np.asarray(x)[:count], rows)))
 
 
 def _of_arrays(static, robust, count, arrays):
-    """The trajectory with the number of outputs that was asked for first, all outputs, and whether it is settled."""
+    """The trajectory with the first `count` outputs, all padded outputs, and whether it is settled."""
     *motion, settings = static.together(arrays)
     found, settled = _trajectory(*motion, replace(settings, robust=robust, unroll_up_to=UNROLL_AT_ONCE_UP_TO))
     rows = found.rows()
@@ -169,12 +169,12 @@ def _trajectory_of(*problem):
 
 
 def _trajectory(system, q0, v0, params, ts, guards, settings):
-    """The trajectory, and whether it is settled: what was taken for regular failed for no other reason than that."""
+    """The trajectory, and whether it is settled: the robust solve would give the same."""
     s, method = settings, method_of(settings, system, ts[0], q0, v0, params)
     asked = Asked(s.method, s.controller, s.dt0, s.max_step, s.jump_ts, s.drift)
     how = _how(method, s.method, settings, isinstance(system, Hybrid))
     settings = eqx.tree_at(lambda s: s.method, settings, method, is_leaf=lambda x: x is None)
-    # Derivatives flow to the floating arrays of these; the settings are constants.
+    # Derivatives flow to the floating-point arrays of these; the settings are constants.
     x, rest = eqx.partition((system, q0, v0, params, ts, guards, settings.jump_ts), eqx.is_inexact_array)
     fixed, static = eqx.partition((rest, settings), eqx.is_array)
 
@@ -190,7 +190,7 @@ def _trajectory(system, q0, v0, params, ts, guards, settings):
         return fields, fields.pop("record", None)
 
     if settings.adjoint is None:
-        # Each leg of a motion in phases is replayed by itself.
+        # Each leg of a motion in phases is replayed separately.
         fields = solve_in_both_modes(of_arrays, x, fixed, recorded=not isinstance(system, Hybrid))
     else:
         fields, _ = of_arrays(x, fixed, settings.adjoint, True)
@@ -204,16 +204,16 @@ def _how(method, asked, settings, in_legs):
     name = type(method).__name__ + ("" if asked is None or asked is method else " (diffrax's, in lagjax's form)")
     terms = diffrax.ODETerm(lambda t, y, args: y)
     chosen = "fixed" if isinstance(settings.controller, diffrax.ConstantStepSize) else "controller"
-    # Many short legs: what chose their steps is not seen by how many there are.
+    # With many short legs the number of steps does not tell what chose them.
     chosen = chosen if settings.controller else "legs" if in_legs else "tolerance"
     return How(name, method.error_order(terms), evaluations_a_step(method), chosen)
 
 
 def method_of(settings, system, *state):
-    """The method asked for, if it can do it; by default the fastest that can."""
+    """Return the method asked for, raising if it cannot do it; by default the fastest that can."""
     chosen = settings.method
     if chosen is None:
-        # BacksolveAdjoint integrates a state that is no pair (q, v).
+        # BacksolveAdjoint integrates a state that is not a pair (q, v).
         pairs = not isinstance(settings.adjoint, diffrax.BacksolveAdjoint)
         if not pairs or not _are_free_of_velocities(system, *state):
             return Dopri8()
@@ -222,19 +222,19 @@ def method_of(settings, system, *state):
         cause = "there are constraints" if any(phase.constraints for phase in phases_of(system)) else "these do"
         raise ValueError(
             f"{type(chosen).__name__} is for accelerations that do not depend on velocities, and {cause}.\n"
-            "Usual cause: coordinates in which the kinetic energy has q in it (polar, joint angles), friction, or a "
+            "Usual cause: a kinetic energy that depends on q (polar coordinates, joint angles), friction, or a "
             "rotating frame.\n"
             "Fix: method=lj.Dopri8(), or leave method out: it is then chosen."
         )
-    # With other adjoints, and for conditions that ask it, the solver stays the one that was given.
+    # With other adjoints, and for conditions that evaluate it, the given solver is kept.
     ours = in_our_form(chosen) if settings.event is None and isinstance(settings.adjoint, FOLLOWED) else None
     return chosen if ours is None else ours
 
 
 def nystrom_for(system, params) -> Nystrom:
-    """The method by default for accelerations that do not depend on velocities."""
-    # A network's own motion is less smooth than that of closed forms: at equal error, from 1e-3 to 1e-11, order 8
-    # takes two thirds to nine tenths of the evaluations of order 12, with many outputs half.
+    """The default method for accelerations that do not depend on velocities."""
+    # The motion of a network is less smooth than that of closed forms: at equal error, from 1e-3 to 1e-11, order 8
+    # takes two thirds to nine tenths of the evaluations of order 12, and half with many outputs.
     return Nystrom8() if has_networks(system, params) else Nystrom12()
 
 

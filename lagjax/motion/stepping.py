@@ -1,9 +1,9 @@
-"""Any diffrax solver, kept on the constraints and exact between its steps.
+"""Any diffrax solver, kept on the constraints and accurate between its steps.
 
 `OnManifold` wraps a diffrax solver. After each step it returns the state to the constraint manifold, and
 its dense output is a step of the solver itself: the state at t inside a step from t0 is one step from t0
 to t. Outputs and event times therefore have the order of the method (Kvaerno5's own interpolant is cubic,
-Dopri8's is of order six) and satisfy the constraints, for one step's cost an output.
+Dopri8's is of order six) and satisfy the constraints, at the cost of one step per output.
 """
 
 from collections.abc import Callable
@@ -28,21 +28,21 @@ from lagjax.numerics.radau import Radau5
 
 # Without projection a state drifts off its constraints, and dependent ones then disagree by that much.
 DEPENDENT_BELOW_WHILE_DRIFTING = 1e-3
-# An output is a shorter step than the accepted one that it lies in: its error should be smaller, not this much larger.
+# An output is a shorter step than the accepted one around it: its error should be smaller, not this much larger.
 OUTPUT_TOLERANCES = 100.0
-# With this share of a state as its error, a fixed step is beyond the method's stability.
+# A fixed step whose error is this share of the state is beyond the method's stability.
 LOST = 0.3
 NOT_FINITE = diffrax.RESULTS.nonfinite_input
 
 
 class Stages(NamedTuple):
-    """What the vector field gets in the stages of one step: the constraint equations to solve with do not change."""
+    """The constraint equations that the vector field solves with, the same in all stages of one step."""
 
     independent: Bool[Array, " m"] | None
 
 
 class Field(eqx.Module):
-    """d(q, v)/dt = (v, a), the robust way; with Baumgarte's feedback, if there is a rate of it."""
+    """d(q, v)/dt = (v, a) by the robust solve; with Baumgarte's feedback, if its rate is given."""
 
     equations: Equations
     feedback: Float[Array, ""] | None = None
@@ -53,7 +53,7 @@ class Field(eqx.Module):
 
 
 class FastField(eqx.Module):
-    """The same from the equations written out, which may give NaN where the robust way does not."""
+    """The same by the fast, written-out equations, which may give NaN where the robust solve does not."""
 
     equations: Equations
 
@@ -62,16 +62,16 @@ class FastField(eqx.Module):
 
 
 class OnManifold(diffrax.AbstractWrappedSolver):
-    """Wrap `solver`: project after each step (where `project`), and step for dense output.
+    """Wrap `solver`: project after each step (if `project`), and compute dense output by steps.
 
-    A step that cannot be returned to the constraints is rejected; with a fixed step the solve ends there. `controlled`
-    says that steps are chosen by the tolerances. `arriving` says that outputs are wanted at the ends of steps only.
-    `jump_ts` become ends of steps by the controller; here each step stays on its side of them.
+    A step that cannot be returned to the constraints is rejected; with fixed steps the solve ends there. `controlled`:
+    the tolerances choose the steps. `arriving`: outputs are wanted only at the ends of steps. The controller makes
+    steps end at `jump_ts`; here each step is kept on its side of them.
 
-    The equations belong to the solver, since diffrax hands an interpolation only times and states; by `fast`, the same
-    method, it steps on those that are written out. `feedback` is the rate of Baumgarte's. Where `refused`, and where a
-    step is not finite, its error is infinite: an adaptive solve ends within a few steps at the smallest step size, one
-    with fixed steps at once.
+    The solver holds the equations, since diffrax gives an interpolation only times and states; `fast`: the same method,
+    for steps with the written-out equations. `feedback`: the rate of Baumgarte's feedback. If `refused`, and if a step
+    is not finite, its error is infinite: an adaptive solve ends within a few steps at the smallest step size, one with
+    fixed steps at once.
     """
 
     solver: diffrax.AbstractSolver
@@ -93,7 +93,7 @@ class OnManifold(diffrax.AbstractWrappedSolver):
     def term_compatible_contr_kwargs(self):
         return self.solver.term_compatible_contr_kwargs
 
-    # diffrax asks for the next three only where the wrapped solver is of the kind that has them.
+    # diffrax reads the next three only if the wrapped solver is of the kind that has them.
     @property
     def scan_kind(self):
         return cast(diffrax.AbstractRungeKutta, self.solver).scan_kind
@@ -112,12 +112,12 @@ class OnManifold(diffrax.AbstractWrappedSolver):
 
     @property
     def terms(self) -> diffrax.AbstractTerm:
-        """The vector field the robust way."""
+        """The vector field by the robust solve."""
         return diffrax.ODETerm(Field(self.equations, self.feedback))
 
     @property
     def fast_terms(self) -> diffrax.AbstractTerm:
-        """The vector field as it is written out."""
+        """The vector field by the written-out equations."""
         return diffrax.ODETerm(FastField(self.equations))
 
     def _between(self, *, t0, t1, y0, y1=None, state=None):
@@ -151,23 +151,23 @@ class OnManifold(diffrax.AbstractWrappedSolver):
         if self.jump_ts is not None:
             t0, t1, made_jump = between_jumps(t0, t1, self.jump_ts, made_jump)
         if self.fast is None:
-            y1, error, solver_state, result = self._careful_step(t0, t1, y0, solver_state, made_jump)
+            y1, error, solver_state, result = self._robust_step(t0, t1, y0, solver_state, made_jump)
         else:
-            y1, error, solver_state, result = self._quick_step(t0, t1, y0, solver_state, made_jump)
-        # Infinite, a state would make its own error relative to it zero.
+            y1, error, solver_state, result = self._fast_step(t0, t1, y0, solver_state, made_jump)
+        # An infinite state would make its error relative to it zero.
         failed = self.refused | ~all_finite((y1, error))
         y1 = jtu.tree_map(lambda y1, y0: jnp.where(failed, y0, y1), y1, y0)
         error = jtu.tree_map(lambda x: jnp.where(failed, jnp.inf, x), error)
         result = diffrax.RESULTS.where(failed & (result == diffrax.RESULTS.successful), NOT_FINITE, result)
         if self.arriving:
             return y1, error, {"y0": y0, "y1": y1}, solver_state, result
-        # Newton's iteration for an output starts from the polynomial of the step that it lies in.
+        # Newton's iteration for an output starts from the polynomial of the step around it.
         continued = solver_state if isinstance(self.solver, Radau5) else None
         return y1, error, {"y0": y0, "state": continued}, solver_state, result
 
     # Jitted, so that it is traced once: diffrax traces the body of its loop three times.
     @eqx.filter_jit
-    def _quick_step(self, t0, t1, y0, solver_state, made_jump):
+    def _fast_step(self, t0, t1, y0, solver_state, made_jump):
         fast, terms = self.fast, self.fast_terms
         assert fast is not None
         jumped = True if self.project else made_jump
@@ -179,13 +179,13 @@ class OnManifold(diffrax.AbstractWrappedSolver):
         valid = all_finite((y1, error))
 
         def again():
-            y1, error, _, result = self._careful_step(t0, t1, y0, None, True)
+            y1, error, _, result = self._robust_step(t0, t1, y0, None, True)
             return y1, error, fast.init(terms, t1, t1, y1, None), result
 
-        # A branch also in a batch, where it is taken for all lanes or none.
+        # A branch also in a batch, where all lanes take it or none.
         return lax.cond(eqxi.unvmap_all(valid), lambda: (y1, error, solver_state, result), again)
 
-    def _careful_step(self, t0, t1, y0, solver_state, made_jump):
+    def _robust_step(self, t0, t1, y0, solver_state, made_jump):
         # The projection moves the state, so a derivative kept from the last step's end is stale.
         jumped = True if self.project else made_jump
         terms, stages = self.terms, self._stages(t0, y0)
@@ -200,7 +200,7 @@ class OnManifold(diffrax.AbstractWrappedSolver):
         return y1, error, solver_state, result
 
     def again(self, t0, t1, y0):
-        """The end of an accepted step by what is known at its start, and whether it was taken so, or robustly."""
+        """Repeat an accepted step from its start, fast if possible; return its end, and whether that is finite."""
         if self.fast is None:
             return self.again_robustly(t0, t1, y0), jnp.asarray(True)
         if self.jump_ts is not None:
@@ -210,10 +210,10 @@ class OnManifold(diffrax.AbstractWrappedSolver):
         return y1, all_finite((y1, error))
 
     def again_robustly(self, t0, t1, y0):
-        """The end of an accepted step the robust way."""
+        """Repeat an accepted step with the robust solve; return its end."""
         if self.jump_ts is not None:
             t0, t1, _ = between_jumps(t0, t1, self.jump_ts, True)
-        return self._careful_step(t0, t1, y0, None, True)[0]
+        return self._robust_step(t0, t1, y0, None, True)[0]
 
     def rates(self, t, y):
         """The accelerations, and the multipliers by name."""
@@ -223,7 +223,7 @@ class OnManifold(diffrax.AbstractWrappedSolver):
         return a, multipliers
 
     def acceptable(self, y0, y1, error):
-        """Whether an output's error is not far above the tolerance; a step to it has not passed the controller.
+        """Whether an output's error is not far above the tolerance; the controller does not check steps to outputs.
 
         With fixed steps there is no tolerance; beyond a method's limit of stability the error is as large as the state.
         """
@@ -241,7 +241,7 @@ class OnManifold(diffrax.AbstractWrappedSolver):
 
 
 class Arrived(Interpolation):
-    """The state at an end of a step, where all outputs are: the first of them at the start."""
+    """The state at the ends of a step, where all outputs are; only the first output is at a start."""
 
     t0: PyTree
     t1: PyTree
@@ -253,7 +253,7 @@ class Arrived(Interpolation):
 
 
 class SteppedTo(Interpolation):
-    """The state inside a step, by one step of the solver from the step's start; NaN where that step fails."""
+    """The state inside a step, by one step of the solver from the step's start; NaN if that step fails."""
 
     t0: PyTree
     t1: PyTree
@@ -263,12 +263,12 @@ class SteppedTo(Interpolation):
 
     def at(self, t):
         s = self.solver
-        # Three places of diffrax's program ask, and each is compiled: the robust step alone takes a third of the time
-        # of both, and costs little at run time, since most outputs are ends of steps.
+        # diffrax's program contains this three times, each compiled: the robust step alone compiles in a third of the
+        # time of both, and costs little at run time, since most outputs are ends of steps.
         t0, made_jump = self.t0, False
         if s.jump_ts is not None:
             t0, t, made_jump = between_jumps(t0, t, s.jump_ts, made_jump)
-        y, error, _, result = s._careful_step(t0, t, self.y0, self.state, made_jump)
+        y, error, _, result = s._robust_step(t0, t, self.y0, self.state, made_jump)
         valid = (result == diffrax.RESULTS.successful) & s.acceptable(self.y0, y, error)
         return jtu.tree_map(lambda x: jnp.where(valid, x, jnp.nan), y)
 

@@ -1,17 +1,17 @@
-"""Why an integration stopped before its last output, in the user's words.
+"""Find out why an integration stopped before its last output, and say so in the user's terms.
 
-Where steps collapse or `max_steps` is used up, the motion is taken up again for some steps from where it ended, one by
-one, and these are looked at:
+If steps collapse or `max_steps` is used up, some more steps are taken from where the motion ended, one by one, and
+examined:
 
-- The rate of progress at the end, not on the average, says how many steps are missing.
-- A step that was rejected, however short it had become, is halved where the acceleration changes more, again and
-  again: a smooth function changes by nothing any more in the end, one that jumps by its jump. In the same way the
-  derivative of the acceleration finds a kink. Time, position or velocity alone on the other side say what it is by.
+- The rate of progress at the end, not the average rate, tells how many steps are missing.
+- A rejected step is bisected, always into the half in which the acceleration changes more: in the end a smooth function
+  no longer changes, one that jumps still changes by its jump. The derivative of the acceleration finds a kink in the
+  same way. Moving only time, position or velocity to the other side tells which of them the break depends on.
 - Steps that shrink while accelerations grow approach a singularity.
-- Eigenvalues of d(v, a)/d(q, v) that are long compared with one over a step limit it: those that are real and negative
-  by the stability of an explicit method (a stiff system), those that are imaginary as frequencies to be resolved.
+- Eigenvalues of d(v, a)/d(q, v) that are large compared with one over a step limit it: real negative ones by the
+  stability of an explicit method (a stiff system), imaginary ones as frequencies to be resolved.
 
-This takes a compilation and some seconds, and only who has failed waits for it.
+This takes a compilation and some seconds, and is done only after a failure.
 
 Source: Hairer & Wanner, *Solving ODEs II*, §IV.2 (stiffness and its detection).
 """
@@ -36,32 +36,32 @@ from lagjax.motion.solve import method_of
 from lagjax.motion.stepping import Field
 from lagjax.motion.tolerances import tolerances_at
 
-# The steps that are looked at; the first of them only find their length.
+# The number of steps that are examined, and the first of these, which only find their length.
 LOOKED_AT, SETTLED = 160, 40
-# diffrax's choice of the next step.
+# diffrax's constants for the choice of the next step.
 SAFETY, SHORTEST, LONGEST = 0.9, 0.2, 10.0
-# Rejected steps that are halved, and how often.
-HALVED, HALVINGS = 12, 44
-# A change over 2^-44 of a rejected step counts as a jump from this share of the largest acceleration in it on.
+# The number of rejected steps that are bisected, and how often each is.
+BISECTED, BISECTIONS = 12, 44
+# A change over 2^-44 of a rejected step is a jump (or kink) above this share of the largest acceleration in it.
 JUMP, KINK = 1e-4, 1e-2
 POLE = 1e3  # times as large inside a step as at its ends.
-# The velocities of a motion that sticks agree to this share.
+# The velocities at the breaks of a sticking motion agree to this share.
 HELD = 1e-6
-# A step times the largest eigenvalue, where that limits it; and eigenvalues so different that some are fast.
+# A step times an eigenvalue that limits it; and the ratio of eigenvalues from which the larger one is fast.
 LIMITED, FAST = 0.3, 30.0
-# The same where it limits an explicit method's stability, at two to six.
+# The same product for the stability of an explicit method, which ends at two to six.
 UNSTABLE = 1.5
 # Accelerations grew and steps shrank by these factors.
 GREW, SHRANK = 3.0, 0.3
-BLOWN_UP = 1e6  # times those at the start: there is no other cause.
-# More steps than this are no advice, and this many times as many only the last one.
+BLOWN_UP = 1e6  # times those at the start: a singularity in any case.
+# Above so many missing steps max_steps is not advised; above so many times those taken, only as the second advice.
 TOO_MANY, MANY_TIMES = 1e8, 10
-# What keeps steps short where nothing else does.
+# The cause and the fix if no other cause is found.
 SPAN = "a span that takes more steps: of very many periods, or at a tight tolerance", "a looser rtol and atol"
 
 
 class Steps(NamedTuple):
-    """The steps from where a motion ended: of each its start, its length, and whether it was accepted."""
+    """The steps from where a motion ended: for each its start, its length, and whether it was accepted."""
 
     t: np.ndarray
     y: list
@@ -71,18 +71,18 @@ class Steps(NamedTuple):
 
     @property
     def rate(self) -> float:
-        """How far a step goes, rejected ones included, after the first have found their length."""
+        """The progress per step, counting rejected ones, after the first steps have found their length."""
         settled = slice(SETTLED if len(self.h) > 2 * SETTLED else 0, None)
         return abs(float(np.sum((self.h * self.accepted)[settled]))) / len(self.h[settled])
 
     @property
     def missing(self) -> float:
-        """How many steps there are to the end."""
+        """How many steps are missing to the end."""
         return len(self.h) + (self.left / self.rate if self.rate > 0 else np.inf)
 
     @property
     def kept(self) -> np.ndarray:
-        """Which steps were accepted, but for the first, whose length was guessed."""
+        """The indices of the accepted steps, except the first, whose length was guessed."""
         return np.flatnonzero(self.accepted)[1:]
 
 
@@ -103,9 +103,9 @@ def stopped_early(trajectory, settings) -> str:
     if bool(trajectory.result == RESULTS.unsolved_step) and settings.controller is not None:
         return (
             f"{what}: {RESULTS[trajectory.result]} The last state is {describe(end.q)}.\n"
-            "Usual cause: a fixed step that is too long: for the method's stability, an implicit one's root finder, or "
-            "for the return to the constraints.\n"
-            "Fix: a smaller dt0, or leave stepsize_controller out: steps that fail are then taken again, shorter."
+            "Usual cause: a fixed step that is too long for the method's stability, for an implicit method's root "
+            "finder, or for the return to the constraints.\n"
+            "Fix: a smaller dt0, or leave stepsize_controller out: failed steps are then repeated, shorter."
         )
     cause, fix = (
         "a singularity of the motion (a collision, a singular configuration), a jump in a force, or NaN from L beyond "
@@ -137,7 +137,7 @@ def _used_up(trajectory, settings):
     if not missing < TOO_MANY:
         progress = f"At the rate of its last steps ({rate:.2g} each) it does not arrive"
         return f"{last} {progress}.\nUsual cause: {cause}.\nFix: {fix}."
-    # Half as many again: the rate is that of one place.
+    # Half as many again, since the rate is that of one place.
     more = f"max_steps={_rounded_up(taken + 1.5 * missing)}"
     fix = f"{fix}; else {more}" if missing > MANY_TIMES * taken and fix is not SPAN[1] else f"{more}, or {fix}"
     progress = f"At the rate of its last steps ({rate:.2g} each) it needs {missing:.2g} more"
@@ -145,40 +145,40 @@ def _used_up(trajectory, settings):
 
 
 def _rounded_up(count):
-    """Two digits."""
+    """A count rounded up to two digits."""
     unit = 10 ** max(0, int(np.log10(count)) - 1)
     return int(-(-count // unit) * unit)
 
 
 def last_steps(trajectory, settings) -> Steps:
-    """Take up the motion where it ended, and put down each step."""
+    """Continue the motion from where it ended, and return each step."""
     system, params, end = trajectory.system, trajectory.params, trajectory.end
     state = (end.t, end.q, end.v, params)
     method = method_alone(settings, method_of(settings, system, *state))
     terms = diffrax.ODETerm(Field(equations_of(system, *state)))
     order = float(method.error_order(terms))
-    # Near a singularity nothing is as large as it was at the start.
+    # Tolerances from the start: near a singularity sizes differ from those at the start.
     first = State(*jax.tree.map(lambda x: x[0], (trajectory.t, trajectory.q, trajectory.v)), params)
     tolerance = tolerances_at(first, trajectory.t, settings)
-    way, last = np.sign(float(trajectory.t[-1] - end.t)), float(trajectory.t[-1])
+    direction, last = np.sign(float(trajectory.t[-1] - end.t)), float(trajectory.t[-1])
     t, y = float(end.t), (end.q, end.v)
     size = abs(t - float(trajectory.t[0])) / max(1, int(trajectory.stats["num_accepted_steps"]))
     size = size or 1e-3 * abs(last - t)
-    put_down = []
-    while len(put_down) < LOOKED_AT and abs(last - t) > 0:
-        # The end is reached exactly.
+    taken_steps = []
+    while len(taken_steps) < LOOKED_AT and abs(last - t) > 0:
+        # The last step ends exactly at the last time.
         size = min(size, abs(last - t), float(settings.max_step))
-        times = jnp.asarray(t), jnp.asarray(t + way * size)
+        times = jnp.asarray(t), jnp.asarray(t + direction * size)
         after, error = _attempt(method, terms, *times, y, params, tolerance)
         error = float(error)
-        put_down.append((t, y, way * size, error < 1))
+        taken_steps.append((t, y, direction * size, error < 1))
         if error < 1:
-            t, y = (last if size == abs(last - t) else t + way * size), after
+            t, y = (last if size == abs(last - t) else t + direction * size), after
         factor = SAFETY * error ** (-1 / order) if error > 0 else LONGEST
         size *= np.clip(factor if np.isfinite(error) else 0.0, *((1.0, LONGEST) if error < 1 else (SHORTEST, SAFETY)))
         if size < 4 * np.finfo(float).eps * max(abs(t), 1e-300):
             break
-    ts, ys, h, accepted = zip(*put_down)
+    ts, ys, h, accepted = zip(*taken_steps)
     return Steps(np.array(ts), list(ys), np.array(h), np.array(accepted), abs(last - t))
 
 
@@ -187,13 +187,13 @@ def _attempt(method, terms, t0, t1, y, params, tolerance):
     """One step, and its error in units of the tolerance."""
     after, error, _, _, result = method.step(terms, t0, t1, y, params, method.init(terms, t0, t1, y, params), True)
     rows = lambda tree: jnp.abs(coordinates.flatten(tree)[0]).reshape(2, -1)
-    own = of_a_step(jnp.maximum(rows(y), rows(after)), tolerance)
-    largest = jnp.max(rows(error) / jnp.where(own > 0, own, 1.0))
+    allowed = of_a_step(jnp.maximum(rows(y), rows(after)), tolerance)
+    largest = jnp.max(rows(error) / jnp.where(allowed > 0, allowed, 1.0))
     return after, jnp.where((result == diffrax.RESULTS.successful) & jnp.isfinite(largest), largest, jnp.inf)
 
 
 class _Path:
-    """Accelerations on the path with the velocity and acceleration of a state: q + s v + s² a/2, v + s a."""
+    """Accelerations along the parabola through a state: q + s v + s² a/2, v + s a."""
 
     def __init__(self, trajectory):
         self.system, self.params = trajectory.system, trajectory.params
@@ -203,7 +203,7 @@ class _Path:
         self.usual = max(np.max(np.abs(self.at(t, y, 0.0))), u**2 / max(x, 1e-300))
 
     def at(self, t, y, s, order=0):
-        """The acceleration (order 0) or its derivative by s (1), of t, q and v those at s, or s[0], s[1], s[2]."""
+        """The acceleration (order 0) or its derivative by s (1); t, q, v are taken at s, or at s[0], s[1], s[2]."""
         s = jnp.broadcast_to(jnp.asarray(s, dtype=float), 3)
         return np.asarray(_on_path(self.system, self.params, jnp.asarray(t), y, s, order))
 
@@ -241,7 +241,7 @@ def _jacobian(system, params, t, y):
 
 
 class _Break(NamedTuple):
-    """Where an acceleration or its derivative breaks: of which coordinate, from what to what, with what it changes."""
+    """A jump of an acceleration or of its derivative: time, coordinate, the values, and what it depends on (`by`)."""
 
     t: float
     name: str
@@ -254,10 +254,10 @@ class _Break(NamedTuple):
 def _jump(path, steps):
     """A jump of the acceleration, or of its derivative, inside steps that were rejected."""
     rejected = np.flatnonzero(~steps.accepted)
-    # The shortest of them: there the least else happens.
-    shortest = rejected[np.argsort(np.abs(steps.h[rejected]))][:HALVED]
+    # The shortest ones, since least else happens in them.
+    shortest = rejected[np.argsort(np.abs(steps.h[rejected]))][:BISECTED]
     for order in (0, 1):
-        breaks = [found for i in shortest if (found := _halved(path, steps, i, order)) is not None]
+        breaks = [found for i in shortest if (found := _bisected(path, steps, i, order)) is not None]
         if len(breaks) > len(shortest) // 2:
             return _of_breaks(breaks, order, f"{len(rejected)} of {len(steps.h)} steps were rejected")
     return None
@@ -286,12 +286,12 @@ def _of_breaks(breaks, order, rejected):
     )
 
 
-def _halved(path, steps, i, order):
-    """Where the acceleration (order 0) or its derivative (1) breaks on a rejected step, if it does."""
+def _bisected(path, steps, i, order):
+    """Bisect a rejected step: where the acceleration (order 0) or its derivative (1) breaks, or None."""
     t, y, low, high = steps.t[i], steps.y[i], 0.0, float(steps.h[i])
     below, above = path.at(t, y, low, order), path.at(t, y, high, order)
     size = at_ends = max(np.max(np.abs(below)), np.max(np.abs(above)))
-    for _ in range(HALVINGS):
+    for _ in range(BISECTIONS):
         middle = 0.5 * (low + high)
         between = path.at(t, y, middle, order)
         if not np.all(np.isfinite([below, between, above])):
@@ -303,12 +303,12 @@ def _halved(path, steps, i, order):
             low, below = middle, between
     which = int(np.argmax(np.abs(above - below)))
     change = abs(above - below)[which]
-    # A pole is no jump: it has larger values the nearer one looks.
+    # A pole is not a jump: its values grow as the interval shrinks.
     if size > POLE * at_ends:
         return None
     if not change > (KINK if order else JUMP) * size:
         return None
-    # With t, q or v alone on the other side of it.
+    # With only t, q or v on the other side of the break.
     alone = [path.at(t, y, np.where(np.arange(3) == k, high, low), order)[which] for k in range(3)]
     by = ("time", "position", "velocity")[int(np.argmax(np.abs(alone - below[which])))]
     velocity = float(coordinates.flatten(y[1])[0][which])
@@ -316,7 +316,7 @@ def _halved(path, steps, i, order):
 
 
 def _singularity(path, steps):
-    """Steps that shrink where accelerations grow."""
+    """Find a singularity: steps shrink while accelerations grow."""
     kept = steps.kept
     if not kept.size:
         return None
@@ -324,7 +324,7 @@ def _singularity(path, steps):
     last, limit = at(kept[-1]), steps.t[kept[-1]]
     shrinks = lengths[-1] < SHRANK * lengths[0] and np.mean(np.diff(lengths) < 0) > 0.8
     if len(kept) >= 6 and np.max(last) > GREW * np.max(at(kept[0])) and shrinks:
-        # Steps in a geometric series end at its limit.
+        # Steps in a geometric series converge to its limit.
         ratio = min(np.median(lengths[1:] / lengths[:-1]), 1 - 1e-9)
         limit += np.sign(steps.h[kept[-1]]) * lengths[-1] / (1 - ratio)
     elif not np.max(last) > BLOWN_UP * path.usual:
@@ -337,12 +337,12 @@ def _singularity(path, steps):
 
 
 def _fast(path, steps):
-    """Eigenvalues that are long compared with one over a step."""
+    """Find eigenvalues that are large compared with one over a step."""
     kept = steps.kept
     if not kept.size:
         return None
     t, y, step = steps.t[kept[-1]], steps.y[kept[-1]], float(np.median(np.abs(steps.h[kept])))
-    # Backward in time what decays grows.
+    # Backward in time, decay turns into growth.
     rates = np.sign(steps.h[kept[-1]]) * path.rates(t, y)
     if not np.all(np.isfinite(rates)) or np.max(np.abs(rates)) * step < LIMITED:
         return None
@@ -352,7 +352,7 @@ def _fast(path, steps):
             return None
         return (
             f"a stiff system: something decays at a rate of {-fastest.real:.2g} per unit of time, and an explicit "
-            "method takes steps as short as that also after it is over",
+            "method needs steps as short as that even after the decay is over",
             "method=lj.Radau5(), whose steps follow the motion alone",
         )
     if fastest.real > abs(fastest.imag):
@@ -365,14 +365,14 @@ def _fast(path, steps):
     if not np.any(np.abs(rates) < abs(fastest) / FAST):
         return cause, SPAN[1]
     return (
-        f"{cause}: a stiff spring, or another high frequency beside the motion",
+        f"{cause}: a stiff spring, or another high frequency on top of the motion",
         "a constraint in place of the stiff spring, or, where that oscillation does not matter, "
         "method=lj.Radau5(step_powers=(0, 1)), which does not follow it",
     )
 
 
 def _beyond(trajectory):
-    """Whether the constraints can be met a little after the end; in words where they cannot."""
+    """Explain that the constraints cannot be met a little after the end; None if they can."""
     system, end = trajectory.system, trajectory.end
     if not system.constraints:
         return None
@@ -383,7 +383,7 @@ def _beyond(trajectory):
     except ValueError as error:
         return (
             f"the constraints cannot be met a little later. {error}\n"
-            "(There: a loop that closes only so far, or one motion prescribed twice.)"
+            "(Usual there: a loop that can close only so far, or one motion prescribed twice.)"
         )
     return None
 

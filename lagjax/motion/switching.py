@@ -1,4 +1,4 @@
-"""What a hybrid system brings to a solve: its phases, their guards, and what switches do to the state."""
+"""The parts of a solve that a hybrid system defines: phases, their guards, and the resets of the state by switches."""
 
 from collections.abc import Callable, Hashable, Mapping
 from typing import Any
@@ -30,11 +30,11 @@ from lagjax.motion.legs import Phase
 
 
 class Reset(eqx.Module):
-    """What a switch does to the state: (t, q, v, multipliers, params) -> (q, v), and whether the motion rests there.
+    """The effect of a switch: (t, q, v, multipliers, params) -> (q, v), and whether the motion comes to rest there.
 
-    `function` gives velocities, or the whole state; without one the state stays. With `settle`, which does so where the
-    motion comes to rest, the guard `when` opens by less than `slower_than` after it. What the function has `read` from
-    outside tells it from one of the same code.
+    `function` gives velocities, or the whole state; without one the state is kept. If `settle` is given and the guard
+    `when` opens at no more than `slower_than` after the reset, the motion comes to rest, with the velocities of
+    `settle`. `read`: the values that the function reads from outside, which tell it from another of the same code.
     """
 
     function: Callable | None
@@ -65,31 +65,32 @@ class Reset(eqx.Module):
 
 
 def each_phase(system: System | Hybrid, function: Callable[[System], System]) -> Any:
-    """The system, or that of each phase, as `function` gives it."""
+    """Apply `function` to the system, or to the system of each phase."""
     if isinstance(system, Hybrid):
         return replace_fields(system, systems=tuple(map(function, system.systems)))
     return function(system)
 
 
 def check_phases(hybrid: Hybrid, start: State):
-    """Raise where constraints of one name have different shapes in two phases."""
-    seen: dict[str, tuple[tuple, str]] = {}
+    """Raise if constraints of the same name have different shapes in two phases."""
+    first: dict[str, tuple[tuple, str]] = {}
     for name, system in zip(hybrid.names, hybrid.systems):
         for constraint, shape in constraints.shapes(system, *start).items():
-            other, phase = seen.setdefault(constraint, (shape, name))
+            other, phase = first.setdefault(constraint, (shape, name))
             if other != shape:
                 raise ValueError(
-                    f"constraint '{constraint}' has shape {other} in phase '{phase}', and {shape} in '{name}'.\n"
-                    "Fix: another name for one of them."
+                    f"constraint '{constraint}' has shape {other} in phase '{phase}', but {shape} in '{name}'.\n"
+                    "Fix: give one of them another name."
                 )
 
 
 def refuse_beside_switches(hybrid: Hybrid, start: State, ts, adjoint, event):
-    """Raise where an argument has no meaning for a motion in phases."""
+    """Raise if an argument has no meaning for a motion in phases."""
     check_phases(hybrid, start)
     if runs_backward(ts):
         raise ValueError(
-            "a motion in phases runs forward: what an impact has lost is not known.\nFix: times that increase."
+            "a motion in phases runs forward only: what an impact has lost cannot be restored backward in time.\n"
+            "Fix: times that increase."
         )
     if isinstance(adjoint, diffrax.BacksolveAdjoint):
         raise ValueError(
@@ -97,22 +98,22 @@ def refuse_beside_switches(hybrid: Hybrid, start: State, ts, adjoint, event):
         )
     if left_to_diffrax(event) is not None:
         raise ValueError(
-            "an event that asks diffrax, as diffrax.steady_state_event does, is not for a motion in phases.\n"
+            "a condition for diffrax, such as diffrax.steady_state_event(), cannot be used with a motion in phases.\n"
             "Fix: events= with a lj.Crossing."
         )
 
 
 def phases_in(hybrid: Hybrid, start: State, events: Mapping[str, Crossing]) -> tuple[Phase, ...]:
-    """What ends each phase, called once on shapes, and what is recorded in all; `start`: the motion's first state."""
+    """The guards that end each phase, called once on shapes, and the recorded events; `start`: the first state."""
     for name, crossing in events.items():
         if takes_of(crossing.guard) != OF_STATE:
             raise ValueError(
-                f"event '{name}' takes multipliers, which are others in each phase.\n"
-                "Fix: lj.Switch(..., when=lj.releases(name)) for a contact that lets go; traj.multipliers at outputs."
+                f"event '{name}' takes multipliers, which differ from phase to phase.\n"
+                "Fix: lj.Switch(..., when=lj.releases(name)) if a contact lets go; or traj.multipliers at outputs."
             )
     if SWITCHES in events:
         raise ValueError(
-            f"an event of events= is named '{SWITCHES}': so are the switches in traj.events.\nFix: another name."
+            f"an event in events= is named '{SWITCHES}', the name of the switches in traj.events.\nFix: another name."
         )
     return tuple(_phase(hybrid, i, start, events) for i in range(len(hybrid.systems)))
 
@@ -136,8 +137,8 @@ def _reset(switch: Switch, read: Hashable, hybrid, system, start) -> Reset:
         return reset
     if takes_of(switch.when) != OF_STATE:
         raise ValueError(
-            f"the switch {switch.in_words()} has rest=, and its guard takes multipliers: how fast it opens is not "
-            "seen by velocities.\nFix: rest= with lj.touches(gap) alone."
+            f"the switch {switch.in_words()} has rest=, and its guard takes multipliers: velocities do not tell how "
+            "fast it opens.\nFix: rest= only with lj.touches(gap)."
         )
     settle = Plastic().between(system, hybrid.systems[hybrid.names.index(switch.rest)])
     return Reset(reset.function, reset.takes, read, settle, switch.when, switch.slower_than)
@@ -160,17 +161,17 @@ def _reset_alone(switch: Switch, read: Hashable, hybrid, system, start) -> Reset
             f"{call} must return velocities like v, or a pair (q, v).\n"
             f"  v has shapes {jax.tree.map(jnp.shape, start.v)}\n"
             f"  it returned {jax.tree.map(jnp.shape, found)}\n"
-            "Usual cause: the velocity that jumps alone.\n"
+            "Usual cause: only the velocity that jumps was returned.\n"
             'Fix: return v | {"y": -v["y"]}.'
         )
     return Reset(lift_function(function, tuple(given[name] for name in takes)), takes, read)
 
 
 class OfPhases(eqx.Module):
-    """A reset that needs to know the systems before and after a switch."""
+    """A reset that depends on the systems before and after a switch."""
 
     def between(self, before: System, after: System) -> Callable:
-        """`reset(t, q, v, params)` for a switch between these."""
+        """Return `reset(t, q, v, params)` for a switch between these systems."""
         raise NotImplementedError
 
 
@@ -178,7 +179,7 @@ class Plastic(OfPhases):
     """The nearest velocities in the metric of M that the constraints of the next phase allow."""
 
     def between(self, before: System, after: System) -> Callable:
-        """The velocities after it."""
+        """The reset onto the constraints of `after`."""
         return Nearest(after)
 
 
@@ -203,22 +204,22 @@ def _alike(found, wanted):
     return same and shapes(found) == shapes(wanted)
 
 
-def _looked_at(switch: Switch):
-    """The switch with the first functions that mean the same as its own, and what they read."""
+def _with_first_alike(switch: Switch):
+    """The switch with the first functions seen that mean the same as its own, and the values that these read."""
     functions = switch.when, switch.reset
     if not is_eager():
         return switch, tuple(map(read_by, functions))
     found, read = zip(*((None, ()) if function is None else first_guard_alike(function) for function in functions))
     if any(one is not other for one, other in zip(found, functions)):
-        own = lambda x: any(x is function for function in functions)
-        switch = eqx.tree_at(lambda s: (s.when, s.reset), switch, found, is_leaf=own)
+        is_function = lambda x: any(x is function for function in functions)
+        switch = eqx.tree_at(lambda s: (s.when, s.reset), switch, found, is_leaf=is_function)
     return switch, read
 
 
 def starting(system, start: str | None):
-    """The system, where it is a hybrid one in the phase from which motions start, with what its switches read now."""
+    """The system; a hybrid one starts in phase `start`, with the values that its switches read now."""
     if isinstance(system, Hybrid):
-        switches, read = zip(*map(_looked_at, system.switches)) if system.switches else ((), ())
+        switches, read = zip(*map(_with_first_alike, system.switches)) if system.switches else ((), ())
         return replace_fields(system.starting(start), switches=switches, read=read)
     if start is not None:
         raise ValueError("start= names the first phase of a lj.Hybrid, and this is one lj.System.\nFix: leave it out.")

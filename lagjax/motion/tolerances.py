@@ -1,15 +1,15 @@
-"""What the error of a step may be, number by number.
+"""The error allowed in a step, for each number of the state.
 
-A tolerance in the user's units is nothing to a motion of nanometres and everything to one of light years. Where `atol`
-is left to the library, each coordinate and each velocity is therefore judged by its own size alone:
+An absolute tolerance in the user's units is far too coarse for a motion of nanometres and far too fine for one of light
+years. If `atol` is not given, each coordinate and each velocity is therefore judged by its own size alone:
 
     rtol max(|y|, a thousandth of the largest |y| so far),        for velocities also of √(|a| |q|)
 
-It is taken at the larger end of the step, so that passing through zero costs nothing; what dies out is followed over
-three decades; √(|a| |q|) is the velocity that belongs to an extent and an acceleration, which is what there is at rest
-when a force sets in. Below that comes only what rounding makes of the other coordinates: a motion in a plane leaves the
-third dimension at round-off, which no step can follow. They are compared by √M_ii q_i and √M_ii v_i, all of one unit
-whatever the coordinates are. Where all is zero at the start, nothing tells a size but the user's units.
+|y| is taken at the end of the step where it is larger, so that passing through zero costs nothing; a motion that dies
+out is followed over three decades; √(|a| |q|) is the velocity that goes with an extent and an acceleration, which is
+all there is at rest when a force sets in. To this is added only the round-off from the other coordinates: a motion in a
+plane leaves the third dimension at round-off, which no step can follow. Sizes are compared as √M_ii q_i and √M_ii v_i,
+which have the same unit for all coordinates. If everything is zero at the start, only the user's units tell a size.
 """
 
 from typing import NamedTuple
@@ -23,19 +23,19 @@ from jaxtyping import Array, Float
 
 from lagjax.motion.consistency import stopped
 
-# Of the size of an angle no more counts than this: relative to a thousand turns, a tolerance would mean nothing.
+# The size of an angle counts up to this: a tolerance relative to a thousand turns would mean nothing.
 TURN = 2 * np.pi
-# This part of the largest that a number has been counts as its size.
+# The size of a number is at least this part of the largest value that it has had.
 DIED_OUT = 1e-3
-# What rounding makes of one number in another, in units of the last digit.
+# The round-off that one number causes in another, in units of the last digit.
 ROUNDED = 8.0
-# A first step that is too short costs one more, one that is too long several; it may also pass over an event.
+# A first step that is too short costs one more step, one that is too long several; it may also miss an event.
 FIRST = 0.1
-# What is lighter than this, by the root of the mass, is taken for no lighter: rounding also comes by constraints.
+# The root of a mass counts as at least this part of the largest one: round-off also comes through constraints.
 LIGHT = 1e-6
-# This part of the extent of all others counts for a coordinate at rest at zero where a force sets in.
+# A coordinate at rest at zero counts as at least this part of the extent of all others when a force sets in.
 OF_OTHERS = 1e-6
-# Of the coordinates and velocities that the first acceleration makes of a motion from nothing in all its time.
+# For a start from zero: parts of the coordinates and velocities that its acceleration yields in the whole time.
 FROM_NOTHING = 1e-6, 1e-3
 
 
@@ -47,11 +47,11 @@ class Tolerances(NamedTuple):
 
 
 class Scales(NamedTuple):
-    """What the start tells of a motion's size; rows are coordinates and velocities.
+    """The size of a motion as told by its start; rows are coordinates and velocities.
 
-    - `root_mass`: √M_ii, and about one over it.
-    - `reach`: the largest of the numbers by that, never zero.
-    - `time`: in which they change. `first`: the sizes of the numbers; where all are zero what is taken for them.
+    - `root_mass`: √M_ii; `over_root_mass`: one over it, bounded.
+    - `reach`: the largest of √M_ii times the numbers, never zero.
+    - `time`: the time in which they change. `first`: the sizes of the numbers; if all are zero, a substitute.
     """
 
     root_mass: Float[Array, "1 n"]
@@ -62,9 +62,9 @@ class Scales(NamedTuple):
 
 
 def tolerances_at(start, ts, settings, sizes_so_far=None) -> Tolerances:
-    """The tolerances of a whole state, for constraints, which see coordinates together: as given, or by the start.
+    """The tolerances of the whole state, as given or from the start's size; for constraints, which mix coordinates.
 
-    `seen` (2, n): how large coordinates and velocities have been before it.
+    `sizes_so_far` (2, n): the largest coordinates and velocities before it.
     """
     if not settings.by_size:
         return Tolerances(settings.rtol, settings.atol)
@@ -78,12 +78,12 @@ def tolerances_at(start, ts, settings, sizes_so_far=None) -> Tolerances:
 
 
 def span_of(ts):
-    """The time that a motion takes; positive also where it is refused."""
+    """The time that a motion takes; positive even if the motion is refused."""
     return jnp.maximum(jnp.abs(ts[-1] - ts[0]), jnp.finfo(ts.dtype).tiny)
 
 
 def scales_of(mass, q, v, a, span) -> Scales:
-    """The scales of a motion, by its first state and the accelerations there, which need not be finite."""
+    """The scales of a motion, from its first state and the accelerations there, which need not be finite."""
     root_mass, sizes = (
         jnp.sqrt(jnp.nan_to_num(mass[None], posinf=0.0)),
         jnp.abs(jnp.nan_to_num(_rows(q, v, a), posinf=0.0)),
@@ -92,7 +92,7 @@ def scales_of(mass, q, v, a, span) -> Scales:
     over_root_mass = 1 / jnp.maximum(root_mass, LIGHT * jnp.where(heaviest > 0, heaviest, 1.0))
     of_q, of_v, of_a = jnp.max(root_mass * sizes, axis=1)
     nothing = (of_q == 0) & (of_v == 0)
-    # What is zero is made of the others: a velocity of extent and acceleration, else all of the time that there is.
+    # Zero sizes follow from the others: a velocity from extent and acceleration, otherwise from the time scale.
     of_v = jnp.maximum(of_v, jnp.sqrt(of_a * of_q))
     larger, smaller = jnp.stack([of_q, of_v]), jnp.stack([of_v, of_a])
     known = (larger > 0) & (smaller > 0)
@@ -107,27 +107,27 @@ def scales_of(mass, q, v, a, span) -> Scales:
 
 
 def shared(scales: Scales, sizes) -> Float[Array, "2 n"]:
-    """What is as large in each number as the largest of all in its own, of `sizes` (2, n)."""
+    """For each number the value as large, in √M_ii times it, as the largest of all `sizes` (2, n)."""
     return jnp.max(scales.root_mass * sizes, axis=1, keepdims=True) * scales.over_root_mass
 
 
 def rounding(others: Float[Array, "2 n"]) -> Float[Array, "2 n"]:
-    """What rounding makes of numbers that are zero where the others are as large as this."""
+    """The round-off in numbers that are zero while the others are as large as this."""
     return ROUNDED * jnp.finfo(others.dtype).eps * others
 
 
 def as_nothing(scales: Scales, rtol) -> Float[Array, " 2n"]:
-    """The `atol` of each coordinate and each velocity by the start alone: for iterations inside a step."""
+    """The `atol` of each coordinate and each velocity from the start alone, for iterations inside a step."""
     others = scales.reach * scales.over_root_mass
-    own = jnp.where(scales.first > 0, scales.first, others)
-    return jnp.ravel(DIED_OUT * rtol[:, None] * own + rounding(others))
+    own_size = jnp.where(scales.first > 0, scales.first, others)
+    return jnp.ravel(DIED_OUT * rtol[:, None] * own_size + rounding(others))
 
 
 class Weighing(diffrax.AbstractAdaptiveStepSizeController):
-    """Wrap `controller`, which knows one tolerance: each number's error counts in units of its own.
+    """Wrap `controller`, which has a single tolerance: each number's error is weighed by its own allowed error.
 
-    With `scales` by its own size; without them by `tolerances`, of coordinates and of velocities. Of the coordinates
-    that are `angles`, (n,), at most a turn counts. The state has the largest numbers so far, (2, n).
+    That follows the number's own size if `scales` are given, otherwise `tolerances`, of coordinates and of velocities.
+    At most a turn counts of coordinates that are `angles`, (n,). The state holds the largest numbers so far, (2, n).
     """
 
     controller: diffrax.PIDController
@@ -152,7 +152,7 @@ class Weighing(diffrax.AbstractAdaptiveStepSizeController):
         return self.controller.dtmin
 
     def wrap(self, direction):
-        """The same for time in this direction, which is always forward."""
+        """Return this controller: time always runs forward."""
         return self
 
     def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
@@ -175,29 +175,30 @@ class Weighing(diffrax.AbstractAdaptiveStepSizeController):
     # Jitted, so that it is traced once: diffrax traces the body of its loop three times.
     @eqx.filter_jit
     def _weighed(self, h, y0, y1, error, largest):
-        """The error in the controller's units, and the largest numbers with this step."""
-        error, as_it_was = ravel_pytree(error)
+        """The error in the controller's units, and the largest numbers including this step."""
+        error, unravel = ravel_pytree(error)
         before, after, h = stopped((_rows(*y0), _rows(*y1), h))
         size = jnp.maximum(jnp.abs(before), jnp.abs(after))
         if largest is None:
-            own, now = self.tolerances.atol[:, None] + self.tolerances.rtol[:, None] * self._turned(size), None
+            allowed = self.tolerances.atol[:, None] + self.tolerances.rtol[:, None] * self._capped_angles(size)
+            now = None
         else:
             now = jnp.maximum(size, largest)
-            own = self._by_size(size, now, jnp.abs(after - before)[1] / h)
-        weights = (self.atol + self.rtol * size) / jnp.where(own > 0, own, 1.0)
-        return as_it_was(error * weights.ravel()), now
+            allowed = self._allowed_by_size(size, now, jnp.abs(after - before)[1] / h)
+        weights = (self.atol + self.rtol * size) / jnp.where(allowed > 0, allowed, 1.0)
+        return unravel(error * weights.ravel()), now
 
-    def _by_size(self, size, largest, rate):
+    def _allowed_by_size(self, size, largest, rate):
         scales = self.scales
         assert scales is not None
         others = shared(scales, largest)
-        q, v = self._turned(jnp.maximum(size, DIED_OUT * largest))
-        own = jnp.stack([q, jnp.maximum(v, jnp.sqrt(rate * (q + OF_OTHERS * others[0])))])
+        q, v = self._capped_angles(jnp.maximum(size, DIED_OUT * largest))
+        own_size = jnp.stack([q, jnp.maximum(v, jnp.sqrt(rate * (q + OF_OTHERS * others[0])))])
         if any(self.angles):
             others = jnp.maximum(others, np.stack([self.angles, np.zeros(len(self.angles))]).astype(others.dtype))
-        return self.tolerances.rtol[:, None] * own + rounding(others)
+        return self.tolerances.rtol[:, None] * own_size + rounding(others)
 
-    def _turned(self, sizes):
+    def _capped_angles(self, sizes):
         if not any(self.angles):
             return sizes
         most = np.stack([np.where(self.angles, TURN, np.inf), np.full(len(self.angles), np.inf)])
@@ -205,5 +206,5 @@ class Weighing(diffrax.AbstractAdaptiveStepSizeController):
 
 
 def _rows(*trees):
-    """The numbers of trees of the same structure, a row a tree."""
+    """The numbers of trees of the same structure, one row per tree."""
     return ravel_pytree(trees)[0].reshape(len(trees), -1)

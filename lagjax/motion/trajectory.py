@@ -1,4 +1,4 @@
-"""The answer of an integration: times, states, multipliers, and how it went."""
+"""The result of an integration: times, states, multipliers, and how it went."""
 
 import os
 from collections.abc import Callable, Sequence
@@ -31,7 +31,7 @@ from lagjax.motion.saving import save
 
 
 class AccuracyWarning(UserWarning):
-    """A motion was computed, and shows by itself that it is less accurate than its tolerance suggests."""
+    """A motion was computed, and its own checks show that it is less accurate than its tolerance suggests."""
 
 
 class Snapshot(NamedTuple):
@@ -46,9 +46,9 @@ class Snapshot(NamedTuple):
 class How(NamedTuple):
     """How a motion was stepped through.
 
-    `order`: of the error that chooses steps; `evaluations`: of the equations in a step, None for an implicit method;
-    `steps`: chosen by the "tolerance" (in several "legs" of a motion), "fixed", or by the user's "controller";
-    `backward`: in time.
+    `order`: of the error that chooses steps; `evaluations`: of the equations per step, None for an implicit method;
+    `steps`: chosen by the "tolerance", by it over several "legs", "fixed", or by the user's "controller"; `backward`:
+    whether time decreases.
     """
 
     method: str
@@ -59,7 +59,7 @@ class How(NamedTuple):
 
 
 class Asked(NamedTuple):
-    """What `integrate` was asked for beside the motion and its tolerances, each as it takes it."""
+    """The other arguments of `integrate`, apart from the motion and its tolerances, as it takes them."""
 
     method: diffrax.AbstractSolver | None
     stepsize_controller: diffrax.AbstractStepSizeController | None
@@ -70,7 +70,7 @@ class Asked(NamedTuple):
 
 
 class Static(NamedTuple):
-    """What of a trajectory is not an array: it must be hashable, so that JAX can carry it along."""
+    """The parts of a trajectory that are not arrays; they must be hashable, so that JAX can carry them along."""
 
     rest: Packed
     how: How
@@ -80,30 +80,30 @@ class Static(NamedTuple):
         return self.how.method
 
 
-# What stands on the integrator, which makes trajectories, and so above this file: it is put here by `integrate.py`.
+# Functions that need the integrator, which imports this file: `integrate.py` enters them here.
 BY_INTEGRATION: dict[str, Callable] = {}
 
 
 class Trajectory(eqx.Module):
-    """A motion at the requested times. It prints its own quality, and plots and plays itself.
+    """A motion at the requested times. It prints its own quality, and can plot and animate itself.
 
-    - `t` (T,): the times asked for, which increase or decrease.
+    - `t` (T,): the requested times, increasing or decreasing.
     - `q`, `v`: in the structure of the initial state, each leaf with a leading axis T. NaN after an event
       or a failure ended the motion.
     - `multipliers`: by constraint name, (T, *shape of the constraint), from the projected states.
     - `end`: the last instant reached (`t`, `q`, `v`, `multipliers`): the event, where one ended the motion.
     - `stats`: `num_steps`, `num_accepted_steps`, `num_rejected_steps`.
-    - `error`: estimates of the errors of `q`, `v`, `multipliers` and of the times of `events` (`Errors`); None where
-      they were not made.
+    - `error`: estimates of the errors of `q`, `v`, `multipliers` and of the times of `events` (`Errors`); None if they
+      were not made.
     - `scaled_error`: the worst error in units of what is allowed (10,000 tolerances, and a thousandth of each number);
-      above 1 the motion is less accurate than that, and `integrate` warns. Without `error` it is how far the Jacobi
-      integral, where it must be constant, and the constraints changed, in units of what the tolerance lets expect; 0
-      where nothing must stay.
+      above 1 the motion is less accurate than that, and `integrate` warns. Without `error` it is the change of the
+      Jacobi integral, if it must be constant, and of the constraints, in units of what the tolerance lets expect; 0 if
+      nothing must be constant.
     - `result`: a `RESULTS` item; `lj.RESULTS.successful`, `event_occurred`, or what went wrong.
-    - `events`: by name, the `Crossings` of what was asked for.
-    - `params`, `system`: what was integrated; `asked`: by which method, with which steps. `tolerance`: (rtol, atol),
-      each (2,): for coordinates and for velocities. Where no atol was given it is (2, n), for each of them: what is as
-      good as zero on this motion.
+    - `events`: by name, the `Crossings` of the requested events.
+    - `params`, `system`: what was integrated; `asked`: the method and the steps that were asked for. `tolerance`:
+      (rtol, atol), each (2,): for coordinates and for velocities. If no atol was given it is (2, n), one for each
+      number: what is as good as zero in this motion.
 
     Under `vmap` every array has the batch's axes in front.
     """
@@ -128,7 +128,7 @@ class Trajectory(eqx.Module):
 
     @property
     def any_system(self) -> System | UnknownSystem:
-        """The system; of a trajectory from a file that was read without it what the file says of it."""
+        """The system; for a trajectory that was read from a file without it, the description in the file."""
         return self._problem()[0]
 
     @property
@@ -143,7 +143,7 @@ class Trajectory(eqx.Module):
         return self.static.rest.together(self.arrays)
 
     def rows(self) -> dict:
-        """What there is of each output, by the names of the fields."""
+        """The fields with one row per output, by name."""
         return {"t": self.t, "q": self.q, "v": self.v, "multipliers": self.multipliers}
 
     def jacobi_integral(self) -> Float[Array, " T"]:
@@ -174,23 +174,23 @@ class Trajectory(eqx.Module):
         and the end of the motion.
 
         **Returns:** a `Snapshot` (`t`, `q`, `v`, `multipliers`), each leaf with the shape of `t` in front; on the
-        constraints. At an output it is that output. Of a batch the axes of the batch come first. It is differentiable
-        in `t` and in all that the motion is. Under `jit` and in a batch it is NaN where there is no motion.
+        constraints. At an output it is that output. For a batch the batch's axes come first. It is differentiable
+        in `t` and in everything the motion depends on. Under `jit` and in a batch it is NaN outside of the motion.
 
-        Each time costs a short solve from the output before it: with outputs as dense as steps, a step.
+        Each time costs a short solve from the previous output: with outputs as dense as steps, one step.
 
         **Raises:** `ValueError` for a time outside of the motion, or after its end by an event or a failure; for
-        outputs off the constraints (`drift="none"`), and steps of a controller that has a plan for the whole motion.
+        outputs off the constraints (`drift="none"`), and for a controller that plans the steps of the whole motion.
         """
         return BY_INTEGRATION["at"](self, t)
 
     def save(self, path: str | os.PathLike) -> None:
         """Write the motion into a file, an npz; `lj.load_trajectory(path, system)` reads it, bit for bit.
 
-        The functions of the system are not in it. Whoever is stopped while it is written leaves the file of before.
+        The functions of the system are not in it. If writing is interrupted, the previous file remains.
 
-        **Raises:** `TypeError` for what is no data in `params` or in the structure of q, by name; `OSError` where there
-        is no such folder.
+        **Raises:** `TypeError`, naming them, for entries of `params` or of the structure of q that are not data;
+        `OSError` if there is no such folder.
         """
         save(self, path)
 
@@ -204,33 +204,33 @@ class Trajectory(eqx.Module):
         >>> print(data["q.y"].dims, data["q.y"].sel(t=0.2).item(), data.attrs["params.g"])
         ('t',) 0.4 10.0
 
-        Variables are named as here: `q.y`, `v.y`, with their estimated errors as `error.q.y`, and multipliers as their
-        constraints. Their dimensions are `t` and, of a coordinate that is an array, `y_0` and so on. `result`, `end`
-        and the numbers of steps come with them; the method, tolerances and parameters are attributes.
+        Variables are named as here: `q.y`, `v.y`, their estimated errors `error.q.y`, and multipliers like their
+        constraints. Their dimensions are `t` and, for a coordinate that is an array, `y_0` and so on. `result`, `end`
+        and the numbers of steps are variables too; the method, tolerances and parameters are attributes.
 
         **Arguments:** `dims`: the names of a batch's axes, which come first; by default "batch", or "batch_0" and so
         on. The parameters of a batch are variables.
 
-        **Raises:** `ImportError` without xarray; `ValueError` for another number of names than of axes.
+        **Raises:** `ImportError` without xarray; `ValueError` if the number of names differs from that of the axes.
         """
         return dataset(self, dims)
 
     def plot(self, charges=False):
         """Plot coordinates, velocities and multipliers against time; returns a matplotlib `Figure`.
 
-        `charges=True` adds what is known to be conserved, its relative change; so do `lj.symmetries(...)`, or functions
-        of (t, q, v, params) by name.
+        `charges=True` adds the relative change of the quantities known to be conserved; `lj.symmetries(...)`, or
+        functions of (t, q, v, params) by name, add that of others.
 
-        **Raises:** `ImportError` without matplotlib; `ValueError` for a batched trajectory, or no charges.
+        **Raises:** `ImportError` without matplotlib; `ValueError` for a batched trajectory, or without any charges.
         """
         self._check_alone("plot()")
         return plot.time_series(np.asarray(self.t), panels(self, charges))
 
     def phase_portrait(self):
-        """Plot velocities against coordinates, a panel a coordinate; returns a matplotlib `Figure`.
+        """Plot velocities against coordinates, one panel per coordinate; returns a matplotlib `Figure`.
 
-        A dot marks the start. An angle (a coordinate that is seen through sines and cosines alone) that goes around is
-        drawn between -π and π. Of a batched trajectory every lane is drawn.
+        A dot marks the start. An angle (a coordinate that enters only through sines and cosines) that goes around is
+        drawn between -π and π. For a batched trajectory every lane is drawn.
 
         **Raises:** `ImportError` without matplotlib.
         """
@@ -244,7 +244,7 @@ class Trajectory(eqx.Module):
     def animate(
         self, positions: Callable, *, seconds: float | None = None, rate: float = 25.0, trail: float = 2.0
     ) -> Animation:
-        """Play the motion: points in the plane, lines that link them, and trails.
+        """Animate the motion: points in the plane, lines that link them, and trails.
 
         >>> import jax.numpy as jnp
         >>> import lagjax as lj
@@ -256,15 +256,15 @@ class Trajectory(eqx.Module):
 
         **Arguments:**
 
-        - `positions`: `positions(t, q, params)` -> a point `(x, y)`; or points (k, 2), linked by lines in order; or
-          these by name, each name in a colour of its own. The last point of each leaves a trail. Plain NumPy will do.
+        - `positions`: `positions(t, q, params)` -> a point `(x, y)`; or points (k, 2), linked by lines in order; or a
+          dictionary of these, each name in its own colour. The last point of each leaves a trail. Plain NumPy works.
         - `seconds`: how long it plays; by default as long as the motion takes in units of t, but 2 to 20 s.
-        - `rate`: frames a second. Between outputs q is interpolated, cubically, with v as its slope.
+        - `rate`: frames per second. Between outputs q is interpolated, cubically, with v as its slope.
         - `trail`: how many seconds of playing the trails reach back.
 
-        **Returns:** an `Animation`. It ends where the motion did: at an event, or at the last output before it failed.
+        **Returns:** an `Animation`. It ends with the motion: at an event, or at the last output before it failed.
 
-        **Raises:** `ValueError` for a batched trajectory, positions that are no points of the plane, and outputs too
+        **Raises:** `ValueError` for a batched trajectory, positions that are not points of the plane, and outputs too
         far apart to tell what happens between them.
         """
         self._check_alone("animate(positions)")
@@ -272,7 +272,7 @@ class Trajectory(eqx.Module):
         return frames.film(self, positions, seconds, rate, trail, ended_by_event)
 
     def _of_system(self):
-        """What a line each says of the system and its events."""
+        """The printed rows on the system and its events."""
         of_events = [(f"event '{name}'", crossings.in_words()) for name, crossings in self.events.items()]
         if isinstance(self.any_system, UnknownSystem):
             return [("system", repr(self.any_system)), *of_events]
@@ -319,7 +319,7 @@ def worst_drift(system, t, q, v, params):
 
 
 def pack(system, params, asked: Asked, how: How) -> tuple[PyTree, Static]:
-    """Split (system, params, asked) into arrays and hashable rest."""
+    """Split (system, params, asked) into arrays and a hashable rest."""
     arrays, rest = packed.pack((system, params, asked))
     return arrays, Static(rest, how)
 

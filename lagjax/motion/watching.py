@@ -1,27 +1,28 @@
-"""Crossings inside steps: the sign of each guard is followed along the flow, and each crossing is the end of a step.
+"""Crossings inside steps: the sign of each guard is followed along the flow, and each crossing becomes a step's end.
 
-A step of a method of high order is a good part of a period long, and a guard may cross zero in it and come back. So
-after each accepted step the guards are followed between its ends, where q, v and a are known, along the quintic that
-fits them, with the cubics through (q, v) and (v, a) beside it: their distance bounds the error (it is the error of the
-cubic, 120/(ω h)² times that of the quintic). At a few nodes both give the guard g and its rate dg/dt, and each piece
-between two nodes is one of three:
+A step of a method of high order is a good part of a period long, and a guard may cross zero within it and come back. So
+after each accepted step the guards are followed between its ends, where q, v and a are known, along the quintic through
+these, and along the cubics through (q, v) and (v, a): their distance bounds the error (it is the error of the cubic,
+120/(ω h)² times that of the quintic). At a few nodes both give the guard g and its rate dg/dt, and each piece between
+two nodes is one of three:
 
     clear      no zero: the four control points of the cubic through (g, dg/dt) at its ends (Bézier's polygon, in whose
                hull it lies) have one sign, by more than the error
     monotone   the rates and the polygon have one direction: the signs at its ends tell whether it crosses
     in doubt   anything else: an extremum near zero, or an interpolant that is too crude
 
-A step without doubts and crossings is taken as it is. Any other is taken in parts, each a step of the method from where
-the part before it ended: where a piece is in doubt, up to there (the extremum, or halfway); where a guard crosses, up
-to the root, which Newton's formula on the flow finds in two or three steps. So the motion is asked in one way only, by
-steps of the loop that steps anyway: a program has one copy of the equations, and in a batch nobody waits for a lane
-that looks closer. The wrapped controller is not asked about parts. It gets the step as a whole, and what it answered is
+A step without doubts and crossings is taken unchanged. Any other is taken in parts, each a step of the method from the
+end of the previous part: if a piece is in doubt, up to the doubtful point (the extremum, or halfway); if a guard
+crosses, up to the root, which Newton's formula on the flow finds in two or three steps. So the motion is evaluated in
+one way only, by steps of the existing loop: a program has one copy of the equations, and in a batch no lane waits for
+one that looks closer. The wrapped controller does not see the parts. It gets the step as a whole, and its answer is
 kept until the last part is taken.
 
-Of a crossing the time, without derivatives, and the state at that time, with them, are kept: `crossing_times.py` makes
-both what follows from staying on the guard.
+Of a crossing the time is kept without derivatives, and the state at that time with them: `crossing_times.py` gives both
+the derivatives that follow from staying on the guard.
 
-All is written guard by guard and node by node, on single numbers: on a CPU arrays of four are slower than four numbers.
+Everything is written guard by guard and node by node, on single numbers: on a CPU arrays of four are slower than four
+numbers.
 
 Source: Farouki & Rajan, Comput. Aided Geom. Des. 4 (1987) 191 (hulls); Hairer & Wanner, *Solving ODEs I*, §II.6 (dense
 output by Hermite's formula); Shampine & Thompson, Appl. Math. Comput. 39 (2000) 43s (crossings inside a step).
@@ -56,22 +57,22 @@ from lagjax.motion.pieces import (
 )
 from lagjax.motion.sight import Sight
 
-# How often to look inside one step: an extremum takes three, a jump fifty.
+# The most looks inside one step: an extremum takes three, a jump fifty.
 LOOKS = 200
-# Steps to find a root: by Newton's formula three; by halves fifty.
+# The most steps to find a root: Newton's formula takes three, bisection fifty; and what still counts as few.
 ROOT_LOOKS, FEW_LOOKS = 100, 5
-# An extremum is where it is believed to be if what is left changes its height by less than this part.
+# An extremum is found if the remaining distance changes its height by less than this part; and the most attempts.
 NEAR_EXTREMUM, EXTREMUM_LOOKS = 0.1, 8
-# An interval of so many resolutions of time is not parted again.
+# An interval this many resolutions of time long is not divided again.
 NARROW = 16
-# Roots so near to each other, in resolutions of time, are at one time.
+# Roots this close to each other, in resolutions of time, count as simultaneous.
 AT_ONCE = 4
-# diffrax takes no step that ends within a hundred round-offs of the end of the motion, but the one to the end itself.
+# diffrax takes no step that ends within a hundred round-offs of the motion's end, except the one to the end itself.
 NEAR_THE_LAST = 32
 
 
 class Move(NamedTuple):
-    """What is made of a step: whether it `takes` the part, where the next one ends, and what is known then.
+    """The decision about a step: whether it `takes` the part, where the next part ends (`at`), and what is known then.
 
     `crossed`: the guards that cross at the end of this part. `turns`: those known to turn there; `turns_left`: those
     found to turn at its start.
@@ -87,8 +88,8 @@ class Move(NamedTuple):
 
 
 class Segment(NamedTuple):
-    """The guards between the last part's end and this one's: see `Pieces`; the signs that are believed, and the first
-    root that is wanted."""
+    """The guards between the last part's end and this one's (see `Pieces`), the signs that are certain, and the first
+    wanted root."""
 
     left: Node
     right: Node
@@ -102,7 +103,7 @@ class Segment(NamedTuple):
 class Watching(diffrax.AbstractStepSizeController):
     """Wrap `controller`: follow the guards through each step that it accepts, and end the solve at a terminal one.
 
-    What was found is the controller's state: that of the wrapped one, and a `Watched`. `last`: the motion's end.
+    The controller's state is that of the wrapped one and a `Watched`, with the crossings. `last`: the final time.
     """
 
     controller: diffrax.AbstractStepSizeController
@@ -111,12 +112,12 @@ class Watching(diffrax.AbstractStepSizeController):
 
     @property
     def kinds(self) -> tuple[Kind, ...]:
-        """Of the guards."""
+        """The kinds of the guards."""
         return self.sight.guards.kinds
 
     @property
     def resolution(self) -> Float[Array, ""]:
-        """How near to each other two times can be told apart."""
+        """The smallest difference of two times that can be told apart."""
         return self.sight.resolution
 
     def wrap(self, direction):
@@ -145,10 +146,10 @@ class Watching(diffrax.AbstractStepSizeController):
         keep, next_t0, next_t1, jumped, asked, result = self.controller.adapt_step_size(
             t0, t1, y0, y1_candidate, args, y_error, error_order, inner
         )
-        # A part that fails, though the whole step did not, is halved: the controller has had its say.
-        lost = parted & ~all_finite(y_error)
-        # With fixed steps it is Python's True.
-        keep = jnp.where(parted, ~lost, keep)
+        # A part that fails, though the whole step did not, is halved: the controller has already accepted the step.
+        failed = parted & ~all_finite(y_error)
+        # With fixed steps `keep` is Python's True.
+        keep = jnp.where(parted, ~failed, keep)
         before = watched.part.until, watched.part.following, watched.part.jumps
         until, following, jumps = _where(parted, before, (t1, next_t1, jnp.asarray(jumped)))
         state = t0, t1, y0, y1_candidate, args, watched, until
@@ -157,18 +158,18 @@ class Watching(diffrax.AbstractStepSizeController):
             eqxi.unvmap_any(keep), lambda: self._follow(keep, *state), lambda: unchanged
         )
         done = takes & (t1 >= until)
-        ours = keep | lost
-        # The end of the whole step moves with the outputs.
-        at = jnp.where(done, following, jnp.where(lost, t0 + 0.5 * (t1 - t0), jnp.where(at >= until, until, at)))
+        ours = keep | failed
+        # `until` replaces an equal `at`: the end of the whole step has derivatives by the output times.
+        at = jnp.where(done, following, jnp.where(failed, t0 + 0.5 * (t1 - t0), jnp.where(at >= until, until, at)))
         part = watched.part._replace(parted=ours & ~done, until=until, following=following, jumps=jumps)
         result = diffrax.RESULTS.where(parted, diffrax.RESULTS.successful, result)
-        result = diffrax.RESULTS.where(lost & (t1 - t0 <= resolution), diffrax.RESULTS.dt_min_reached, result)
+        result = diffrax.RESULTS.where(failed & (t1 - t0 <= resolution), diffrax.RESULTS.dt_min_reached, result)
         ended = ended & (result == diffrax.RESULTS.successful)
         return (
             takes,
             jnp.where(ours, jnp.where(takes, t1, t0), next_t0),
             jnp.where(ours, at, next_t1),
-            # Known while tracing, it spares diffrax what it does after a jump.
+            # If False while tracing, diffrax omits what it does after a jump.
             jumped if jumped is False else done & jumps,
             (_where(parted, inner, asked), watched._replace(part=part)),
             diffrax.RESULTS.where(ended, diffrax.RESULTS.event_occurred, result),
@@ -177,7 +178,7 @@ class Watching(diffrax.AbstractStepSizeController):
     # Jitted, so that it is traced once: diffrax traces the body of its loop three times.
     @eqx.filter_jit
     def _follow(self, keep, t0, t1, y0, y1, args, watched: Watched, until):
-        """Whether a part is taken, where the next one ends, whether the motion ends with it, and what is known then."""
+        """Whether a part is taken, where the next one ends, whether the motion ends now, and the new `Watched`."""
         fixed, part = stopped(self), watched.part
         known = stopped((t0, t1, y0, y1, args, watched._replace(y=None), until))
         move, a, values = fixed._move(keep, *known)
@@ -206,9 +207,9 @@ class Watching(diffrax.AbstractStepSizeController):
         return takes, move.at, ended, later
 
     def _move(self, keep, t0, t1, y0, y1, args, watched: Watched, until):
-        """What is made of a step from t0 to t1; and the acceleration and the guards at its end."""
+        """The decision about a step from t0 to t1; and the acceleration and the guards at its end."""
         part, begins, kinds = watched.part, ~watched.begun, self.kinds
-        # The first step is asked for its start, and taken again.
+        # The first step is used to evaluate the guards at the start, and then taken again.
         t, y = _where(begins, (t0, y0), (t1, y1))
         a, _ = self.sight.motion.rates(t, y)
         left = Node(t0, y0, watched.a, watched.values)
@@ -219,10 +220,10 @@ class Watching(diffrax.AbstractStepSizeController):
         right = right._replace(values=values)
         of_guards = apart(self.sight.judged, left, right, inner)
         doubts = [_any(p.doubt) for p in of_guards]
-        # Where doubts remain, only the signs at the ends are believed.
+        # If doubts remain, only the signs at the ends are used.
         signs = [[jnp.where(x, 0.0, sign) for sign in p.sign[:-1]] + p.sign[-1:] for p, x in zip(of_guards, doubts)]
         crosses = [changes(f.sign, sign) for f, sign in zip(watched.followed, signs)]
-        # Nothing else to be seen: most steps of most motions.
+        # Nothing to look at more closely, as in most steps of most motions.
         calm = watched.begun & (part.root.guard < 0) & (part.asked < 0) & ~_any(doubts + [_any(c) for c in crosses])
         nothing, at_end = (jnp.asarray(False),) * len(kinds), t1 >= until
         followed = tuple(f._replace(sign=last_known(f.sign, sign)) for f, sign in zip(watched.followed, signs))
@@ -232,7 +233,7 @@ class Watching(diffrax.AbstractStepSizeController):
         )  # fmt: skip
 
         def closer():
-            # Where a root is sought, those of other guards on the way there.
+            # While a root is sought, only the roots of other guards before it are of interest.
             others = [[c & (part.root.guard != i) for c in mine] for i, mine in enumerate(crosses)]
             root = apart(partial(first_root, kinds), times, of_guards, signs, others)
             segment = Segment(left, right, times, of_guards, doubts, signs, root)
@@ -245,17 +246,17 @@ class Watching(diffrax.AbstractStepSizeController):
         return lax.cond(eqxi.unvmap_all(calm | ~keep), lambda: onward, closer), a, values
 
     def _looked(self, segment: Segment, watched: Watched, until) -> Move:
-        """Settle what is between two nodes, or say where to look next; where a guard crosses, go to the root."""
+        """Settle the interval between two nodes, or choose where to look next; if a guard crosses, go to the root."""
         part, left, right, no = watched.part, segment.left, segment.right, (jnp.asarray(False),) * len(self.kinds)
         again, at_extremum, turns, followed = apart(self._at_extremum, right, left, part, watched.followed, until)
         right = right._replace(values=tuple(v._replace(turns=v.turns | x) for v, x in zip(right.values, turns)))
         given_up = part.looks >= LOOKS
-        # By halves down to the resolution of time: a jump, whose place is then known.
+        # Bisected down to the resolution of time: a jump, whose time is then known.
         narrow = right.t - left.t <= NARROW * self.resolution
         root, following = segment.root, apart(next_node, left, right, segment.times, segment.of_guards, self.resolution)
         settled, takes, crosses = apart(self._settled, segment.in_doubt, again, narrow | given_up, root)
         looking = ~again & ~settled
-        # A start beyond the guard is as near to it as a root can be.
+        # If the interval starts beyond the guard already, the start is as near as a root can be.
         sign = _chosen(root.guard, [v.g for v in left.values]) * root.after
         begin = jnp.where((sign >= 0) & (root.low <= left.t), left.t + self.resolution, root.guess)
         at = jnp.where(again, at_extremum, jnp.where(following.needed, following.at, right.t))
@@ -278,12 +279,12 @@ class Watching(diffrax.AbstractStepSizeController):
         return Move(takes, at, later, followed, no, turns, tuple(looking & x for x in following.turns_left))
 
     def _settled(self, in_doubt, again, anyway, root: Root):
-        """Whether no doubt is left, and then, whether nothing is crossed, or something is."""
+        """Whether no doubt is left; whether, in addition, nothing is crossed; or something is."""
         settled = ~again & (~_any(in_doubt) | anyway)
         return settled, settled & (root.guard < 0), settled & (root.guard >= 0)
 
     def _toward_root(self, segment: Segment, watched: Watched, until) -> Move:
-        """One step of Newton's formula, or of halves where that does not get on; the part is taken at the root."""
+        """One step of Newton's formula, or of bisection if that makes no progress; the part is taken at the root."""
         part, t, none = watched.part, segment.right.t, jnp.asarray(-1)
         no = (jnp.asarray(False),) * len(self.kinds)
         found, sooner, takes, onward, at = apart(self._nearer, segment, part)
@@ -308,49 +309,49 @@ class Watching(diffrax.AbstractStepSizeController):
         return Move(takes, jnp.where(found, until, at), later, tuple(followed), tuple(crossing), no, no)
 
     def _nearer(self, segment: Segment, part: Part):
-        """Whether the root is found, whether another one is `sooner`, and whether the part is taken; the root that is
-        sought then, and where."""
+        """Whether the root is found, whether another one is `sooner`, whether the part is taken; the root to seek next,
+        and where."""
         root, t = part.root, segment.right.t
         g, rate = (_chosen(root.guard, [getattr(v, name) for v in segment.right.values]) for name in ("g", "rate"))
         crossed = g * root.after >= 0
         low, high = jnp.where(crossed, root.low, jnp.maximum(root.low, t)), jnp.where(crossed, t, root.high)
         step = -g / jnp.where(rate != 0, rate, jnp.nan)
         narrow, size = high - low <= self.resolution, jnp.abs(step)
-        # To the last digit, where rounding lets it.
+        # To the last digit, if round-off permits.
         small = size <= jnp.where(part.tries < FEW_LOOKS, 0.25, 1.0) * self.resolution
         found = small | (narrow & crossed) | (part.tries >= ROOT_LOOKS)
         found = found | (crossed & (t >= self.last) & (size <= NEAR_THE_LAST * self.resolution))
-        # What jumps is zero nowhere: the first time after it counts.
+        # A guard that jumps is zero nowhere: the first time after the jump counts.
         nearer = (t + step > low) & (t + step < high) & (size <= 0.5 * jnp.abs(part.moved))
         at = jnp.where(narrow, high, jnp.where(nearer, t + step, low + 0.5 * (high - low)))
-        # Another guard may be crossed on the way: the one that was sought is not the first. Of two that jump at one
-        # time neither is, whatever an interpolant says.
+        # If another guard crosses on the way, the one sought is not the first. If two jump at the same time, neither is
+        # sooner, whatever an interpolant says.
         earlier = segment.root
         before, limit = (x - AT_ONCE * self.resolution for x in (t, root.before))
         sooner = found & (earlier.guard >= 0) & (earlier.guess < before) & (t < limit)
         found = found & ~sooner
-        # diffrax halves what it is asked for next to the end of the motion: no root before there, go on from there.
+        # Near the end of the motion diffrax may step only halfway: if there is no root before, go on from there.
         takes = found | (~sooner & ~crossed & (t <= root.low))
         onward = _where(sooner, earlier._replace(before=t), root._replace(low=low, high=high))
         return found, sooner, takes, onward, jnp.where(sooner, self._inside(earlier, earlier.guess), at)
 
     def _inside(self, root: Root, at):
-        """A time between the two that enclose a root."""
+        """The time `at`, limited to the bracket of a root."""
         return jnp.clip(at, jnp.minimum(root.low + self.resolution, root.high), root.high)
 
     def _at_extremum(self, here: Node, left: Node, part: Part, followed, until):
-        """Whether an extremum is to be looked for again, and where; else which guard turns here, if one does."""
+        """Whether to look again for an extremum, and where; otherwise which guard turns here, if any."""
         g, rate = (_chosen(part.asked, [getattr(v, name) for v in here.values]) for name in ("g", "rate"))
         asked = part.asked >= 0
         shift = -rate / part.curvature
         there = (0.5 * jnp.abs(rate * shift) <= NEAR_EXTREMUM * jnp.abs(g)) | (jnp.abs(shift) <= self.resolution)
         at = here.t + shift
-        # Else what led here was too crude: what is before it is looked at with what is known now.
+        # Otherwise the interpolants that led here were too crude, and the part before is examined with better ones.
         nearer = (at > left.t) & (at < until) & (jnp.abs(shift) <= 0.5 * jnp.abs(part.moved))
         again = asked & ~there & nearer & (part.tries < EXTREMUM_LOOKS) & (part.looks < LOOKS)
         mine, doubtful = [asked & there & (part.asked == i) for i in range(len(here.values))], []
         for f, turns, before, value in zip(followed, mine, left.values, here.values):
-            # Next to a start on the guard it is that start.
+            # An extremum next to a start on the guard is that start.
             touches = turns & self.sight.touches(value) & ~self.sight.is_on(before)
             doubtful.append(f._replace(uncertain=f.uncertain | touches))
         return again, at, tuple(mine), tuple(doubtful)

@@ -1,9 +1,9 @@
-"""The way back over the recorded steps of a motion: what `replay.py` is about, as a loop.
+"""The loop back over the recorded steps of a motion; `replay.py` has the derivation.
 
-It goes through the steps in pieces of as many as there are rows, the last piece first, whose rows are in hand; those
-before it are run again, each from a place that was kept. In a batch a step of all lanes is pulled back at once, so that
-the cotangents of what they share are sums inside products of matrices. Lanes have different numbers of steps: each
-begins with its own last one, and stands still when it is through.
+It goes through the steps in pieces of as many steps as there are rows. The rows of the last piece, which comes first,
+are at hand; earlier pieces are run again, each from a checkpoint. In a batch one step of all lanes is pulled back at
+once, so that the cotangents of shared arrays are summed inside matrix products. Lanes have different numbers of steps:
+each begins with its own last one, and idles when it has finished.
 """
 
 from collections.abc import Callable
@@ -27,26 +27,27 @@ from lagjax.numerics.evaluations import evaluations_a_step
 from lagjax.numerics.nystrom import Nystrom
 from lagjax.numerics.runge_kutta import ExplicitRungeKutta
 
-# Operations of a step pulled back in which each stage has a copy of the right-hand side, instead of a loop. What is not
-# one machine function goes through memory at each turn of a loop, large matrices and their cotangents included: with
-# copies gradients by a network of twenty thousand numbers, or in 64 lanes, take a fifth less. They compile for longer.
+# Up to so many operations of a step pulled back, each stage gets a copy of the right-hand side instead of a loop. What
+# is not one machine function goes through memory at each turn of a loop, large matrices and their cotangents included:
+# with copies, gradients by a network of twenty thousand numbers, or in 64 lanes, take a fifth less. Compiling takes
+# longer.
 COPIES = 1000
 
 
 class Lanes(NamedTuple):
-    """Of a batch: how many lanes there are, and which operands have one row for each."""
+    """A batch: the number of lanes, and which operands have one row per lane."""
 
     count: int
     batched: tuple[bool, ...]
 
     def each(self, function, more=0):
-        """`function` of the operands, and of `more` that all are batched, for all lanes."""
+        """Map `function` over the lanes; it takes the operands and `more` arguments that are all batched."""
         return jax.vmap(function, [0 if b else None for b in self.batched] + [0] * more, axis_size=self.count)
 
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """A motion as a function of its arrays, each of them once; all else is kept here."""
+    """A motion as a function of its arrays, each of which occurs once; everything else is stored here."""
 
     structure: Any
     places: tuple[int, ...]
@@ -55,7 +56,7 @@ class Motion:
     checked: bool
     bent: bool
     results: Callable
-    # The structure of the record, once it has been traced.
+    # The structure of the record, filled when it has been traced.
     found: list
 
     def problem(self, leaves) -> Problem:
@@ -74,21 +75,21 @@ class Motion:
 
     @property
     def robust(self) -> bool:
-        """Whether some steps may have been taken the robust way, and not as they are written out."""
+        """Whether some steps may have used the robust solve instead of the written-out equations."""
         solver = self.static.solver
         return solver.fast is not None and solver.equations.fallback
 
     @property
     def where(self) -> Problem:
-        """The problem, in place of each array its number."""
+        """The problem with the index of each array in its place."""
         return jtu.tree_unflatten(self.structure, self.places)
 
 
 class Sweep(NamedTuple):
-    """How far the way back has come: the step `k` is the next one, and rows are those of the piece `number`.
+    """The state of the loop back: the next step `k`, and the rows of the piece `number`.
 
-    `y`: the cotangent of the state where the step k ends, without that of an output there; `moved`: those of the
-    arrays so far; `output`: the last output that is not passed yet.
+    `y`: the cotangent of the state at the end of step k, without that of an output there; `moved`: the cotangents of
+    the arrays so far; `output`: the last output not passed yet.
     """
 
     k: Int[Array, ""]
@@ -100,9 +101,9 @@ class Sweep(NamedTuple):
 
 
 def swept_back(leaves, found: Recorded, asked, *, motion: Motion, moved, lanes: Lanes | None):
-    """The cotangents of the arrays that are `moved`, from those of the outputs, of the last time and the last state.
+    """The cotangents of the arrays with indices `moved`, from those of the outputs, the last time and the last state.
 
-    Of outputs at one time the first has the cotangents of all: see `together`.
+    The first of several outputs at one time has the cotangents of all of them: see `together`.
     """
     of_outputs, of_t, of_y = asked
     way = _Way(leaves, motion, moved, lanes, found.record, of_outputs)
@@ -121,7 +122,7 @@ def swept_back(leaves, found: Recorded, asked, *, motion: Motion, moved, lanes: 
 
 
 def together(leaves, motion: Motion, lanes: Lanes | None, of_outputs):
-    """The cotangents of outputs; of those at one time the first has the cotangents of all."""
+    """The cotangents of outputs, with those of all outputs at one time added to the first of these."""
     _, first = _outputs(leaves, motion, lanes)
     summed = lambda first, ct: jnp.zeros_like(ct).at[first].add(ct)
     summed = summed if lanes is None else jax.vmap(summed)
@@ -129,7 +130,7 @@ def together(leaves, motion: Motion, lanes: Lanes | None, of_outputs):
 
 
 def filled(leaves, moved, chosen):
-    """The arrays, those that are moved being the chosen ones."""
+    """The arrays, with those at the indices `moved` replaced by `chosen`."""
     every = list(leaves)
     for i, x in zip(moved, chosen):
         every[i] = x
@@ -138,7 +139,7 @@ def filled(leaves, moved, chosen):
 
 @dataclass(frozen=True, eq=False)
 class _Way:
-    """What does not change on the way back, of one lane or of all."""
+    """The constants of the way back, for one lane or for all lanes."""
 
     leaves: list
     motion: Motion
@@ -153,7 +154,7 @@ class _Way:
 
     @cached_property
     def of_times(self) -> bool:
-        """Whether the cotangents of times are asked for."""
+        """Whether the cotangents of times are wanted."""
         return bool({self.where.t0, self.where.controller.ts} & set(self.moved))
 
     @property
@@ -179,33 +180,33 @@ class _Way:
         return of(tree, i) if self.lanes is None else jax.vmap(of)(tree, i)
 
     def each(self, function: Callable, more: int) -> Callable:
-        """`function(problem, ...)` of the arrays and so many arguments."""
+        """Turn `function(problem, ...)` into one of the arrays and `more` arguments, mapped over the lanes."""
         of = lambda *x: function(self.motion.problem(x[: len(x) - more]), *x[len(x) - more :])
         return of if self.lanes is None else self.lanes.each(of, more)
 
     def safe(self, tree):
-        """Rows for lanes; one without steps stands in for the longest: NaN, its own may be, times zero is NaN."""
+        """Values per lane; lanes without steps get the longest lane's, since zero times their own may be NaN."""
         if self.lanes is None:
             return tree
         idle, longest = self.record.count == 0, jnp.argmax(self.record.count)
         return jax.tree.map(lambda x: jnp.where(like(idle, x), x[longest][None], x), tree)
 
     def added(self, total, i, ct):
-        """The cotangents of the arrays with one more, of the i-th, if it is asked for."""
+        """The cotangents of the arrays, with `ct` added to that of the i-th, if it is wanted."""
         if i not in self.moved:
             return total
         ct = jnp.sum(ct, axis=0) if self.lanes is not None and not self.is_lane(i) else ct
         return [x + ct if j == i else x for j, x in zip(self.moved, total)]
 
     def at_time(self, t, ct):
-        """The cotangent of a time as that of the end of a step that it is."""
+        """The cotangent of a time as that of the equal end of a step."""
         of = lambda ts, t, ct: jnp.where((jnp.arange(ts.size) == jnp.sum(ts < t)) & (ts == t), ct, 0.0)
         ends = self.where.controller.ts
         of = of if self.lanes is None else jax.vmap(of, (0 if self.is_lane(ends) else None, 0, 0))
         return of(self.leaves[ends], t, ct)
 
     def pulled(self, t0, t1, y, ct):
-        """The cotangents of the arrays, of both times (None where not asked for) and of the state at a step's start."""
+        """The cotangents of the arrays, of both times (None if not wanted) and of the state at a step's start."""
         leaves = [self.safe(x) if self.is_lane(i) else x for i, x in enumerate(self.leaves)]
         chosen = [leaves[i] for i in self.moved]
         start = (chosen, t0, t1, y) if self.of_times else (chosen, y)
@@ -217,14 +218,14 @@ class _Way:
 
         _, pull, valid = jax.vjp(partial(end, OnManifold.again), *start, has_aux=True)
         if self.motion.robust:
-            # Not a choice between two ends: what is not valid has no derivative, and zero times that is NaN.
+            # Choose between pulls, not between ends: the derivative of an invalid end is NaN, and zero times it too.
             robustly = lambda ct: jax.vjp(partial(end, OnManifold.again_robustly), *start)[1](ct)
             pull = partial(lax.cond, eqxi.unvmap_all(valid), pull, robustly)
         of_arrays, *of_start = pull(ct)
         return (of_arrays, *of_start) if self.of_times else (of_arrays, None, None, *of_start)
 
     def copied(self, solver: OnManifold, t0, t1, y) -> OnManifold:
-        """The solver with its right-hand side copied to each stage, where that is worth while."""
+        """The solver with its right-hand side copied to each stage, if that is worthwhile."""
         method = solver.solver
         if solver.fast is not None or not isinstance(method, Nystrom | ExplicitRungeKutta):
             return solver
@@ -236,11 +237,11 @@ class _Way:
         return replace(solver, solver=replace(method, in_a_loop=False))
 
     def is_on(self, s: Sweep):
-        """Whether the next step is one of this piece."""
+        """Whether the next step belongs to this piece."""
         return (s.k >= s.number * self.many) & (s.k >= 0)
 
     def turn(self, s: Sweep) -> Sweep:
-        """One step further back."""
+        """Pull back one step."""
         on = self.is_on(s)
         t0, t1, y0 = self.at(s.rows, jnp.maximum(s.k, 0) % self.many)
         here = on & (t1 > t0)
@@ -260,7 +261,7 @@ class _Way:
         return Sweep(s.k - on, s.number, s.rows, y, total, jnp.where(hit, self.at(self.first, output - 1), s.output))
 
     def piece(self, s: Sweep) -> Sweep:
-        """One piece further back."""
+        """Pull back one piece."""
         number = jnp.where(s.k >= 0, s.k // self.many, -1)
         # The piece before this one ends where this one begins.
         end, further = self.at(s.rows.t0, jnp.zeros_like(number)), number < s.number
@@ -274,6 +275,6 @@ class _Way:
 
 
 def _outputs(leaves, motion, lanes):
-    """The times of the outputs, and the first at each of them, of one lane or of all."""
+    """The output times, and the first output at each of them, for one lane or for all."""
     of = lambda *leaves: (motion.problem(leaves).ts, motion.problem(leaves).first)
     return of(*leaves) if lanes is None else lanes.each(of)(*leaves)

@@ -1,7 +1,7 @@
-"""The works of the forces of one motion: powers at its instants, and their integrals between them.
+"""The work of each force in one motion: powers at its instants, and their integrals between them.
 
-The motion is run once more, by the same method with the same tolerances, with outputs at the nodes of a quadrature,
-which is refined until it is better than the motion.
+The motion is integrated again, by the same method with the same tolerances, with outputs at the nodes of a quadrature,
+which is refined until it is more accurate than the motion.
 
 Source: Piessens et al., *QUADPACK* (1983), §2.2.
 """
@@ -27,17 +27,17 @@ from lagjax.motion.trajectory import Trajectory
 from lagjax.numerics import quadrature
 
 FORCE, DISSIPATION, TIME = "force", "dissipation", "explicit time"
-# How often the intervals that are not good enough are halved, and up to how many of them.
+# How often inaccurate intervals are halved, and the most intervals.
 HALVINGS, MOST_INTERVALS = 12, 10_000
 # The outer nodes of an interval are two thousandths of it from its ends.
 APART = 2e3
 
 
 class Work(NamedTuple):
-    """What one source gives to a motion, at every output.
+    """The work that one source does on a motion, at every output.
 
-    `power`, like v: by coordinate, `[L]/[t]`; `work`, like v: its integral from the first output on, `[L]`. Of explicit
-    time, which belongs to no coordinate, they are (T,). `total` (T,): the work of all coordinates.
+    `power`, like v: by coordinate, `[L]/[t]`; `work`, like v: its integral from the first output on, `[L]`. Those of
+    explicit time, which belongs to no coordinate, are (T,). `total` (T,): the work summed over the coordinates.
     """
 
     power: PyTree[Float[Array, "T ..."]]
@@ -46,16 +46,16 @@ class Work(NamedTuple):
 
 
 class Motion:
-    """One motion that is known, in NumPy's arrays: its instants, the phase of each, and the instants of its switches.
+    """One computed motion, in NumPy arrays: its instants, the phase of each, and the instants of its switches.
 
-    `t`, `q`, `v`, `multipliers`, `phase`: outputs, and the end where it lies `beyond` them. `systems`: those whose
-    forces are accounted for, a phase each; `forward`: 1, or -1 where time decreases. `sources`: by name how many
-    numbers its power has. `switch_times` (S,), and `entered` (S + 1,): the phases in their order.
+    `t`, `q`, `v`, `multipliers`, `phase`: at the outputs, and at the end if it lies `beyond` them. `systems`: those
+    whose forces are accounted for, one per phase; `forward`: 1, or -1 if time decreases. `sources`: by name the size
+    of each power. `switch_times` (S,), and `entered` (S + 1,): the phases in their order.
     """
 
     def __init__(self, trajectory: Trajectory, accounted):
         self.trajectory, self.systems, self.params = trajectory, phases_of(accounted), trajectory.params
-        # The number of outputs with which the motion is run again.
+        # The number of outputs when the motion is integrated again.
         self.room = 0
         rows, end = jax.tree.map(np.asarray, (trajectory.rows(), trajectory.end))
         states = [x.reshape(len(x), -1) for x in jax.tree.leaves((rows["q"], rows["v"]))]
@@ -88,7 +88,7 @@ class Motion:
         return jax.tree.map(lambda x: x[row], (self.t, self.q, self.v))
 
     def energies(self) -> "Energies":
-        """At each instant, by the system of its own phase."""
+        """The energies at each instant, by the system of its phase."""
         return self._energies(self.phase, self.t, self.q, self.v)
 
     def _energies(self, phase, *state):
@@ -99,13 +99,13 @@ class Motion:
         return found
 
     def works(self, allowed) -> tuple[dict[str, Work], float]:
-        """The work of each source, and what the errors of their integrals add up to: what is allowed, or more."""
+        """The work of each source, and the sum of the estimated errors of the integrals, which may exceed `allowed`."""
         powers = self._powers(self.phase, self.t, self.q, self.v, self.multipliers)
         works, error = self._integrated(allowed) if len(self.t) > 1 and self.sources else (powers, 0.0)
         return {name: self._work(name, powers[name], works[name]) for name in self.sources}, error
 
     def _powers(self, phase, t, q, v, multipliers):
-        """By source, (rows, n)."""
+        """The powers by source, (rows, n)."""
         powers = {name: np.zeros((len(t), size), self.t.dtype) for name, size in self.sources.items()}
         for i in np.unique(phase):
             system = self.systems[i]
@@ -116,7 +116,7 @@ class Motion:
         return powers
 
     def _integrated(self, allowed):
-        """The works until each instant, (T, n) by source, and what their errors add up to."""
+        """The works until each instant, (T, n) by source, and the sum of their errors."""
         knots = self._knots()
         apart = np.abs(np.diff(knots)) > self._shortest()
         a, b = self._cut(knots[:-1][apart], knots[1:][apart])
@@ -151,11 +151,11 @@ class Motion:
         return self.forward * np.unique(self.forward * np.concatenate([self.t, np.asarray(more, self.t.dtype)]))
 
     def _shortest(self):
-        """Of an interval whose nodes can be told apart."""
+        """The shortest interval whose nodes can be told apart."""
         return APART * np.finfo(self.t.dtype).eps * np.max(np.abs(self.t))
 
     def _cut(self, a, b):
-        """Intervals, cut where there are fewer of them than the motion had steps."""
+        """Cut the intervals into about as many pieces as the motion had steps, if there are fewer."""
         steps = int(self.trajectory.stats["num_accepted_steps"])
         span = np.sum(np.abs(b - a))
         pieces = np.maximum(1, np.ceil(steps * np.abs(b - a) / span)).astype(int)
@@ -163,7 +163,7 @@ class Motion:
         return np.concatenate([c[:-1] for c in cuts]), np.concatenate([c[1:] for c in cuts])
 
     def _again(self, a, b):
-        """The powers at the nodes of intervals, on the motion as it is run again."""
+        """The powers at the nodes of intervals, from integrating the motion again."""
         t = quadrature.nodes(a, b).ravel()
         ts = self._with_others(t)
         traj, first = self.trajectory, self._at(0)[1:]
@@ -178,8 +178,8 @@ class Motion:
             again = integrate(traj.system, *first, self.params, ts=ts, throw=False, estimate_error=False, **settings)
         if not is_among(again.result, ENDED_WELL):
             raise ValueError(
-                f"the motion could not be run again for its works: {message(again.result)}\n"
-                "Usual cause: a motion at the edge of what its tolerance allows.\nFix: a tighter or looser rtol."
+                f"the motion could not be integrated again for the work of its forces: {message(again.result)}\n"
+                "Usual cause: a motion that only just succeeds at its tolerance.\nFix: a tighter or looser rtol."
             )
         rows, place = again.rows(), np.searchsorted(self.forward * ts, self.forward * t)
         rows = jax.tree.map(lambda x: np.asarray(x)[place], {name: rows[name] for name in ("q", "v", "multipliers")})
@@ -187,22 +187,22 @@ class Motion:
         return self._powers(phase, t, **rows)
 
     def _with_others(self, t):
-        """These times in their order, the first and the last instant, and as many between as make one program do."""
+        """These times in order, the first and last instant, and others: up to a length that one program serves."""
         self.room = max(self.room, 2 ** (len(t) + 1).bit_length())
         others = np.linspace(self.t[0], self.t[-1], self.room - len(t), dtype=self.t.dtype)
         return self.forward * np.unique(self.forward * np.concatenate([t, others]))
 
     def _phase_of(self, t):
-        """The phase at times that are none of a switch."""
+        """The phase at times other than those of switches."""
         return self.entered[np.searchsorted(self.switch_times, t, side="right")]
 
     def switches_until(self, row: int) -> int:
-        """How many switches were before an instant: an output at one is before it, an end behind it."""
+        """How many switches precede an instant: an output at the time of a switch is before it, an end after it."""
         side = "right" if self.beyond and row == len(self.t) - 1 else "left"
         return int(np.searchsorted(self.switch_times, self.t[row], side=side))
 
     def jumps(self) -> np.ndarray:
-        """By how much the Jacobi integral jumps at each switch."""
+        """The jump of the Jacobi integral at each switch."""
         if self.switches is None or not len(self.switch_times):
             return np.zeros(0, self.t.dtype)
         s = self.switches
@@ -211,7 +211,7 @@ class Motion:
         return self._energies(self.entered[1:], self.switch_times, *after).h - h_before
 
     def ways(self) -> tuple[str, ...]:
-        """From which phase to which each switch leads."""
+        """The phase before and after each switch, in words."""
         names = () if self.switches is None else [self.switches.names[i] for i in self.entered]
         return tuple(f"{x} -> {y}" for x, y in zip(names, names[1:]))
 
@@ -248,7 +248,7 @@ def _energies(system, t, q, v, params):
 
 
 def _sources(system, state, params) -> dict[str, int]:
-    """What does work in a system, and how many numbers its power has."""
+    """The sources of work in a system, and the size of each power."""
     n = coordinates.flatten(state[1])[0].size
     found = {FORCE: n} if system.force is not None else {}
     found |= {DISSIPATION: n} if system.dissipation is not None else {}
@@ -284,5 +284,5 @@ def _powers(system, t, q, v, multipliers, params):
 
 
 def constraint_in_words(name: str) -> str:
-    """How a constraint is called among the sources."""
+    """The name of a constraint among the sources."""
     return f"constraint '{name}'"

@@ -1,7 +1,7 @@
-"""The stability report: hard cases, each accurate, degraded with a warning, or refused with a reason.
+"""The stability report: hard cases, each of which is accurate, degraded with a warning, or refused with a reason.
 
-`python -m lagjax stability` prints it: masses, angles, speeds, stiffness, amplitudes, spans and precisions at the
-ends of their ranges, each against a closed form or an independent value.
+`python -m lagjax stability` prints it: masses, angles, speeds, stiffness, amplitudes, time spans and precisions at the
+ends of their ranges, each compared with a closed form or an independent value.
 """
 
 from lagjax.stability.rows import trials

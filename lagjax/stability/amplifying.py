@@ -1,7 +1,7 @@
-"""Motions that make more of an error than a method does: close encounters, tumbling and chaos.
+"""Motions that amplify errors more than any method causes: close encounters, tumbling and chaos.
 
-What is left of a chaotic motion depends on the last digit of a number, and nothing but a warning is right then. Their
-last states are extrapolated in long double, on equations derived by hand (`benchmarks/amplifying.py`).
+The end of a chaotic motion depends on the last digit of a number, so the only correct answer is a warning. The
+reference end states were extrapolated in long double, from equations derived by hand (`benchmarks/amplifying.py`).
 """
 
 from functools import partial
@@ -45,7 +45,7 @@ kepler, cubic, pendulum, body = map(System, (attracted, henon_heiles, two_rods, 
 
 
 def _on_ellipse(eccentricity, q0, v0, params, ts):
-    """From the pericentre of an ellipse with k = a = 1, by Newton's method for Kepler's equation."""
+    """Motion from the pericentre of an ellipse with k = a = 1, by Newton's method for Kepler's equation."""
     mean = jnp.mod(ts, 2 * jnp.pi)
     anomaly = mean + eccentricity * jnp.sin(mean)
     for _ in range(40):
@@ -57,7 +57,7 @@ def _on_ellipse(eccentricity, q0, v0, params, ts):
 
 
 def _turns(eccentricity, **what):
-    """Ten turns: an error of the energy is one of the time, which counts most next to the pericentre."""
+    """Ten turns: an energy error becomes a time error, which matters most next to the pericentre."""
     turns = np.array([0.0, 0.25, 5.0 + 1e-4, 10.0 + 1e-4])
     exact = partial(_on_ellipse, eccentricity)
     q0 = np.array([1 - eccentricity, 0.0])
@@ -69,18 +69,18 @@ def _turns(eccentricity, **what):
 
 
 def _to(name, system, params, span, start, end, **what):
-    """A motion of which the last state is known."""
+    """A motion with a known last state."""
     both = [{key: np.array([first[key], last[key]]) for key in first} for first, last in zip(start, end)]
     ts = np.array([0.0, span])
     return Trial("amplifying", name, system, *start, params, ts, lambda *_: tuple(both), **what)
 
 
 def amplifying():
-    """Eccentric orbits, a body about its middle axis, and chaos, in which no digit is left."""
+    """Eccentric orbits, a body turning about its middle axis, and chaos, after which no digit is correct."""
     zero = {"x": 0.0, "y": 0.0}
     return [
         _turns(0.9, expected=None),
-        # What is lost of the velocity there is more than 10,000 tolerances.
+        # The velocity error at the pericentre is more than 10,000 tolerances.
         _turns(0.99, expected=DEGRADED, tier=REDUCED),
         _turns(0.999, expected=DEGRADED),
         _to(

@@ -1,4 +1,4 @@
-"""Constraints that say the same twice, and constraints that cannot both hold."""
+"""Redundant constraints, and constraints that contradict each other."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -20,7 +20,7 @@ def rod(t, q, params):
 
 
 def rod_again(t, q, params):
-    """The same rod, by its length."""
+    """The same rod, expressed by its length."""
     return 3.0 * (jnp.sqrt(q @ q) - params["a"])
 
 
@@ -45,7 +45,7 @@ def _on_the_rod(q0, v0, params, ts):
 
 
 def redundant():
-    """A rod given twice; two rods of different length; and two motions that part at once."""
+    """A rod given twice; two rods of different length; and a point that is both held level and lifted."""
     params, ts = {"a": 0.75, "g": 9.8125}, np.linspace(0.0, 3.0, 5)
     q0, v0 = 0.75 * np.array([np.sin(1.0), -np.cos(1.0)]), np.zeros(2)
     along = by_parameter(q0, v0, params, "g")

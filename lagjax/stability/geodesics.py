@@ -1,4 +1,4 @@
-"""Geodesics of a sphere: nearly antipodal points and the pole, in three sets of coordinates."""
+"""Geodesics of a sphere: nearly antipodal points and the pole, in three coordinate systems."""
 
 import jax
 import jax.numpy as jnp
@@ -22,7 +22,7 @@ def _circle(q0, v0, params, ts):
 
 
 def _circle_from_angles(q0, v0, params, ts):
-    """The unit speed path in r from angles and their rates."""
+    """The exact path in space, from angles and their rates."""
     at = lambda q: sphere_geodesic.cartesian(params, q["psi"], q["theta"])
     r, rate = jax.jvp(at, (q0,), (v0,))
     speed = jnp.sqrt(jnp.sum(rate**2))
@@ -30,12 +30,12 @@ def _circle_from_angles(q0, v0, params, ts):
     return path
 
 
-def _seen_in_space(trajectory):
+def _position_in_space(trajectory):
     return sphere_geodesic.cartesian({"R": sphere_geodesic.PARAMS["R"]}, trajectory.q["psi"], trajectory.q["theta"])
 
 
 def _over_azimuth(q0, v0, params, ts):
-    """ψ and ψ' from cot ψ = A cos θ + B sin θ through the start."""
+    """ψ and ψ' from the great circle cot ψ = A cos θ + B sin θ through the start."""
     q, slope = jnp.cos(q0) / jnp.sin(q0), -v0 / jnp.sin(q0) ** 2
     shifted = q * jnp.cos(ts - ts[0]) + slope * jnp.sin(ts - ts[0])
     rate = slope * jnp.cos(ts - ts[0]) - q * jnp.sin(ts - ts[0])
@@ -43,7 +43,7 @@ def _over_azimuth(q0, v0, params, ts):
 
 
 def geodesics():
-    """Nearly antipodal points and the pole, embedded, by arc length in angles, and over the azimuth."""
+    """Nearly antipodal points and the pole: embedded in space, by arc length in angles, and over the azimuth."""
     params, rows = sphere_geodesic.PARAMS, []
     near = (0.75, 0.25, np.pi - 0.75 + 1e-6, np.pi + 0.25 + 1e-6)
     for name, ends in (("pi - 1e-6 apart", near), ("over the pole", (0.5, 0.0, 0.25, np.pi))):
@@ -63,7 +63,7 @@ def geodesics():
         rows.append(
             Trial(
                 "geodesic", name, by_angles, q0, v0, params, np.linspace(0.0, 2.1, 5), _circle_from_angles,
-                None if miss == 0 else along, observed=_seen_in_space,
+                None if miss == 0 else along, observed=_position_in_space,
                 amplification=1 / miss if miss else 1.0, tier=FULL if miss else REDUCED,
             )
         )  # fmt: skip

@@ -1,4 +1,4 @@
-"""Wedge and bead on a hoop: mass ratios, angles, speeds, amplitudes and single precision, against closed forms."""
+"""Wedge and bead on a hoop: mass ratios, angles, speeds, amplitudes and float32, compared with closed forms."""
 
 from dataclasses import replace
 
@@ -13,11 +13,11 @@ from lagjax.stability.trial import ACCURATE, FULL, QUICK, REDUCED, REFUSED, Tria
 
 
 def single(tree):
-    """The same in float32."""
+    """The tree in float32."""
     return jax.tree.map(np.float32, tree)
 
 
-# Mass ratio and angle of the wedge.
+# The wedge: mass ratio and angle.
 
 
 def _wedge_motion(q0, v0, params, ts):
@@ -40,7 +40,7 @@ def wedge():
     ]  # fmt: skip
 
 
-# The bead on the hoop: a pendulum that is also driven.
+# The bead on the hoop: a pendulum, with or without rotation of the hoop.
 
 
 def _bead_motion(q0, v0, params, ts):
@@ -48,11 +48,11 @@ def _bead_motion(q0, v0, params, ts):
 
 
 def swing(name, change, psi, span, points=6, **what):
-    """From rest at ψ, over `span` periods; each tolerance by the size of its coordinate."""
+    """A swing from rest at ψ over `span` periods; absolute tolerances in proportion to angle and rate."""
     params = {"m": 0.5, "a": 0.75, "g": 9.8125} | change
     period = float(bead_on_hoop.exact_period(params, psi))
     tolerance = what.get("tolerance", 1e-10)
-    # What is asked of the velocity is relative to its own largest value.
+    # The tolerance of the velocity is relative to its largest value.
     rate = float(np.max(np.abs(bead_on_hoop.exact_motion(params, psi, np.linspace(0.0, period, 64))[1])))
     options = {"rtol": np.full(2, tolerance), "atol": tolerance * np.array([psi, rate])} | what.pop("options", {})
     ts = np.linspace(0.0, span * period, points)
@@ -64,7 +64,7 @@ def swing(name, change, psi, span, points=6, **what):
 
 
 def bead():
-    """From a plain pendulum to a million turns a second, and a billionth beside the critical speed."""
+    """From a plain pendulum to a hoop at omega = 1e6, and a hoop within a billionth of the critical speed."""
     critical = float(np.sqrt(9.8125 / 0.75))
     tiers = {0.0: QUICK, 1e6: QUICK}
     rows = [
@@ -79,12 +79,12 @@ def bead():
 
 
 def by_both(rows):
-    """By the default, which is `Nystrom12` for the bead, and by the default of systems with constraints."""
+    """The rows by the default method, `Nystrom12` for the bead, and by the default method of constrained systems."""
     return [*rows, *(replace(row, method=Dopri8()) for row in rows)]
 
 
 def separatrix():
-    """Released next to the top: counted from the top, where nothing is lost, and from the bottom."""
+    """Release close to the top, with the angle from the top, which loses no digits, and from the bottom."""
     rows = []
     for distance in (1e-2, 1e-4, 1e-8):
         params = {"m": 0.5, "a": 0.75, "g": -9.8125, "omega": 0.0}
@@ -107,9 +107,9 @@ def separatrix():
                 amplification=1 / distance, expected=ACCURATE if distance > 1e-8 else None,
             )
         )  # fmt: skip
-    # Past the other side it comes that close to the top again, and an error of its energy decides on which side: errors
-    # are amplified by the square of the distance's inverse. At 1e-6 no double holds the answer, and no sign of that is
-    # in the motion itself; what the energy shows is all right.
+    # On the other side the pendulum comes as close to the top again, and its energy error decides whether it passes
+    # over: errors are amplified by the inverse square of the distance. At 1e-6 double precision cannot represent the
+    # answer, and nothing in the motion shows this; its energy looks correct.
     distance = 1e-2
     rows.append(
         swing(
@@ -121,12 +121,12 @@ def separatrix():
 
 
 def _fall(q0, v0, params, ts):
-    """χ and its rate from rest at χ0 next to the top (g counted negative there): tan(χ/2) = tan(χ0/2) / cn(ω0 t)."""
+    """χ and its rate from rest at χ0 close to the top (where g < 0): tan(χ/2) = tan(χ0/2) / cn(ω0 t)."""
     rate = jnp.sqrt(-params["g"] / params["a"])
     s2, c2 = jnp.sin(0.5 * q0) ** 2, jnp.cos(0.5 * q0) ** 2
     sn, cn, dn = jacobi_elliptic(rate * ts, c2, s2)
     tangent = jnp.tan(0.5 * q0)
-    # χ = 2 atan(tangent / cn) continued through the bottom, χ = π, where cn = 0.
+    # χ = 2 atan(tangent / cn), continued through the bottom, χ = π, where cn = 0.
     return 2 * jnp.arctan2(tangent, cn), 2 * tangent * rate * sn * dn / (cn**2 + tangent**2)
 
 
@@ -134,7 +134,7 @@ def _fall(q0, v0, params, ts):
 
 
 def float32():
-    """What single precision can do, where it wears out, and what it cannot."""
+    """Cases within the reach of single precision, at its limits, and beyond it."""
     at, start = sliding_wedge.PARAMS, (sliding_wedge.Q0, sliding_wedge.V0)
     rows = []
     for ratio in (1e-6, 1e6):

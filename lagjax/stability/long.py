@@ -1,4 +1,4 @@
-"""Very many periods of a pendulum: swinging, and turning over the top."""
+"""Very many periods of a pendulum that swings or turns over the top."""
 
 import diffrax
 import jax.numpy as jnp
@@ -20,14 +20,14 @@ UNIT = {"a": 1.0, "g": 1.0, "omega": 0.0}
 
 
 def _whole_turns(q0, v0, params, ts):
-    """Started at the bottom with the rate v0, it is there again after whole turns: direction and rate."""
+    """Direction and rate near whole turns, after which the pendulum is back at the bottom with the rate v0."""
     period = bead_on_hoop.rotation_period(UNIT, v0**2 - 2.0)
     over = v0 * (ts - jnp.round(ts / period) * period)
     return jnp.stack([jnp.cos(over), jnp.sin(over)]), v0 + 0 * ts
 
 
 def _direction(trajectory):
-    # Of six million radians the relative error would hide a lost phase.
+    # The relative error of an angle of six million radians would hide a phase error.
     return jnp.stack([jnp.cos(trajectory.q), jnp.sin(trajectory.q)]), trajectory.v
 
 
@@ -36,7 +36,7 @@ def long():
     omega = {"omega": 0.0}
     rate, per_turn = 100.0, 24
     turn = float(bead_on_hoop.rotation_period(UNIT, rate**2 - 2.0))
-    # Steps at equal angles: what they miss of a weak periodic force cancels over a turn.
+    # Steps at equal angles: their errors due to a weak periodic force cancel over a turn.
     fixed = {"stepsize_controller": diffrax.ConstantStepSize(), "dt0": np.asarray(turn / per_turn), "max_steps": None}
     turns = lambda n, **what: Trial(
         "long", f"{n:.0e} turns, {per_turn} fixed steps each", rotor, 0.0, rate, {}, np.array([0.0, n * turn]),

@@ -1,4 +1,4 @@
-"""The largest stable fixed step, found by trying, against the method's stability function.
+"""The largest stable fixed step, found by trial, compared with the method's stability function.
 
 One step of a Runge-Kutta method (A, b) on y' = λ y multiplies y by R(z) = 1 + z bᵀ (I - z A)⁻¹ 1, z = h λ. On the
 oscillator q̈ = -ω² q the eigenvalues are λ = ±iω: the step is stable as long as |R(ihω)| <= 1.
@@ -16,7 +16,7 @@ from lagjax.mechanics.system import System
 from lagjax.motion.integrate import integrate
 from lagjax.stability.trial import ACCURATE, FULL, Outcome
 
-# An amplitude that grows by less than this in as many steps counts as stable; Dopri8 crosses 1 steeply.
+# A step is stable if the amplitude grows by less than GROWTH in STEPS steps; |R| of Dopri8 crosses 1 steeply.
 STEPS, GROWTH = 4000, 1.01
 OMEGA = 1e5
 HALVINGS = 20
@@ -31,23 +31,23 @@ oscillator = System(lagrangian)
 
 
 def exact(q0, v0, params, ts):
-    """q = cos ω t and its rate."""
+    """The exact q and its rate."""
     w = params["omega"]
     return q0 * jnp.cos(w * ts) + v0 / w * jnp.sin(w * ts), v0 * jnp.cos(w * ts) - w * q0 * jnp.sin(w * ts)
 
 
 def amplification(method, z):
-    """R(z) from the method's tableau, for an array of z: stage by stage, as the tableau is lower triangular."""
+    """R(z) for an array of z, computed stage by stage from the method's lower triangular tableau."""
     tableau, z = method.tableau, np.asarray(z)
     diagonal = np.zeros(len(tableau.b_sol)) if tableau.a_diagonal is None else tableau.a_diagonal
     stages = []
-    for row, own in zip([[], *tableau.a_lower], diagonal):
-        stages.append((1 + z * sum((a * k for a, k in zip(row, stages)), 0 * z)) / (1 - z * own))
+    for row, on_diagonal in zip([[], *tableau.a_lower], diagonal):
+        stages.append((1 + z * sum((a * k for a, k in zip(row, stages)), 0 * z)) / (1 - z * on_diagonal))
     return 1 + z * sum(b * k for b, k in zip(tableau.b_sol, stages))
 
 
 def stable_limit(method, growth=GROWTH, steps=STEPS) -> float:
-    """The smallest hω above which the amplitude grows beyond `growth` in `steps` steps; infinite without one."""
+    """The smallest hω at which the amplitude grows by more than `growth` in `steps` steps; infinite if none does."""
     y = np.concatenate([np.linspace(1e-4, 20.0, 200_000), np.logspace(np.log10(20.0), 6, 1000)])
     unstable = y[steps * np.log(np.abs(amplification(method, 1j * y))) > np.log(growth)]
     return unstable[0] if unstable.size else np.inf
@@ -63,23 +63,23 @@ class StableStep:
     family: str = field(default="stable step", init=False)
 
     def attempt(self) -> Outcome:
-        """Bisect between a step that is stable and one that is not."""
+        """Bisect between a stable and an unstable step."""
         low, high = 0.05, 40.0
         limit = stable_limit(self.method)
         if self._stable(1e6):
-            found, effort = np.inf, "any h"
+            measured, effort = np.inf, "any h"
         else:
             for _ in range(HALVINGS):
                 middle = 0.5 * (low + high)
                 low, high = (middle, high) if self._stable(middle) else (low, middle)
-            found, effort = low, f"h = {low:.4f}/omega"
-        same = np.isinf(limit) and np.isinf(found)
+            measured, effort = low, f"h = {low:.4f}/omega"
+        same = np.isinf(limit) and np.isinf(measured)
         return Outcome(
             family=self.family,
             name=f"oscillator of omega = {OMEGA:g}, against |R(ihω)| = 1",
             method=type(self.method).__name__,
             effort=effort,
-            error=0.0 if same else abs(found / limit - 1),
+            error=0.0 if same else abs(measured / limit - 1),
             allowed=1e-3,
             expected=self.expected,
         )

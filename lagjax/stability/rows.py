@@ -12,5 +12,5 @@ FAMILIES = (wedge, bead, separatrix, long, stiff, stable_steps, geodesics, ampli
 
 
 def trials(tier=FULL):
-    """The rows of a report: those of QUICK, of REDUCED, or of FULL."""
+    """The rows of the QUICK, REDUCED or FULL report."""
     return [row for family in FAMILIES for row in family() if row.tier <= tier]

@@ -1,4 +1,4 @@
-"""Stiff springs and mechanisms, and what a fixed step may be."""
+"""Stiff springs and mechanisms, and the limits of a fixed step."""
 
 import diffrax
 import jax.numpy as jnp
@@ -22,7 +22,7 @@ whirled = System(spring)
 
 
 def _whirl(q0, v0, params, ts):
-    """The circle at the rate ω, whose radius k / (k - ω²) is where the spring holds it."""
+    """The circle at the rate ω, on which the spring balances at the radius k / (k - ω²)."""
     rate = v0[1] / q0[0]
     radius = params["k"] / (params["k"] - rate**2)
     cos, sin = jnp.cos(rate * ts), jnp.sin(rate * ts)
@@ -31,8 +31,8 @@ def _whirl(q0, v0, params, ts):
 
 def stiff():
     """A mass whirled on a spring of stiffness k, up to 1e5 times faster than the motion; mechanisms; fixed steps."""
-    # At the limit of its stability a step of order 12 makes more of a derivative than of the motion, which the step
-    # size holds back.
+    # At its stability limit the method of order 12 amplifies a derivative more than the motion, which alone the step
+    # size controls; hence `derived` only up to k < 1e7.
     rows = [_spring(k, None, derived=k < 1e7) for k in (1e4, 1e6, 1e8, 1e10)]
     rows += [_spring(k, Dopri8(), derived=True) for k in (1e4, 1e6, 1e8)]
     rows += [_spring(k, Radau5(), expected=None) for k in (1e4, 1e6, 1e8, 1e10)]
@@ -42,7 +42,7 @@ def stiff():
 def _spring(k, method, derived=False, **what):
     radius = k / (k - 1.0)
     q0, v0, params = np.array([radius, 0.0]), np.array([0.0, radius]), {"k": k}
-    # Along the family of circles: dr/dω = 2 k ω / (k - ω²)².
+    # The derivative along the family of circles: dr/dω = 2 k ω / (k - ω²)².
     slope = 2 * k / (k - 1.0) ** 2
     along = np.array([slope, 0.0]), np.array([0.0, radius + slope]), zeros(params)
     return Trial(

@@ -1,14 +1,13 @@
-"""One row of the stability report: a motion that is hard, its exact answer, and what the library made of it.
+"""One row of the stability report: a hard motion, its exact answer, and the library's result.
 
-A row is *accurate* where its error is a small multiple of the tolerance, *degraded* where the library warned or its own
-estimate says as much, and *refused* where it raised. What is none of the three was *silently wrong*. A tolerance bounds
-what is lost a period; what is lost of the energy shifts the phase in all later periods; and a motion may amplify it.
-Hence
+A row is *accurate* if its error is a small multiple of the tolerance, *degraded* if the library warned or its own error
+estimate shows the error, and *refused* if it raised. Everything else is *silently wrong*. The tolerance bounds the
+error per period, an energy error shifts the phase in all later periods, and the motion itself may amplify errors. Hence
 
     allowed = PER_PERIOD · tolerance · periods · (1 + periods/1000) · amplification, and never above USELESS
 
-and ten times that for the derivative of the motion. Neither is chosen by what came out. Where a derivative is known,
-the motion is also one of several lanes of a compiled program with derivatives, and has to be as right there.
+and ten times that for the derivative of the motion. Neither was fitted to the results. If a derivative is known, the
+motion also runs as one of several lanes of a compiled program with derivatives, and must be as accurate there.
 """
 
 import warnings
@@ -31,31 +30,32 @@ from lagjax.motion.trajectory import Trajectory
 from lagjax.report import relative_error
 
 PER_PERIOD = 100.0
-# With fewer than two digits left nothing has been computed, whatever was asked.
+# A result with fewer than two correct digits is never accurate, whatever the tolerance.
 USELESS = 1e-2
 OF_DERIVATIVES = 10.0
-# An error that is at most this many times its estimate has been told.
-TOLD = 10.0
-# How far along the derivative's direction the lanes start; the first is the row itself.
+# An error counts as reported if it is at most this many times its estimate.
+REPORTED_WITHIN = 10.0
+# The offsets of the lanes' starts along the direction of the derivative; the first lane is the row itself.
 LANES = 0.0, 1e-3
 ACCURATE, DEGRADED, REFUSED, SILENTLY_WRONG = "accurate", "degraded", "refused", "SILENTLY WRONG"
 VERDICTS = (ACCURATE, DEGRADED, REFUSED, SILENTLY_WRONG)
-# Which rows belong to which report: each also has those of the ones before it.
+# The reports to which rows belong; each report includes the rows of the ones before it.
 QUICK, REDUCED, FULL = 0, 1, 2
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of a row.
+    """The result of a row.
 
-    - `effort`: steps, accepted and rejected, or the largest stable step.
-    - `error`: relative, against the exact answer; infinite where there is no answer. `allowed`: of it.
+    - `effort`: the number of steps, accepted and rejected, or the largest stable step.
+    - `error`: relative to the exact answer; infinite if there is no result. `allowed`: the error that counts as
+      accurate.
     - `residual`: of the constraints, None without constraints.
-    - `lanes`: the error of the same motion in lanes of a program; `gradient`: relative error of its derivative there,
-      forward mode against the exact one; None where not tried.
-    - `estimated`: the error as the motion itself estimates it, by the same measure; None where that is not the one.
-    - `said`: the first sentence of what the library warned of or raised.
-    - `expected`: the verdict that the row should have, None where any honest one will do.
+    - `lanes`: the error of the same motion in lanes of a program; `gradient`: the relative error of its derivative
+      there, in forward mode; both None if not tried.
+    - `estimated`: the motion's own estimate of the error in the same measure; None if it has none.
+    - `said`: the first sentence of each warning or of the error that the library raised.
+    - `expected`: the verdict that the row should have; None if any verdict except silently wrong is acceptable.
     """
 
     family: str
@@ -80,25 +80,25 @@ class Outcome:
         if self.said:
             return DEGRADED
         errors = self.error, self.lanes or 0.0, (self.gradient or 0.0) / OF_DERIVATIVES
-        # NaN is not right.
+        # `<=` so that NaN is not accurate.
         if all(error <= self.allowed for error in errors):
             return ACCURATE
-        told = TOLD * (self.estimated or 0.0)
-        return DEGRADED if all(error <= max(told, self.allowed) for error in errors) else SILENTLY_WRONG
+        reported = REPORTED_WITHIN * (self.estimated or 0.0)
+        return DEGRADED if all(error <= max(reported, self.allowed) for error in errors) else SILENTLY_WRONG
 
     @property
     def passed(self) -> bool:
-        """Whether the row was honest, and came out as expected."""
+        """Whether the row is not silently wrong and has the expected verdict."""
         return self.verdict != SILENTLY_WRONG and self.expected in (None, self.verdict)
 
 
 def zeros(tree):
-    """A direction that leaves `tree` alone."""
+    """The zero direction for `tree`."""
     return jax.tree.map(lambda x: np.zeros(np.shape(x)), tree)
 
 
 def by_parameter(q0, v0, params, name, size=1.0):
-    """The direction along one parameter."""
+    """The direction that changes one parameter."""
     return zeros(q0), zeros(v0), zeros(params) | {name: size}
 
 
@@ -110,11 +110,11 @@ def _states(trajectory):
 class Trial:
     """A motion to integrate and its exact answer.
 
-    - `exact(q0, v0, params, ts)`: what `observed(trajectory)` must be, differentiable; by default (q, v).
+    - `exact(q0, v0, params, ts)`: the exact value of `observed(trajectory)`, by default (q, v); differentiable.
     - `method`: None for the default. `along`: (dq0, dv0, dparams), the direction of the derivative; None for no check
-      of it, nor in lanes.
-    - `tolerance`: what is asked. `options` of `integrate` beside it, such as an atol by size.
-    - `periods`, `amplification`: how long, and by how much the motion itself magnifies an error of its start.
+      of the derivative and of lanes.
+    - `tolerance`: the requested one; `options`: further options of `integrate`, such as an atol per coordinate.
+    - `periods`: the length of the motion; `amplification`: the factor by which it magnifies an error of its start.
     """
 
     family: str
@@ -139,23 +139,23 @@ class Trial:
     def allowed(self) -> float:
         """The error that counts as accurate."""
         periods = max(1.0, self.periods) * (1 + self.periods / 1000)
-        grown = PER_PERIOD * self.tolerance * periods * max(1.0, self.amplification)
-        return min(grown, USELESS)
+        bound = PER_PERIOD * self.tolerance * periods * max(1.0, self.amplification)
+        return min(bound, USELESS)
 
     def attempt(self) -> Outcome:
-        """Integrate as a user would, and compare."""
-        with warnings.catch_warnings(record=True) as heard:
+        """Integrate as a user would, and compare with the exact answer."""
+        with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             try:
                 trajectory = integrate(self.system, self.q0, self.v0, self.params, ts=self.ts, **self._options())
             except (ValueError, RuntimeError) as error:
                 return self._outcome(raised=True, said=_first_sentence(error))
         steps = f"{int(trajectory.stats['num_steps'])} steps"
-        said = "; ".join(_first_sentence(warning.message) for warning in heard)
+        said = "; ".join(_first_sentence(warning.message) for warning in caught)
         residual = float(trajectory.residual()) if self.system.constraints else None
         if self.exact is None:
             return self._outcome(trajectory.static.how.method, effort=steps, residual=residual, said=said)
-        error = relative_error(self.observed(trajectory), self.exact(*self._exactly()))
+        error = relative_error(self.observed(trajectory), self.exact(*self._exact_inputs()))
         lanes, gradient = self._errors_in_lanes(self.exact)
         return self._outcome(
             trajectory.static.how.method, effort=steps, error=error, residual=residual, said=said, lanes=lanes,
@@ -178,8 +178,8 @@ class Trial:
             allowed=self.allowed, expected=self.expected, **what,
         )  # fmt: skip
 
-    def _exactly(self):
-        """The inputs as they were rounded to the motion's dtype, in double precision."""
+    def _exact_inputs(self):
+        """The inputs, rounded to the motion's dtype and converted back to double precision."""
         start = coordinates.state(self.ts[0], self.q0, self.v0, self.params)
         ts = np.asarray(self.ts).astype(start.t.dtype)
         return jax.tree.map(lambda x: jnp.asarray(x, float), (start.q, start.v, start.params, ts))
@@ -187,9 +187,9 @@ class Trial:
     def _errors_in_lanes(self, exact):
         if self.along is None:
             return None, None
-        *exactly, ts = self._exactly()
-        tangents = jax.tree.map(lambda x, dx: jnp.broadcast_to(jnp.asarray(dx, float), x.shape), exactly, [*self.along])
-        wanted = jax.jvp(lambda *x: exact(*x, ts), tuple(exactly), tuple(tangents))
+        *inputs, ts = self._exact_inputs()
+        tangents = jax.tree.map(lambda x, dx: jnp.broadcast_to(jnp.asarray(dx, float), x.shape), inputs, [*self.along])
+        wanted = jax.jvp(lambda *x: exact(*x, ts), tuple(inputs), tuple(tangents))
         start = coordinates.state(self.ts[0], self.q0, self.v0, self.params)
         point, dtype = [start.q, start.v, start.params], start.t.dtype
         tangents = jax.tree.map(lambda x, dx: dx.astype(x.dtype), point, tangents)
@@ -201,7 +201,7 @@ class Trial:
 
 @compiled
 def _in_lanes(system, point, tangents, ts, options, observed):
-    """What is observed and its directional derivative, in forward mode; the other lanes start a little further on."""
+    """The observed values and their directional derivative in forward mode; the other lanes start displaced."""
 
     def motion(q0, v0, params):
         return observed(integrate(system, q0, v0, params, ts=ts, throw=False, **options))
@@ -215,7 +215,7 @@ def _in_lanes(system, point, tangents, ts, options, observed):
 
 
 def _gathered(tree):
-    """Coordinates together and velocities together: a derivative is measured by the largest of each."""
+    """One vector of coordinates and one of velocities: the error of a derivative is relative to the largest of each."""
     parts = tree if isinstance(tree, tuple) else (tree,)
     return [np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(part)]) for part in parts]
 
@@ -240,7 +240,7 @@ def stability_table(outcomes: Sequence[Outcome]) -> str:
         "what the library said",
     )
     cells = [_cells(outcome) for outcome in outcomes]
-    # The last column is prose: keep it to the left.
+    # The last column is text, so it is left-aligned.
     width = max(len(row[-1]) for row in [header, *cells])
     body = table((*header[:-1], header[-1].ljust(width)), [(*row[:-1], row[-1].ljust(width)) for row in cells])
     counts = {verdict: sum(outcome.verdict == verdict for outcome in outcomes) for verdict in VERDICTS}
@@ -249,8 +249,8 @@ def stability_table(outcomes: Sequence[Outcome]) -> str:
             *(line.rstrip() for line in body.split("\n")),
             "",
             "error and gradient: relative, against the exact motion and its exact derivative; in lanes: the error of "
-            "the same motion in a compiled batch with derivatives; estimated: the error as the motion itself says it; "
-            f"accurate: at most {PER_PERIOD:g} tolerances a period, more after thousands, times the motion's own "
+            "the same motion in a compiled batch with derivatives; estimated: the motion's own estimate of its error; "
+            f"accurate: at most {PER_PERIOD:g} tolerances per period, more after thousands, times the motion's own "
             f"amplification, and {OF_DERIVATIVES:g} times that for the gradient",
             ", ".join(f"{count} {verdict}" for verdict, count in counts.items()),
         ]
@@ -276,6 +276,6 @@ def _cells(outcome):
 
 
 def _short(text, longest=120):
-    """The beginning and the end, where the reason stands."""
+    """The text shortened to its beginning and its end, which contains the reason."""
     half = (longest - 5) // 2
     return text if len(text) <= longest else f"{text[:half]} ... {text[-half:]}"

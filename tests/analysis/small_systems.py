@@ -1,4 +1,4 @@
-"""Systems with small motions in closed form, that several tests share."""
+"""Systems whose small motions are known in closed form, shared by several tests."""
 
 import jax.numpy as jnp
 
@@ -12,18 +12,18 @@ def bead_lagrangian(t, q, v, params):
 
 
 def chain_lagrangian(t, q, v, params):
-    """Equal masses in a row between two walls, and springs."""
+    """Equal masses in a row, connected by springs to each other and to two walls."""
     ends = jnp.concatenate([jnp.zeros(1, q.dtype), q, jnp.zeros(1, q.dtype)])
     return 0.5 * params["m"] * jnp.sum(v**2) - 0.5 * params["k"] * jnp.sum(jnp.diff(ends) ** 2)
 
 
 def free_chain_lagrangian(t, q, v, params):
-    """The same without walls."""
+    """The chain without walls."""
     return 0.5 * params["m"] * jnp.sum(v**2) - 0.5 * params["k"] * jnp.sum(jnp.diff(q) ** 2)
 
 
 def foucault_lagrangian(t, q, v, params):
-    """An isotropic oscillator in a frame that turns."""
+    """An isotropic oscillator in a rotating frame."""
     turn = params["turn"]
     moving = (v["x"] - turn * q["y"]) ** 2 + (v["y"] + turn * q["x"]) ** 2
     return 0.5 * moving - 0.5 * params["omega"] ** 2 * (q["x"] ** 2 + q["y"] ** 2)
@@ -37,7 +37,7 @@ def spherical_lagrangian(t, q, v, params):
 
 
 def top_lagrangian(t, q, v, params):
-    """A symmetric top on its tip, by two tilts and its spin: regular where it stands upright."""
+    """A symmetric top on its tip, by two tilts and its spin: regular in the upright position."""
     spin = v["spin"] + v["alpha"] * jnp.sin(q["beta"])
     tilting = (v["alpha"] * jnp.cos(q["beta"])) ** 2 + v["beta"] ** 2
     height = jnp.cos(q["alpha"]) * jnp.cos(q["beta"])
@@ -61,13 +61,13 @@ def disk_lagrangian(t, q, v, params):
 
 
 def rolling(t, q, v, params):
-    """The contact moves along the heading by what the rim unrolls."""
+    """The contact moves along the heading as far as the rim rolls."""
     r = params["r"]
     return jnp.stack([v["x"] - r * v["spin"] * jnp.cos(q["yaw"]), v["y"] - r * v["spin"] * jnp.sin(q["yaw"])])
 
 
 def plane_lagrangian(t, q, v, params):
-    """A unit mass in a plane without forces but Q and R."""
+    """A unit mass on two springs in a plane; circulatory force and dissipation are added below."""
     return 0.5 * (v["x"] ** 2 + v["y"] ** 2) - 0.5 * (params["k1"] * q["x"] ** 2 + params["k2"] * q["y"] ** 2)
 
 

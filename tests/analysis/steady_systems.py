@@ -14,7 +14,7 @@ def truss_lagrangian(t, q, v, params):
 
 
 def snap_through(params):
-    """The load at which it snaps: P = 2 k (l0/l - 1) q is largest at l³ = l0 a²."""
+    """The snap-through load: P = 2 k (l0/l - 1) q is largest at l³ = l0 a²."""
     a, h, k = params["a"], params["h"], params["k"]
     rest = jnp.sqrt(a**2 + h**2)
     length = jnp.cbrt(rest * a**2)
@@ -22,22 +22,22 @@ def snap_through(params):
 
 
 def column_lagrangian(t, q, v, params):
-    """Two links with springs at their joints, pressed by P: their angles from the upright."""
+    """Two links with springs at their joints, compressed by P; q are their angles from the vertical."""
     bending = 0.5 * params["c"] * (q[0] ** 2 + (q[1] - q[0]) ** 2)
     return 0.5 * jnp.sum(v**2) - bending - params["P"] * params["l"] * jnp.sum(jnp.cos(q))
 
 
-# P l / c at which it buckles: 1 - 3 x + x² = 0 up to their order.
+# The values of P l / c at which the column buckles, the roots of 1 - 3 x + x² = 0.
 BUCKLING = (3 - np.sqrt(5)) / 2, (3 + np.sqrt(5)) / 2
 
 
 def exchange_lagrangian(t, q, v, params):
-    """Rest at 0 and at (mu - c)/d, which exchange their stability where they meet."""
+    """Equilibria at 0 and at (mu - c)/d, which exchange their stability where they meet."""
     return 0.5 * v**2 + 0.5 * (params["mu"] - params["c"]) * q**2 - params["d"] * q**3 / 3
 
 
 def top_lagrangian(t, q, v, params):
-    """A symmetric top by two tilts, about x and then about the new y, and its spin: regular where it is upright."""
+    """A symmetric top by two tilts, about x and then about the new y, and its spin; regular in the upright position."""
     a, b = q["a"], q["b"]
     across = 0.5 * params["I1"] * ((v["a"] * jnp.cos(b)) ** 2 + v["b"] ** 2)
     about = 0.5 * params["I3"] * (v["spin"] + v["a"] * jnp.sin(b)) ** 2
@@ -57,7 +57,7 @@ def ziegler_lagrangian(t, q, v, params):
 
 
 def follower_force(t, q, v, params):
-    """P at the tip, along the outer link, whichever way that points."""
+    """The force P at the tip, which always points along the outer link."""
     return params["P"] * params["l"] * jnp.stack([jnp.sin(q[0] - q[1]), 0.0 * q[1]])
 
 
@@ -67,12 +67,12 @@ def joint_friction(t, q, v, params):
 
 
 def flutter_load(params):
-    """Without damping, P l / c = 7/2 - √2."""
+    """The flutter load without damping, P l / c = 7/2 - √2."""
     return (3.5 - jnp.sqrt(2.0)) * params["c"] / params["l"]
 
 
 def damped_flutter_load(params):
-    """With it, P l / c = 41/28 + b²/(2 m l² c), which for b → 0 is much less."""
+    """The flutter load with damping, P l / c = 41/28 + b²/(2 m l² c), much smaller even for b → 0."""
     share = params["b"] ** 2 / (params["m"] * params["l"] ** 2 * params["c"])
     return (41 / 28 + 0.5 * share) * params["c"] / params["l"]
 
@@ -88,13 +88,13 @@ def rod_3d(t, q, params):
 
 
 def about_z(q, params):
-    """A rotation about the vertical, at one radian a unit of time."""
+    """A rotation about the vertical at one radian per unit of time."""
     x, y, z = q["r"]
     return {"r": jnp.stack([-y, x, 0 * z])}
 
 
 def rail_pendulum_lagrangian(t, q, v, params):
-    """A mass on a round table with a pole at its centre: a spherical pendulum seen from a frame that turns."""
+    """A spherical pendulum in a rotating frame, in Cartesian coordinates of the horizontal plane."""
     x, y = q
     u = jnp.stack([v[0] - params["omega"] * y, v[1] + params["omega"] * x])
     depth = jnp.sqrt(1 - x**2 - y**2)
@@ -120,7 +120,7 @@ ZIEGLER = {"m": 1.3, "l": 0.7, "c": 2.0, "b": 0.2, "P": 0.1}
 
 
 def disk_lagrangian(t, q, v, params):
-    """A thin uniform disk on a plane: its centre, and its heading, lean and spin."""
+    """A thin uniform disk on a plane, by its centre, heading, lean and spin."""
     m, r, lean = params["m"], params["r"], q["lean"]
     across = v["lean"] ** 2 + (v["heading"] * jnp.cos(lean)) ** 2
     about = (v["spin"] + v["heading"] * jnp.sin(lean)) ** 2
@@ -129,7 +129,7 @@ def disk_lagrangian(t, q, v, params):
 
 
 def rolling(t, q, v, params):
-    """Its point of contact does not slide, forward or sideways."""
+    """The point of contact slides neither forward nor sideways."""
     r, cos, sin = params["r"], jnp.cos(q["heading"]), jnp.sin(q["heading"])
     forward = v["x"] * cos + v["y"] * sin - r * (v["spin"] + v["heading"] * jnp.sin(q["lean"]))
     sideways = v["y"] * cos - v["x"] * sin + r * jnp.cos(q["lean"]) * v["lean"]
@@ -142,10 +142,10 @@ UPRIGHT_DISK = {"x": 0.0, "y": 0.0, "heading": 0.0, "lean": 0.0, "spin": 0.0}
 
 
 def straight_on(q, params):
-    """Rolling along x at one radian a unit of time."""
+    """Rolling along x at one radian per unit of time."""
     return UPRIGHT_DISK | {"spin": 1.0, "x": params["r"]}
 
 
 def slowest_rolling(params):
-    """Upright it is stable for a spin above √(g/(3 r))."""
+    """The upright disk is stable if its spin is above √(g/(3 r))."""
     return jnp.sqrt(params["g"] / (3 * params["r"]))

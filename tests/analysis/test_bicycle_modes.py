@@ -39,7 +39,7 @@ WEAVE_SPEED, CAPSIZE_SPEED = 4.29238253634111, 6.02426201538837
 
 
 def published(speed):
-    """The four roots of the table, by frequency and growth."""
+    """The four roots in the table, from its frequencies and growth rates."""
     if speed == 0:
         return np.array(AT_REST, complex)
     weave = WEAVE[speed]
@@ -56,7 +56,7 @@ def by_linear_equations(speed):
 
 
 def in_order(roots):
-    """Real ones first, the fastest growing before the others."""
+    """Sort roots: real ones first, then by falling growth."""
     return np.array(sorted(roots, key=lambda x: (x.imag > 1e-9, -x.real)))
 
 
@@ -67,7 +67,7 @@ def modes_at(speed, params=bicycle.PARAMS):
 
 @pytest.mark.slow
 def test_the_published_table():
-    """All 44 roots of Table 2 from the nonlinear equations, to their 14 decimals; twin: another trail has others."""
+    """All 44 roots of Table 2 from the nonlinear equations, to 14 decimals; twin: another trail gives other roots."""
     for speed in range(11):
         modes = modes_at(float(speed))
         got = in_order(modes.roots[~modes.zero])
@@ -80,7 +80,7 @@ def test_the_published_table():
 
 @pytest.mark.slow
 def test_verdicts_and_names():
-    """It weaves below 4.29 m/s, falls over slowly above 6.02, and stays between; what is zero is named."""
+    """It weaves below 4.29 m/s, falls over slowly above 6.02, and is stable between; zero modes are named."""
     verdicts = {speed: modes_at(speed).verdict for speed in (0.0, 4.29238, 4.29239, 6.02426, 6.02427, 10.0)}
     assert list(verdicts.values()) == [
         "divergence", "flutter", "asymptotically stable", "asymptotically stable", "divergence", "divergence"
@@ -92,7 +92,7 @@ def test_verdicts_and_names():
 
 @pytest.mark.slow
 def test_weave_and_capsize_speeds():
-    """Where the growth is zero, by the secant method, to 1e-12."""
+    """The speed at which the growth is zero, by the secant method to 1e-12."""
 
     def growth(speed, weaves):
         modes = modes_at(speed)

@@ -44,7 +44,7 @@ def bead(first, start, last):
 
 
 def check(critical, exact, params, along):
-    """The critical parameter and its derivatives by all others; twin: one that is off by a millionth is seen."""
+    """The critical parameter and its derivatives by all others; twin: an error of a millionth is detected."""
     value = float(exact(params))
     assert abs(float(critical.parameter) / value - 1) < CRITICAL < abs((1 + 1e-6) * value / value - 1)
     slopes = jax.grad(exact)(params)
@@ -78,7 +78,7 @@ def test_bead(from_the_side):
 
 
 def test_truss():
-    """It snaps through at folds, either way, at the closed form's load; between them it is unstable."""
+    """It snaps through at folds in both directions, at the load of the closed form; between them it is unstable."""
     found = lj.continue_equilibria(truss, TRUSS, 0.6, along="P", to=6.0)
     assert [c.kind for c in found.critical] == ["fold", "fold"] and len(found) == 1
     lower, upper = sorted(found.critical, key=lambda c: c.parameter)
@@ -95,7 +95,7 @@ def test_truss():
 
 
 def test_exchange_of_stability():
-    """Two branches cross at mu = c, transcritically; neither is the one that folds."""
+    """Two branches cross transcritically at mu = c, and neither folds."""
     found = lj.continue_equilibria(exchange, EXCHANGE, 0.0, along="mu", to=1.0)
     (critical,) = found.critical
     assert critical.kind == "transcritical"
@@ -111,7 +111,7 @@ def test_exchange_of_stability():
 
 @pytest.mark.slow
 def test_column():
-    """It buckles at P l = c (3 ∓ √5)/2, each a pitchfork with a branch of its own; the first alone is stable."""
+    """It buckles at P l = c (3 ∓ √5)/2, each a pitchfork with its own branch; only the first branch is stable."""
     found = lj.continue_equilibria(column, COLUMN, np.zeros(2), along="P", to=6.0)
     assert [c.kind for c in found.critical] == ["pitchfork", "pitchfork"] and len(found) == 3
     for critical, factor in zip(found.critical, BUCKLING):
@@ -123,7 +123,7 @@ def test_column():
 
 @pytest.mark.slow
 def test_cross_rails():
-    """ω² = k/m: a line of equilibria; ω² = K/m: the equilibrium goes to infinity, from either side."""
+    """ω² = k/m: a line of equilibria; ω² = K/m: the equilibrium goes to infinity, from both sides."""
     params = cross_rails.PARAMS
     system = cross_rails.rotating_system
 
@@ -147,7 +147,7 @@ def test_cross_rails():
 
 @pytest.mark.slow
 def test_sleeping_top():
-    """Two frequencies meet at ω_c = 2 √(M g l I1)/I3, where the top wakes: found along the held spin."""
+    """Two frequencies meet at ω_c = 2 √(M g l I1)/I3, where the sleeping top wakes, along the held spin."""
     start = UPRIGHT | {"spin": 12.0}
     found = lj.continue_equilibria(top, TOP, UPRIGHT, velocity=start, along="v.spin", to=2.0)
     (critical,) = found.critical
@@ -173,7 +173,7 @@ def test_flutter_of_a_column():
 
 @pytest.mark.slow
 def test_several_zeros_together():
-    """A round pendulum that turns: at ω² = g/l its stiffness vanishes in all directions, and stability is not lost."""
+    """A rotating spherical pendulum: at ω² = g/l its stiffness vanishes in all directions, but it stays stable."""
     params = {"omega": 0.2, "g": 4.0}
     found = lj.continue_equilibria(turning_pendulum, params, np.zeros(2), along="omega", to=3.0)
     (critical,) = found.critical
@@ -183,7 +183,7 @@ def test_several_zeros_together():
 
 @pytest.mark.exhaustive
 def test_a_moving_constraint():
-    """The hoop driven by a constraint, whose rate the equations find: the same pitchfork, with the motor's torque."""
+    """A constraint drives the hoop, and the equations find its rate: the same pitchfork, with the motor's torque."""
     start = {"psi": 0.0, "theta": 0.0}
     settings = {"velocity": start | {"theta": 1.0}, "cyclic": "theta", "hold": None}
     params = BEAD | {"omega": 1.0}
@@ -197,7 +197,7 @@ def test_a_moving_constraint():
 
 @pytest.mark.slow
 def test_rolling_disk():
-    """Rolling on straight ahead it is stable above √(g/(3 r)): a root leaves many zeros, and no branch crosses."""
+    """Rolling straight ahead it is stable above √(g/(3 r)): one of many zero roots grows; no branch crosses."""
     velocity = {name: 8.0 * rate for name, rate in straight_on(UPRIGHT_DISK, DISK).items()}
     settings = {"velocity": velocity, "cyclic": straight_on, "along": "v[0]", "to": 0.5}
     (critical,) = lj.continue_equilibria(disk, DISK, UPRIGHT_DISK, **settings).critical
@@ -207,7 +207,7 @@ def test_rolling_disk():
 
 @pytest.mark.slow
 def test_closed_curve_and_folds_of_a_side_branch():
-    """A circle that crosses at both of its ends; a subcritical pitchfork whose branch folds at mu = -1/4."""
+    """A circle that crosses the first branch at both ends; a subcritical pitchfork whose branch folds at mu = -1/4."""
     one = lambda potential: lj.System(lambda t, q, v, p: 0.5 * v**2 - potential(q, p["mu"]))
     circle = one(lambda q, mu: 0.25 * q**4 - 0.5 * (1 - mu**2) * q**2)
     found = lj.continue_equilibria(circle, {"mu": -2.0}, 0.0, along="mu", to=2.0)
@@ -223,7 +223,7 @@ def test_closed_curve_and_folds_of_a_side_branch():
 
 @pytest.mark.exhaustive
 def test_folds_of_random_curves():
-    """Branches that are graphs mu(q): every fold between their ends is found, and no other, by a fine grid of mu'."""
+    """Branches that are graphs mu(q): exactly the folds between their ends are found, by a fine grid of mu'."""
 
     def potential(t, q, v, p):
         waves = p["a"] * jnp.cos(q) + p["b"] * jnp.cos(2 * q + p["shift"]) / 2 + p["d"] * jnp.cos(5 * q) / 5
@@ -252,23 +252,23 @@ def test_folds_of_random_curves():
 @pytest.mark.slow
 @pytest.mark.parametrize("e", [1e-3, 1e-6])
 def test_nearly_a_pitchfork(e):
-    """With a small push there is no crossing, and steps do not jump to the other side: the branch stays stable."""
+    """With a small push there is no crossing, steps do not jump to the other branch, and the branch stays stable."""
     pushed = lj.System(lambda t, q, v, p: 0.5 * v**2 + 0.5 * p["mu"] * q**2 - 0.25 * q**4 + p["e"] * q)
     found = lj.continue_equilibria(pushed, {"mu": -1.0, "e": e}, 0.0, along="mu", to=1.0)
     assert len(found) == 1 and not found.critical and found[0].stable.all() and found[0].q[-1] > 0.9
     back = lj.continue_equilibria(pushed, {"mu": 1.0, "e": e}, -1.0, along="mu", to=-1.0)
-    # The other side folds where mu³ = 27 e²/4.
+    # The other branch folds where mu³ = 27 e²/4.
     (critical,) = back.critical
     assert critical.kind == "fold"
     np.testing.assert_allclose(critical.parameter, np.cbrt(6.75 * e**2), rtol=1e-10)
     np.testing.assert_allclose(critical.derivative["e"], 2 / 3 * np.cbrt(6.75 / e), rtol=1e-8)
 
 
-# What is said.
+# Printed results and messages.
 
 
 def test_derivatives_are_those_of_other_runs():
-    """Twin of the derivatives: a step in g moves the critical speed by as much, and a wrong sign would be seen."""
+    """Twin of the derivatives: a step in g moves the critical speed as predicted; a wrong sign would be detected."""
     at = lambda g: float(
         lj.continue_equilibria(bead_on_hoop.system, BEAD | {"omega": 1.0, "g": g}, 0.0, along="omega", to=8.0)
         .critical[0]
@@ -281,7 +281,7 @@ def test_derivatives_are_those_of_other_runs():
 
 
 def test_what_is_drawn():
-    """Stable solid and unstable dashed, a mark for the pitchfork, names on the axes; a name of nothing is refused."""
+    """Stable parts are solid, unstable dashed, the pitchfork is marked, axes are named; unknown names are refused."""
     found = bead(1.0, 0.0, 8.0)
     (axis,) = found.plot().axes
     dashes = {line.get_linestyle() for line in axis.get_lines() if len(line.get_xdata()) > 2}
@@ -296,19 +296,19 @@ def test_what_is_drawn():
     "change, words",
     [
         ({"along": "speed"}, "along='speed' is no number in params; there are 'a', 'g', 'm' and 'omega'"),
-        ({"to": 6.0}, "no way to go from 6"),
+        ({"to": 6.0}, "leaves the parameter 'omega' no range: it starts at 6"),
         ({"velocity": 1.0}, "L depends on 'q'"),
     ],
 )
 def test_bad_input(change, words):
-    """What is wrong is said, with the names."""
+    """Errors name what is wrong."""
     settings = {"along": "omega", "to": 8.0} | change
     with pytest.raises(ValueError, match=words):
         lj.continue_equilibria(bead_on_hoop.system, BEAD, 1.0, **settings)
 
 
 def test_no_start_and_no_program():
-    """Where there is no equilibrium there is no branch; and inside of a program its points cannot be counted."""
+    """Without an equilibrium there is no branch; and inside a compiled program its points cannot be counted."""
     with pytest.raises(ValueError, match="no equilibrium was found from the start"):
         lj.continue_equilibria(exchange, EXCHANGE | {"mu": 1.0, "d": 0.0, "c": np.nan}, 0.5, along="mu", to=2.0)
     with pytest.raises(TypeError, match="JAX is tracing"):
@@ -316,7 +316,7 @@ def test_no_start_and_no_program():
 
 
 def test_a_branch_that_stalls():
-    """Where L ends it stops, says so, and what it has until there is returned; twin: short of that it arrives."""
+    """It stops where L is undefined, says so, and returns its points so far; twin: a shorter range is completed."""
     edge = lambda t, q, v, p: 0.5 * v**2 - 0.5 * q**2 - p["s"] * jnp.sqrt(1.0 - q) ** 3 + p["f"] * q
     system, params = lj.System(edge), {"f": 0.0, "s": 0.1}
     found = lj.continue_equilibria(system, params, 0.0, along="f", to=3.0)

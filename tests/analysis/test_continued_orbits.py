@@ -17,22 +17,22 @@ def swinging(amplitude, length=1.0):
     return 4 * np.sqrt(length) * special.ellipk(np.sin(amplitude / 2) ** 2)
 
 
-def gone(rate, period, z):
-    """Where SciPy's motion is after a period."""
+def after_a_period(rate, period, z):
+    """The state of SciPy's motion after a period."""
     return integrate.solve_ivp(rate, [0, period], z, method="DOP853", rtol=1e-13, atol=1e-13).y[:, -1]
 
 
 def monodromy(rate, period, z, step=1e-5):
-    """How that changes with the start, by central differences."""
-    return np.stack([(gone(rate, period, z + e) - gone(rate, period, z - e)) / (2 * step)
+    """The derivative of `after_a_period` by the start, by central differences."""
+    return np.stack([(after_a_period(rate, period, z + e) - after_a_period(rate, period, z - e)) / (2 * step)
                      for e in step * np.eye(len(z))], axis=1)  # fmt: skip
 
 
 def shot(rate, period, z):
-    """A periodic state near another, by SciPy's motions alone, and its multipliers."""
-    z = optimize.fsolve(lambda z: gone(rate, period, z) - z, z, xtol=1e-9)
+    """A periodic state near another one, by SciPy's motions only, and its multipliers."""
+    z = optimize.fsolve(lambda z: after_a_period(rate, period, z) - z, z, xtol=1e-9)
     matrix = monodromy(rate, period, z)
-    return z - np.linalg.solve(matrix - np.eye(len(z)), gone(rate, period, z) - z), np.linalg.eigvals(matrix)
+    return z - np.linalg.solve(matrix - np.eye(len(z)), after_a_period(rate, period, z) - z), np.linalg.eigvals(matrix)
 
 
 # Families of a conservative system.
@@ -40,7 +40,7 @@ def shot(rate, period, z):
 
 @pytest.mark.slow
 def test_pendulum_by_its_amplitude():
-    """The period is 4 K(k) √(l/g) at every point, also off the closed form's grid; twin: of small swings it is not."""
+    """The period is 4 K(k) √(l/g) at every point; twin: that of small swings is different."""
     orbit = lj.periodic_orbit(pendulum, (1.0, 0.0), 6.7, UNIT)
     branch = lj.continue_orbits(orbit, along="q", to=3.0)
     np.testing.assert_allclose(branch.period, swinging(branch.q), rtol=1e-11)
@@ -48,7 +48,7 @@ def test_pendulum_by_its_amplitude():
     assert np.max(np.abs(branch.period / (2 * np.pi) - 1)) > 1
     np.testing.assert_allclose(branch.high, branch.q, atol=1e-6)
     np.testing.assert_allclose(branch.low, -branch.q, atol=1e-6)
-    # A point of it is an orbit, of which the motion closes.
+    # A point of the branch is an orbit, and its motion closes.
     middle = branch[len(branch) // 2]
     end = middle.trajectory.q[-1]
     np.testing.assert_allclose(end, middle.q, atol=1e-9)
@@ -65,7 +65,7 @@ def test_pendulum_by_its_amplitude():
 @pytest.mark.slow
 @pytest.mark.parametrize("along, to", [("energy", 0.9), ("l", 3.0)])
 def test_pendulum_on_a_rod(along, to):
-    """On a constraint: by energy, and by the rod's length with the energy held; the rod keeps its length."""
+    """With a constraint: along the energy, and along the rod's length at constant energy; the rod keeps its length."""
     start = {"x": np.sin(1.0), "y": -np.cos(1.0)}, {"x": 0.0, "y": 0.0}
     orbit = lj.periodic_orbit(rod_pendulum, start, 6.7, UNIT | {"m": 1.0})
     branch = lj.continue_orbits(orbit, along=along, to=to)
@@ -77,7 +77,7 @@ def test_pendulum_on_a_rod(along, to):
 
 @pytest.mark.exhaustive
 def test_relative_orbits():
-    """In a central force, by the law of the force: at r² it is a harmonic oscillator, whose r has the period π."""
+    """In a central force, along the exponent of its law: the harmonic oscillator, at r², has the period π in r."""
 
     def lagrangian(t, q, v, p):
         return 0.5 * (v["r"] ** 2 + (q["r"] * v["phi"]) ** 2) - q["r"] ** p["power"] / p["power"]
@@ -93,7 +93,7 @@ def test_relative_orbits():
 
 
 def duffing_lagrangian(t, q, v, p):
-    """A spring that hardens, and a force that drives."""
+    """A hardening spring with a driving force."""
     return 0.5 * v**2 - 0.5 * q**2 - p["b"] * q**4 / 4 + p["f"] * q * jnp.cos(p["omega"] * t)
 
 
@@ -102,16 +102,16 @@ DRIVEN = {"b": 0.75, "f": 0.3125, "omega": 0.5, "c": 0.125}
 
 
 def duffing_rate(omega):
-    """The same for SciPy."""
+    """The same equation for SciPy."""
     b, f, _, c = DRIVEN.values()
     return lambda t, y: [y[1], -y[0] - b * y[0] ** 3 - c * y[1] + f * np.cos(omega * t)]
 
 
 @pytest.mark.slow
 def test_resonance_curve():
-    """Both folds, every orbit, stability: by SciPy's shooting; amplitudes about those of harmonic balance.
+    """Both folds, every orbit and its stability agree with SciPy's shooting; amplitudes are near harmonic balance.
 
-    Twin: off by a millionth an orbit is not SciPy's, and beyond the folds there is only one.
+    Twin: a state off by a millionth is not SciPy's orbit, and beyond the folds there is only one orbit.
     """
     orbit = lj.periodic_orbit(duffing, (0.4, 0.0), 2 * np.pi / DRIVEN["omega"], DRIVEN)
     branch = lj.continue_orbits(orbit, along="omega", to=3.0)
@@ -142,7 +142,7 @@ def test_resonance_curve():
     grid = np.linspace(1.0, 2.0, 4001)
     several = grid[[len(one_harmonic(w)) == 3 for w in grid]]
     np.testing.assert_allclose([lower.parameter, upper.parameter], [several[0], several[-1]], rtol=0.01)
-    # SciPy's orbits at the folds have the multiplier 1, which is a double root: off by the root of what they are off.
+    # SciPy's orbits at the folds have the double multiplier 1, which is off by the root of the orbits' error.
     for fold in branch.critical:
         omega = float(fold.parameter)
         z = np.array([branch.q[fold.index], branch.v[fold.index]])
@@ -151,15 +151,15 @@ def test_resonance_curve():
 
 
 def mathieu_lagrangian(t, q, v, p):
-    """x'' + (a - 2 q cos 2t) x = 0, a pendulum on a moving pivot near rest; and as it swings far."""
+    """x'' + (a - 2 q cos 2t) x = 0, a pendulum on a moving pivot near rest; and with large swings."""
     return 0.5 * v**2 + (p["a"] - 2 * p["q"] * jnp.cos(2 * t)) * jnp.cos(q)
 
 
 @pytest.mark.slow
 def test_tongues_of_a_parametric_pendulum():
-    """At rest its multiplier passes -1 and 1 where Mathieu's characteristic values are, a tongue of 5e-4 too.
+    """At rest its multiplier passes -1 and 1 at Mathieu's characteristic values, also at a tongue of width 5e-4.
 
-    Twin: those of another q are others.
+    Twin: the characteristic values of another q differ.
     """
     system, q = lj.System(mathieu_lagrangian), 0.25
     orbit = lj.periodic_orbit(system, (0.0, 0.0), np.pi, {"a": 0.1, "q": q})
@@ -212,7 +212,7 @@ def oscillator(t, q, v, p):
 
 @pytest.mark.slow
 def test_van_der_pol_family():
-    """Periods are those in the literature; where all circles close, at μ = 0, the multiplier passes 1.
+    """Periods are those in the literature; at μ = 0, where all circles are orbits, the multiplier passes 1.
 
     Urabe, *IRE Trans. Circuit Theory* 7 (1960) 382; 6.663286859323130 and 7.629874479674862: Andersen & Geer (1982).
     """
@@ -251,7 +251,7 @@ def test_a_cycle_that_shrinks_and_one_that_folds():
 
 @pytest.mark.slow
 def test_torus_of_a_driven_van_der_pol():
-    """With less drive it loses the entrainment: a pair passes the circle, as SciPy's multipliers do."""
+    """With less drive entrainment is lost: a pair passes the unit circle, as SciPy's multipliers do."""
     lagrangian = lambda t, q, v, p: 0.5 * v**2 - 0.5 * q**2 + p["f"] * q * jnp.cos(2 * t)
     system = lj.System(lagrangian, force=lambda t, q, v, p: 0.5 * (1 - q**2) * v)
     orbit = lj.periodic_orbit(system, (-2.0, 0.0), np.pi, {"f": 6.0})
@@ -262,17 +262,17 @@ def test_torus_of_a_driven_van_der_pol():
     rate = lambda t, y: [y[1], -y[0] + 0.5 * (1 - y[0] ** 2) * y[1] + f * np.cos(2 * t)]
     _, found = shot(rate, np.pi, np.array([branch.q[torus.index], branch.v[torus.index]]) + 1e-4)
     np.testing.assert_allclose(np.abs(found), 1.0, atol=1e-8)
-    # By Liouville the size is known: ∮ (1 - q²)/2 dt = 0 there; twin: not elsewhere.
+    # Liouville's formula gives the size there: ∮ (1 - q²)/2 dt = 0; twin: not elsewhere.
     of = lambda i: np.prod(np.abs(branch.multipliers[i]))
     assert abs(of(torus.index) - 1) < 1e-11 < abs(of(torus.index + 2) - 1)
 
 
-# What is drawn and said.
+# Plots and messages.
 
 
 @pytest.mark.slow
 def test_what_is_drawn_and_refused():
-    """Stable solid and unstable dashed, folds marked; names of nothing and a range that leads nowhere are refused."""
+    """Stable parts are solid, unstable dashed, folds are marked; unknown names and an empty range are refused."""
     orbit = lj.periodic_orbit(duffing, (0.4, 0.0), 2 * np.pi / DRIVEN["omega"], DRIVEN)
     branch = lj.continue_orbits(orbit, along="omega", to=1.7, most_points=400)
     (axis,) = branch.plot().axes
@@ -288,7 +288,7 @@ def test_what_is_drawn_and_refused():
         lj.continue_orbits(orbit, along="speed", to=1.0)
     with pytest.raises(ValueError, match="along='period': the system depends on time"):
         lj.continue_orbits(orbit, along="period", to=1.0)
-    with pytest.raises(ValueError, match="no way to go from 0.5"):
+    with pytest.raises(ValueError, match="leaves the parameter 'omega' no range: it starts at 0.5"):
         lj.continue_orbits(orbit, along="omega", to=0.5)
     with pytest.raises(TypeError, match="JAX is tracing"):
         jax.jit(lambda orbit: lj.continue_orbits(orbit, along="omega", to=1.0).period)(orbit)
@@ -297,7 +297,7 @@ def test_what_is_drawn_and_refused():
 
 
 def test_no_orbit_to_begin_with():
-    """A system, and a state, are no orbit."""
+    """A system is not an orbit."""
     with pytest.raises(TypeError, match="needs a periodic orbit, not System") as raised:
         lj.continue_orbits(pendulum, along="g", to=2.0)  # type: ignore
     assert "Fix: orbit = lj.periodic_orbit" in str(raised.value) and PARAMS["g"] > 0

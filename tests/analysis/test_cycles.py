@@ -13,7 +13,7 @@ G_OVER_L = PARAMS["g"] / PARAMS["l"]
 
 
 def closes(orbit, turned=0.0):
-    """How far the motion of `lj.integrate` is from its start after the period, less what it has turned or moved on."""
+    """How far the motion of `lj.integrate` is from its start after the period, without its turns and shifts."""
     traj = orbit.trajectory
     gone = jax.tree.map(lambda x: x[-1] - x[0], traj.q)
     moved = jax.tree.map(lambda x, turns, shift: x - 2 * np.pi * turns - shift, gone, orbit.turns, orbit.shift)
@@ -33,7 +33,7 @@ def swinging(amplitude, params=PARAMS):
     "hold", ["energy", *(pytest.param(x, marks=pytest.mark.exhaustive) for x in ("period", ("q", "v")))]
 )
 def test_pendulum(hold):
-    """What is held stays, and period and amplitude are those of the elliptic integral; twin: what is not held moves."""
+    """The held quantity stays; period and amplitude are those of the elliptic integral; twin: the others change."""
     guess = 0.9 * swinging(2.0) if hold != "period" else 1.02 * swinging(2.0)
     orbit = lj.periodic_orbit(pendulum, (2.0, 0.0), guess, PARAMS, hold=hold)
     assert bool(orbit.converged)
@@ -47,7 +47,7 @@ def test_pendulum(hold):
 
 @pytest.mark.slow
 def test_pendulum_that_goes_around():
-    """It turns once in T = ∫ dφ / √(2 (E + cos φ)), counted by itself; twin: without a turn there is no such motion."""
+    """It turns once in T = ∫ dφ / √(2 (E + cos φ)), counted automatically; twin: without a turn there is no orbit."""
     rate = 2.5 * np.sqrt(G_OVER_L)
     orbit = lj.periodic_orbit(pendulum, (0.0, rate), 1.0, PARAMS)
     energy = rate**2 / 2 - G_OVER_L
@@ -62,7 +62,7 @@ def test_pendulum_that_goes_around():
 
 @pytest.mark.slow
 def test_pendulum_on_a_rod():
-    """The same period on a constraint, which the orbit satisfies to round-off, from a start that is off it."""
+    """The same period with a constraint, which the orbit satisfies to round-off, from a start that violates it."""
     amplitude, l = 2.0, PARAMS["l"]
     start = {"x": l * np.sin(amplitude) + 0.01, "y": -l * np.cos(amplitude)}, {"x": 0.05, "y": 0.0}
     orbit = lj.periodic_orbit(rod_pendulum, start, 0.8 * swinging(amplitude), PARAMS)
@@ -87,7 +87,7 @@ kepler = lj.System(kepler_lagrangian)
 
 @pytest.mark.slow
 def test_kepler():
-    """Every orbit of the energy has Kepler's period, from a guess of two thirds of it: all multipliers are 1."""
+    """Every orbit of an energy has Kepler's period, found from a guess of two thirds of it: all multipliers are 1."""
     speed, mu = 1.25, 1.25
     exact = 2 * np.pi / np.sqrt(mu) * (2 - speed**2 / mu) ** -1.5
     orbit = lj.periodic_orbit(kepler, (np.array([1.0, 0.0]), np.array([0.0, speed])), 0.65 * exact, {"mu": mu})
@@ -102,14 +102,14 @@ def polar_lagrangian(t, q, v, p):
 
 @pytest.mark.slow
 def test_relative_orbit():
-    """In a central force r comes back and φ has moved on, both as quadratures say; twin: as a whole it is not back."""
+    """In a central force r comes back and φ advances, both as by quadrature; twin: as a whole it does not close."""
     polar, power, speed = lj.System(polar_lagrangian), 1.0, 0.5
     start = {"r": 1.0, "phi": 0.0}, {"r": 0.0, "phi": speed}
     orbit = lj.periodic_orbit(polar, start, 1.8, {"power": power}, relative="phi")
     r, w, vr = (float(x) for x in (orbit.q["r"], orbit.v["phi"], orbit.v["r"]))
     h, energy = r**2 * w, 0.5 * vr**2 + 0.5 * (r * w) ** 2 + r
     near, far = np.sort(np.roots([-1.0, energy, 0.0, -(h**2) / 2]).real)[-2:]
-    # r = m + d sin s takes the roots away from the ends.
+    # r = m + d sin s removes the square-root singularities at the ends.
     middle, half = (near + far) / 2, (far - near) / 2
     third = -(h**2) / 2 / (near * far)  # The cubic is -(r - near)(r - far)(r - third).
 
@@ -126,7 +126,7 @@ def test_relative_orbit():
 
 
 def duffing_lagrangian(t, q, v, p):
-    """A spring that hardens, and a force that drives."""
+    """A hardening spring with a driving force."""
     return 0.5 * v**2 - 0.5 * q**2 - p["b"] * q**4 / 4 + p["f"] * q * jnp.cos(p["omega"] * t)
 
 
@@ -136,7 +136,7 @@ DRIVEN = {"b": 0.75, "f": 0.3125, "omega": 1.25, "c": 0.125}
 
 @pytest.mark.slow
 def test_duffing():
-    """The driven orbit attracts, and is that of SciPy's motion after its transients; twin: off by a digit it is not."""
+    """The driven orbit attracts, and is SciPy's motion after its transients; twin: a rounded period is refused."""
     period = 2 * np.pi / DRIVEN["omega"]
     orbit = lj.periodic_orbit(duffing, (1.0, 0.0), period, DRIVEN)
     assert bool(orbit.converged) and float(orbit.period) == period
@@ -154,7 +154,7 @@ def test_duffing():
 
 @pytest.mark.slow
 def test_knife_edge_on_a_slope():
-    """A velocity constraint: the blade turns at ω and goes along a cycloid, to the side and not down the slope."""
+    """A velocity constraint: the blade turns at ω and moves on a cycloid, sideways and not down the slope."""
 
     def lagrangian(t, q, v, p):
         return 0.5 * (v["x"] ** 2 + v["y"] ** 2 + p["I"] * v["turn"] ** 2) + p["slope"] * q["y"]
@@ -176,15 +176,15 @@ def test_knife_edge_on_a_slope():
 
 
 def inverted_lagrangian(t, q, v, p):
-    """A pendulum by its angle from the upward vertical, pushed to and fro."""
+    """A pendulum by its angle from the upward vertical, pushed back and forth."""
     return 0.5 * v**2 - p["k"] * jnp.cos(q) + p["f"] * q * jnp.cos(t)
 
 
 @pytest.mark.slow
 def test_unstable_orbit_by_parts():
-    """A pendulum is pushed so as to stay up, for two periods of the push, in which neighbours leave it e^(4π)-fold.
+    """A pushed pendulum stays up for two periods of the push, in which neighbours leave it e^(4π)-fold.
 
-    Small pushes f make q = -f cos(t)/(1 + k) up to f³; a guess of zero leaves it at once.
+    For small pushes f, q = -f cos(t)/(1 + k) up to f³; the motion from a guess of zero leaves it at once.
     """
     inverted, f = lj.System(inverted_lagrangian), 0.01
     orbit = lj.periodic_orbit(inverted, (0.0, 0.0), 4 * np.pi, {"k": 1.0, "f": f}, parts=8)
@@ -260,7 +260,7 @@ def test_derivatives():
 
 @pytest.mark.exhaustive
 def test_derivative_of_a_shift():
-    """How far a relative orbit moves on, by its first radius and speed: forward and in reverse, against differences."""
+    """Derivatives of a relative orbit's shift by first radius and speed: both modes, against differences."""
 
     def shift(x):
         start = {"r": x[0], "phi": 0.0 * x[0]}, {"r": 0.0 * x[0], "phi": x[1]}
@@ -277,7 +277,7 @@ def test_derivative_of_a_shift():
 
 @pytest.mark.slow
 def test_stiff_cycle():
-    """Van der Pol's at μ = 10: states fall onto the cycle, the other multiplier is nothing, and said to be unknown.
+    """Van der Pol's at μ = 10: states fall onto the cycle; the other multiplier is almost 0, and reported as unknown.
 
     The period of 19.07836957: Urabe, *IRE Trans. Circuit Theory* 7 (1960) 382.
     """
@@ -285,14 +285,15 @@ def test_stiff_cycle():
     orbit = lj.periodic_orbit(system, (2.0, 0.0), 18.0, {"mu": 10.0})
     np.testing.assert_allclose(orbit.period, 19.07836957, atol=1e-8)
     found = lj.floquet(orbit)
-    assert bool(found.attracts) and float(found.liouville) < 1e-100 and "1 is not known" in repr(found)
-    # Twin: at μ = 1, where it is 9e-4, it is known.
+    assert bool(found.attracts) and float(found.liouville) < 1e-100
+    assert "1 of the multipliers is not known" in repr(found)
+    # Twin: at μ = 1 the multiplier is 9e-4, and known.
     assert "not known" not in repr(lj.floquet(van_der_pol_orbit(1.0)))
 
 
 @pytest.mark.slow
 def test_lanes_and_sweeps():
-    """A batch over μ is what a loop gives, and a sweep says which points did not converge."""
+    """A batch over μ agrees with a loop, and a sweep reports which points did not converge."""
     mu = jnp.array([0.5, 1.0, 2.0])
     lanes = jax.jit(jax.vmap(van_der_pol_orbit))(mu)
     # Andersen & Geer's and others' values.
@@ -311,7 +312,7 @@ def test_lanes_and_sweeps():
     assert "did not converge" in words
 
 
-# What is refused, or not found.
+# Bad input, and searches that fail.
 
 SIMPLE = {"start": (2.0, 0.0), "period": 6.0}
 REFUSED = {
@@ -325,13 +326,13 @@ REFUSED = {
     ),
     "seen": (pendulum, {"relative": "q"}, ValueError, "the system depends on it"),
     "no angle of that name": (pendulum, {"turns": {"phi": 1}}, ValueError, "turns names 'phi'"),
-    "damped": (duffing, {"hold": "energy"}, ValueError, "so its period is that of the drive"),
+    "damped": (duffing, {"hold": "energy"}, ValueError, "so the orbit has the period of the drive"),
 }
 
 
 @pytest.mark.parametrize("system, given, error, words", REFUSED.values(), ids=REFUSED)
 def test_refused_in_words(system, given, error, words):
-    """What makes no sense, with its fix."""
+    """Bad arguments are refused, with a fix."""
     given = SIMPLE | given
     with pytest.raises(error, match=words) as raised:
         lj.periodic_orbit(system, given.pop("start"), given.pop("period"), PARAMS | DRIVEN, **given)
@@ -340,7 +341,7 @@ def test_refused_in_words(system, given, error, words):
 
 @pytest.mark.slow
 def test_no_cycle_of_a_damped_pendulum():
-    """There is none but rest, which is not taken for one; the best that was found is returned, and said to be that."""
+    """There is only rest, which does not count as an orbit; the best candidate is returned, with a warning."""
     damped = lj.System(pendulum.lagrangian, dissipation=lambda t, q, v, p: 0.5 * p["c"] * v**2)
     with pytest.raises(ValueError, match="the Jacobi integral is not conserved here"):
         lj.periodic_orbit(damped, (2.0, 0.0), 3.0, PARAMS | {"c": 0.5}, hold="energy")
@@ -351,7 +352,7 @@ def test_no_cycle_of_a_damped_pendulum():
 
 @pytest.mark.exhaustive
 def test_whole_numbers_and_pictures():
-    """A start and parameters in whole numbers; an orbit is drawn closed."""
+    """A start and parameters in whole numbers work; the drawn orbit is closed."""
     orbit = lj.periodic_orbit(pendulum, (jnp.float64(1), jnp.float64(0)), 3, {"g": 10, "l": 1})
     np.testing.assert_allclose(orbit.period, swinging(1.0, {"g": 10, "l": 1}), rtol=1e-10)
     line = np.asarray(orbit.plot().axes[0].lines[0].get_xydata())

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import lagjax as lj
-from lagjax.analysis.found_equilibria import LASTS_NOT, NO_BALANCE, NOT_FINITE
+from lagjax.analysis.found_equilibria import NO_BALANCE, NOT_FINITE, NOT_LASTING
 from lagjax.mechanisms import governor
 from lagjax.scenes import bead_on_hoop, cross_rails
 from tests.analysis.steady_systems import (
@@ -32,7 +32,7 @@ tilt_of = lambda params: jnp.arccos(params["g"] / (params["a"] * params["omega"]
 
 
 def test_pendulum():
-    """It rests below, stable, and above, not; starts a turn apart lead to the same; twin: with -g it is the reverse."""
+    """Rest is stable below and unstable above; starts a turn apart are merged; twin: with -g it is the reverse."""
     found = lj.equilibria(pendulum, PARAMS, starts=[0.3, 3.0, -3.0, 2 * np.pi + 0.2])
     assert len(found) == 2 and np.asarray(found.of_start).tolist() == [0, 1, 1, 0]
     np.testing.assert_allclose(found.q, [0.0, np.pi], atol=1e-14)
@@ -61,7 +61,7 @@ def test_double_pendulum():
 
 @pytest.mark.parametrize("times", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_multiplier_and_redundant_rods(times):
-    """2 y λ = g, shared by rods that say the same as the shortest multipliers are; twin: the sign of λ above."""
+    """2 y λ = g, shared by redundant rods as multipliers of least norm; twin: λ has the other sign above."""
     again = lj.Holonomic(lambda t, q, params: 2 * rod(t, q, params))
     two = lj.System(cartesian_lagrangian, {"rod": lj.Holonomic(rod), "again": again})
     starts = [{"x": 0.3, "y": -1.0}, {"x": 0.3, "y": 1.0}]
@@ -91,7 +91,7 @@ def test_bead_and_its_derivatives():
 
 @pytest.mark.slow
 def test_whole_numbers_and_one_start():
-    """Integers are numbers like others; a state by itself is a start."""
+    """Integers work like floats; a single state is one start."""
     found = lj.equilibria(pendulum, {"g": 10, "l": 2}, starts=[3])
     np.testing.assert_allclose(found.q, [np.pi], rtol=1e-14)
     one = lj.equilibria(double_pendulum, CHAIN, starts=np.array([0.1, 0.2]))
@@ -133,7 +133,7 @@ def test_cross_rails():
 
 @pytest.mark.slow
 def test_the_driven_hoop():
-    """Its angle turns at ω, which the motor's constraint asks for: given, or found; twin: at rest it does not last."""
+    """Its angle turns at the motor's rate ω, given or found from the constraint; twin: at rest it does not last."""
     start = {"psi": 1.0, "theta": 0.0}
     given = lj.equilibria(bead_on_hoop.driven_system, BEAD, starts=[start], velocities={"psi": 0.0, "theta": 6.0})
     free = {"cyclic": "theta", "hold": None, "velocities": {"psi": 0.0, "theta": 5.0}}
@@ -144,12 +144,12 @@ def test_the_driven_hoop():
         np.testing.assert_allclose(steady.multipliers["motor"], 0.0, atol=1e-13)
         assert steady.stable.tolist() == [True]
     resting = lj.equilibria(bead_on_hoop.driven_system, BEAD, starts=[start])
-    assert len(resting) == 0 and resting.status.tolist() == [LASTS_NOT]
+    assert len(resting) == 0 and resting.status.tolist() == [NOT_LASTING]
 
 
 @pytest.mark.slow
 def test_conical_pendulum():
-    """Along a symmetry that is a function: cos θ = g/(Ω² l) and λ = -½ Ω²; with the momentum held, Ω l² sin²θ is."""
+    """Along a symmetry given as a function: cos θ = g/(Ω² l), λ = -½ Ω²; also with the momentum Ω l² sin²θ held."""
     params, omega = {"g": 9.0, "l": 1.25}, 4.0
     theta = np.arccos(params["g"] / (omega**2 * params["l"]))
     place = lambda angle: {"r": params["l"] * np.array([np.sin(angle), 0.0, -np.cos(angle)])}
@@ -159,7 +159,7 @@ def test_conical_pendulum():
     np.testing.assert_allclose(found.q["r"][0, 2], -params["l"] * np.cos(theta), rtol=1e-13)
     np.testing.assert_allclose(found.multipliers["rod"], [-0.5 * omega**2], rtol=1e-13)
     np.testing.assert_allclose(found.rates, [[omega]], rtol=1e-15)
-    # Small motions about it: Ω² (1 + 3 cos²θ).
+    # Small motions have the squared frequency Ω² (1 + 3 cos²θ).
     fastest = np.nanmax(np.abs(found.eigenvalues))
     np.testing.assert_allclose(fastest, omega * np.sqrt(1 + 3 * np.cos(theta) ** 2), rtol=1e-9)
     held = lj.equilibria(conical, params, velocities=speed(theta + 0.1, omega), hold="momentum", **settings)
@@ -183,7 +183,7 @@ def test_sleeping_top():
 
 @pytest.mark.slow
 def test_governor():
-    """Its balls' moment about a hinge vanishes: by the equilibrium of one rod and the slider, written by hand."""
+    """The balls' moment about a hinge vanishes, from the equilibrium of one rod and the slider, written by hand."""
     parts, p, rate = governor.Parts, governor.PARAMS, governor.RATE
 
     def turn(q, params):
@@ -212,7 +212,7 @@ def test_governor():
 
 @pytest.mark.slow
 def test_roots_have_derivatives():
-    """Of a damped pendulum, s = -c/2 ± i√(±g - c²/4), by g and c, in both modes and on a rod; twin: of another c."""
+    """Derivatives of a damped pendulum's s = -c/2 ± i√(±g - c²/4), both modes, also on a rod; twin: with another c."""
     damped = lj.System(
         lambda t, q, v, p: 0.5 * v**2 + p["g"] * jnp.cos(q), dissipation=lambda t, q, v, p: 0.5 * p["c"] * v**2
     )
@@ -236,7 +236,7 @@ def test_roots_have_derivatives():
 
 @pytest.mark.slow
 def test_roots_are_those_of_the_linearisation():
-    """Two derivations agree: gyroscopic, on constraints of positions and of velocities, with all kinds of forces."""
+    """Two derivations agree: gyroscopic, holonomic and velocity constraints, all kinds of forces."""
     rng = np.random.default_rng(3)
     matrices = {name: rng.normal(size=(4, 4)) for name in "KMDGN"}
     params = {name: x @ x.T + np.eye(4) if name in "KMD" else x for name, x in matrices.items()}
@@ -267,11 +267,11 @@ def test_roots_are_those_of_the_linearisation():
         assert max(off.min(axis=0).max(), off.min(axis=1).max()) < 1e-12 * largest
 
 
-# Where there is none.
+# Searches that find no equilibrium.
 
 
 def test_starts_that_lead_nowhere():
-    """A least imbalance that is not zero is none; the starts are reported, and others find what there is."""
+    """A nonzero minimum of the imbalance is no equilibrium; these starts are reported, and others find one."""
     hill = lj.System(lambda t, q, v, p: 0.5 * v**2 - q**3 / 3 - p["c"] * q)
     none = lj.equilibria(hill, {"c": 1.0}, starts=[1.0, -2.0])
     assert len(none) == 0 and none.status.tolist() == [NO_BALANCE] * 2
@@ -294,7 +294,7 @@ def test_starts_that_lead_out():
 
 
 def test_a_critical_point_is_one_of_many_for_a_start():
-    """At the critical speed the bottom is found, slowly, and has a zero mode; twin: beside it there is none."""
+    """At the critical speed the bottom is found slowly, with a zero mode; twin: at another speed there is none."""
     at = lj.equilibria(bead_on_hoop.system, bead_on_hoop.CRITICAL, starts=[0.3])
     assert abs(float(at.q[0])) < 1e-6 and at.zero_modes.tolist() == [1]
     beside = lj.equilibria(bead_on_hoop.system, bead_on_hoop.CRITICAL | {"omega": 3.9}, starts=[0.3])
@@ -312,13 +312,13 @@ def test_a_critical_point_is_one_of_many_for_a_start():
     ],
 )
 def test_bad_input(settings, words):
-    """What is wrong is said, with the names, before anything is computed."""
+    """Errors name what is wrong before anything is computed."""
     with pytest.raises(ValueError, match=words):
         lj.equilibria(pendulum, PARAMS, **settings)
 
 
 def test_what_is_printed():
-    """A line each: the state, the multipliers, whether it is stable."""
+    """The table has one line for each equilibrium: state, multipliers, stability."""
     found = lj.equilibria(rod_pendulum, PARAMS, starts=[{"x": 0.3, "y": -1.0}, {"x": 0.3, "y": 1.0}])
     lines = repr(found).splitlines()
     assert lines[0] == "Equilibria: 2 from 2 starts"
@@ -328,6 +328,6 @@ def test_what_is_printed():
 
 @pytest.mark.slow
 def test_a_batch():
-    """Under `vmap` nothing is merged, and what is printed says so."""
+    """Under `vmap` nothing is merged, and the printed form shows the batch."""
     found = jax.vmap(lambda g: lj.equilibria(pendulum, {"g": g, "l": 1.0}, starts=[0.1, 3.0, -3.0]))(jnp.ones(2))
     assert found.found.shape == (2, 3) and found.found.all() and "a batch of 2 with 3 starts each" in repr(found)

@@ -21,7 +21,7 @@ mathieu = lj.System(mathieu_lagrangian)
 @jax.jit
 @jax.vmap
 def swing(a, q):
-    """M over half a turn of the drive's phase, its slope in a, and whether it is stable."""
+    """M over half a turn of the drive's phase, its derivative by a, and whether it is stable."""
 
     def half_turn(a):
         found = lj.floquet(mathieu, 0.0, 0.0, 0.0, {"a": a, "q": q}, jnp.pi)
@@ -46,14 +46,14 @@ A, Q, ROW, COLUMN, WIDTH = BOUNDARIES.T
 
 
 def off(value, slope, row, column):
-    """How far a is off a zero of an entry of M, entry by entry."""
+    """The distance of a from a zero of each entry of M."""
     at = np.arange(len(A)), row.astype(int), column.astype(int)
     return np.asarray(value)[at] / np.asarray(slope)[at]
 
 
 @pytest.mark.slow
 def test_boundaries_of_mathieu():
-    """M has its zero at each boundary to 1e-9 in a; twins: a shift by 1e-7 is seen, and the other entry has none."""
+    """M has its zero at each boundary to 1e-9 in a; twins: a shift by 1e-7 is detected; the other entry has no zero."""
     value, slope, _ = swing(A, Q)
     np.testing.assert_array_less(np.abs(off(value, slope, ROW, COLUMN)), 1e-9)
     np.testing.assert_allclose(np.trace(value, axis1=1, axis2=2) ** 2, 4.0, rtol=1e-9)
@@ -63,11 +63,11 @@ def test_boundaries_of_mathieu():
 
 @pytest.mark.slow
 def test_verdict_across_boundaries():
-    """Unstable a hundred millionth inside a tongue, stable as much outside, but in those that let nothing grow."""
+    """Unstable 1e-8 inside a tongue and stable 1e-8 outside, except in tongues too narrow for growth."""
     wide = np.abs(WIDTH) > 1e-2
     inside = -np.sign(WIDTH) * 1e-8
     assert not swing(A + inside, Q)[2][wide].any() and swing(A - inside, Q)[2][wide].all()
-    # Twin: in the middle of a narrower one states grow, by a part of 1e-4 in each period.
+    # Twin: in the middle of a narrower tongue states grow, by 1e-4 in each period.
     narrow = (np.abs(WIDTH) < 1e-2) & (np.abs(WIDTH) > 1e-4)
     assert narrow.sum() == 4 and not swing(np.where(narrow, A - WIDTH / 2, A), Q)[2][narrow].any()
 
@@ -107,17 +107,17 @@ def upright(Omega, system=kapitza):
 
 @pytest.mark.slow
 def test_kapitza():
-    """Upright it is stable exactly where a > a_0(q), a = -4g/(lΩ²), q = 2A/l, near A²Ω² = 2gl; twin: just below not."""
+    """Upright it is stable exactly where a > a_0(q), a = -4g/(lΩ²), q = 2A/l, near A²Ω² = 2gl; twin: not just below."""
     edge = np.sqrt(-4 * SHAKEN["g"] / SHAKEN["l"] / special.mathieu_a(0, 2 * SHAKEN["A"] / SHAKEN["l"]))
     found = jax.jit(jax.vmap(upright))(edge * np.array([1 - 1e-7, 1 + 1e-7]))
     assert list(found.stable) == [False, True]
-    # The limit of fast drives, from the averaged equations, is near.
+    # The boundary is near the limit of fast drives from the averaged equations.
     assert abs((SHAKEN["A"] * edge) ** 2 / (2 * SHAKEN["g"] * SHAKEN["l"]) - 1) < 0.01
 
 
 @pytest.mark.exhaustive
 def test_kapitza_on_a_moving_constraint():
-    """In Cartesian coordinates on a rod whose pivot moves the multipliers are the same, two of them."""
+    """In Cartesian coordinates, on a rod with a moving pivot, the two multipliers are the same."""
     for Omega in (60.0, 100.0):
         rod, angle = upright(Omega, kapitza_rod), upright(Omega)
         np.testing.assert_allclose(np.sort_complex(rod.multipliers), np.sort_complex(angle.multipliers), rtol=1e-7)
@@ -130,20 +130,20 @@ def elliptic(amplitude, params):
 
 
 def test_pendulum():
-    """M = 1 + (dT/dE) f dEᵀ is known in closed form, and both multipliers are 1 for their reasons."""
+    """M = 1 + (dT/dE) f dEᵀ in closed form, and both multipliers are 1 for a known reason."""
     amplitude = 2.0
     found = lj.floquet(pendulum, 0.0, amplitude, 0.0, PARAMS, elliptic(amplitude, PARAMS))
     g_over_l = PARAMS["g"] / PARAMS["l"]
     m = np.sin(amplitude / 2) ** 2
     k, e = special.ellipk(m), special.ellipe(m)
     slope = 4 / np.sqrt(g_over_l) * (e - (1 - m) * k) / (2 * m * (1 - m)) * np.sin(amplitude) / 2
-    # At rest f = (0, -g/l sin q), and a start shifted by dq comes back after T + T'dq: v is by then f (-T' dq).
+    # With v = 0, f = (0, -g/l sin q). A start shifted by dq returns after T + T'dq, so after T it is off by -f T' dq.
     exact = np.array([[1.0, 0.0], [slope * g_over_l * np.sin(amplitude), 1.0]])
     np.testing.assert_allclose(found.monodromy, exact, atol=1e-9)
     np.testing.assert_array_equal(found.multipliers, [1.0, 1.0])
     assert found.trivial.all() and "1 (along the motion), 1 (across energies)" in repr(found)
     assert bool(found.stable) and "linearly stable" in found.verdict
-    # Twin: at rest no multiplier is trivial, and they are e^{±i ω T}.
+    # Twin: at the equilibrium no multiplier is trivial; they are e^{±i ω T}.
     rest = lj.floquet(pendulum, 0.0, 0.0, 0.0, PARAMS, 1.0)
     np.testing.assert_allclose(rest.multipliers, np.exp([1j * np.sqrt(g_over_l), -1j * np.sqrt(g_over_l)]), rtol=1e-9)
     assert not rest.trivial.any()
@@ -156,7 +156,7 @@ def kepler_lagrangian(t, q, v, p):
 
 @pytest.mark.exhaustive
 def test_kepler():
-    """All four multipliers are 1, two of them for a reason that is known, the others to 1e-5; and M is no identity."""
+    """All four multipliers are 1, two of them for known reasons, the others to 1e-5; and M is not the identity."""
     mu, speed = 1.25, 1.25
     period = 2 * np.pi / np.sqrt(mu) * (2 - speed**2 / mu) ** -1.5
     found = lj.floquet(
@@ -170,16 +170,16 @@ def test_kepler():
 
 
 def on_a_sphere(t, q, v, p):
-    """A unit mass that hangs, in space."""
+    """A unit mass under gravity in three dimensions."""
     return 0.5 * v @ v - p["g"] * q[2]
 
 
 @pytest.mark.slow
 def test_conical_pendulum():
-    """Circling at an angle θ it swings about that √(1 + 3 cos² θ) times in a turn, on a constraint that is given twice.
+    """Circling at an angle θ it swings about that √(1 + 3 cos² θ) times in a turn, with a constraint given twice.
 
-    Landau & Lifshitz, *Mechanics*, §14, problem 1: by the effective potential. The turn is a symmetry that is not known
-    from the coordinates, and here the motion itself.
+    Landau & Lifshitz, *Mechanics*, §14, problem 1: by the effective potential. The rotation is a symmetry that the
+    coordinates do not show, and here it is the motion itself.
     """
     rod = lj.Holonomic(lambda t, q, p: q @ q - p["l"] ** 2)
     again = lj.Holonomic(lambda t, q, p: 1.0 - q @ q / p["l"] ** 2)
@@ -199,7 +199,7 @@ def test_conical_pendulum():
 
 
 def doubled(count):
-    """The same rod so many times."""
+    """The same rod several times."""
     rod = lj.Holonomic(lambda t, q, p: q @ q - p["l"] ** 2)
     return lj.System(on_a_sphere, {f"rod {i}": rod for i in range(count)})
 
@@ -227,7 +227,7 @@ def test_van_der_pol():
     assert found.trivial.tolist() == [True, False] and bool(found.attracts)
     np.testing.assert_allclose(found.multipliers[1], np.exp(end), rtol=1e-8)
     np.testing.assert_allclose(found.product, found.liouville, rtol=1e-7)
-    # Backward in time the cycle is the same, and a neighbour leaves it.
+    # Backward in time the cycle is the same, but repels.
     away = lj.floquet(van_der_pol, 0.0, orbit.q, -orbit.v, {"mu": -1.0}, orbit.period)
     np.testing.assert_allclose(away.multipliers[1], np.exp(-end), rtol=1e-8)
     assert not bool(away.stable) and "above 1" in away.verdict
@@ -235,7 +235,7 @@ def test_van_der_pol():
 
 @pytest.mark.slow
 def test_liouville_with_damping():
-    """On a rod and off it, with R = ½ c v², the product is e^(-cT) for each freedom; twin: with 2R it is the square."""
+    """With and without a rod, R = ½ c v² gives the product e^(-cT) for each freedom; twin: 2R gives its square."""
     c, period = 0.375, 1.25
     for factor in (1.0, 2.0):
         damped = lj.System(
@@ -255,11 +255,11 @@ def test_liouville_with_damping():
 
 @pytest.mark.exhaustive
 def test_derivatives():
-    """Of the largest multiplier of Mathieu's equation in a, both modes, against the discriminant D: μ + 1/μ = D."""
+    """The derivative of Mathieu's largest multiplier by a, both modes, against the discriminant D: μ + 1/μ = D."""
     largest = lambda a: lj.floquet(mathieu, 0.0, 0.0, 0.0, {"a": a, "q": 0.25}, jnp.pi).largest
     value, slope, _ = swing(np.append(1.0, A[1:]), np.append(0.25, Q[1:]))
     mu = float(jax.jit(largest)(1.0))
-    # μ < -1 here, and `largest` is -μ.
+    # Here μ < -1, so `largest` is -μ.
     exact = -float(jnp.trace(slope[0])) / (1 - mu**-2)
     np.testing.assert_allclose(-mu - 1 / mu, jnp.trace(value[0]), rtol=1e-11)
     np.testing.assert_allclose(jax.jit(jax.jacfwd(largest))(1.0), exact, rtol=1e-9)
@@ -286,7 +286,7 @@ def test_sweep_of_stability():
 
 @pytest.mark.slow
 def test_what_is_printed_and_drawn():
-    """Multipliers, verdict, Liouville's product, the error; a flip and a pair have their words."""
+    """The summary has multipliers, verdict, Liouville's product and error; a flip and a pair are named."""
     found = lj.floquet(mathieu, 0.0, 0.0, 0.0, {"a": 1.0, "q": 0.25}, jnp.pi)
     words = repr(found)
     assert "below -1; what grows has twice the period" in words and "by Liouville's formula 1" in words
@@ -297,7 +297,7 @@ def test_what_is_printed_and_drawn():
 
 
 def test_refused_in_words():
-    """A state that does not come back, what is left out, what is neither system nor orbit."""
+    """Refused: a state that does not come back, a missing argument, neither a system nor an orbit."""
     with pytest.raises(ValueError, match="does not come back after period = 1: it is off by"):
         lj.floquet(pendulum, 0.0, 2.0, 0.0, PARAMS, 1.0)
     with pytest.raises(TypeError, match="needs period with a system"):
@@ -308,7 +308,7 @@ def test_refused_in_words():
 
 @pytest.mark.slow
 def test_equations_that_fail():
-    """A degenerate L and a parameter that is not a number are said in words, also where an orbit is looked for."""
+    """A degenerate L and a NaN parameter are named in the message, also in the search for an orbit."""
     massless = lj.System(lambda t, q, v, p: 0.5 * v["x"] ** 2 - q["x"] ** 2 - (q["y"] - q["x"]) ** 2)
     start = {"x": 1.0, "y": 1.0}, {"x": 0.0, "y": 0.0}
     with pytest.raises(ValueError, match="the mass matrix is singular in coordinate 'y'"):

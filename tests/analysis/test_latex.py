@@ -1,4 +1,4 @@
-"""Equations in LaTeX: as textbooks have them, and as the program computes them."""
+"""Equations in LaTeX agree with textbooks and with the program that computes them."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -14,7 +14,7 @@ X, Y = symbol("x", "x", 1), symbol("y", "y", 2)
 
 
 def test_algebra():
-    """Products multiply out, what cancels is gone, roots of a square sum come back; each against numbers."""
+    """Products are expanded, cancelling terms vanish, powers of a root recombine; each is compared with numbers."""
     at = {"x": 0.75, "y": -1.25}
     root = (X * X + number(3.0)).power(0.5)
     cases = [
@@ -35,7 +35,7 @@ def test_algebra():
 
 
 def test_typesetting():
-    """Numbers as fractions, names as letters, signs, brackets."""
+    """Numbers are typeset as fractions and names as letters, with the right signs and brackets."""
     assert typeset.latex(number(0.5) * X * Y - number(1.25) * Y.power(-1)) in (
         r"\frac{x y}{2} - \frac{5}{4 y}",
         r"-\frac{5}{4 y} + \frac{x y}{2}",
@@ -46,7 +46,7 @@ def test_typesetting():
 
 
 def test_textbook_equations():
-    """Goldstein's wedge, and the rails with Coriolis' factor 2, as they are printed."""
+    """The equations of Goldstein's wedge, and of the rails with the Coriolis factor 2, are those in print."""
     found = lj.latex(sliding_wedge.system, sliding_wedge.Q0, sliding_wedge.V0, sliding_wedge.PARAMS)
     assert found.lines[:3] == (
         r"M \ddot{X} = -\sin(\alpha) \lambda_{\mathrm{incline}}",
@@ -60,7 +60,7 @@ def test_textbook_equations():
 
 
 def test_others():
-    """A double pendulum in an array; constraints of velocities and dissipation; a scalar with a root."""
+    """Also for a double pendulum in an array, velocity constraints with dissipation, and a scalar with a root."""
     found = lj.latex(double_pendulum, np.array([0.25, 0.5]), np.array([0.5, 0.25]), DOUBLE_PARAMS)
     assert r"l_{1} l_{2} m_{2} \cos(q_{0} - q_{1}) \ddot{q_{1}}" in found.lines[0]
     rolling = lj.Nonholonomic(lambda t, q, v, p: v["x"] - p["R"] * v["phi"])
@@ -80,7 +80,7 @@ def test_others():
 
 
 def test_what_cannot_be_written(monkeypatch):
-    """A branch has no formula; nine coordinates nobody reads; formulas that are wrong are not shown."""
+    """Refused: a branch, which has no formula; nine coordinates; equations that are too long; wrong formulas."""
     branch = lj.System(lambda t, q, v, p: 0.5 * v**2 - jnp.where(q > 0, q**2, q**4))
     with pytest.raises(ValueError, match="the equations contain"):
         lj.latex(branch, 0.25, 0.5)

@@ -1,4 +1,4 @@
-"""Lyapunov exponents: linear systems in closed form, sums by the damping, chaos by SciPy's variational equations."""
+"""Lyapunov exponents against closed forms of linear systems, sums from damping, and SciPy for chaos."""
 
 import jax
 import jax.numpy as jnp
@@ -13,13 +13,13 @@ G_OVER_L = PARAMS["g"] / PARAMS["l"]
 
 
 def hill_lagrangian(t, q, v, p):
-    """Two hills of different steepness, and coordinates that have both."""
+    """Two hills of different steepness, in coordinates that mix both."""
     return 0.5 * v @ v + 0.5 * p["k"] @ jnp.stack([q[0] + q[1], q[0] - q[1]]) ** 2 / 2
 
 
 @pytest.mark.parametrize("c", [0.0, 0.375])
 def test_linear(c):
-    """λ = -c/2 ± √(k + c²/4) for each; they sum to -c for each freedom; twin: without damping it is another sum."""
+    """λ = -c/2 ± √(k + c²/4) for each k; they sum to -c for each freedom, and to zero without damping."""
     k = np.array([4.0, 0.5])
     hill = lj.System(hill_lagrangian, dissipation=lambda t, q, v, p: 0.5 * p["c"] * v @ v)
     start = np.zeros(2), np.zeros(2)
@@ -34,7 +34,7 @@ def test_linear(c):
 
 @pytest.mark.slow
 def test_on_a_constraint():
-    """A pendulum that stands on its rod parts as e^(±√(g/l) t), two exponents; hanging it does not part."""
+    """Neighbours of an inverted rod pendulum separate as e^(±√(g/l) t), two exponents; hanging, they do not."""
     l, ts = PARAMS["l"], np.linspace(0.0, 10.0, 41)
     at = lambda y: ({"x": 0.0, "y": y}, {"x": 0.0, "y": 0.0})
     up = lj.lyapunov_exponents(rod_pendulum, *at(l), PARAMS, ts=ts, count=2)
@@ -46,7 +46,7 @@ def test_on_a_constraint():
 
 
 def test_regular():
-    """A pendulum's neighbours part as t does: zero within the uncertainty, which shrinks; twin: not a fifth of it."""
+    """A pendulum's neighbours separate like t: zero within the uncertainty, which shrinks; twin: not within a fifth."""
     run = lambda end: lj.lyapunov_exponents(pendulum, 2.0, 0.0, PARAMS, ts=np.linspace(0.0, end, 401), count=2)
     short, long = run(200.0), run(1000.0)
     for found in (short, long):
@@ -67,12 +67,12 @@ henon_heiles = lj.System(henon_heiles_lagrangian)
 
 
 def thrown(energy, y, vy):
-    """A start on x = 0 with an energy."""
+    """A start on x = 0 with the given energy."""
     return np.array([0.0, y]), np.array([np.sqrt(2 * energy - y**2 + 2 * y**3 / 3 - vy**2), vy])
 
 
 def by_scipy(start, times):
-    """The largest exponent over times, by the variational equations and renormalisation."""
+    """The largest exponent over `times`, by the variational equations and renormalisation."""
 
     def rate(t, w):
         x, y, u, v, a, b, c, d = w
@@ -91,7 +91,7 @@ def by_scipy(start, times):
 
 @pytest.mark.slow
 def test_henon_heiles():
-    """At E = 1/6 most motions are chaotic, at 1/12 none is seen to be; SciPy's agree within what is uncertain."""
+    """The motion is chaotic at E = 1/6 and regular at 1/12; SciPy's exponents agree within the uncertainty."""
     ts = np.linspace(0.0, 1500.0, 751)
     for energy, y, vy, sensitive in ((1 / 6, -0.2, 0.1, True), (1 / 12, 0.1, 0.0, False)):
         start = thrown(energy, y, vy)
@@ -99,7 +99,7 @@ def test_henon_heiles():
         assert bool(found.sensitive) == sensitive
         independent = by_scipy(start, np.linspace(0.0, 1500.0, 151))
         assert abs(float(found.exponents[0]) - independent) < 2 * float(found.uncertainty[0])
-        # In pairs, and two are zero: along the motion, and across energies.
+        # Exponents come in pairs; two are zero: along the motion, and across energies.
         pairs = found.exponents + found.exponents[::-1]
         np.testing.assert_allclose(pairs, 0.0, atol=float(np.max(found.uncertainty)))
         assert abs(found.exponents[1]) < found.uncertainty[1]
@@ -109,13 +109,13 @@ def test_henon_heiles():
 
 
 def duffing_lagrangian(t, q, v, p):
-    """A spring with two valleys, driven."""
+    """A driven mass in a double well."""
     return 0.5 * v**2 + 0.5 * q**2 - 0.25 * q**4 + p["f"] * q * jnp.cos(t)
 
 
 @pytest.mark.exhaustive
 def test_lanes_of_the_driven_duffing():
-    """Over the strength of the drive lanes are what a loop gives, chaotic or not; both sum to the damping."""
+    """Lanes over the drive's strength agree with single runs, chaotic or not; their exponents sum to -c."""
     duffing = lj.System(duffing_lagrangian, dissipation=lambda t, q, v, p: 0.5 * p["c"] * v**2)
     ts = np.linspace(0.0, 600.0, 301)
     run = lambda f: lj.lyapunov_exponents(duffing, 1.0, 0.0, {"f": f, "c": 0.25}, ts=ts, count=2)
@@ -127,7 +127,7 @@ def test_lanes_of_the_driven_duffing():
 
 
 def test_what_is_printed_drawn_and_refused():
-    """Exponents with their uncertainty, the sum beside Liouville's; running means; too few times."""
+    """Printed: exponents, uncertainty, Liouville's sum; drawn: running means; refused: too few or unsorted times."""
     found = lj.lyapunov_exponents(pendulum, 2.0, 0.0, PARAMS, ts=np.linspace(0.0, 200.0, 401), count=2)
     assert "±" in repr(found) and "by Liouville's formula 0" in repr(found)
     assert len(found.plot().axes[0].lines) == 2

@@ -1,4 +1,4 @@
-"""Small motions and their modes against closed forms, published values, and roots in many digits."""
+"""Small motions and their modes against closed forms, published values, and roots in high precision."""
 
 import jax
 import jax.numpy as jnp
@@ -22,18 +22,18 @@ def rails(params):
     return lj.normal_modes(cross_rails.rotating_system, 0.0, at, {"R": 0.0, "r": 0.0}, params)
 
 
-# One freedom.
+# One degree of freedom.
 
 
 def bead_frequency(omega):
-    """Below the critical speed at the bottom, above it at the angle α with cos α = g/(a ω²)."""
+    """The frequency at the bottom below the critical speed, and at α with cos α = g/(a ω²) above it."""
     ratio = BEAD["g"] / (BEAD["a"] * omega**2)
     at = jnp.arccos(jnp.minimum(ratio, 1.0)) if omega**2 > BEAD["g"] / BEAD["a"] else 0.0
     return lj.normal_modes(small.bead, 0.0, at, 0.0, BEAD | {"omega": omega}).frequency[0]
 
 
 def test_the_bead():
-    """√(ω0² - ω²) below, ω sin α above, with derivatives by ω, to 1e-10 and 1e-8; twin: with the other's form not."""
+    """√(ω0² - ω²) below, ω sin α above, and derivatives by ω, to 1e-10 and 1e-8; twin: not the other formula."""
     squared = BEAD["g"] / BEAD["a"]
     frequency = jax.jit(
         jax.vmap(
@@ -50,14 +50,14 @@ def test_the_bead():
     alpha = np.arccos(squared / above**2)
     got, slope = frequency(np.stack([alpha, above], axis=1))
     np.testing.assert_allclose(got, above * np.sin(alpha), **EQUAL)
-    # The equilibrium moves with ω: dα/dω = 2 cos α / (ω sin α); of ω sin α = √(ω² - ω0⁴/ω²).
+    # The equilibrium moves with ω, dα/dω = 2 cos α / (ω sin α); the frequency is ω sin α = √(ω² - ω0⁴/ω²).
     whole = slope[:, 1] + slope[:, 0] * 2 * np.cos(alpha) / (above * np.sin(alpha))
     np.testing.assert_allclose(whole, (above + squared**2 / above**3) / got, rtol=1e-8)
     assert np.min(np.abs(got / np.sqrt(above**2 - squared) - 1)) > 1e-3
 
 
 def test_verdicts_of_the_bead():
-    """Bottom and top, below and above: stable or divergence; at the critical speed itself undecided."""
+    """Stable or divergent at the bottom and the top, below and above the critical speed; at it undecided."""
     says = lambda at, omega: lj.normal_modes(small.bead, 0.0, at, 0.0, BEAD | {"omega": omega}).verdict
     assert [says(0.0, 2.0), says(0.0, 3.0), says(np.pi, 2.0)] == ["stable", "divergence", "divergence"]
     exactly = BEAD | {"a": 1.0, "g": 4.0, "omega": 2.0}
@@ -70,7 +70,7 @@ def test_verdicts_of_the_bead():
 
 
 def test_the_force_of_a_constraint_is_in_the_stiffness():
-    """A pendulum on a rod in Cartesian coordinates: g/l from λ·∂²g alone; L itself has no stiffness at all."""
+    """A rod pendulum in Cartesian coordinates gets g/l from λ·∂²g alone; L itself has no stiffness."""
     params = {"g": 9.8125, "l": 1.25}
     modes = lj.normal_modes(rod_pendulum, 0.0, {"x": 0.0, "y": -1.25}, {"x": 0.0, "y": 0.0}, params)
     found = modes.linearisation
@@ -81,7 +81,7 @@ def test_the_force_of_a_constraint_is_in_the_stiffness():
 
 @pytest.mark.slow
 def test_the_double_pendulum_by_angles_and_by_rods():
-    """Roots of det(K - ω² M), by angles and with two constraints, and one of these given twice."""
+    """The roots of det(K - ω² M), in angles, with two constraints, and with one constraint given twice."""
     m1, m2, l1, l2, g = (DOUBLE_PARAMS[name] for name in ("m1", "m2", "l1", "l2", "g"))
     M = np.array([[(m1 + m2) * l1**2, m2 * l1 * l2], [m2 * l1 * l2, m2 * l2**2]])
     K = np.diag([(m1 + m2) * g * l1, m2 * g * l2])
@@ -95,11 +95,11 @@ def test_the_double_pendulum_by_angles_and_by_rods():
         assert modes.verdict == "stable"
 
 
-# Many freedoms.
+# Many degrees of freedom.
 
 
 def test_a_chain():
-    """2 √(k/m) sin(jπ/(2(n+1))) between walls, and its shapes; twin: not the frequencies of a free chain."""
+    """Frequencies 2 √(k/m) sin(jπ/(2(n+1))) between walls, and shapes; twin: not those of a free chain."""
     n, params = 6, {"m": 2.0, "k": 3.0}
     modes = lj.normal_modes(small.chain, 0.0, np.zeros(n), np.zeros(n), params)
     j = np.arange(1, n + 1)
@@ -113,7 +113,7 @@ def test_a_chain():
 
 @pytest.mark.slow
 def test_a_free_chain_and_a_hard_one():
-    """Moving as a whole is a zero mode that is named, and no instability; one of a hundred masses to 1e-10."""
+    """The rigid motion of a free chain is a named zero mode, not an instability; a hundred masses to 1e-10."""
     modes = lj.normal_modes(small.free_chain, 0.0, np.zeros(4), np.zeros(4), {"m": 2.0, "k": 3.0})
     assert modes.verdict == "stable" and list(modes.zero) == [True, False, False, False]
     np.testing.assert_allclose(modes.shapes[0], np.ones(4), atol=1e-12)
@@ -126,7 +126,7 @@ def test_a_free_chain_and_a_hard_one():
 
 @pytest.mark.slow
 def test_symmetries_are_told_from_critical_points():
-    """A molecule in the plane may move and turn: stable; q⁴, whose stiffness is as zero, is left undecided."""
+    """A molecule free to move and turn in the plane is stable; q⁴, also without stiffness, is undecided."""
 
     def spring(t, q, v, params):
         return 0.5 * jnp.sum(v**2) - 0.5 * params["k"] * (jnp.sqrt(jnp.sum((q[0] - q[1]) ** 2)) - 1.0) ** 2
@@ -140,7 +140,7 @@ def test_symmetries_are_told_from_critical_points():
 
 
 def test_what_is_free_and_what_is_held():
-    """A free mass at any speed has one zero mode; one that a constraint holds has no motion, and that is said."""
+    """A free mass at any speed has one zero mode; a mass held by a constraint has no motion, which is an error."""
     free = lj.System(lambda t, q, v, params: 0.5 * v**2)
     modes = lj.normal_modes(free, 0.0, 1.0, 2.0, None)
     assert modes.verdict == "stable" and "any q and any speed" in repr(modes)
@@ -153,7 +153,7 @@ def test_what_is_free_and_what_is_held():
 
 
 def test_cross_rails():
-    """Both frequencies; stable, divergence, stabilised in turn with the speed, and what the energies say of that."""
+    """Both frequencies; stable, divergent, then stabilised with rising speed, with the signs of the energies."""
     np.testing.assert_allclose(rails(cross_rails.PARAMS).frequency, rails_by_hand(2.5), **EQUAL)
     verdicts = {omega: rails(cross_rails.PARAMS | {"omega": omega}).verdict for omega in (2.5, 5.0, 8.0)}
     assert verdicts == {2.5: "stable", 5.0: "divergence", 8.0: "gyroscopically stabilised"}
@@ -168,7 +168,7 @@ def rails_by_hand(omega):
 
 @pytest.mark.slow
 def test_derivatives_of_the_rails():
-    """By ω, of first and second order, forward and reverse; of the shapes by differences."""
+    """First and second derivatives by ω, forward and reverse; those of shapes against finite differences."""
     got = lambda omega: rails(cross_rails.PARAMS | {"omega": omega}).frequency
     exact = jax.jacfwd(rails_by_hand)(2.5)
     np.testing.assert_allclose(jax.jit(jax.jacfwd(got))(2.5), exact, rtol=1e-8)
@@ -183,7 +183,7 @@ def test_derivatives_of_the_rails():
 
 @pytest.mark.slow
 def test_damping_what_gyroscopic_forces_hold():
-    """A little of it makes the mode of negative energy grow, and the other one decay."""
+    """A little damping makes the mode of negative energy grow, and the other one decay."""
     damped = lj.System(
         cross_rails.rotating_lagrangian, dissipation=lambda t, q, v, p: 0.05 * (v["R"] ** 2 + v["r"] ** 2)
     )
@@ -195,7 +195,7 @@ def test_damping_what_gyroscopic_forces_hold():
 
 @pytest.mark.slow
 def test_stability_of_a_hundred_thousand_rails():
-    """Stable exactly where (1 - ω²m/K)(1 - ω²m/k) > 0; twin: with one factor alone thousands differ."""
+    """Stable exactly if (1 - ω²m/K)(1 - ω²m/k) > 0; twin: with only one factor thousands differ."""
     random, count = np.random.default_rng(0), 100_000
     drawn = {
         "K": random.uniform(0.1, 60, count),
@@ -210,7 +210,7 @@ def test_stability_of_a_hundred_thousand_rails():
 
 @pytest.mark.slow
 def test_small_roots_have_all_digits():
-    """Near critical speeds at large ω the small root is that of the exact problem to 1e-10, by mpmath."""
+    """Near critical speeds at large ω the small root agrees with mpmath's to 1e-10."""
     m = 1.0
     for omega, over_K, over_k in ((1e4, 1e-3, 0.5), (1e4, 1e-4, 1e-4), (1e6, 0.5, 1e-3), (1e3, -1e-3, -0.5)):
         params = {"m": m, "K": m * omega**2 * (1 + over_K), "k": m * omega**2 * (1 + over_k), "R0": 0.0, "omega": omega}
@@ -220,13 +220,13 @@ def test_small_roots_have_all_digits():
             fast = half + mpmath.sqrt(half**2 - (K - squared) * (k - squared))
             exact = mpmath.sqrt((K - squared) * (k - squared) / fast)
         got = np.min(rails(params).frequency)
-        # ω² as a double, and what is left of K - ω² after it.
+        # The exact root uses ω² and K as rounded to double precision.
         assert abs(got / float(exact) - 1) < 1e-10, (omega, over_K, over_k)
 
 
 @pytest.mark.slow
 def test_foucault_and_a_charge():
-    """ω ± Ω in a turning frame; √(..) of a charge is its cyclotron frequency, and what is free is no instability."""
+    """ω ± Ω in a rotating frame; the cyclotron frequency of a charge, whose free drift is no instability."""
     modes = lj.normal_modes(small.foucault, 0.0, STILL, STILL, {"turn": 0.25, "omega": 3.0})
     np.testing.assert_allclose(modes.frequency, [2.75, 3.25], **EQUAL)
     fast = lj.normal_modes(small.foucault, 0.0, STILL, STILL, {"turn": 4.0, "omega": 3.0})
@@ -241,7 +241,7 @@ def test_foucault_and_a_charge():
 
 
 def test_the_conical_pendulum():
-    """It nods with Ω √(1 + 3 cos²θ); any azimuth is as good; twin: at another speed it is no steady motion."""
+    """It oscillates with Ω √(1 + 3 cos²θ) at any azimuth; twin: at another speed it is not steady."""
     theta, params = 0.7, {"l": 1.25, "g": 9.8125}
     turn = np.sqrt(params["g"] / (params["l"] * np.cos(theta)))
     at = {"theta": theta, "phi": 0.3}
@@ -253,7 +253,7 @@ def test_the_conical_pendulum():
 
 
 def test_a_sleeping_top():
-    """(I₃ω ± √(I₃²ω² - 4 M g l I₁)) / 2 I₁: stable from ω_c = 2 √(M g l I₁) / I₃ on, flutter below."""
+    """(I₃ω ± √(I₃²ω² - 4 M g l I₁)) / 2 I₁: stable above ω_c = 2 √(M g l I₁) / I₃, flutter below."""
     params = {"I1": 2.0, "I3": 1.5, "Mgl": 3.0}
     critical = 2 * np.sqrt(params["Mgl"] * params["I1"]) / params["I3"]
     upright = {"alpha": 0.0, "beta": 0.0, "spin": 0.0}
@@ -265,14 +265,14 @@ def test_a_sleeping_top():
 
 
 def disk_critical(params):
-    """Of the disk's spin: C (C + m r²) Ω² = A m g r, from λ² (A + m r²) = m g r - C (C + m r²) Ω² / A."""
+    """The critical spin: C (C + m r²) Ω² = A m g r, from λ² (A + m r²) = m g r - C (C + m r²) Ω² / A."""
     A, C, m, g, r = (params[name] for name in ("A", "C", "m", "g", "r"))
     return np.sqrt(A * m * g * r / (C * (C + m * r**2)))
 
 
 @pytest.mark.slow
 def test_a_rolling_disk():
-    """Its leaning has that root at each speed; g/(3r) of a thin disk; from there on it stays upright."""
+    """The lean mode has this root at each speed; above Ω² = g/(3r) a thin disk stays upright."""
     m, r, g = 1.5, 0.4, 9.81
     params = {"m": m, "r": r, "g": g, "A": 0.25 * m * r**2, "C": 0.5 * m * r**2}
     critical = disk_critical(params)
@@ -295,7 +295,7 @@ def test_a_rolling_disk():
 
 
 def test_damping_and_circulation():
-    """Damped, held, fluttering from 2n > |k₁ - k₂| on, as Ziegler found; overdamped roots are two."""
+    """Damped and overdamped roots; stable up to 2n = |k₁ - k₂| and flutter above it, as Ziegler found."""
     at = lambda **params: lj.normal_modes(small.circulating, 0.0, STILL, STILL, params)
     modes = at(k1=1.0, k2=4.0, n=0.0, c=0.5)
     np.testing.assert_allclose(modes.roots, [-0.25 + 1j * np.sqrt(k - 0.0625) for k in (1.0, 4.0)], rtol=1e-12)
@@ -309,12 +309,12 @@ def test_damping_and_circulation():
     np.testing.assert_allclose(at(k1=1.0, k2=1.5, n=0.0, c=0.5).linearisation.damping, 0.5 * np.eye(2))
 
 
-# Derivatives where there is none, and programs.
+# Double roots, and compiled programs.
 
 
 @pytest.mark.slow
 def test_a_double_root_is_reported():
-    """Of an isotropic oscillator: finite derivatives, of the mean, and it is said."""
+    """An isotropic oscillator has finite derivatives, those of the mean, and is reported as double."""
     at = lambda k1: lj.normal_modes(small.circulating, 0.0, STILL, STILL, {"k1": k1, "k2": 4.0, "n": 0.0, "c": 0.0})
     modes = at(4.0)
     assert list(modes.double) == [True, True] and "double" in repr(modes)
@@ -325,7 +325,7 @@ def test_a_double_root_is_reported():
 
 
 def test_programs_never_hold_nan():
-    """Traced, a state that is none of equilibrium, a mass of zero, and NaN itself: codes and residuals, no NaN."""
+    """In a program, states off equilibrium and NaN inputs give codes and residuals, never NaN."""
     codes = jax.jit(jax.vmap(lambda at, omega: lj.normal_modes(small.bead, 0.0, at, 0.0, BEAD | {"omega": omega})))
     modes = codes(np.array([0.0, 0.5, np.nan, 0.0]), np.array([1.0, 1.0, 1.0, np.nan]))
     assert all(np.isfinite(x).all() for x in (modes.roots, modes.shapes, modes.code))
@@ -338,7 +338,7 @@ def test_programs_never_hold_nan():
 
 
 def test_messages():
-    """No equilibrium, no mass, time in L, velocities that turn: in the user's words."""
+    """No equilibrium, no mass, explicit time, a violated constraint, wrong types: each error is clear."""
     with pytest.raises(ValueError, match="not an equilibrium: 'q' accelerates by"):
         lj.linearise(small.bead, 0.0, 0.3, 0.0, BEAD)
     massless = lj.System(lambda t, q, v, params: 0.5 * v["a"] ** 2 - 0.5 * (q["a"] ** 2 + q["b"] ** 2))
@@ -356,7 +356,7 @@ def test_messages():
 
 
 def test_it_draws_itself():
-    """Roots, shapes and a film."""
+    """Roots and shapes are drawn, and a mode is animated."""
     modes = rails(cross_rails.PARAMS)
     assert modes.plot().axes and modes[1].plot().axes
     film = modes[0].animate(lambda t, q, params: (q["R"], q["r"]), amplitude=0.1)

@@ -1,4 +1,4 @@
-"""Hamilton's and Routh's functions and the action: against closed forms and Lagrange's equations."""
+"""Hamilton's and Routh's functions and the action, against closed forms and Lagrange's equations."""
 
 import jax
 import jax.numpy as jnp
@@ -12,13 +12,13 @@ P = np.array([3.0, 1.0, -2.0])
 
 
 def relativistic(t, q, v, params):
-    """A fast particle on a spring, whose push grows with time."""
+    """A relativistic particle on a spring whose stiffness grows with time."""
     m, c = params["m"], params["c"]
     return -m * c**2 * jnp.sqrt(1 - v @ v / c**2) - 0.5 * params["k"] * (1 + t) * q @ q
 
 
 def magnetic(t, q, v, params):
-    """A charge in a uniform magnetic field along z, and an electric one along x that swings."""
+    """A charge in a uniform magnetic field along z and an oscillating electric field along x."""
     B, m = params["B"], params["m"]
     return 0.5 * m * v @ v + 0.5 * B * (q[0] * v[1] - q[1] * v[0]) + jnp.cos(t) * q[0]
 
@@ -52,7 +52,7 @@ def exact_charge(q, p, t, params):
     ids=["fast", "charge"],
 )
 def test_hamiltonians_in_closed_form(system, exact, params):
-    """H, its first and second derivatives; Hamilton's equations are Lagrange's. Twin: a wrong sign."""
+    """H and its first and second derivatives; Hamilton's equations agree with Lagrange's. Twin: a wrong sign."""
     H, t = lj.hamiltonian(system), 0.5
 
     @jax.jit
@@ -83,7 +83,7 @@ def test_hamiltonians_in_closed_form(system, exact, params):
 
 @pytest.mark.slow
 def test_forces_and_batches():
-    """In a dict, with friction: ṗ is Lagrange's; a batch of momenta is one lane each; NaN where there is none."""
+    """In a dict with friction ṗ is Lagrange's, lane by lane in a batch; NaN if no velocity has the momentum."""
     friction = lambda t, q, v, params: 0.25 * (v["x"] ** 2 + v["y"] ** 2)
     cosh = lambda t, q, v, params: jnp.log(jnp.cosh(v["x"])) + 0.5 * v["y"] ** 2 - q["x"] * q["y"]
     H = lj.hamiltonian(lj.System(cosh, dissipation=friction))
@@ -98,7 +98,7 @@ def test_forces_and_batches():
 
 
 def test_a_degenerate_lagrangian_is_named():
-    """The coordinate whose velocity the momenta do not tell; constraints have no Hamilton's equations of their own."""
+    """The error names the coordinate whose velocity is undetermined; systems with constraints are refused."""
     linear = lj.System(lambda t, q, v, params: 0.5 * v["x"] ** 2 + q["x"] * v["y"])
     state = 0.0, {"x": 1.0, "y": 1.0}, {"x": 1.0, "y": 1.0}, None
     with pytest.raises(ValueError, match="L is degenerate in 'y'"):
@@ -106,7 +106,7 @@ def test_a_degenerate_lagrangian_is_named():
     assert np.isnan(jax.jit(lambda x: lj.hamiltonian(linear)(0.0, {"x": x, "y": 1.0}, *state[2:]))(1.0))
     free = lambda t, q, v, params: 0.5 * (v["x"] ** 2 + v["y"] ** 2)
     held = lj.System(free, {"line": lj.Holonomic(lambda t, q, params: q["x"] - q["y"])})
-    with pytest.raises(ValueError, match="Hamilton's equations are those of free coordinates"):
+    with pytest.raises(ValueError, match="Hamilton's equations need free coordinates"):
         lj.hamiltonian(held).rates(*state)
     with pytest.raises(TypeError, match="first argument must be a lj.System"):
         lj.hamiltonian(free)
@@ -124,7 +124,7 @@ def reduced_top():
 
 @pytest.mark.slow
 def test_the_top_without_its_cyclic_angles():
-    """Its nutation is Lagrange's, its cyclic velocities come back; twin: the other momentum, R with the other sign."""
+    """The nutation is Lagrange's and the cyclic velocities are recovered; twin: with other momenta it is not."""
     reduced, state, params = reduced_top()
     full = lj.accelerations(TOP, 0.0, *SPINNING, OF_TOP)[0]["theta"]
     found = lj.accelerations(reduced, 0.0, *state, params)[0]["theta"]
@@ -142,7 +142,7 @@ def test_the_top_without_its_cyclic_angles():
 
 @pytest.mark.slow
 def test_a_routhian_moves_as_the_whole():
-    """A nutation, and an array with one entry less, with what is not quadratic: a fast particle in a central field."""
+    """A nutation; and, in an array with one entry less and a non-quadratic L, a relativistic central motion."""
     reduced, state, params = reduced_top()
     ts = np.linspace(0.0, 2.0, 9)
     whole = lj.integrate(TOP, *SPINNING, OF_TOP, ts=ts, rtol=1e-11, atol=1e-11)
@@ -158,7 +158,7 @@ def test_a_routhian_moves_as_the_whole():
 
 @pytest.mark.slow
 def test_a_routhian_with_forces_on_what_is_left():
-    """A top whose tilt is pushed, by its cyclic velocity too, and rubbed: as the whole; twin: without the push."""
+    """A top with a force on its tilt that contains a cyclic velocity, and friction; twins: without either."""
     push = lambda t, q, v, p: {"phi": 0.0 * t, "psi": 0.0 * t, "theta": p["f"] * jnp.cos(t) * v["phi"]}
     forced = lj.System(top, force=push, dissipation=lambda t, q, v, p: 0.5 * p["c"] * v["theta"] ** 2)
     params, (_, state, reduced) = OF_TOP | {"f": 0.5, "c": 0.25}, reduced_top()
@@ -180,7 +180,7 @@ def test_a_routhian_with_forces_on_what_is_left():
 
 
 def test_what_is_not_cyclic_is_named():
-    """A coordinate that L contains, a force, a constraint; parameters without momenta; one eliminated and given."""
+    """Errors for a coordinate in L, a force, a constraint; missing momenta; an eliminated coordinate in q."""
     of_theta = {"phi": 0.1, "psi": 0.2}, {"phi": 0.1, "psi": 0.2}
     of_phi = {"theta": 0.5, "psi": 0.2}, {"theta": 0.1, "psi": 0.2}
     momenta = {"params": OF_TOP, "momenta": {"theta": 1.0, "phi": 1.0, "x": 1.0}}
@@ -197,7 +197,7 @@ def test_what_is_not_cyclic_is_named():
         (held, "phi", of_phi, momenta, "'phi' is not cyclic: constraint 'held' contains it"),
         (TOP, "phi", of_phi, OF_TOP, "the parameters of a Routhian are those of the system and the momenta"),
         (TOP, "phi", of_phi, {"params": OF_TOP, "momenta": {}}, "the momentum of 'phi' is missing"),
-        (TOP, "phi", SPINNING, momenta, "'phi' is eliminated, and among the coordinates still"),
+        (TOP, "phi", SPINNING, momenta, "'phi' is eliminated, but still among the coordinates"),
     ]
     for system, name, state, params, words in cases:
         reduced = lj.routhian(system, name)
@@ -208,13 +208,13 @@ def test_what_is_not_cyclic_is_named():
 
 
 def swinging(t, q, v, params):
-    """An oscillator."""
+    """A harmonic oscillator."""
     return 0.5 * v**2 - 0.5 * params["k"] * q**2
 
 
 @pytest.mark.slow
 def test_the_action_is_stationary_on_motions():
-    """S of an oscillator in closed form; δS = 0 there, and ½ δ²S as known; twin: a straight path. ∂S/∂q₁ is p."""
+    """S of an oscillator in closed form; δS = 0 and δ²S as known; ∂S/∂q₁ is p. Twin: a straight path."""
     system, params, end = lj.System(swinging), {"k": 4.0}, 0.5
     w = 2.0
 
@@ -232,13 +232,13 @@ def test_the_action_is_stationary_on_motions():
 
 @pytest.mark.slow
 def test_the_action_of_a_trajectory():
-    """The same from outputs, cut within them and backward; twin: without what is cut off."""
+    """The action from outputs, with ends between them and backward; twin: the part differs from the whole."""
     system, params, w = lj.System(swinging), {"k": 4.0}, 2.0
     motion = lj.integrate(system, 0.0, w, params, ts=np.linspace(0.0, 1.0, 41), rtol=1e-12, atol=1e-12)
     exact = lambda a, b: 0.25 * w * (np.sin(2 * w * b) - np.sin(2 * w * a))
     np.testing.assert_allclose(lj.action(system, motion), exact(0.0, 1.0), rtol=1e-10)
     part = lj.action(system, motion, t0=0.11, t1=0.87)
-    # Between outputs an end is as good as the cubic.
+    # With an end between outputs the action is only as accurate as the cubic.
     np.testing.assert_allclose(part, exact(0.11, 0.87), rtol=1e-7)
     np.testing.assert_allclose(lj.action(system, motion, t0=0.87, t1=0.11), -part, rtol=1e-12)
     assert abs(part - exact(0.0, 1.0)) > 1e-4

@@ -1,4 +1,4 @@
-"""What `symmetries` finds: exactly what is known of each system, in words, with its numbers."""
+"""`symmetries` finds exactly the known symmetries of each system, in words, with the right numbers."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -18,7 +18,7 @@ TABLE = {
     "dumbbell": {"L_z", "Jacobi integral"},
     "helix": {"h p_z + 2π L_z with h = 0.5", "Jacobi integral"},
 }
-# Free flight is boosted, too.
+# Directions of free flight also have boosts.
 BOOSTED = {"plane": {"t p_x - x", "t p_y - y"}, "half plane": {"t p_x - x"}} | dict.fromkeys(
     ("cylinder", "elliptic cylinder"), {"t p_z - z"}
 )
@@ -26,7 +26,7 @@ BOOSTED = {"plane": {"t p_x - x", "t p_y - y"}, "half plane": {"t p_x - x"}} | d
 
 @pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow) if n in SLOW else n for n in TABLE])
 def test_the_seven_mass_distributions(name):
-    """Goldstein, Exercise 2-19: exactly the table, no line more and none less; for the helix with its pitch."""
+    """Goldstein, Exercise 2-19: exactly the entries of the table; for the helix with its pitch."""
     q, v, _ = mass_distributions.ORBITS[name]
     params = mass_distributions.PARAMS[name] | ({"h": 0.5} if name == "helix" else {})
     found = lj.symmetries(mass_distributions.SYSTEMS[name], q, v, params)
@@ -47,7 +47,7 @@ def test_the_seven_mass_distributions(name):
 
 @pytest.mark.exhaustive
 def test_a_left_handed_helix_of_any_pitch():
-    """The sign and the size of the screw follow h; and what is printed as conserved is not."""
+    """The sign and the size of the screw follow h; the book's printed h p_z + L_z is another generator."""
     params = mass_distributions.PARAMS["helix"] | {"h": -1.7}
     q, v, _ = mass_distributions.ORBITS["helix"]
     found = lj.symmetries(mass_distributions.SYSTEMS["helix"], q, v, params, basis={})
@@ -62,7 +62,7 @@ def test_a_left_handed_helix_of_any_pitch():
 
 
 def test_the_wedge():
-    """p_X + p_x and E, and with t the center of mass M X + m x; only one of the momenta alone is none."""
+    """p_X + p_x and E, and with t the centre of mass M X + m x; neither momentum alone is conserved."""
     params = sliding_wedge.PARAMS
     start = sliding_wedge.start_on_incline(params, along=1.0, along_rate=0.25)
     found = lj.symmetries(sliding_wedge.system, *start, params)
@@ -74,7 +74,7 @@ def test_the_wedge():
 
 
 def test_the_rails_in_both_frames():
-    """The rotating frame keeps its Jacobi integral; the lab neither E nor L_z, but E - ω L_z, the same number."""
+    """The rotating frame conserves its Jacobi integral; the lab conserves only E - ω L_z, which is equal to it."""
     params = cross_rails.PARAMS
     inside = lj.symmetries(cross_rails.rotating_system, cross_rails.Q0, cross_rails.V0, params)
     assert list(inside) == ["Jacobi integral"]
@@ -88,14 +88,14 @@ def test_the_rails_in_both_frames():
 
 
 def test_kepler_and_what_is_no_motion_of_points():
-    """L and E: six of Kepler's seven constants are not motions of points; the scaling is his third law, told apart."""
+    """Only L and E are found, not the Runge-Lenz vector; the scaling of Kepler's third law is listed separately."""
     found = lj.symmetries(KEPLER, *IN_SPACE, OF_KEPLER)
     assert list(found) == ["L_x", "L_y", "L_z", "Jacobi integral"]
     (third,) = found.scalings
     assert third.exponents == {"q[0]": 1.0, "q[1]": 1.0, "q[2]": 1.0, "t": 1.5} and third.factor == -1.0
     rubbed = lj.System(KEPLER.lagrangian, dissipation=lambda t, q, v, params: 0.05 * v @ v)
     assert len(lj.symmetries(rubbed, *IN_SPACE, OF_KEPLER)) == 0
-    # An inverse square leaves the action as it is, and so is a symmetry: x·p - 2 t E.
+    # For an inverse square potential the scaling leaves the action unchanged, so it is a symmetry: x·p - 2 t E.
     square = lj.System(lambda t, q, v, p: 0.5 * p["m"] * v @ v - p["k"] / (q @ q))
     found = lj.symmetries(square, *IN_SPACE, OF_KEPLER)
     assert found.timed == ("q·p - 2 t (Jacobi integral)",) and not found.scalings
@@ -106,7 +106,7 @@ def test_kepler_and_what_is_no_motion_of_points():
 
 @pytest.mark.slow
 def test_two_bodies_and_free_fall():
-    """All ten of Galilei's for two bodies, with both masses by name; of a falling stone also what has t in it."""
+    """All ten Galilean symmetries of two bodies, with masses by name; for a falling stone also those with t."""
 
     def attracted(t, q, v, p):
         d = q["r"][0] - q["r"][1]
@@ -129,7 +129,7 @@ def test_two_bodies_and_free_fall():
 
 
 def test_fields_that_are_tilted():
-    """Across a tilted uniform force a momentum stays; a charge in a magnetic field is shifted up to a gauge."""
+    """The momentum across a tilted uniform force is conserved; a magnetic field allows shifts up to a gauge."""
     tilted = lj.System(lambda t, q, v, p: 0.5 * v @ v + 3 * q[0] + 4 * q[1])
     found = lj.symmetries(tilted, np.array([1.0, 2.0]), np.array([0.25, 0.5]))
     assert found.steady == ("4 p_q[0] - 3 p_q[1]", "Jacobi integral")
@@ -137,20 +137,20 @@ def test_fields_that_are_tilted():
     found = lj.symmetries(magnetic, *IN_SPACE, {"m": 1.3, "B": 2.5})
     words = "p_q[0] - B q[1] with B = 2.5", "2 L_z - B q[0]^2 + B q[1]^2 with B = 2.5"
     assert set(found.steady) == {"p_q[1]", "p_q[2]", "Jacobi integral", *words}
-    # p_x - B y and p_y are the centers of the circles: their bracket with the motion vanishes.
+    # p_x - B y and p_y are the centres of the circles: their rates of change vanish.
     np.testing.assert_allclose([found[w].rate(0.0, *IN_SPACE, {"m": 1.3, "B": 2.5}) for w in words], 0.0, atol=1e-13)
 
 
 @pytest.mark.slow
 def test_constraints_of_velocities():
-    """A rolling disk under a pull along x: E, and its spin about the vertical; nothing of the plane's symmetry."""
+    """A rolling disk pulled along x conserves E and its spin about the vertical; the plane's symmetries are broken."""
     found = lj.symmetries(DISK, ON_PLANE, rolling(), RADIUS)
     assert set(found.steady) == {"p_theta", "Jacobi integral"}
     assert found.timed == ("4 t p_theta - theta",)
 
 
 def test_own_generators_come_first():
-    """A generator of the user's keeps its name, and does not come twice; one of no symmetry changes nothing."""
+    """A user's generator keeps its name and is not repeated; one that is no symmetry changes nothing."""
     own = {"turn": lambda t, q, params: jnp.stack([-q[1], q[0], 0.0 * q[2]]), "stretch": lambda t, q, params: q}
     found = lj.symmetries(KEPLER, *IN_SPACE, OF_KEPLER, basis=own)
     assert set(found) == {"turn", "L_x", "L_y", "Jacobi integral"}
@@ -158,7 +158,7 @@ def test_own_generators_come_first():
 
 
 def test_float32_is_honest():
-    """In float32 the same are found, with a gap that says how surely."""
+    """In float32 the same symmetries are found, with a smaller gap."""
     q, v = (x.astype(np.float32) for x in IN_SPACE)
     params = {name: np.float32(x) for name, x in OF_KEPLER.items()}
     found = lj.symmetries(KEPLER, q, v, params)
@@ -166,14 +166,14 @@ def test_float32_is_honest():
 
 
 def test_a_weak_disturbance_is_seen():
-    """A field of 1e-6 breaks the rotation; the gap says that it is little. Twin: without it."""
+    """A field of 1e-6 breaks rotations, and the gap shows that it is small."""
     disturbed = lambda size: lj.System(lambda t, q, v, p: KEPLER.lagrangian(t, q, v, p) + size * q[0])
     found = lj.symmetries(disturbed(1e-6), *IN_SPACE, OF_KEPLER)
     assert list(found) == ["L_x", "Jacobi integral"] and found.gap < 1e10
 
 
 def test_small_angles_are_no_small_system():
-    """Near rest a pendulum on a cart looks linear, with more symmetries than it has; its angle is drawn in radians."""
+    """Near rest a pendulum on a cart looks linear; angles drawn over radians avoid spurious symmetries."""
 
     def cart(t, q, v, p):
         bob = 2.0 * p["l"] * v["x"] * v["theta"] * jnp.cos(q["theta"]) + (p["l"] * v["theta"]) ** 2
@@ -184,14 +184,14 @@ def test_small_angles_are_no_small_system():
 
 
 def test_a_wave_that_travels():
-    """Neither p nor E is conserved, but ω p - k E."""
+    """In a travelling wave neither p nor E is conserved, but ω p - k E is."""
     wave = lj.System(lambda t, q, v, p: 0.5 * v**2 - jnp.cos(p["k"] * q - p["w"] * t))
     found = lj.symmetries(wave, 0.3, 0.5, {"k": 2.1, "w": 3.3})
     assert list(found) == ["w p_q - k Jacobi integral with w = 3.3, k = 2.1"]
 
 
 def test_bad_input():
-    """Tracing, no states, a name that was not found: each is said."""
+    """Errors for tracing, a wrong generator, no states, and an unknown name."""
     import jax
 
     with pytest.raises(TypeError, match="symmetries are found from values"):
@@ -208,7 +208,7 @@ def test_bad_input():
 
 @pytest.mark.slow
 def test_charges_of_a_trajectory_are_drawn():
-    """True draws what the structure shows, a mapping what is given. Twins: what is not known, no function."""
+    """`True` draws charges that the structure shows, a mapping the given ones. Twins: none known, not a function."""
     params = sliding_wedge.PARAMS
     start = sliding_wedge.start_on_incline(params, along=1.0, along_rate=0.25)
     motion = lj.integrate(sliding_wedge.system, *start, params, ts=np.linspace(0.0, 1.0, 9))

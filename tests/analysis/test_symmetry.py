@@ -1,4 +1,4 @@
-"""Noether's charges against closed forms, what is and what is not a symmetry, and the rates of what is broken."""
+"""Noether's charges against closed forms, tests of symmetries, and the rates of broken charges."""
 
 import jax
 import jax.numpy as jnp
@@ -13,17 +13,17 @@ RADIUS = {"R": 0.75}
 
 
 def central(t, q, v, params):
-    """A particle in a central field, in an array of three."""
+    """A particle in a central field, with coordinates in an array of three."""
     return 0.5 * params["m"] * v @ v + params["k"] / jnp.sqrt(q @ q)
 
 
 def falling(t, q, v, params):
-    """A stone."""
+    """A falling stone."""
     return 0.5 * params["m"] * (v["x"] ** 2 + v["y"] ** 2) - params["m"] * params["g"] * q["y"]
 
 
 def rolling_disk():
-    """An upright disk that rolls on a plane, pulled along x, as by a slope."""
+    """An upright disk that rolls on a plane and is pulled along x, as on a slope."""
     lagrangian = lambda t, q, v, p: (
         0.5 * (v["x"] ** 2 + v["y"] ** 2) + 0.25 * v["phi"] ** 2 + 0.125 * v["theta"] ** 2 + 0.5 * q["x"]
     )
@@ -40,14 +40,14 @@ ON_PLANE = {"phi": 0.25, "theta": 0.75, "x": 0.0, "y": 0.5}
 
 
 def rolling(start=ON_PLANE):
-    """A velocity of the disk that rolls."""
+    """A velocity with which the disk rolls."""
     phi = 2.0
     x, y = RADIUS["R"] * phi * np.cos(start["theta"]), RADIUS["R"] * phi * np.sin(start["theta"])
     return {"phi": phi, "theta": 0.5, "x": x, "y": y}
 
 
 def test_charges_in_closed_form():
-    """p, L, E and the screw's at random states, under vmap; twins: another pitch, the sign of a rotation."""
+    """p, L, E and the screw's charge at random states, under vmap; twins: another pitch, the opposite sign of L."""
     names = list("xyz")
     state = [{k: RANDOM.normal(size=20) for k in names} for _ in range(2)]
     q, v = state
@@ -71,7 +71,7 @@ def test_charges_in_closed_form():
 
 
 def test_a_vector_as_axis_and_a_center():
-    """n·L about a point c is n·((q - c) x p); translations along n give n·p. Twin: another center."""
+    """n·L about a point c is n·((q - c) x p); translations along n give n·p. Twin: another centre."""
     q, v = IN_SPACE
     axis, center, p = np.array([1.0, 2.0, 2.0]), (0.5, -1.0, 0.25), OF_KEPLER["m"] * v
     charge = lj.noether_charge(KEPLER, lj.Generator.rotation(axis, about=center))(0.0, q, v, OF_KEPLER)
@@ -82,7 +82,7 @@ def test_a_vector_as_axis_and_a_center():
 
 
 def test_a_charge_has_derivatives():
-    """∂L_z/∂m = (q x v)_z, by jacobians in both modes."""
+    """∂L_z/∂m = (q x v)_z, by derivatives in both modes."""
     q, v = IN_SPACE
     charge = lj.noether_charge(KEPLER, lj.Generator.rotation("z"))
     of_m = lambda m: charge(0.0, q, v, OF_KEPLER | {"m": m})
@@ -91,7 +91,7 @@ def test_a_charge_has_derivatives():
 
 
 def test_a_boost_needs_its_gauge_term():
-    """t p - m x stays along a free direction; twins: without the gauge term, along the force, another mass."""
+    """t p - m x is conserved along a free direction; twins: without the gauge term, another mass."""
     start = {"x": 0.5, "y": 1.0}, {"x": 2.0, "y": 0.5}
     boost = lambda axis, m: lj.Generator.boost(axis, lambda t, q, params: m * q[axis])
     assert lj.is_symmetry(STONE, boost("x", OF_STONE["m"]), *start, OF_STONE)
@@ -105,7 +105,7 @@ def test_a_boost_needs_its_gauge_term():
 
 
 def moved_and_predicted(system, generator, q, v, params):
-    """By how much a charge changes on a motion, and the integral of its predicted rate; the first rate."""
+    """The change of a charge along a motion, the integral of its predicted rate, and the first rate."""
     nodes, weights = np.polynomial.legendre.leggauss(12)
     ts = np.concatenate([[0.0], 0.5 * (nodes + 1), [1.0]])
     motion = lj.integrate(system, q, v, params, ts=ts, rtol=1e-11, atol=1e-11)
@@ -117,7 +117,7 @@ def moved_and_predicted(system, generator, q, v, params):
 
 @pytest.mark.slow
 def test_the_rate_of_a_broken_charge_is_that_of_the_motion():
-    """dC/dt along motions is what `rate` says: by L, by friction, by constraints of velocities. Twin: without these."""
+    """dC/dt along motions agrees with `rate` for L, friction, velocity constraints. Twin: without the latter two."""
     squashed = lambda t, q, v, p: central(t, q, v, p) - 0.25 * q[0] ** 2 * jnp.cos(t)
     rubbed = lj.System(squashed, dissipation=lambda t, q, v, params: 0.125 * v @ v)
     turn = lj.Generator.rotation("z") + 0.5 * lj.Generator.time_translation()
@@ -132,7 +132,7 @@ def test_the_rate_of_a_broken_charge_is_that_of_the_motion():
 
 @pytest.mark.slow
 def test_constraints_forbid_and_allow():
-    """The wedge's p_X + p_x; on the disk's constraints a shift is no symmetry, though they look the same."""
+    """The wedge allows p_X + p_x; the disk's constraints forbid a shift, although it leaves them unchanged."""
     start = sliding_wedge.start_on_incline(sliding_wedge.PARAMS, along=1.0, along_rate=0.25)
     both = lj.is_symmetry(sliding_wedge.system, lj.Generator.shift({"X": 1, "x": 1}), *start, sliding_wedge.PARAMS)
     np.testing.assert_allclose(both.charge, sliding_wedge.horizontal_momentum(sliding_wedge.PARAMS, start[1]))
@@ -149,7 +149,7 @@ def test_constraints_forbid_and_allow():
 
 @pytest.mark.slow
 def test_a_moving_constraint_does_work():
-    """On a hoop that turns at a given rate E is not conserved, E - ω L_z is; twin: the other sign."""
+    """On a hoop that turns at a given rate E is not conserved, but E - ω L_z is; twin: the opposite sign."""
     bead = lambda t, q, v, p: 0.5 * v @ v - p["g"] * q[2]
     sphere = lj.Holonomic(lambda t, q, p: q @ q - 1.0)
     plane = lj.Holonomic(lambda t, q, p: q[1] * jnp.cos(p["w"] * t) - q[0] * jnp.sin(p["w"] * t))
@@ -163,7 +163,7 @@ def test_a_moving_constraint_does_work():
 
 @pytest.mark.slow
 def test_under_vmap_and_in_a_sweep():
-    """At which ratio of two springs does the plane turn? At one, to round-off; the rate is (k_y - k_x) x y."""
+    """A rotation is a symmetry of two springs only at the ratio one, to round-off; else the rate is (k_x - k_y) x y."""
     springs = lambda t, q, v, p: 0.5 * v @ v - 0.5 * (q[0] ** 2 + p["ratio"] * q[1] ** 2)
     system = lj.System(springs)
     q, v = np.array([1.0, 0.5]), np.array([0.25, 0.125])
@@ -190,7 +190,7 @@ def test_energy_in_one_frame_and_not_in_the_other():
 
 
 def test_a_generator_of_the_wrong_structure_is_named():
-    """Each message names the coordinate, or what is there, and the fix."""
+    """Each message names the coordinate or the wrong value."""
     state = 0.0, {"x": 0.5, "y": 1.0}, {"x": 2.0, "y": 0.5}, OF_STONE
     cases = [
         (lambda t, q, params: {"x": 1.0}, ValueError, "it lacks 'y'"),
@@ -218,7 +218,7 @@ def test_a_generator_of_the_wrong_structure_is_named():
 
 
 def test_no_states_no_verdict():
-    """Where no state satisfies the constraints, or L is finite nowhere, that is said."""
+    """An error says that no state satisfies the constraints, or that L is finite nowhere."""
     nowhere = lj.System(falling, {"never": lj.Holonomic(lambda t, q, p: q["x"] ** 2 + 1.0)})
     state = {"x": 0.5, "y": 1.0}, {"x": 2.0, "y": 0.5}
     with pytest.raises(ValueError, match="only 0 states were found"):
@@ -230,7 +230,7 @@ def test_no_states_no_verdict():
 
 @pytest.mark.slow
 def test_float32_and_a_force_that_reacts():
-    """In float32 a rotation passes at its round-off. Coulomb's friction takes the momentum along its normal force."""
+    """In float32 a rotation passes within round-off; Coulomb friction breaks the momentum at the predicted rate."""
     q, v = (x.astype(np.float32) for x in IN_SPACE)
     found = lj.is_symmetry(KEPLER, lj.Generator.rotation("z"), q, v, {"m": np.float32(1.25), "k": np.float32(2.0)})
     assert found and found.residual.dtype == np.float32

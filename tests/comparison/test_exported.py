@@ -1,4 +1,4 @@
-"""Comparisons in pandas and xarray: the same numbers, and what is not known."""
+"""Comparisons in pandas and xarray: the same numbers, and unknown ones marked as such."""
 
 import numpy as np
 import pandas
@@ -9,7 +9,7 @@ from lagjax.comparison.points import Curve, Point
 
 
 def point(method, tolerance, error, steps, **others):
-    """A point, in closed form."""
+    """A point with made-up numbers."""
     known = {"trusted": True, "seconds": 1e-3 * (steps or 1), "least": 9e-4, "evaluations": steps and 6 * steps}
     return Point(method, tolerance, error, steps=steps, **known | {"result": "successful"} | others)
 
@@ -21,7 +21,7 @@ found = lj.WorkPrecision({"A": Curve("A", None, 2.5, ALL), "B": Curve("B", None,
 
 
 def test_pandas():
-    """A row a point, bit for bit; what is not known is not zero."""
+    """One row per point, bit for bit; unknown numbers are not zero."""
     table = found.to_pandas()
     assert len(table) == 4 and table["method"].tolist() == ["A", "A", "A", "B"]
     for name in ("tolerance", "error", "seconds", "least", "trusted", "result"):
@@ -30,12 +30,12 @@ def test_pandas():
     np.testing.assert_array_equal(table["order"].to_numpy()[:3], found["A"].order)
     assert isinstance(table["method"].dtype, pandas.CategoricalDtype)
     assert min(table[table["method"] == "A"]["error"].tolist()) == ERRORS[1e-7]
-    # Twin: another error is seen.
+    # Twin: another error is noticed.
     assert not table["error"].equals(found.to_pandas()["error"] * (1 + 1e-15))
 
 
 def test_xarray():
-    """By method and tolerance; NaN where there is no such point."""
+    """Arrays by method and tolerance; NaN where there is no such point."""
     data = found.to_xarray()
     assert dict(data.sizes) == {"solver": 2, "tolerance": 3} and data["tolerance"].values.tolist() == list(ERRORS)
     np.testing.assert_array_equal(data["error"].sel(solver="A"), list(ERRORS.values()))
@@ -46,7 +46,7 @@ def test_xarray():
 
 @pytest.mark.parametrize("name, call", [("pandas", found.to_pandas), ("xarray", found.to_xarray)])
 def test_without_the_extra(monkeypatch, name, call):
-    """It says how to get it."""
+    """Without the package the message says how to install it."""
     monkeypatch.setitem(__import__("sys").modules, name, None)
     with pytest.raises(ImportError, match=rf'needs {name}(.|\n)*pip install "lagjax\[data\]"'):
         call()

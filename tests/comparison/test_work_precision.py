@@ -1,4 +1,4 @@
-"""Methods compared on a user's own motion: errors, orders, marks, choices, and what is refused."""
+"""Methods compared on a user's own motion: errors, orders, marks, choices, and refused arguments."""
 
 import diffrax
 import jax
@@ -22,13 +22,13 @@ def swing(t, rate=RATE):
 
 
 def compared(start=np.pi / 2, ts=TS, **options):
-    """The pendulum, released at rest."""
+    """A comparison on the pendulum, released at rest."""
     return lj.work_precision(pendulum, start, 0.0, PARAMS, ts=ts, repeats=2, **options)
 
 
 @pytest.fixture(scope="module")
 def found():
-    """With all defaults."""
+    """A comparison with all defaults."""
     return compared()
 
 
@@ -36,7 +36,7 @@ def found():
 def test_default_methods_and_their_orders(found):
     """The default of `integrate` comes first; each method shows its order; Tsit5's is not Dopri8's."""
     assert list(found.curves) == ["Nystrom12", "Dopri8", "Tsit5"]
-    # Of an oscillation the amplitude's error is of one order more.
+    # The error of an oscillation's amplitude has one order more.
     for name, order in (("Tsit5", 5), ("Dopri8", 8), ("Nystrom12", 12)):
         assert order - 1 < found[name].order < order + 2.5
     assert all(point.ended_well and point.seconds > 0 for point in found.points)
@@ -45,7 +45,7 @@ def test_default_methods_and_their_orders(found):
 
 @pytest.mark.parametrize("power", [4, 9])
 def test_order_is_the_slope_above_round_off(power):
-    """Error over evaluations, where it falls: what is too large, stalls, failed or is not trusted does not count."""
+    """The slope of error over evaluations where it falls: large, stalled, failed and untrusted errors do not count."""
     point = lambda n, error, trusted=True: Point("m", 1e-3, error, trusted, 1.0, 1.0, n, n, "")
     falling = [point(n, 0.02 * (100.0 / n) ** power) for n in (100, 200, 400, 800)]
     around = [point(90, 0.5), point(95, np.inf)], [point(1600, falling[-1].error), point(3200, 1e-30, trusted=False)]
@@ -55,7 +55,7 @@ def test_order_is_the_slope_above_round_off(power):
 
 
 def test_a_lucky_tolerance_is_not_taken():
-    """What is within an error once, and out of it at a tighter tolerance, does not count."""
+    """A tolerance within the error does not count if a tighter one is outside."""
     point = lambda tolerance, error: Point("m", tolerance, error, True, -np.log(tolerance), 1.0, 1, 1, "")
     lucky, out, fast, slow = point(1e-3, 1e-8), point(1e-4, 1e-5), point(1e-5, 1e-7), point(1e-6, 1e-8)
     assert Curve("m", None, 0.0, (lucky, out, fast, slow)).within(1e-6) is fast
@@ -64,25 +64,25 @@ def test_a_lucky_tolerance_is_not_taken():
 
 
 def test_evaluations_are_steps_times_stages(found):
-    """Sixteen, thirteen and six a step: the last is the first of the next one."""
+    """Sixteen, thirteen and six per step: the last evaluation is the first of the next step."""
     for name, stages in (("Nystrom12", 16), ("Dopri8", 13), ("Tsit5", 6)):
         assert all(point.evaluations == stages * point.steps for point in found[name].points)
 
 
 def test_errors_are_those_against_the_closed_form(found):
-    """Against Jacobi's functions, each leaf by its largest value on the way: what the reference of its own says."""
+    """Errors relative to each leaf's largest value agree with those against Jacobi's functions."""
     largest = np.pi / 2, np.sqrt(2) * RATE
     for point in found["Tsit5"].points:
         got = point.trajectory.q, point.trajectory.v
         error = max(np.max(np.abs(x - y)) / scale for x, y, scale in zip(got, swing(TS), largest))
         assert point.error == pytest.approx(error, rel=1e-2, abs=2 * found.reference.error)
-    # Twin: another pendulum's motion is not what was measured.
+    # Twin: another pendulum's motion has a much larger distance.
     other = np.max(np.abs(found["Dopri8"].points[-1].trajectory.q - swing(TS, 1.001 * RATE)[0]))
     assert other > 1e3 * found["Dopri8"].points[-1].error
 
 
 def test_the_reference_of_its_own_says_how_far_it_can_be_trusted(found):
-    """Two methods agree to ten digits or more; what is below is marked, and nothing else."""
+    """Two methods agree to ten digits or more; only errors below that are marked."""
     assert found.reference.agrees and 10 <= found.reference.digits <= 14
     for point in found.points:
         assert point.trusted == (point.error > 2 * found.reference.error)
@@ -90,7 +90,7 @@ def test_the_reference_of_its_own_says_how_far_it_can_be_trusted(found):
 
 
 def test_best_says_what_to_take(found):
-    """Of each method the fastest within the error, fastest first; less than the reference knows is refused."""
+    """The fastest point of each method within the error, fastest first; an error below the reference's is refused."""
     best = found.best(error=1e-6)
     assert {choice.name for choice in best} == set(found.curves)
     assert all(choice.error <= 1e-6 for choice in best)
@@ -99,12 +99,12 @@ def test_best_says_what_to_take(found):
     for choice in best:
         tighter = [p for p in found[choice.name].points if p.tolerance <= choice.tolerance]
         assert all(point.error <= 1e-6 for point in tighter)
-    with pytest.raises(ValueError, match="less than the reference may itself be off"):
+    with pytest.raises(ValueError, match="below the possible error of the reference"):
         found.best(error=1e-17)
 
 
 def test_table_and_picture(found):
-    """The table has a line for each point; the figure two panels with an order beside each curve."""
+    """The table has a line for each point; the figure has two panels with an order next to each curve."""
     printed = repr(found)
     for part in ("Nystrom12 and Dopri8 at 1e-13", "digits can be trusted", "1e-12", "evaluations", "compile/s"):
         assert part in printed, part
@@ -117,7 +117,7 @@ def test_table_and_picture(found):
 
 @pytest.mark.parametrize("off", [0.0, 1e-5])
 def test_a_wrong_reference_is_found_out(off):
-    """Solves that agree with each other, and not with the reference: it is off by that; twin: the right one is not."""
+    """If solves agree with each other but not with the reference, its error is reported; twin: the right reference."""
     wrong = lambda ts: swing(ts, (1 + off) * RATE)
     found = compared(methods=[lj.Dopri8()], tolerances=(1e-6, 1e-9, 1e-10), reference=wrong)
     if off:
@@ -132,7 +132,7 @@ def test_a_wrong_reference_is_found_out(off):
 
 
 def test_a_motion_that_amplifies_is_said_to():
-    """From 1e-9 beside the top two methods come to agree on nothing, after 25 s."""
+    """From 1e-9 next to the top, two methods no longer agree after 25 s."""
     found = compared(np.pi - 1e-9, np.array([0.0, 25.0]), methods=[lj.Dopri8()], tolerances=(1e-6, 1e-12))
     assert not found.reference.agrees and found.reference.digits < 7
     assert "WARNING" in repr(found)
@@ -140,7 +140,7 @@ def test_a_motion_that_amplifies_is_said_to():
 
 @pytest.mark.slow
 def test_errors_of_an_event_are_those_of_its_time_and_state():
-    """The quarter period is K(1/2)/ω; a loose tolerance misses it by as much as is said, relative to the span."""
+    """The quarter period is K(1/2)/ω; a loose tolerance misses it by the stated error, relative to the span."""
     down = {"down": lj.Crossing(lambda t, q, v, params: q, direction=-1)}
     found = compared(ts=np.array([0.0, 2.0]), methods=[lj.Dopri8()], tolerances=(1e-4, 1e-8), events=down)
     exact, largest = special.ellipk(0.5) / RATE, np.sqrt(2) * RATE
@@ -154,7 +154,7 @@ def test_errors_of_an_event_are_those_of_its_time_and_state():
 
 
 def test_a_failing_point_keeps_its_reason_and_the_others_go_on():
-    """Too few steps for tight tolerances; another tool's failure is a point's, too; twin: none at loose ones."""
+    """Too few steps at tight tolerances, or a failing other tool, give failed points; twin: loose tolerances."""
     other = lambda tolerance: (*swing(TS), 77) if tolerance > 1e-7 else (np.full(3, np.nan), np.zeros(3), None)
     found = compared(
         methods={"fifth": lj.Tsit5()}, tolerances=(1e-3, 1e-11), reference=swing, max_steps=500, others={"exact": other}
@@ -168,8 +168,8 @@ def test_a_failing_point_keeps_its_reason_and_the_others_go_on():
 
 @pytest.mark.slow
 def test_nothing_in_reach_is_said_with_its_reason():
-    """Where every solve fails, what `integrate` says of it."""
-    with pytest.raises(RuntimeError, match=r"no method came to the end.*Tsit5"):
+    """If every solve fails, the error contains the message of `integrate`."""
+    with pytest.raises(RuntimeError, match=r"no method reached the end.*Tsit5"):
         compared(methods=[lj.Tsit5()], tolerances=(1e-6,), reference=swing, max_steps=3)
 
 
@@ -183,17 +183,17 @@ def test_nothing_in_reach_is_said_with_its_reason():
         ({"methods": [lj.Dopri8(), "RK45"]}, TypeError, "method 'str'.*not str"),
         ({"methods": [diffrax.Euler()]}, TypeError, r"does not estimate its error(.*\n)*.*HalfSolver\(diffrax.Euler"),
         ({"methods": {"s": diffrax.SemiImplicitEuler()}}, TypeError, "method 's'.*does not estimate its error"),
-        ({"tolerances": (1e-6, 0.0)}, ValueError, "positive numbers, and one is 0"),
+        ({"tolerances": (1e-6, 0.0)}, ValueError, "positive numbers, but one is 0"),
         ({"tolerances": (1e-6, -1e-8)}, ValueError, "positive"),
         ({"tolerances": (1e-17,)}, ValueError, "below what float64 can reach"),
         ({"tolerances": ()}, ValueError, "sequence of positive numbers"),
         ({"rtol": 1e-6}, TypeError, "no argument 'rtol'(.*\n)*.*tolerances="),
-        ({"reference": "exact"}, TypeError, "reference is str"),
-        ({"reference": swing, "error": len}, ValueError, "two ways to say the same"),
+        ({"reference": "exact"}, TypeError, "reference is of type str"),
+        ({"reference": swing, "error": len}, ValueError, "two ways to define the error"),
     ],
 )
 def test_bad_input(options, error, words):
-    """Each is refused before anything is compiled, with what to write."""
+    """Each is refused before anything is compiled, with a fix as code."""
     with pytest.raises(error, match=words):
         compared(**options)
 
@@ -203,17 +203,17 @@ def test_bad_input(options, error, words):
     [
         ((np.zeros(3),), TypeError, "two things"),
         ((np.zeros(3), {"theta": np.zeros(3)}), ValueError, "velocities are not in the structure of v0"),
-        ((np.zeros(2), np.zeros(3)), ValueError, r"shape \(2,\) at 'q', and \(3,\) is asked"),
+        ((np.zeros(2), np.zeros(3)), ValueError, r"shape \(2,\) at 'q', but \(3,\) is needed"),
     ],
 )
 def test_a_reference_that_does_not_fit(reference, error, words):
-    """Its structure and its shapes are those of the motion at its times."""
+    """The reference must have the structure and shapes of the motion at its times."""
     with pytest.raises(error, match=words):
         compared(methods=[lj.Tsit5()], tolerances=(1e-3,), reference=reference)
 
 
 def test_nystrom_methods_are_for_accelerations_without_velocities():
-    """Where there are constraints it is refused, and not among the defaults; twin: the pendulum has it."""
+    """With constraints a Nyström method is refused."""
     start = {"x": 1.25, "y": 0.0}, {"x": 0.0, "y": 0.0}
     with pytest.raises(ValueError, match="method 'Nystrom12' is for accelerations.*there are constraints"):
         lj.work_precision(rod_pendulum, *start, PARAMS, ts=TS, methods=[lj.Nystrom12()])

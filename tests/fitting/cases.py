@@ -1,4 +1,4 @@
-"""Systems to be fitted, with the truth: what is free, where the guess is, what is measured and how well."""
+"""Systems to be fitted, with the truth: the free parameters, their guesses, the measurements and their errors."""
 
 from typing import Any, NamedTuple
 
@@ -11,7 +11,7 @@ from lagjax.scenes import bead_on_hoop, cross_rails, mass_distributions, rolling
 
 
 class Case(NamedTuple):
-    """`sigma` by kind of measurement, of what `measured(traj)` returns; the guess is the truth times `off`."""
+    """`sigma` by kind of measurement that `measured(traj)` returns; `free` has the factors of the guesses."""
 
     system: Any
     params: dict
@@ -23,20 +23,20 @@ class Case(NamedTuple):
     sigma: dict
 
     def truth(self):
-        """The motion that is measured."""
+        """The true motion."""
         return lj.integrate(self.system, self.q0, self.v0, self.params, ts=self.ts)
 
     def guess(self):
-        """Parameters off the truth."""
+        """Parameters with the guesses of the free ones."""
         return {**self.params, **{name: self.params[name] * off for name, off in self.free.items()}}
 
     def fit(self, measured, **options):
-        """The fit of some measurements."""
+        """A fit to some measurements."""
         record = lj.Record(self.ts, **measured, q0=self.q0, v0=self.v0, sigma=self.sigma)
         return lj.fit(self.system, record, self.guess(), free=sorted(self.free), **options)
 
     def noisy(self, measured, key):
-        """Measurements with errors of these sizes."""
+        """Measurements with errors of the sizes `sigma`."""
         leaves, structure = jax.tree.flatten(measured)
         like = lambda kind: jax.tree.map(lambda _: self.sigma[kind], measured[kind])
         sigmas = jax.tree.leaves({kind: like(kind) for kind in measured})

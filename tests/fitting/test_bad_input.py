@@ -1,4 +1,4 @@
-"""Wrong records, names and guesses are refused in the user's words."""
+"""Wrong records, names and guesses raise errors in the user's words."""
 
 import numpy as np
 import pytest
@@ -13,19 +13,19 @@ Q = np.cos(T)
 @pytest.mark.parametrize(
     "make, words",
     [
-        (lambda: lj.Record(T[::-1], q=Q), "must increase, and t"),
+        (lambda: lj.Record(T[::-1], q=Q), "must increase, but t"),
         (lambda: lj.Record(np.where(T > 0.5, np.nan, T), q=Q), "NaN"),
-        (lambda: lj.Record(T, q=Q[:-1]), r"shape \(19,\), and the record has 20 times"),
+        (lambda: lj.Record(T, q=Q[:-1]), r"shape \(19,\), but the record has 20 times"),
         (lambda: lj.Record(T, q={"theta": Q[None]}), "'theta' has the shape"),
         (lambda: lj.Record(T, q=np.where(T > 0.5, np.inf, Q)), "infinity"),
         (lambda: lj.Record(T), "no measurement"),
         (lambda: lj.Record([0.0], q=[1.0]), "two or more"),
-        (lambda: lj.Record(T, q=Q, hold_v=True), "v0 is known, and it is not given"),
+        (lambda: lj.Record(T, q=Q, hold_v=True), "v0 is known, but it is not given"),
         (lambda: lj.Record(T, q={"theta": Q}, hold_q="theta"), "q0 is known"),
     ],
 )
 def test_records(make, words):
-    """A record that makes no sense says why."""
+    """A record that makes no sense raises an error that says why."""
     with pytest.raises(ValueError, match=words):
         make()
 
@@ -56,37 +56,37 @@ RECORD = lj.Record(T, q=Q)
         ((lj.Record(T, q=Q, sigma={"v": 0.1}), PENDULUM, {}), ValueError, "sigma has no entry 'q'"),
         ((lj.Record(T, q=Q, sigma=-1.0), PENDULUM, {}), ValueError, "sigma must be positive"),
         ((lj.Record(T, q=Q, params={"mass": 2.0}), PENDULUM, {}), ValueError, "'mass', which is not in params"),
-        ((lj.Record(T, q=Q, params={"m": 2.0}), PENDULUM, {}), ValueError, "also to be found"),
+        ((lj.Record(T, q=Q, params={"m": 2.0}), PENDULUM, {}), ValueError, "which the fit is to find"),
         ((lj.Record(T, end={"t": 1.0}, q0=0.1, v0=0.0), PENDULUM, {}), ValueError, "event"),
         (([RECORD, lj.Record(T, v=Q)], PENDULUM, {}), ValueError, "record 1 holds 'v'"),
         (([RECORD, lj.Record(T, q=Q, sigma=1.0)], PENDULUM, {}), ValueError, "record 0 has no sigma"),
     ],
 )
 def test_arguments(arguments, error, words):
-    """What does not match is named before anything is compiled."""
+    """Arguments that do not match are named before anything is compiled."""
     records, params, options = arguments
     with pytest.raises(error, match="(?s)" + words):
         lj.fit(pendulum, records, params, **options)
 
 
 def test_wrong_names_of_coordinates_and_constraints():
-    """A measurement that the motion does not have."""
+    """Measurements of names that the motion does not have are refused."""
     start = dict(q0={"x": 2.0, "y": 0.0}, v0={"x": 0.0, "y": 0.0})
     for measured in ({"q": {"z": Q}}, {"multipliers": {"rope": Q}}):
-        with pytest.raises(ValueError, match="and there"):
+        with pytest.raises(ValueError, match="but the motion has no such name"):
             lj.fit(hung, lj.Record(T, **measured, **start), HUNG)
 
 
 @pytest.mark.slow
 def test_a_guess_that_cannot_move():
-    """A guess from which the motion fails at once: an error with the integration's own words."""
+    """A guess from which the motion fails at once gives an error with the message of `integrate`."""
     with pytest.raises(ValueError, match="(?s)from the guess the motion of record 0 fails.*mass matrix"):
         lj.fit(pendulum, RECORD, PENDULUM | {"l": 0.0}, free="g")
 
 
 @pytest.mark.slow
 def test_wrapped_angles():
-    """An angle that jumps by a turn is pointed out."""
+    """An angle that jumps by a turn gives a warning."""
     angle = np.linspace(0.0, 9.0, 60)
     wrapped = (angle + np.pi) % (2 * np.pi) - np.pi
     with pytest.warns(lj.FitWarning, match="np.unwrap"):

@@ -1,4 +1,4 @@
-"""What a fit finds, and what it says of what it cannot find."""
+"""What a fit finds, and what it says about what it cannot find."""
 
 from typing import Any, NamedTuple
 
@@ -39,12 +39,12 @@ def swinging():
 
 
 def noisy(x, sigma=0.01, seed=0):
-    """With errors."""
+    """Values with normal errors."""
     return x + sigma * np.random.default_rng(seed).normal(size=x.shape)
 
 
 def test_finds_parameters_and_start(swinging, capsys):
-    """Without errors: parameters, start and their names, to 1e-8; without a guess of the start. It shows its steps."""
+    """Without errors or a guess of the start: parameters and start to 1e-8. The fit shows its steps."""
     record = lj.Record(TS, q=swinging[0])
     found = lj.fit(pendulum, record, GUESS, free=FREE, progress=True)
     shown = capsys.readouterr().err
@@ -54,14 +54,14 @@ def test_finds_parameters_and_start(swinging, capsys):
     np.testing.assert_allclose([found.q0[0], found.v0[0]], [1.0, 0.0], atol=1e-8)
     assert found.params["l"] == found.values[1] and found.params["m"] == 1.0
     # Twin: another friction law does not fit.
-    with pytest.warns(lj.FitWarning, match="residuals of 'q' are no errors of measurement"):
+    with pytest.warns(lj.FitWarning, match="residuals of 'q' are not measurement errors"):
         stuck = lj.fit(pendulum, record, GUESS | {"c": 0.2}, free=["l"], bounds={"l": (0.0, None)})
     assert stuck.rms()["q"] > 1e-2 and not capsys.readouterr().err
 
 
 @pytest.mark.slow
 def test_against_scipy(swinging):
-    """Estimates and covariance are those of SciPy's least squares with numerical slopes."""
+    """Estimates and covariance agree with SciPy's least squares with numerical slopes."""
     data = noisy(swinging[0])
     found = lj.fit(pendulum, lj.Record(TS, q=data, sigma=0.01), GUESS, free=FREE, bounds={"l": (0.0, None)})
     solve = jax.jit(
@@ -79,7 +79,7 @@ def test_against_scipy(swinging):
     np.testing.assert_allclose(found.chi2, 2 * theirs.cost, rtol=1e-8)
     assert abs(float(found.correlation[0, 1])) < 1 and float(found.correlation[1, 1]) == pytest.approx(1)
     assert int(found.freedom) == 96
-    # Sigmas taken from the residuals give nearly the same.
+    # Without sigma, errors estimated from the residuals give nearly the same.
     alone = lj.fit(pendulum, lj.Record(TS, q=data), GUESS, free=FREE, bounds={"l": (0.0, None)})
     np.testing.assert_allclose(alone.values, found.values, rtol=1e-6)
     np.testing.assert_allclose(float(alone.noise), np.sqrt(float(found.chi2) / 96) * 0.01, rtol=1e-4)
@@ -87,7 +87,7 @@ def test_against_scipy(swinging):
 
 @pytest.mark.slow
 def test_gaps_and_several_runs(swinging):
-    """Missing values, another run with its own start, length and mass, and only what is missing is left out."""
+    """Only missing values are left out; another run may have its own start, length and mass."""
     angle = swinging[0].copy()
     angle[10:20] = np.nan
     other = lj.integrate(pendulum, -0.4, 1.0, PENDULUM | {"m": 2.0}, ts=TS[:60])
@@ -106,7 +106,7 @@ def test_gaps_and_several_runs(swinging):
 
 @pytest.mark.slow
 def test_identifiability_before_and_after(swinging):
-    """Of m, l, g and friction a swing shows g/l and c/(m l²); what is not seen gets no uncertainty."""
+    """A swing determines g/l and c/(m l²); what is not determined gets no uncertainty."""
     record = lj.Record(TS, q=noisy(swinging[0]))
     told = lj.identifiability(pendulum, record, PENDULUM)
     assert told.rank == 2 and told.combined()[0] == "g/l"
@@ -116,10 +116,10 @@ def test_identifiability_before_and_after(swinging):
     assert np.isnan(found.sd).all() and np.isfinite(found.start_sd[0][0])
     assert "not determined" in repr(found)
     np.testing.assert_allclose(found.values[1] / found.values[2], 9.81 / 1.25, rtol=0.01)
-    # Twin: with l known the rest of these is seen, and the mass where friction is known.
+    # Twin: with l known, g and c are determined; m and c only as a ratio.
     assert lj.identifiability(pendulum, record, PENDULUM, free=["g", "c"]).rank == 2
     assert lj.identifiability(pendulum, record, PENDULUM, free=["m", "c"]).combined() == ["c/m"]
-    # Lengths, times and the scale of L: all but one common factor.
+    # The scale of L is not determined: all but one common factor.
     scaled = lambda t, q, v, p: 0.5 * p["inertia"] * v**2 + p["weight"] * jnp.cos(q)
     rubbed = lj.System(scaled, dissipation=lambda t, q, v, p: 0.5 * p["drag"] * v**2)
     told = lj.identifiability(rubbed, record, {"inertia": 1.0, "weight": 8.0, "drag": 0.1})
@@ -131,7 +131,7 @@ def test_identifiability_before_and_after(swinging):
 
 @pytest.mark.slow
 def test_a_measured_force_shows_the_mass():
-    """The scale of L is invisible in a motion, and seen in a multiplier."""
+    """A motion does not determine the scale of L, but a multiplier does."""
     case = CASES["pendulum on a rod"]
     traj = case.truth()
     record = lambda **measured: lj.Record(
@@ -144,10 +144,10 @@ def test_a_measured_force_shows_the_mass():
 
 @pytest.mark.exhaustive
 def test_a_start_on_constraints_is_as_uncertain_as_they_are():
-    """Held at its side a bob is a rod's length away, to the error of that length; as much in the angle, exactly."""
+    """A bob released at the rod's side is as uncertain as the rod's length; the angle gives exactly the same."""
     case = CASES["pendulum on a rod"]
     data = case.noisy({"q": case.truth().q}, jax.random.key(1))["q"]
-    # Of y nothing is known but a guess, which is off the rod.
+    # Only a guess of y is given, which is off the rod.
     record = lj.Record(case.ts, q={"x": data["x"]}, q0={"x": 1.9, "y": 0.1}, sigma=0.02)
     found = lj.fit(hung, record, HUNG | {"l": 2.1}, free=["g", "l"])
     (q_sd,), (v_sd,) = found.start_sd
@@ -163,14 +163,14 @@ def test_a_start_on_constraints_is_as_uncertain_as_they_are():
     slope = np.concatenate([np.zeros((4, 1)), slope], axis=1)
     expected = np.sqrt(np.diag(slope @ joint @ slope.T))
     np.testing.assert_allclose([q_sd["x"], q_sd["y"], v_sd["x"], v_sd["y"]], expected, rtol=1e-2)
-    # Twin: with the length taken for known, the side's distance would be as well.
+    # Twin: if the length were known, so would be the distance.
     slope[:, 1] = 0
     assert np.sqrt(slope[0] @ joint @ slope[0]) < 0.2 * expected[0]
 
 
 @pytest.mark.slow
 def test_a_start_that_the_data_do_not_see():
-    """Of a coordinate that is not measured, and moves on its own, nothing is known; nor of what L asks for in vain."""
+    """The start of an unmeasured, uncoupled coordinate is not determined; without a guess of it the fit is refused."""
     both = lambda t, q, v, p: 0.5 * (v["a"] ** 2 + v["b"] ** 2) - 0.5 * p["k"] * q["a"] ** 2 - 0.5 * q["b"] ** 2
     ts = np.linspace(0.0, 4.0, 60)
     record = lj.Record(ts, q={"a": np.cos(2 * ts)}, q0={"a": 1.0, "b": 0.5})
@@ -195,7 +195,7 @@ SPRINGS = Springs(jnp.array([1.0, 2.0]), {"k": jnp.array([3.0, 5.0])})
 
 @pytest.mark.exhaustive
 def test_elements_of_any_pytree():
-    """One entry of an array is found, the others stay; bounds by element; a run with parameters of its own."""
+    """One entry of an array is fitted, the others stay; bounds by element; a run with its own parameters."""
     ts = np.linspace(0.0, 4.0, 60)
     heavy = SPRINGS._replace(m=jnp.array([1.5, 2.0]))
     runs = [lj.integrate(springs, jnp.ones(2), jnp.zeros(2), p, ts=ts).q for p in (SPRINGS, heavy)]
@@ -209,25 +209,25 @@ def test_elements_of_any_pytree():
 
 @pytest.mark.slow
 def test_what_the_residuals_tell():
-    """Nothing is left over of as many numbers as measurements; what follows a curve is no error of measurement."""
+    """As many unknowns as measurements leave no uncertainty; residuals on a curve are not measurement errors."""
     spring = lj.System(lambda t, q, v, p: 0.5 * v**2 - 0.5 * p["k"] * q**2)
     with pytest.warns(lj.FitWarning, match="as many unknowns as measurements.*\n.*sigma="):
         found = lj.fit(spring, lj.Record([0.0, 0.5, 1.0], q=[1.0, 0.9, 0.6]), {"k": 1.0})
     assert np.isnan(found.sd).all() and np.isnan(found.start_sd[0][0])
-    # Twin: the same with the size of the errors told.
+    # Twin: the same with the size of the errors given.
     told = lj.fit(spring, lj.Record([0.0, 0.5, 1.0], q=[1.0, 0.9, 0.6], sigma=0.01), {"k": 1.0})
     assert np.isfinite(told.sd).all()
     clean = lj.integrate(spring, 1.0, 0.0, {"k": 4.0}, ts=TS).q
     data = noisy(np.asarray(clean) + 0.3 * np.cos(9 * TS), 0.02)
-    with pytest.warns(lj.FitWarning, match="residuals of 'q' are no errors of measurement"):
+    with pytest.warns(lj.FitWarning, match="residuals of 'q' are not measurement errors"):
         lj.fit(spring, lj.Record(TS, q=data), {"k": 3.0})
-    # Twin: as large, and each on its own.
+    # Twin: residuals as large, but uncorrelated.
     lj.fit(spring, lj.Record(TS, q=noisy(np.asarray(clean), 0.25)), {"k": 3.0})
 
 
 @pytest.mark.exhaustive
 def test_observation_velocity_and_end():
-    """Positions through an observation function, velocities, a time of departure: each finds what it shows."""
+    """Fits to observed positions, to velocities and to a time of departure find what these determine."""
     measured = lambda t, q, v, params: {"x": params["l"] * jnp.sin(q), "y": -params["l"] * jnp.cos(q)}
     traj = lj.integrate(pendulum, 1.0, 0.0, PENDULUM, ts=TS)
     seen = jax.vmap(lambda t, q, v: measured(t, q, v, PENDULUM))(traj.t, traj.q, traj.v)
@@ -252,7 +252,7 @@ def test_observation_velocity_and_end():
 
 @pytest.mark.exhaustive
 def test_a_long_record_wants_a_growing_horizon():
-    """27 periods at once end in a wrong minimum; a growing part of them, joined windows, and many starts do not."""
+    """A fit of 27 periods at once ends in a wrong minimum; growing parts, joined windows and many starts do not."""
     ts = np.linspace(0.0, 60.0, 1500)
     known = PENDULUM | {"c": 0.01}
     truth = lj.integrate(pendulum, 1.0, 0.0, known, ts=ts)
@@ -267,11 +267,11 @@ def test_a_long_record_wants_a_growing_horizon():
     apart = fit(0.9, window=5.0, joined=False)
     np.testing.assert_allclose(apart.values, [1.25], rtol=0.01)
     assert float(apart.sd[0]) > 2 * float(found.sd[0])
-    # Twin: at once, it is lost; by default it is started again from elsewhere.
-    with pytest.warns(lj.FitWarning, match="residuals of 'q' are no errors of measurement"):
+    # Twin: at once and without restarts the search fails.
+    with pytest.warns(lj.FitWarning, match="residuals of 'q' are not measurement errors"):
         lost = fit(0.9, grow=False, restarts=0)
     assert lost.rms()["q"] > 0.1
-    # Unless it is started from many places.
+    # Many starts succeed.
     best = fit(1.15, grow=False, restarts=30, spread=0.3)
     np.testing.assert_allclose(best.values, found.values, rtol=1e-5)
     assert best.costs is not None and len(best.costs) == 31
@@ -280,7 +280,7 @@ def test_a_long_record_wants_a_growing_horizon():
 
 @pytest.mark.slow
 def test_outliers_priors_and_bounds(swinging):
-    """A robust loss forgives wild values; a prior counts as a measurement; a bound is named."""
+    """A robust loss tolerates outliers; a prior counts as a measurement; a reached bound is named."""
     data = noisy(swinging[0])
     wild = data.copy()
     wild[::10] += 1.5
@@ -293,7 +293,7 @@ def test_outliers_priors_and_bounds(swinging):
     assert off(plain) > 10 and off(robust) < 2
     assert np.all(robust.sd > clean.sd) and np.all(robust.sd < 2 * clean.sd)
     astray = eqx.tree_at(lambda found: found.unknowns.shared, clean, jnp.array([0.05, 1e9]))
-    assert "'l' was guessed to be 1.4, and came to 1e+09" in caveats(astray)[0] and not caveats(clean)
+    assert "'l' was guessed to be 1.4, and ended at 1e+09" in caveats(astray)[0] and not caveats(clean)
 
     known = fit(data, priors={"l": (1.248, 0.0005)})
     weights = np.array([1 / clean.sd[1] ** 2, 1 / 0.0005**2])
@@ -309,7 +309,7 @@ def test_outliers_priors_and_bounds(swinging):
 
 @pytest.mark.exhaustive
 def test_outliers_from_far(swinging, monkeypatch):
-    """With a wild value first, and others, a robust loss still gets from a bad guess to the truth."""
+    """With outliers, even as the first value, a robust loss still gets from a bad guess to the truth."""
     rng = np.random.default_rng(2)
     wild = swinging[0] + 0.002 * rng.normal(size=100)
     wild[::7] += rng.normal(size=15)
@@ -318,14 +318,14 @@ def test_outliers_from_far(swinging, monkeypatch):
     found = fit(loss="cauchy")
     assert bool(found.converged) and np.max(found.sd) < 1e-3 and abs(float(found.q0[0]) - 1.0) < 0.005
     np.testing.assert_allclose(found.values, [0.05, 1.25], atol=3 * np.max(found.sd))
-    # Without a guess of the start the wild value is not taken for one.
+    # Without a guess of the start, it is not read off the outlier.
     start.clear()
     np.testing.assert_allclose(fit(loss="huber").values, [0.05, 1.25], atol=4 * np.max(found.sd))
-    # Twin: with an ordinary error of a sigma from the beginning all of the data look like outliers.
+    # Twin: with an ordinary error of one sigma from the beginning, all data look like outliers.
     start.update({"q0": 0.3, "v0": 2.0})
     monkeypatch.setattr(search, "_ordinary", lambda *state: 1.0)
     with pytest.warns(lj.FitWarning) as told:
-        # Another number of iterations, so that it is traced again.
+        # Another number of iterations makes it trace again.
         astray = fit(loss="cauchy", iterations=99, restarts=0)
     assert any("times as large as sigma says" in str(warning.message) for warning in told)
     assert not np.allclose(astray.values, found.values, atol=0.1)
@@ -333,13 +333,13 @@ def test_outliers_from_far(swinging, monkeypatch):
 
 @pytest.mark.parametrize("wild", [0, 3, 6])
 def test_a_start_is_read_off_without_wild_values(wild):
-    """From the first seven samples, one of them wild: position and velocity nearly as from the others."""
+    """An outlier among the first seven samples hardly changes the position and velocity that are read off."""
     t = 0.05 * np.arange(40.0)
     x = 1.0 + 0.5 * t - 2.0 * t**2 + 1e-3 * np.random.default_rng(0).normal(size=40)
     x[wild] += 3.0
     q, v = _parabola(t, x, np.arange(40))
     assert abs(q - 1.0) < 0.01 and abs(v - 0.5) < 0.1
-    # Twin: least squares follow it; and a parabola through samples far apart keeps them all.
+    # Twin: least squares follow the outlier; a parabola through samples far apart keeps them all.
     near = np.polynomial.Polynomial.fit(t[:7], x[:7], 2)
     assert abs(near(0.0) - 1.0) > 0.1 or abs(near.deriv()(0.0) - 0.5) > 1.0
     t, far = np.arange(7.0), np.cos(0.8 * np.arange(7.0))
@@ -356,9 +356,10 @@ def problem(case, measured, **options):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", exhaustive_but(("pendulum",), ("pendulum", "pendulum on a rod", "rolling hoop")))
 def test_slopes_three_ways(name):
-    """Slopes of all residuals, measured multipliers among them: forward, reverse, and by differences.
+    """Slopes of all residuals, including measured multipliers: forward, reverse, and by differences.
 
-    Steps do not depend on what is varied, so that what is differenced is smooth. Times of events: see the rolling hoop.
+    The steps do not depend on the varied unknowns, so the differenced function is smooth. For times of events, see the
+    rolling hoop.
     """
     case = CASES[name]
     fixed = {"stepsize_controller": diffrax.ConstantStepSize(), "dt0": np.asarray(0.01)}
@@ -383,7 +384,7 @@ def test_slopes_three_ways(name):
 
 @pytest.mark.slow
 def test_inside_a_program(swinging):
-    """Fits of many measurements in one program: the same as one by one."""
+    """Fits of many measurements in one program give the same as one by one."""
     data = np.stack([noisy(swinging[0], seed=i) for i in range(3)])
 
     def estimate(x):
@@ -396,7 +397,7 @@ def test_inside_a_program(swinging):
 
 @pytest.mark.exhaustive
 def test_other_optimisers(swinging):
-    """Another least-squares solver, and minimisers with derivatives in reverse, end in the same place."""
+    """Another least-squares solver, and minimisers with reverse-mode derivatives, end at the same point."""
     data = noisy(swinging[0])
     fit = lambda **more: lj.fit(pendulum, lj.Record(TS, q=data, sigma=0.01), GUESS, free=FREE, **more)
     ours = fit()
@@ -425,7 +426,7 @@ def test_log_likelihood(swinging):
 
 
 def test_prints_and_plots(swinging):
-    """The table has estimates with their uncertainties in the user's units; the picture a row a channel."""
+    """The table has estimates with uncertainties in the user's units; the figure has one row per channel."""
     found = lj.fit(pendulum, lj.Record(TS, q=noisy(swinging[0])), GUESS, free=FREE, units={"l": "m"})
     lines = repr(found).splitlines()
     assert lines[0].startswith("Fit: converged")
@@ -440,9 +441,9 @@ def test_prints_and_plots(swinging):
 
 
 def test_called_again_it_compiles_nothing(swinging):
-    """Nor of some samples less, from another guess, by other data: what fills a record up counts for nothing.
+    """A second fit compiles nothing, even with fewer samples, another guess or other data; padding does not count.
 
-    Nor where it is printed; the first time that is one program, of the starts and their slopes.
+    Printing compiles nothing, either, except one program for the starts and their slopes the first time.
     """
 
     def of(n, guess=GUESS):
@@ -461,14 +462,14 @@ def test_called_again_it_compiles_nothing(swinging):
     for n, found in again.items():
         assert bool(found.converged) and found.residuals()["q"].shape == (n,) and float(found.freedom) == n - 4
         np.testing.assert_allclose(found.values, [0.05, 1.25], rtol=1e-8)
-    # Twin: what is compiled is counted.
+    # Twin: a compilation is counted.
     with compiles() as programs:
         jax.jit(lambda x: x + np.pi)(1.0)
     assert len(programs) == 1
 
 
 def test_all_samples_of_a_whole_record_count():
-    """The last one, too, where the sum of its first time and its length is rounded to less. Twin: the sum."""
+    """The last sample counts even if first time plus length is rounded to less than its time. Twin: the sum."""
     random = np.random.default_rng(0)
     times = [np.sort(random.uniform(0.1, 10.0, 5)) for _ in range(100)]
     assert all(np.all(_counts(t, 3, 1.0) == (t <= t[3])) for t in times)
@@ -477,7 +478,7 @@ def test_all_samples_of_a_whole_record_count():
 
 @pytest.mark.slow
 def test_a_fit_sees_what_has_changed():
-    """A number that L reads from outside: w² = k, with k = 4 times that number."""
+    """A fit uses the current value of a number that L reads from outside: w² = k times that number."""
     strength, t = np.array([1.0]), np.linspace(0.0, 4.0, 30)
     spring = lj.System(lambda t, q, v, params: 0.5 * v**2 - 0.5 * strength[0] * params["k"] * q**2)
     of = lambda: lj.fit(spring, lj.Record(t, q=np.cos(2.0 * t)), {"k": 3.0}).values[0]
@@ -488,7 +489,7 @@ def test_a_fit_sees_what_has_changed():
 
 @pytest.mark.slow
 def test_unknowns_of_a_start_keep_to_the_constraints():
-    """Whatever its unknowns, a start satisfies the constraints, for other parameters too."""
+    """A start satisfies the constraints for any unknowns and parameters."""
     case = CASES["pendulum on a rod"]
     p = problem(case, {"q": case.truth().q})
     assert p.start.local.shape == (1, 2)
@@ -502,7 +503,7 @@ def test_unknowns_of_a_start_keep_to_the_constraints():
 
 @pytest.mark.exhaustive
 def test_log_likelihood_of_several_runs(swinging):
-    """Two records: the likelihood of both, at their best the sum of squares."""
+    """With two records, the likelihood at the estimates is that of the sum of squares of both."""
     records = [lj.Record(TS, q=noisy(swinging[0], seed=i), q0=1.0, v0=0.0, sigma=0.01) for i in (1, 2)]
     found = lj.fit(pendulum, records, GUESS, free=FREE)
     assert float(found.log_likelihood(found.sampling)) == pytest.approx(-0.5 * float(found.chi2), rel=1e-9)

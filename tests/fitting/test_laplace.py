@@ -1,4 +1,4 @@
-"""Laplace's approximation: exact of a normal posterior, the true Hessian elsewhere, words where there is no peak."""
+"""Laplace's approximation: exact for a normal posterior, the true Hessian elsewhere, caveats without a peak."""
 
 import equinox as eqx
 import jax
@@ -19,7 +19,7 @@ FAR = np.linspace(0.0, 6.0, 15)
 
 
 def measured(seed=0):
-    """A fall with errors."""
+    """Measurements of a fall, with errors."""
     return 1.0 + 0.5 * T + 4.9 * T**2 + SIGMA * np.random.default_rng(seed).normal(size=21)
 
 
@@ -35,7 +35,7 @@ def exact(y, prior):
 
 @pytest.mark.slow
 def test_a_linear_motion_has_this_posterior():
-    """Mean, covariance and evidence of a fall with a prior; no word is left, and nothing is compiled twice."""
+    """Mean, covariance and evidence of a fall with a prior; there are no caveats, and nothing is compiled twice."""
     y = measured()
     fit = lambda prior, y=y: lj.fit(fall, lj.Record(T, q=y, sigma=SIGMA), {"g": 9.0}, priors={"g": prior})
     found = fit((9.81, 0.1))
@@ -52,14 +52,14 @@ def test_a_linear_motion_has_this_posterior():
     with compiles() as programs:
         other = fit((9.9, 0.02)).laplace()
     assert programs == []
-    # Twin: another prior has another evidence, its own.
+    # Twin: another prior has another evidence.
     assert other.log_evidence == pytest.approx(exact(y, (9.9, 0.02))[2], abs=1e-6)
     assert abs(other.log_evidence - evidence) > 0.3
 
 
 @pytest.mark.slow
 def test_draws():
-    """Draws of the fall have its covariance, and their density is that of a standard normal one."""
+    """Draws have the covariance of the fall, and the standardised density is a standard normal one."""
     y = measured()
     found = lj.fit(fall, lj.Record(T, q=y, sigma=SIGMA), {"g": 9.0}, priors={"g": (9.81, 0.1)})
     told, (mean, covariance, _) = found.laplace(), exact(y, (9.81, 0.1))
@@ -72,7 +72,7 @@ def test_draws():
     z = jax.random.normal(jax.random.key(1), (5, 3))
     of = jax.vmap(told.standardised(found.log_posterior))(z) - told.standardised(found.log_posterior)(jnp.zeros(3))
     np.testing.assert_allclose(of, -0.5 * np.sum(np.asarray(z) ** 2, axis=1), rtol=1e-6)
-    # Twin: of the likelihood alone it is not.
+    # Twin: the likelihood alone is not.
     of = jax.vmap(told.standardised(found.log_likelihood))(z) - told.standardised(found.log_likelihood)(jnp.zeros(3))
     assert not np.allclose(of, -0.5 * np.sum(np.asarray(z) ** 2, axis=1), rtol=0.05)
     density, point = found.log_posterior, {"g": 9.7, "starts": told.unknowns(jnp.ones(3))["starts"]}
@@ -82,15 +82,15 @@ def test_draws():
 
 @pytest.fixture(scope="module")
 def rough():
-    """A large swing, measured so badly that residuals are no small part of it."""
+    """A large swing, measured so badly that its residuals are large."""
     clean = np.asarray(lj.integrate(swing, 2.0, 0.0, {"w2": 4.0}, ts=FAR).q)
     data = clean + 0.6 * np.random.default_rng(0).normal(size=15)
     return data, lj.fit(swing, lj.Record(FAR, q=data, q0=2.0, v0=0.0, sigma=0.6), {"w2": 4.2})
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_large_residuals_against_scipy(rough):
-    """The inverse covariance is the second difference of half the squares of SciPy's motion; and JAX's Hessian."""
+    """The inverse covariance agrees with second differences of SciPy's motion, and with JAX's Hessian."""
     data, found = rough
     told = found.laplace()
 
@@ -106,7 +106,7 @@ def test_large_residuals_against_scipy(rough):
 
     by_differences = (4 * second(1e-3) - second(2e-3)) / 3
     np.testing.assert_allclose(np.linalg.inv(told.covariance), by_differences, rtol=1e-4, atol=1e-3)
-    # Twin: Gauss and Newton's is another one; so is one with the term S of the other sign.
+    # Twin: the Gauss-Newton one differs; so does one with the term S of the other sign.
     gauss_newton = np.linalg.inv(told.gauss_newton)
     assert not np.allclose(gauss_newton, by_differences, rtol=0.02)
     assert not np.allclose(2 * gauss_newton - by_differences, by_differences, rtol=0.02)
@@ -121,7 +121,7 @@ def test_large_residuals_against_scipy(rough):
 
 @pytest.mark.slow
 def test_evidence_against_quadrature():
-    """The integral of the density by one unknown is nearly that of the parabola, the nearer the smaller the errors."""
+    """The evidence is nearly the integral of the density over one unknown, the more so the smaller the errors."""
     off = []
     for sigma in (0.4, 0.1):
         clean = np.asarray(lj.integrate(swing, 2.0, 0.0, {"w2": 4.0}, ts=FAR).q)
@@ -134,16 +134,16 @@ def test_evidence_against_quadrature():
         known = np.log(mass) + best - 15 * np.log(sigma) - 7.5 * np.log(2 * np.pi)
         off.append(abs(told.log_evidence - known))
     assert off[0] < 0.05 and off[1] < off[0] / 3
-    # Twin: without its width.
+    # Twin: without the width of the density.
     assert abs(told.log_evidence - (best - 15 * np.log(sigma) - 7.5 * np.log(2 * np.pi))) > 1.0
 
 
 @pytest.mark.slow
 def test_no_peak(rough):
-    """Where the density does not fall, or the estimate is no peak, the direction is named and nothing is drawn."""
+    """A direction without a peak is named, and nothing is drawn; an estimate off the peak gets a caveat."""
     data, found = rough
     moved = lambda x: eqx.tree_at(lambda f: f.unknowns.shared, found, np.array([x]))
-    with pytest.warns(lj.FitWarning, match="no peak but a saddle or a flat: the density does not fall along .*'w2'"):
+    with pytest.warns(lj.FitWarning, match="no peak, but a saddle or plateau: the density does not fall along .*'w2'"):
         told = moved(2.5).laplace()
     assert told.eigenvalues[0] < 0 and not told.positive_definite and np.isnan(told.log_evidence)
     assert np.isnan(told.sd[0]) and "no peak" in repr(told)
@@ -151,13 +151,13 @@ def test_no_peak(rough):
         with pytest.raises(ValueError, match="(?s)no normal distribution here: no peak.*priors="):
             draw()
     aside = moved(found.values[0] + 0.2 * found.sd[0]).laplace()
-    assert aside.positive_definite and aside.off > 0.1 and "the estimate is no peak" in aside.caveats[0]
-    # Twin: at the peak none of it.
-    assert found.laplace().off < 1e-3 and all("no peak" not in words for words in found.laplace().caveats)
+    assert aside.positive_definite and aside.off > 0.1 and "the estimate is not the peak" in aside.caveats[0]
+    # Twin: there is no such caveat at the peak.
+    assert found.laplace().off < 1e-3 and all("peak" not in words for words in found.laplace().caveats)
 
     with pytest.warns(lj.FitWarning):
         unseen = lj.fit(pendulum, lj.Record(T, q=np.cos(T), sigma=0.3), PENDULUM, free=["c", "g", "l"], restarts=0)
-    with pytest.warns(lj.FitWarning, match="the data do not see .*'g'.*'l'"):
+    with pytest.warns(lj.FitWarning, match="the data do not determine .*'g'.*'l'"):
         told = unseen.laplace()
     assert np.isnan(told.sd[:3]).all() and np.isfinite(told.sd[3:]).all() and len(told.unseen) == 1
     with pytest.raises(TypeError, match="outside of the program"):
@@ -166,7 +166,7 @@ def test_no_peak(rough):
 
 @pytest.mark.exhaustive
 def test_windows_records_and_a_loss_that_forgives():
-    """Windows on their own, losses that forgive: as JAX has the Hessian of all unknowns; joined windows are refused."""
+    """With independent windows or a robust loss it agrees with JAX's Hessian; joined windows are refused."""
     of_all = lambda f: jax.jit(jax.hessian(lambda x: -f.log_likelihood(ravel_pytree(f.sampling)[1](x))))
 
     def compared(found, rtol=1e-5):
@@ -199,7 +199,7 @@ def test_windows_records_and_a_loss_that_forgives():
     forgiving = lj.fit(swing, wild, {"w2": 4.0}, loss="cauchy", restarts=0)
     told = compared(forgiving)
     assert np.isnan(told.log_evidence) and abs(forgiving.values[0] - 4.0) < 0.3
-    # Twin: by squares another one.
+    # Twin: least squares give another one.
     with pytest.warns(lj.FitWarning):
         squares = lj.fit(swing, wild, {"w2": 4.0}, restarts=0).laplace()
     assert not np.allclose(squares.sd, told.sd, rtol=0.02)

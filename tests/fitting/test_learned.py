@@ -1,4 +1,4 @@
-"""Networks inside L: a potential learned from motion, on states that it was not trained on."""
+"""Networks inside L: a potential learned from motion, tested on states that it was not trained on."""
 
 import warnings
 
@@ -36,14 +36,14 @@ def records():
 
 
 def error(potential):
-    """The largest difference from the true potential where the motions were, up to a constant."""
+    """The largest difference from the true potential in the range of the motions, up to a constant."""
     q = jnp.linspace(-1.6, 1.6, 33)
     difference = jax.vmap(potential)(q) - well(q)
     return float(jnp.max(jnp.abs(difference - jnp.mean(difference))))
 
 
 def train(width, depth, **options):
-    """A fit of all weights; single ones mean nothing, which is not worth a warning."""
+    """A fit of all weights, without the warning that single ones are not determined."""
     net = eqx.nn.MLP("scalar", "scalar", width, depth, jnp.tanh, key=jax.random.key(0))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", lj.FitWarning)
@@ -64,9 +64,9 @@ def test_a_learned_potential():
     assert "31 numbers" in repr(found.identifiability)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_learned_friction():
-    """A force -v f(v²) that is no viscous friction, where the motions had velocities."""
+    """A force -v f(v²) other than viscous friction is learned for the velocities of the motions."""
     restoring = lambda t, q, v, params: 0.5 * v**2 + 9.0 * jnp.cos(q)
     rubs = lambda v: -(0.3 * jnp.tanh(3 * v) + 0.1 * v**3)
     truth = lj.System(restoring, force=lambda t, q, v, params: rubs(v))
@@ -92,7 +92,7 @@ def test_a_learned_friction():
 
 @pytest.mark.exhaustive
 def test_slopes_of_a_network_in_reverse():
-    """The gradient of the cost by 193 weights: pulled back in one pass, and pushed forward along each."""
+    """The gradient of the cost by 193 weights is the same in one reverse pass and in forward mode along each."""
     net = eqx.nn.MLP("scalar", "scalar", 12, 2, jnp.tanh, key=jax.random.key(0))
     params, priors = {"potential": net}, {"potential": (0.0, 10.0)}
     options = {"rtol": 1e-9, "atol": 1e-9}

@@ -1,4 +1,4 @@
-"""What to measure next: standard deviations after further measurements are those of formulas, and come true."""
+"""What to measure next: predicted standard deviations agree with formulas and with repeated fits."""
 
 from itertools import combinations
 
@@ -9,7 +9,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import lagjax as lj
-from lagjax.fitting.candidates import judged, sd_after_each, sd_of, without
+from lagjax.fitting.candidates import assess, eliminate_unknowns, sd_after_each, sd_of
 from tests.counting import compiles
 from tests.fitting.cases import CASES, HUNG, PENDULUM, hung, pendulum
 
@@ -18,7 +18,7 @@ T, LONG = np.linspace(0.0, 2.0, 21), np.linspace(0.0, 4.0, 21)
 SIGMA = 0.01
 fall = lj.System(lambda t, q, v, p: 0.5 * v**2 + p["g"] * q)
 fallen = lj.Record(T, q=5.0 * T**2, sigma=SIGMA)
-# A spring that a known force may pull: without it only k/m shows.
+# A spring that a known force may pull: without it only k/m is determined.
 pulled = lj.System(lambda t, q, v, p: 0.5 * p["m"] * v["x"] ** 2 - 0.5 * p["k"] * q["x"] ** 2 + p["F"] * q["x"])
 PULLED = {"m": 1.0, "k": 4.0, "F": 0.0}
 
@@ -34,7 +34,7 @@ def sds(rows):
 
 
 def two_runs(first, second, held=False):
-    """The slopes of two falls with one g, the second with a start that is unknown or held."""
+    """The slopes of two falls with the same g; the start of the second is unknown or held."""
     rows = np.zeros((len(first) + len(second), 3 if held else 5))
     rows[: len(first), :3] = first
     rows[len(first) :, 0] = second[:, 0]
@@ -45,7 +45,7 @@ def two_runs(first, second, held=False):
 @pytest.mark.parametrize("rank", [5, 3, 2])
 @pytest.mark.parametrize("m", [1, 3])
 def test_one_time_after_the_other(rank, m):
-    """The formula for many single times is that of all equations together, also where something is not determined."""
+    """The formula for single times agrees with solving all equations, even if something is not determined."""
     random = np.random.default_rng(rank + m)
     known = random.normal(size=(7, rank)) @ random.normal(size=(rank, 5))
     rows = random.normal(size=(40, m, 5))
@@ -53,7 +53,7 @@ def test_one_time_after_the_other(rank, m):
         found = sd_after_each(direction, known, rows, LEAST)
         each = [sd_of(direction, np.concatenate([known, block]), LEAST) for block in rows]
         np.testing.assert_allclose(found, each, rtol=1e-8)
-        # Twin: beside less that is known.
+        # Twin: with fewer known equations.
         assert np.isinf(each).all() or not np.allclose(
             sd_after_each(direction, known[1:], rows, LEAST), each, rtol=1e-3
         )
@@ -63,31 +63,31 @@ def test_one_time_after_the_other(rank, m):
 
 
 def test_unknowns_of_no_interest_are_eliminated():
-    """What is left of the equations says as much of the others as all of them do; a column of zeros is no unknown."""
+    """Elimination keeps all information on the other unknowns; a column of zeros does not count as an unknown."""
     random = np.random.default_rng(0)
     of, others = random.normal(size=(20, 2)), random.normal(size=(20, 3))
-    left = without(of, np.concatenate([others, np.zeros((20, 1)), others[:, :1]], axis=1))
+    left = eliminate_unknowns(of, np.concatenate([others, np.zeros((20, 1)), others[:, :1]], axis=1))
     both = np.concatenate([of, others], axis=1)
     np.testing.assert_allclose(sds(left), sds(both)[:2], rtol=1e-10)
-    # Twin: with the others known.
+    # Twin: with the eliminated unknowns known.
     assert np.all(sds(of) < 0.99 * sds(both)[:2])
 
 
 @pytest.mark.parametrize("count", [3, 4])
 def test_best_times_against_all_choices(count):
-    """Exchanges find the best of all sets of times, of random slopes and of a parabola's: its ends and its middle."""
+    """Exchanges find the best of all sets of times, for random slopes and for a parabola (its ends and middle)."""
     along = np.array([1.0, 0.0, 0.0])
     random = np.random.default_rng(1)
     cases = [parabola(np.linspace(0.0, 2.0, 11)), *(random.normal(size=(11, 3)) for _ in range(6))]
     for i, rows in enumerate(cases):
-        candidate = judged(
+        candidate = assess(
             "a run", np.linspace(0.0, 2.0, 11), rows[:, None], np.zeros((1, 3)), along, np.ones(3), {}, LEAST
         )
         times, sd = candidate.at_best(count)
         all_of_them = [sd_of(along, rows[list(places)], LEAST) for places in combinations(range(11), count)]
         assert sd <= 1.02 * min(all_of_them) and sd < np.median(all_of_them)
         if i == 0:
-            # (q(0) - 2 q(1) + q(2)) / 1² has the error √6 σ; of four the middle, which weighs most, is nearly doubled.
+            # (q(0) - 2 q(1) + q(2)) / 1² has the error √6 σ; a fourth time lies near the middle, which weighs most.
             np.testing.assert_allclose(times[[0, 1, -1]], [0.0, 1.0 if count == 3 else 0.8, 2.0], atol=0.21)
             if count == 3:
                 np.testing.assert_allclose(sd, np.sqrt(6) * SIGMA, rtol=1e-10)
@@ -97,7 +97,7 @@ def test_best_times_against_all_choices(count):
 
 @pytest.mark.slow
 def test_falling():
-    """g after another fall: from a start that is unknown, or known; longer, or not; after one further measurement."""
+    """The error of g after another fall with an unknown or known start, a longer one, or one more measurement."""
     zeros = {"q": np.zeros(21), "q0": 0.0, "v0": 0.0, "sigma": SIGMA}
     others = {"again": lj.Record(T, **zeros), "longer": lj.Record(LONG, **zeros)}
     others["from a stand"] = lj.Record(LONG, **zeros, hold_q=True, hold_v=True)
@@ -109,7 +109,7 @@ def test_falling():
     np.testing.assert_allclose(told["longer"].sd, sds(two_runs(first, parabola(LONG)))[0], rtol=1e-9)
     known = sds(two_runs(first, parabola(LONG), held=True))[0]
     np.testing.assert_allclose(told["from a stand"].sd, known, rtol=1e-9)
-    # Twin: to take the longer one's start for known would be far too good.
+    # Twin: with a known start the longer fall would be far better.
     assert known < 0.8 * told["longer"].sd
     times, sd = told["longer"].at_best(3)
     np.testing.assert_allclose(times, [0.0, 2.0, 4.0])
@@ -126,13 +126,13 @@ def test_falling():
     after = [sds(np.concatenate([first, parabola(np.array([t]))]))[0] for t in told["q"].t]
     np.testing.assert_allclose(told["q"].alone, after, rtol=1e-8)
     assert "q at t = 4.1" in repr(told)
-    # Twin: without what is known of the start.
+    # Twin: without the further measurement.
     assert not np.allclose(told["q"].alone, told.now, rtol=0.3)
 
 
 @pytest.mark.slow
 def test_what_is_not_determined():
-    """Of a spring only k/m shows; a run with a force of known size would show k, as the formula says; another not."""
+    """A spring determines only k/m; a run with a known force would determine k, as the formula says, another not."""
     t = np.linspace(0.0, 6.0, 40)
     of = lambda force: lj.Record(
         t, q={"x": np.zeros(40)}, q0={"x": 0.5}, v0={"x": 0.0}, sigma=0.01, params={"F": force}
@@ -156,22 +156,22 @@ def test_what_is_not_determined():
     both[:40, :2], both[:40, 2:4] = slopes[0]
     both[40:, :2], both[40:, 4:] = slopes[1]
     np.testing.assert_allclose(told.best.sd, sds(both)[0], rtol=1e-6)
-    # Of the frequency, a function of what is found, all is known: its own formula, and that a late time says most.
+    # The frequency, a function of the parameters, is determined: it has its own formula, and late times are best.
     w = lambda params: jnp.sqrt(params["k"] / params["m"])
     told = ask(shrink=w).next
     alone = both[:40, [0, 2, 3]]
     np.testing.assert_allclose(told.now, sds(alone)[0] * 0.5 / np.sqrt(4.0), rtol=1e-6)
     assert told.best.times[0] > 8.0 and told.best.sd < 0.7 * told.now
-    for wrong, words in ((lambda p: p["F"], "does not depend on what is found"), (lambda p: jnp.ones(2), "one number")):
+    for wrong, words in ((lambda p: p["F"], "does not depend on the fitted"), (lambda p: jnp.ones(2), "single number")):
         with pytest.raises(ValueError, match=words):
             ask(shrink=wrong)
-    # Twin: a candidate of the same force, whatever is said of it.
+    # Twin: a candidate with the same force determines the mass no better.
     assert np.isinf(ask(shrink="m", candidates={"free": of(0.0)}).next.best.sd)
 
 
 @pytest.mark.slow
 def test_a_pendulum_in_air_against_scipy():
-    """Friction from positions and velocities, further ones in the same run: slopes by differences of SciPy's motion."""
+    """Further positions and velocities for friction agree with slopes by differences of SciPy's motion."""
     ts, free = np.linspace(0.0, 5.0, 40), ["c", "l"]
     record = lj.Record(ts, q=np.zeros(40), q0=1.0, v0=0.0, sigma={"q": 0.01, "v": 0.03})
     told = lj.identifiability(pendulum, record, PENDULUM, free=free, shrink="c").next
@@ -189,15 +189,15 @@ def test_a_pendulum_in_air_against_scipy():
         after = [sds(np.concatenate([first, row[None] / sigma]))[0] for row in of]
         np.testing.assert_allclose(told[name].alone, after, rtol=1e-5)
         assert told[name].times[0] == told[name].t[np.argmin(after)] and told[name].sigma == {name: sigma}
-    # Twin: with the other's error.
+    # Twin: with the error of the positions.
     assert not np.allclose(
         told["v"].alone, [sds(np.concatenate([first, r[None] / 0.01]))[0] for r in slopes[1]], rtol=1e-3
     )
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_it_comes_true():
-    """Fits of many repeats with the best candidate measured: the spread of friction is as was foretold."""
+    """Repeated fits with the best candidate measured have the predicted spread of friction."""
     ts, late = np.linspace(0.0, 3.0, 30), np.linspace(0.0, 8.0, 30)
     run = lambda t, q, q0, **more: lj.Record(t, q=q, q0=q0, v0=0.0, sigma=0.02, **more)
     zeros, free = np.zeros(30), ["c", "l"]
@@ -220,16 +220,16 @@ def test_it_comes_true():
         return {"now": fit(both[:1]), "after": fit(both)}
 
     found = lj.sweep(repeat, {"seed": np.arange(400)}, progress=False).values
-    # Of 400 a standard deviation is known to 3.5 %.
+    # A standard deviation of 400 values is known to 3.5 %.
     assert np.std(found["now"]) == pytest.approx(told.now, rel=0.12)
     assert np.std(found["after"]) == pytest.approx(told.best.sd, rel=0.12)
-    # Twin: that of the next best candidate is none.
+    # Twin: the prediction for the second-best candidate differs.
     assert told.candidates[1].sd > 1.3 * told.best.sd
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_constraints_forces_and_observations():
-    """Candidates of other kinds: on a rod only its force shows the mass; the angle's system says the same of g/l."""
+    """On a rod only its force determines the mass; the system in the angle gives the same errors of g."""
     case = CASES["pendulum on a rod"]
     start = {"q0": case.q0, "v0": case.v0}
     zeros = {"x": np.zeros(60), "y": np.zeros(60)}
@@ -242,7 +242,7 @@ def test_constraints_forces_and_observations():
     assert np.isinf(told.now) and told.best.name == "force" and np.isinf(told["motion"].sd)
     further = lj.identifiability(hung, record, HUNG, free=["g", "l"], shrink="g").next
     assert {c.name for c in further.candidates} == {"x", "y", "v.x", "v.y"}
-    # In the angle, seen by its x and y.
+    # The system in the angle, observed by x and y.
     place = lambda t, q, v, p: {"x": p["l"] * jnp.sin(q), "y": -p["l"] * jnp.cos(q)}
     of_angle = lj.System(lambda t, q, v, p: 0.5 * p["m"] * p["l"] ** 2 * v**2 + p["m"] * p["g"] * p["l"] * jnp.cos(q))
     seen = lj.Record(case.ts, observed=zeros, q0=np.pi / 2, v0=0.0, sigma={"observed": 0.02})
@@ -255,7 +255,7 @@ def test_constraints_forces_and_observations():
 
 @pytest.mark.slow
 def test_windows_runs_without_sigma_and_several():
-    """Without sigma the figures are multiples of an error; several records are told apart; windows have starts each."""
+    """Without sigma results are multiples of an error; records are distinguished; each window has its own start."""
     plain = lj.identifiability(fall, lj.Record(T, q=5.0 * T**2), {"g": 9.81}, shrink="g").next
     scaled = lj.identifiability(fall, fallen, {"g": 9.81}, shrink="g").next
     assert not plain.absolute and {c.name for c in plain.candidates} == {"q"}
@@ -288,9 +288,9 @@ RUN = {"q0": 0.0, "v0": 0.0}
 @pytest.mark.parametrize(
     "more, error, words",
     [
-        ({"shrink": "h"}, ValueError, "shrink names 'h', which is not among what is found: 'g'"),
+        ({"shrink": "h"}, ValueError, "shrink names 'h', which is not among the fitted parameters: 'g'"),
         ({"candidates": {"a": fallen}}, ValueError, 'shrink="g"'),
-        ({"shrink": "g", "free": []}, ValueError, "no parameter is found"),
+        ({"shrink": "g", "free": []}, ValueError, "no parameter is fitted"),
         ({"shrink": "g", "candidates": {}}, ValueError, "candidates is empty"),
         ({"shrink": "g", "candidates": {"a": T}}, TypeError, "candidate 'a' must be a lj.Record"),
         (
@@ -302,13 +302,13 @@ RUN = {"q0": 0.0, "v0": 0.0}
     ],
 )
 def test_words(more, error, words):
-    """What makes no sense is refused in the user's words."""
+    """Arguments that make no sense raise errors in the user's words."""
     with pytest.raises(error, match=words):
         lj.identifiability(fall, fallen, {"g": 9.81}, **more)
 
 
 def test_words_where_it_is_traced():
-    """It looks at numbers, and says so in a program."""
+    """Inside a program it raises an error, since it needs numbers."""
     of = lambda q: lj.identifiability(fall, lj.Record(T, q=q, sigma=SIGMA), {"g": 9.81}, shrink="g").next.now
     with pytest.raises(TypeError, match="not in jit, vmap or lj.sweep"):
         jax.jit(of)(5.0 * T**2)

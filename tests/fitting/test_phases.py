@@ -1,4 +1,4 @@
-"""Fits of motions in phases: what is lost at each bounce, and where a motion starts."""
+"""Fits of motions in phases: the coefficient of restitution, and the phase in which a motion starts."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ TS = np.linspace(0.0, 2.0, 41)
 
 
 def bounced(g, e):
-    """Heights of a ball that falls from 1, in closed form."""
+    """Heights of a ball that falls from a height of 1, in closed form."""
     fall = np.sqrt(2 / g)
     q, begins, up = 1 - 0.5 * g * TS**2, fall, e * g * fall
     for _ in range(8):
@@ -22,9 +22,9 @@ def bounced(g, e):
     return q
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_what_a_bounce_leaves():
-    """Gravity, restitution and the start from heights, through three impacts."""
+    """A fit to heights finds gravity, restitution and the start through three impacts."""
     found = lj.fit(ball, lj.Record(TS, q=bounced(9.81, 0.8)), {"g": 9.5, "e": 0.75}, progress=False)
     assert found.converged
     np.testing.assert_allclose([found.params["g"], found.params["e"]], [9.81, 0.8], rtol=1e-7)
@@ -37,7 +37,7 @@ KEPT = 0.8
 
 @pytest.mark.slow
 def test_what_a_switch_reads_may_change(monkeypatch):
-    """A fit sees a restitution that is a global: with another one the same measurements do not fit any more."""
+    """A fit uses the current value of a global restitution: with another one the measurements no longer fit."""
     reset = lambda t, q, v, params: -KEPT * v
     system = lj.Hybrid({"flies": falling}, [lj.Switch("flies", to="flies", when=bounce.when, reset=reset)])
     record = lj.Record(TS, q=bounced(9.81, 0.8), sigma=0.01)
@@ -49,9 +49,9 @@ def test_what_a_switch_reads_may_change(monkeypatch):
 
 
 def test_refused_in_words():
-    """Windows would start in phases that nobody knows; a phase that is none."""
+    """Windows, which would start in unknown phases, and an unknown phase are refused."""
     record = lj.Record(TS, q=bounced(9.81, 0.8))
-    with pytest.raises(ValueError, match=r"(?s)lj\.Hybrid nobody knows.*Fix:"):
+    with pytest.raises(ValueError, match=r"(?s)lj\.Hybrid the phase in which each window would start is.*Fix:"):
         lj.fit(ball, record, {"g": 9.5, "e": 0.75}, window=0.5)
     with pytest.raises(ValueError, match="'lies' is not a phase"):
         lj.fit(ball, record, {"g": 9.5, "e": 0.75}, start="lies")

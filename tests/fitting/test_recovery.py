@@ -1,4 +1,4 @@
-"""Fits of every scene find the truth, and are as uncertain as they say."""
+"""Fits of every scene find the truth, with the correct uncertainties."""
 
 import jax
 import jax.numpy as jnp
@@ -11,9 +11,9 @@ from tests.fitting.cases import CASES
 from tests.tiers import exhaustive_but
 
 REPEATS = 200
-# Of 200 repeats 95 % lie inside a 95 % interval, give or take 4 (2.6 standard deviations).
+# 95 % of 200 repeats lie inside a 95 % interval, give or take 4 % (2.6 standard deviations).
 INSIDE = (0.91, 0.99)
-# Starts on constraints, on one that depends on a parameter that is found.
+# Starts on constraints, one of which depends on a fitted parameter.
 STARTS_TOO = ("sphere", "wedge")
 
 
@@ -25,7 +25,7 @@ def inside(values, sd, truth):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", exhaustive_but(("pendulum",), CASES))
 def test_recovers_the_truth_and_its_uncertainty(name):
-    """Without errors the truth to 1e-8; with errors the truth within the 95 % interval in 95 % of 200 repeats."""
+    """Without errors the truth to 1e-8; with errors, 95 % of 200 repeats have the truth in their 95 % interval."""
     case = CASES[name]
     measured = case.measured(case.truth())
     truth = np.array([case.params[n] for n in sorted(case.free)])
@@ -41,7 +41,7 @@ def test_recovers_the_truth_and_its_uncertainty(name):
             sd = ravel_pytree((sd, found.start_sd))[0]
         return values, sd, found.converged
 
-    # One program: of the first point's measurements the errors are none.
+    # One program; the first point has no measurement errors.
     values, sd, converged = lj.sweep(repeat, {"seed": np.arange(REPEATS + 1)}, progress=False).values
     assert converged.all()
     np.testing.assert_allclose(values[0, : len(truth)], truth, rtol=1e-8)
@@ -51,6 +51,6 @@ def test_recovers_the_truth_and_its_uncertainty(name):
     values, sd = values[1:], sd[1:]
     share = inside(values, sd, truth)
     assert np.all((share >= INSIDE[0]) & (share <= INSIDE[1])), share
-    # Twins: uncertainties that are half or twice as large are found out.
+    # Twins: uncertainties half or twice as large fail.
     assert np.all(inside(values, 0.5 * sd, truth) < INSIDE[0])
     assert np.all(inside(values, 2 * sd, truth) > INSIDE[1])

@@ -1,4 +1,4 @@
-"""NUTS through a fit's density, in Laplace's coordinates, against posteriors that are known."""
+"""NUTS on a fit's density, in standardised coordinates, against known posteriors."""
 
 import blackjax
 import jax
@@ -12,12 +12,12 @@ from tests.fitting.test_laplace import SIGMA, T, exact, fall, measured, swing
 
 pytestmark = pytest.mark.slow
 DRAWS = 3000
-# A large swing from rest, seen at four times: its frequency and its amplitude make up for each other.
+# A large swing from rest, measured at four times: frequency and amplitude can compensate for each other.
 TS, ROUGH, PRIOR = np.array([0.5, 1.0, 3.6, 3.8]), 0.2, (4.0, 1.5)
 
 
 def nuts(density, n, key):
-    """Draws (DRAWS, n) of a density of z, nearly a standard normal one, from its peak; the first 200 are left out."""
+    """Draws (DRAWS, n) of a nearly standard normal density of z, started at its peak; the first 200 are discarded."""
     kernel = blackjax.nuts(density, step_size=0.5, inverse_mass_matrix=jnp.ones(n))
 
     @jax.jit
@@ -29,7 +29,7 @@ def nuts(density, n, key):
 
 
 def errors(x, mean, sd, quantile):
-    """How many of their Monte-Carlo errors mean, variance and the share below a 90 % quantile are off."""
+    """The deviations of mean, variance and the share below the 90 % quantile, in Monte-Carlo errors."""
     size = lambda y: float(blackjax.diagnostics.effective_sample_size(jnp.asarray(y)[None]))
     x = np.asarray(x)
     squares, below = (x - mean) ** 2, (x < quantile).astype(float)
@@ -56,7 +56,7 @@ def on_a_grid(data):
     density = density / density.sum()
     found = []
     for x, p in zip(axes, (density.sum(axis=1), density.sum(axis=0))):
-        # The mass beyond the grid is not missed.
+        # The mass beyond the grid is negligible.
         assert max(p[:3].max(), p[-3:].max()) < 1e-8
         mean = x @ p
         found.append((mean, np.sqrt((x - mean) ** 2 @ p), np.interp(0.9, np.cumsum(p) - p / 2, x)))
@@ -65,7 +65,7 @@ def on_a_grid(data):
 
 @pytest.mark.exhaustive
 def test_a_normal_posterior():
-    """A fall: the draws have the exact mean, standard deviation and quantile of every unknown."""
+    """Draws for a fall have the exact mean, standard deviation and quantile of every unknown."""
     y = measured()
     found = lj.fit(fall, lj.Record(T, q=y, sigma=SIGMA), {"g": 9.0}, priors={"g": (9.81, 0.1)})
     told = found.laplace()
@@ -75,15 +75,15 @@ def test_a_normal_posterior():
     start = np.asarray(draws["starts"])[:, 0] + (told.mean[1:] - np.asarray(found.sampling["starts"])[0])
     for x, m, s in zip((draws["g"], *start.T), mean, sd):
         assert np.max(np.abs(errors(x, m, s, m + 1.2816 * s))) < 4
-    # Twin: of the likelihood without its prior they have another one.
+    # Twin: draws of the likelihood without its prior do not.
     draws = told.unknowns(nuts(told.standardised(found.log_likelihood), 3, jax.random.key(0)))
     assert np.max(np.abs(errors(draws["g"], mean[0], sd[0], mean[0] + 1.2816 * sd[0]))) > 8
 
 
 def test_a_bent_posterior():
-    """A large swing from rest, of unknown frequency and amplitude: as quadrature of Jacobi's functions has it."""
+    """Draws for a large swing of unknown frequency and amplitude agree with quadrature of Jacobi's functions."""
     data = angle(TS, 4.0, 2.2) + ROUGH * np.random.default_rng(0).normal(size=4)
-    # The run begins at its first time, at which nothing is measured.
+    # The run starts at its first time, where nothing is measured.
     times, angles = np.append(0.0, TS), np.append(np.nan, data)
     record = lj.Record(times, q=angles, q0=2.0, v0=0.0, hold_v=True, sigma=ROUGH)
     found = lj.fit(swing, record, {"w2": 4.0}, priors={"w2": PRIOR}, bounds={"w2": (0.0, None)})
@@ -95,5 +95,5 @@ def test_a_bent_posterior():
     both = lambda draws: (draws["w2"], draws["starts"][:, 0, 0] + offset)
     for x, exactly in zip(both(draws), known):
         assert np.max(np.abs(errors(x, *exactly))) < 4
-    # Twin: Laplace's normal distribution is not this one: both are bent.
+    # Twin: Laplace's normal distribution does not agree, since the posterior is bent.
     assert all(np.max(np.abs(errors(x, *exactly))) > 8 for x, exactly in zip(both(normal), known))

@@ -1,4 +1,4 @@
-"""Fits in files: bit for bit, with the functions that are given again."""
+"""Fits saved to files and loaded bit for bit, with the functions passed again."""
 
 import jax
 import numpy as np
@@ -15,7 +15,7 @@ def swing(t, q, v, params):
 
 
 def squared(t, q, v, params):
-    """What is measured."""
+    """The observed quantity."""
     return {"d": q["x"] ** 2}
 
 
@@ -24,7 +24,7 @@ NOISE = 1e-3 * np.random.default_rng(0).normal(size=len(T))
 
 
 def check(found, path, *given):
-    """All arrays bit for bit, all else equal, and the same in print."""
+    """Save and load a fit: arrays are equal bit for bit, everything else is equal and prints the same."""
     found.save(path)
     again = lj.load_fit(path, *given)
     for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(again), strict=True):
@@ -36,7 +36,7 @@ def check(found, path, *given):
 
 @pytest.mark.slow
 def test_saved_and_loaded(tmp_path):
-    """With its functions it goes on as before; without, it has what was found, and says what it misses."""
+    """With its functions a loaded fit is complete; without, it has its results, and says what is missing."""
     path, guess = tmp_path / "fit.npz", {"k": 3.5}
     record = lj.Record(T, q={"x": np.cos(2.0 * T) + NOISE}, observed={"d": np.cos(2.0 * T) ** 2 + NOISE}, sigma=1e-3)
     found = lj.fit(spring, record, guess, observe=squared)
@@ -57,15 +57,15 @@ def test_saved_and_loaded(tmp_path):
     stiffer = lj.System(lambda t, q, v, params: swing(t, q, v, {"k": 2 * params["k"]}))
     with pytest.raises(ValueError, match="the Lagrangian: its value was"):
         lj.load_fit(path, stiffer)
-    with pytest.raises(TypeError, match="has no events that would have to be given"):
+    with pytest.raises(TypeError, match="has no events to be passed again"):
         lj.load_fit(path, spring, events={})
     with pytest.raises(ValueError, match=r"holds a fit, not a trajectory.\nFix: lj.load_fit"):
         lj.load_trajectory(path)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_constraints_and_options(tmp_path):
-    """The starts on constraints are known without them; options that hold functions are given again."""
+    """Starts on constraints are available without the system; options with functions are passed again."""
     rod = lj.System(
         lambda t, q, v, params: 0.5 * (v["x"] ** 2 + v["y"] ** 2) - params["g"] * q["y"],
         {"rod": lj.Holonomic(lambda t, q, params: q["x"] ** 2 + q["y"] ** 2 - 1.0)},

@@ -1,4 +1,4 @@
-"""Training by optimisers of optax: its steps against formulas, what is held back, what fails."""
+"""Training with optimisers of optax: steps against formulas, held-back records, failing motions."""
 
 import warnings
 
@@ -13,11 +13,11 @@ from scipy.optimize import least_squares
 import lagjax as lj
 from lagjax.fitting import trained
 from lagjax.fitting.optimisers import Optimiser, as_params, as_vector, is_of_optax
-from lagjax.fitting.own_starts import settled
+from lagjax.fitting.own_starts import fit_starts
 from lagjax.fitting.parameters import find
 from lagjax.fitting.problem import problem_of
-from lagjax.fitting.trained import parted_records
-from lagjax.fitting.training import Task, begun, round_of
+from lagjax.fitting.trained import split_records
+from lagjax.fitting.training import Task, initial_state, round_of
 from tests.counting import compiles
 
 T = np.linspace(0.0, 3.0, 31)
@@ -25,21 +25,21 @@ spring = lj.System(lambda t, q, v, params: 0.5 * v**2 - 0.5 * params["k"] * q**2
 
 
 def record(seed=0, known=True, amplitude=1.0, t=T, **of_run):
-    """The spring with k = 4, let go at an amplitude, with errors of 0.01."""
+    """The spring with k = 4, released at an amplitude, with errors of 0.01."""
     q = amplitude * np.cos(2 * t) + 0.01 * np.random.default_rng(seed).normal(size=len(t))
     held = dict(q0=amplitude, v0=0.0, hold_q=True, hold_v=True) if known else {}
     return lj.Record(t, q=q, sigma=0.01, **held, **of_run)
 
 
 def quietly(*args, **options):
-    """A fit, whatever there is to doubt about it."""
+    """A fit without its warnings."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", lj.FitWarning)
         return lj.fit(*args, **{"progress": False, "rtol": 1e-9, "atol": 1e-9} | options)
 
 
 def test_optimisers_by_what_they_mean():
-    """Two that are made alike are one, so that nothing is compiled anew; twin: another rate is another."""
+    """Two equal optimisers compare equal, so nothing is compiled again; twin: another rate differs."""
     made = lambda rate: Optimiser(optax.chain(optax.clip_by_global_norm(1.0), optax.adam(rate)))
     assert made(1e-2) == made(1e-2) and hash(made(1e-2)) == hash(made(1e-2))
     assert made(1e-2) != made(1e-3)
@@ -47,7 +47,7 @@ def test_optimisers_by_what_they_mean():
 
 
 def test_optimisers_see_params():
-    """What is found in the structure of params, None for the rest, and back."""
+    """Fitted numbers in the structure of params, None for the rest, and back."""
     params = {"a": 1.0, "net": {"w": np.ones((2, 3)), "f": jnp.tanh}, "m": np.arange(3.0)}
     found = find(params, ["net", "m[1]"], {}, {}, np.dtype(float))
     y = jnp.arange(7.0)
@@ -58,23 +58,23 @@ def test_optimisers_see_params():
 
 
 def test_which_records_are_held_back():
-    """A part by seed, at least one, never all; given ones; none."""
+    """A fraction by seed, at least one record, never all; given ones; none."""
     records = [record(i) for i in range(5)]
-    kept, held = parted_records(records, 0.4, 0)
+    kept, held = split_records(records, 0.4, 0)
     assert len(kept) == 3 and len(held) == 2 and all(any(r is s for s in records) for r in kept + held)
-    assert [len(x) for x in parted_records(records, 0.99, 0)] == [4, 1] or len(parted_records(records, 0.99, 0)[0]) >= 1
-    assert [len(x) for x in parted_records(records, [], 0)] == [5, 0]
-    assert [len(x) for x in parted_records(records, None, 0)] == [5, 0]
-    assert parted_records(records[0], records[1], 0)[1] == [records[1]]
+    assert [len(x) for x in split_records(records, 0.99, 0)] == [4, 1] or len(split_records(records, 0.99, 0)[0]) >= 1
+    assert [len(x) for x in split_records(records, [], 0)] == [5, 0]
+    assert [len(x) for x in split_records(records, None, 0)] == [5, 0]
+    assert split_records(records[0], records[1], 0)[1] == [records[1]]
     for wrong, words in ((1.5, "between 0 and 1"), (-0.1, "between 0 and 1")):
         with pytest.raises(ValueError, match=words):
-            parted_records(records, wrong, 0)
+            split_records(records, wrong, 0)
     with pytest.raises(ValueError, match="one record cannot be divided"):
-        parted_records(records[0], 0.5, 0)
+        split_records(records[0], 0.5, 0)
 
 
 def test_what_does_not_go_together():
-    """Messages for joined windows, restarts, an optimiser that was not called, arguments of training without one."""
+    """Joined windows, restarts, an optimiser that was not called, or training arguments without one are refused."""
     for options, error, words in (
         ({"optimiser": optax.sgd(0.1), "window": 1.0}, ValueError, "joined=False"),
         ({"optimiser": optax.sgd(0.1), "restarts": 3}, ValueError, "trains once"),
@@ -93,13 +93,13 @@ def problem_with(records, **options):
     return problem_of(spring, records, {"k": 3.0}, None, None, None, None, "squares", options.get("window"), settings)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_starts_of_their_own():
-    """Each window's start, for a k that is wrong, is that of SciPy's least squares with cos and sin."""
+    """Each window's start, for a wrong k, is that of SciPy's least squares with cos and sin."""
     records = [record(i, known=False, amplitude=a) for i, a in enumerate((1.0, 0.5))]
     problem = problem_with(records)
     problem = jax.tree.map(lambda x: jnp.asarray(x) if isinstance(x, np.ndarray) else x, problem)
-    own, at = jax.jit(lambda x, own: settled(problem, x, own, 20, 1e-14))(
+    own, at = jax.jit(lambda x, own: fit_starts(problem, x, own, 20, 1e-14))(
         jnp.array([3.0]), jnp.asarray(problem.start.local)
     )
     w = np.sqrt(3.0)
@@ -114,25 +114,25 @@ def test_starts_of_their_own():
 
 @pytest.mark.slow
 def test_a_step_is_the_formula():
-    """One step of gradient descent from known starts: k less the rate times the slope of the mean square."""
+    """One step of gradient descent from known starts: k minus the rate times the slope of the mean square."""
     r, prior, rate = record(), (5.0, 0.5), 1e-3
     found = quietly(spring, [r], {"k": 3.9}, priors={"k": prior}, optimiser=optax.sgd(rate), iterations=1)
     w = np.sqrt(3.9)
     off, slope = np.cos(w * T) - r.measured["q"], -T * np.sin(w * T) / (2 * w)
     exact = (np.sum(off * slope) / 0.01**2 + (3.9 - prior[0]) / prior[1] ** 2) / len(T)
     np.testing.assert_allclose((3.9 - found.params["k"]) / rate, exact, rtol=1e-6)
-    # Twin: without the prior it is another step.
+    # Twin: without the prior the step differs.
     assert abs(np.sum(off * slope) / 0.01**2 / len(T) - exact) > 1e-3 * abs(exact)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_only_what_is_in_a_batch_moves():
-    """A round of one step moves the start of one window, and leaves the others bit by bit where they are."""
+    """A round of one step moves the start of one window, and leaves the others unchanged bit for bit."""
     problem = problem_with([record(i, known=False) for i in range(4)])
     numbers = (np.asarray(x) for x in (0, 10, 10))
     task = Task(problem, None, Optimiser(optax.adam(0.1)), 1, 1, *numbers)
-    # Starts that are off, so that there is somewhere to go.
-    state = begun(task)
+    # Inaccurate starts, so that they can move.
+    state = initial_state(task)
     state = state._replace(local=np.asarray(state.local) + 0.01)
     seen = []
     for _ in range(4):
@@ -144,9 +144,9 @@ def test_only_what_is_in_a_batch_moves():
     assert sorted(seen) == [0, 1, 2, 3]
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_what_fails_moves_nothing():
-    """A motion that is NaN leaves the others to be fitted, is counted, and is told."""
+    """A motion with NaN is counted and reported, and the others are still fitted."""
     system = lj.System(lambda t, q, v, p: 0.5 * v**2 - 0.5 * (p["k"] + 0.0 * jnp.sqrt(p["sane"])) * q**2)
     records = [record(0, params={"sane": 1.0}), record(1, params={"sane": -1.0}), record(2, params={"sane": 1.0})]
     options = dict(free=["k"], optimiser=optax.adam(0.05), iterations=100, progress=False)
@@ -155,7 +155,7 @@ def test_what_fails_moves_nothing():
         found = lj.fit(system, records, {"k": 3.0, "sane": 1.0}, **options)
     assert any("100 of 300 motions stopped early" in str(w.message) for w in told)
     assert abs(found.params["k"] - 4.0) < 0.05 and int(found.training.failed) == 100
-    # Twin: where all fail there is nothing to train.
+    # Twin: if all fail, the fit is refused.
     with pytest.raises(ValueError, match="from the guess the motion"):
         quietly(system, records[1:2], {"k": 3.0, "sane": 1.0}, **options)
 
@@ -177,10 +177,10 @@ def records_of_well():
         yield lj.Record(ts, q=q + 0.002 * rng.normal(size=len(ts)), sigma=0.002)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_potential_is_learned(monkeypatch):
-    """With batches: the held-back residuals come down to sigma, the best parameters count, a seed is a course; nothing
-    is compiled a second time, also after an interrupt.
+    """With batches, held-back residuals fall to sigma and the best parameters count; a seed is reproducible; nothing is
+    compiled a second time, even after an interrupt.
     """
     records, net = list(records_of_well()), lj.learned.Network(1.0, key=jax.random.key(0))
     steps = 1000
@@ -217,9 +217,9 @@ def test_a_potential_is_learned(monkeypatch):
     assert np.any(train(1).values != found.values)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_patience():
-    """A rate that is too long ends early, with the guess; twin: patience for more goes on."""
+    """Training with too large a rate ends early, with the guess; twin: with more patience it continues."""
     options = dict(optimiser=optax.sgd(10.0), iterations=200, held_back=[record(5)])
     found = quietly(spring, [record()], {"k": 4.0}, patience=2, **options)
     assert bool(found.training.early) and int(found.steps) == 20 < 200
@@ -229,7 +229,7 @@ def test_patience():
 
 @pytest.mark.exhaustive
 def test_inside_of_a_program():
-    """Under jit, and in lanes, a training is that of a call by itself."""
+    """Under jit and in lanes, a training gives the same as a single call."""
 
     def trained(q):
         held = lj.Record(T, q=np.cos(2 * T), q0=1.0, v0=0.0, sigma=0.01)
@@ -246,9 +246,9 @@ def test_inside_of_a_program():
     np.testing.assert_allclose(scores, np.stack([s for _, s in alone]), rtol=1e-6)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_bounds_forgiveness_and_modules():
-    """Bounds hold, a Huber loss forgives outliers, and a part of params is named as a module."""
+    """Bounds hold, a Huber loss tolerates outliers, and a module in params can be fitted by name."""
     rng = np.random.default_rng(1)
     r = record(3)
     wild = np.where(rng.random(len(T)) < 0.1, 1.0, 0.0)

@@ -169,10 +169,10 @@ def test_derivatives(of):
     """By t the velocity, also at outputs and at both ends; by a parameter as central differences, in both modes."""
     x = lambda moment: jnp.sin(moment.q) if of is swing else moment.q["x"]
     place = lambda g, t: x(of(g=g).at(t))
+    both, gradient = jax.jit(jax.jacfwd(place, argnums=(0, 1))), jax.jit(jax.grad(place))
     for t in (0.0, 0.3, float(TS[3]), 4.0):
         _, v = exact(t)
-        forward, by_t = jax.jit(jax.jacfwd(place, argnums=(0, 1)))(1.0, t)
-        reverse = jax.jit(jax.grad(place))(1.0, t)
+        (forward, by_t), reverse = both(1.0, t), gradient(1.0, t)
         h = 1e-4
         central = (place(1.0 + h, t) - place(1.0 - h, t)) / (2 * h)
         np.testing.assert_allclose((forward, reverse), central, atol=1e-6)

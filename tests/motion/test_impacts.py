@@ -1,4 +1,4 @@
-"""Impacts with friction: closed forms of a ball, all laws at random states, the energy, derivatives, what is none."""
+"""Impacts with friction: closed forms of a ball, all laws at random states, energy, derivatives, invalid friction."""
 
 from typing import Any
 
@@ -33,13 +33,13 @@ def bounce(friction: Any = coefficient, restitution=0.5):
 
 
 def impact(guard, system):
-    """What an impact does to the velocities: (t, q, v, params) -> like v."""
+    """The velocities after an impact, as a function (t, q, v, params) -> like v."""
     found = guard.reset.between(system, system)
     return jax.jit(lambda t, q, v, params: found(t, q, v, params))
 
 
 def after(x, y, phi, mu=0.2, e=0.5, disk=0.4):
-    """In closed form: the velocities after it, and whether it sticks."""
+    """The velocities after an impact in closed form, and whether the contact sticks."""
     slip, share = x + R * phi, disk / (1 + disk)
     holds = abs(slip) * share <= mu * (1 + e) * abs(y)
     push = -share * slip if holds else -np.sign(slip) * mu * (1 + e) * abs(y)
@@ -47,7 +47,7 @@ def after(x, y, phi, mu=0.2, e=0.5, disk=0.4):
 
 
 def test_a_ball_slides_or_sticks():
-    """Sphere and disk on either side of the boundary and next to it; a sticking sphere has v' = (5 v - 2 R ω)/7."""
+    """Spheres and disks slide or stick on either side of the boundary; a sticking sphere has v' = (5 v - 2 R ω)/7."""
     q, found = {"x": 0.0, "y": R, "phi": 0.3}, impact(bounce(), flying)
     velocities = lambda *v, **p: found(0.0, q, dict(zip(("x", "y", "phi"), v)), PARAMS | p)
     edge = 0.2 * 1.5 * 2.0 * 7 / 2
@@ -67,10 +67,10 @@ def test_a_ball_slides_or_sticks():
     v = velocities(1.0, -2.0, 1.6)
     np.testing.assert_allclose(v["x"], (5 * 1.0 - 2 * R * 1.6) / 7, rtol=1e-14)
     np.testing.assert_allclose(velocities(9.0, -2.0, 1.6)["x"], 9.0 - 0.2 * 1.5 * 2.0, rtol=1e-14)
-    # At the boundary the two agree.
+    # At the boundary sliding and sticking agree.
     near = [velocities(edge - R * 1.6 + off, -2.0, 1.6)["phi"] for off in (-1e-9, 1e-9)]
     np.testing.assert_allclose(near[0], near[1], rtol=0, atol=3e-8)
-    # What opens is not hit.
+    # A contact that is opening receives no impulse.
     np.testing.assert_allclose(velocities(1.0, 2.0, 1.6)["x"], 1.0)
     # Twins: no friction, and friction that drives the sliding.
     smooth = impact(lj.touches(above, 0.5), flying)(0.0, q, {"x": 9.0, "y": -2.0, "phi": 1.6}, PARAMS)
@@ -85,7 +85,7 @@ def kinetic(system, q, v, params=PARAMS):
 
 
 def test_a_ball_never_gains():
-    """With any restitution and any velocities an impact of a ball takes energy, or leaves it."""
+    """At any restitution and velocities an impact never increases the energy of a ball."""
     rng = np.random.default_rng(3)
     q, found = {"x": 0.0, "y": R, "phi": 0.3}, impact(bounce(restitution=lambda speed: 0.7 + 0.0 * speed), flying)
     for x, y, phi, mu in rng.normal(size=(40, 4)) * [3.0, 3.0, 20.0, 1.0]:
@@ -125,9 +125,9 @@ def all_solutions(p, v, e=0.0):
 
 
 def test_all_laws_at_random_states():
-    """In 200 random metrics with a constraint that holds there is one solution, and it is found; no energy is gained.
+    """In 200 random metrics with one more constraint the only solution is found, and no energy is gained.
 
-    Twin: impulses in the metric of the coordinates are others.
+    Twin: impulses in the metric of the coordinates differ.
     """
     rng, found, off, modes = np.random.default_rng(0), impact(LAWS, ANY), [], []
     for _ in range(200):
@@ -143,7 +143,7 @@ def test_all_laws_at_random_states():
 
 
 def test_newton_may_gain():
-    """Friction that turns the sliding around, with restitution, can gain energy: Newton's law, as the source says."""
+    """Friction that reverses the sliding can, with restitution by Newton's law, gain energy, as the source says."""
     rng, guard = np.random.default_rng(1), lj.touches(LAWS.gap, 0.9, coefficient, along)
     found, gained = impact(guard, ANY), []
     for _ in range(200):
@@ -158,7 +158,7 @@ def test_newton_may_gain():
 
 @pytest.mark.slow
 def test_sliding_that_is_settled():
-    """A contact that cannot slide keeps its constraints; where friction jams what must slide there is no impulse."""
+    """A contact that cannot slide keeps its constraints; if friction jams one that must slide, there is no impulse."""
     rng = np.random.default_rng(2)
     p, v = anything(rng)
     found, smooth = impact(LAWS, ANY), impact(lj.touches(LAWS.gap, 0.0), ANY)
@@ -182,7 +182,7 @@ def on_wire(name):
 
 @pytest.mark.parametrize("name", ["a wire", "wire"])
 def test_what_holds_goes_by_any_name(name):
-    """It stays on the wire and loses half its speed, whether the constraint's name comes before the gap's or after."""
+    """A bead stays on its wire and halves its speed, whether the constraint's name sorts before the gap's or after."""
     switch, (system,) = on_wire(name).switches[0], on_wire(name).systems
     found = impact(switch.when, system)(0.0, jnp.zeros(2), jnp.array([-8.0, -4.0]), {"mu": 0.1})
     np.testing.assert_allclose(found, [4.0, 2.0], rtol=1e-13)
@@ -190,7 +190,7 @@ def test_what_holds_goes_by_any_name(name):
 
 @pytest.mark.slow
 def test_a_contact_that_jams_is_said():
-    """By name, and with what it came from; the motion is kept up to there."""
+    """A jammed contact is reported by name and cause; the motion up to it is kept."""
     start, ts = (jnp.array([2.0, 1.0]), jnp.zeros(2), {"mu": 5.0}), np.array([0.0, 1.0, 1.2])
     with pytest.raises(RuntimeError, match="(?s)'falls' -> 'falls'.* at t = 1.00963755 .*not finite.*jams.*Fix: less"):
         lj.integrate(on_wire("wire"), *start, ts=ts)
@@ -200,7 +200,7 @@ def test_a_contact_that_jams_is_said():
 
 
 def test_said_by_name():
-    """What is no friction."""
+    """Invalid friction is refused by name."""
     with pytest.raises(ValueError, match="friction is given and sliding is not"):
         lj.touches(above, 0.5, friction=0.2)
     with pytest.raises(ValueError, match="sliding is given and friction is not"):
@@ -223,14 +223,14 @@ HEIGHT, UNTIL = 0.8, 0.6
 
 
 def thrown(given, **options):
-    """A ball thrown from a height with given x and φ velocities and friction, over one impact."""
+    """A ball thrown from a height with given x and φ velocities and friction, through one impact."""
     x, phi, mu = given
     q0, v0 = {"x": 0.0, "y": R + HEIGHT, "phi": 0.0}, {"x": x, "y": 0.0, "phi": phi}
     return lj.integrate(hopping, q0, v0, PARAMS | {"mu": mu}, ts=np.array([0.0, UNTIL]), **options)
 
 
 def thrown_exactly(x, phi, mu):
-    """Where it is in the end, and its angle."""
+    """The final position and angle of the ball, in closed form."""
     fall, speed = np.sqrt(2 * HEIGHT / G), np.sqrt(2 * HEIGHT * G)
     (u, _, spin), _ = after(x, -speed, phi, mu=mu)
     return np.array([x * fall + u * (UNTIL - fall), phi * fall + spin * (UNTIL - fall)])
@@ -238,7 +238,7 @@ def thrown_exactly(x, phi, mu):
 
 @pytest.mark.exhaustive
 def test_thrown_on_a_floor():
-    """Where it is after the impact, the impulse, and both derivatives, for members that slide and that stick."""
+    """Position after the impact, impulse, and derivatives in both modes, for lanes that slide and that stick."""
     members = np.array([[9.0, 1.0, 0.2], [1.0, 1.0, 0.2], [-9.0, 4.0, 0.1]])
 
     def ends(given):
@@ -289,7 +289,7 @@ landing = lj.Hybrid(
 
 @pytest.mark.slow
 def test_it_lands_sliding_or_rolling():
-    """The phase after an impact: one that sticks ends the sliding at once, one that slides ends it later."""
+    """A ball that sticks at the impact rolls at once, one that slides rolls later."""
     fall, ts = np.sqrt(2 * HEIGHT / G), np.array([0.0, UNTIL, 3.0])
     sticking = in_phases(landing, *start(1.0, 1.0), PARAMS, ts=ts)
     assert list(sticking.named_phases()) == ["flying", "rolls", "rolls"]
@@ -297,7 +297,7 @@ def test_it_lands_sliding_or_rolling():
     np.testing.assert_allclose(sticking.v["x"][-1], (5 - 2 * R) / 7, rtol=1e-9)
     slipping = in_phases(landing, *start(9.0, 1.0), PARAMS, ts=ts)
     assert list(slipping.named_phases()) == ["flying", "slides", "rolls"]
-    # Sliding ends as that of 9 and R at 3.5 μ g, of which the impact took 3.5 μ times the speed of the fall.
+    # Sliding at 9 + R decreases at the rate 3.5 μ g; the impact takes off 3.5 μ times the speed of the fall.
     when = (9.0 + R) / (3.5 * 0.2 * G)
     np.testing.assert_allclose(slipping.switches.t[:2], [fall, when], rtol=1e-9)
     np.testing.assert_allclose(slipping.v["x"][-1], (45 - 2 * R) / 7, rtol=1e-9)
@@ -310,13 +310,13 @@ shaken = lj.System(lambda t, q, v, p: 0.5 * v**2 - p["g"] * q, {"table": lj.Holo
 
 
 def on_a_table(leave, **options):
-    """A body on a table that is shaken, with this switch to let go."""
+    """A body on a shaken table; `leave`: the switch that lets it go."""
     land = lj.Switch("flies", to="lies", when=lj.touches(over))
     hybrid = lj.Hybrid({"lies": shaken, "flies": point}, [leave, land], most_switches=4)
     return in_phases(hybrid, 0.0, 0.6, SHAKEN, ts=np.array([0.0, 0.1, 0.2]), estimate_error=False, **options)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_what_lets_go_may_touch_again():
     """A body leaves a shaken table at a² = g, flies, and lands. Twin: one that closes by 1e-9 never does."""
     traj = on_a_table(lj.Switch("lies", to="flies", when=lj.releases("table")), rtol=1e-11)

@@ -1,4 +1,4 @@
-"""The front door: orders, constraints, derivatives, lanes, events, float32."""
+"""`integrate`: accuracy, constraints, derivatives, batches, events, float32."""
 
 import diffrax
 import equinox as eqx
@@ -12,14 +12,14 @@ from lagjax.jax_internals.programs import length
 from tests.plain import not_plain
 from tests.systems import HORIZONTAL, PARAMS, TS, pendulum, pendulum_lagrangian, rod_pendulum
 
-# Swinging hard, from 2 rad at 3 rad/s: nonlinear, and no symmetry that would raise an order.
+# A wide swing, from 2 rad at 3 rad/s: nonlinear, and without a symmetry that would raise an order.
 SWING = (2.0, 3.0)
 SWING_TS = np.array([0.0, 0.26, 0.77, 1.01])
 
 
 @pytest.fixture(scope="module")
 def exact():
-    """The pendulum by its angle at 1e-13, checked against SciPy in `test_against_scipy`."""
+    """The pendulum in its angle at 1e-13, checked against SciPy in `test_against_scipy`."""
     return lj.integrate(pendulum, *SWING, PARAMS, ts=SWING_TS, rtol=1e-13, atol=1e-13)
 
 
@@ -97,7 +97,7 @@ def test_second_derivative_forward():
     ],
 )
 def test_diffrax_adjoints_are_accepted(adjoint):
-    """Each adjoint gives cos(2t)'s derivative by the stiffness of an oscillator."""
+    """Each adjoint gives the derivative of an oscillator's cos(2t) by its stiffness."""
     system = lj.System(lambda t, q, v, params: 0.5 * v**2 - 0.5 * params * q**2)
     mode = jax.jacfwd if isinstance(adjoint, diffrax.ForwardMode) else jax.grad
     final = lambda k: lj.integrate(
@@ -145,7 +145,7 @@ def test_gradient_of_a_batch():
     ],
 )
 def test_gradient_by_a_closed_over_value(transform):
-    """A value that L closes over has its derivative too; before it was lifted, jit(grad) gave zero in silence."""
+    """A value that L closes over has its derivative; before such values were lifted, jit(grad) silently gave zero."""
 
     def final(k):
         oscillator = lj.System(lambda t, q, v, params: 0.5 * v**2 - 0.5 * k * q**2)
@@ -215,7 +215,7 @@ def test_event_time_gradient():
     ids=["default", "8", "5"],
 )
 def test_float32_with_explicit_time(method):
-    """Stages at times of their own stay in float32, also where JAX has float64."""
+    """Stages at intermediate times stay in float32 even if JAX has float64 enabled."""
     driven = lj.System(lambda t, q, v, params: 0.5 * v**2 + params * q * jnp.sin(3 * t))
     ts = np.array([0.0, 1.0, 2.0], np.float32)
     traj = lj.integrate(driven, np.float32(0.0), np.float32(0.0), np.float32(2.0), ts=ts, method=method)
@@ -249,7 +249,7 @@ def test_one_compilation_for_all_tolerances_states_and_parameters():
         traced.clear()
         lj.integrate(system, 1.0 + i, 0.0, {"g": 9.0 + i, "l": 1.25}, ts=TS + i, rtol=tolerance, atol=tolerance)
         traces.append(len(traced))
-    # Two traces a call find shapes; the rest is compilation.
+    # Two traces per call find shapes; the rest is compilation.
     first, *later = traces
     assert sum(later) <= 4 < first
 
@@ -287,7 +287,7 @@ def test_feedback_and_values_closed_over_where_equations_are_not_written_out():
 
 @pytest.mark.slow
 def test_an_empty_batch():
-    """No lanes give no motions: by every kind of method, with constraints, events and derivatives, and printed."""
+    """A batch without lanes gives no motions: with every kind of method, constraints, events, derivatives, printed."""
     nobody = jnp.zeros(0)
     run = lambda q, **options: lj.integrate(pendulum, q, 0.0, PARAMS, ts=TS, **options)
     fell = diffrax.Event(lambda t, y, params, **kwargs: y[0] - 0.9)
@@ -305,7 +305,7 @@ def test_an_empty_batch():
 
 @pytest.mark.slow
 def test_calls_of_the_host_are_the_users():
-    """A force from Python for a time, in one branch, in motion and in a sweep; a check of the user's own."""
+    """A force from Python in one branch works in a motion and in a sweep; so does a check of the user's own."""
     free = lambda t, q, v, p: 0.5 * v**2
     shape = jax.ShapeDtypeStruct((), jnp.float64)
 
@@ -326,11 +326,11 @@ def test_calls_of_the_host_are_the_users():
 
 
 class OwnDopri8(diffrax.Dopri8):
-    """A user's, which stays what it is."""
+    """A user's subclass, which is used unchanged."""
 
 
 class OwnTsit5(diffrax.Tsit5):
-    """Another one."""
+    """Another user's subclass."""
 
 
 SHIPPED = [
@@ -349,7 +349,7 @@ def by_method(method, **options):
 @not_plain
 @pytest.mark.parametrize(("shipped", "ours", "own"), SHIPPED, ids=["Dopri8", "Tsit5"])
 def test_methods_of_diffrax_run_in_our_form(shipped, ours, own):
-    """As it is shipped, one gives our program, and says so; a subclass runs as it is, to the same answer."""
+    """A method of diffrax's gives our program, and says so; a subclass runs unchanged, with the same answer."""
     g, name = jnp.asarray(PARAMS["g"]), type(ours).__name__
     operations = lambda method: length(jax.make_jaxpr(lambda g: by_method(method)(g).q)(g).jaxpr)
     assert operations(shipped) == operations(ours) != operations(own)
@@ -362,7 +362,7 @@ def test_methods_of_diffrax_run_in_our_form(shipped, ours, own):
 
 @pytest.mark.slow
 def test_methods_with_options_stay():
-    """Another method, one with an option set, and one that a condition needs are not ours."""
+    """Other methods, those with an option set, and those that a condition evaluates are not replaced by ours."""
     looped = diffrax.Dopri8(scan_kind="lax")
     method_by = lambda method, **options: (
         jax.eval_shape(by_method(method, **options), jnp.asarray(PARAMS["g"])).static.method

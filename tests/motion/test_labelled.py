@@ -15,13 +15,13 @@ system = lj.System(
 
 
 def thrown(g, ts=TS, **settings):
-    """A stone, and beside it what moves at the speed 2."""
+    """A thrown stone, and a second coordinate that moves at speed 2."""
     q, v = {"r": jnp.array([0.0, 1.0]), "a": 0.0}, {"r": jnp.array([3.0, 4.0]), "a": 2.0}
     return lj.integrate(system, q, v, {"g": g, "who": "me", "w": np.array([1.0, 2.0])}, ts=ts, **settings)
 
 
 def test_one_motion():
-    """Leaves by name, against time; what was integrated, in attributes; values are those of the trajectory."""
+    """Variables by name against time with the trajectory's values; attributes say what was integrated."""
     traj = thrown(10.0)
     data = traj.to_xarray()
     assert data["q.r"].dims == data["v.r"].dims == ("t", "r_0") and data["q.a"].dims == data["table"].dims == ("t",)
@@ -36,7 +36,7 @@ def test_one_motion():
 
 @pytest.mark.slow
 def test_batches():
-    """Axes in front, under their names; parameters are variables, and times that lanes do not share too."""
+    """The batch's axes come first, under their names; parameters, and times that lanes do not share, are variables."""
     lanes = jax.vmap(thrown)(jnp.array([1.0, 10.0]))
     data = lanes.to_xarray()
     assert data["q.r"].dims == ("batch", "t", "r_0") and data["params.g"].dims == ("batch",)
@@ -52,7 +52,7 @@ def test_batches():
 
 @pytest.mark.slow
 def test_phases_and_events():
-    """The phase of each output, in numbers with their meaning; the times of switches."""
+    """The phase of each output as a number with its meaning, and the times of switches."""
     ball = lj.System(lambda t, q, v, params: 0.5 * v**2 - 10.0 * q)
     floor = lj.Switch("air", to="air", when=lambda t, q, v, params: q, reset=lambda t, q, v, params: -0.5 * v)
     data = lj.integrate(lj.Hybrid({"air": ball}, [floor], most_switches=3), 5.0, 0.0, ts=np.array([0.0, 1.5]))

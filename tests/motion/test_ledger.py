@@ -1,4 +1,4 @@
-"""The energy ledger: works in closed form, the balance of every scene, and what must break it."""
+"""The energy ledger: works in closed form, the balance of every scene, and changes that must break it."""
 
 import jax
 import jax.numpy as jnp
@@ -17,12 +17,12 @@ WITH_RUNS = [name for name, scene in SCENES.items() if scene.runs()]
 
 
 def falling(t, q, v, params):
-    """Of unit mass, with g = 10."""
+    """A fall of unit mass, with g = 10."""
     return 0.5 * v**2 - 10.0 * q
 
 
 def drag(t, q, v, params):
-    """-v."""
+    """Rayleigh's function of the force -v."""
     return 0.5 * v**2
 
 
@@ -30,7 +30,7 @@ DRAGGED = lj.System(falling, dissipation=drag)
 
 
 def flipped(system):
-    """The same system with forces and dissipation of the other sign, and constraints that push the other way."""
+    """The system with forces and dissipation of the opposite sign, and constraints that push the other way."""
     constraints = {
         name: lj.Holonomic(lambda t, q, p, g=c.g: -g(t, q, p))
         if isinstance(c, lj.Holonomic)
@@ -50,7 +50,7 @@ def flipped(system):
 
 
 def test_quadrature_is_exact_to_its_degree():
-    """Polynomials up to degree 22; twin: degree 24 is not. What the coarse rule misses is in the estimate."""
+    """Exact for polynomials up to degree 22; twin: not for degree 24. The estimate covers the error at a kink."""
     a, b = np.array([-0.5, 1.0]), np.array([1.0, 0.25])
     powers = np.arange(25)
     found = quadrature.integrals(quadrature.nodes(a, b)[:, :, None] ** powers, a, b)
@@ -102,7 +102,7 @@ def test_the_wedge_takes_what_the_mass_gives():
 
 @pytest.mark.slow
 def test_the_motor_pays_for_the_hoop():
-    """The motor's work is ω ΔL_z, so that E - ω L_z stays: the Jacobi integral of the bead alone."""
+    """The motor's work is ω ΔL_z, so that E - ω L_z, the Jacobi integral of the bead alone, stays constant."""
     params = bead_on_hoop.PARAMS
     traj = lj.integrate(
         bead_on_hoop.driven_system, *bead_on_hoop.driven_start(params, 1.0), params, ts=np.linspace(0.0, 1.0, 6)
@@ -134,7 +134,7 @@ def test_time_and_velocities_that_are_prescribed():
 
 @pytest.mark.slow
 def test_backward():
-    """Works backward have the other sign; an interval between outputs may be as long as it likes."""
+    """Backward in time works have the opposite sign; an interval between outputs may have any length."""
     there = lj.integrate(DRAGGED, 5.0, 0.0, ts=np.array([0.0, 20.0]))
     back = lj.integrate(DRAGGED, there.q[-1], there.v[-1], ts=np.array([20.0, 17.0]))
     ledgers = [lj.energy_ledger(traj) for traj in (there, back)]
@@ -144,7 +144,7 @@ def test_backward():
 
 @pytest.mark.slow
 def test_impacts():
-    """A ball loses 1 - e² of what it has at each impact, and drag the rest; an output may be at one."""
+    """A ball loses 1 - e² of its energy at each impact, and drag takes the rest; an output may be at an impact."""
     ball = DRAGGED
     floor = lj.Switch("flying", to="flying", when=lj.touches(lambda t, q, params: q, 0.5))
     hybrid = lj.Hybrid({"flying": ball}, [floor], most_switches=4)
@@ -158,13 +158,13 @@ def test_impacts():
         np.testing.assert_allclose(ledger.impacts, -0.5 * (1 - 0.25) * speeds**2, rtol=1e-9)
         assert ledger.closes and ledger.switches == ("flying -> flying",) * 2
         assert not lj.energy_ledger(traj, lj.Hybrid({"flying": flipped(ball)}, [floor], most_switches=4)).closes
-    # Whether the output is before the impact or behind it is in its velocity.
+    # The velocity tells whether the output is before or after the impact.
     assert (ledger.impact_total[1] == 0) == (at_impact.v[1] < 0) and "2 switches" in repr(ledger)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_friction_on_a_multiplier():
-    """A sphere that slides, and rolls from then on: two sevenths of its energy go; twin: friction of the other sign."""
+    """A sphere that slides and then rolls loses two sevenths of its energy; twin: friction of the opposite sign."""
     traj = throw(0.25, estimate_error=False)
     ledger = lj.energy_ledger(traj)
     assert len(traj.switches) == 1 and ledger.relative_closure < 100 * RTOL
@@ -176,12 +176,12 @@ def test_friction_on_a_multiplier():
 @pytest.mark.slow
 @pytest.mark.parametrize("scene", exhaustive_but(("sliding_wedge", "cross_rails"), WITH_RUNS))
 def test_every_scene_closes(scene):
-    """To a hundred tolerances, on every run of the main job; with flipped forces it does not."""
+    """Every run of a scene closes to a hundred tolerances; twin: with flipped forces it does not."""
     for run in SCENES[scene].runs():
         traj = lj.integrate(run.system, run.q0, run.v0, run.params, ts=run.ts, events=run.events, estimate_error=False)
         ledger = lj.energy_ledger(traj)
         assert ledger.relative_closure < 100 * RTOL, run.name
-        # What L itself does by explicit time has no sign to flip.
+        # The work of explicit time in L has no sign to flip.
         others = [work for name, work in ledger.sources() if name != "explicit time"]
         if any(np.ptp(work.total) > 1e-3 * ledger.scale for work in others):
             wrong = lj.energy_ledger(traj, flipped(run.system))
@@ -190,7 +190,7 @@ def test_every_scene_closes(scene):
 
 @pytest.mark.exhaustive
 def test_tolerances():
-    """It closes to a hundred tolerances at loose ones, too, and in float32."""
+    """The ledger closes to a hundred tolerances also at loose ones, and in float32."""
     system = lj.System(lambda t, q, v, params: 0.5 * v**2 + jnp.cos(q) * (1 + 0.2 * jnp.sin(3 * t)), dissipation=drag)
     for rtol in (1e-4, 1e-7, 1e-11):
         ledger = lj.energy_ledger(lj.integrate(system, 2.0, 1.0, ts=np.array([0.0, 7.0, 20.0]), rtol=rtol))
@@ -202,7 +202,7 @@ def test_tolerances():
 
 @pytest.mark.slow
 def test_settings_are_those_of_the_motion():
-    """A stiff decay by Radau5, with forces that jump: the motion is run again as it was."""
+    """A stiff decay by Radau5, with forces that jump: the motion is integrated again with the same settings."""
     push = lambda t, q, v, params: jnp.where(t < 1.0, 2.0, 0.0)
     system = lj.System(lambda t, q, v, params: 0.5 * v**2, force=push, dissipation=lambda t, q, v, params: 500 * v**2)
     ts = np.array([0.0, 0.7, 3.0])
@@ -215,7 +215,7 @@ def test_settings_are_those_of_the_motion():
 
 
 def test_bad_input():
-    """What is no single motion that was computed is refused, with what to do."""
+    """Anything but a single computed motion is refused, with a remedy."""
     of = lambda q0: lj.integrate(DRAGGED, q0, 0.0, ts=np.array([0.0, 1.0]))
     with pytest.raises(TypeError, match="made of a motion that was computed, not of float"):
         lj.energy_ledger(3.0)

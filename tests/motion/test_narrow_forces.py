@@ -1,4 +1,4 @@
-"""Forces that act for a short time or on a short way: `max_step` and `jump_ts`."""
+"""Forces that act for a short time or over a short distance: `max_step` and `jump_ts`."""
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +15,7 @@ START, STOP = 50.25, 50.35
 
 
 def push(t, q, v, params):
-    """10 in between."""
+    """A force of 10 between START and STOP."""
     return jnp.where((t >= START) & (t < STOP), 10.0, 0.0)
 
 
@@ -25,7 +25,7 @@ AFTER = 0.05 + (100.0 - STOP)
 
 
 def test_a_pulse():
-    """Steps of a tenth of the span see nothing of it; those limited by `max_step` do, and `jump_ts` makes it exact."""
+    """Steps of a tenth of the span miss the pulse; steps limited by `max_step` meet it; `jump_ts` makes it exact."""
     run = lambda **limits: lj.integrate(pushed, 0.0, 0.0, ts=CALM, **limits)
     missed = run()
     assert missed.q[-1] == 0.0 and missed.stats["num_steps"] < 10
@@ -38,7 +38,7 @@ def test_a_pulse():
 
 @pytest.mark.slow
 def test_outputs_meet_a_pulse():
-    """No step is longer than the time between two outputs: asked for every 0.05, the pulse is met."""
+    """No step is longer than the time between two outputs: with outputs every 0.05 the pulse is met."""
     traj = lj.integrate(pushed, 0.0, 0.0, ts=np.linspace(0.0, 100.0, 2001))
     np.testing.assert_allclose(traj.q[-1], AFTER, rtol=1e-6)
 
@@ -67,7 +67,7 @@ def test_a_barrier():
 @pytest.mark.slow
 @pytest.mark.parametrize("method", exhaustive_but((lj.Radau5,), (lj.Nystrom12, lj.Dopri8, lj.Tsit5, lj.Radau5)))
 def test_outputs_at_and_beside_jumps(method):
-    """Outputs at the jumps, within a round-off of them, and between; each method restarts there."""
+    """Outputs at the jumps, within round-off of them, and between; each method restarts at a jump."""
     beside = np.nextafter(START, 100.0)
     ts = np.array([0.0, 10.0, START, beside, 50.3, STOP, 60.0, 100.0])
     traj = lj.integrate(pushed, 0.0, 0.0, ts=ts, jump_ts=[START, STOP], method=method())
@@ -79,7 +79,7 @@ def test_outputs_at_and_beside_jumps(method):
 
 @pytest.mark.slow
 def test_jumps_backward_with_constraints_and_lanes():
-    """A rod driven by a switched torque: rejected steps are few, and the way back is the way there."""
+    """A rod driven by a switched torque: few steps are rejected, and integrating backward retraces the motion."""
     rod = lj.Holonomic(lambda t, q, params: q["x"] ** 2 + q["y"] ** 2 - 1.0)
     torque = lambda t, params: jnp.where((t >= params["on"]) & (t < params["on"] + 0.3), 4.0, 0.0)
     system = lj.System(
@@ -112,7 +112,7 @@ def test_jumps_backward_with_constraints_and_lanes():
 def test_derivatives_by_the_time_of_a_jump():
     """A fall, and a force F from t_on: q(T) = v0 T - g/2 T² + F/2 (T - t_on)², differentiated in both modes.
 
-    An output at the jump itself does not move with it: as before the jump, its derivative is zero.
+    An output at the jump itself does not depend on the jump: its derivative is zero, as before the jump.
     """
     switched = lj.System(
         lambda t, q, v, params: 0.5 * v**2 - params["g"] * q,
@@ -139,7 +139,7 @@ def test_derivatives_by_the_time_of_a_jump():
 
 
 def test_the_times_that_steps_end_at():
-    """Jumps outside the span and repeated times are left out; a step beside a jump keeps to its side of it."""
+    """Jumps outside the span and repeated times are left out; a step next to a jump stays on its side of it."""
     ts, jump_ts = jnp.array([0.0, 1.0, 2.0]), jnp.array([1.5, 1.0, -1.0, 7.0])
     np.testing.assert_array_equal(together(ts, jump_ts), [0.0, 1.0, 1.5, 2.0, 2.0, 2.0, 2.0])
     t0, t1, made_jump = between_jumps(jnp.asarray(1.0), jnp.asarray(1.5), jump_ts, False)

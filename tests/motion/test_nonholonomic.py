@@ -1,7 +1,7 @@
 """Velocity constraints in motion, against closed forms: rolling, skating, cruising, driven in time.
 
-Each system has its twin in NumPy: `M a = F + Aᵀ λ`, `A a = gamma` written out by hand and integrated by SciPy. Whole,
-the twin follows the closed form; with one of the usual errors built in, it leaves it. So the closed form would show
+Each system has its twin in NumPy: `M a = F + Aᵀ λ`, `A a = gamma` written out by hand and integrated by SciPy. The
+correct twin follows the closed form; with one of the usual errors built in, it deviates. So the closed form would show
 that error here too:
 
     half Chetaev     the force of λ is ½ Aᵀ λ: phi differentiated as if it were linear in v
@@ -323,7 +323,7 @@ def test_cruise():
 
 
 def test_cruise_would_show_an_error():
-    """Half of Chetaev's force leaves the motion of a single constraint as it is and doubles μ: it is seen there."""
+    """Half of Chetaev's force does not change the motion of a single constraint but doubles μ, where it is seen."""
     ts = np.array([0.0, 0.5, 1.0, 2.0])
     q, v, multiplier = (np.asarray(part).T for part in cruise_exact(CRUISE, ts))
     start = np.concatenate([q[:, 0], v[:, 0]])
@@ -474,7 +474,7 @@ COIN_TS = np.linspace(0.0, 3.0, 16)
 
 @pytest.mark.slow
 def test_tilted_disk_rolls_steadily():
-    """At the spin that its tilt asks for, a disk rolls on a circle; the contact carries m g, and m R ω₃ Ω inwards."""
+    """At the spin required by its tilt, a disk rolls on a circle; the contact carries m g, and m R ω₃ Ω inwards."""
     tilt, turn = 1.125, 2.5
     spin = steady_spin(COIN, tilt, turn)
     q0, v0 = coin_state(COIN, 0.0, tilt, 0.0, turn * np.sin(tilt), spin)
@@ -513,7 +513,7 @@ def test_wobbling_disk():
     assert departure(found, y[[0, 1, 2, 5, 6]]) < 1e-10
     assert departure(tight.multipliers["rolling"].T, force[:2]) < 1e-9
     assert departure([tight.multipliers["contact"]], force[2:]) < 1e-9
-    # It does wobble, and the force of the contact with it.
+    # The disk really wobbles, and so does the contact force.
     assert np.ptp(y[1]) > 0.05 and np.ptp(force[2]) > 1.0
     assert float(tight.drift()) < 1e-10
     assert float(loose.residual()) < ROUND_OFF
@@ -562,7 +562,7 @@ def ball_exact(params, ts, start, rate):
 
 @pytest.mark.slow
 def test_ball_on_a_turntable_of_varying_speed():
-    """The ball's centre turns at 2/7 of the table's speed, also while that changes; λ is the friction m r̈."""
+    """The ball's centre turns at 2/7 of the table's speed, even while that changes; λ is the friction m r̈."""
     ts = np.linspace(0.0, 4.0, 17)
     start, rate = 0.5 + 0.25j, 0.375 - 0.5j
     z, dz, ddz = ball_exact(TABLE, ts, start, rate)
@@ -617,7 +617,7 @@ INSIDE = {"m": 1.5, "rho": 1.25, "R": 0.25, "I": 0.0625, "g": 9.8125}
 
 @pytest.mark.slow
 def test_semi_holonomic_rolling_over_a_long_run():
-    """After 100 swings ρ θ + R φ is what it was, at the tolerance, though only its rate is constrained."""
+    """After 100 swings ρ θ + R φ is unchanged within the tolerance, though only its rate is constrained."""
     special = pytest.importorskip("scipy.special")
     m, rho, radius, g = (INSIDE[name] for name in ("m", "rho", "R", "g"))
     inertia = INSIDE["I"] / radius**2
@@ -645,7 +645,7 @@ def test_semi_holonomic_rolling_over_a_long_run():
 
 
 def test_returning_to_a_velocity_constraint_leaves_positions():
-    """Without a position constraint q stays, bit for bit; v moves to the nearest that rolls, in the metric of M."""
+    """Without a position constraint q is unchanged bit for bit; v moves to the nearest rolling one by the metric M."""
     rng = np.random.default_rng(3)
     x, u = rng.normal(size=(2, 4))
     names = ("angle", "heading", "x", "y")
@@ -660,7 +660,7 @@ def test_returning_to_a_velocity_constraint_leaves_positions():
 
 
 def test_returning_to_the_plane_rolls():
-    """With both kinds, positions move only as the rolling allows: a disk lifted off its plane does not slide."""
+    """With both kinds of constraint, positions move only as rolling allows: a lifted disk does not slide."""
     q, v = coin_state(COIN, 0.25, 1.25, 0.375, 1.5, -6.0)
     lifted = q | {"z": q["z"] + 1e-4}
     state = 0.0, lifted, v
@@ -733,14 +733,14 @@ def test_an_error_in_the_equations_would_show(flaw, monkeypatch):
 
     monkeypatch.setattr(constraints, "acceleration_rows", rows)
     monkeypatch.setattr(saddle_point, "saddle_point", acting)
-    # Functions that differ in something: the compiled programs of the true equations are not used.
+    # The functions differ by `of`, so that the compiled programs of the true equations are not reused.
     system = lj.System(
         lambda t, q, v, params, of=flaw: thrown(t, q, v, params),
         {"drive": lj.Nonholonomic(lambda t, q, v, params, of=flaw: driving(t, q, v, params))},
     )
     ts = np.linspace(0.0, 4.0, 9)
     q, v, force = driven_exact(DRIVEN, ts)
-    # A method that is not ours: what is written out solves the same equations with an elimination of its own.
+    # A method that is not ours: the written-out equations would use their own elimination, not this one.
     method = diffrax.Dopri8(scan_kind="lax")
     traj = lj.integrate(system, q[:, 0], v[:, 0], DRIVEN, ts=ts, rtol=TIGHT, atol=TIGHT, method=method)
     off = departure([traj.q.T, traj.v.T, traj.multipliers["drive"]], [q, v, force])

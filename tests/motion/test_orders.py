@@ -1,7 +1,7 @@
 """The order of every method, measured; and gradients through a thousand constrained steps.
 
-One motion in two forms: a double pendulum by its angles (the mass matrix turns with them), and as two masses on rods
-(the constraints' multipliers are the tensions). Its reference is the textbook equation by SciPy, good to 2e-13.
+One motion in two forms: a double pendulum by its angles (its mass matrix depends on them), and as two masses on rods
+(the constraints' multipliers are the tensions). The reference is the textbook equation by SciPy, good to 2e-13.
 Small angles, so that a step of order eight is already in its asymptotic range while its error is far above round-off;
 many outputs, all between steps, so that no single phase of a step decides.
 
@@ -30,7 +30,7 @@ ROD_SWING = jax.tree.map(np.asarray, rods_from_angles(*DOUBLE_SWING, DOUBLE_PARA
 
 
 def tension_multipliers(q, v):
-    """The multipliers (T, 2) of a state: each rod's length stays, `r·a = -v²`, under gravity and both rods' pull."""
+    """The multipliers (T, 2) of states: each rod keeps its length, `r·a = -v²`, under gravity and both rods' pull."""
     m1, m2, g = (DOUBLE_PARAMS[name] for name in ("m1", "m2", "g"))
     r, d = q["first"], q["second"] - q["first"]
     u, w = v["first"], v["second"] - v["first"]
@@ -80,7 +80,7 @@ def run(form, method, dt, ts=OUTPUTS):
 
 
 def computed(form, traj):
-    """What a trajectory says, in the layout of `exact`."""
+    """The values of a trajectory, in the layout of `exact`."""
     if form == "free":
         return {"q": traj.q, "v": traj.v}
     multipliers = np.stack([traj.multipliers["inner"], traj.multipliers["outer"]], axis=-1)
@@ -102,16 +102,16 @@ def within(order, measured):
 # A constant step leaves an implicit method no error estimate to take its root finder's tolerance from.
 NEWTON = optx.Newton(rtol=1e-10, atol=1e-12, norm=optx.max_norm)
 
-# Steps a unit of time: errors from 1e-1 (Euler) down to 7e-12 (Tsit5, free), 50 times the reference's.
+# Steps per unit of time: errors from 1e-1 (Euler) down to 7e-12 (Tsit5, free), 50 times the reference's.
 FAST = [(lj.Tsit5(), 5, (112, 160, 224)), (lj.Dopri8(), 8, (18, 22, 28))]
 
 
 class ShippedDopri8(diffrax.Dopri8):
-    """Diffrax's own: as it is shipped it would run in our form."""
+    """diffrax's own Dopri8: an instance of the original class would run in our form."""
 
 
 SLOW = [(lj.Radau5(root_finder=SimplifiedNewton(rtol=1e-12, atol=1e-12)), 5, (28, 40, 56))]
-# One of each kind that diffrax has: the rest differ in their numbers alone.
+# One of each kind that diffrax has: the others differ only in their coefficients.
 OTHERS = [
     (ShippedDopri8(), 8, (18, 22, 28)),
     (diffrax.Kvaerno5(root_finder=NEWTON), 5, (28, 40, 56)),
@@ -130,7 +130,7 @@ TIERS = {
 
 
 def cases():
-    """Every method free and projected, in its tier."""
+    """Every method, free and projected, in its tier."""
     for method, order, steps in FAST + SLOW + OTHERS:
         for form in ("free", "constrained"):
             case = name_of(method), form

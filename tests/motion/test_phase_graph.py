@@ -19,13 +19,13 @@ PHASES = {
 
 
 def edge(t, q, v, params):
-    """How far the table goes on."""
+    """The distance to the edge of the table."""
     return 3.0 - q["x"]
 
 
 @pytest.fixture(scope="module")
 def explanation():
-    """Of a stone on the table that slides with 2."""
+    """The explanation of a stone that slides on the table at speed 2."""
     touches = lj.touches(lambda t, q, params: q["y"], 0.5)
     switches = [
         lj.Switch("flying", to="flying", when=touches, rest="sliding"),
@@ -36,7 +36,7 @@ def explanation():
 
 
 def test_phases_and_guards(explanation):
-    """Freedoms of each phase, values of the guards with its own multipliers, and phases without a way in or out."""
+    """Degrees of freedom of each phase, guards with its own multipliers, and phases without a way in or out."""
     assert [found.degrees_of_freedom for found in explanation.phases.values()] == [2, 1, 2]
     assert [(phase, to) for phase, to, _, _ in explanation.switches] == [
         ("flying", ("flying", "sliding")), ("sliding", ("flying",)), ("sliding", ("flying",)),
@@ -49,14 +49,14 @@ def test_phases_and_guards(explanation):
 
 
 def test_elsewhere_guards_have_no_value():
-    """Where the state is none of a phase, its guards are not evaluated."""
+    """The guards of a phase to which the state does not belong are not evaluated."""
     hybrid = lj.Hybrid(PHASES, [lj.Switch("sliding", to="flying", when=lj.releases("table"))])
     found = lj.explain(hybrid, 0.0, {"x": 1.0, "y": 5.0}, {"x": 2.0, "y": 0.0})
     assert found.switches[0][3] is None and "now" not in repr(found)
 
 
 def test_picture(explanation):
-    """A name each phase, an arrow each way out."""
+    """The picture has a name for each phase, and an arrow for each switch."""
     axis = explanation.plot().axes[0]
     words = [text.get_text() for text in axis.texts]
     assert [word for word in words if word] == ["touches", "touches", "edge", "releases", *PHASES]

@@ -1,4 +1,4 @@
-"""Motion under redundant constraints: motion, derivatives and lanes are those of the system without them."""
+"""Motion under redundant constraints: motion, derivatives and batches are those of the system without redundancy."""
 
 import diffrax
 import jax
@@ -33,7 +33,7 @@ def test_pendulum_on_two_rods():
 def test_door_swings_like_its_angle(drift):
     """A door with 18 equations of which 11 are independent follows its one-angle equation, whatever the drift control.
 
-    The equations depend on each other only where they hold: solved with all of them, the door would fly off.
+    The equations are dependent only where they hold: solved with all of them, the door would fly off.
     """
     field = DOOR_STATE[3]["field"]
     by_angle = lj.System(lambda t, q, v, params: 0.5 * 2 * v**2 + 2 * (field[0] * jnp.cos(q) + field[1] * jnp.sin(q)))
@@ -48,7 +48,7 @@ def test_door_swings_like_its_angle(drift):
 
 
 def outcome(system, x):
-    """The end of the pendulum on its rods, and the force that they exert together."""
+    """The end of the pendulum on its rods, and the total force of the rods."""
     q = {"x": 0.8 * x["l"], "y": 0.6 * x["l"]}
     v = {"x": -0.6 * x["v"], "y": 0.8 * x["v"]}
     traj = lj.integrate(
@@ -66,7 +66,7 @@ two_rods = lj.System(
 
 @pytest.mark.exhaustive
 def test_derivatives_in_lanes():
-    """Reverse derivatives of end and force, in lanes, are the forward ones of the pendulum in its angle."""
+    """Reverse derivatives of end and force, in a batch, are the forward ones of the pendulum in its angle."""
     lanes = {"g": jnp.array([9.8, 5.0]), "l": jnp.array([1.25, 2.0]), "v": jnp.array([2.5, -1.0])}
     one = lambda x: jnp.stack(outcome_of_one(x))
     got = jax.vmap(jax.jacrev(lambda x: outcome(two_rods, x)))(lanes)
@@ -90,7 +90,7 @@ def outcome_of_one(x):
 
 @pytest.mark.exhaustive
 def test_redundancy_that_ends_is_reported():
-    """Two rods of equal length agree; once one of them grows, no motion satisfies both, and that is said."""
+    """Two rods of equal length agree; once one of them grows, no motion satisfies both, and this is reported."""
     grows = lj.Holonomic(lambda t, q, params: rod(t, q, params) - jnp.where(t > 0.5, (t - 0.5) ** 3, 0.0))
     system = lj.System(cartesian_lagrangian, {"rod": lj.Holonomic(rod), "grows": grows})
     with pytest.raises(RuntimeError, match="stopped at t = 0.5"):

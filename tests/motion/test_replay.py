@@ -16,25 +16,25 @@ PARAMS = {"g": 9.81, "l": 2.0}
 
 @pytest.fixture(autouse=True)
 def in_reverse(monkeypatch):
-    """Few numbers are replayed, too; each test has systems of its own, since JAX keeps what it has transformed."""
+    """Replay also with few parameters; each test makes its own systems, since JAX caches what it has transformed."""
     monkeypatch.setattr(both_modes, "PUSH_UP_TO", 0)
 
 
 def pendulum(drag=0.05):
-    """In its angle."""
+    """A pendulum described by its angle."""
     lagrangian = lambda t, q, v, p: 0.5 * p["l"] ** 2 * v**2 + p["g"] * p["l"] * jnp.cos(q)
     return lj.System(lagrangian, dissipation=lambda t, q, v, p: 0.5 * drag * v**2)
 
 
 def rod(copies=1):
-    """The same in the plane on a rod, or on several that say the same."""
+    """The same pendulum in the plane on a rod, or on several equivalent constraints."""
     lagrangian = lambda t, q, v, p: 0.5 * (v["x"] ** 2 + v["y"] ** 2) - p["g"] * q["y"]
     hold = lambda c: lj.Holonomic(lambda t, q, p: c * (q["x"] ** 2 + q["y"] ** 2 - p["l"] ** 2))
     return lj.System(lagrangian, {f"rod {i}": hold(i + 1.0) for i in range(copies)})
 
 
 def end(system, q0, v0, params, ts=TS, **options):
-    """A number that all outputs have a part in, some of them more than others; NaN does not count."""
+    """A number that depends on all outputs, with different weights; NaN does not count."""
     traj = lj.integrate(system, q0, v0, params, ts=ts, rtol=1e-10, throw=False, **options)
     weights = np.linspace(1.0, 2.0, len(ts))
     rows = jax.tree.leaves((traj.q, traj.v, traj.multipliers))
@@ -43,7 +43,7 @@ def end(system, q0, v0, params, ts=TS, **options):
 
 
 def modes_agree(function, x, rtol=1e-8):
-    """Reverse mode's derivatives, which are forward mode's."""
+    """Check that both modes agree; return the derivatives."""
     reverse, forward = jax.jit(jax.grad(function))(x), jax.jit(jax.jacfwd(function))(x)
     largest = max(float(jnp.max(jnp.abs(d))) for d in jax.tree.leaves(forward))
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=rtol, atol=rtol * largest), reverse, forward)
@@ -51,7 +51,7 @@ def modes_agree(function, x, rtol=1e-8):
 
 
 def test_a_pendulum_by_parameters_state_and_times():
-    """By g, l, the first state and all output times."""
+    """The modes agree on derivatives by g, l, the first state and all output times."""
     system = pendulum()
     modes_agree(lambda x: end(system, *x[:2], x[2], x[3]), (0.75, 0.25, PARAMS, jnp.asarray(TS)))
 
@@ -71,10 +71,10 @@ def test_a_cotangent_that_is_dropped_is_seen(monkeypatch):
         modes_agree(lambda p: end(system, 0.75, 0.25, p), PARAMS)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("room", exhaustive_but(((4, 2),), ((16, 64), (16, 4), (4, 2))))
 def test_more_steps_than_there_is_room_for(monkeypatch, room):
-    """Steps run again from the places that are kept, each of them or every other one, are the same steps."""
+    """Steps run again from checkpoints, from all of them or from every other one, are the same steps."""
     of = lambda system: jax.grad(lambda p: end(system, 0.75, 0.25, p, method=lj.Tsit5()))(PARAMS)
     expected, (rows, places) = of(pendulum()), room
     monkeypatch.setattr(recording, "ROWS", rows)
@@ -87,7 +87,7 @@ def test_more_steps_than_there_is_room_for(monkeypatch, room):
 
 @pytest.mark.slow
 def test_lanes_that_fail_have_no_part():
-    """A lane without mass does not start; the derivatives by what lanes share are those of the others, its own zero."""
+    """A lane without mass does not start: it adds nothing to derivatives by shared parameters, and its own are zero."""
     heavy = lj.System(lambda t, q, v, p: 0.5 * p["m"] * v**2 - 0.5 * p["k"] * q**2)
     one = lambda k, m: end(heavy, 0.5, 0.0, {"k": k, "m": m})
     derivatives = jax.jit(jax.grad(lambda k, m, w: jnp.sum(w * jax.vmap(one, (None, 0))(k, m)), (0, 1)))
@@ -97,10 +97,10 @@ def test_lanes_that_fail_have_no_part():
     np.testing.assert_allclose(by_m, m, rtol=1e-12)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("kind", exhaustive_but(((8, 3), (72, 1)), ((8, 3), (72, 1), (72, 3), (8, 1))))
 def test_networks_as_matrices(kind):
-    """Stages in a loop and as copies; two coordinates of unlike masses, by the weights, the masses and the start."""
+    """Stages in a loop and as copies; two coordinates of different masses; by the weights, the masses and the start."""
     hidden, lanes = kind
     random = np.random.default_rng(0)
     w = [random.normal(size=(2, hidden)), random.normal(size=(hidden, hidden)) / hidden, random.normal(size=hidden)]
@@ -126,7 +126,7 @@ def test_networks_as_matrices(kind):
 
 @pytest.mark.slow
 def test_differences_on_the_same_steps():
-    """Where each step goes from one output to the next, a difference quotient of whole motions has the same steps."""
+    """If each step goes from one output to the next, a difference quotient of whole motions uses the same steps."""
     system, ts = pendulum(), np.linspace(0.0, 2.0, 41)
     function = jax.jit(lambda l: end(system, 0.75, 0.25, PARAMS | {"l": l}, ts, dt0=0.05))
     assert lj.integrate(system, 0.75, 0.25, PARAMS, ts=ts, rtol=1e-10, dt0=0.05).stats["num_steps"] == len(ts) - 1
@@ -138,7 +138,7 @@ def test_differences_on_the_same_steps():
 @pytest.mark.slow
 @pytest.mark.parametrize("copies", exhaustive_but((2,), (1, 2)))
 def test_constraints_and_their_multipliers(copies):
-    """A rod, and two that say the same, whose steps are taken the robust way; in lanes, and from a turning point."""
+    """A rod, and two equivalent ones, whose steps use the robust solve; in a batch, and from a turning point."""
     system, q0 = rod(copies), {"x": 2.0, "y": 0.0}
     one = lambda vy, p: end(system, q0, {"x": 0.0, "y": vy}, p)
     modes_agree(lambda x: jnp.sum(jax.vmap(one, (0, None))(*x)), (jnp.array([0.0, 0.5]), PARAMS))
@@ -146,7 +146,7 @@ def test_constraints_and_their_multipliers(copies):
 
 @pytest.mark.slow
 def test_at_rest():
-    """Hanging still, the derivatives are finite, and those of the linear equation."""
+    """For a pendulum hanging still the derivatives are finite, and equal those of the linear equation."""
     system = pendulum(drag=0.0)
     by_q = jax.grad(lambda q: lj.integrate(system, q, 0.0, PARAMS, ts=TS, rtol=1e-10, atol=1e-10).q[-1])(0.0)
     np.testing.assert_allclose(by_q, np.cos(np.sqrt(9.81 / 2.0) * TS[-1]), rtol=1e-8)
@@ -155,7 +155,7 @@ def test_at_rest():
 @pytest.mark.slow
 @pytest.mark.parametrize("method", exhaustive_but((None,), (None, diffrax.Kvaerno5())))
 def test_implicit_methods(method):
-    """A stiff spring: by the implicit function theorem at each step."""
+    """A stiff spring: derivatives by the implicit function theorem at each step."""
     system = lj.System(
         lambda t, q, v, p: 0.5 * v**2 - 0.5 * p["k"] * q**2, dissipation=lambda t, q, v, p: 0.5 * p["c"] * v**2
     )
@@ -164,7 +164,7 @@ def test_implicit_methods(method):
 
 @pytest.mark.slow
 def test_a_force_that_jumps():
-    """By the time of the jump, which is an end of steps."""
+    """The modes agree on the derivative by the time of the jump, which is the end of a step."""
     system = lj.System(
         lambda t, q, v, p: 0.5 * v**2 - 0.5 * q**2, force=lambda t, q, v, p: jnp.where(t > p["s"], p["f"], 0.0)
     )
@@ -172,13 +172,13 @@ def test_a_force_that_jumps():
 
 
 def falling():
-    """A stone in its height."""
+    """A falling stone, described by its height."""
     return lj.System(lambda t, q, v, p: 0.5 * v**2 - p["g"] * q)
 
 
 @pytest.mark.slow
 def test_an_event():
-    """The time, velocity and last output of a fall to the floor."""
+    """Derivatives of the end time, the end velocity and the outputs of a fall to the floor."""
     stone, floor = falling(), lj.Crossing(lambda t, q, v, p: q, direction=-1)
 
     def function(x):
@@ -191,9 +191,9 @@ def test_an_event():
     np.testing.assert_allclose(found["g"], by_g, rtol=1e-9)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_two_switches():
-    """A ball that bounces twice."""
+    """The modes agree on a ball that bounces twice."""
     bounce = lj.Switch("up", to="up", when=lambda t, q, v, p: q, reset=lambda t, q, v, p: -p["e"] * v)
     bouncing = lj.Hybrid({"up": falling()}, [bounce], most_switches=3)
     at = np.array([0.0, 0.25, 0.75, 1.0])
@@ -202,7 +202,7 @@ def test_two_switches():
 
 
 def long_swing():
-    """A pendulum of thirty numbers over two thousand of its times, and the derivative of its last angle by them."""
+    """The derivative of a pendulum's last angle, after a time of 2000, by its thirty parameters."""
     system = lj.System(lambda t, q, v, p: 0.5 * v**2 + jnp.sum(p) * jnp.cos(q))
     end = lambda p, adjoint: lj.integrate(system, 1.0, 0.0, p, ts=np.array([0.0, 2e3]), adjoint=adjoint).q[-1]
     return lambda adjoint: jax.jit(jax.grad(lambda p: end(p, adjoint)))
@@ -210,14 +210,14 @@ def long_swing():
 
 @pytest.mark.slow
 def test_a_budget_of_memory(monkeypatch):
-    """A record is as large as was asked for, and pieces that are stepped through again meet, whatever is rounded."""
+    """A record has the requested size, and pieces that are run again meet whatever the round-off."""
     at, swing = jnp.full(30, 1 / 30), long_swing()
     whole, pieces = (swing(lj.Replay(memory=memory)) for memory in (1e6, 1e5))
     assert 0.8e6 < whole.lower(at).compile().memory_analysis().temp_size_in_bytes < 1.2e6
     assert 0.8e5 < pieces.lower(at).compile().memory_analysis().temp_size_in_bytes < 1.2e5
     np.testing.assert_allclose(pieces(at), whole(at), rtol=1e-6)
     until = recording._until
-    # The steps that are taken again are longer from the first on.
+    # The repeated steps are longer, from the first one on.
     longer = lambda p, run, *rest: until(
         p, run._replace(place=run.place._replace(t1=run.place.t + 1.01 * (run.place.t1 - run.place.t))), *rest
     )
@@ -233,11 +233,11 @@ def test_a_budget_of_memory(monkeypatch):
 
 
 def test_a_budget_that_is_none():
-    """In the user's words."""
+    """A budget that is too small, not positive or not usable is refused with a remedy."""
     with pytest.raises(ValueError, match=r"(?s)has no room.*Fix: lj.Replay\(memory=5e3\)"):
         long_swing()(lj.Replay(memory=100.0))(jnp.ones(30))
     with pytest.raises(ValueError, match="positive number of bytes"):
         lj.Replay(memory=-1.0)
     constant = dict(stepsize_controller=diffrax.ConstantStepSize(), dt0=0.01)
-    with pytest.raises(ValueError, match="which is not kept with a stepsize_controller"):
+    with pytest.raises(ValueError, match="none is kept with a stepsize_controller"):
         lj.integrate(pendulum(), 1.0, 0.0, PARAMS, ts=TS, adjoint=lj.Replay(memory=1e6), **constant)

@@ -1,4 +1,4 @@
-"""Reverse mode by replay equals forward mode on the scenes and the mechanisms, and in lanes of them."""
+"""Reverse mode by replay equals forward mode on the scenes and the mechanisms, and in batches of them."""
 
 import jax
 import jax.numpy as jnp
@@ -23,12 +23,12 @@ OUTPUTS = 7
 
 @pytest.fixture(autouse=True)
 def in_reverse(monkeypatch):
-    """Few numbers are replayed, too."""
+    """Replay also with few parameters."""
     monkeypatch.setattr(both_modes, "PUSH_UP_TO", 0)
 
 
 def modes_agree(system, q0, v0, params, ts, lanes=0, **options):
-    """Along one direction of all numbers: what is pushed forward, and the gradient's product with it."""
+    """Along one direction of all parameters, forward mode equals the product of the gradient with that direction."""
     random = np.random.default_rng(0)
     floats = jax.tree.map(lambda x: jnp.asarray(x, float), (params, q0, v0))
     # Starts stay on the constraints.
@@ -52,10 +52,10 @@ def modes_agree(system, q0, v0, params, ts, lanes=0, **options):
     np.testing.assert_allclose(terms.sum(), along, rtol=1e-8, atol=1e-8 * np.max(np.abs(terms)))
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("name", exhaustive_but(SHOWN[:2], tuple(RUNS)))
 def test_scenes(name):
-    """Over a fifth of their time, with the event that ends them where there is one."""
+    """The modes agree over a fifth of a run's time, or up to the event that ends the run."""
     run = RUNS[name]
     ts = np.linspace(run.ts[0], run.ts[0] + 0.2 * (run.ts[-1] - run.ts[0]), OUTPUTS)
     ts = np.linspace(run.ts[0], run.ts[-1], OUTPUTS) if run.events else ts
@@ -65,7 +65,7 @@ def test_scenes(name):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", exhaustive_but(("double_pendulum",), tuple(MECHANISMS)))
 def test_mechanisms(name):
-    """Over a short time: redundant ones are stepped the robust way."""
+    """The modes agree over a short time; redundant mechanisms use the robust solve."""
     m = MECHANISMS[name]
     modes_agree(m.system, m.q0, m.v0, m.params, np.linspace(0.0, min(m.end, 0.02), OUTPUTS))
 
@@ -73,7 +73,7 @@ def test_mechanisms(name):
 @pytest.mark.exhaustive
 @pytest.mark.parametrize("name", SHOWN[::2])
 def test_lanes_of_scenes(name):
-    """Three lanes with other parameters, by what they share."""
+    """The modes agree on derivatives of three lanes with different parameters by what they share."""
     run = RUNS[name]
     ts = np.linspace(run.ts[0], run.ts[0] + 0.2 * (run.ts[-1] - run.ts[0]), OUTPUTS)
     modes_agree(run.system, run.q0, run.v0, run.params, ts, lanes=3)

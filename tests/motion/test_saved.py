@@ -1,4 +1,4 @@
-"""Trajectories in files: bit for bit, with the system that is given again, and safe from harm."""
+"""Trajectories in files come back bit for bit, with the system passed again; interrupted writing does no harm."""
 
 import json
 import os
@@ -41,7 +41,7 @@ def free(t, q, v, params):
 
 
 def falling(t, q, v, params):
-    """In a plane."""
+    """A unit mass falling in a plane."""
     return 0.5 * (v["x"] ** 2 + v["y"] ** 2) - params["g"] * q["y"]
 
 
@@ -55,12 +55,12 @@ START = {"x": 1.0, "y": 0.0}, {"x": 0.0, "y": 0.0}
 
 
 def swing(g=9.81, **settings):
-    """The pendulum let go from the side."""
+    """The pendulum released from the side."""
     return lj.integrate(rod, *START, {"g": g}, ts=TS, **settings)
 
 
 def check(traj, system, path):
-    """It comes back: all arrays bit for bit and of the same kind, all else equal, and what it prints."""
+    """Check that a trajectory comes back: arrays bit for bit and of the same kind, all else equal, and its print."""
     traj.save(path)
     again = lj.load_trajectory(path, system)
     pairs = list(zip(jax.tree.leaves(traj), jax.tree.leaves(again), strict=True))
@@ -91,13 +91,13 @@ def check(traj, system, path):
 )
 @pytest.mark.slow
 def test_structures(q0, tmp_path):
-    """Every structure that coordinates may have, and both dtypes."""
+    """Every structure that coordinates may have, and both dtypes, come back."""
     traj = lj.integrate(springs, q0, jax.tree.map(jnp.zeros_like, q0), ts=TS)
     check(traj, springs, tmp_path / "x.npz")
 
 
 def test_system_given_again(tmp_path):
-    """With its system it says and does all that it did; without, what was computed, and what it misses."""
+    """With its system a trajectory works as before; without, it has the computed values and says what is missing."""
     path = tmp_path / "swing.npz"
     traj = swing(events={"low": lj.Crossing(lambda t, q, v, params: q["y"] + 0.9, terminal=False)})
     again = check(traj, rod, path)
@@ -110,13 +110,13 @@ def test_system_given_again(tmp_path):
     for ask in (without.drift, without.residual, without.jacobi_integral, lambda: lj.energy_ledger(without)):
         with pytest.raises(ValueError, match=r"needs the functions of the system .*\n.*load_trajectory\(path, system="):
             ask()
-    # What was read without its system is written again with all that is known of it.
+    # A trajectory read without its system is written again with all that is known of the system.
     check(without, None, path)
     assert repr(lj.load_trajectory(path, rod)) == repr(traj)
 
 
 def test_another_system_is_told(tmp_path):
-    """By what differs at a state of the motion; twin: the same functions, made anew, are the same system."""
+    """Another system is refused by what differs at a state; twin: the same functions, redefined, are accepted."""
     path = tmp_path / "swing.npz"
     swing().save(path)
     pull = lambda t, q, v, params: {"x": 0.0 * q["x"], "y": 0.0 * q["y"]}
@@ -126,7 +126,7 @@ def test_another_system_is_told(tmp_path):
         (lj.System(falling, {"rod": lj.Holonomic(lambda t, q, params: q["x"])}), "the constraint 'rod': its value was"),
         (lj.System(lambda *state: falling(*state) + 0.1 * state[1]["x"], rod.constraints), "Lagrangian: its value was"),
         (lj.System(falling, rod.constraints, force=pull), "the force is there, but was not before"),
-        (lj.System(lambda t, q, v, params: params["mass"]), "cannot be asked at a state of that motion"),
+        (lj.System(lambda t, q, v, params: params["mass"]), "cannot be evaluated at a state of that motion"),
     ):
         with pytest.raises(ValueError, match=words):
             lj.load_trajectory(path, other)
@@ -138,7 +138,7 @@ def test_another_system_is_told(tmp_path):
 
 @pytest.mark.slow
 def test_how_it_ended(tmp_path):
-    """By an event, or without success: the reason, and NaN where there is no motion."""
+    """After an event or a failure, the result, the end and NaN beyond it come back."""
     low = {"low": lj.Crossing(lambda t, q, v, params: q["y"] + 0.9)}
     for traj, result in (
         (swing(events=low), lj.RESULTS.event_occurred),
@@ -150,7 +150,7 @@ def test_how_it_ended(tmp_path):
 
 @pytest.mark.slow
 def test_methods_and_controllers(tmp_path):
-    """What was asked comes back, so that the motion is continued as before."""
+    """The method and the steps asked for come back, so that `at` continues the motion as before."""
     pid = dict(method=diffrax.Dopri5(), stepsize_controller=diffrax.PIDController(rtol=1e-6, atol=1e-6))
     implicit = dict(method=lj.Radau5(), max_step=0.1, jump_ts=[0.5])
     for settings in (pid, implicit):
@@ -159,9 +159,9 @@ def test_methods_and_controllers(tmp_path):
         np.testing.assert_array_equal(again.at(0.3).q["x"], traj.at(0.3).q["x"])
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_many_motions(tmp_path):
-    """Batches, the values of sweeps (NumPy's arrays), and motions in phases."""
+    """Batches, the values of sweeps (NumPy arrays), and motions in phases come back."""
     check(jax.vmap(swing)(jnp.array([1.0, 9.81])), rod, tmp_path / "x.npz")
     swept = lj.sweep(lambda point: swing(point["g"]), {"g": np.array([1.0, 9.81])}, progress=False)
     check(swept.values, rod, tmp_path / "x.npz")
@@ -179,7 +179,7 @@ def test_many_motions(tmp_path):
 
 
 def test_a_million_outputs(tmp_path):
-    """Bit for bit, NaN and the sign of zero too; twin: one bit that is another one is seen."""
+    """A million outputs come back bit for bit, with NaN and the sign of zero; twin: a single changed bit is seen."""
     traj, rng = lj.integrate(springs, {"x": 1.0}, {"x": 0.0}, ts=TS), np.random.default_rng(0)
     x = rng.normal(size=1_000_000)
     x[:3] = np.nan, -0.0, 5e-324
@@ -194,7 +194,7 @@ def test_a_million_outputs(tmp_path):
 
 
 def test_parameters(tmp_path):
-    """All data that params are made of, and networks with functions of JAX; a function of the user's is told."""
+    """All data in params come back, and networks with functions of JAX; a function of the user's is refused by name."""
     net = eqx.nn.MLP(1, 1, 4, 1, key=jax.random.key(0))
     params = {"f": jnp.cos, "net": net, "half": jnp.ones(2, jnp.bfloat16), "n": 3, "x": 2.5, "who": "me", "no": None}
     params |= {"many": [True, (1, np.float32(2.0))], "inf": float("inf"), "by number": {7: np.arange(3)}}
@@ -207,7 +207,7 @@ def test_parameters(tmp_path):
 
 
 def test_named_tuples_of_a_class_that_is_gone(tmp_path, monkeypatch):
-    """They come back as others of the same name and fields; an object's class has to be imported."""
+    """They come back as another class of the same name and fields; the class of an object has to be imported."""
     of = lambda q0, v0: lj.integrate(springs, q0, v0, ts=TS)
     of(Pair(1.0, 2.0), Pair(0.0, 0.0)).save(tmp_path / "pair.npz")
     of(Place(jnp.array(1.0), "here"), Place(jnp.array(0.0), "here")).save(tmp_path / "place.npz")
@@ -219,7 +219,7 @@ def test_named_tuples_of_a_class_that_is_gone(tmp_path, monkeypatch):
 
 
 def test_files_that_are_not_whole(tmp_path):
-    """Missing, cut off, changed inside, of something else or of a newer version: each in words, none read."""
+    """Files that are missing, cut off, changed, of another kind or a newer version are refused with the reason."""
     path, traj = tmp_path / "x.npz", lj.integrate(springs, {"x": 1.0}, {"x": 0.0}, ts=TS)
     traj.save(path)
     whole = path.read_bytes()
@@ -242,7 +242,7 @@ def test_files_that_are_not_whole(tmp_path):
     for header, words in (
         ({"format": files.FORMAT + 1, "versions": {"lagjax": "9.0"}}, "written by lagjax 9.0, .*\nFix: pip install -U"),
         ({"format": files.FORMAT, "kind": "fit"}, r"holds a fit, not a trajectory.\nFix: lj.load_fit\(path\)"),
-        ({"format": files.FORMAT, "kind": "trajectory", "trajectory": {}}, "is damaged: what it says of itself"),
+        ({"format": files.FORMAT, "kind": "trajectory", "trajectory": {}}, "is damaged: its description is incomplete"),
     ):
         with zipfile.ZipFile(path, "w") as entries:
             entries.writestr(files.HEADER, json.dumps(header))
@@ -253,7 +253,7 @@ def test_files_that_are_not_whole(tmp_path):
 
 
 def test_a_failure_leaves_the_file_of_before(tmp_path, monkeypatch):
-    """Where writing fails, nothing is left of the new file, and all of the old one; folders that are none are told."""
+    """If writing fails, the new file leaves nothing and the old one is intact; folders that do not exist are named."""
     path, traj = tmp_path / "x.npz", lj.integrate(springs, {"x": 1.0}, {"x": 0.0}, ts=TS)
     traj.save(path)
     before = path.read_bytes()
@@ -288,7 +288,7 @@ files.write(sys.argv[1], "trajectory", {}, {"a": np.zeros(1), "b": np.zeros(1000
 
 @pytest.mark.slow
 def test_a_killed_process_leaves_the_file_of_before(tmp_path):
-    """Whoever is killed while writing."""
+    """A process killed while writing leaves the previous file, and the next write succeeds."""
     path, traj = tmp_path / "x.npz", lj.integrate(springs, {"x": 1.0}, {"x": 0.0}, ts=TS)
     traj.save(path)
     before = path.read_bytes()
@@ -300,7 +300,7 @@ def test_a_killed_process_leaves_the_file_of_before(tmp_path):
 
 @pytest.mark.slow
 def test_float64_where_jax_works_in_float32(tmp_path):
-    """Refused, rather than half of the digits lost in silence."""
+    """It is refused, rather than silently losing half of the digits."""
     lj.integrate(springs, 1.0, 0.0, ts=TS).save(tmp_path / "x.npz")
     with jax.enable_x64(False), pytest.raises(ValueError, match="holds float64 arrays, and JAX works in 32 bits"):
         lj.load_trajectory(tmp_path / "x.npz")

@@ -1,4 +1,4 @@
-"""Second derivatives in every order of the modes, of few numbers and of many."""
+"""Second derivatives in every order of the modes, by few parameters and by many."""
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +11,7 @@ from tests.tiers import exhaustive_but
 
 TS = np.array([0.0, 0.9])
 spring = lj.System(lambda t, q, v, params: 0.5 * v**2 - 0.5 * (params * q) ** 2)
-# A force made of thirty numbers: sums of two products of them.
+# A force of thirty parameters, which enter as two sums of squares.
 of_many = lj.System(lambda t, q, v, p: 0.5 * v**2 - q * (p["a"] @ p["a"]) - 0.5 * q**2 * (p["b"] @ p["b"]))
 MANY = {"a": np.linspace(0.05, 0.2, 15), "b": np.linspace(0.1, 0.2, 15)}
 
@@ -27,12 +27,12 @@ def exact(x):
 
 
 def of_thirty(p, system=of_many):
-    """A motion by thirty numbers, more than are pushed forward."""
+    """The end of a motion with thirty parameters, more than are differentiated in forward mode."""
     return lj.integrate(system, 0.3, 0.0, p, ts=TS, rtol=1e-10, atol=1e-10, method=lj.Tsit5()).q[-1]
 
 
 def of_thirty_by_hand(p):
-    """q'' = -A - B q from 0.3 at rest."""
+    """The same from the solution of q'' = -A - B q from rest at 0.3."""
     force, stiffness = p["a"] @ p["a"], p["b"] @ p["b"]
     rest = -force / stiffness
     return rest + (0.3 - rest) * jnp.cos(0.9 * jnp.sqrt(stiffness))
@@ -49,7 +49,7 @@ def test_modes_in_any_order(inner, outer):
 
 @pytest.mark.slow
 def test_gradients_of_gradients():
-    """`grad(grad)` by one number, jitted and in lanes."""
+    """`grad(grad)` by one parameter, jitted and batched, is that of the formula."""
     second = lambda f: jax.grad(jax.grad(lambda k: f(jnp.stack([0.75, k]))))
     k = jnp.array([0.5, 1.25, 2.0])
     np.testing.assert_allclose(jax.jit(jax.vmap(second(end)))(k), jax.vmap(second(exact))(k), atol=1e-8)
@@ -57,7 +57,7 @@ def test_gradients_of_gradients():
 
 @pytest.mark.exhaustive
 def test_a_hessian_times_a_vector_by_many_numbers():
-    """`jvp(grad)` by 30 numbers, whose gradient is a replay of the steps, is that of the formula."""
+    """`jvp(grad)` by 30 parameters, whose gradient is a replay of the steps, is that of the formula."""
     along = jax.tree.map(np.cos, MANY)
     product = lambda f: jax.jvp(jax.grad(f), (MANY,), (along,))[1]
     found, expected = product(of_thirty), product(of_thirty_by_hand)
@@ -71,7 +71,7 @@ bouncing = lj.Hybrid({"falling": falling}, [BOUNCE], most_switches=4)
 
 
 def landed(p):
-    """When and how fast a stone from 0.5, thrown at 0.2, comes to the floor."""
+    """When and how fast a stone, thrown upward from 0.5 at speed 0.2, hits the floor."""
     end = lj.integrate(falling, 0.5, 0.2, p, ts=TS, events={"floor": FLOOR}).end
     return jnp.stack([end.t, end.v])
 
@@ -83,7 +83,7 @@ def landed_by_formula(p):
 
 
 def bounced(p):
-    """Where it is a while after it bounced."""
+    """The position of the stone some time after it bounced."""
     return lj.integrate(bouncing, 0.5, 0.2, p, ts=TS).q[-1]
 
 
@@ -93,7 +93,7 @@ def bounced_by_formula(p):
     return -p[1] * v * (TS[-1] - t) - 0.5 * p[0] * (TS[-1] - t) ** 2
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.parametrize(
     "found, exact",
     [
@@ -102,7 +102,7 @@ def bounced_by_formula(p):
     ],
 )
 def test_at_a_crossing_that_moves(found, exact, monkeypatch):
-    """Second derivatives of the time and state of a crossing, and through it; twin: of states at a time that stays."""
+    """Second derivatives of, and through, the time and state of a crossing; twin: with the crossing time held fixed."""
     p = jnp.array([4.0, 0.7])
     second = lambda: jax.jacfwd(jax.jacfwd(found))(p)
     np.testing.assert_allclose(second(), jax.jacfwd(jax.jacfwd(exact))(p), atol=1e-9)

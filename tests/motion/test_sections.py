@@ -1,4 +1,4 @@
-"""Poincaré sections, periods and turning points: by elliptic integrals, Kepler's law and effective potentials."""
+"""Poincaré sections, periods and turning points against elliptic integrals, Kepler's law and effective potentials."""
 
 import warnings
 
@@ -36,7 +36,7 @@ def of_pendulum(q0, l):
 
 @pytest.mark.parametrize("q0", [0.5, 2.0, 3.0])
 def test_periods_of_the_pendulum(q0):
-    """Each is the complete elliptic integral to 1e-9; twin: the period of small swings is off by more."""
+    """Each period is the complete elliptic integral to 1e-9; twin: the period of small swings is off by more."""
     section, exact = swing(q0, PARAMS["l"]), of_pendulum(q0, PARAMS["l"])[0]
     count = int(section.count)
     found = lj.periods(section)
@@ -47,7 +47,7 @@ def test_periods_of_the_pendulum(q0):
 
 
 def test_states_at_the_bottom():
-    """There q is zero, and v is what the energy gives, upward: ½ v² = (g/l) (1 - cos q0), from the third quarter on."""
+    """At the bottom q is zero and v follows from the energy, ½ v² = (g/l) (1 - cos q0), from the third quarter on."""
     found, period = swing(2.0, PARAMS["l"]).crossings.found(), of_pendulum(2.0, PARAMS["l"])[0]
     np.testing.assert_allclose(found.q, 0.0, atol=1e-12)
     np.testing.assert_allclose(found.v, np.sqrt(2 * PARAMS["g"] / PARAMS["l"] * (1 - np.cos(2.0))), rtol=1e-9)
@@ -55,7 +55,7 @@ def test_states_at_the_bottom():
 
 
 def test_turning_points_of_the_pendulum():
-    """They are where it was released, and opposite; between them is half a period; the release itself is none."""
+    """Turning points are at the release and opposite, half a period apart; the release itself is not one."""
     turns = swing(2.0, PARAMS["l"]).trajectory.events["turn"]
     found = turns.found()
     np.testing.assert_allclose(found.q, 2.0 * (-1.0) ** (1 + np.arange(len(found.t))), rtol=1e-9)
@@ -65,7 +65,7 @@ def test_turning_points_of_the_pendulum():
 
 @pytest.mark.slow
 def test_derivatives_of_the_period():
-    """By amplitude and length, forward and reverse: of one period, and of the mean over those that there are."""
+    """Derivatives of one period and of the mean period, by amplitude and length, forward and reverse."""
 
     def period(x):
         start = x[0], 0.0 * x[0], {"g": PARAMS["g"], "l": x[1]}
@@ -86,7 +86,7 @@ def by_hand(t):
 
 
 def test_nothing_beyond_the_last_one_is_differentiated():
-    """Gradients at times that are there are those of the sum; twin: through a root of squares they are none."""
+    """Gradients of a sum of known periods are exact despite NaN times; twin: through a root of squares they are NaN."""
     t = jnp.array([1.0, 2.5, 4.5, jnp.nan, jnp.nan])
     total = lambda periods: jax.grad(lambda t: jnp.sum(periods(t)[:2]))(t)
     np.testing.assert_array_equal(total(lambda t: lj.periods(by_hand(t))), [-1.0, 0.0, 1.0, 0.0, 0.0])
@@ -97,7 +97,7 @@ def test_nothing_beyond_the_last_one_is_differentiated():
 
 
 def test_what_is_printed():
-    """Counts, the mean period and its spread, the error of the times, doubts; while it is traced, that."""
+    """The print has counts, the mean period and its spread, the times' error and doubts; it also works while traced."""
     section = swing(2.0, PARAMS["l"])
     period = of_pendulum(2.0, PARAMS["l"])[0]
     words = repr(section)
@@ -120,14 +120,14 @@ TURNS = {"turn": lj.turning_points("r"), "nearest": lj.turning_points("r", direc
 
 
 def radial(r, speed, mu, k, span):
-    """Thrown at right angles from a distance; its radial turning points."""
+    """The radial turning points of a mass thrown at right angles from a distance r."""
     start = {"r": r, "phi": 0.0 * r}, {"r": 0.0 * r, "phi": speed / r}
     return lj.integrate(central, *start, {"mu": mu, "k": k}, ts=[0.0, span], events=TURNS, **TIGHT).events
 
 
 @pytest.mark.parametrize("mu, k, speed", [(1.25, 0.0, 1.25), (0.0, 0.75, 1.25), (1.25, 0.75, 0.5), (0.5, 0.25, 1.5)])
 def test_radial_turning_points(mu, k, speed):
-    """They are the roots of E = h²/(2r²) + U(r), in turn: of ½ k r⁴ - E r² - μ r + ½ h²."""
+    """They alternate between the roots of E = h²/(2r²) + U(r), that is of ½ k r⁴ - E r² - μ r + ½ h²."""
     energy, h = 0.5 * speed**2 - mu + 0.5 * k, speed
     roots = np.roots([0.5 * k, 0.0, -energy, -mu, 0.5 * h**2])
     near, far = np.sort(roots[(abs(roots.imag) < 1e-9) & (roots.real > 0)].real)
@@ -137,7 +137,7 @@ def test_radial_turning_points(mu, k, speed):
     assert len(turns.t) > 2 and abs(far - near) > 0.1
     np.testing.assert_allclose(turns.q["r"][0::2], other, rtol=1e-9)
     np.testing.assert_allclose(turns.q["r"][1::2], 1.0, rtol=1e-9)
-    # Twin: in one direction there is every second one, the nearest.
+    # Twin: with one direction there is only every second one, the nearest.
     np.testing.assert_allclose(nearest.q["r"], near, rtol=1e-9)
     np.testing.assert_array_equal(nearest.t, turns.t[int(other == far) :: 2][: len(nearest.t)])
 
@@ -148,7 +148,7 @@ def kepler(speed, mu):
 
 
 def test_radial_periods():
-    """Kepler's third law; of a spring they are half of its own; twin: with both forces they are neither."""
+    """Radial periods obey Kepler's third law, or are half a spring's period; twin: with both forces neither holds."""
     period = lambda mu, k, speed: np.asarray(lj.periods(radial(1.0, speed, mu, k, 30.0)["nearest"]))[:2]
     np.testing.assert_allclose(period(1.25, 0.0, 1.25), kepler(1.25, 1.25), rtol=1e-9)
     np.testing.assert_allclose(period(0.0, 0.75, 1.25), np.pi / np.sqrt(0.75), rtol=1e-9)
@@ -157,7 +157,7 @@ def test_radial_periods():
 
 @pytest.mark.exhaustive
 def test_derivatives_of_keplers_period():
-    """By the speed at right angles and by μ, forward and reverse."""
+    """Derivatives by the initial speed and by μ, forward and reverse."""
     period = lambda x: lj.periods(radial(jnp.ones(()), x[0], x[1], 0.0, 30.0)["nearest"])[1]
     x = jnp.array([1.25, 1.25])
     exact = jax.grad(lambda x: kepler(*x))(x)
@@ -190,7 +190,7 @@ def orbit(y, span=70.0, **settings):
 
 @pytest.mark.slow
 def test_section_of_henon_and_heiles():
-    """On it x = 0, vx > 0, and the energy is the start's; twin: crossed the other way it is other points."""
+    """On the section x = 0, vx > 0, and the energy is the start's; twin: crossings the other way are other points."""
     section = orbit(0.125)
     found, other = section.crossings.found(), lj.PoincareSection(section.trajectory, "back").crossings.found()
     assert len(found.t) == int(section.count) == 11
@@ -200,13 +200,13 @@ def test_section_of_henon_and_heiles():
         y, speed = crossed.q["y"], crossed.v["x"] ** 2 + crossed.v["y"] ** 2
         np.testing.assert_allclose(0.5 * speed + y**2 / 2 - y**3 / 3, ENERGY, rtol=1e-8)
     assert np.abs(found.q["y"][:, None] - other.q["y"][None, :]).min() > 1e-4
-    # An energy of another size would be seen.
+    # The kinetic energy of y varies, so that a wrong energy would be seen.
     assert np.ptp(0.5 * found.v["y"] ** 2) > 1e-3
 
 
 @pytest.mark.slow
 def test_more_than_there_is_room_for():
-    """It is said when it happens, printed and drawn; twin: nothing is said where there is room."""
+    """Crossings that are not kept are warned of, printed and drawn; twin: no such note if there is room."""
     with pytest.warns(lj.EventWarning, match="'section' happened 19 times, and the first 12 are kept"):
         section = orbit(0.125, span=120.0)
     assert int(section.count) == 19 and np.isfinite(section.t).all() and section.t.shape == (KEPT,)
@@ -219,7 +219,7 @@ def test_more_than_there_is_room_for():
 
 @pytest.mark.slow
 def test_lanes():
-    """A batch is what a loop gives, and prints and draws its lanes."""
+    """A batch equals a loop over its lanes, and prints and draws them."""
     starts = jnp.array([0.125, -0.1, 0.2])
     lanes = jax.jit(jax.vmap(lambda y: orbit(y, span=80.0)))(starts)
     for i, y in enumerate(starts):
@@ -237,7 +237,7 @@ def test_lanes():
 
 
 def test_pictures():
-    """A panel a coordinate that the section does not hold fixed, or what is asked for."""
+    """One panel per coordinate that the section does not hold fixed, or the requested one."""
     section = orbit(0.125)
     (axis,) = section.plot().axes
     assert (axis.get_xlabel(), axis.get_ylabel()) == ("q.y", "v.y")
@@ -247,14 +247,14 @@ def test_pictures():
     np.testing.assert_array_equal(axis.lines[0].get_xydata(), np.stack([found.t, found.q["x"]], axis=1))
     with pytest.raises(ValueError, match="to plot 'q.z': there is none; there are t, q.x, q.y"):
         section.plot(x="q.z", y="v.y")
-    with pytest.raises(ValueError, match="one of them was given"):
+    with pytest.raises(ValueError, match="only one of them was given"):
         section.plot(x="q.y")
     with pytest.raises(ValueError, match="did not cross the section"):
         orbit(0.125, span=1.0).plot()
 
 
 def test_angles_within_half_turns():
-    """They come back by whole turns, and half a turn to round-off is one place; twin: one degree short of it is not."""
+    """Angles are shifted by whole turns, and ±π within round-off is one value; twin: one degree short of it is not."""
     found = sections._within_half_turns(np.array([7.0, -7.0, np.pi - 1e-9, np.pi + 1e-9, -np.pi, 3.1241]))
     np.testing.assert_allclose(found, [7 - 2 * np.pi, 2 * np.pi - 7, -np.pi, -np.pi, -np.pi, 3.1241], atol=2e-9)
 
@@ -265,7 +265,7 @@ def driven_lagrangian(t, q, v, p):
 
 
 def test_once_a_period_of_the_drive():
-    """The steady motion q = f cos(ωt) / (1 - ω²) is one point of it; twin: off by the free motion, it goes around."""
+    """The steady motion q = f cos(ωt) / (1 - ω²) is one point of the section; twin: with free motion added it moves."""
     driven, f, omega = lj.System(driven_lagrangian), 0.5, 0.625
     drive = lambda t, q, v, p: jnp.sin(p["omega"] * t)
     run = lambda q0: lj.poincare(driven, q0, 0.0, {"force": f, "omega": omega}, section=drive, ts=[0.0, 62.0], **TIGHT)
@@ -279,7 +279,7 @@ def test_once_a_period_of_the_drive():
     assert np.ptp(found.q) > off
 
 
-# What is refused.
+# Refused input.
 
 REFUSED = {
     "no function": ({"section": 0.0}, TypeError, "a function of"),
@@ -293,14 +293,14 @@ REFUSED = {
 
 @pytest.mark.parametrize("given, error, words", REFUSED.values(), ids=REFUSED)
 def test_refused_in_words(given, error, words):
-    """What is no section, before anything is compiled."""
+    """Invalid sections are refused before anything is compiled."""
     with pytest.raises(error, match=words) as raised:
         lj.poincare(pendulum, 1.0, 0.0, PARAMS, ts=[0.0, 1.0], **given)
     assert "Fix:" in str(raised.value)
 
 
 def test_refused_elsewhere():
-    """A coordinate that is not named among several, what has no periods, events that were not recorded, phases."""
+    """Refused: turning points without a name among several coordinates, periods of other things, unrecorded events."""
     start = jnp.zeros(2), jnp.ones(2)
     with pytest.raises(ValueError, match=r"There are q\[0\], q\[1\]") as raised:
         events = {"turn": lj.turning_points()}
@@ -311,9 +311,9 @@ def test_refused_elsewhere():
     with pytest.raises(TypeError, match="by its name, not as int"):
         lj.turning_points(0)
     section = swing(2.0, PARAMS["l"])
-    with pytest.raises(TypeError, match="not of a Trajectory"):
+    with pytest.raises(TypeError, match="not from a Trajectory"):
         lj.periods(section.trajectory)
-    with pytest.raises(ValueError, match="one crossing alone"):
+    with pytest.raises(ValueError, match="only one crossing was kept"):
         lj.periods(by_hand(jnp.ones(1)))
     with pytest.raises(ValueError, match="no event 'top'; recorded: 'section', 'turn'"):
         lj.PoincareSection(section.trajectory, "top")

@@ -1,4 +1,4 @@
-"""Sizes at which XLA changes its mind: many outputs, wide networks, long tables; in processes that may end.
+"""Sizes at which XLA behaves differently: many outputs, wide networks, long tables; in processes that may crash.
 
 The oscillator q'' = -q from rest at 1 is cos t.
 """
@@ -33,16 +33,16 @@ TRANSFORMED = {
 
 
 def survives(script):
-    """The script ends well, and says where it was if not."""
+    """Run the script; it must succeed, otherwise show its last output."""
     run = [sys.executable, "-c", START + script]
     ended = subprocess.run(run, capture_output=True, text=True, timeout=900, env=os.environ | {"PYTHONPATH": "."})
     assert ended.returncode == 0, f"{ended.stdout[-300:]}\n{ended.stderr[-2000:]}"
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("how", exhaustive_but(("closed over",), TRANSFORMED))
 def test_any_number_of_outputs(how):
-    """2 times (one output after the start) to 100,000; XLA ended the process above 10 kB that it knew."""
+    """From 2 times (one output after the start) to 100,000; XLA ended the process for constants above 10 kB."""
     sizes = (2, 3, 1000, 1024, 1025, 1251, 5000, 100_000) if how == "closed over" else (2, 1251, 100_000)
     lines = [f"for size in {sizes}:", "    print(size, flush=True)"]
     lines += ["    ts = np.linspace(0.0, 3.0, size)", "    known = jnp.asarray(ts)", "    " + TRANSFORMED[how]]
@@ -52,7 +52,7 @@ def test_any_number_of_outputs(how):
 @pytest.mark.exhaustive
 @pytest.mark.parametrize("width", (16, 32, 63, 64, 65, 128))
 def test_networks_of_any_width(width):
-    """One in `params`, one closed over, in value and derivative, against the network left out of all rewriting."""
+    """A network in `params` and one closed over, with derivatives, against SciPy with the network not rewritten."""
     survives(f"""
 net = eqx.nn.MLP(2, "scalar", {width}, 2, activation=jnp.tanh, key=jax.random.key(0))
 energy = lambda q, v, net: 0.5 * v @ v - 0.5 * q @ q - 0.1 * net(q)
@@ -72,7 +72,7 @@ agrees(slope, (step(1 + 1e-4) - step(1 - 1e-4)) / 2e-4, 1e-6)
 
 @pytest.mark.exhaustive
 def test_mass_matrices_and_tables_of_any_size():
-    """Coordinates around 16, whose matrix products have 4,096 multiplications, and tables around 10 kB."""
+    """Around 16 coordinates, whose matrix products have 4,096 multiplications, and tables around 10 kB."""
     survives("""
 for n in (9, 15, 16, 17):
     k = np.random.default_rng(0).normal(size=(n, n))

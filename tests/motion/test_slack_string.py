@@ -1,4 +1,4 @@
-"""A pendulum on a string: it goes slack where nothing pulls any more, and taut again with a jerk.
+"""A pendulum on a string, which goes slack when its tension ends, and taut again with a jerk.
 
 Thrown from the bottom with v₀² between 2 g l and 5 g l it leaves the circle at the angle φ above the horizontal, where
 v² = g l sin φ, that is sin φ = (v₀² - 2 g l) / (3 g l). On its parabola x² + y² - l² = t³ (¼ g² t - g v cos φ): the
@@ -17,12 +17,12 @@ L, G = 0.75, 9.81
 
 
 def lagrangian(t, q, v, params):
-    """Of a body of mass one."""
+    """The Lagrangian of a body of unit mass."""
     return 0.5 * jnp.sum(v**2) - G * q[1]
 
 
 def gap(t, q, params):
-    """What is left of the string."""
+    """The length of string left before it is taut."""
     return L - jnp.hypot(q[0], q[1])
 
 
@@ -37,7 +37,7 @@ string = lj.Hybrid(
 
 
 def thrown(speed, until=1.2):
-    """From the bottom, to the right."""
+    """The pendulum thrown from the bottom to the right."""
     start = jnp.array([0.0, -L]), jnp.array([speed, 0.0])
     traj = lj.integrate(string, *start, ts=jnp.array([0.0, until]), rtol=1e-11, estimate_error=False)
     assert isinstance(traj, lj.HybridTrajectory)
@@ -46,7 +46,7 @@ def thrown(speed, until=1.2):
 
 @pytest.mark.slow
 def test_slack_and_taut():
-    """Times, places and the velocity that is left, against closed forms. Twin: those of another speed."""
+    """Times, places and the remaining velocity against closed forms. Twin: those of another speed differ."""
     speed = np.sqrt(3.0 * G * L)
     traj = thrown(speed)
     assert traj.switches.to[:2].tolist() == [1, 0] and len(traj.switches) == 2

@@ -1,4 +1,4 @@
-"""What is hardly ever meant is told: a force in place of R."""
+"""A warning of input that is hardly ever meant: a force in place of R."""
 
 import jax
 import jax.numpy as jnp
@@ -31,7 +31,7 @@ STARTS = [(0.3, 0.0), (0.3, 1.7), (0.0, -2.0), (2.0, 1e-3)]
 @pytest.mark.parametrize("q, v", STARTS)
 @pytest.mark.parametrize("which", ODD)
 def test_a_force_in_place_of_a_dissipation(which, q, v):
-    """Told at rest, too, with both ways out."""
+    """The warning is given at rest too, with both remedies."""
     with pytest.warns(UserWarning, match=r"changes its sign with v(.|\n)*force=f(.|\n)*R = 0.5 c v²"):
         warn_of_odd_dissipation(ODD[which], coordinates.state(0.5, q, v, {"c": 0.3}))
 
@@ -39,13 +39,13 @@ def test_a_force_in_place_of_a_dissipation(which, q, v):
 @pytest.mark.parametrize("q, v", STARTS)
 @pytest.mark.parametrize("which", RIGHT)
 def test_what_dissipates_is_left_alone(which, q, v):
-    """The twin: no warning, which would be an error here."""
+    """Twin: no warning, which would be an error here."""
     new = lambda *of_state: RIGHT[which](*of_state)
     warn_of_odd_dissipation(new, coordinates.state(0.5, q, v, {"c": 0.3}))
 
 
 def test_integrate_tells_and_goes_on():
-    """Of one coordinate, by a function with a name: as R it is a constant force of 0.5. Traced values are let be."""
+    """`integrate` warns by the function's name, goes on with its constant force of 0.5, and ignores traced values."""
 
     def drag(t, q, v, params):
         return -0.5 * v["x"]

@@ -1,4 +1,4 @@
-"""What is said where `max_steps` is used up or steps collapse: each cause by its own words, and none by another's."""
+"""Messages when `max_steps` is used up or steps collapse: each cause by its own words, and none by another's."""
 
 import re
 
@@ -17,7 +17,7 @@ def free(t, q, v, params):
 
 
 def spring(t, q, v, params):
-    """And on a spring."""
+    """A particle on a spring."""
     return 0.5 * v**2 - 0.5 * q**2
 
 
@@ -56,7 +56,7 @@ CASES = {
     "a stiff spring": (
         lj.System(stiff_rod), ({"x": 1.0, "y": 0.0}, {"x": 0.0, "y": 0.0}), 10.0, {"spring"}),
     "many periods": (pendulum, (1.0, 0.0), 3000.0, {"span"}),
-    # Twins: what is smooth, or does not decay, or stays away from where it is singular, is told otherwise.
+    # Twins: what is smooth, does not decay, or stays away from its singularity gets another message.
     "friction with a slope": (
         force(lambda t, q, v, params: -2 * jnp.tanh((v - 0.5) / 0.5) - jnp.sin(4 * q)), (0.0, 1.0), 3000.0, set()),
     "a repulsion": (lj.System(lambda t, q, v, params: 0.5 * v**2 - 1 / q - 0.5 * q**2), (1.0, -3.0), 3000.0, set()),
@@ -66,7 +66,7 @@ CASES = {
 @pytest.mark.slow
 @pytest.mark.parametrize("case", CASES)
 def test_each_cause_is_told_apart(case):
-    """The words of the right cause with its remedy, and of no other."""
+    """The message has the words of the right cause with its remedy, and of no other."""
     system, start, span, kinds = CASES[case]
     params = PARAMS if system is pendulum else None
     limit = 90 if case == "a collision" else 500
@@ -81,7 +81,7 @@ def test_each_cause_is_told_apart(case):
 @pytest.mark.slow
 @pytest.mark.parametrize("backward", (False, True))
 def test_the_number_of_steps_is_the_one_that_is_missing(backward):
-    """What is asked for suffices, and is less than three times what it takes; also backward in time."""
+    """The advised max_steps suffices, and is less than three times what is needed; also backward in time."""
     ts = np.array([0.0, 300.0])
     run = lambda **options: lj.integrate(pendulum, 1.0, 0.0, PARAMS, ts=ts[::-1] if backward else ts, **options)
     with pytest.raises(RuntimeError, match="max_steps") as raised:
@@ -93,7 +93,7 @@ def test_the_number_of_steps_is_the_one_that_is_missing(backward):
 
 @pytest.mark.slow
 def test_a_short_fixed_step():
-    """Of fixed steps the number is known: 10,000 of 0.01."""
+    """The number of fixed steps is known: 10,000 of 0.01."""
     with pytest.raises(RuntimeError, match="it needs 9.8e\\+03 more"):
         lj.integrate(
             pendulum, 1.0, 0.0, PARAMS, ts=np.array([0.0, 100.0]), dt0=0.01, max_steps=200,
@@ -103,7 +103,7 @@ def test_a_short_fixed_step():
 
 @pytest.mark.slow
 def test_the_advice_for_friction_helps():
-    """A steep slope in place of the jump: the block that is driven at 0.5 is caught and goes with it."""
+    """A steep slope in place of the jump: the block is caught by the belt, which moves at 0.5, and goes with it."""
     sloped = force(lambda t, q, v, params: -2 * jnp.tanh((v - 0.5) / 1e-3))
     traj = lj.integrate(sloped, 0.0, 1.0, ts=np.array([0.0, 0.25, 10.0]), method=lj.Radau5())
     # From 1 to 0.5 at a deceleration of 2, and on at 0.5.
@@ -114,7 +114,7 @@ def test_the_advice_for_friction_helps():
 
 @pytest.mark.slow
 def test_steps_that_collapse_at_a_singularity():
-    """Not for want of steps: the singularity is named beside what it may be."""
+    """If steps collapse before max_steps, the singularity is named too."""
     kepler = lj.System(lambda t, q, v, params: 0.5 * v**2 + 1 / q)
     with pytest.raises(RuntimeError, match="near t = 1.1107"):
         lj.integrate(kepler, 1.0, 0.0, ts=np.array([0.0, 2.0]), method=lj.Dopri8())

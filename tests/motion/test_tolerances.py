@@ -1,4 +1,4 @@
-"""Tolerances by a motion's own size: the same motion in any units, and what has no size of its own."""
+"""Tolerances from a motion's own size: the same motion in any units, and numbers without a size of their own."""
 
 import warnings
 
@@ -10,13 +10,13 @@ import pytest
 import lagjax as lj
 from lagjax.motion.tolerances import Tolerances, Weighing, rounding, scales_of, shared
 
-# In units of length and of time that are powers of four: scaling by them is exact, square roots included.
+# The units of length and of time are powers of four, so that scaling by them is exact, also in square roots.
 UNITS = {"nanometres": (2.0**-30, 1.0), "light years": (2.0**54, 1.0), "years": (1.0, 2.0**-24)}
 rod = lj.System(
     lambda t, q, v, p: 0.5 * p["m"] * jnp.sum(v**2) - p["m"] * p["g"] * q[1],
     constraints={"rod": lj.Holonomic(lambda t, q, p: jnp.sum(q**2) - p["l"] ** 2)},
 )
-# A length beside an angle: a mass on a spring that turns.
+# A length and an angle: a mass on a spring that turns.
 turning = lj.System(
     lambda t, q, v, p: (
         0.5 * p["m"] * (v["r"] ** 2 + (q["r"] * v["psi"]) ** 2)
@@ -28,14 +28,14 @@ driven = lj.System(lambda t, q, v, p: 0.5 * v**2 - 0.5 * q**2 + p["push"] * q)
 
 
 def on_rod(length=1.0, time=1.0, **options):
-    """Swings of a pendulum in Cartesian coordinates, as numbers of these units are long."""
+    """Swings of a pendulum in Cartesian coordinates, in these units of length and time."""
     g, ts = length / time**2, np.linspace(0.0, 20.0, 9) * time
     q0 = length * np.array([np.sin(1.25), -np.cos(1.25)])
     return lj.integrate(rod, q0, np.zeros(2), {"m": 2.0, "l": length, "g": g}, ts=ts, **options)
 
 
 def on_spring(length=1.0, time=1.0, **options):
-    """The same for a length and an angle, of which only the length changes with the unit."""
+    """Swings of a mass on a spring: a length and an angle, of which only the length changes with the unit."""
     params = {"m": 2.0, "l": length, "k": 32.0 / time**2, "g": length / time**2}
     q0, v0 = {"r": 1.25 * length, "psi": 0.0}, {"r": 0.0, "psi": 1.5 / time}
     return lj.integrate(turning, q0, v0, params, ts=np.linspace(0.0, 20.0, 9) * time, **options)
@@ -44,7 +44,7 @@ def on_spring(length=1.0, time=1.0, **options):
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::lagjax.AccuracyWarning")
 def test_any_units():
-    """The same digits and the same steps; twin: with an absolute tolerance a nanometre is nothing."""
+    """Any units give the same digits and steps; twin: an absolute tolerance loses a motion of nanometres."""
     usual = on_rod()
     for name, (length, time) in UNITS.items():
         other = on_rod(length, time)
@@ -59,7 +59,7 @@ def test_any_units():
 
 @pytest.mark.slow
 def test_an_angle_beside_a_length():
-    """The unit of length is no unit of the angle's: each has its own, but for rounding among the very light."""
+    """The unit of length does not affect the angle's tolerance, except for round-off among very light masses."""
     usual = on_spring()
     for name, (length, time) in UNITS.items():
         other = on_spring(length, time)
@@ -70,7 +70,7 @@ def test_an_angle_beside_a_length():
 
 @pytest.mark.parametrize("start", [(1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)], ids=["extent", "speed", "push"])
 def test_small_motions(start):
-    """A nanometre from rest, from the origin, and from rest at the origin: nine digits of either by the closed form."""
+    """Motions of a nanometre by extent, speed or force agree with the closed form to nine digits."""
     (q0, v0, push), t = 1e-9 * np.array(start), np.linspace(0.0, 200.0, 11)
     traj = lj.integrate(driven, q0, v0, {"push": push}, ts=t)
     expected = push + (q0 - push) * np.cos(t) + v0 * np.sin(t)
@@ -79,18 +79,18 @@ def test_small_motions(start):
 
 
 def test_given_tolerances_stay():
-    """An atol is what it was, in the user's units; print says which of the two it is."""
+    """A given atol stays in the user's units; the print tells it from tolerances by size."""
     given, own = on_rod(atol=1e-9), on_rod()
     assert given.tolerance[1].shape == (2,) and own.tolerance[1].shape == (2, 2)
     assert "atol 1e-09" in str(given) and "atol by size" in str(own)
 
 
-def weighed(size, error, seen=None, mass=(1.0, 1.0), rtol=1e-9):
-    """The weighed error of one step of length 1 from and to velocities and coordinates of this size, as (2, 2)."""
+def weighed(size, error, sizes_so_far=None, mass=(1.0, 1.0), rtol=1e-9):
+    """The weighed error, (2, 2), of one step of length 1 from and to coordinates and velocities of this size."""
     y = tuple(jnp.asarray(row) for row in size)
     scales = scales_of(jnp.asarray(mass), *y, jnp.zeros(2), 1.0)
-    if seen is not None:
-        scales = scales._replace(first=jnp.asarray(seen))
+    if sizes_so_far is not None:
+        scales = scales._replace(first=jnp.asarray(sizes_so_far))
     weighing = Weighing(
         diffrax.PIDController(rtol=rtol, atol=rtol),
         Tolerances(jnp.full(2, rtol), jnp.full(2, rtol)),
@@ -103,23 +103,23 @@ def weighed(size, error, seen=None, mass=(1.0, 1.0), rtol=1e-9):
 
 
 def test_each_by_its_own_size():
-    """An error of rtol |y| counts as one, whatever |y| is; so does a thousandth of the largest that has been."""
+    """An error of rtol |y| counts as one whatever |y| is; |y| is at least a thousandth of the largest so far."""
     size = np.array([[1e-12, 1e9], [3e-12, 2e9]])
     np.testing.assert_allclose(weighed(size, 1e-9 * size, mass=(1e18, 1e-24)), 1.0, rtol=1e-2)
-    died_out = weighed(1e-6 * np.ones((2, 2)), 1e-12 * np.ones((2, 2)), seen=np.ones((2, 2)))
+    died_out = weighed(1e-6 * np.ones((2, 2)), 1e-12 * np.ones((2, 2)), sizes_so_far=np.ones((2, 2)))
     np.testing.assert_allclose(died_out, 1.0, rtol=1e-2)
 
 
 def test_what_others_round_off():
-    """A coordinate at round-off has the others' round-off as its tolerance, by their masses."""
+    """A coordinate at round-off has the others' round-off as its tolerance, scaled by the masses."""
     size = np.array([[1e3, 1e-16], [1.0, 1e-19]])
     assert np.all(weighed(size, np.array([[0.0, 1e-13], [0.0, 1e-16]])) < 1)
-    # The other one has a million times the mass: a thousandth of the motion is as much to it.
+    # With 1e12 times the mass, a millionth of the other's motion is as much to it.
     assert weighed(size, np.array([[0.0, 1e-13], [0.0, 0.0]]), mass=(1.0, 1e12))[0, 1] > 1
 
 
 def test_scales_have_units():
-    """Scaled by length, time and mass alike; twin: a coordinate of another unit alone changes nothing of the others."""
+    """Scales follow the units of length and time; twin: changing one coordinate's unit does not affect the others."""
     mass, q, v, a = jnp.asarray([4.0, 0.25]), jnp.asarray([3.0, 0.0]), jnp.asarray([0.0, 0.5]), jnp.asarray([1.0, 2.0])
     usual = scales_of(mass, q, v, a, 10.0)
     length, time = 2.0**-20, 2.0**12
@@ -137,7 +137,7 @@ def test_scales_have_units():
 
 
 def test_regular_in_any_units():
-    """A mass of a gram on a rod of a light year is no singular one; twin: a coordinate without mass is."""
+    """A mass of a gram on a rod of a light year is not singular; twin: a coordinate without mass is."""
     q0 = 2.0**54 * np.array([np.sin(1.25), -np.cos(1.25)])
     a, _ = lj.accelerations(rod, 0.0, q0, np.zeros(2), {"m": 1e-3, "l": 2.0**54, "g": 1.0})
     np.testing.assert_allclose(a @ q0 / 2.0**54, 0.0, atol=1e-14)
@@ -146,7 +146,7 @@ def test_regular_in_any_units():
 
 
 def test_at_rest_until_a_force_sets_in():
-    """Nothing tells how large a motion will be whose force is switched on later: it is found without a word of it."""
+    """The size of a motion whose force sets in later is unknown at the start: it is computed without a warning."""
     late = lj.System(
         lambda t, q, v, p: 0.5 * v**2 - 0.5 * (q - p["rest"]) ** 2,
         force=lambda t, q, v, p: jnp.where(t > 5.25, 10.0, 0.0),
@@ -160,7 +160,7 @@ def test_at_rest_until_a_force_sets_in():
 
 @pytest.mark.exhaustive
 def test_at_round_off_without_mass():
-    """A coordinate that is zero but for rounding, and has no mass to compare it by, does not stop the motion."""
+    """A coordinate that is zero within round-off and has no mass to compare it by does not stop the motion."""
     beside = lj.Holonomic(lambda t, q, p: q[2] - 3.0 * (q[0] ** 2 + q[1] ** 2 - 1.0))
     massless = lj.System(
         lambda t, q, v, p: 0.5 * (v[0] ** 2 + v[1] ** 2) - q[1],

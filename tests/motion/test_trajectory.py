@@ -1,4 +1,4 @@
-"""The answer prints itself, plots itself, and carries what it was made of."""
+"""A trajectory prints itself, plots itself, and carries its system and parameters."""
 
 from contextlib import nullcontext
 
@@ -24,7 +24,7 @@ def traj():
 
 
 def test_prints_like_an_instrument(traj):
-    """Method, tolerance, steps, residual, Jacobi integral, shapes and dtype stand in the print."""
+    """The print has method, tolerance, steps, residual, Jacobi integral, shapes and dtype."""
     text = repr(traj)
     for part in (
         "Dopri8",
@@ -41,7 +41,7 @@ def test_prints_like_an_instrument(traj):
 
 
 def test_says_what_need_not_be_conserved(traj):
-    """Where the Jacobi integral may change, its change is no error, and the print says why; a result has words."""
+    """If the Jacobi integral may change, its change is not an error, and the print says why; results have messages."""
     assert "need not be conserved" not in repr(traj)
     driven = lj.System(lambda t, q, v, params: 0.5 * v**2 - 0.5 * q**2 + jnp.cos(t) * q)
     swing = lj.integrate(driven, 1.0, 0.0, None, ts=TS)
@@ -60,7 +60,7 @@ CHANGES = {
 
 @pytest.mark.parametrize("words", CHANGES)
 def test_what_changes_the_jacobi_integral(words):
-    """Each cause by its name, and none of a system that conserves it."""
+    """Each cause is named, and a system that conserves the Jacobi integral has none."""
     state = jnp.asarray(0.0), jnp.asarray(1.0), jnp.asarray(1.0), None
     free = lambda t, q, v, params: 0.5 * v**2
     assert list(what_changes_jacobi_integral(lj.System(free, **CHANGES[words]), *state)) == [words]
@@ -68,7 +68,7 @@ def test_what_changes_the_jacobi_integral(words):
 
 
 def test_carries_its_system_and_parameters(traj):
-    """`system` and `params` give back what went in, and the Jacobi integral is that of its own states."""
+    """`system` and `params` return what was passed in, and the Jacobi integral is that of the trajectory's states."""
     assert traj.system.constraints.keys() == {"rod"}
     assert {name: float(x) for name, x in traj.params.items()} == PARAMS
     at = jax.tree.map(lambda x: x[2], (traj.t, traj.q, traj.v))
@@ -78,7 +78,7 @@ def test_carries_its_system_and_parameters(traj):
 
 
 def test_plot_has_a_panel_for_each_kind(traj):
-    """Coordinates, velocities and multipliers, named; one panel less without constraints."""
+    """Panels of coordinates, velocities and multipliers, named; one fewer without constraints."""
     axes = traj.plot().axes
     assert [axis.get_ylabel() for axis in axes] == ["q", "v", "multipliers: rod"]
     assert [text.get_text() for text in axes[0].get_legend().get_texts()] == ["x", "y"]
@@ -88,7 +88,7 @@ def test_plot_has_a_panel_for_each_kind(traj):
 
 @pytest.mark.exhaustive
 def test_a_batch_is_plotted_lane_by_lane():
-    """A batch refuses to plot itself and says how to take a lane."""
+    """A batch refuses to plot itself and says how to select a lane."""
     batch = jax.vmap(lambda q0: lj.integrate(pendulum, q0, 0.0, PARAMS, ts=TS))(np.array([0.5, 1.0]))
     with pytest.raises(ValueError, match="(?s)batch of shape.*Fix:"):
         batch.plot()
@@ -98,14 +98,14 @@ def test_a_batch_is_plotted_lane_by_lane():
 
 @pytest.mark.slow
 def test_phase_portrait_of_a_rotation_stays_in_a_turn():
-    """An angle that goes around lies between -π and π, cut where it leaves; one that swings is left alone."""
+    """An angle that goes around is drawn between -π and π, cut at the ends; one that only swings is left alone."""
     spin = lj.integrate(pendulum, 1.0, 9.0, PARAMS, ts=np.linspace(0.0, 3.0, 101))
     assert float(np.ptp(spin.q)) > 2 * 2 * np.pi
     (axis,) = spin.phase_portrait().axes
     x, y = map(np.asarray, axis.lines[0].get_data())
     assert np.nanmax(np.abs(x)) <= np.pi and np.nanmax(x) == np.pi and np.nanmin(x) == -np.pi
     assert np.isnan(x).sum() == int(np.ptp(np.floor((np.asarray(spin.q) + np.pi) / (2 * np.pi))))
-    # On the cut the curve is still an orbit: ½ v² - (g/l) cos q is that of the start, to the outputs' distance.
+    # At the cut the curve is still the orbit: ½ v² - (g/l) cos q is the start's, within the spacing of outputs.
     energy = 0.5 * y**2 - PARAMS["g"] / PARAMS["l"] * np.cos(x)
     np.testing.assert_allclose(energy[np.isfinite(energy)], energy[0], rtol=2e-3)
     assert [label.get_text() for label in axis.get_xticklabels() if abs(label.get_position()[0]) < 3.2] == [
@@ -117,7 +117,7 @@ def test_phase_portrait_of_a_rotation_stays_in_a_turn():
 
 @pytest.mark.slow
 def test_phase_portrait_has_a_panel_a_coordinate(traj):
-    """Names of the user's; lengths keep their own ticks and are never cut; a batch has a curve a lane."""
+    """Panels have the user's names; lengths keep their ticks and are never cut; a batch has one curve per lane."""
     axes = [axis for axis in traj.phase_portrait().axes if axis.get_visible()]
     assert [(axis.get_xlabel(), axis.get_ylabel()) for axis in axes] == [("q: x", "v: x"), ("q: y", "v: y")]
     np.testing.assert_array_equal(axes[1].lines[0].get_data(), [traj.q["y"], traj.v["y"]])
@@ -131,7 +131,7 @@ def test_phase_portrait_has_a_panel_a_coordinate(traj):
 
 @pytest.mark.slow
 def test_phase_portrait_ends_with_the_motion():
-    """The NaN after an event are not drawn."""
+    """NaN after an event is not drawn."""
     down = diffrax.Event(lambda t, y, params, **kwargs: y[0])
     ended = lj.integrate(pendulum, 1.0, 0.0, PARAMS, ts=np.linspace(0.0, 2.0, 41), event=down)
     x, _ = ended.phase_portrait().axes[0].lines[0].get_data()
@@ -140,14 +140,14 @@ def test_phase_portrait_ends_with_the_motion():
 
 @pytest.mark.slow
 def test_the_wait_for_the_compiler_is_told_once(monkeypatch):
-    """The first motion of a kind says that it compiles, to whom `progress` says; the next one compiles nothing."""
+    """The first motion of a kind announces its compilation, as `progress` says; the next one compiles nothing."""
     told = []
     monkeypatch.setattr(solve, "waiting", lambda *said: told.append(said) or nullcontext())
     system = lj.System(lambda t, q, v, params: 0.5 * v**2 - params["g"] * q)
     for g in (1.0, 2.0):
         lj.integrate(system, 1.0, 0.0, {"g": g}, ts=TS, estimate_error=False)
     assert told == [(None, "compiling")]
-    # Not to show it makes no other program, and another system does.
+    # Not showing progress uses the same program; another system needs a new one.
     lj.integrate(system, 1.0, 0.0, {"g": 1.0}, ts=TS, estimate_error=False, progress=False)
     assert len(told) == 1
     lj.integrate(lj.System(lambda t, q, v, params: v**2), 1.0, 0.0, ts=TS, estimate_error=False, progress=False)
