@@ -149,6 +149,12 @@ def given_params(params, dtype):
     """The same as `as_arrays`, but NumPy arrays stay."""
 
     def convert(x):
+        if isinstance(x, jax.Array) and jnp.issubdtype(x.dtype, jax.dtypes.extended):
+            raise TypeError(
+                f"params holds a typed random key ({x.dtype}), and parameters must be numbers.\n"
+                'Fix: "key": jax.random.key_data(key) in params, which functions of jax.random take as it is; or draw '
+                "the random numbers first, and pass these."
+            )
         is_weak = isinstance(x, jax.Array) and not is_traced(x) and x.weak_type
         if isinstance(x, float) or is_weak and jnp.issubdtype(x.dtype, jnp.floating):
             return np.asarray(x, dtype)

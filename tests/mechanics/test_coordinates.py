@@ -76,3 +76,13 @@ def test_a_time_is_one_number():
     for t in (np.zeros(1), {"x": 0.0}, "0", True, None):
         with pytest.raises(TypeError, match="t must be one number, not (?s:.*)another order"):
             coordinates.state(t, 1.0, 0.0, None)
+
+
+def test_random_keys_in_params():
+    """A typed key is refused with the remedy; the remedy gives the numbers that the key gives."""
+    spread = lambda t, q, v, p: 0.5 * v**2 - 0.5 * q**2 * (1 + jax.random.normal(p["key"]) ** 2)
+    key, system = jax.random.key(1), lj.System(spread)
+    with pytest.raises(TypeError, match=r"typed random key[^\n]*\nFix: \"key\": jax.random.key_data"):
+        lj.accelerations(system, 0.0, 1.0, 0.0, {"key": key})
+    found, _ = lj.accelerations(system, 0.0, 1.0, 0.0, {"key": jax.random.key_data(key)})
+    np.testing.assert_allclose(found, -(1 + jax.random.normal(key) ** 2), rtol=1e-12)
