@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import lagjax as lj
 from lagjax.mechanics import coordinates
 
 
