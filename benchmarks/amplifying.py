@@ -1,4 +1,4 @@
-"""Motions that amplify errors, chaotic and nearly singular ones: their equations by hand, for long double."""
+"""Motions that amplify errors, chaotic and nearly singular ones, with equations written by hand for long double."""
 
 from functools import partial
 
@@ -22,7 +22,7 @@ def pendulum_lagrangian(t, q, v, params):
 
 
 def damped_pendulum_lagrangian(t, q, v, params):
-    """The same with a push that turns with the time."""
+    """The same with a push whose direction rotates with time."""
     return 0.5 * v**2 + params["k"] * jnp.cos(q) + params["push"] * q * jnp.cos(params["rate"] * t)
 
 
@@ -55,7 +55,7 @@ def wall_lagrangian(t, q, v, params):
 
 
 def top_lagrangian(t, q, v, params):
-    """A free rigid body in Euler's angles z-x-z."""
+    """A free rigid body in Euler angles z-x-z."""
     s, c = jnp.sin(q["theta"]), jnp.cos(q["theta"])
     one = v["phi"] * s * jnp.sin(q["psi"]) + v["theta"] * jnp.cos(q["psi"])
     two = v["phi"] * s * jnp.cos(q["psi"]) - v["theta"] * jnp.sin(q["psi"])
@@ -64,7 +64,7 @@ def top_lagrangian(t, q, v, params):
 
 
 def quaternion_lagrangian(t, q, v, params):
-    """The same by a quaternion (scalar first): ω = 2 q* q̇."""
+    """The same with a quaternion (scalar first): ω = 2 q* q̇."""
     one = 2 * (q[0] * v[1] - q[1] * v[0] - q[2] * v[3] + q[3] * v[2])
     two = 2 * (q[0] * v[2] + q[1] * v[3] - q[2] * v[0] - q[3] * v[1])
     three = 2 * (q[0] * v[3] - q[1] * v[2] + q[2] * v[1] - q[3] * v[0])
@@ -130,7 +130,7 @@ def two_rods(name, q0, v0, ts, **how):
 
 
 def masses_on_rods(ts):
-    """The mechanism of two masses in Cartesian coordinates, from both rods horizontal; by its angles."""
+    """The mechanism of two masses in Cartesian coordinates, rods horizontal at first; the reference uses angles."""
     g = LONG(double_pendulum.PARAMS["g"])
 
     def field(t, y):
@@ -213,7 +213,7 @@ def spin_rates(w):
 
 
 def tumbling(name, spin, ts, **how):
-    """Near the intermediate axis, in Euler's angles; `spin` about the three axes."""
+    """Rotation near the intermediate axis, in Euler angles; `spin` is about the three axes."""
     theta, psi = 1.25, 0.5
 
     def angles(theta, psi, w):
@@ -245,7 +245,7 @@ def turned(q, w):
 
 
 def tumbling_quaternion(name, spin, ts, **how):
-    """The same by a quaternion held at length one."""
+    """The same with a quaternion constrained to unit length."""
     field = lambda t, y: np.array([*(x / 2 for x in turned(y[:4], y[4:])), *spin_rates(y[4:])])
     seen = lambda y: (y[:, :4].astype(float), np.stack(turned(y.T[:4], y.T[4:]), axis=1).astype(float) / 2)
     q0 = np.array([1.0, 0.0, 0.0, 0.0])
@@ -254,7 +254,7 @@ def tumbling_quaternion(name, spin, ts, **how):
 
 
 def single(motion):
-    """In single precision, of numbers that it holds."""
+    """The motion in single precision, with numbers that it represents exactly."""
     start = jax.tree.map(np.float32, (motion.q0, motion.v0, motion.params, motion.ts))
     return motion._replace(floor=1e-6, **dict(zip(("q0", "v0", "params", "ts"), start)))
 
@@ -266,14 +266,14 @@ SPIN = (0.0009765625, 2.0, 0.001953125)
 
 
 def through_zero(t, q, v, params):
-    """Where the pendulum, or the first rod, hangs down."""
+    """Zero when the pendulum, or the first rod, hangs down."""
     return q["one"] if isinstance(q, dict) else q
 
 
 def motions():
     """All of them."""
     upto, few, tight = partial(np.linspace, 0.0), (1e-6, 1e-9), (1e-7, 1e-10, 1e-11)
-    # No output at a time that single precision does not hold.
+    # Single precision represents all these output times exactly.
     binary = np.arange(0.0, 8.25, 0.5)
     fixed = lambda dt: {"dt0": dt, "stepsize_controller": diffrax.ConstantStepSize()}
     recorded = lambda most: lj.Crossing(through_zero, terminal=False, most=most)

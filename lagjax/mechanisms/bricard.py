@@ -10,8 +10,8 @@ fixed). A rod is rigid with its two hinges fixed in it if for i = 0 ... 4
 
     |r_i|² = l²,    r_i·u_i = 0,    r_i·u_(i+1) = 0,    u_i·u_(i+1) = 0,    |u_i|² = 1 (i = 1 ... 4)
 
-with r_i = P_(i+1) - P_i: 24 equations for 24 coordinates. Only 23 are independent: any one follows from the others, and
-one degree of freedom remains. Grübler's count for a spatial chain of six hinges gives none.
+with r_i = P_(i+1) - P_i: 24 equations for 24 coordinates. Only 23 are independent: one, no particular one, follows from
+the others, and one degree of freedom remains. Grübler's count for a spatial chain of six hinges gives none.
 
 A rod of square section has a width a, and so a second moment m a²/12, along each of its two hinges' axes,
 
