@@ -95,11 +95,11 @@ def named(*names):
     """(q, v) of several coordinates, each in a dictionary."""
     count = len(names)
 
-    def seen(y):
+    def to_qv(y):
         y = y.astype(float)
         return dict(zip(names, y.T[:count])), dict(zip(names, y.T[count:]))
 
-    return seen
+    return to_qv
 
 
 def swing(name, q0, v0, ts, **how):
@@ -139,7 +139,7 @@ def masses_on_rods(ts):
         one, two, share = -s * w**2 - 2 * g * np.sin(a), s * u**2 - g * np.sin(b), 1 / (1 + s**2)
         return np.array([u, w, (one - c * two) * share, (2 * two - c * one) * share])
 
-    def seen(y):
+    def to_qv(y):
         arm = lambda a: np.stack([np.sin(a), -np.cos(a)], axis=1)
         moved = lambda a, rate: np.stack([np.cos(a) * rate, np.sin(a) * rate], axis=1)
         a, b, u, w = y.T
@@ -150,7 +150,7 @@ def masses_on_rods(ts):
     # The angle whose sine is exactly one.
     quarter = 2 * np.arctan(LONG(1))
     return by_long_double(
-        f"two masses on rods, {ts[-1]:g} s", m.system, m.q0, m.v0, m.params, ts, field, [quarter, quarter, 0, 0], seen,
+        f"two masses on rods, {ts[-1]:g} s", m.system, m.q0, m.v0, m.params, ts, field, [quarter, quarter, 0, 0], to_qv,
         tolerances=(1e-5, 1e-8),
     )  # fmt: skip
 
@@ -189,10 +189,10 @@ def bodies(name, m, q0, v0, ts, **how):
         pull = np.sum(masses * apart / (square * np.sqrt(square)), axis=0)
         return np.concatenate([y[6:], pull.ravel()])
 
-    seen = lambda y: tuple(part.astype(float).reshape(-1, 3, 2) for part in (y[:, :6], y[:, 6:]))
+    to_qv = lambda y: tuple(part.astype(float).reshape(-1, 3, 2) for part in (y[:, :6], y[:, 6:]))
     start = np.concatenate([q0.ravel(), v0.ravel()])
     params = {"m": np.asarray(m, float)}
-    return by_long_double(name, three_bodies, q0, v0, params, ts, field, start, seen, **how)
+    return by_long_double(name, three_bodies, q0, v0, params, ts, field, start, to_qv, **how)
 
 
 def bounces(name, ts, **how):
@@ -225,7 +225,7 @@ def tumbling(name, spin, ts, **how):
                 phi_rate * np.sin(theta) * np.cos(psi) - theta_rate * np.sin(psi),
                 phi_rate * np.cos(theta) + psi_rate]  # fmt: skip
 
-    def seen(y):
+    def to_qv(y):
         rates = angles(y[:, 1], y[:, 2], y[:, 3:].T)
         names = ("phi", "theta", "psi")
         return tuple({k: np.asarray(x, float) for k, x in zip(names, part)} for part in (y[:, :3].T, rates))
@@ -235,7 +235,7 @@ def tumbling(name, spin, ts, **how):
     v0 = {k: float(x) for k, x in zip(q0, angles(theta, psi, spin))}
     theta, psi = LONG(theta), LONG(psi)
     start = [*q0.values(), *spins(*exactly(list(v0.values())))]
-    return by_long_double(name, rigid_body, q0, v0, INERTIA, ts, field, start, seen, **how)
+    return by_long_double(name, rigid_body, q0, v0, INERTIA, ts, field, start, to_qv, **how)
 
 
 def turned(q, w):
@@ -247,10 +247,10 @@ def turned(q, w):
 def tumbling_quaternion(name, spin, ts, **how):
     """The same with a quaternion constrained to unit length."""
     field = lambda t, y: np.array([*(x / 2 for x in turned(y[:4], y[4:])), *spin_rates(y[4:])])
-    seen = lambda y: (y[:, :4].astype(float), np.stack(turned(y.T[:4], y.T[4:]), axis=1).astype(float) / 2)
+    to_qv = lambda y: (y[:, :4].astype(float), np.stack(turned(y.T[:4], y.T[4:]), axis=1).astype(float) / 2)
     q0 = np.array([1.0, 0.0, 0.0, 0.0])
     v0 = np.array([0.0, *spin]) / 2
-    return by_long_double(name, by_quaternion, q0, v0, INERTIA, ts, field, [*q0, *spin], seen, **how)
+    return by_long_double(name, by_quaternion, q0, v0, INERTIA, ts, field, [*q0, *spin], to_qv, **how)
 
 
 def single(motion):

@@ -76,12 +76,12 @@ class Browser:
         number = self.count
         until = time.monotonic() + self.patience
         while time.monotonic() < until:
-            for told in self._read():
-                if told.get("id") == number:
-                    if "error" in told:
-                        raise RuntimeError(f"{method}: {told['error']}")
-                    return told["result"]
-                self.events.append(told)
+            for message in self._read():
+                if message.get("id") == number:
+                    if "error" in message:
+                        raise RuntimeError(f"{method}: {message['error']}")
+                    return message["result"]
+                self.events.append(message)
         raise RuntimeError(f"{method}: no answer in {self.patience:g} s")
 
     def _read(self):
@@ -123,10 +123,10 @@ class Page:
 
     def run(self, script):
         """Evaluate an expression in the page, wait for it, and return its value."""
-        told = self.ask("Runtime.evaluate", expression=script, returnByValue=True, awaitPromise=True)
-        if "exceptionDetails" in told:
-            raise RuntimeError(told["exceptionDetails"].get("exception", {}).get("description", str(told)))
-        return told["result"].get("value")
+        message = self.ask("Runtime.evaluate", expression=script, returnByValue=True, awaitPromise=True)
+        if "exceptionDetails" in message:
+            raise RuntimeError(message["exceptionDetails"].get("exception", {}).get("description", str(message)))
+        return message["result"].get("value")
 
     def wait(self, condition, seconds=30.0):
         """Wait until an expression in the page is true."""
@@ -147,16 +147,16 @@ class Page:
 
     def picture(self, path):
         """Write the visible part of the page as PNG."""
-        told = self.ask("Page.captureScreenshot", captureBeyondViewport=True)
-        Path(path).write_bytes(base64.b64decode(told["data"]))
+        message = self.ask("Page.captureScreenshot", captureBeyondViewport=True)
+        Path(path).write_bytes(base64.b64decode(message["data"]))
 
     def complaints(self):
         """Errors of the page's scripts, and the addresses that it requested besides itself."""
         found = []
-        for told in self.browser.events:
-            if told.get("sessionId") != self.session:
+        for message in self.browser.events:
+            if message.get("sessionId") != self.session:
                 continue
-            kind, params = told.get("method"), told.get("params", {})
+            kind, params = message.get("method"), message.get("params", {})
             if kind == "Runtime.exceptionThrown":
                 found.append(params["exceptionDetails"].get("exception", {}).get("description", "an exception"))
             elif kind == "Log.entryAdded" and params["entry"]["level"] == "error":

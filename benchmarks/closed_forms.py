@@ -169,13 +169,13 @@ def crank():
         J, slope, weight = inertia(y[0])
         return np.array([y[1], -(slope * y[1] ** 2 / 2 + weight) / J])
 
-    def seen(y):
+    def to_qv(y):
         angle, rate = y.T
         q, unit, _ = driven_crank.exact(angle.astype(float), slider_crank.PARAMS | {"rate": 1.0})
         return q, jax.tree.map(lambda x: x * rate.astype(float), unit)
 
     m = slider_crank.MECHANISM
-    found = reference(field, [0, LONG(150)], seen)
+    found = reference(field, [0, LONG(150)], to_qv)
     return Motion("slider-crank", m.system, m.q0, m.v0, m.params, np.linspace(0.0, m.end, 11), found.exact,
                   "long double", found.known, tolerances=(1e-5, 1e-8))  # fmt: skip
 

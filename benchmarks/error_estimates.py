@@ -79,26 +79,26 @@ def solve(motion, tolerance, estimate=True):
 
 def judged(motion, tolerance):
     """The verdict on one call."""
-    with warnings.catch_warnings(record=True) as heard:
+    with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         traj = solve(motion, tolerance)
-    spoke = any(issubclass(one.category, lj.AccuracyWarning) for one in heard)
+    did_warn = any(issubclass(one.category, lj.AccuracyWarning) for one in caught)
     there = np.isfinite(np.asarray(jax.tree.leaves(traj.q)[0]).reshape(len(motion.ts), -1)[:, 0])
     there[0] = False
     known, right = motion.known(motion.ts), motion.exact(motion.ts)
     # Outputs may coincide with zeros of a number, such as the velocity after each half period.
-    way = motion.exact(on_its_way(motion.ts))
+    on_the_way = motion.exact(on_its_way(motion.ts))
     true, estimate = [], []
-    for found, error, exact, on_the_way in zip((traj.q, traj.v), (traj.error.q, traj.error.v), right, way):
-        found, error, exact, on_the_way = (as_arrays(tree) for tree in (found, error, exact, on_the_way))
-        scales = [largest(leaf) for leaf in on_the_way]
+    for found, error, exact, between in zip((traj.q, traj.v), (traj.error.q, traj.error.v), right, on_the_way):
+        found, error, exact, between = (as_arrays(tree) for tree in (found, error, exact, between))
+        scales = [largest(leaf) for leaf in between]
         zero = [0 * leaf for leaf in exact]
         true.append(worst(found, exact, scales)[there])
         estimate.append(worst(error, zero, scales)[there] * SCALE["of estimates"])
     true, estimate, floor = np.concatenate(true), np.concatenate(estimate), np.maximum(motion.floor, known)[there]
     return Verdict(
         motion, tolerance, true, estimate, ratio(estimate, true, np.tile(floor, 2)), of_events(motion, traj),
-        float(np.max(known)), spoke and float(traj.scaled_error) * SCALE["of estimates"] > 1,
+        float(np.max(known)), did_warn and float(traj.scaled_error) * SCALE["of estimates"] > 1,
     )  # fmt: skip
 
 
@@ -148,7 +148,7 @@ def compiles():
     found.extend(_COMPILED[before:])
 
 
-def heard(event, seconds, **_):
+def on_compile_event(event, seconds, **_):
     """A listener for `jax.monitoring`."""
     if event == "/jax/core/compile/backend_compile_duration":
         _COMPILED.append(seconds)
@@ -199,7 +199,7 @@ def totals(verdicts, costs):
     true, estimate = (np.concatenate([getattr(v, kind) for v in verdicts]) for kind in ("true", "estimate"))
     warned = np.concatenate([np.full(len(v.true), v.warned) for v in verdicts])
     events = np.concatenate([v.events for v in verdicts])
-    gone = true > NO_DIGIT
+    lost = true > NO_DIGIT
     off = [v for v in verdicts if np.max(v.true, initial=0) > MUST_WARN]
     good = [v for v in verdicts if np.max(v.true, initial=0) < min(RIGHT, RIGHT_IN_TOLERANCES * v.tolerance)]
     each = len(verdicts)
@@ -207,8 +207,8 @@ def totals(verdicts, costs):
               pairs=len(ratios))  # fmt: skip
     yield row("pairs with an estimate within 1/100 and 100", share(within(ratios, 100)), 1.0, "more",
               beyond=int(np.sum(~within(ratios, 100))))  # fmt: skip
-    yield row("of those where no digit is left: said", share((estimate > SAID)[gone] & warned[gone]), 1.0, "more",
-              pairs=int(np.sum(gone)))  # fmt: skip
+    yield row("of those where no digit is left: said", share((estimate > SAID)[lost] & warned[lost]), 1.0, "more",
+              pairs=int(np.sum(lost)))  # fmt: skip
     yield row("motions off by more than 1e-3: warned of", share([v.warned for v in off]), 1.0, "more", motions=len(off))
     yield row("false alarms, of all motions", sum(v.warned for v in good) / each, 0.02, right=len(good), motions=each)
     yield row("crossings with an estimate within 1/10 and 10", share(within(events, 10)), 0.95, "more",
@@ -225,7 +225,7 @@ def totals(verdicts, costs):
 
 def rows(wanted, missed):
     """Yield the lines of the requested motions, and the totals; `missed` collects the missed targets."""
-    jax.monitoring.register_event_duration_secs_listener(heard)
+    jax.monitoring.register_event_duration_secs_listener(on_compile_event)
     verdicts, costs = [], []
     for motion in [*closed_forms.motions(), *amplifying.motions()]:
         if not wanted(motion.name):

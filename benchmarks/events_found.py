@@ -53,13 +53,13 @@ class Family(NamedTuple):
     """Motions of one system, whose program depends only on numbers.
 
     `draw(rng)` -> (q0, v0, params, span); `exact(q0, v0, params, span)` -> a function that maps times to the two arrays
-    that the guard reads; `seen(q, v, multipliers)` -> the same two numbers of a state.
+    that the guard reads; `guard_inputs(q, v, multipliers)` -> the same two numbers of a state.
     """
 
     system: Callable[[], lj.System]
     draw: Callable
     exact: Callable
-    seen: Callable
+    guard_inputs: Callable
     method: Callable = lambda: None
     tightest: float = -11.0
     multipliers: bool = False
@@ -73,12 +73,12 @@ def coupled(x, y, c):
 # Exact motions.
 
 
-def by_scipy(field, start, span, seen):
+def by_scipy(field, start, span, guard_inputs):
     """The reference for a motion without a closed form."""
     solved = solve_ivp(
         field, (0.0, 1.001 * span), start, "DOP853", rtol=1e-13, atol=1e-14, max_step=span / 40, dense_output=True
     )
-    return lambda t: seen(solved.sol(t))
+    return lambda t: guard_inputs(solved.sol(t))
 
 
 def oscillation(q0, v0, p, span):
@@ -268,7 +268,7 @@ TWINS = ("oscillator, Nystrom12", "pendulum, Nystrom12", "rod, Dopri8")
 
 def program(family):
     """(q0, v0, params, span, rtol) -> crossing times, their number, `uncertain`, the end state, success."""
-    height = lambda q, v, multipliers, c: coupled(*family.seen(q, v, multipliers), c) - c["level"]
+    height = lambda q, v, multipliers, c: coupled(*family.guard_inputs(q, v, multipliers), c) - c["level"]
     guard = lambda t, q, v, p: height(q, v, {}, p["guard"])
     if family.multipliers:
         guard = lambda t, q, v, multipliers, p: height(q, v, multipliers, p["guard"])
@@ -279,7 +279,7 @@ def program(family):
             system, q0, v0, params, ts=jnp.stack([jnp.zeros_like(span), span]), rtol=rtol, atol=rtol, events=events,
             method=family.method(), throw=False,
         )  # fmt: skip
-        found, end = traj.events["level"], family.seen(traj.end.q, traj.end.v, traj.end.multipliers)
+        found, end = traj.events["level"], family.guard_inputs(traj.end.q, traj.end.v, traj.end.multipliers)
         return found.t, found.count, found.uncertain, end, traj.end.t
 
     return run

@@ -775,8 +775,8 @@ def alone(program, case) -> Verdict:
     seconds = time.perf_counter() - started
     if report is None:
         error = _error(case, traj)
-        said = [str(w.message) for w in caught if issubclass(w.category, lj.AccuracyWarning)]
-        report = f"AccuracyWarning: {said[0]}" if said else None
+        messages = [str(w.message) for w in caught if issubclass(w.category, lj.AccuracyWarning)]
+        report = f"AccuracyWarning: {messages[0]}" if messages else None
     return Verdict(case, "alone", report, error, _named(case, report), seconds, crashed)
 
 
@@ -822,8 +822,8 @@ def reproduction(family, verdict) -> str:
     parts += [f"end={float(case.end)!r}", f"tolerance={float(case.tolerance)!r}"]
     parts += [f"dt0={float(case.dt0)!r}"] if case.dt0 is not None else []
     parts += ["dtype=np.float32"] if case.dtype == np.float32 else []
-    said = "successful" if verdict.report is None else verdict.report.splitlines()[0]
-    heading = f"  {family.name}, {verdict.way}: {said}; error {verdict.error:.2g}"
+    outcome = "successful" if verdict.report is None else verdict.report.splitlines()[0]
+    heading = f"  {family.name}, {verdict.way}: {outcome}; error {verdict.error:.2g}"
     return f"{heading}\n    alone({program}, Case({', '.join(parts)}))"
 
 
@@ -856,8 +856,8 @@ def outcomes_of(task):
         # The first case of each outcome includes compilation: only a case that is slow again counts as slow.
         slow = [v for v in broken + healthy if v.way == "alone" and v.seconds > SLOW]
         slow = [v for v in slow if alone(family.program, v.case).seconds > SLOW]
-        said = sorted({_anonymous(v.report) for v in broken if v.report})
-        outcomes.append((row, *([reproduction(family, v) for v in group] for group in (findings, slow)), said))
+        reports = sorted({_anonymous(v.report) for v in broken if v.report})
+        outcomes.append((row, *([reproduction(family, v) for v in group] for group in (findings, slow)), reports))
     return outcomes
 
 
@@ -884,13 +884,13 @@ def main():
     with multiprocessing.get_context("spawn").Pool(options.workers) as pool:
         tasks = [(indices, options.seed, options.count) for indices in programs.values()]
         for outcomes in pool.imap_unordered(outcomes_of, tasks):
-            for row, found, late, said in outcomes:
+            for row, found, late, reports in outcomes:
                 table.append(row)
                 findings += found
                 slow += late
                 print("{family:48s} {cases:5d}  {right:5d}  {alone:5.0%}  {lanes:5.0%} {named:>7s}  {false:5d}  "
                       "{worst:7.1g} {seconds:4.1f} s".format(**row), flush=True)  # fmt: skip
-                for report in said if options.messages else []:
+                for report in reports if options.messages else []:
                     print("      " + report.replace("\n", "\n      "))
     cases, seconds = sum(row["cases"] for row in table), time.perf_counter() - started
     score = {way: sum(row[way] * row["cases"] for row in table) / cases for way in ("alone", "lanes")}

@@ -34,7 +34,7 @@ OFF = 0.3
 FOUND, FLAGGED = 0.99, 1.0
 # A search ends within this relative distance of its minimal cost.
 ROUND_OFF = 1e-6
-WILD, OF_SAMPLES = 30.0, 0.08
+OUTLIER, SHARE = 30.0, 0.08
 
 
 class Case(NamedTuple):
@@ -53,7 +53,7 @@ class Case(NamedTuple):
     measured: Callable = lambda traj: {"q": traj.q}
     hint: Any = None
     options: dict = {}
-    wild: bool = False
+    outliers: bool = False
 
     def record(self, measured):
         """A `Record` of some measurements."""
@@ -158,7 +158,7 @@ CASES = {
     ),
     "outliers: long record of a pendulum": Case(
         lj.System(swing, dissipation=rubbed), {"w2": 8.0, "c": 0.05}, ("c", "w2"), of(1.0, 0.0),
-        np.linspace(0.0, 30.0, 600), {"q": 0.01}, options={"loss": "cauchy"}, wild=True,
+        np.linspace(0.0, 30.0, 600), {"q": 0.01}, options={"loss": "cauchy"}, outliers=True,
     ),
     "outliers: coupled masses, one unseen": Case(
         lj.System(coupled, dissipation=lambda t, q, v, p: 0.5 * p["c"] * (v["a"] ** 2 + v["b"] ** 2)),
@@ -189,8 +189,8 @@ def drawn(case, seeds):
     for seed in range(seeds):
         random = np.random.default_rng(seed + seeds)
         error = random.normal(size=clean.shape[1])
-        if case.wild:
-            error = np.where(random.uniform(size=error.size) < OF_SAMPLES, WILD * random.normal(size=error.size), error)
+        if case.outliers:
+            error = np.where(random.uniform(size=error.size) < SHARE, OUTLIER * random.normal(size=error.size), error)
         errors.append(error)
     errors = np.stack(errors)
     loss = case.options.get("loss", "squares")
@@ -213,26 +213,26 @@ def rows(name, case, seeds, alone_too, restarts):
     seconds = time.perf_counter() - started
     values, cost, converged, tries, steps = swept.values
     right = cost <= costs * (1 + ROUND_OFF)
-    yield from told(f"{name}, in a sweep", right, swept.ok, seconds=seconds, starts=float(np.mean(tries)),
+    yield from shares(f"{name}, in a sweep", right, swept.ok, seconds=seconds, starts=float(np.mean(tries)),
                     steps=float(np.mean(steps)))  # fmt: skip
     if not np.array_equal(converged, swept.ok):
         yield row(f"{name}: converged and status differ", np.sum(converged != swept.ok), 0)
     for s in np.flatnonzero(~right | ~swept.ok)[:10]:
         how = in_words(swept.status.result[s])
         print(f"      seed {s}: chi2 {2 * cost[s]:.6g}, of the truth {2 * costs[s]:.6g}; {how}")
-    started, alone, told_of, lowest = time.perf_counter(), [], [], []
+    started, alone, warned_of, lowest = time.perf_counter(), [], [], []
     for seed in range(alone_too):
-        with warnings.catch_warnings(record=True) as said:
+        with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", lj.FitWarning)
             found = case.fit(tree(data[seed]))
         alone.append((float(found.cost), bool(found.converged)))
-        told_of.append(any(issubclass(w.category, lj.FitWarning) for w in said) or bool(found.converged))
+        warned_of.append(any(issubclass(w.category, lj.FitWarning) for w in caught) or bool(found.converged))
     seconds = time.perf_counter() - started
     if alone:
         below, well = np.array(alone).T
-        yield from told(f"{name}, alone", below <= costs[:alone_too] * (1 + ROUND_OFF), well > 0, seconds=seconds)
-    if not all(told_of):
-        yield row(f"{name}: flagged without a warning", alone_too - sum(told_of), 0)
+        yield from shares(f"{name}, alone", below <= costs[:alone_too] * (1 + ROUND_OFF), well > 0, seconds=seconds)
+    if not all(warned_of):
+        yield row(f"{name}: flagged without a warning", alone_too - sum(warned_of), 0)
     for seed in range(restarts):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", lj.FitWarning)
@@ -243,7 +243,7 @@ def rows(name, case, seeds, alone_too, restarts):
         yield row(f"{name}: ends called right, {restarts} of them, above the best of 64", max(lower, 0), 0)
 
 
-def told(what, right, ok, **more):
+def shares(what, right, ok, **more):
     """The share of right results, the share of the others that is flagged, and false alarms."""
     count = len(right)
     yield row(f"{what}: global minimum", np.mean(right), FOUND, "more", missed=int(np.sum(~right)), of=count, **more)

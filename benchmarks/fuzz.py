@@ -44,7 +44,7 @@ from lagjax.jax_internals.one_function import one_function
 jax.config.update("jax_enable_x64", True)
 
 END, OUTPUTS = 0.8, 5
-# A motion whose reference needs more evaluations (most take a millisecond) counts as not solvable ("wild").
+# A motion whose reference needs more evaluations (most take a millisecond) counts as not solvable.
 PATIENCE = 50_000
 # Allowed differences, relative to 1 + the largest value; at a tolerance of 1e-9 this leaves room for kinks.
 VALUES_AGREE, DERIVATIVES_AGREE = 1e-6, 1e-5
@@ -390,16 +390,16 @@ class Reference:
 
         def patiently(t, y):
             if next(evaluations, None) is None:
-                raise Wild
+                raise NotFollowed
             return rate(t, y)
 
         found = solve_ivp(patiently, (0, END), y, "DOP853", np.linspace(0, END, OUTPUTS), rtol=1e-10, atol=1e-11)
         if not found.success or not np.all(np.isfinite(found.y)) or np.max(np.abs(found.y)) > 1e4:
-            raise Wild
+            raise NotFollowed
         return found.y
 
 
-class Wild(Exception):
+class NotFollowed(Exception):
     """A motion that SciPy cannot follow."""
 
 
@@ -436,7 +436,7 @@ def run_quickly(seed: int) -> str:
     along = jax.tree.map(lambda x: rng.normal(size=np.shape(x)).astype(np.asarray(x).dtype), inputs)
     expected, slope = jax.jit(lambda x, dx: jax.jvp(partial(stepped, reference.acceleration), x, dx))(inputs, along)
     if not np.all(np.isfinite(expected)) or np.max(np.abs(expected)) > 1e4:
-        return "skipped: wild"
+        return "skipped: SciPy cannot follow it"
     # Once with the values known at compile time, once with the values passed as arguments.
     marked = lambda *x: one_function(partial(stepped, ours), *x, checked=True)
     known = jax.jit(lambda y: marked(y, jax.tree.map(jnp.asarray, reference.floating)))(reference.start)
@@ -455,8 +455,8 @@ def run(seed: int, every: bool) -> str:
     """Return "ok" or what is wrong with a case."""
     try:
         return _run(seed, every)
-    except Wild:
-        return "skipped: wild"
+    except NotFollowed:
+        return "skipped: SciPy cannot follow it"
 
 
 def _run(seed, every):
@@ -526,23 +526,23 @@ def in_a_process(function, seed: int, verbose: bool, seconds: float = 300) -> st
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", lj.AccuracyWarning)
-                said = function(seed)
+                verdict = function(seed)
         except BaseException as error:
             if verbose:
                 traceback.print_exc()
-            said = f"RAISED: {type(error).__name__}: {' '.join(str(error).split())[:160]}"
-        os.write(write, said.encode())
+            verdict = f"RAISED: {type(error).__name__}: {' '.join(str(error).split())[:160]}"
+        os.write(write, verdict.encode())
         os._exit(0)
     os.close(write)
     ready, _, _ = select.select([read], [], [], seconds)
     if not ready:
         os.kill(child, signal.SIGKILL)
-    said = os.read(read, 65536).decode() if ready else ""
+    verdict = os.read(read, 65536).decode() if ready else ""
     os.close(read)
     _, status = os.waitpid(child, 0)
     if not ready:
         return f"SLOW: over {seconds:g} s"
-    return said or f"DIED: {signal.Signals(os.WTERMSIG(status)).name if os.WIFSIGNALED(status) else status}"
+    return verdict or f"DIED: {signal.Signals(os.WTERMSIG(status)).name if os.WIFSIGNALED(status) else status}"
 
 
 def main():
@@ -560,9 +560,9 @@ def main():
     verdicts = Counter()
     for seed in seeds:
         start = time.perf_counter()
-        said = in_a_process(function, seed, bool(options.only), options.seconds)
-        verdicts[said.split(":")[0]] += 1
-        print(f"{seed:6d}  {time.perf_counter() - start:5.1f} s  {said}", flush=True)
+        verdict = in_a_process(function, seed, bool(options.only), options.seconds)
+        verdicts[verdict.split(":")[0]] += 1
+        print(f"{seed:6d}  {time.perf_counter() - start:5.1f} s  {verdict}", flush=True)
         if options.only:
             print("        ", Counter(random_case(seed).features), flush=True)
     print(dict(verdicts))

@@ -74,19 +74,19 @@ def integrated(field, start, ts, columns):
 class Integrated(NamedTuple):
     """A reference motion: `exact(ts)` -> (q, v), and `known(ts)`, its own error at each time.
 
-    `field(t, y)` in long double; `start` (n,), its state at ts[0]; `seen(y)`: states (T, n) to (q, v).
+    `field(t, y)` in long double; `start` (n,), its state at ts[0]; `to_qv(y)`: states (T, n) to (q, v).
     """
 
     field: Callable
     start: Any
-    seen: Callable
-    twice: dict
+    to_qv: Callable
+    computed: dict
 
     def at(self, ts, columns):
         key = (columns, np.asarray(ts).tobytes())
-        if key not in self.twice:
-            self.twice[key] = self.seen(integrated(self.field, self.start, ts, columns))
-        return self.twice[key]
+        if key not in self.computed:
+            self.computed[key] = self.to_qv(integrated(self.field, self.start, ts, columns))
+        return self.computed[key]
 
     def exact(self, ts):
         """Coordinates and velocities at the times, leaves (T, ...)."""
@@ -98,9 +98,9 @@ class Integrated(NamedTuple):
         return worst(one, other, [largest(leaf) for leaf in other])
 
 
-def reference(field, start, seen):
+def reference(field, start, to_qv):
     """An `Integrated` from numbers in double precision."""
-    return Integrated(field, np.asarray(start, LONG), seen, {})
+    return Integrated(field, np.asarray(start, LONG), to_qv, {})
 
 
 def largest(leaf):

@@ -45,9 +45,9 @@ class Motion(NamedTuple):
         return self._replace(events=events, when=when)
 
 
-def by_long_double(name, system, q0, v0, params, ts, field, start, seen, **how):
+def by_long_double(name, system, q0, v0, params, ts, field, start, to_qv, **how):
     """A motion whose reference is integrated in long double from equations derived by hand."""
-    found: Integrated = reference(field, start, seen)
+    found: Integrated = reference(field, start, to_qv)
     return Motion(name, system, q0, v0, params, ts, found.exact, "long double", found.known, **how)
 
 

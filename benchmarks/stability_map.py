@@ -4,9 +4,9 @@ The carriage on rotating cross-rails, m ω²/K and m ω²/k each from 0.05 to 20
 (1 - m ω²/K)(1 - m ω²/k) > 0. `lj.normal_modes` at its equilibrium judges each pair of springs, as `lj.sweep` calls it;
 the second call is timed, after compiling.
 
-    wrong verdicts                  of points where |1 - m ω²/K| and |1 - m ω²/k| exceed 1e-12: on a critical line itself
+    wrong verdicts                  at points where |1 - m ω²/K| and |1 - m ω²/k| exceed 1e-12: on a critical line
                                     a frequency is zero, and round-off in the inputs decides
-    seconds                         wall time of a whole call, labelled results included
+    seconds                         wall time of a whole call, including the labelled results
 
     python benchmarks/stability_map.py [--json FILE]
 """
@@ -26,7 +26,7 @@ SIDES, CALLS, DECIDED = (316, 317), 5, 1e-12
 
 
 def rows(wanted):
-    """The map on a grid that crosses both critical lines."""
+    """The rows of the map, on a grid that crosses both critical lines."""
     over_K, over_k = (np.geomspace(0.05, 20.0, count) for count in SIDES)
     call = lambda: lj.sweep(
         lambda point: is_held(point["over_K"], point["over_k"]), {"over_K": over_K, "over_k": over_k}, progress=False

@@ -93,12 +93,12 @@ def kind_of(node: ast.Call) -> str:
 
 def messages(source: str) -> list[tuple[str, str]]:
     """(kind, text) of each message in a module: raised, warned of, or built in one function and raised elsewhere."""
-    found, seen = [], set()
+    found, known = [], set()
 
     def add(kind, text):
         text = text and re.sub(r"…(?:\s?…)+", "…", text).strip()
-        if text and telling(text) and text not in seen:
-            seen.add(text)
+        if text and telling(text) and text not in known:
+            known.add(text)
             found.append((kind, text))
 
     tree = ast.parse(source)

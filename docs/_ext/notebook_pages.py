@@ -42,8 +42,8 @@ def with_alt_texts(notebook: dict, name: str) -> dict:
             headings = re.findall(r"^#+ (.*)", text, re.MULTILINE)
             heading = headings[-1] if headings else heading
         elif any("image/png" in output.get("data", {}) for output in cell["outputs"]):
-            said = words(text) or "drawn by " + text.strip().splitlines()[-1]
-            alt = cell["metadata"].get("alt") or f"Figure, {heading}: {said}"
+            description = words(text) or "drawn by " + text.strip().splitlines()[-1]
+            alt = cell["metadata"].get("alt") or f"Figure, {heading}: {description}"
             cell["metadata"]["mystnb"] = {"image": {"alt": alt.replace("$", "")}}
     return notebook
 
