@@ -4,9 +4,9 @@ The carriage on rotating cross-rails, m ω²/K and m ω²/k each from 0.05 to 20
 (1 - m ω²/K)(1 - m ω²/k) > 0. `lj.normal_modes` at its equilibrium judges each pair of springs, as `lj.sweep` calls it;
 the second call is timed, after compiling.
 
-    wrong verdicts                  at points where |1 - m ω²/K| and |1 - m ω²/k| exceed 1e-12: on a critical line
-                                    a frequency is zero, and round-off in the inputs decides
-    seconds                         wall time of a whole call, including the labelled results
+    wrong verdicts      among the points where |1 - m ω²/K| and |1 - m ω²/k| exceed 1e-12: on a critical line itself a
+                        frequency is zero, and round-off in the inputs decides
+    seconds             wall time of a whole call, labelled results included
 
     python benchmarks/stability_map.py [--json FILE]
 """
