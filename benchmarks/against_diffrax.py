@@ -1,9 +1,9 @@
 """What does lagjax cost on top of diffrax?
 
-The bead on a rotating hoop, 100 periods at 1e-9: diffrax with the acceleration derived by hand against lagjax with
-automatic derivatives, its checks and its outputs; and the Cartesian pendulum, where lagjax returns to the rod after
-every step and diffrax, given the hand-derived tension, drifts. Both in one process, in turn, medians after warm-up;
-compile time apart.
+Two comparisons: the bead on a rotating hoop, 100 periods at 1e-9, where diffrax uses an acceleration derived by hand
+and lagjax automatic derivatives, its checks and its outputs; and the Cartesian pendulum, where lagjax projects onto the
+rod after every step and diffrax, with the hand-derived tension, drifts. Both run alternately in one process; times are
+medians after warm-up, and compile time is separate.
 
     python benchmarks/against_diffrax.py [--json FILE]
 """
@@ -44,7 +44,7 @@ def bead_by_lagjax(method, end):
 
 
 def pendulum_by_hand(method, end):
-    """diffrax with the tension of the rod derived by hand, and no return to it."""
+    """diffrax with the tension of the rod derived by hand, without projection onto the rod."""
 
     def field(t, y, args):
         q, v = y

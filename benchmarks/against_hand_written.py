@@ -1,14 +1,15 @@
-"""What does the right-hand side from L cost beside the one derived by hand?
+"""What does the right-hand side from L cost compared with one derived by hand?
 
-Every system of the six scenes, alone and in 1,000 lanes: `lj.accelerations` and the accelerations and multipliers as a
-robust person writes them in `jax.numpy`, in the same coordinates and as the same function of the state, the
-multipliers eliminated by hand (`by_hand.py`). And the double pendulum beside numba.
+For every system of the six scenes, alone and in 1,000 lanes, `lj.accelerations` is compared with accelerations and
+multipliers written robustly by hand in `jax.numpy`, in the same coordinates and as the same function of the state, with
+the multipliers eliminated by hand (`by_hand.py`). The double pendulum is also compared with numba.
 
-Both run in a compiled loop in which every acceleration changes the next state a little, so that nothing can be left out
-or moved in front of the loop but what depends on `params` alone; and both loops are compiled as `lj.integrate` compiles
-its own, as one machine function where that is possible: between kernels XLA would spend more time than in them. The
-loop's own cost is in both; "net" is the ratio without it, measured with a loop that evaluates nothing. Nanoseconds are
-minima. "error" is the largest difference of the two, relative to the largest value, over 1,000 states.
+Both run in a compiled loop in which every acceleration changes the next state a little, so that the compiler can
+neither omit anything nor move anything out of the loop except what depends on `params` alone. Both loops are compiled
+as `lj.integrate` compiles its own, as one machine function if possible: otherwise XLA would spend more time between
+kernels than in them. Both include the loop's own cost; "net" is the ratio without it, measured with a loop that
+evaluates nothing. Nanoseconds are minima. "error" is the largest difference of the two, relative to the largest value,
+over 1,000 states.
 
     python benchmarks/against_hand_written.py [--json FILE] [--only TEXT]
 """
@@ -30,7 +31,7 @@ except ImportError:
 jax.config.update("jax_enable_x64", True)
 
 LANES = 1000
-# Seconds of one measured loop: long beside the call, short beside whatever else the machine does.
+# Seconds of one measured loop: long compared with a call, short compared with other activity of the machine.
 LOOP = 3e-3
 REPEATS = 31
 # How far a state moves along its velocity and acceleration from one evaluation to the next.
@@ -38,7 +39,7 @@ NUDGE = 1e-7
 
 
 def loop(right_hand_side):
-    """`count` evaluations, each at a state changed by the one before; t, q, v and the multipliers' sum at the end."""
+    """`count` evaluations, each at a state changed by the previous one; returns t, q, v and the sum of multipliers."""
 
     def run(count, q, v, params):
         def evaluate(_, carry):
@@ -58,12 +59,12 @@ def from_lagrangian(system):
 
 
 def nothing(t, q, v, params):
-    """The right-hand side of the loop that measures the loop."""
+    """An empty right-hand side, to measure the loop itself."""
     return v, {}
 
 
 def lanes_of(case):
-    """The case's state changed at random, LANES times."""
+    """LANES random variations of the case's state."""
     random = np.random.default_rng(0)
     return [
         jax.tree.map(lambda x: jnp.asarray(x + 0.1 * random.standard_normal((LANES, *np.shape(x)))), state)
@@ -83,7 +84,7 @@ def difference(found, right):
 
 
 def evaluations_in(function):
-    """How many evaluations take LOOP seconds; `function` takes their number."""
+    """The number of evaluations that take LOOP seconds; `function` takes this number."""
     many, seconds = 1, 0.0
     while seconds < 0.1 * LOOP:
         many *= 4
@@ -100,7 +101,7 @@ def calls(case, params, right_hand_sides, batched):
 
 
 def compared(case, batched):
-    """The row of one scene's system, alone or in lanes."""
+    """The row of one system, alone or in lanes."""
     params = jax.tree.map(jnp.asarray, case.params)
     both = calls(case, params, (from_lagrangian(case.system), case.by_hand, nothing), batched)
     count = evaluations_in(both[1])
@@ -121,7 +122,7 @@ def named(case, batched):
 
 
 def against_numba(batched):
-    """The double pendulum's row: a lane's share of ours over numba's."""
+    """The double pendulum's row: our time per lane over that of numba."""
     case, target = DOUBLE_PENDULUM, 0.5 if batched else 2.5
     what = f"{case.name}, {'a lane of 1000' if batched else 'single'}: from L / numba"
     if numba is None:
@@ -167,7 +168,7 @@ if numba is not None:
 
     @numba.njit(error_model="numpy")
     def numba_lanes(count, one, two, rate1, rate2, m1, m2, l1, l2, g):
-        """`loop` on arrays of double pendulums, all of them for one evaluation after the other."""
+        """`loop` on arrays of double pendulums: each evaluation treats all of them."""
         one, two, rate1, rate2 = one.copy(), two.copy(), rate1.copy(), rate2.copy()
         for _ in range(count):
             for i in range(one.size):
@@ -180,7 +181,7 @@ if numba is not None:
 
 
 def rows(wanted):
-    """Every system of the scenes, then the double pendulum beside numba."""
+    """Every system of the scenes, then the double pendulum compared with numba."""
     for case in (*CASES, DOUBLE_PENDULUM):
         for batched in (False, True):
             if wanted(named(case, batched)):

@@ -1,12 +1,12 @@
-"""How fast is lagjax beside the tools that people use for the same work?
+"""How fast is lagjax compared with the tools that people use for the same work?
 
     bead       on a rotating hoop, 100 periods; error of angle and rate at the outputs against elliptic functions
     pendulum   in Cartesian coordinates on a rod, 20 s from the horizontal; with its multiplier; against the same
     crank      the slider-crank of `lagjax.mechanisms`, 7 coordinates and 6 constraints; against its reference
     chain      of 64 links in absolute angles, one right-hand side; against MuJoCo's accelerations
 
-Every tool solves at the loosest tolerance of a ladder from which on it stays within the error asked for; what is timed
-is the solve alone, compiled and prepared before. A tool that is not installed is skipped by name (`peers.py`).
+Every tool solves at the loosest tolerance of a ladder below which it stays within the required error; only the solve is
+timed, after compilation and preparation. A tool that is not installed is skipped and named (`peers.py`).
 
     python benchmarks/against_peers.py [--json FILE] [--only TEXT]
 """
@@ -27,7 +27,7 @@ from lagjax.scenes import bead_on_hoop
 
 jax.config.update("jax_enable_x64", True)
 
-# Seconds: a solve of a millisecond just after another tool's of twenty measures how cold the caches are.
+# Seconds per turn: a solve of one millisecond right after another tool's of twenty would measure cold caches.
 TURN = 1e-2
 # Quarters of a decade.
 LADDER = tuple(10.0 ** (-k / 4) for k in range(16, 53))
@@ -36,9 +36,9 @@ PERIODS, PENDULUM_END, LINKS = 100, 20.0, 64
 
 
 def loosest(prepare, error, allowed, ladder=LADDER):
-    """The solve at the loosest tolerance from which on the error stays within `allowed`, as (solve, tolerance, error).
+    """The solve at the loosest tolerance below which the error stays within `allowed`, as (solve, tolerance, error).
 
-    Two tolerances in a row must do: an error may be small by chance.
+    Two consecutive tolerances must satisfy this, because an error may be small by chance.
     """
     before = None
     for tolerance in ladder:
@@ -51,7 +51,7 @@ def loosest(prepare, error, allowed, ladder=LADDER):
 
 
 def beside(what, ours, theirs, target=None, repeats=15):
-    """The row of one solve over another, each (solve, tolerance, error)."""
+    """The row of the time of one solve over that of another, each (solve, tolerance, error)."""
     times = in_turn(ours[0], theirs[0], repeats=repeats, shortest=TURN)
     ratio, of_minima = times.ratio()
     return row(
@@ -61,7 +61,7 @@ def beside(what, ours, theirs, target=None, repeats=15):
 
 
 def by_lagjax(system, q0, v0, params, ts):
-    """`prepare(tolerance)` for our default: compiled once, the tolerance an argument."""
+    """`prepare(tolerance)` for our default method, compiled once with the tolerance as an argument."""
     program = jax.jit(
         lambda tolerance, params: lj.integrate(
             system, q0, v0, params, ts=ts, rtol=tolerance, atol=tolerance, throw=False
@@ -120,7 +120,7 @@ def bead_rows(wanted):
 
 
 class Once:
-    """A value computed when it is first asked for."""
+    """A value computed at first use."""
 
     def __init__(self, compute):
         self.compute = compute
@@ -134,7 +134,7 @@ class Once:
 
 
 def against(what, ours, build, error, allowed, target, ladder=LADDER):
-    """The row of ours over a tool, or why there is none."""
+    """The row of our time over that of a tool, or the reason why there is none."""
     try:
         theirs = loosest(build(), error, allowed, ladder)
     except (ImportError, ArithmeticError) as reason:
@@ -153,12 +153,12 @@ def rod(t, q, params):
 
 
 def angle_lagrangian(t, q, v, params):
-    """The same, by the angle from the bottom."""
+    """The same in the angle from the bottom."""
     return 0.5 * (params["l"] * v) ** 2 + params["g"] * params["l"] * jnp.cos(q)
 
 
 def pendulum_rows(wanted):
-    """The Cartesian pendulum beside the angle form and beside IDAS."""
+    """The Cartesian pendulum compared with the angle form and with IDAS."""
     params, l = {"g": 9.8125, "l": 1.25}, 1.25
     swing = math.sqrt(params["g"] / l)
     k = math.sqrt(0.5)
@@ -198,7 +198,7 @@ def pendulum_rows(wanted):
 
 
 def crank_rows(wanted):
-    """The slider-crank beside IDAS."""
+    """The slider-crank compared with IDAS."""
     what, mechanism = "slider-crank: lagjax / IDAS", slider_crank.MECHANISM
     if not wanted(what):
         return
@@ -230,13 +230,13 @@ def crank_rows(wanted):
 
 
 def chain_lagrangian(t, q, v, params):
-    """Unit masses on unit rods, each by its angle from the vertical."""
+    """Unit masses on unit rods, described by their angles from the vertical."""
     across, along = jnp.cumsum(jnp.cos(q) * v), jnp.cumsum(jnp.sin(q) * v)
     return 0.5 * jnp.sum(across**2 + along**2) + params["g"] * jnp.sum(jnp.cumsum(jnp.cos(q)))
 
 
 def chain_rows(wanted):
-    """One right-hand side of the chain beside one step of MuJoCo."""
+    """One right-hand side of the chain compared with one step of MuJoCo."""
     what, params = f"chain, {LINKS} links: right-hand side / MuJoCo's step", {"g": 9.81}
     if not wanted(what):
         return

@@ -1,4 +1,4 @@
-"""Motions that amplify errors, chaotic and nearly singular ones: their equations by hand, for long double."""
+"""Motions that amplify errors, chaotic and nearly singular ones, with equations written by hand for long double."""
 
 from functools import partial
 
@@ -22,7 +22,7 @@ def pendulum_lagrangian(t, q, v, params):
 
 
 def damped_pendulum_lagrangian(t, q, v, params):
-    """The same with a push that turns with the time."""
+    """The same with a push whose direction rotates with time."""
     return 0.5 * v**2 + params["k"] * jnp.cos(q) + params["push"] * q * jnp.cos(params["rate"] * t)
 
 
@@ -55,7 +55,7 @@ def wall_lagrangian(t, q, v, params):
 
 
 def top_lagrangian(t, q, v, params):
-    """A free rigid body in Euler's angles z-x-z."""
+    """A free rigid body in Euler angles z-x-z."""
     s, c = jnp.sin(q["theta"]), jnp.cos(q["theta"])
     one = v["phi"] * s * jnp.sin(q["psi"]) + v["theta"] * jnp.cos(q["psi"])
     two = v["phi"] * s * jnp.cos(q["psi"]) - v["theta"] * jnp.sin(q["psi"])
@@ -64,7 +64,7 @@ def top_lagrangian(t, q, v, params):
 
 
 def quaternion_lagrangian(t, q, v, params):
-    """The same by a quaternion (scalar first): ω = 2 q* q̇."""
+    """The same with a quaternion (scalar first): ω = 2 q* q̇."""
     one = 2 * (q[0] * v[1] - q[1] * v[0] - q[2] * v[3] + q[3] * v[2])
     two = 2 * (q[0] * v[2] + q[1] * v[3] - q[2] * v[0] - q[3] * v[1])
     three = 2 * (q[0] * v[3] - q[1] * v[2] + q[2] * v[1] - q[3] * v[0])
@@ -95,11 +95,11 @@ def named(*names):
     """(q, v) of several coordinates, each in a dictionary."""
     count = len(names)
 
-    def seen(y):
+    def to_qv(y):
         y = y.astype(float)
         return dict(zip(names, y.T[:count])), dict(zip(names, y.T[count:]))
 
-    return seen
+    return to_qv
 
 
 def swing(name, q0, v0, ts, **how):
@@ -130,7 +130,7 @@ def two_rods(name, q0, v0, ts, **how):
 
 
 def masses_on_rods(ts):
-    """The mechanism of two masses in Cartesian coordinates, from both rods horizontal; by its angles."""
+    """The mechanism of two masses in Cartesian coordinates, rods horizontal at first; the reference uses angles."""
     g = LONG(double_pendulum.PARAMS["g"])
 
     def field(t, y):
@@ -139,7 +139,7 @@ def masses_on_rods(ts):
         one, two, share = -s * w**2 - 2 * g * np.sin(a), s * u**2 - g * np.sin(b), 1 / (1 + s**2)
         return np.array([u, w, (one - c * two) * share, (2 * two - c * one) * share])
 
-    def seen(y):
+    def to_qv(y):
         arm = lambda a: np.stack([np.sin(a), -np.cos(a)], axis=1)
         moved = lambda a, rate: np.stack([np.cos(a) * rate, np.sin(a) * rate], axis=1)
         a, b, u, w = y.T
@@ -150,7 +150,7 @@ def masses_on_rods(ts):
     # The angle whose sine is exactly one.
     quarter = 2 * np.arctan(LONG(1))
     return by_long_double(
-        f"two masses on rods, {ts[-1]:g} s", m.system, m.q0, m.v0, m.params, ts, field, [quarter, quarter, 0, 0], seen,
+        f"two masses on rods, {ts[-1]:g} s", m.system, m.q0, m.v0, m.params, ts, field, [quarter, quarter, 0, 0], to_qv,
         tolerances=(1e-5, 1e-8),
     )  # fmt: skip
 
@@ -189,10 +189,10 @@ def bodies(name, m, q0, v0, ts, **how):
         pull = np.sum(masses * apart / (square * np.sqrt(square)), axis=0)
         return np.concatenate([y[6:], pull.ravel()])
 
-    seen = lambda y: tuple(part.astype(float).reshape(-1, 3, 2) for part in (y[:, :6], y[:, 6:]))
+    to_qv = lambda y: tuple(part.astype(float).reshape(-1, 3, 2) for part in (y[:, :6], y[:, 6:]))
     start = np.concatenate([q0.ravel(), v0.ravel()])
     params = {"m": np.asarray(m, float)}
-    return by_long_double(name, three_bodies, q0, v0, params, ts, field, start, seen, **how)
+    return by_long_double(name, three_bodies, q0, v0, params, ts, field, start, to_qv, **how)
 
 
 def bounces(name, ts, **how):
@@ -213,7 +213,7 @@ def spin_rates(w):
 
 
 def tumbling(name, spin, ts, **how):
-    """Near the intermediate axis, in Euler's angles; `spin` about the three axes."""
+    """Rotation near the intermediate axis, in Euler angles; `spin` is about the three axes."""
     theta, psi = 1.25, 0.5
 
     def angles(theta, psi, w):
@@ -225,7 +225,7 @@ def tumbling(name, spin, ts, **how):
                 phi_rate * np.sin(theta) * np.cos(psi) - theta_rate * np.sin(psi),
                 phi_rate * np.cos(theta) + psi_rate]  # fmt: skip
 
-    def seen(y):
+    def to_qv(y):
         rates = angles(y[:, 1], y[:, 2], y[:, 3:].T)
         names = ("phi", "theta", "psi")
         return tuple({k: np.asarray(x, float) for k, x in zip(names, part)} for part in (y[:, :3].T, rates))
@@ -235,7 +235,7 @@ def tumbling(name, spin, ts, **how):
     v0 = {k: float(x) for k, x in zip(q0, angles(theta, psi, spin))}
     theta, psi = LONG(theta), LONG(psi)
     start = [*q0.values(), *spins(*exactly(list(v0.values())))]
-    return by_long_double(name, rigid_body, q0, v0, INERTIA, ts, field, start, seen, **how)
+    return by_long_double(name, rigid_body, q0, v0, INERTIA, ts, field, start, to_qv, **how)
 
 
 def turned(q, w):
@@ -245,16 +245,16 @@ def turned(q, w):
 
 
 def tumbling_quaternion(name, spin, ts, **how):
-    """The same by a quaternion held at length one."""
+    """The same with a quaternion constrained to unit length."""
     field = lambda t, y: np.array([*(x / 2 for x in turned(y[:4], y[4:])), *spin_rates(y[4:])])
-    seen = lambda y: (y[:, :4].astype(float), np.stack(turned(y.T[:4], y.T[4:]), axis=1).astype(float) / 2)
+    to_qv = lambda y: (y[:, :4].astype(float), np.stack(turned(y.T[:4], y.T[4:]), axis=1).astype(float) / 2)
     q0 = np.array([1.0, 0.0, 0.0, 0.0])
     v0 = np.array([0.0, *spin]) / 2
-    return by_long_double(name, by_quaternion, q0, v0, INERTIA, ts, field, [*q0, *spin], seen, **how)
+    return by_long_double(name, by_quaternion, q0, v0, INERTIA, ts, field, [*q0, *spin], to_qv, **how)
 
 
 def single(motion):
-    """In single precision, of numbers that it holds."""
+    """The motion in single precision, with numbers that it represents exactly."""
     start = jax.tree.map(np.float32, (motion.q0, motion.v0, motion.params, motion.ts))
     return motion._replace(floor=1e-6, **dict(zip(("q0", "v0", "params", "ts"), start)))
 
@@ -266,14 +266,14 @@ SPIN = (0.0009765625, 2.0, 0.001953125)
 
 
 def through_zero(t, q, v, params):
-    """Where the pendulum, or the first rod, hangs down."""
+    """Zero when the pendulum, or the first rod, hangs down."""
     return q["one"] if isinstance(q, dict) else q
 
 
 def motions():
     """All of them."""
     upto, few, tight = partial(np.linspace, 0.0), (1e-6, 1e-9), (1e-7, 1e-10, 1e-11)
-    # No output at a time that single precision does not hold.
+    # Single precision represents all these output times exactly.
     binary = np.arange(0.0, 8.25, 0.5)
     fixed = lambda dt: {"dt0": dt, "stepsize_controller": diffrax.ConstantStepSize()}
     recorded = lambda most: lj.Crossing(through_zero, terminal=False, most=most)

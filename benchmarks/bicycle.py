@@ -2,7 +2,8 @@
 
 Two frames that roll on two thin wheels: the body, and the front, which turns in it about the steering axis. x is
 forward, y to the right, z down; g is along +z. Nine coordinates: the rear hub (x, y, z), the body's yaw ψ, roll φ and
-pitch θ, the steering angle δ, and how far each wheel has turned in its frame. With rotations about fixed axes,
+pitch θ, the steering angle δ, and the angle by which each wheel has turned in its frame. With rotations about fixed
+axes,
 
     body in space   B = R_z(ψ) R_x(φ) R_y(θ)            front in the body   S = 1 + sin δ [e]× + (1 - cos δ) [e]×²
 
@@ -15,11 +16,12 @@ d = (ẑ - n_z n) / √(1 - n_z²):
     contact   C_z + r √(1 - n_z²) = 0                  two of them, holonomic
     no slip   (Ċ + ω × r d)_{x, y} = 0                 two equations each: four, not integrable
 
-Three freedoms of velocity are left: forward, roll, steering. About running straight at the speed u they are linear,
+Three degrees of freedom of the velocity remain: forward, roll, steering. Linearised about straight running at the speed
+u, roll and steering obey
 
     M (φ̈, δ̈) + u C₁ (φ̇, δ̇) + (g K₀ + u² K₂) (φ, δ) = 0
 
-with the matrices below, against which the tests hold the accelerations.
+with the matrices below; the tests compare the accelerations with them.
 
 Source: Meijaard, Papadopoulos, Ruina & Schwab, *Proc. R. Soc. A* 463 (2007) 1955: Table 1, and the benchmark's M, C₁,
 K₀, K₂.
@@ -34,7 +36,7 @@ PARAMS = {
     "g": 9.81, "wheelbase": 1.02, "trail": 0.08, "tilt": np.pi / 10,
     "rear": {"r": 0.3, "m": 2.0, "I": np.array([0.0603, 0.12, 0.0603])},
     "front": {"r": 0.35, "m": 3.0, "I": np.array([0.1405, 0.28, 0.1405])},
-    # Centres from the rear contact, as printed.
+    # Centres of mass relative to the rear contact, as printed.
     "body": {"m": 85.0, "at": np.array([0.3, 0.0, -0.9]),
              "I": np.array([[9.2, 0.0, 2.4], [0.0, 11.0, 0.0], [2.4, 0.0, 2.8]])},
     "fork": {"m": 4.0, "at": np.array([0.9, 0.0, -0.7]),
@@ -49,7 +51,7 @@ K2 = np.array([[0.0, 76.59734589573222], [0.0, 2.65431523794604]])
 
 
 def about_axis(x):
-    """The rotations by an angle about x, y and z."""
+    """The matrices of rotation by an angle about x, y and z."""
     c, s = jnp.cos(x), jnp.sin(x)
     one, nil = jnp.ones_like(c), jnp.zeros_like(c)
     rows = lambda *entries: jnp.stack(entries).reshape(3, 3)
@@ -61,7 +63,7 @@ def about_axis(x):
 
 
 class Pose:
-    """Both frames: their rotations, the places of their parts, and what moves how."""
+    """Both frames: rotations, angular velocities, and positions and velocities of their parts."""
 
     def __init__(self, q, v, params):
         _, by_pitch, _ = about_axis(q["pitch"])
@@ -79,23 +81,23 @@ class Pose:
         self.body_rate = by_pitch.T @ rolling + jnp.stack([nil, v["pitch"], nil])
         self.fork_rate = turned.T @ self.body_rate + v["steer"] * axis
         self.hub, self.hub_rate = jnp.stack([q["x"], q["y"], q["z"]]), jnp.stack([v["x"], v["y"], v["z"]])
-        # The hub stands a radius above the contact, from which all lengths are counted.
+        # All lengths are relative to the rear contact, one radius below the hub.
         self.up = jnp.stack([nil, nil, params["rear"]["r"] + nil])
         self.pivot = jnp.stack([params["wheelbase"] + params["trail"] + nil, nil, nil])
 
     def on_body(self, at):
-        """Place and velocity of a point of the body, given where it is when all angles are zero."""
+        """Position and velocity of a point of the body, given by its place when all angles are zero."""
         arm = at + self.up
         return self.hub + self.body @ arm, self.hub_rate + self.body @ jnp.cross(self.body_rate, arm)
 
     def on_fork(self, at):
-        """The same of a point of the front."""
+        """The same for a point of the front frame."""
         place, rate = self.on_body(self.pivot)
         arm = at - self.pivot
         return place + self.fork @ arm, rate + self.fork @ jnp.cross(self.fork_rate, arm)
 
     def wheels(self, v, params):
-        """Of each wheel: its parameters, the place and velocity of its centre, its frame, its rate in that frame."""
+        """For each wheel: its parameters, position and velocity of its centre, its frame, its rate in that frame."""
         nil = jnp.zeros_like(self.hub[0])
         spin = lambda x: jnp.stack([nil, x, nil])
         rear, front = params["rear"], params["front"]
@@ -120,7 +122,7 @@ def lagrangian(t, q, v, params):
 
 
 def steepest(frame):
-    """From a wheel's centre to its lowest point, of length one; and √(1 - n_z²)."""
+    """The unit vector from a wheel's centre to its lowest point, and √(1 - n_z²)."""
     axle = frame[:, 1]
     upright = jnp.sqrt(1 - axle[2] ** 2)
     return (jnp.array([0.0, 0.0, 1.0]) - axle[2] * axle) / upright, upright
@@ -134,7 +136,7 @@ def contact(t, q, params):
 
 
 def slip(t, q, v, params):
-    """Velocities along the ground of what touches it."""
+    """Velocities along the ground of the points of contact."""
     rates = []
     for wheel, _, rate, frame, turning in Pose(q, v, params).wheels(v, params):
         down, _ = steepest(frame)
@@ -146,7 +148,7 @@ system = lj.System(lagrangian, {"contact": lj.Holonomic(contact), "no slip": lj.
 
 
 def straight(speed, roll_rate=0.0, params=PARAMS):
-    """Upright, straight ahead, and about to tip over the line of both contacts: (q, v)."""
+    """Upright and straight ahead, with a roll rate about the line of both contacts: (q, v)."""
     nil = dict.fromkeys(("x", "y", "z", "yaw", "roll", "pitch", "steer", "rear", "front"), 0.0)
     turning = {"rear": -speed / params["rear"]["r"], "front": -speed / params["front"]["r"]}
     tipping = {"roll": roll_rate, "y": roll_rate * params["rear"]["r"]}

@@ -1,4 +1,4 @@
-"""A browser without a window, driven over a pipe: Chromium's DevTools protocol with Python's standard library alone.
+"""A headless browser, driven over a pipe: Chromium's DevTools protocol with only Python's standard library.
 
 >>> with Browser() as browser:  # doctest: +SKIP
 ...     page = browser.open("motion.html")
@@ -22,18 +22,18 @@ FLAGS = (
     *("--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-sync"),
     *("--disable-background-networking", "--disable-component-update", "--remote-debugging-pipe", "--mute-audio"),
 )
-# The browser reads commands from its file number 3, and answers into number 4.
+# The browser reads commands from file descriptor 3 and answers on file descriptor 4.
 AS_3_AND_4 = "import os, sys; _, a, b, *run = sys.argv; os.dup2(int(a), 3); os.dup2(int(b), 4); os.execv(run[0], run)"
 KEYS = {"ArrowRight": 39, "ArrowLeft": 37, "Home": 36, "End": 35, "Tab": 9, " ": 32}
 
 
 def installed() -> str | None:
-    """Where a browser of this kind is, `$LAGJAX_CHROMIUM` first; None where there is none."""
+    """The path of a Chromium browser, `$LAGJAX_CHROMIUM` first; None if there is none."""
     return os.environ.get("LAGJAX_CHROMIUM") or next(filter(None, map(shutil.which, NAMES)), None)
 
 
 class Browser:
-    """A browser with a profile of its own that is gone when it is closed."""
+    """A browser with its own profile, which is deleted when the browser is closed."""
 
     def __init__(self, flags=(), patience=60.0):
         self.patience, self.count, self.events = patience, 0, []
@@ -42,7 +42,7 @@ class Browser:
         assert path, "no Chromium or Chrome is installed"
         to_browser, self.out = os.pipe()
         self.back, from_browser = os.pipe()
-        # Not among the numbers that the browser expects, which one would overwrite.
+        # Use descriptors that do not collide with those that the browser expects.
         ends = [fcntl.fcntl(end, fcntl.F_DUPFD_CLOEXEC, 10) for end in (to_browser, from_browser)]
         self.process = subprocess.Popen(
             [sys.executable, "-c", AS_3_AND_4, *map(str, ends), path, *FLAGS, *flags,
@@ -69,19 +69,19 @@ class Browser:
         self.profile.cleanup()
 
     def ask(self, method, session=None, **params):
-        """The answer of the browser to one command."""
+        """Send one command to the browser and return its answer."""
         self.count += 1
         message = {"id": self.count, "method": method, "params": params}
         os.write(self.out, json.dumps(message | ({"sessionId": session} if session else {})).encode() + b"\0")
         number = self.count
         until = time.monotonic() + self.patience
         while time.monotonic() < until:
-            for told in self._read():
-                if told.get("id") == number:
-                    if "error" in told:
-                        raise RuntimeError(f"{method}: {told['error']}")
-                    return told["result"]
-                self.events.append(told)
+            for message in self._read():
+                if message.get("id") == number:
+                    if "error" in message:
+                        raise RuntimeError(f"{method}: {message['error']}")
+                    return message["result"]
+                self.events.append(message)
         raise RuntimeError(f"{method}: no answer in {self.patience:g} s")
 
     def _read(self):
@@ -96,7 +96,7 @@ class Browser:
         return [json.loads(text) for text in whole]
 
     def open(self, address, width=1000, height=800) -> "Page":
-        """Open a file or an address, and wait until it is there."""
+        """Open a file or an address, and wait until it is loaded."""
         if Path(address).exists():
             address = Path(address).resolve().as_uri()
         target = self.ask("Target.createTarget", url="about:blank")["targetId"]
@@ -118,15 +118,15 @@ class Page:
         self.browser, self.session = browser, session
 
     def ask(self, method, **params):
-        """The answer to a command about this page."""
+        """Send a command about this page and return the answer."""
         return self.browser.ask(method, self.session, **params)
 
     def run(self, script):
-        """The value of an expression in the page, which is waited for."""
-        told = self.ask("Runtime.evaluate", expression=script, returnByValue=True, awaitPromise=True)
-        if "exceptionDetails" in told:
-            raise RuntimeError(told["exceptionDetails"].get("exception", {}).get("description", str(told)))
-        return told["result"].get("value")
+        """Evaluate an expression in the page, wait for it, and return its value."""
+        message = self.ask("Runtime.evaluate", expression=script, returnByValue=True, awaitPromise=True)
+        if "exceptionDetails" in message:
+            raise RuntimeError(message["exceptionDetails"].get("exception", {}).get("description", str(message)))
+        return message["result"].get("value")
 
     def wait(self, condition, seconds=30.0):
         """Wait until an expression in the page is true."""
@@ -137,7 +137,7 @@ class Page:
             time.sleep(0.02)
 
     def press(self, key, modifiers=0):
-        """Press a key, as a person does."""
+        """Press a key, as a user does."""
         about = {"key": key, "code": "Space" if key == " " else key, "windowsVirtualKeyCode": KEYS.get(key, 0)}
         text = {"text": " "} if key == " " else {"text": "\r"} if key == "Enter" else {}
         if key == "Enter":
@@ -146,17 +146,17 @@ class Page:
         self.ask("Input.dispatchKeyEvent", type="keyUp", modifiers=modifiers, **about)
 
     def picture(self, path):
-        """Write what is seen of the page, as PNG."""
-        told = self.ask("Page.captureScreenshot", captureBeyondViewport=True)
-        Path(path).write_bytes(base64.b64decode(told["data"]))
+        """Write the visible part of the page as PNG."""
+        message = self.ask("Page.captureScreenshot", captureBeyondViewport=True)
+        Path(path).write_bytes(base64.b64decode(message["data"]))
 
     def complaints(self):
-        """What the page's scripts complained about, and the addresses that it asked for beside itself."""
+        """Errors of the page's scripts, and the addresses that it requested besides itself."""
         found = []
-        for told in self.browser.events:
-            if told.get("sessionId") != self.session:
+        for message in self.browser.events:
+            if message.get("sessionId") != self.session:
                 continue
-            kind, params = told.get("method"), told.get("params", {})
+            kind, params = message.get("method"), message.get("params", {})
             if kind == "Runtime.exceptionThrown":
                 found.append(params["exceptionDetails"].get("exception", {}).get("description", "an exception"))
             elif kind == "Log.entryAdded" and params["entry"]["level"] == "error":

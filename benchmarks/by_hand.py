@@ -1,6 +1,7 @@
-"""Every system of the scenes with its equations by hand, and a state: the yardstick of `against_hand_written.py`.
+"""Every system of the scenes with its equations written by hand and a state: the reference of
+`against_hand_written.py`.
 
-The equations are in `lagjax/scenes/by_hand.py`, where the main job compares with them, too.
+The equations are in `lagjax/scenes/by_hand.py`; the main job compares with them too.
 """
 
 from typing import Any, NamedTuple
@@ -21,7 +22,7 @@ from lagjax.scenes import (
 
 
 class Case(NamedTuple):
-    """A system, its parameters, its right-hand side by hand, and a state about which it is evaluated."""
+    """A system, its parameters, its right-hand side by hand, and the state near which it is evaluated."""
 
     name: str
     system: Any
@@ -32,7 +33,7 @@ class Case(NamedTuple):
 
 
 def wedge(t, q, v, params):
-    """Constant: the scene's closed form."""
+    """Constant accelerations: the scene's closed form."""
     exact = sliding_wedge.exact_accelerations(params)
     return {"X": exact.X, "x": exact.x, "y": exact.y}, {"incline": exact.incline}
 

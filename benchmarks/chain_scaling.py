@@ -1,15 +1,16 @@
 """How do cost and compile time grow with the number of links?
 
-Chains of N links of one metre and one kilogram together, in Cartesian coordinates with one length constraint a link
-(open, hung at both ends, closed), a net of them, and the open chain in absolute angles. For each N
+Chains of N links, with a total length of one metre and a total mass of one kilogram, in Cartesian coordinates with one
+length constraint per link (open, hung at both ends, closed), a net, and the open chain in absolute angles. For each N
+this measures
 
 - one evaluation of the equations of motion, inside a compiled loop, microseconds;
-- one step of `lj.integrate` (Dopri8, fixed steps, with its projection), microseconds, beside the error of what must
-  stay: the energy, relative, and the worst constraint residual;
+- one step of `lj.integrate` (Dopri8, fixed steps, with its projection), microseconds, with the relative energy error
+  and the worst constraint residual;
 - the time to trace and compile that integration, seconds.
 
-and the exponent p of cost = N^p fitted from 16 to 256 links, to the least times. Cartesian chains are compared with the
-same motion in angles. Each row is the median (least in a further column) of repeated runs in one process.
+and the exponent p of cost = N^p, fitted from 16 to 256 links to the least times. Cartesian chains are compared with the
+same motion in angles. Each row is the median (the minimum is in another column) of repeated runs in one process.
 
     python benchmarks/chain_scaling.py [--json FILE] [--only TEXT]
 """
@@ -42,7 +43,7 @@ def particles(t, q, v, params):
 
 
 def lengths(ends):
-    """The squared length of each link, of points that hang at `ends[0]`, and at `ends[1]` where there is one."""
+    """The squared length of each link, for points that hang from `ends[0]`, and from `ends[1]` if it exists."""
 
     def residual(t, q, params):
         points = jnp.concatenate([ends[0][None], q, *[end[None] for end in ends[1:]]])
@@ -69,7 +70,7 @@ def open_chain(count):
 
 
 def hung_chain(count):
-    """Hung at both ends: an arc, released at rest; one link more than particles."""
+    """Hung at both ends as an arc, released at rest, with one more link than particles."""
     angle = np.linspace(-1.0, 1.0, count + 1)
     points = np.cumsum(np.stack([np.cos(angle), np.sin(angle)], 1), axis=0) / count
     constraint = lengths([np.zeros(2), points[-1]])
@@ -85,7 +86,7 @@ def closed_chain(count):
 
 
 def net(count):
-    """A square net in space of about `count` particles, hung at its upper corners, wavy, released at rest."""
+    """A wavy square net in space of about `count` particles, hung at its upper corners, released at rest."""
     width = round(np.sqrt(count))
     place = np.arange(width**2).reshape(width, width)
     across, down = [place[:, 1:], place[:, :-1]], [place[1:], place[:-1]]
@@ -102,7 +103,7 @@ def net(count):
 
 
 def chain_in_angles(count):
-    """The open chain in absolute angles: no constraints, and a mass matrix that couples all."""
+    """The open chain in absolute angles: no constraints, and a mass matrix that couples all angles."""
 
     def lagrangian(t, q, v, params):
         x = params["l"] * jnp.cumsum(jnp.cos(q) * v)
@@ -124,7 +125,7 @@ SCENES = {
 
 
 def evaluations(system, q, v, params):
-    """A compiled loop of evaluations, each at a state that depends on the last."""
+    """A compiled loop of evaluations, each at a state that depends on the previous one."""
 
     def loop(t, q, v, params):
         equations = equations_of(system, t, q, v, params)
@@ -143,7 +144,7 @@ def evaluations(system, q, v, params):
 
 
 def steps(system, q, v, params):
-    """A compiled integration with fixed steps of a hundredth of the time in which a link falls by its length."""
+    """A compiled integration with fixed steps, each a hundredth of the time in which a link falls by its length."""
     step = 0.01 * jnp.sqrt(params["l"] / params["g"])
 
     def solve(q, v, params, step):
@@ -158,12 +159,12 @@ def steps(system, q, v, params):
 
 
 def growth(counts, seconds):
-    """The exponent p of cost = N^p, least squares of the logarithms."""
+    """The exponent p of cost = N^p, by least squares of the logarithms."""
     return float(np.polyfit(np.log(counts), np.log(seconds), 1)[0])
 
 
 def rows(wanted):
-    """One scene after the other, then what the fits say."""
+    """The rows of all scenes, then the comparison with angles."""
     for name, scene in SCENES.items():
         if wanted(name):
             yield from of_scene(name, scene)
@@ -200,7 +201,7 @@ def of_scene(name, scene):
 
 
 def against_angles():
-    """The same motion, 0.5 s at 1e-9, in Cartesian coordinates and in angles: time, and how far apart they end."""
+    """The same motion, 0.5 s at 1e-9, in Cartesian coordinates and in angles: time, and difference at the end."""
     for count in (2, 4, 8, 16):
         solves = []
         for scene in (open_chain, chain_in_angles):

@@ -1,4 +1,4 @@
-"""Motions with a closed form: the six scenes, Kepler's orbits, rods and disks, springs that are stiff."""
+"""Motions with a closed form: the six scenes, Kepler orbits, rods and disks, stiff springs."""
 
 from functools import partial
 
@@ -27,7 +27,7 @@ def polar_lagrangian(t, q, v, params):
 
 
 def spring_lagrangian(t, q, v, params):
-    """A spring, pushed as cos t."""
+    """A spring, driven by a force cos t."""
     return 0.5 * v**2 - 0.5 * params["k"] * q**2 + params["push"] * q * jnp.cos(t)
 
 
@@ -37,13 +37,13 @@ def drag(t, q, v, params):
 
 
 def two_springs_lagrangian(t, q, v, params):
-    """A soft and a stiff spring in a row."""
+    """A soft and a stiff spring in series."""
     stretch = q["b"] - q["a"]
     return 0.5 * (v["a"] ** 2 + v["b"] ** 2) - 0.5 * q["a"] ** 2 - 0.5 * params["k"] * stretch**2
 
 
 def relative_drag(t, q, v, params):
-    """The stiff one is damped."""
+    """Damping of the stiff spring."""
     return 0.5 * params["c"] * (v["b"] - v["a"]) ** 2
 
 
@@ -78,7 +78,7 @@ def ellipse(x0, v0, ts):
         x0, v0 = mpmath.mpf(float(x0)), mpmath.mpf(float(v0))
         a = 1 / (2 / x0 - v0**2)
         e = 1 - x0 / a
-        # Counted from the nearer end: where it starts at the farther one, e < 0.
+        # Angles are counted from the nearer apsis; a start at the farther one has e < 0.
         rate, b = a ** mpmath.mpf(-1.5), a * mpmath.sqrt(1 - e**2)
         rows = []
         for t in ts:
@@ -101,7 +101,7 @@ def _between(e, mean):
 
 
 def orbit(name, e, turns, outputs, polar=False, far=False, **how):
-    """An ellipse of half-axis about one, from its nearer or its farther end."""
+    """An ellipse with a semi-axis of about one, starting at its nearer or farther apsis."""
     x0, v0 = (1 + e, np.sqrt((1 - e) / (1 + e))) if far else (1 - e, np.sqrt((1 + e) / (1 - e)))
     ts = np.linspace(0.0, 2 * np.pi * turns, outputs)
     names, columns = (("r", "phi"), slice(4, 8)) if polar else (("x", "y"), slice(0, 4))
@@ -112,7 +112,7 @@ def orbit(name, e, turns, outputs, polar=False, far=False, **how):
 
     state = ({"r": x0, "phi": 0.0}, {"r": 0.0, "phi": v0 / x0}) if polar else ({"x": x0, "y": 0.0}, {"x": 0.0, "y": v0})
     if polar:
-        # The speed across is what the rate times the distance is, not the number before it was divided.
+        # The transverse speed is the rounded rate times the distance, not the number before the division.
         with mpmath.workdps(50):
             v0 = mpmath.mpf(float(v0 / x0)) * mpmath.mpf(float(x0))
     system = kepler_polar if polar else kepler
@@ -121,7 +121,7 @@ def orbit(name, e, turns, outputs, polar=False, far=False, **how):
 
 
 def borrowed(name, motion, outputs, end=None, **how):
-    """A motion of `work_precision.py`, at more times."""
+    """A motion of `work_precision.py` at more times."""
     ts = np.linspace(motion.ts[0], motion.ts[1] if end is None else end, outputs)
     start = motion.q0, motion.v0
     return Motion(name, motion.system, *start, motion.params, ts, motion.exact, "closed form", **how)
@@ -136,7 +136,7 @@ def bead(name, psi, periods, outputs, change=None, **how):
 
 
 def leaving():
-    """The hoop until it leaves the cylinder, at a time known by Carlson's integral."""
+    """The hoop until it leaves the cylinder, at a time known from Carlson's integral."""
     params, tilt = rolling_hoop.PARAMS, 0.25
     theta, ts = np.pi / 2 - tilt, np.linspace(0.0, 4.0, 9)
     exact, start = lambda t: rolling_hoop.exact_motion(params, theta, t), rolling_hoop.start(params, theta)
@@ -148,7 +148,7 @@ def leaving():
 
 
 def crank():
-    """The slider-crank, by the one equation of its crank's angle in long double."""
+    """The slider-crank; the reference solves the equation of its crank's angle in long double."""
     p = exactly(slider_crank.PARAMS)
     ratio = p["l1"] / p["l2"]
 
@@ -169,19 +169,19 @@ def crank():
         J, slope, weight = inertia(y[0])
         return np.array([y[1], -(slope * y[1] ** 2 / 2 + weight) / J])
 
-    def seen(y):
+    def to_qv(y):
         angle, rate = y.T
         q, unit, _ = driven_crank.exact(angle.astype(float), slider_crank.PARAMS | {"rate": 1.0})
         return q, jax.tree.map(lambda x: x * rate.astype(float), unit)
 
     m = slider_crank.MECHANISM
-    found = reference(field, [0, LONG(150)], seen)
+    found = reference(field, [0, LONG(150)], to_qv)
     return Motion("slider-crank", m.system, m.q0, m.v0, m.params, np.linspace(0.0, m.end, 11), found.exact,
                   "long double", found.known, tolerances=(1e-5, 1e-8))  # fmt: skip
 
 
 def linear(name, system, names, matrix, start, ts, params, **how):
-    """A linear motion y' = A y, by the eigenvectors of A to 50 digits; `start` ends with what drives it."""
+    """A linear motion y' = A y, by the eigenvectors of A to 50 digits; the last entries of `start` are the drive."""
     count = len(names)
 
     def exact(ts):
@@ -202,20 +202,20 @@ def linear(name, system, names, matrix, start, ts, params, **how):
 
 
 def pushed_spring(name, k, c, push, ts, q0=1.0, **how):
-    """One spring, driven as cos t."""
+    """One spring, driven by cos t."""
     matrix = [[0, 1, 0, 0], [-k, -c, push, 0], [0, 0, 0, -1], [0, 0, 1, 0]]
     params = {"k": k, "c": c, "push": push}
     return linear(name, spring, ("q",), matrix, [q0, 0.0, 1.0, 0.0], ts, params, **how)
 
 
 def springs_in_a_row(name, k, c, ts, start, **how):
-    """A soft spring and a stiff one behind it."""
+    """A soft spring and a stiff one in series."""
     matrix = [[0, 0, 1, 0], [0, 0, 0, 1], [-1 - k, k, -c, c], [k, -k, c, -c]]
     return linear(name, two_springs, ("a", "b"), matrix, [1.0, start, 0.0, 0.0], ts, {"k": k, "c": c}, **how)
 
 
 def slow_start(k):
-    """b for a = 1 where the stiff spring does not oscillate: k / (k - w²), with w the lower frequency."""
+    """The b for a = 1 at which the stiff spring does not oscillate: k / (k - w²), with w the lower frequency."""
     k = LONG(k)
     return float(k / (k - 2 * k / (2 * k + 1 + np.sqrt(4 * k**2 + 1))))
 
@@ -276,7 +276,7 @@ def thrown():
 
 
 def radial(t, q, v, params):
-    """r·v, which is zero at the ends of an ellipse."""
+    """r·v, which is zero at the apsides of an ellipse."""
     return q["x"] * v["x"] + q["y"] * v["y"]
 
 
@@ -329,6 +329,6 @@ def motions():
         pushed_spring("stiff damping, Radau5", 1e3, 1e4, 1e3, upto(10, 11), 1.0, **stiff),
         pushed_spring("stiff spring, Radau5", 1e6, 10.0, 1e6, upto(10, 11), **stiff),
         springs_in_a_row("soft and stiff spring, Radau5", 1e4, 1e3, upto(10, 11), 1.0, **stiff),
-        # An oscillation of the stiff spring this method leaves out, as it says, and no estimate can see it.
+        # This method does not resolve oscillations of the stiff spring (as documented), and no estimate detects them.
         springs_in_a_row("soft and stiff spring, undamped, Radau5", 1e6, 0.0, upto(10, 11), slow_start(1e6), **springs),
     ]  # fmt: skip

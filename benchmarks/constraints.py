@@ -1,11 +1,12 @@
-"""What does it cost to keep constraints, and to have too many of them?
+"""What does it cost to satisfy constraints, and to have redundant ones?
 
-1. The return to the constraints after every step: the Cartesian pendulum with `drift="project"` and with `"none"`,
-   20 s at 1e-8; its share of the run time, and how much less the Jacobi integral changes.
-2. Redundant constraints: a pendulum on two rods in place of one, and a door with 18 equations in place of the 11 that
-   are independent; the ratio of the run times.
+1. The projection onto the constraints after every step: the Cartesian pendulum with `drift="project"` and with
+   `"none"`, 20 s at 1e-8; the projection's share of the run time, and how much it reduces the change of the Jacobi
+   integral.
+2. Redundant constraints: a pendulum on two rods instead of one, and a door with 18 equations instead of the 11
+   independent ones; the ratio of the run times.
 
-Both of a pair in one process, in turn, medians (and minima) of the compiled program after warm-up.
+Both of a pair run alternately in one process; times are medians (and minima) of the compiled program after warm-up.
 
     python benchmarks/constraints.py [--json FILE]
 """
@@ -50,18 +51,18 @@ def plate(t, q, v, params):
 
 
 def hinges(t, q, params):
-    """The inner corners, and the rectangle."""
+    """The inner corners are fixed, and the corners form a rectangle."""
     return jnp.concatenate([q[0], q[1] - jnp.array([0.0, 0.0, 2.0]), q[3] - q[1] - q[2] + q[0]])
 
 
 def distances(pairs):
-    """Squared distances of pairs of corners, less what they are."""
+    """Squared distances of pairs of corners, minus their values."""
     lengths = {(0, 1): 4.0, (0, 2): 1.0, (0, 3): 5.0, (1, 2): 5.0, (1, 3): 1.0, (2, 3): 4.0}
     return lambda t, q, p: jnp.stack([jnp.sum((q[i] - q[j]) ** 2) - lengths[i, j] for i, j in pairs])
 
 
 def third_hinge(t, q, params):
-    """Halfway up, held in all three directions."""
+    """The point halfway up the hinge line is held in all three directions."""
     return 0.5 * (q[0] + q[1]) - jnp.array([0.0, 0.0, 1.0])
 
 
@@ -85,7 +86,7 @@ def solve(system, start, method, end, drift=None):
 
 
 def timed(first, second):
-    """Median and least seconds of each, in turn; and what they return."""
+    """Run both alternately; return median and least seconds of each, and their results."""
     tolerance, times = jnp.asarray(TOLERANCE), ([], [])
     found = [jax.block_until_ready(f(tolerance)) for f in (first, second)]
     for _ in range(REPEATS):

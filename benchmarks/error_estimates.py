@@ -1,26 +1,27 @@
-"""Is the estimate of a motion's error right? How often is what it says ten or a hundred times too small or too large?
+"""Is the estimate of a motion's error right? How often is it ten or a hundred times too small or too large?
 
-Motions of the six scenes, of mechanisms, chaotic and nearly singular ones, stiff ones, with events, backward, in single
-precision and with fixed steps, at up to three tolerances each: `closed_forms.py` and `amplifying.py`. Their references:
+The motions (`closed_forms.py` and `amplifying.py`) are those of the six scenes and of mechanisms; chaotic, nearly
+singular and stiff ones; with events, backward, in single precision and with fixed steps; at up to three tolerances
+each. Their references are
 
     closed forms, elliptic functions   of the scenes and the tests, which check them; in double precision
-    Kepler's equation, eigenvectors    to 50 digits by mpmath, from the very numbers that the solve starts from
+    Kepler's equation, eigenvectors    to 50 digits by mpmath, from exactly the numbers that the solve starts from
     long double                        extrapolation of orders 16 and 20, on equations by hand (`long_double.py`)
 
-"known" in a line is how far the last two part on the way, relative; closed forms are taken to be good to a floor of
-1e-13, and what is below the floor, or below what is known, counts as that: true error and estimate alike.
+"known" in a line is the largest relative difference of these two extrapolations along the motion; closed forms are
+assumed to have a floor of 1e-13. True errors and estimates below the floor, or below "known", count as that value.
 
 At every output after the start, for coordinates and for velocities (a *pair*): the largest error of a number over its
 largest value on the way is compared with the largest estimate, in the same units. Events: likewise, the error of each
-crossing's time over the span. Ratios are estimate / true error. "No digit left" is a true error above 0.1; it is said
-where the estimate is above 1e-3 and the call warned. A false alarm is a warning of a motion that is right to 1e-4 and
-to 10,000 tolerances.
+crossing's time over the span. Ratios are estimate / true error. "No digit left" means a true error above 0.1; it counts
+as reported if the estimate is above 1e-3 and the call warned. A false alarm is a warning for a motion that is right to
+1e-4 and to 10,000 tolerances.
 
-Cost: the time of a call with the estimate over that without, minus one; medians of calls in turn, at the tightest
-tolerance. Programs: what is compiled by calls with the estimate after one without, where none of them warns.
+Cost: the time of a call with the estimate over that without, minus one; medians of alternating calls, at the tightest
+tolerance. Programs: the number compiled by calls with the estimate after one without, if none of them warns.
 
-`rtol` is given alone, and with `--atol` an equal atol beside it. The twin, `--twin`, divides every estimate by 1,000,
-and what decides on a warning: it has to miss. Exit status 1 where a target is missed.
+By default only `rtol` is given; with `--atol` also an equal atol. The twin, `--twin`, divides every estimate by 1,000,
+including the one that decides on a warning: it must miss the targets. The exit status is 1 if a target is missed.
 
     python benchmarks/error_estimates.py [--json FILE] [--only TEXT] [--atol] [--twin]
 """
@@ -51,9 +52,9 @@ _COMPILED = []
 
 
 class Verdict(NamedTuple):
-    """One motion at one tolerance: `ratios` (pairs,) of estimates and `events` of crossings' times, NaN where none.
+    """One motion at one tolerance: `ratios` (pairs,) for estimates and `events` for crossing times, NaN if unknown.
 
-    `true` and `estimate` (pairs,) in the same order, coordinates first; `warned`, that the call did.
+    `true` and `estimate` (pairs,) are in the same order, coordinates first; `warned` says whether the call warned.
     """
 
     motion: object
@@ -78,31 +79,31 @@ def solve(motion, tolerance, estimate=True):
 
 def judged(motion, tolerance):
     """The verdict on one call."""
-    with warnings.catch_warnings(record=True) as heard:
+    with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         traj = solve(motion, tolerance)
-    spoke = any(issubclass(one.category, lj.AccuracyWarning) for one in heard)
+    did_warn = any(issubclass(one.category, lj.AccuracyWarning) for one in caught)
     there = np.isfinite(np.asarray(jax.tree.leaves(traj.q)[0]).reshape(len(motion.ts), -1)[:, 0])
     there[0] = False
     known, right = motion.known(motion.ts), motion.exact(motion.ts)
-    # Outputs may be where a number is always zero, such as the velocity after each half of a period.
-    way = motion.exact(on_its_way(motion.ts))
+    # Outputs may coincide with zeros of a number, such as the velocity after each half period.
+    on_the_way = motion.exact(on_its_way(motion.ts))
     true, estimate = [], []
-    for found, error, exact, on_the_way in zip((traj.q, traj.v), (traj.error.q, traj.error.v), right, way):
-        found, error, exact, on_the_way = (as_arrays(tree) for tree in (found, error, exact, on_the_way))
-        scales = [largest(leaf) for leaf in on_the_way]
+    for found, error, exact, between in zip((traj.q, traj.v), (traj.error.q, traj.error.v), right, on_the_way):
+        found, error, exact, between = (as_arrays(tree) for tree in (found, error, exact, between))
+        scales = [largest(leaf) for leaf in between]
         zero = [0 * leaf for leaf in exact]
         true.append(worst(found, exact, scales)[there])
         estimate.append(worst(error, zero, scales)[there] * SCALE["of estimates"])
     true, estimate, floor = np.concatenate(true), np.concatenate(estimate), np.maximum(motion.floor, known)[there]
     return Verdict(
         motion, tolerance, true, estimate, ratio(estimate, true, np.tile(floor, 2)), of_events(motion, traj),
-        float(np.max(known)), spoke and float(traj.scaled_error) * SCALE["of estimates"] > 1,
+        float(np.max(known)), did_warn and float(traj.scaled_error) * SCALE["of estimates"] > 1,
     )  # fmt: skip
 
 
 def on_its_way(ts):
-    """Times that are no multiples of any period, the first of `ts` first."""
+    """Times that are not multiples of any period, starting with the first of `ts`."""
     golden = (np.sqrt(5.0) - 1) / 2
     return ts[0] + (ts[-1] - ts[0]) * np.sort(np.arange(ON_THE_WAY) * golden % 1)
 
@@ -113,7 +114,7 @@ def as_arrays(tree):
 
 
 def of_events(motion, traj):
-    """Estimated over true errors of the times of all crossings that were found."""
+    """Estimated over true errors of the times of all crossings found."""
     ratios, span = [], abs(motion.ts[-1] - motion.ts[0])
     for name, exact in motion.when.items():
         times = np.asarray(traj.events[name].t, float)
@@ -125,12 +126,12 @@ def of_events(motion, traj):
 
 
 def ratio(estimate, true, floor):
-    """Estimate over true error, both at least the floor; NaN where there is no estimate."""
+    """Estimate over true error, both at least the floor; NaN if there is no estimate."""
     return np.maximum(estimate, floor) / np.maximum(true, floor)
 
 
 def within(ratios, factor):
-    """Which of the ratios are within a factor; those that are not known are not."""
+    """Which of the ratios are within a factor; unknown ones count as outside."""
     return (ratios >= 1 / factor) & (ratios <= factor)
 
 
@@ -141,20 +142,20 @@ def share(yes):
 
 @contextmanager
 def compiles():
-    """A list that holds, when it is over, one item for each program compiled meanwhile."""
+    """A list with one item for each program compiled inside the context."""
     before, found = len(_COMPILED), []
     yield found
     found.extend(_COMPILED[before:])
 
 
-def heard(event, seconds, **_):
+def on_compile_event(event, seconds, **_):
     """A listener for `jax.monitoring`."""
     if event == "/jax/core/compile/backend_compile_duration":
         _COMPILED.append(seconds)
 
 
 def cost_of(motion):
-    """The time of the estimate over that of the solve, that of the solve in ms, and the programs that it compiled."""
+    """The time of the estimate over that of the solve, the time of the solve in ms, and the programs it compiled."""
     tightest = motion.tolerances[-1]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -163,7 +164,7 @@ def cost_of(motion):
         for tolerance in motion.tolerances[::-1]:
             with compiles() as found:
                 traj = jax.block_until_ready(solve(motion, tolerance))
-            # What a warning says of the motion is measured by programs of its own.
+            # A warning runs extra programs to describe the motion, which do not count.
             programs += 0 if traj.scaled_error > 1 else len(found)
         times = in_turn(lambda: solve(motion, tightest), lambda: solve(motion, tightest, False), repeats=REPEATS)
     return times.ratio()[0] - 1, 1e3 * times.medians[1], programs
@@ -193,12 +194,12 @@ def farthest(ratios):
 
 
 def totals(verdicts, costs):
-    """The rows that have a target."""
+    """The summary rows, with targets."""
     ratios = np.concatenate([v.ratios for v in verdicts])
     true, estimate = (np.concatenate([getattr(v, kind) for v in verdicts]) for kind in ("true", "estimate"))
     warned = np.concatenate([np.full(len(v.true), v.warned) for v in verdicts])
     events = np.concatenate([v.events for v in verdicts])
-    gone = true > NO_DIGIT
+    lost = true > NO_DIGIT
     off = [v for v in verdicts if np.max(v.true, initial=0) > MUST_WARN]
     good = [v for v in verdicts if np.max(v.true, initial=0) < min(RIGHT, RIGHT_IN_TOLERANCES * v.tolerance)]
     each = len(verdicts)
@@ -206,8 +207,8 @@ def totals(verdicts, costs):
               pairs=len(ratios))  # fmt: skip
     yield row("pairs with an estimate within 1/100 and 100", share(within(ratios, 100)), 1.0, "more",
               beyond=int(np.sum(~within(ratios, 100))))  # fmt: skip
-    yield row("of those where no digit is left: said", share((estimate > SAID)[gone] & warned[gone]), 1.0, "more",
-              pairs=int(np.sum(gone)))  # fmt: skip
+    yield row("of those where no digit is left: said", share((estimate > SAID)[lost] & warned[lost]), 1.0, "more",
+              pairs=int(np.sum(lost)))  # fmt: skip
     yield row("motions off by more than 1e-3: warned of", share([v.warned for v in off]), 1.0, "more", motions=len(off))
     yield row("false alarms, of all motions", sum(v.warned for v in good) / each, 0.02, right=len(good), motions=each)
     yield row("crossings with an estimate within 1/10 and 10", share(within(events, 10)), 0.95, "more",
@@ -223,8 +224,8 @@ def totals(verdicts, costs):
 
 
 def rows(wanted, missed):
-    """Yield the lines of the motions asked for, and the totals; `missed` collects what is."""
-    jax.monitoring.register_event_duration_secs_listener(heard)
+    """Yield the lines of the requested motions, and the totals; `missed` collects the missed targets."""
+    jax.monitoring.register_event_duration_secs_listener(on_compile_event)
     verdicts, costs = [], []
     for motion in [*closed_forms.motions(), *amplifying.motions()]:
         if not wanted(motion.name):

@@ -1,25 +1,26 @@
-"""Are all crossings found, in order, at their times, and none invented? And what does an event cost?
+"""Are all crossings found, in order and at the right times, and none invented? And what does an event cost?
 
 1,000 random pairs of a motion and a guard, a x + b y + c x y - level in its coordinates (or velocities, or a
 multiplier), at tolerances from 1e-4 to 1e-11. Levels lie anywhere, from 1e-9 to 0.1 of the guard's range below one of
-its extrema, from 1e-12 to 1e-3 to either side of one (grazing), and on the guard's value at the start, to the digit and
-1e-15 to either side. The reference is a closed form, or SciPy's DOP853 at 1e-13 with steps of a fortieth of the span.
+its extrema, from 1e-12 to 1e-3 on either side of one (grazing), and on the guard's value at the start, exactly and
+1e-15 on either side. The reference is a closed form, or SciPy's DOP853 at 1e-13 with steps of a fortieth of the span.
 
-What is found is judged on the exact motion. How far the guard is from zero there at the time that was found, over the
-guard's range, is the error of that time in units of the time in which the guard changes by its range; unlike the time
-itself it is well conditioned also where the guard grazes. It may be
+The crossings found are judged on the exact motion. The guard's value on it at the found time, divided by the guard's
+range, is the error of that time in units of the time in which the guard changes by its range. Unlike the time itself it
+is well conditioned even if the guard grazes zero. It may be
 
     10 rtol + 10 times the error of the motion's state at the end of the span (over its range),
 
-since no crossing can be better known than the motion on which it lies; "late" counts the crossings beyond that, and
-"worst" is the largest error over that bound. An extremum farther than twice the bound and 1e-9 from zero is sure:
-between two of them, what is found is what there is, no more ("invented") and no less ("missed"). Around nearer ones
-another number than the exact motion's must be said, by `uncertain` ("unsaid"). "needless" is the share of pairs with
-`uncertain` though no extremum is nearer than a hundred times the bound.
+since a crossing cannot be more accurate than the motion on which it lies; "late" counts the crossings beyond that, and
+"worst" is the largest error over that bound. An extremum farther from zero than twice the bound and 1e-9 is sure:
+between two sure extrema the crossings found must be the exact ones, no more ("invented") and no fewer ("missed").
+Around nearer extrema, a number of crossings that differs from the exact one must be flagged by `uncertain` (otherwise
+"unsaid"). "needless" is the share of pairs with `uncertain` although no extremum is nearer than a hundred times the
+bound.
 
-The twin looks at the ends of steps only: the same program with nothing known in between.
+The twin looks only at the ends of steps: the same program without information in between.
 
-Cost: the time of a solve of fifty periods with an event over that without, in turn in one process.
+Cost: the time of a solve of fifty periods with an event over that without, measured alternately in one process.
 
     python benchmarks/events_found.py [--json FILE] [--only TEXT] [--pairs N] [--seed N]
 """
@@ -49,35 +50,35 @@ REPEATS = 15
 
 
 class Family(NamedTuple):
-    """Motions of one system: its program depends on numbers alone.
+    """Motions of one system, whose program depends only on numbers.
 
-    `draw(rng)` -> (q0, v0, params, span); `exact(q0, v0, params, span)` -> a function of times to the two arrays that
-    the guard reads; `seen(q, v, multipliers)` -> the same two from a state.
+    `draw(rng)` -> (q0, v0, params, span); `exact(q0, v0, params, span)` -> a function that maps times to the two arrays
+    that the guard reads; `guard_inputs(q, v, multipliers)` -> the same two numbers of a state.
     """
 
     system: Callable[[], lj.System]
     draw: Callable
     exact: Callable
-    seen: Callable
+    guard_inputs: Callable
     method: Callable = lambda: None
     tightest: float = -11.0
     multipliers: bool = False
 
 
 def coupled(x, y, c):
-    """The guard but for its level."""
+    """The guard without its level."""
     return c["a"] * x + c["b"] * y + c["c"] * x * y
 
 
 # Exact motions.
 
 
-def by_scipy(field, start, span, seen):
-    """Of a motion that has no closed form."""
+def by_scipy(field, start, span, guard_inputs):
+    """The reference for a motion without a closed form."""
     solved = solve_ivp(
         field, (0.0, 1.001 * span), start, "DOP853", rtol=1e-13, atol=1e-14, max_step=span / 40, dense_output=True
     )
-    return lambda t: seen(solved.sol(t))
+    return lambda t: guard_inputs(solved.sol(t))
 
 
 def oscillation(q0, v0, p, span):
@@ -149,7 +150,7 @@ def double_swing(q0, v0, p, span):
     return by_scipy(field, [*q0, *v0], span, lambda y: (y[0], y[1]))
 
 
-# Systems, each made anew, so that the twin's programs are its own.
+# Systems, created separately for each use, so that the twin has its own programs.
 
 
 def oscillator():
@@ -226,13 +227,13 @@ def draws_rod(rng):
 
 
 def draws_kepler(rng):
-    """Ellipses, from their far end."""
+    """Ellipses, starting at the far apsis."""
     e = rng.uniform(0.0, 0.7)
     return np.array([1 + e, 0.0]), np.array([0.0, np.sqrt((1 - e) / (1 + e))]), {"mu": 1.0}, rng.uniform(6.0, 14.0)
 
 
 def draws_double(rng):
-    """Not far from rest, where it is not chaotic."""
+    """Near rest, where the motion is not chaotic."""
     return rng.uniform(-0.8, 0.8, 2), rng.normal(size=2) * 0.5, {"g": rng.uniform(1.0, 9.81)}, rng.uniform(2.0, 6.0)
 
 
@@ -266,8 +267,8 @@ TWINS = ("oscillator, Nystrom12", "pendulum, Nystrom12", "rod, Dopri8")
 
 
 def program(family):
-    """(q0, v0, params, span, rtol) -> times of crossings, their number, `uncertain`, the state at the end, well."""
-    height = lambda q, v, multipliers, c: coupled(*family.seen(q, v, multipliers), c) - c["level"]
+    """(q0, v0, params, span, rtol) -> crossing times, their number, `uncertain`, the end state, success."""
+    height = lambda q, v, multipliers, c: coupled(*family.guard_inputs(q, v, multipliers), c) - c["level"]
     guard = lambda t, q, v, p: height(q, v, {}, p["guard"])
     if family.multipliers:
         guard = lambda t, q, v, multipliers, p: height(q, v, multipliers, p["guard"])
@@ -278,18 +279,18 @@ def program(family):
             system, q0, v0, params, ts=jnp.stack([jnp.zeros_like(span), span]), rtol=rtol, atol=rtol, events=events,
             method=family.method(), throw=False,
         )  # fmt: skip
-        found, end = traj.events["level"], family.seen(traj.end.q, traj.end.v, traj.end.multipliers)
+        found, end = traj.events["level"], family.guard_inputs(traj.end.q, traj.end.v, traj.end.multipliers)
         return found.t, found.count, found.uncertain, end, traj.end.t
 
     return run
 
 
 class Pair(NamedTuple):
-    """A motion with a guard, what is exact, and the tolerance to run it at."""
+    """A motion with a guard, its exact values, and the tolerance."""
 
     arguments: tuple
     kind: str
-    scale: np.ndarray  # of the two things that the guard reads, and of the guard
+    scale: np.ndarray  # of the two numbers that the guard reads, and of the guard
     g: Callable
     end: tuple
     ticks: np.ndarray  # the start, all extrema, the end
@@ -315,7 +316,7 @@ def _pair(motion, q0, v0, params, span, grid, x, y, rng):
     if rng.uniform() < 0.4:
         weights |= {"b": 0.0, "c": 0.0}
     elif rng.uniform() < 0.3:
-        # Four crossings a period where x and y are in quadrature.
+        # This gives four crossings per period if x and y are in quadrature.
         weights |= {"a": 0.0, "b": 0.0}
     bare = lambda t: coupled(*motion(t), weights)
     values = coupled(x, y, weights)
@@ -337,7 +338,7 @@ def _pair(motion, q0, v0, params, span, grid, x, y, rng):
         distance = 10.0 ** (rng.uniform(-9, -1) if below else rng.uniform(-12, -3))
         level = heights[i] + size * distance * inward * (1 if below else rng.choice([-1, 1]))
     if kind == "on the start":
-        # A start on the guard is no crossing: it counts on the side to which it leaves.
+        # A start on the guard is not a crossing: it counts as on the side to which the guard moves.
         heights[0] = level + size * np.sign(values[1] - values[0])
     guard = weights | {"level": level}
     return Pair(
@@ -353,7 +354,7 @@ def _extremum(g, before, after, rises):
 
 
 class Verdict(NamedTuple):
-    """Numbers of crossings, but for `needless` and `worst`."""
+    """Numbers of crossings, except for `needless` and `worst`."""
 
     there: int
     missed: int
@@ -365,7 +366,7 @@ class Verdict(NamedTuple):
 
 
 def judge(pair, rtol, outcome) -> Verdict:
-    """Compare with what is exact."""
+    """Compare with the exact crossings."""
     t, count, uncertain, end, end_t = outcome
     span, t = pair.arguments[-1], np.asarray(t)[np.isfinite(t)]
     *_, size = pair.scale
@@ -377,12 +378,12 @@ def judge(pair, rtol, outcome) -> Verdict:
     disorder = int(np.sum(np.diff(t) <= 0)) + (int(count) != len(t)) + (float(end_t) != span)
     missed = invented = unsaid = there = 0
     edges = np.flatnonzero(sure)
-    # From each sure extremum to the next one; before the first and after the last one what is there is not sure.
+    # From each sure extremum to the next one; crossings before the first and after the last one are not sure.
     stretches = list(zip(edges[:-1], edges[1:]))
     edge = [(0, edges[0]), (edges[-1], len(signs) - 1)] if len(edges) else [(0, len(signs) - 1)]
     for i, j in [*stretches, *[(i, j) for i, j in edge if i < j]]:
         exact = int(np.sum(signs[i:j] * signs[i + 1 : j + 1] < 0))
-        # A crossing of the last stretch may be found at its very end.
+        # A crossing of the last stretch may be found exactly at its end.
         mine = int(np.sum((t > pair.ticks[i]) & (t <= pair.ticks[j]))) if i else int(np.sum(t <= pair.ticks[j]))
         there += exact
         if j == i + 1 and sure[i] and sure[j]:
@@ -395,7 +396,7 @@ def judge(pair, rtol, outcome) -> Verdict:
 
 
 def of_family(name, family, count, seed, lanes=False):
-    """Run all pairs, alone or in lanes; a `Verdict` each."""
+    """Run all pairs, alone or in lanes, and give a `Verdict` for each."""
     rng = np.random.default_rng([seed, *name.encode()])
     pairs = pairs_of(family, count, rng)
     rtols = 10.0 ** rng.uniform(family.tightest, -4, count)
@@ -414,7 +415,7 @@ def of_family(name, family, count, seed, lanes=False):
 
 
 def at_ends_of_steps(begin, inner, off, end, h, touches, pieces=sight.pieces_of):
-    """The twin's pieces: nothing is known or in doubt between the ends of a step."""
+    """The twin's pieces: no information and no doubt between the ends of a step."""
     found = pieces(begin, inner, off, end, h, touches)
     between = len(found.sign) - 1
     return found._replace(sign=[0.0 * h] * between + found.sign[-1:], doubt=[jnp.asarray(False)] * len(found.doubt))
@@ -429,7 +430,7 @@ def totals(verdicts):
 
 
 def rows(wanted):
-    """Yield the rows asked for."""
+    """Yield the requested rows."""
     groups = [(name, False) for name in FAMILIES] + [(name, True) for name in IN_LANES]
     each = -(-OPTIONS["pairs"] // len(groups))
     for name, lanes in groups:
@@ -460,7 +461,7 @@ COSTS = {
 
 
 def costs(wanted):
-    """With an event that would end the motion, at a level out of reach, and with all passes recorded, over without."""
+    """Time over that without events: a terminal event at an unreachable level, and one that records all crossings."""
     for name, (system, q0, v0, params, span, height) in COSTS.items():
         if not wanted(f"cost: {name}"):
             continue

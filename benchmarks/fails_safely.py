@@ -1,18 +1,18 @@
 """Does lagjax fail safely: is every failure reported as one?
 
-Some four hundred systems are broken at random, one family of breakages after the other: singular, contradictory, an
-inconsistent start, NaN, a tolerance out of reach, too few steps, and some that tempt an integrator to go on in
-silence. Each is integrated alone, where an exception or `lj.AccuracyWarning` reports it, and as a lane of a `vmap`,
-where its result must not be `successful`, or its `scaled_error` above 1. Each has a healthy twin from the same
-generator, which must not be reported and must be right: within 100 tolerances of a closed form or a first integral.
+About four hundred systems are broken at random, in families: singular, contradictory, an inconsistent start, NaN, an
+unreachable tolerance, too few steps, and some that tempt an integrator to continue silently. Each is integrated alone,
+where an exception or `lj.AccuracyWarning` reports it, and as a lane of a `vmap`, where its result must not be
+`successful`, or its `scaled_error` above 1. Each has a healthy twin from the same generator, which must not be reported
+and must be right: within 100 tolerances of a closed form or a first integral.
 
-What is called successful counts as unreported where nothing solves the broken equations (`error` is None), or where
-the answer is wrong: more than 10,000 tolerances (`WRONG`) from what is known of it. lagjax itself warns where a Jacobi
-integral changes by 1000; an error of the motion is easily several times that of one integral.
+A result called successful counts as unreported if the broken equations have no solution (`error` is None), or if the
+answer is wrong by more than 10,000 tolerances (`WRONG`). lagjax itself warns if a Jacobi integral changes by 1000; an
+error of the motion is easily several times that of one integral.
 
     python benchmarks/fails_safely.py [--seed N] [--count N] [--family WORDS] [--json FILE] [--messages]
 
-The exit status is 1 if one broken system goes unreported in either way, or one healthy twin is reported or wrong.
+The exit status is 1 if any broken system goes unreported in either way, or any healthy twin is reported or wrong.
 """
 
 import argparse
@@ -49,7 +49,7 @@ OUTPUTS = 5
 
 @dataclass(frozen=True, eq=False)
 class Program:
-    """What is compiled once: a system, and the options that are no arrays."""
+    """A program that is compiled once: a system, and the options that are not arrays."""
 
     system: lj.System
     options: dict[str, Any] = field(default_factory=dict)
@@ -57,9 +57,9 @@ class Program:
 
 @dataclass
 class Case:
-    """One system with its numbers. `error(traj)` is how wrong a trajectory is, None where none can be right.
+    """One system with its numbers. `error(traj)` is the error of a trajectory, None if none can be right.
 
-    `named`: a pattern of what the report should call by name.
+    `named`: a pattern of the names that the report should contain.
     """
 
     q0: Any
@@ -82,7 +82,7 @@ class Case:
 
 @dataclass(frozen=True)
 class Family:
-    """Systems that break in one way: `draw(rng, broken)` is one of them, or its healthy twin."""
+    """Systems that break in one way: `draw(rng, broken)` gives one of them, or its healthy twin."""
 
     name: str
     program: Program
@@ -118,7 +118,7 @@ inertia = Program(lj.System(inertia_lagrangian))
 
 
 def massless(rng, broken):
-    """A mass that is zero or 1e-15 of the others, along a coordinate or any direction."""
+    """A mass that is zero or 1e-15 of the others, along a coordinate or a random direction."""
     masses, j = rng.uniform(0.5, 2.0, 4), rng.integers(4)
     along = rng.integers(2)
     axes = np.eye(4)[rng.permutation(4)] if along else rotation(rng, 4)
@@ -133,7 +133,7 @@ def massless(rng, broken):
         exact = (y0 * np.cos(rate * t) + u0 / rate * np.sin(rate * t)) @ axes.T
         return np.max(np.abs(np.stack([traj.q[name] for name in "abcd"], axis=-1) - exact)) / np.max(np.abs(exact))
 
-    # Any coordinate that has a part in the massless direction is rightly named.
+    # It is right to name any coordinate with a share in the massless direction.
     named = "|".join(f"'{name}'" for name, share in zip("abcd", np.abs(axes[:, j])) if share > 0.1)
     by_name = lambda values: dict(zip("abcd", values))
     params = {"masses": masses, "axes": axes}
@@ -186,7 +186,7 @@ def start_on_quadric(rng):
 
 
 def without_a_derivative(rng, broken):
-    """The surface given as a square, whose derivative vanishes where it holds: nothing determines its multiplier."""
+    """The surface given as a square, whose derivative vanishes on it: nothing determines its multiplier."""
     q, v, params, _, error = start_on_quadric(rng)
     params["squared"] = float(broken)
     return Case(q, v, params, rng.uniform(0.5, 2.0), None if broken else error, "'surface'")
@@ -214,7 +214,7 @@ def nan_in_a_constraint(rng, broken):
     return Case(q, v, params, rng.uniform(0.5, 2.0), None if broken else error, "'surface'")
 
 
-# --- One coordinate beside a harmonic one, in potentials that end somewhere. Each: V(b), where it ends.
+# --- One coordinate next to a harmonic one, in potentials that end somewhere. Each entry: V(b), and its end.
 
 POTENTIALS = (
     ("square root, attracting", lambda n, b, c: c * n.sqrt(1 - b), 1.0),
@@ -243,7 +243,7 @@ potentials = Program(lj.System(potential_lagrangian))
 
 
 def in_potential(rng, broken, kinds):
-    """A motion towards the end of its potential: until past it, or over 0.4 of the time to it."""
+    """A motion towards the end of its potential: beyond it, or for 0.4 of the time to it."""
     kind = rng.choice(kinds)
     c, k, a0, u0, b0 = rng.uniform(0.5, 2.0), rng.uniform(0.5, 4.0), *rng.normal(size=2), rng.uniform(0.3, 0.7)
     if kind == VANISHING_MASS:
@@ -254,7 +254,7 @@ def in_potential(rng, broken, kinds):
         _, potential, there = POTENTIALS[kind]
         w0 = (1 if there else -1) * (rng.uniform(0.3, 1.0) + (np.sqrt(2 * c) if there else 0.0))
         energy = lambda b, w: 0.5 * w**2 + potential(np, b, c)
-        # ∫ db / |b'| to the end: of the energy integral.
+        # The time to the end: ∫ db / |b'|, from the energy integral.
         h = energy(b0, w0)
         end = abs(quad(lambda b: 1 / np.sqrt(2 * (h - potential(np, b, c))), b0, min(there, 60.0), limit=200)[0])
 
@@ -282,7 +282,7 @@ def not_finite(rng, broken, where):
     return case
 
 
-# --- Singular on the way: a massless crank's dead centre, the pole of a sphere.
+# --- Singular during the motion: a massless crank's dead centre, the pole of a sphere.
 
 
 def crank_lagrangian(t, q, v, params):
@@ -297,7 +297,7 @@ crank = Program(
 
 
 def dead_centre(rng, broken):
-    """x = reach cos(w t - phase), w² = k + kappa: beyond the crank's length or not."""
+    """x = reach cos(w t - phase), w² = k + kappa, with the reach beyond the crank's length or not."""
     length, k, kappa = rng.uniform(0.5, 2.0, 3)
     w, x = np.sqrt(k + kappa), length * rng.uniform(-0.4, 0.4)
     reach = length * (rng.uniform(1.02, 2.0) if broken else rng.uniform(0.5, 0.9))
@@ -318,7 +318,7 @@ polar = Program(
 
 
 def pole(rng, broken):
-    """A great circle through the pole, or past it by less than 1e-6; it goes on, and so may the answer if right."""
+    """A great circle through the pole, or past it by less than 1e-6; a right answer may continue beyond it."""
     miss = rng.choice([0.0, log_uniform(rng, 1e-17, 1e-6)]) if broken else rng.uniform(0.2, 0.6)
     first, theta = -rng.uniform(0.5, 1.3), rng.uniform(-3.0, 3.0)
     c, s = np.cos(first), np.sin(first)
@@ -339,12 +339,12 @@ def pole(rng, broken):
 
 
 def drive(t, params):
-    """What both drives ask for."""
+    """The motion that both drives prescribe."""
     return jnp.sin(params["rate"] * t + params["phase"])
 
 
 def departure(t, params):
-    """By how much they differ: from the start, or from `later` on."""
+    """The difference of the drives: from the start, or from `later` on."""
     after = jnp.maximum(t - params["later"], 0.0)
     powers = jnp.stack([jnp.ones_like(t), t, t**2, after, after**2, after**3])
     return jnp.dot(params["departs"], powers)
@@ -492,7 +492,7 @@ parallelogram = Program(
 def flat_position(rng, broken):
     """A parallelogram, driven by a torque, through its flat position, where it could also fold: both cranks turn alike.
 
-    The coupler's force passes through infinity there, and the motion does not notice.
+    The coupler's force passes through infinity there, without effect on the motion.
     """
     r, angle, rate = rng.uniform(0.3, 0.9), rng.uniform(0.5, 2.5), rng.uniform(0.5, 2.0)
     inertia_of_right, torque = rng.uniform(0.5, 2.0), rng.choice([0.0, rng.uniform(0.1, 1.0)])
@@ -534,7 +534,7 @@ timed = Program(lj.System(lambda t, q, v, params: 0.5 * v["x"] ** 2, force=timed
 
 
 def force_in_time(rng, broken, kinds):
-    """A force that is singular at t1: past it, or until 0.7 of it. The velocity is an integral."""
+    """A force that is singular at t1, integrated past t1 or until 0.7 of it. The velocity is an integral."""
     kind, c, t1, x, u = rng.choice(kinds), rng.uniform(0.5, 2.0), rng.uniform(0.5, 2.0), *rng.normal(size=2)
     _, _, integral, goes_on = FORCES[kind]
 
@@ -553,7 +553,7 @@ def oscillator_lagrangian(t, q, v, params):
 
 
 oscillator_system = lj.System(oscillator_lagrangian)
-# A tolerance that no step reaches would otherwise be tried a million times.
+# Without this limit an unreachable tolerance would be tried a million times.
 oscillator = Program(oscillator_system, {"max_steps": 2**16})
 few_steps = Program(oscillator_system, {"max_steps": 16})
 fixed_explicit = Program(
@@ -607,7 +607,7 @@ def too_few_steps(rng, broken):
 
 
 def unstable_steps(rng, broken):
-    """Forty explicit steps of 2 to 20 radians, beyond Tsit5's stability, or of 0.02."""
+    """Forty explicit steps of 2 to 20 radians, beyond Tsit5's stability limit, or of 0.02."""
     case = oscillation(rng, 1.0)
     case.dt0 = (rng.uniform(4.0, 20.0) if broken else 0.02) / np.sqrt(case.params["k"])
     case.end = 40 * case.dt0
@@ -624,7 +624,7 @@ damped = Program(
 
 
 def unstable_damped_steps(rng, broken):
-    """Forty explicit steps of 4 to 20 decay times: stiff damping beyond Tsit5's stability, and no energy to watch."""
+    """Forty steps of 4 to 20 decay times: damping beyond Tsit5's stability limit, without a conserved energy."""
     c, (x, u) = rng.uniform(5.0, 50.0), rng.normal(size=2)
     dt = (rng.uniform(4.0, 20.0) if broken else 0.01) / c
 
@@ -720,7 +720,7 @@ FAMILIES = (
 
 @dataclass
 class Verdict:
-    """One case in one way: what was said of it, and whether that was honest."""
+    """The result of one case, alone or as a lane: what was reported, and whether that was right."""
 
     case: Case
     way: str
@@ -737,12 +737,12 @@ class Verdict:
 
     @property
     def unreported(self):
-        """Whether a wrong answer was passed off as a good one, or the report of it broke down."""
+        """Whether a wrong answer was presented as right, or the report crashed."""
         return self.crashed or (self.report is None and self.wrong)
 
     @property
     def false_alarm(self):
-        """Of a healthy case: whether it was reported, or is not right."""
+        """Whether a healthy case was reported, or is wrong."""
         return self.report is not None or not self.error <= RIGHT * self.case.tolerance
 
 
@@ -770,18 +770,18 @@ def alone(program, case) -> Verdict:
             traj = integrate(program, case.arrays(), throw=True)
         except (ValueError, RuntimeError) as failure:
             report = f"{type(failure).__name__}: {failure}"
-        except Exception as failure:  # Any other kind is no report, and a finding.
+        except Exception as failure:  # Any other kind is not a report but a finding.
             report, crashed = f"{type(failure).__name__}: {failure}", True
     seconds = time.perf_counter() - started
     if report is None:
         error = _error(case, traj)
-        said = [str(w.message) for w in caught if issubclass(w.category, lj.AccuracyWarning)]
-        report = f"AccuracyWarning: {said[0]}" if said else None
+        messages = [str(w.message) for w in caught if issubclass(w.category, lj.AccuracyWarning)]
+        report = f"AccuracyWarning: {messages[0]}" if messages else None
     return Verdict(case, "alone", report, error, _named(case, report), seconds, crashed)
 
 
 def side_by_side(program, cases) -> list[Verdict]:
-    """Integrate cases as lanes of one batch; the time is that of the batch."""
+    """Integrate cases as lanes of one batch; `seconds` is the time of the batch."""
     numbers = jax.tree.map(lambda *leaves: np.stack(leaves), *(case.arrays() for case in cases))
     started = time.perf_counter()
     batch = jax.tree.map(np.asarray, in_lanes(program)(numbers))
@@ -805,7 +805,7 @@ def _named(case, report):
 
 
 def judge(family, rng, count) -> tuple[list[Verdict], list[Verdict]]:
-    """Draw broken cases and as many healthy twins, and integrate all in both ways."""
+    """Draw broken cases and as many healthy twins, and integrate all of them alone and as lanes."""
     broken = [family.draw(rng, True) for _ in range(count)]
     healthy = [family.draw(rng, False) for _ in range(count)]
     lanes = side_by_side(family.program, broken + healthy)
@@ -814,7 +814,7 @@ def judge(family, rng, count) -> tuple[list[Verdict], list[Verdict]]:
 
 
 def reproduction(family, verdict) -> str:
-    """The call that shows a finding."""
+    """The call that reproduces a finding."""
     case = verdict.case
     plain = jax.tree.map(lambda x: np.asarray(x).tolist(), {"q0": case.q0, "v0": case.v0, "params": case.params})
     program = next(name for name, value in globals().items() if value is family.program)
@@ -822,8 +822,8 @@ def reproduction(family, verdict) -> str:
     parts += [f"end={float(case.end)!r}", f"tolerance={float(case.tolerance)!r}"]
     parts += [f"dt0={float(case.dt0)!r}"] if case.dt0 is not None else []
     parts += ["dtype=np.float32"] if case.dtype == np.float32 else []
-    said = "successful" if verdict.report is None else verdict.report.splitlines()[0]
-    heading = f"  {family.name}, {verdict.way}: {said}; error {verdict.error:.2g}"
+    outcome = "successful" if verdict.report is None else verdict.report.splitlines()[0]
+    heading = f"  {family.name}, {verdict.way}: {outcome}; error {verdict.error:.2g}"
     return f"{heading}\n    alone({program}, Case({', '.join(parts)}))"
 
 
@@ -845,7 +845,7 @@ def rates(family, broken, healthy) -> dict:
 
 
 def outcomes_of(task):
-    """The rows, findings, slow cases and different reports of families, in a process of its own."""
+    """The rows, findings, slow cases and different reports of families, in a separate process."""
     outcomes = []
     indices, seed, count = task
     for index in indices:
@@ -853,11 +853,11 @@ def outcomes_of(task):
         broken, healthy = judge(family, np.random.default_rng([seed, index]), count)
         row = rates(family, broken, healthy) | {"seconds": time.perf_counter() - began}
         findings = [v for v in broken if v.unreported] + [v for v in healthy if v.false_alarm]
-        # The first that fails or succeeds in some way pays for compiling: only what is slow again is slow.
+        # The first case of each outcome includes compilation: only a case that is slow again counts as slow.
         slow = [v for v in broken + healthy if v.way == "alone" and v.seconds > SLOW]
         slow = [v for v in slow if alone(family.program, v.case).seconds > SLOW]
-        said = sorted({_anonymous(v.report) for v in broken if v.report})
-        outcomes.append((row, *([reproduction(family, v) for v in group] for group in (findings, slow)), said))
+        reports = sorted({_anonymous(v.report) for v in broken if v.report})
+        outcomes.append((row, *([reproduction(family, v) for v in group] for group in (findings, slow)), reports))
     return outcomes
 
 
@@ -865,7 +865,7 @@ def main():
     """Judge every family and print the table, then the findings."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--count", type=int, default=COUNT, help="broken systems a family, and as many healthy ones")
+    parser.add_argument("--count", type=int, default=COUNT, help="broken systems per family, and as many healthy ones")
     parser.add_argument("--family", default="", help="only families with these words in their name")
     parser.add_argument("--workers", type=int, default=2, help="processes")
     parser.add_argument("--json", help="also write the rows there")
@@ -880,17 +880,17 @@ def main():
     for index in chosen:
         programs.setdefault(FAMILIES[index].program, []).append(index)
     started, table, findings, slow = time.perf_counter(), [], [], []
-    # Nearly all of the time is compiling, on one core: families that share a program stay together.
+    # Nearly all of the time is compilation on one core, so families that share a program stay together.
     with multiprocessing.get_context("spawn").Pool(options.workers) as pool:
         tasks = [(indices, options.seed, options.count) for indices in programs.values()]
         for outcomes in pool.imap_unordered(outcomes_of, tasks):
-            for row, found, late, said in outcomes:
+            for row, found, late, reports in outcomes:
                 table.append(row)
                 findings += found
                 slow += late
                 print("{family:48s} {cases:5d}  {right:5d}  {alone:5.0%}  {lanes:5.0%} {named:>7s}  {false:5d}  "
                       "{worst:7.1g} {seconds:4.1f} s".format(**row), flush=True)  # fmt: skip
-                for report in said if options.messages else []:
+                for report in reports if options.messages else []:
                     print("      " + report.replace("\n", "\n      "))
     cases, seconds = sum(row["cases"] for row in table), time.perf_counter() - started
     score = {way: sum(row[way] * row["cases"] for row in table) / cases for way in ("alone", "lanes")}

@@ -1,19 +1,19 @@
-"""What a person waits for: the first answer of a fresh process, and the next call, beside bare diffrax.
+"""How long does a user wait for the first answer of a fresh process and for the next call, compared with bare diffrax?
 
-Each figure is of a new process, with everything that a person waits for after `import`: tracing, compiling, running. A
-bare program is what a robust person writes for the same problem: accelerations derived by hand, diffrax's Dopri8 in
-`jax.jit`, the same tolerance and outputs. Both are measured in the same run, one after the other, medians of three.
+Each figure is from a new process and includes everything after `import`: tracing, compiling, running. A bare program
+solves the same problem with robust accelerations derived by hand and diffrax's Dopri8 in `jax.jit`, with the same
+tolerance and outputs. Both are measured alternately in the same run; values are medians of three.
 
-    first answer / bare     of the same problem, wall clock; of a sweep: of one of its motions, by us
-    again                   the same call with other numbers, eager, in seconds, beside the jitted solve
-    programs, traced        what that second call still compiles and traces: nothing
-    a step                  a call's time by its number of steps
-    kept programs           the first answer of a second process that shares JAX's compilation cache with a first one
-    instructions            of the largest program before XLA optimises it: the volume that is compiled
+    first answer / bare     for the same problem, wall clock; for a sweep: over one of its motions by lagjax
+    again                   the same call with other numbers, eager, in seconds, compared with the jitted solve
+    programs, traced        what the second call still compiles and traces: nothing
+    a step                  a call's time divided by its number of steps
+    kept programs           the first answer of a second process that shares JAX's compilation cache with the first
+    instructions            of the largest program before XLA optimises it: the amount to compile
     import                  `import lagjax` after `import jax, diffrax`
 
-Programs are kept by `jax.config.update("jax_compilation_cache_dir", FOLDER)` and, since JAX leaves out what compiled in
-less than a second, `jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)`.
+Programs are cached by `jax.config.update("jax_compilation_cache_dir", FOLDER)` and, since JAX does not cache programs
+that compiled in less than a second, `jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)`.
 
     python benchmarks/first_answer.py [--json FILE] [--only TEXT] [--processor-time]
 """
@@ -37,7 +37,7 @@ if CACHE:
     jax.config.update("jax_compilation_cache_dir", CACHE)
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
 import lagjax as lj
-# The first operation of a process starts JAX's back end, whoever asks for it.
+# The first operation of a process starts JAX's backend, so that it counts for neither.
 jax.block_until_ready(jnp.arange(3.0) + 1.0)
 clock = getattr(time, CLOCK)
 compiled, traced = [], []
@@ -87,7 +87,7 @@ started = time.perf_counter()
 import lagjax
 print(json.dumps(time.perf_counter() - started))
 """
-# XLA itself writes down what it is given.
+# XLA itself dumps its input.
 DUMPED = """
 import os
 os.environ["XLA_FLAGS"] = f"--xla_dump_to={FOLDER} --xla_dump_hlo_as_text"
@@ -100,10 +100,10 @@ print(json.dumps(max(p.read_text().count(" = ") for p in Path(FOLDER).glob("*bef
 
 
 class Question(NamedTuple):
-    """A definition; `answer(x)` in it by lagjax, and beside it (None: nothing to compare with); targets, in seconds.
+    """A definition; `answer(x)` by lagjax, and by the comparison (None if there is none); targets, in seconds.
 
-    The targets are of the first answer, or of its ratio to what is beside it; of another call; of one step of it; of
-    the first answer with kept programs; and of how many instructions the program has. None: not measured.
+    The targets are for the first answer, or its ratio to the comparison; for another call; for one step of it; for the
+    first answer with cached programs; and for the number of instructions of the program. None: not measured.
     """
 
     definition: str
@@ -164,7 +164,7 @@ SLIDER_CRANK = """
 from lagjax.mechanisms.slider_crank import MECHANISM
 system, params, start, ts = MECHANISM.system, MECHANISM.params, (MECHANISM.q0, MECHANISM.v0), np.linspace(0.0, 0.1, 5)
 """
-# Nine coordinates, two wheels on the ground and four equations of no slip; pushed, so that it sways while it runs.
+# Nine coordinates, two wheels on the ground and four no-slip equations; pushed, so that it sways as it runs.
 VEHICLE = f"""
 import sys
 sys.path.insert(0, {str(Path(__file__).parent)!r})
@@ -172,7 +172,7 @@ import bicycle
 system, params, ts = bicycle.system, bicycle.PARAMS, np.linspace(0.0, 2.0, 5)
 start = bicycle.straight(4.6, roll_rate=0.5)
 """
-# A bead on a hoop that turns; a system is asked what it is like.
+# A bead on a rotating hoop, for the questions of `lagjax.analysis`.
 BEAD = """
 hoop = lj.System(lambda t, q, v, p: 0.5 * (v**2 + (p["w"] * jnp.sin(q)) ** 2) + p["g"] * jnp.cos(q))
 at_rest = {"x": 0.0, "y": -2.0}, {"x": 0.0, "y": 0.0}
@@ -264,13 +264,13 @@ QUESTIONS = {
 
 
 def measured(definition, answer, again=False, cache=None):
-    """What a new process prints."""
+    """Run the question in a new process and return what it prints."""
     clock = "process_time" if CLOCK["seconds"] is time.process_time else "perf_counter"
     return in_new_process(f"CLOCK, AGAIN, CACHE = {clock!r}, {again!r}, {cache!r}\n{START}{definition}{answer}\n{END}")
 
 
 def rows(wanted):
-    """The import, then each question, by the rows about it that are wanted."""
+    """The import, then the requested rows of each question."""
     if wanted("import lagjax"):
         yield row("import lagjax", statistics.median(in_new_process(IMPORT) for _ in range(REPEATS)), 0.3)
     for name, question in QUESTIONS.items():
@@ -289,7 +289,7 @@ def rows(wanted):
 
 
 def first_and_next(name, question):
-    """The first answer and another call; ours and what is beside it by turns."""
+    """The first answer and another call, of lagjax and of the comparison alternately."""
     again = question.again is not None or question.step is not None
     ours, beside = [], []
     for _ in range(REPEATS):

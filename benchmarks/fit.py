@@ -1,9 +1,9 @@
-"""What does a fit cost, against SciPy's least squares over `solve_ivp` with numerical slopes?
+"""What does a fit cost, against SciPy's least squares over `solve_ivp` with numerical derivatives?
 
-A pendulum with friction, 100 samples of its angle with errors of 0.01: four numbers, the length, the friction and the
-state at the first sample, from 10 to 60 % off. Both must end at the same optimum, which is checked ("apart" is the
-largest difference in standard deviations). Compiling is timed in a process of its own, where nothing has been compiled
-before: the first call less a later one.
+A pendulum with friction, 100 samples of its angle with errors of 0.01: four unknowns (the length, the friction and the
+state at the first sample) with guesses 10 to 60 % off. Both must end at the same optimum, which is checked ("apart" is
+the largest difference in standard deviations). Compilation is timed in a separate process, where nothing has been
+compiled before: the first call minus a later one.
 
     python benchmarks/fit.py [--json FILE] [--only TEXT]
 """
@@ -26,7 +26,7 @@ jax.config.update("jax_enable_x64", True)
 PARAMS = {"m": 1.0, "l": 1.25, "g": 9.81, "c": 0.05}
 GUESS, START = PARAMS | {"l": 1.4, "c": 0.08}, (0.9, 0.1)
 TS, SIGMA = np.linspace(0.0, 5.0, 100), 0.01
-# SciPy's slopes are differences: what they are taken of must be ten times as accurate as their steps.
+# SciPy's derivatives are differences: the residuals must be ten times as accurate as the difference steps.
 TOLERANCE = 1e-9
 LANES = 200
 
@@ -53,7 +53,7 @@ def by_lagjax(data):
 
 
 def by_scipy(data):
-    """Numbers in the order c, l, q0, v0."""
+    """Unknowns in the order c, l, q0, v0."""
     m, g = PARAMS["m"], PARAMS["g"]
 
     def residuals(x):
@@ -67,7 +67,7 @@ def by_scipy(data):
 
 
 def first_and_second():
-    """Seconds of the first and of a second fit in this process."""
+    """Seconds of the first and of the second fit in this process."""
     data = measured()
     seconds = []
     for _ in range(2):
@@ -78,7 +78,7 @@ def first_and_second():
 
 
 def rows(wanted):
-    """Yield the rows asked for."""
+    """Yield the requested rows."""
     data = measured()
     if wanted("one fit"):
         found, theirs = by_lagjax(data), by_scipy(data)

@@ -6,13 +6,13 @@ is the single pendulum, `t, theta1, theta2, dtheta1, dtheta2` the double one; an
 
     python benchmarks/fit_measured_pendulum.py double_pendulum.csv --json rows.json
 
-A motion shows only ratios of its Lagrangian's coefficients. With B the moment of the second arm about its joint,
+A motion determines only ratios of its Lagrangian's coefficients. With B the moment of the second arm about its joint,
 
     L/B = A θ1'²/2 + θ2'²/2 + C θ1' θ2' cos(θ1 - θ2) - D cos θ1 - E cos θ2,
     A = (I1 + m1 a1² + m2 L1²)/B,  B = I2 + m2 a2²,  C = m2 a2 L1/B,  D = (m1 a1 + m2 L1) g/B,  E = m2 a2 g/B.
 
-The double pendulum is chaotic: its record is cut into windows, each from a start of its own. What the published
-parameters are worth is measured on the same windows, with their starts fitted and nothing else.
+The double pendulum is chaotic: its record is cut into windows, each with its own initial state. The published
+parameters are judged on the same windows, with only their initial states fitted.
 """
 
 import argparse
@@ -33,9 +33,9 @@ DOUBLE = {
     "m1": 0.0938439748, "m2": 0.13759597, "a1": 0.108565215, "a2": 0.116779018, "L1": 0.172719204, "I1": 4.3752943e-4,
     "I2": 1.26882939e-3, "k1": 2.37142783e-4, "k2": 1e-5, "g": 9.80858023,
 }  # fmt: skip
-# Of the single pendulum's record; of a window of the double one's.
+# Seconds of the single pendulum's record, and of a window of the double pendulum's.
 UNTIL, WINDOW = 20.0, 2.0
-# How far the guess is from what is published.
+# The guess as a multiple of the published values.
 OFF = {"A": 1.2, "C": 0.85, "D": 1.2, "E": 0.85, "k1": 2.0, "k2": 2.0}
 SOLVE = {"rtol": 1e-8, "atol": 1e-8}
 
@@ -46,7 +46,7 @@ def single_lagrangian(t, q, v, params):
 
 
 def single_friction(t, q, v, params):
-    """Viscous, and the drag of the air with the square of the speed."""
+    """Viscous friction, and air drag with the square of the speed."""
     return 0.5 * params["viscous"] * v**2 + params["drag"] * jnp.abs(v) ** 3 / 3
 
 
@@ -58,7 +58,7 @@ def double_lagrangian(t, q, v, params):
 
 
 def double_friction(t, q, v, params):
-    """Viscous, in both joints."""
+    """Viscous friction in both joints."""
     return 0.5 * params["k1"] * v["theta1"] ** 2 + 0.5 * params["k2"] * (v["theta2"] - v["theta1"]) ** 2
 
 
@@ -83,7 +83,7 @@ def row(what, value, published, target, met):
 
 
 def rms(found):
-    """Of all angles together."""
+    """The root mean square of the residuals of all angles together."""
     return float(np.sqrt(np.nanmean(np.stack(list(found.residuals().values())) ** 2)))
 
 

@@ -1,10 +1,10 @@
-"""How often does a fit end in the global minimum, and does it say so where it does not?
+"""How often does a fit end in the global minimum, and does it say so if it does not?
 
-Twelve systems: scenes, driven ones, chaotic ones by windows, constrained ones, measurements with outliers. For each
-seed the truth is drawn so that every guess is up to 30 % off, and measured with errors. An end is the global minimum
-where its cost is no larger than that of the truth itself, which is larger than the least by a few units at most; for
-some seeds the best of 64 further starts is looked for, and must not be lower. Every other end must be flagged: not
-`converged`, with a warning, and not successful in a sweep. Right ends that are flagged are false alarms.
+Twelve systems: scenes, driven ones, chaotic ones with windows, constrained ones, measurements with outliers. For each
+seed the truth is drawn so that every guess is up to 30 % off, and measured with errors. A result counts as the global
+minimum if its cost is no larger than that of the truth, which exceeds the minimum by a few units at most; for some
+seeds the best of 64 further starts is computed too, and must not be lower. Every other result must be flagged: not
+`converged`, with a warning, and not successful in a sweep. Right results that are flagged are false alarms.
 
     python benchmarks/fits_found.py [--seeds N] [--alone N] [--restarts N] [--only TEXT] [--json FILE]
 """
@@ -32,16 +32,16 @@ jax.config.update("jax_enable_x64", True)
 
 OFF = 0.3
 FOUND, FLAGGED = 0.99, 1.0
-# Of the cost; a search ends within this of its minimum.
+# A search ends within this relative distance of its minimal cost.
 ROUND_OFF = 1e-6
-WILD, OF_SAMPLES = 30.0, 0.08
+OUTLIER, SHARE = 30.0, 0.08
 
 
 class Case(NamedTuple):
-    """A system to be fitted: `guess` of all its parameters, of which `free` are found; `start(params)` of its motion.
+    """A system to fit: `guess` of all its parameters, of which `free` are fitted; `start(params)` of its motion.
 
-    `hint` is a guess of the start, by default read off what was measured; `sigma` by kind of measurement, of what
-    `measured(traj)` returns.
+    `hint` is a guess of the initial state, by default derived from the measurements; `sigma` is given by kind of
+    measurement, for what `measured(traj)` returns.
     """
 
     system: Any
@@ -53,7 +53,7 @@ class Case(NamedTuple):
     measured: Callable = lambda traj: {"q": traj.q}
     hint: Any = None
     options: dict = {}
-    wild: bool = False
+    outliers: bool = False
 
     def record(self, measured):
         """A `Record` of some measurements."""
@@ -76,17 +76,17 @@ def rubbed(t, q, v, p):
 
 
 def pushed(t, q, v, p):
-    """L of a pendulum with a force in time."""
+    """L of a pendulum with a time-dependent force."""
     return swing(t, q, v, p) + p["A"] * jnp.cos(p["W"] * t) * q
 
 
 def shaken(t, q, v, p):
-    """L of a pendulum whose support is shaken along the vertical."""
+    """L of a pendulum whose support is shaken vertically."""
     return 0.5 * v**2 + (p["w2"] + p["A"] * jnp.cos(p["W"] * t)) * jnp.cos(q)
 
 
 def duffing(t, q, v, p):
-    """L of a spring that hardens, with a force in time."""
+    """L of a hardening spring with a time-dependent force."""
     return 0.5 * v**2 - 0.5 * p["k"] * q**2 - 0.25 * p["k3"] * q**4 + p["A"] * jnp.cos(p["W"] * t) * q
 
 
@@ -158,7 +158,7 @@ CASES = {
     ),
     "outliers: long record of a pendulum": Case(
         lj.System(swing, dissipation=rubbed), {"w2": 8.0, "c": 0.05}, ("c", "w2"), of(1.0, 0.0),
-        np.linspace(0.0, 30.0, 600), {"q": 0.01}, options={"loss": "cauchy"}, wild=True,
+        np.linspace(0.0, 30.0, 600), {"q": 0.01}, options={"loss": "cauchy"}, outliers=True,
     ),
     "outliers: coupled masses, one unseen": Case(
         lj.System(coupled, dissipation=lambda t, q, v, p: 0.5 * p["c"] * (v["a"] ** 2 + v["b"] ** 2)),
@@ -170,7 +170,7 @@ CASES = {
 
 
 def drawn(case, seeds):
-    """Truths by name (n, free), and measurements (n, m) as vectors, their costs, and what makes a tree of a vector."""
+    """Truths by name (n, free), measurements (n, m) as vectors, their costs, and the function to unravel a vector."""
     draw = lambda seed: np.random.default_rng(seed)
     offs = np.stack([1 + OFF * draw(seed).uniform(-1, 1, len(case.free)) for seed in range(seeds)])
     truths = np.array([case.guess[name] for name in case.free]) / offs
@@ -189,8 +189,8 @@ def drawn(case, seeds):
     for seed in range(seeds):
         random = np.random.default_rng(seed + seeds)
         error = random.normal(size=clean.shape[1])
-        if case.wild:
-            error = np.where(random.uniform(size=error.size) < OF_SAMPLES, WILD * random.normal(size=error.size), error)
+        if case.outliers:
+            error = np.where(random.uniform(size=error.size) < SHARE, OUTLIER * random.normal(size=error.size), error)
         errors.append(error)
     errors = np.stack(errors)
     loss = case.options.get("loss", "squares")
@@ -202,7 +202,7 @@ def rows(name, case, seeds, alone_too, restarts):
     """Yield the rows of one system."""
     truths, data, costs, tree = drawn(case, seeds)
     if not np.all(np.isfinite(data)):
-        raise ValueError(f"{name}: a motion of the truth fails")
+        raise ValueError(f"{name}: a true motion fails to integrate")
 
     def run(point):
         found = case.fit(tree(point["data"]))
@@ -213,26 +213,26 @@ def rows(name, case, seeds, alone_too, restarts):
     seconds = time.perf_counter() - started
     values, cost, converged, tries, steps = swept.values
     right = cost <= costs * (1 + ROUND_OFF)
-    yield from told(f"{name}, in a sweep", right, swept.ok, seconds=seconds, starts=float(np.mean(tries)),
+    yield from shares(f"{name}, in a sweep", right, swept.ok, seconds=seconds, starts=float(np.mean(tries)),
                     steps=float(np.mean(steps)))  # fmt: skip
     if not np.array_equal(converged, swept.ok):
         yield row(f"{name}: converged and status differ", np.sum(converged != swept.ok), 0)
     for s in np.flatnonzero(~right | ~swept.ok)[:10]:
         how = in_words(swept.status.result[s])
         print(f"      seed {s}: chi2 {2 * cost[s]:.6g}, of the truth {2 * costs[s]:.6g}; {how}")
-    started, alone, told_of, lowest = time.perf_counter(), [], [], []
+    started, alone, warned_of, lowest = time.perf_counter(), [], [], []
     for seed in range(alone_too):
-        with warnings.catch_warnings(record=True) as said:
+        with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", lj.FitWarning)
             found = case.fit(tree(data[seed]))
         alone.append((float(found.cost), bool(found.converged)))
-        told_of.append(any(issubclass(w.category, lj.FitWarning) for w in said) or bool(found.converged))
+        warned_of.append(any(issubclass(w.category, lj.FitWarning) for w in caught) or bool(found.converged))
     seconds = time.perf_counter() - started
     if alone:
         below, well = np.array(alone).T
-        yield from told(f"{name}, alone", below <= costs[:alone_too] * (1 + ROUND_OFF), well > 0, seconds=seconds)
-    if not all(told_of):
-        yield row(f"{name}: flagged without a warning", alone_too - sum(told_of), 0)
+        yield from shares(f"{name}, alone", below <= costs[:alone_too] * (1 + ROUND_OFF), well > 0, seconds=seconds)
+    if not all(warned_of):
+        yield row(f"{name}: flagged without a warning", alone_too - sum(warned_of), 0)
     for seed in range(restarts):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", lj.FitWarning)
@@ -243,8 +243,8 @@ def rows(name, case, seeds, alone_too, restarts):
         yield row(f"{name}: ends called right, {restarts} of them, above the best of 64", max(lower, 0), 0)
 
 
-def told(what, right, ok, **more):
-    """The share that is right, that of the others that is flagged, and false alarms."""
+def shares(what, right, ok, **more):
+    """The share of right results, the share of the others that is flagged, and false alarms."""
     count = len(right)
     yield row(f"{what}: global minimum", np.mean(right), FOUND, "more", missed=int(np.sum(~right)), of=count, **more)
     if np.any(~right):
@@ -257,8 +257,8 @@ def main():
     """Print a table, and the shares over all systems."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, default=200)
-    parser.add_argument("--alone", type=int, help="seeds for which it is fitted alone, too; by default all")
-    parser.add_argument("--restarts", type=int, default=4, help="seeds for which the best of 64 starts is looked for")
+    parser.add_argument("--alone", type=int, help="seeds that are also fitted outside a sweep; by default all")
+    parser.add_argument("--restarts", type=int, default=4, help="seeds for which the best of 64 starts is computed")
     parser.add_argument("--only", metavar="TEXT", default="", help="only systems whose name contains it")
     parser.add_argument("--json", metavar="FILE", help="also write the rows there")
     options = parser.parse_args()

@@ -1,21 +1,22 @@
-"""Is any Lagrangian solved wrong, or does any end the process? Random expressions against naive equations and SciPy.
+"""Is any Lagrangian solved wrongly, or does any crash the process? Random expressions against naive equations and
+SciPy.
 
-Each case is a random system: energies and forces as expression trees, with arrays that are closed over, given in
-`params` or written down as NumPy constants; with tables, indices, integers, mixed kinds, conditionals, loops,
-checkpoints and derivative rules. It goes through `accelerations`, `integrate`, and by turns (all of them with `--all`)
-`jvp`, `vjp` and `vmap` of 3 and of 300. With `--quick` only its equations are looked at, written out and in a loop of a
-few steps that is compiled as one function, which takes a third of the time.
+Each case is a random system: energies and forces are expression trees, with arrays that are closed over, given in
+`params` or written as NumPy constants; with tables, indices, integers, mixed dtypes, conditionals, loops, checkpoints
+and derivative rules. It is passed to `accelerations`, `integrate`, and to one of `jvp`, `vjp` and `vmap` of 3 and of
+300 (to all of them with `--all`). With `--quick` only its equations are tested, written out and in a loop of a few
+steps that is compiled as one function, which takes a third of the time.
 
-The reference is the Euler-Lagrange equation written down naively with JAX's derivatives and a linear solve, and its own
+The reference is the Euler-Lagrange equation, written naively with JAX's derivatives and a linear solve, and its
 derivative, integrated by SciPy's DOP853.
 
-Every case is a process of its own, which may die. Seeds are printed:
+Every case runs in a separate process, which may die. Seeds are printed:
 
     python benchmarks/fuzz.py --cases 150 --seed 0
     python benchmarks/fuzz.py --only 17 --all
     python benchmarks/fuzz.py --quick --cases 1000
 
-Forking is cheap as long as JAX has not started its backend, so that nothing in here makes an array before.
+Forking is cheap as long as JAX has not started its backend, so nothing in this module creates an array before.
 """
 
 import argparse
@@ -43,9 +44,9 @@ from lagjax.jax_internals.one_function import one_function
 jax.config.update("jax_enable_x64", True)
 
 END, OUTPUTS = 0.8, 5
-# Evaluations of the reference, most of which take a millisecond, after which a motion counts as wild.
+# A motion whose reference needs more evaluations (most take a millisecond) counts as not solvable.
 PATIENCE = 50_000
-# Of the values, relative to 1 + the largest; a tolerance of 1e-9 leaves this much room for kinks.
+# Allowed differences, relative to 1 + the largest value; at a tolerance of 1e-9 this leaves room for kinks.
 VALUES_AGREE, DERIVATIVES_AGREE = 1e-6, 1e-5
 TRANSFORMATIONS = ("jvp", "vjp", "vmap3", "vmap300")
 
@@ -61,7 +62,7 @@ class Case(NamedTuple):
 
 
 class Env(NamedTuple):
-    """What an expression is made of: the time, coordinates and velocities one by one, and the parameters."""
+    """The inputs of an expression: the time, single coordinates and velocities, and the parameters."""
 
     t: Any
     q: Any
@@ -70,7 +71,7 @@ class Env(NamedTuple):
 
 
 class Writer:
-    """Writes random expressions, and puts the arrays that they need in `params`, in closures or in constants."""
+    """Writes random expressions, and stores their arrays in `params`, in closures or as constants."""
 
     def __init__(self, rng, n):
         self.rng, self.n, self.params, self.features = rng, n, {}, []
@@ -79,7 +80,7 @@ class Writer:
         return choices[self.rng.integers(len(choices))]
 
     def held(self, array):
-        """A function that returns an array, wherever it is held."""
+        """A function that returns an array, wherever it is stored."""
         array = np.asarray(array)
         where = self.one_of("params", "closed", "constant")
         if where == "params":
@@ -91,7 +92,7 @@ class Writer:
         kept = []
 
         def closed(env):
-            # Made at the first call, so that nothing starts JAX before the fork.
+            # The array is created at the first call, so that nothing starts JAX before the fork.
             with jax.ensure_compile_time_eval():
                 kept[:] = kept or [jnp.asarray(array)]
             return kept[0]
@@ -109,7 +110,7 @@ class Writer:
         return self.one_of(*choices)
 
     def scalar(self, depth, velocities=False):
-        """An expression whose value is a number, of moderate size where its leaves are."""
+        """An expression whose value is a number, of moderate size if its leaves are."""
         if depth <= 0:
             return self.leaf(velocities)
         name = self.one_of(*SCALARS)
@@ -167,7 +168,7 @@ def network(w, depth, velocities):
 
 
 def mixed_kinds(w, depth, velocities):
-    """A product with a matrix of integers, truth values or lower precision."""
+    """A product with a matrix of integers, booleans or lower precision."""
     size = w.size()
     kind = w.one_of(int, bool, np.float32, np.int32)
     matrix = w.held((w.rng.uniform(-1, 2, size=(size, size)) / (1 if kind in (int, np.int32) else 2)).astype(kind))
@@ -205,7 +206,7 @@ def conditional(w, depth, velocities):
 
 
 def loop(w, depth, velocities):
-    """Loops, scans and maps of a few turns."""
+    """Loops, scans and maps of a few iterations."""
     x, count = w.scalar(depth - 1, velocities), int(w.rng.integers(1, 6))
     weights = w.held(w.rng.uniform(-0.5, 0.5, size=count))
     return w.one_of(
@@ -217,11 +218,11 @@ def loop(w, depth, velocities):
 
 
 def integers(w, depth, velocities):
-    """Whole numbers that scale or choose."""
+    """Integers that scale or select."""
     x, n = w.scalar(depth - 1, velocities), w.held(np.array(int(w.rng.integers(1, 12))))
     return w.one_of(
         lambda env: x(env) * (29 // n(env)) / 29,
-        # The dividend changes with the state as far as a program shows it.
+        # As far as the program shows, the dividend depends on the state.
         lambda env: x(env) * lax.div(jnp.floor(env.t + 29.0).astype(int), jnp.asarray(n(env), int)) / 29.0,
         lambda env: x(env) * (jnp.asarray(n(env)) % 5) / 5,
         lambda env: x(env) * jnp.asarray(n(env) > 5, float),
@@ -356,7 +357,7 @@ def random_case(seed: int) -> Case:
 
 
 class Reference:
-    """The equations written down naively, on flat states, and what SciPy makes of them."""
+    """The equations written naively on flat states, and SciPy's solution of them."""
 
     def __init__(self, case):
         self.case = case
@@ -389,17 +390,17 @@ class Reference:
 
         def patiently(t, y):
             if next(evaluations, None) is None:
-                raise Wild
+                raise NotFollowed
             return rate(t, y)
 
         found = solve_ivp(patiently, (0, END), y, "DOP853", np.linspace(0, END, OUTPUTS), rtol=1e-10, atol=1e-11)
         if not found.success or not np.all(np.isfinite(found.y)) or np.max(np.abs(found.y)) > 1e4:
-            raise Wild
+            raise NotFollowed
         return found.y
 
 
-class Wild(Exception):
-    """A motion that SciPy does not follow."""
+class NotFollowed(Exception):
+    """A motion that SciPy cannot follow."""
 
 
 def flat(tree, leading=0):
@@ -414,7 +415,7 @@ def difference(found, expected):
 
 
 def run_quickly(seed: int) -> str:
-    """The same of the equations alone, written out, in a loop compiled as one function; its derivative and lanes."""
+    """Test only the equations, written out in a loop compiled as one function, with its derivative and lanes."""
     case = random_case(seed)
     reference = Reference(case)
     rng = np.random.default_rng([seed, 1])
@@ -435,8 +436,8 @@ def run_quickly(seed: int) -> str:
     along = jax.tree.map(lambda x: rng.normal(size=np.shape(x)).astype(np.asarray(x).dtype), inputs)
     expected, slope = jax.jit(lambda x, dx: jax.jvp(partial(stepped, reference.acceleration), x, dx))(inputs, along)
     if not np.all(np.isfinite(expected)) or np.max(np.abs(expected)) > 1e4:
-        return "skipped: wild"
-    # Once with the values known while it compiles, once with the values passed.
+        return "skipped: SciPy cannot follow it"
+    # Once with the values known at compile time, once with the values passed as arguments.
     marked = lambda *x: one_function(partial(stepped, ours), *x, checked=True)
     known = jax.jit(lambda y: marked(y, jax.tree.map(jnp.asarray, reference.floating)))(reference.start)
     found, pushed = jax.jit(lambda x, dx: jax.jvp(marked, x, dx))(inputs, along)
@@ -451,11 +452,11 @@ def run_quickly(seed: int) -> str:
 
 
 def run(seed: int, every: bool) -> str:
-    """ "ok" or what is wrong with a case."""
+    """Return "ok" or what is wrong with a case."""
     try:
         return _run(seed, every)
-    except Wild:
-        return "skipped: wild"
+    except NotFollowed:
+        return "skipped: SciPy cannot follow it"
 
 
 def _run(seed, every):
@@ -513,7 +514,7 @@ def _rows(tree):
 
 
 def in_a_process(function, seed: int, verbose: bool, seconds: float = 300) -> str:
-    """The same in a process of its own."""
+    """Run a function in a separate process."""
     read, write = os.pipe()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -525,43 +526,43 @@ def in_a_process(function, seed: int, verbose: bool, seconds: float = 300) -> st
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", lj.AccuracyWarning)
-                said = function(seed)
+                verdict = function(seed)
         except BaseException as error:
             if verbose:
                 traceback.print_exc()
-            said = f"RAISED: {type(error).__name__}: {' '.join(str(error).split())[:160]}"
-        os.write(write, said.encode())
+            verdict = f"RAISED: {type(error).__name__}: {' '.join(str(error).split())[:160]}"
+        os.write(write, verdict.encode())
         os._exit(0)
     os.close(write)
     ready, _, _ = select.select([read], [], [], seconds)
     if not ready:
         os.kill(child, signal.SIGKILL)
-    said = os.read(read, 65536).decode() if ready else ""
+    verdict = os.read(read, 65536).decode() if ready else ""
     os.close(read)
     _, status = os.waitpid(child, 0)
     if not ready:
         return f"SLOW: over {seconds:g} s"
-    return said or f"DIED: {signal.Signals(os.WTERMSIG(status)).name if os.WIFSIGNALED(status) else status}"
+    return verdict or f"DIED: {signal.Signals(os.WTERMSIG(status)).name if os.WIFSIGNALED(status) else status}"
 
 
 def main():
-    """Run the cases, say how each went, and fail where one did."""
+    """Run the cases, print the result of each, and fail if one failed."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--cases", type=int, default=150)
-    parser.add_argument("--seed", type=int, default=0, help="of the first case; the others count on")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the first case; the others follow")
     parser.add_argument("--only", type=int, nargs="*", help="these seeds, with their tracebacks")
-    parser.add_argument("--all", action="store_true", help="all transformations of each case, not one of them")
-    parser.add_argument("--quick", action="store_true", help="the equations alone in a loop, which compiles fast")
-    parser.add_argument("--seconds", type=float, default=300, help="that a case may take; more on a loaded machine")
+    parser.add_argument("--all", action="store_true", help="test all transformations of each case instead of one")
+    parser.add_argument("--quick", action="store_true", help="test only the equations in a loop, which compiles fast")
+    parser.add_argument("--seconds", type=float, default=300, help="limit of a case; more on a loaded machine")
     options = parser.parse_args()
     function = run_quickly if options.quick else partial(run, every=options.all)
     seeds = options.only or range(options.seed, options.seed + options.cases)
     verdicts = Counter()
     for seed in seeds:
         start = time.perf_counter()
-        said = in_a_process(function, seed, bool(options.only), options.seconds)
-        verdicts[said.split(":")[0]] += 1
-        print(f"{seed:6d}  {time.perf_counter() - start:5.1f} s  {said}", flush=True)
+        verdict = in_a_process(function, seed, bool(options.only), options.seconds)
+        verdicts[verdict.split(":")[0]] += 1
+        print(f"{seed:6d}  {time.perf_counter() - start:5.1f} s  {verdict}", flush=True)
         if options.only:
             print("        ", Counter(random_case(seed).features), flush=True)
     print(dict(verdicts))

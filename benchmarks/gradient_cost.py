@@ -1,18 +1,18 @@
-"""What does a gradient cost beside a solve?
+"""What does a gradient cost compared with a solve?
 
-The bead on a rotating hoop, 20 periods, by `diffrax`'s Dopri8 as shipped with the acceleration derived by hand, and by
-our default from the Lagrangian: each at the loosest tolerance from which on it is within 1e-7 of Jacobi's elliptic
-functions at the end. Four derivatives: by g, a, ω and the angle of release.
+The bead on a rotating hoop, 20 periods, solved by `diffrax`'s Dopri8 as shipped with the acceleration derived by hand,
+and by our default method from the Lagrangian: each at the loosest tolerance below which it is within 1e-7 of Jacobi's
+elliptic functions at the end. Four derivatives: with respect to g, a, ω and the angle of release.
 
     forward mode   d(ψ, ψ') at the end by `jax.jacfwd`
     reverse mode   of the sum of the squares of ψ and ψ' at 100 outputs by `jax.grad`
 
-"error" is the relative one against derivatives of the closed form, which are checked against its central differences
-first. diffrax's own gradients stand beside them, by `ForwardMode` and by its default adjoint. A mode's programs run
-in turn; ratios are medians over the turns.
+"error" is relative to derivatives of the closed form, which are first checked against its central differences. For
+comparison there are diffrax's own gradients, by `ForwardMode` and by its default adjoint. The programs of a mode run
+alternately; ratios are medians over the turns.
 
-By networks in L (`networks.py`), of a thousand numbers and of twenty thousand: the first gradient and the next ones,
-beside our own solve and beside the gradient of diffrax, each in a process of its own. On one core:
+With networks in L (`networks.py`) of a thousand and of twenty thousand numbers: the first gradient and later ones,
+compared with our own solve and with diffrax's gradient, each in a separate process. On one core:
 
     taskset -c 0 python benchmarks/gradient_cost.py --only numbers
 
@@ -36,7 +36,7 @@ from lagjax.scenes import bead_on_hoop
 jax.config.update("jax_enable_x64", True)
 
 PERIODS, OUTPUTS, ERROR, REPEATS = 20, 100, 1e-7, 15
-# m does not matter to the motion.
+# The motion does not depend on m.
 PARAMS = {name: bead_on_hoop.PARAMS[name] for name in ("g", "a", "omega")} | {"psi": 1.0}
 MASS = bead_on_hoop.PARAMS["m"]
 END = PERIODS * float(bead_on_hoop.exact_period(bead_on_hoop.PARAMS, PARAMS["psi"]))
@@ -58,7 +58,7 @@ def by_lagjax(tolerance, params, ts, adjoint=None):
 
 
 def by_diffrax(tolerance, params, ts, adjoint=None):
-    """ψ and ψ' as diffrax is used: the acceleration by hand, everything else as it comes."""
+    """ψ and ψ' by diffrax as a user would: the acceleration by hand, everything else at its default."""
 
     def field(t, y, params):
         below = params["g"] / params["a"]
@@ -81,7 +81,7 @@ def misfit(motion):
     return lambda params: sum(jnp.sum(x**2) for x in motion(params, ALL_TS))
 
 
-# What is differentiated, and how; and adjoints of diffrax that do it.
+# The differentiated quantity, the JAX transformation, and diffrax's adjoint for it.
 MODES = {
     "forward": (end_state, jax.jacfwd, diffrax.ForwardMode()),
     "reverse": (misfit, jax.grad, diffrax.RecursiveCheckpointAdjoint()),
@@ -89,7 +89,7 @@ MODES = {
 
 
 def true_derivatives(mode):
-    """The derivatives of the closed form; refused where its central differences disagree."""
+    """The derivatives of the closed form; refused if its central differences disagree."""
     measure, derive, _ = MODES[mode]
     function = jax.jit(measure(exact))
     found = jax.jit(derive(measure(exact)))(PARAMS)
@@ -107,7 +107,7 @@ def relative_error(found, right):
 
 
 def program(solve, measure=None, derive=None, adjoint=None, ts=END_TS):
-    """A compiled solve, or a derivative of what `measure` takes of it; both take tolerance and parameters."""
+    """A compiled solve, or a derivative of `measure` of it; both take tolerance and parameters."""
 
     def run(tolerance, params):
         motion = lambda params, ts: solve(tolerance, params, ts, adjoint)
@@ -118,7 +118,7 @@ def program(solve, measure=None, derive=None, adjoint=None, ts=END_TS):
 
 
 def tolerance_of(solve):
-    """The loosest tolerance from which on the end is right within `ERROR`."""
+    """The loosest tolerance below which the error at the end is at most `ERROR`."""
     right = np.array(end_state(exact)(PARAMS))
     rate = END / PERIODS / (2 * np.pi)
     error = lambda state: float(np.max(np.abs(np.array([x[-1] for x in state]) - right) * [1.0, rate]))
@@ -126,7 +126,7 @@ def tolerance_of(solve):
 
 
 def rows(wanted):
-    """By four parameters, and by networks."""
+    """Gradients with respect to four parameters, and to networks."""
     yield from by_parameters(wanted)
     for name, problem in PROBLEMS.items():
         if wanted(name):
@@ -134,7 +134,7 @@ def rows(wanted):
 
 
 def by_network(name, problem):
-    """The gradient of a motion with a network in L: ours, beside our solve and diffrax's."""
+    """Our gradient of a motion with a network in L, compared with our solve and with diffrax's gradient."""
     clock = "process_time" if CLOCK["seconds"] is time.process_time else "perf_counter"
     run = lambda who: in_new_process(
         f"import json, sys\nsys.path.insert(0, {str(Path(__file__).parent)!r})\nfrom networks import measured\n"
@@ -155,7 +155,7 @@ def by_network(name, problem):
 
 
 def by_parameters(wanted):
-    """Each mode: the gradient beside a solve of ours and one of diffrax, and diffrax's own."""
+    """For each mode: our gradient compared with our solve and diffrax's solve, and diffrax's own gradient."""
     names = {mode: f"{mode} mode, {'4 parameters' if mode == 'forward' else f'{OUTPUTS} outputs'}" for mode in MODES}
     if not any(wanted(name) for name in names.values()):
         return

@@ -1,10 +1,10 @@
-"""What switches cost: in a batch, and before the first answer. The targets are 1.5 and 2.
+"""What do switches cost in a batch, and before the first answer? The targets are 1.5 and 2.
 
     python benchmarks/hybrid.py [--skip-first-answer]
 
-The batch are 1,000 pendulums that swing against a wall, each with another amplitude, beside the same 1,000 without the
-wall. The first answers are those of the hoop that rolls, slips and flies, in a process of its own each, beside that of
-its phase with most equations alone.
+The batch consists of 1,000 pendulums that swing against a wall, each with another amplitude, compared with the same
+1,000 without the wall. The first answers are those of the hoop that rolls, slips and flies, each in a separate process,
+compared with that of only the phase with most equations.
 """
 
 import argparse
@@ -36,7 +36,7 @@ THREE = "lj.Hybrid(dict(list(zip(scene.hybrid.names, scene.hybrid.systems))[:3])
 
 
 def pendulum(t, q, v, params):
-    """In its angle, of unit length and mass."""
+    """A pendulum of unit length and mass, in its angle."""
     return 0.5 * v**2 + 9.81 * jnp.cos(q)
 
 
@@ -50,12 +50,12 @@ walled = lj.Hybrid({"swings": free}, [lj.Switch("swings", to="swings", when=lj.t
 
 
 def batch(system):
-    """The last states of a batch of motions, as a compiled function of their starts."""
+    """The final states of a batch of motions, as a compiled function of their initial states."""
     return jax.jit(jax.vmap(lambda q: lj.integrate(system, q, 0.0, ts=TS, estimate_error=False, throw=False).q[-1]))
 
 
 def in_a_batch():
-    """Print the time of the batch with the wall over that without, and how far it is off single runs."""
+    """Print the time of the batch with the wall over that without, and its difference from single runs."""
     starts, without, having = jnp.linspace(-0.2, -1.5, 1000), batch(free), batch(walled)
     times = in_turn(lambda: having(starts), lambda: without(starts), repeats=9)
     some = np.array([0, 499, 999])
@@ -69,7 +69,7 @@ def in_a_batch():
 
 
 def first_answers():
-    """Print the seconds before the first answer of three phases, and of the largest one."""
+    """Print the seconds until the first answer of three phases, and of the largest phase alone."""
 
     def seconds(system):
         return float(subprocess.run([sys.executable, "-c", FIRST_ANSWER.format(system=system)], capture_output=True,

@@ -1,33 +1,34 @@
-"""How well is a motion learned, beside what is published, a neural ODE and a Hamiltonian network?
+"""How well is a motion learned, compared with published results, a neural ODE and a Hamiltonian network?
 
 (1) The double pendulum of Cranmer, Greydanus, Hoyer, Battaglia, Spergel and Ho, "Lagrangian neural networks" (2020,
-arXiv:2003.04630). The setting is that of the authors' own code (github.com/MilesCranmer/lagrangian_nns, commit
+arXiv:2003.04630). The setting follows the authors' own code (github.com/MilesCranmer/lagrangian_nns, commit
 2fc26cb, notebooks DoublePendulum and DoublePendulum-Baseline): unit masses and lengths, g = 9.8; random states, angles
 in one turn and rates of ±10, with their exact accelerations; L one network of three layers of 600 softplus units, and a
-network for the accelerations of the same size; 300 epochs of a million fresh states in batches of 512. What these
-notebooks print, and what is taken here (of the paper itself only the beginning could be read):
+network for the accelerations of the same size; 300 epochs of a million fresh states in batches of 512. The results that
+these notebooks print are used here (only the beginning of the paper itself was accessible):
 
-    loss      |Δa1| + |Δa2| in its mean over 100,000 other states: 0.0689 of L, 0.0739 of the other
-    energy    |E - E_true| / 29.4 after 100 s in its mean over 40 motions (angles in one turn, rates up to 0.1), E by
-              the true formula: 0.0043 of L, 0.080 of the other (of the 40 first ones)
+    loss      the mean of |Δa1| + |Δa2| over 100,000 other states: 0.0689 for L, 0.0739 for the other
+    energy    the mean of |E - E_true| / 29.4 after 100 s over 40 motions (angles in one turn, rates up to 0.1), E by
+              the true formula: 0.0043 for L, 0.080 for the other (for the first 40 motions)
 
-States are drawn here as there; networks are smaller, and see sines and cosines of the angles.
+States are drawn in the same way; networks are smaller, and take sines and cosines of the angles.
 
 (2) Chaotic and dissipative: Shinde et al., "Deepmechanics" (2026, arXiv:2602.18060) find that Hamiltonian and
-Lagrangian networks "struggle to maintain stability for chaotic or nonconservative systems". Of that paper, too, only
-the beginning could be read, no table: the systems are our own choice, that of Hénon and Heiles where it is chaotic and
-a damped double pendulum (`learned_systems.py`). All models see the same noisy positions, first what a smoother makes of
-them state by state, then motions in windows, each from a start that is trained too.
+Lagrangian networks "struggle to maintain stability for chaotic or nonconservative systems". Only the beginning of that
+paper was accessible too, without tables: the systems are our own choice, that of Hénon and Heiles in its chaotic range
+and a damped double pendulum (`learned_systems.py`). All models get the same noisy positions: first smoothed states one
+by one, then motions in windows, whose initial states are trained too.
 
 (3) A measured double pendulum (`learned_pendulum.py`): its rigid-body L is known, friction is learned.
 
-Errors are those of motions from starts that no model has seen, after 1, 10 and 100 natural times: the largest until
-then, of coordinates and of velocities over the natural rate, in its median over the starts; energies by the true
-formula, over their typical size. 10 stands for more than that, and for motions that end. A chaotic motion is lost after
-some ten natural times, whoever computes it: its energy is not. Of several seeds the median is told, with the range.
+Errors are those of motions from initial states that no model has seen, after 1, 10 and 100 natural times: the largest
+error until then, of coordinates and of velocities divided by the natural rate, as the median over the initial states;
+energies by the true formula, relative to their typical size. 10 stands for larger errors and for motions that end
+early. A chaotic motion cannot be predicted beyond about ten natural times by any method, but its energy can. For
+several seeds the median and the range are given.
 
-`--seconds` are processor seconds of training, for each model and seed, after compiling; `--published-seconds` those of
-the first setting.
+`--seconds` are processor seconds of training for each model and seed, after compiling; `--published-seconds` are those
+for the first setting.
 
     python benchmarks/learned.py [--seconds 12] [--published-seconds 30] [--seeds 2] [--record FILE]
                                  [--json FILE] [--only TEXT]
@@ -52,7 +53,7 @@ from learned_systems import DAMPED, NATURAL, PUBLISHED, STARS  # noqa: E402
 from learned_training import Trainer, by_motions, by_states  # noqa: E402
 from measure import main, row  # noqa: E402
 
-# What the authors' notebooks print, of L and of their network for accelerations.
+# Values printed by the authors' notebooks, for L and for their network of accelerations.
 LOSS, OTHER_LOSS, ENERGY, OTHER_ENERGY, LARGEST = 0.06890, 0.07387, 0.004258, 0.08007, 29.4
 HIDDEN, SMALLER, PEAK, BATCH = (32, 32, 32), (24, 24), 0.005, 128
 OPTIONS: dict[str, Any] = {
@@ -64,7 +65,7 @@ OPTIONS: dict[str, Any] = {
 
 
 class Several(NamedTuple):
-    """What several seeds gave, one row each, and how they were trained."""
+    """The results of several seeds, one row each, and their training."""
 
     found: np.ndarray
     shown: dict
@@ -76,7 +77,7 @@ class Several(NamedTuple):
 
 
 def seeds_of(train_one, score):
-    """`train_one(seed)` gives a `Trained`, `score(weights)` numbers; of all seeds."""
+    """Train and score all seeds: `train_one(seed)` gives a `Trained`, `score(weights)` numbers."""
     trained = [train_one(seed) for seed in range(OPTIONS["seeds"])]
     weights = trained[0].weights
     network = weights["network"] if isinstance(weights, dict) and "network" in weights else weights
@@ -97,7 +98,7 @@ def published(wanted):
         if not wanted(name):
             continue
         trainer = Trainer(by_states(model), lambda key: learned_systems.published_states(key, BATCH), 100)
-        # In single precision, as theirs: twice as many steps.
+        # Single precision, as in the authors' code, allows twice as many steps.
         first = lambda seed: jax.tree.map(np.float32, model.first(np.random.default_rng(seed)))
         several = seeds_of(
             lambda seed: trainer.train(first(seed), OPTIONS["published_seconds"], PEAK, seed), scored(model)
@@ -109,7 +110,7 @@ def published(wanted):
 
 
 def scored(model):
-    """`score(weights)` -> the loss on 100,000 other states; the mean error of the energy of 40 motions."""
+    """`score(weights)` -> the loss on 100,000 other states, and the mean energy error of 40 motions."""
     states = learned_systems.published_states(jax.random.key(2**20), 100_000, jnp.float64)
     starts = PUBLISHED.starts(np.random.default_rng(0), 40)
     right = learned_systems.energy(PUBLISHED, *starts)
@@ -132,7 +133,7 @@ def scored(model):
 
 
 def from_positions(truth, wanted):
-    """A system of which noisy positions are known."""
+    """The rows of a system whose noisy positions are known."""
     setting = truth.setting
     mine = ours(setting, SMALLER)
     numbers = count(mine.first(np.random.default_rng(0)))
@@ -158,7 +159,7 @@ def from_positions(truth, wanted):
 
 
 def taught_by(model, windows, sigma, score):
-    """A model that is trained by smoothed states for a quarter of the time, then by motions in windows."""
+    """Train a model with smoothed states for a quarter of the time, then with motions in windows."""
     states = Trainer(by_states(model), drawn_from(windows.states, BATCH), 50)
     moving = Trainer(by_motions(model, windows, sigma), drawn_from((np.arange(len(windows.q)),), 32), 5)
 

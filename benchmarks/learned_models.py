@@ -1,11 +1,11 @@
-"""What learns a motion in `learned.py`: three kinds of model with networks of the same size, behind one interface.
+"""The models of `learned.py`: different kinds with networks of the same size, behind one interface.
 
-ours          L = ½ |Cᵀ(q) v|² - V(q): a mass matrix C Cᵀ that is positive definite, and a potential; where there is
-              friction the force -D Dᵀ v. `lj.accelerations` and `lj.integrate` do the rest
-free L        L(q, v) is one network, as in Cranmer et al. (2020), beside ½ |v|²
+ours          L = ½ |Cᵀ(q) v|² - V(q): a positive-definite mass matrix C Cᵀ and a potential; if there is
+              friction, also the force -D Dᵀ v. `lj.accelerations` and `lj.integrate` do the rest
+free L        L(q, v) is one network, as in Cranmer et al. (2020), plus ½ |v|²
 neural ODE    v' = f(q, v), one network; by diffrax
-Hamiltonian   q' = ∂H/∂p, p' = -∂H/∂q - D Dᵀ q', H(q, p) one network beside ½ |p|². Its momenta are known: they come
-              from velocities by the true mass matrix, which ours has to learn
+Hamiltonian   q' = ∂H/∂p, p' = -∂H/∂q - D Dᵀ q', H(q, p) one network plus ½ |p|². Its momenta are known: they come
+              from velocities by the true mass matrix, which our model has to learn
 """
 
 from typing import Any, NamedTuple
@@ -19,9 +19,9 @@ import lagjax as lj
 
 
 class Setting(NamedTuple):
-    """What all models know of a system: `features(q)`, numbers of order one, and typical sizes.
+    """What all models know about a system: `features(q)`, numbers of order one, and typical sizes.
 
-    `mass(q)` is the true mass matrix, for momenta; `friction` says that there is some.
+    `mass(q)` is the true mass matrix, for momenta; `friction` says whether there is friction.
     """
 
     name: str
@@ -36,8 +36,8 @@ class Setting(NamedTuple):
 class Model(NamedTuple):
     """`first(random)` gives its weights; `accelerations(weights, q, v)`; and see `motion_by`.
 
-    `mismatch(weights, q, v, a)` is how far one state is off; `motion(weights, q0, v0, ts, tolerance)` gives q and v at
-    the times, NaN or infinite where it fails.
+    `mismatch(weights, q, v, a)` is the error at one state; `motion(weights, q0, v0, ts, tolerance)` gives q and v at
+    the times, NaN or infinite if it fails.
     """
 
     name: str
@@ -48,7 +48,7 @@ class Model(NamedTuple):
 
 
 def layers(random, *sizes):
-    """The first weights of a network."""
+    """The initial weights of a network."""
     return [
         (random.normal(size=(n, m)) / np.sqrt(n), np.zeros(m)) for n, m in zip(sizes[:-1], sizes[1:], strict=True)
     ]  # fmt: skip
@@ -68,7 +68,7 @@ def count(weights):
 
 
 def as_wide(numbers, inputs, depth, outputs):
-    """The hidden sizes of a network of so many layers with about so many numbers."""
+    """The hidden sizes of a network with `depth` layers and about `numbers` weights."""
     of = lambda width: width * (inputs + 1) + (depth - 1) * width * (width + 1) + outputs * (width + 1)
     return (min(range(2, 1000), key=lambda width: abs(of(width) - numbers)),) * depth
 
@@ -187,12 +187,12 @@ def hamiltonian(setting, numbers, depth):
     return Model("Hamiltonian", first, accelerations, mismatch, motion)
 
 
-# A motion that needs more has been lost.
+# A motion that needs more steps counts as failed.
 MOST_STEPS = 2**14
 
 
 def by_diffrax(field, y0, weights, ts, tolerance):
-    """The states at all times, by the method that ours is solved with."""
+    """The states at all times, by the same method as ours."""
     found = diffrax.diffeqsolve(
         diffrax.ODETerm(field), diffrax.Tsit5(), ts[0], ts[-1], None, y0, args=weights, saveat=diffrax.SaveAt(ts=ts),
         stepsize_controller=diffrax.PIDController(rtol=tolerance, atol=tolerance), max_steps=MOST_STEPS, throw=False,

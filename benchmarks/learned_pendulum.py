@@ -1,21 +1,22 @@
 """The measured double pendulum of `learned.py`: known L, learned friction.
 
-The record is that of `fit_measured_pendulum.py`, where it comes from, how a file is recognised and what its L is:
+The record is that of `fit_measured_pendulum.py`, which describes its origin, how a file is recognised, and its L:
 
     L/B = A θ1'²/2 + θ2'²/2 + C θ1' θ2' cos(θ1 - θ2) - D cos θ1 - E cos θ2
 
-It is no part of this project: `--record FILE`, or `LAGJAX_DOUBLE_PENDULUM`, names it. Without one a record is made:
-the motion that follows from the published parameters, with errors of 0.2 mrad; its friction is viscous, and there is
-nothing else to be found.
+It is not part of this project: name it with `--record FILE` or `LAGJAX_DOUBLE_PENDULUM`. Without it a record is
+simulated from the published parameters, with errors of 0.2 mrad; its friction is viscous, so the network has nothing
+else to find.
 
     viscous           the six coefficients, trained from the published ones
     learned friction  A, C, D, E likewise, and the force -D(q, v) v with a network for its positive-definite matrix
 
-beside the neural ODE and the Hamiltonian network, which start from nothing, and what is published. Trained are 60 s
-in three parts; the starts of what is judged lie in the 10 s after the first and after the second. After 1 and 10
-natural times of 0.83 s: the largest error of an angle until then, in its median over the starts. Last, a motion from
-the start of the record to its end: phases are lost, and what is judged is the energy, by the published coefficients and
-over E, that friction leaves: its largest error. Smoothed positions are the starts, and the limit of what can be right.
+They are compared with the neural ODE and the Hamiltonian network, which know nothing in advance, and with the published
+parameters. The training data are 60 s in three parts; the judged motions start in the 10 s after the first and after
+the second part. The score after 1 and 10 natural times of 0.83 s is the largest error of an angle until then, as the
+median over the initial states. Finally a motion runs from the start of the record to its end: its phase is lost, so its
+score is the largest error of the energy that friction leaves, by the published coefficients and divided by E. Initial
+states are smoothed positions, which limit the accuracy.
 """
 
 import jax
@@ -33,12 +34,12 @@ import lagjax as lj
 PUBLISHED = published_double()
 NAMES = tuple(PUBLISHED)
 NATURAL, STEP, WINDOW, SIGMA = 0.83, 0.01, 31, 0.0002
-# Seconds of the record: what is trained, and what is judged.
+# Seconds of the record used for training, and for judging.
 TRAINED, JUDGED, BLOCK, GAP = (0.0, 30.0, 60.0), (20.0, 50.0), 20.0, 10.0
 
 
 def record_of(path):
-    """Times, angles (T, 2) at equal steps, and whether they were measured."""
+    """Times, angles (T, 2) at equal steps, and whether the record was measured."""
     if path:
         with open(path) as file:
             columns = [name.split("[")[0].strip() for name in file.readline().split(",")]
@@ -60,18 +61,18 @@ def record_of(path):
 
 
 def lagrangian(t, q, v, p):
-    """L/B, angles from above."""
+    """L/B, with angles from the upper vertical."""
     kinetic = 0.5 * p["A"] * v[0] ** 2 + 0.5 * v[1] ** 2 + p["C"] * v[0] * v[1] * jnp.cos(q[0] - q[1])
     return kinetic - p["D"] * jnp.cos(q[0]) - p["E"] * jnp.cos(q[1])
 
 
 def viscous(t, q, v, p):
-    """R/B, in both joints."""
+    """R/B of viscous friction in both joints."""
     return 0.5 * p["k1"] * v[0] ** 2 + 0.5 * p["k2"] * (v[1] - v[0]) ** 2
 
 
 def mass(q):
-    """M/B as published, for momenta."""
+    """The published M/B, for momenta."""
     across = PUBLISHED["C"] * jnp.cos(q[0] - q[1])
     return jnp.stack([
         jnp.stack([jnp.full_like(across, PUBLISHED["A"]), across]), jnp.stack([across, jnp.ones_like(across)])
@@ -82,19 +83,19 @@ SETTING = Setting("measured pendulum", 2, turned, 8.0, PUBLISHED["E"], mass, fri
 
 
 def coefficients(weights):
-    """Logarithms times ten of what they are over what is published, so that a step of 0.01 is one of a thousandth."""
+    """Coefficients from weights, which are 10 ln(coefficient / published): a step of 0.01 changes one by 0.1 %."""
     return {name: PUBLISHED[name] * jnp.exp(0.1 * x) for name, x in weights["coefficients"].items()}
 
 
 def of_coefficients(name, names, first, force=None, dissipation=None):
-    """A model of known L, whose weights are coefficients and what `first(random)` adds to them."""
+    """A model with known L, whose weights are coefficients and those that `first(random)` adds."""
     system = lj.System(lambda t, q, v, w: lagrangian(t, q, v, coefficients(w)), force=force, dissipation=dissipation)
     start = lambda random: {"coefficients": {name: np.zeros(()) for name in names}} | first(random)
     return of_lagrangian(name, system, start)
 
 
 def friction(t, q, v, weights):
-    """-D Dᵀ w in the joints, w = (θ1', θ2' - θ1'): it takes energy away, however the network is."""
+    """-D Dᵀ w in the joints, w = (θ1', θ2' - θ1'): it removes energy for any network."""
     joints = jnp.stack([v[0], v[1] - v[0]])
     x = jnp.concatenate([turned(q), joints / SETTING.speed])
     damping = factor(weights["friction"], x, 2)
@@ -103,7 +104,7 @@ def friction(t, q, v, weights):
 
 
 def models():
-    """The four that are trained."""
+    """The four models that are trained."""
     learned = lambda random: {"friction": layers(random, 6, 24, 24, 3)}
     known = of_coefficients("learned friction", NAMES[:4], learned, force=friction)
     numbers = 1500
@@ -115,7 +116,7 @@ def models():
 
 
 def energies(q, v):
-    """By the published coefficients, over E; zero where both hang."""
+    """The energy by the published coefficients, divided by E; zero if both arms hang down."""
     kinetic = 0.5 * PUBLISHED["A"] * v[..., 0] ** 2 + 0.5 * v[..., 1] ** 2
     kinetic += PUBLISHED["C"] * v[..., 0] * v[..., 1] * np.cos(q[..., 0] - q[..., 1])
     height = PUBLISHED["D"] * (1 + np.cos(q[..., 0])) + PUBLISHED["E"] * (1 + np.cos(q[..., 1]))
@@ -123,7 +124,7 @@ def energies(q, v):
 
 
 def judge(model, ts, angles, smooth):
-    """`score(weights)`: the errors of angles after 1 and 10 natural times, that of the energy from start to end."""
+    """`score(weights)`: errors of angles after 1 and 10 natural times, and of the energy from start to end."""
     near = [i for begin in JUDGED for i in np.arange(begin + 0.1, begin + GAP - NATURAL - 0.1, 1.0)]
     far = [begin + s for begin in JUDGED for s in np.linspace(0.1, GAP - 10 * NATURAL - 0.1, 4)]
     runs = {}
@@ -150,7 +151,7 @@ def judge(model, ts, angles, smooth):
 
 
 def rows(wanted, path, taught_by):
-    """What is published, then what is learned."""
+    """The rows of the published model, then those of the trained models."""
     title = SETTING.name if path else "made pendulum"
     asked = [model for model in models() if wanted(f"{title}, {model.name}")]
     if not asked and not wanted(f"{title}, published"):

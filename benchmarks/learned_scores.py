@@ -1,4 +1,4 @@
-"""How far the models' motions in `learned.py` are from those that are right, by horizon."""
+"""The errors of the models' motions in `learned.py`, by horizon."""
 
 import jax
 import numpy as np
@@ -8,7 +8,7 @@ HORIZONS, LOST, STARTS, OUTPUTS_A_TIME = (1, 10, 100), 10.0, 8, 4
 
 
 def starts_of(truth):
-    """Starts that no model has seen, their times and their true motions."""
+    """Initial states that no model has seen, with times and true motions."""
     q0, v0 = truth.starts(np.random.default_rng(12345), STARTS)
     ts = np.linspace(0.0, HORIZONS[-1] * NATURAL, HORIZONS[-1] * OUTPUTS_A_TIME + 1)
     return ts, *motions(truth, q0, v0, ts)
@@ -30,6 +30,6 @@ def errors_of(model, truth, right, natural):
 
 
 def until(off, ts, end):
-    """The largest error (starts, T) until then, in its median over the starts; `LOST` where it is more or nothing."""
+    """The median over starts of the largest error (starts, T) until `end`; `LOST` if it is larger or NaN."""
     off = np.where(np.isfinite(off), np.minimum(off, LOST), LOST)
     return float(np.median(off[:, ts <= end * (1 + 1e-9)].max(axis=1)))

@@ -1,10 +1,10 @@
-"""How the models of `learned.py` are trained: one loop for all of them, for so many processor seconds after compiling.
+"""The training of the models of `learned.py`: one loop for all, for a given processor time after compiling.
 
-The step is Muon's for matrices (Jordan et al. 2024: a momentum made orthogonal) and Adam's for all else, with a rate
-that rises for a twentieth of the time and falls as a cosine. Of what was tried on the published double pendulum, Muon
-came two to three times as far as Adam in the same time, and batches of 128 as far as those of 512.
+Matrices use the step of Muon (Jordan et al. 2024: an orthogonalised momentum) and everything else Adam's, with a rate
+that rises for a twentieth of the time and then falls as a cosine. In trials on the published double pendulum, Muon
+got two to three times as far as Adam in the same time, and batches of 128 as far as those of 512.
 
-A `Trainer` knows nothing of motions: what is minimised is `loss(weights, batch)`, and `batches(key)` draws.
+A `Trainer` knows nothing about motions: it minimises `loss(weights, batch)` on batches drawn by `batches(key)`.
 """
 
 import time
@@ -15,12 +15,12 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-# The gradient is cut to this length: one lane near a singular mass matrix would throw the rest.
+# The gradient is clipped to this norm: one lane near a singular mass matrix would spoil the rest.
 LONGEST, RISE, LAST = 50.0, 0.05, 1e-4
 
 
 class Trained(NamedTuple):
-    """What came of it, and the processor seconds of compiling and of the steps."""
+    """The result of a training, and the processor seconds of compiling and of the steps."""
 
     weights: Any
     losses: list
@@ -30,14 +30,14 @@ class Trained(NamedTuple):
 
 
 def rate_at(share):
-    """The rate over its peak when this share of the time is over."""
+    """The learning rate over its peak after this share of the time."""
     if share < RISE:
         return max(share / RISE, 0.1)
     return LAST + (1 - LAST) * 0.5 * (1 + np.cos(np.pi * min(1.0, (share - RISE) / (1 - RISE))))
 
 
 class Trainer:
-    """Steps for `loss(weights, batch)` on what `batches(key)` draws, `together` of them in one compiled call."""
+    """Steps for `loss(weights, batch)` on batches from `batches(key)`, `together` of them in one compiled call."""
 
     def __init__(self, loss, batches, together):
         self.optimiser = optax.chain(optax.clip_by_global_norm(LONGEST), optax.contrib.muon(1.0))
@@ -45,7 +45,7 @@ class Trainer:
         self.program = None
 
     def step(self, carry, key):
-        """One step; nothing changes where the loss or its slope is not finite."""
+        """One step; nothing changes if the loss or its gradient is not finite."""
         weights, state, rate = carry
         value, slope = jax.value_and_grad(self.loss)(weights, self.batches(key))
         usable = jnp.isfinite(optax.global_norm(slope)) & jnp.isfinite(value)
@@ -55,19 +55,19 @@ class Trainer:
         return (weights, state, rate), value
 
     def steps(self, weights, state, rate, key):
-        """The weights after some steps, the optimiser's state, and the mean loss."""
+        """Do some steps; return the weights, the optimiser's state, and the mean loss."""
         (weights, state, _), values = jax.lax.scan(
             self.step, (weights, state, rate), jax.random.split(key, self.together)
         )
         return weights, state, jnp.mean(values)
 
     def train(self, weights, budget, peak, seed=0):
-        """Go on until `budget` processor seconds are over; compiling, once for all seeds, is not counted."""
+        """Train for `budget` processor seconds, not counting compilation, which is done once for all seeds."""
         weights = jax.tree.map(lambda x: jnp.asarray(x, x.dtype), weights)
         state, key = self.optimiser.init(weights), jax.random.key(seed)
         rate = lambda share: jnp.asarray(peak * rate_at(share), jnp.float32)
         started = time.process_time()
-        # Compiled ahead: a program that meets other types refuses them, where `jit` would compile again unseen.
+        # Compiled ahead of time: it refuses arguments of other types, where `jit` would silently compile again.
         self.program = self.program or jax.jit(self.steps).lower(weights, state, rate(0.0), key).compile()
         compiling, losses, started = time.process_time() - started, [], time.process_time()
         while (spent := time.process_time() - started) < budget:
@@ -83,11 +83,11 @@ def by_states(model):
 
 
 def by_motions(model, windows, sigma, tolerance=1e-5):
-    """The loss of windows by their numbers (B,): of `weights["network"]` and `weights["starts"]`, (W, 2, n).
+    """The loss of the windows with the indices (B,), from `weights["network"]` and `weights["starts"]`, (W, 2, n).
 
-    A start is what the smoother says, moved by three of its standard deviations for each unit of its weight. The
-    penalty grows as the square of an error up to three standard deviations of a measurement, and then as itself: a
-    model that is still far off would else be all that is seen.
+    An initial state is that of the smoother, moved by three of its standard deviations per unit of its weight. The
+    penalty is quadratic up to an error of three standard deviations of a measurement and linear beyond, so that large
+    errors of an early model do not dominate.
     """
     measured, first = jnp.asarray(windows.q), jnp.asarray(windows.start)
     spread = jnp.asarray(3 * windows.spread)[None]
@@ -97,7 +97,7 @@ def by_motions(model, windows, sigma, tolerance=1e-5):
         start = first[chosen] + spread * weights["starts"][chosen]
         run = lambda start: model.motion(weights["network"], start[0], start[1], windows.ts, tolerance)[0]
         off = (jax.vmap(run)(start) - measured[chosen]) / (3 * sigma)
-        # A motion that failed says nothing; diffrax leaves infinity there.
+        # A failed motion, which diffrax fills with infinity, contributes nothing.
         off = jnp.where(jnp.isfinite(off), off, 0.0)
         return jnp.mean(jnp.sqrt(1 + off**2) - 1)
 

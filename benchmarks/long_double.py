@@ -1,10 +1,11 @@
-"""Motions integrated in long double, as references: an integrator that has nothing in common with ours.
+"""Reference motions, integrated in long double by an integrator that has nothing in common with lagjax's.
 
 Gragg, Bulirsch and Stoer's extrapolation of the modified midpoint rule, with 2, 4, ..., 2 k substeps (order 2 k), in
-NumPy's long double, of 64 bits of mantissa on x86. What it yields is checked by itself: once with k = 8, once with
-k = 10 and other steps; where they part is how far an answer is known, output by output, whatever the motion amplifies.
+NumPy's long double, of 64 bits of mantissa on x86. It checks its own results: it runs once with k = 8 and once with k =
+10 and other steps. Their difference shows, output by output, how accurate the result is, however much the motion
+amplifies errors.
 
-The equations are given by hand, `field(t, y)`, and all numbers are those of the double precision problem, exactly.
+The equations `field(t, y)` are written by hand, and all numbers are exactly those of the double precision problem.
 
 Source: Hairer, Nørsett & Wanner, *Solving ODEs I*, §II.9.
 """
@@ -17,7 +18,7 @@ import numpy as np
 
 LONG = np.longdouble
 COLUMNS = (8, 10)
-# Of a step's increment about as much is lost to round-off as the weights of the last column add up to.
+# The round-off of a step's increment is amplified by about the sum of the absolute weights of the last column.
 TOLERANCE = LONG(2e-18)
 MOST_STEPS = 200_000
 
@@ -54,7 +55,7 @@ def integrated(field, start, ts, columns):
         length = np.copysign(length, end - t)
         while t != end:
             if abs(length) < 1e-15 * abs(ts[-1] - ts[0]):
-                raise RuntimeError(f"the reference does not get beyond t = {float(t)}")
+                raise RuntimeError(f"the reference cannot integrate beyond t = {float(t)}")
             last = abs(length) >= abs(end - t)
             h = end - t if last else length
             change, error = step(field, t, y, h, columns)
@@ -62,7 +63,7 @@ def integrated(field, start, ts, columns):
             off = np.max(np.abs(error)) / np.max(scale) / TOLERANCE
             if off <= 1:
                 t, y = (end if last else t + h), y + change
-            # A step cut short by an output says little about the next one.
+            # A step shortened by an output says little about the next step.
             proposed = h * min(LONG(3), LONG(0.8) * max(off, LONG(1e-30)) ** LONG(-1 / (2 * columns - 1)))
             if off > 1 or not last or abs(proposed) > abs(length):
                 length = proposed
@@ -71,39 +72,39 @@ def integrated(field, start, ts, columns):
 
 
 class Integrated(NamedTuple):
-    """A reference motion: `exact(ts)` -> (q, v), and `known(ts)`, how far it is known at each time.
+    """A reference motion: `exact(ts)` -> (q, v), and `known(ts)`, its own error at each time.
 
-    `field(t, y)` in long double; `start` (n,), its state at ts[0]; `seen(y)`: states (T, n) to (q, v).
+    `field(t, y)` in long double; `start` (n,), its state at ts[0]; `to_qv(y)`: states (T, n) to (q, v).
     """
 
     field: Callable
     start: Any
-    seen: Callable
-    twice: dict
+    to_qv: Callable
+    computed: dict
 
     def at(self, ts, columns):
         key = (columns, np.asarray(ts).tobytes())
-        if key not in self.twice:
-            self.twice[key] = self.seen(integrated(self.field, self.start, ts, columns))
-        return self.twice[key]
+        if key not in self.computed:
+            self.computed[key] = self.to_qv(integrated(self.field, self.start, ts, columns))
+        return self.computed[key]
 
     def exact(self, ts):
         """Coordinates and velocities at the times, leaves (T, ...)."""
         return self.at(ts, COLUMNS[1])
 
     def known(self, ts):
-        """How far two settings part at each time, (T,), relative to each number's largest value."""
+        """The difference of two settings at each time, (T,), relative to each number's largest value."""
         one, other = (jax.tree.leaves(self.at(ts, columns)) for columns in COLUMNS)
         return worst(one, other, [largest(leaf) for leaf in other])
 
 
-def reference(field, start, seen):
+def reference(field, start, to_qv):
     """An `Integrated` from numbers in double precision."""
-    return Integrated(field, np.asarray(start, LONG), seen, {})
+    return Integrated(field, np.asarray(start, LONG), to_qv, {})
 
 
 def largest(leaf):
-    """The largest value of each number of a leaf (T, ...) over time, 1 where it is always zero."""
+    """The largest value of each number of a leaf (T, ...) over time, 1 if it is always zero."""
     top = np.max(np.abs(leaf), axis=0)
     return np.where(top > 0, top, 1)
 

@@ -1,15 +1,16 @@
-"""Do memory and memory maps stay bounded where one process works on very many systems, one after the other?
+"""Do memory and memory maps stay bounded if one process works on very many systems, one after the other?
 
 Each program that XLA compiles keeps 20 to 500 memory maps, of which Linux allows a process 65,530, and megabytes of
-memory. Here one process makes one system after the other, each another Lagrangian with its numbers written in, so that
-no program serves two of them; asks each for its accelerations, a short motion and the Jacobi integral; and drops it.
+memory. Here one process creates one system after the other, each with a different Lagrangian and its numbers as
+literals, so that no program can be reused. It computes accelerations, a short motion and the Jacobi integral of each,
+and drops it.
 
-    largest, last half / early      of the memory maps and of the resident memory: the largest of all counts in the last
-                                    half, over the largest between system 200, when programs begin to be dropped, and
-                                    the end of the first quarter (or system 300, where that is later)
-    lost                            systems whose numbers were not right: the Jacobi integral along its motion
+    largest, last half / early      for memory maps and resident memory: the largest count in the last half, over the
+                                    largest between system 200, when the first programs are dropped, and the end of
+                                    the first quarter (or system 300, if that is later)
+    lost                            systems with wrong results, judged by the Jacobi integral along the motion
 
-A system takes 1.2 s of a processor: 400 take eight minutes, 2,000 forty. Needs Linux.
+A system takes 1.2 s of processor time: 400 take eight minutes, 2,000 forty. Needs Linux.
 
     python benchmarks/many_systems.py [--systems 2000] [--moving 1] [--json FILE]
 
@@ -46,7 +47,7 @@ TWO = """lambda t, q, v, params: {m} * v[0]**2 + v[1]**2 + {a} * v[0] * v[1] * j
 
 
 def system(number):
-    """A system like no other, and its start: every fourth of two coordinates."""
+    """A system that differs from all others, and its start; every fourth has two coordinates."""
     random = np.random.default_rng(number)
     numbers = dict(zip(("m", "a", "k"), 1 + random.uniform(size=3).round(6)))
     shape = SHAPES[number % 6].format(**numbers)
@@ -56,7 +57,7 @@ def system(number):
 
 
 def one(number, moving):
-    """Whether a system's answers agree: energy at the end of its motion, and acceleration with the slope of v."""
+    """Whether a system's results agree: the energy at the end of its motion, and acceleration with the slope of v."""
     made, (q0, v0) = system(number)
     a, _ = lj.accelerations(made, 0.0, q0, v0, None)
     if not moving:
@@ -68,13 +69,13 @@ def one(number, moving):
 
 
 def in_use():
-    """The memory maps of this process, and its resident megabytes."""
+    """The number of memory maps of this process, and its resident megabytes."""
     pages = int(Path("/proc/self/statm").read_text().split()[1])
     return Path("/proc/self/maps").read_bytes().count(b"\n"), pages * os.sysconf("SC_PAGE_SIZE") / 2**20
 
 
 def rows(count, moving):
-    """A row for each fifty systems, then the verdict."""
+    """A row for every fifty systems, then the verdict."""
     lost, counts = 0, []
     for number in range(1, count + 1):
         lost += not one(number, number % moving == 0)

@@ -1,9 +1,9 @@
-"""Timing in turn, rows and their report: what the benchmarks share.
+"""Alternating timing, rows and their report, shared by the benchmarks.
 
-A speed is a ratio of two things measured in turn in one process, so that whatever else the machine does falls on both.
-Everything is called once before it is timed: compiling is not running. Medians are what is reported; minima stand
-beside them, for a machine that is never quite at rest. On one that others use too, `--processor-time` counts the time
-in which the process ran, over all its threads.
+A speed is the ratio of two things measured alternately in one process, so that other load on the machine affects both.
+Everything is called once before it is timed, so that compilation is not included. Medians are reported, together with
+minima, since the machine is never entirely idle. On a shared machine, `--processor-time` counts the processor time of
+the process, summed over its threads.
 """
 
 import argparse
@@ -22,27 +22,27 @@ import numpy as np
 
 PACKAGES = ("lagjax", "jax", "diffrax", "numpy", "scipy", "numba", "heyoka", "casadi", "scikit-sundae", "mujoco")
 
-# What `in_turn` reads; `main` changes it where `--processor-time` asks.
+# The clock of `in_turn`; `main` changes it for `--processor-time`.
 CLOCK = {"seconds": time.perf_counter}
 
 
 class Times(NamedTuple):
-    """Median and least seconds of each function, in the order given, and all of them, (repeats, functions)."""
+    """Median and least seconds of each function, in the given order, and all times (repeats, functions)."""
 
     medians: list
     minima: list
     turns: np.ndarray
 
     def ratio(self, of=0, to=1):
-        """The median of the turns' ratios, which a machine slow for a while leaves alone, and the ratio of minima."""
+        """The median of the ratios in each turn, insensitive to a temporarily slow machine; the ratio of minima."""
         return float(np.median(self.turns[:, of] / self.turns[:, to])), self.minima[of] / self.minima[to]
 
 
 def in_turn(*functions, repeats=15, shortest=0.0) -> Times:
-    """Time functions without arguments, each in turn, `repeats` times after a first call.
+    """Time functions without arguments alternately, `repeats` times after a first call.
 
-    What they return is waited for. With `shortest` seconds, those that take less are called several times in a row for
-    one measurement, for clocks and calls that cost as much as what they measure.
+    The timing waits for their results. Functions that take less than `shortest` seconds are called several times in a
+    row for one measurement, because the clock and the call themselves cost time.
     """
     calls = []
     for function in functions:
@@ -60,7 +60,7 @@ def _seconds(function, calls):
 
 
 def in_new_process(source):
-    """What a new Python process that runs the source prints on its last line, as JSON."""
+    """Run the source in a new Python process and parse the last line that it prints as JSON."""
     done = subprocess.run([sys.executable, "-c", source], capture_output=True, text=True)
     if done.returncode:
         raise RuntimeError(done.stderr)
@@ -68,18 +68,18 @@ def in_new_process(source):
 
 
 def compiled(function, *arguments):
-    """`jax.jit(function)` compiled for these arguments, and the seconds of tracing and compiling."""
+    """`jax.jit(function)`, compiled for these arguments, and the seconds of tracing and compiling."""
     started = time.perf_counter()
     program = jax.jit(function).lower(*arguments).compile()
     return program, time.perf_counter() - started
 
 
 def row(what, value, target=None, better="less", **more):
-    """One line of a result; without a target it only informs.
+    """One line of a result; without a target it is informative only.
 
     Args:
       what: what was measured, a ratio as "one / another".
-      value, target: numbers; the target is met where value <= target, or >= with `better="more"`.
+      value, target: numbers; the target is met if value <= target, or >= with `better="more"`.
       more: further columns, numbers or text.
     """
     if better not in ("less", "more"):
@@ -89,12 +89,12 @@ def row(what, value, target=None, better="less", **more):
 
 
 def skipped(what, why):
-    """The line of a measurement that could not be made; it counts as neither met nor missed."""
+    """The line of a measurement that was not possible; it counts as neither met nor missed."""
     return {"what": what, "value": None, "target": None, "met": None, "skipped": why}
 
 
 def main(rows, doc, draw=None):
-    """Run a benchmark from the command line: print its rows as they come, and write them where `--json` says.
+    """Run a benchmark from the command line: print its rows as they come, and write them to the file of `--json`.
 
     Args:
       rows: called with `wanted(what)`, which says whether `--only` asks for a row; returns or yields rows.
@@ -105,8 +105,8 @@ def main(rows, doc, draw=None):
     parser.add_argument("--json", metavar="FILE", help="also write the rows there")
     parser.add_argument("--only", metavar="TEXT", default="", help="measure only the rows whose name contains it")
     if draw:
-        parser.add_argument("--plot", metavar="FILE", help="draw what was measured")
-    parser.add_argument("--processor-time", action="store_true", help="not wall time; for a machine others use too")
+        parser.add_argument("--plot", metavar="FILE", help="draw the results")
+    parser.add_argument("--processor-time", action="store_true", help="instead of wall time; for a shared machine")
     options = parser.parse_args()
     if options.processor_time:
         CLOCK["seconds"] = time.process_time
@@ -143,7 +143,7 @@ def machine():
 
 
 def versions():
-    """The versions of Python, lagjax and what it is compared with, as far as they are installed."""
+    """The versions of Python, lagjax and the tools it is compared with, if installed."""
     found = {"python": platform.python_version()}
     for name in PACKAGES:
         try:

@@ -1,4 +1,4 @@
-"""A motion, what is known of it, and how it is to be integrated: what `error_estimates.py` goes through."""
+"""A motion, its reference, and how to integrate it: the cases of `error_estimates.py`."""
 
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
@@ -9,17 +9,17 @@ from long_double import Integrated, reference
 import lagjax as lj
 
 DIGITS = 1e-13
-# Of the span: how far an exact crossing may be from one that was found.
+# How far an exact crossing may be from one that was found, as a fraction of the span.
 NEAR = 0.02
 
 
 class Motion(NamedTuple):
     """A motion from (q0, v0) at ts[0], and its reference.
 
-    - `exact(ts)` -> (q, v), leaves (T, ...); `source` says what it is; `known(ts)` (T,), how far, relative.
-    - `tolerances`: rtol and atol; with fixed steps (`options` has a `dt0`) one only.
-    - `order`: of the method. `events`: what `lj.integrate` takes; `when`: by name, the exact times next to found ones.
-    - `floor`: what is below it, relative, is round-off.
+    - `exact(ts)` -> (q, v), leaves (T, ...); `source` says what it is; `known(ts)` (T,) is its relative error.
+    - `tolerances`: rtol and atol; only one with fixed steps (if `options` has a `dt0`).
+    - `order` of the method. `events`: as for `lj.integrate`; `when`: by name, the exact times next to found ones.
+    - `floor`: relative errors below it are round-off.
     """
 
     name: str
@@ -40,19 +40,19 @@ class Motion(NamedTuple):
     floor: float = DIGITS
 
     def crossing(self, **events):
-        """The same with events by name, of guards that read arrays of states as well; their times are roots."""
+        """The same with events by name, whose guards also accept arrays of states; their exact times are roots."""
         when = {name: lambda times, guard=event.guard: roots(self, guard, times) for name, event in events.items()}
         return self._replace(events=events, when=when)
 
 
-def by_long_double(name, system, q0, v0, params, ts, field, start, seen, **how):
-    """A motion whose reference is integrated in long double, by equations derived by hand."""
-    found: Integrated = reference(field, start, seen)
+def by_long_double(name, system, q0, v0, params, ts, field, start, to_qv, **how):
+    """A motion whose reference is integrated in long double from equations derived by hand."""
+    found: Integrated = reference(field, start, to_qv)
     return Motion(name, system, q0, v0, params, ts, found.exact, "long double", found.known, **how)
 
 
 def roots(motion, guard, times):
-    """The zeros of a guard on the exact motion next to some times, by secants."""
+    """The zeros of a guard on the exact motion next to some times, by the secant method."""
     order = np.argsort(times)
     before, now = np.asarray(times)[order], np.asarray(times)[order] + 1e-6
 
@@ -66,10 +66,10 @@ def roots(motion, guard, times):
     of_before = value(before)
     for _ in range(5):
         of_now, apart = value(now), now - before
-        # What is left of a difference that is next to nothing is round-off.
+        # A tiny difference consists of round-off.
         done = (abs(apart) < DIGITS * room) | (of_now == of_before)
         slope = np.where(done, np.inf, (of_now - of_before) / np.where(done, 1, apart))
-        # A crossing that the exact motion does not have must not lead far away.
+        # If the exact motion lacks a crossing, the search must not move far away.
         before, of_before, now = now, of_now, np.clip(now - of_now / slope, earliest, latest)
     return now[np.argsort(order)]
 

@@ -1,10 +1,10 @@
-"""Motions with a network in L, and their gradients by its numbers: ours and diffrax's, each in a process of its own.
+"""Motions with a network in L, and gradients with respect to its weights: ours and diffrax's, in separate processes.
 
-A particle in the plane, a double pendulum in its angles, and a particle on a rod, whose potential has a network of two
-hidden layers in it. diffrax integrates by its Dopri8 as shipped, its gradient is that of its default adjoint, and its
-accelerations are written by hand as a user of it would, from the same L by `jax.grad` and `jax.jvp`. A tolerance is the
-loosest of a list at which a gradient is within `ERROR` of that at `EXACT`: each is compared with its own limit; these
-are the same to that. `gradient_cost.py` makes rows of this.
+The systems are a particle in the plane, a double pendulum in its angles, and a particle on a rod; their potentials
+contain a network of two hidden layers. diffrax integrates with its Dopri8 as shipped and differentiates with its
+default adjoint; its accelerations are written as a user would, from the same L by `jax.grad` and `jax.jvp`. The
+tolerance is the loosest of a list at which a gradient is within `ERROR` of that at `EXACT`. Each is compared with its
+own limit; the two limits agree to that accuracy. `gradient_cost.py` makes rows of the results.
 
     python benchmarks/networks.py "987 numbers, a particle, 100 outputs" lagjax
 """
@@ -25,7 +25,7 @@ ERROR, EXACT, TOLERANCES, REPEATS = 1e-5, 1e-11, np.geomspace(1e-3, 1e-9, 13), 9
 
 
 class Problem(NamedTuple):
-    """Hidden numbers a layer, lanes (0: a single motion), outputs, and the time of the last one."""
+    """Width of the hidden layers, lanes (0: a single motion), outputs, and the time of the last one."""
 
     kind: str
     hidden: int
@@ -46,7 +46,7 @@ PROBLEMS = {
 
 
 def network(layers, x):
-    """Two hidden layers, one number."""
+    """A network of two hidden layers with one output."""
     for weights, shift in layers[:-1]:
         x = jnp.tanh(x @ weights + shift)
     weights, shift = layers[-1]
@@ -54,7 +54,7 @@ def network(layers, x):
 
 
 def layers(*sizes):
-    """The first numbers of such a network."""
+    """The initial weights of such a network."""
     random = np.random.default_rng(0)
     of = lambda n, m: (random.normal(size=(n, m)) / np.sqrt(n), 0.1 * random.normal(size=m))
     return [of(*pair) for pair in zip(sizes[:-1], sizes[1:])]
@@ -66,14 +66,14 @@ def particle(t, q, v, p):
 
 
 def double_pendulum(t, q, v, p):
-    """Of unit masses and lengths."""
+    """A double pendulum of unit masses and lengths."""
     kinetic = v[0] ** 2 + 0.5 * v[1] ** 2 + v[0] * v[1] * jnp.cos(q[0] - q[1])
-    seen = jnp.concatenate([jnp.sin(q), jnp.cos(q)])
-    return kinetic + 2 * jnp.cos(q[0]) + jnp.cos(q[1]) - 0.2 * network(p, seen)
+    inputs = jnp.concatenate([jnp.sin(q), jnp.cos(q)])
+    return kinetic + 2 * jnp.cos(q[0]) + jnp.cos(q[1]) - 0.2 * network(p, inputs)
 
 
 def on_rod(t, q, v, p):
-    """With weight, on a unit circle."""
+    """A particle with weight on a unit circle."""
     return 0.5 * jnp.sum(v**2) - 9.81 * q[1] - network(p, q)
 
 
@@ -98,7 +98,7 @@ def field(problem):
 
 
 def motion(problem, who, method=""):
-    """`motion(tolerance, p, q0, v0)` -> the outputs; by our default, or the method of that name."""
+    """`motion(tolerance, p, q0, v0)` -> the outputs, by our default method or the method of that name."""
     ts = np.linspace(0.0, problem.end, problem.outputs)
     if who == "diffrax":
         terms = diffrax.ODETerm(field(problem))
@@ -123,7 +123,7 @@ def motion(problem, who, method=""):
 
 
 def measured(name, who, method="", clock="perf_counter"):
-    """Seconds to the first gradient and of each next one, of a solve; the error and the tolerance."""
+    """Seconds of the first gradient, of a later one and of a solve; the error and the tolerance."""
     now = getattr(time, clock)
     jax.config.update("jax_enable_x64", True)
     problem = PROBLEMS[name]
@@ -137,7 +137,7 @@ def measured(name, who, method="", clock="perf_counter"):
         q0 = q0 / np.linalg.norm(q0, axis=1)[:, None]
         v0 = v0 - np.sum(v0 * q0, axis=1)[:, None] * q0
     if problem.kind == "double pendulum":
-        # Small enough that the motion is regular, and a gradient means something after sixteen periods.
+        # Small enough that the motion is regular and the gradient still meaningful after sixteen periods.
         q0 = 0.3 * q0
     one = motion(problem, who, method)
     of_lanes = jax.vmap(one, (None, None, 0, 0)) if problem.lanes else one

@@ -1,24 +1,26 @@
-"""How fast, how large and how right is a batch of motions as one program, on a GPU as on a CPU?
+"""How fast, how large and how accurate is a batch of motions as one program, on a GPU or a CPU?
 
     beads      on the rotating hoop, each at its own speed of the hoop; from rest at 1 rad, against elliptic functions
-    network    the same beads with a network of 49 numbers in their potential, of which the gradient is taken: steps are
-               replayed backward. Against diffrax by hand at a tolerance of 1e-12
+    network    the same beads with a network of 49 weights in their potential; the gradient is with respect to these, by
+               replaying steps backwards. Against diffrax by hand at a tolerance of 1e-12
     rods       point masses in Cartesian coordinates, each on its own rod with its multiplier, against the same
                functions
 
-"motions" is the state at the end, "gradient" that of the sum of its squares: by g and a and each bead's ω, by the
-network, by g and each rod's length. Ours is `jax.vmap` of `lj.integrate`, beside diffrax's Dopri8 as shipped with the
-accelerations derived by hand. Each is measured in a process of its own, at the loosest tolerance of a ladder from which
-on `SAMPLE` of the lanes are within `ERROR`, motions in radians, gradients relative to their largest number.
+"motions" is the state at the end, "gradient" is that of the sum of its squares: with respect to g, a and each bead's ω,
+to the network, or to g and each rod's length. lagjax uses `jax.vmap` of `lj.integrate`; the comparison is diffrax's
+Dopri8 as shipped with the accelerations derived by hand. Each is measured in a separate process, at the loosest
+tolerance of a ladder below which `SAMPLE` of the lanes are within `ERROR`: motions in radians, gradients relative to
+their largest number.
 
-    ours / diffrax          next times; the first call with its compiling stands beside
-    memory                  what the device reports as its peak over what the compiled program states beforehand
+    ours / diffrax          times of later calls; the first call, with its compilation, is given too
+    memory                  the peak reported by the device over the memory that the compiled program states beforehand
     operations on the host  in the compiled program (`host_operations.py`), and in one with a `jax.debug.callback`
-    single precision        a tolerance that float32 cannot reach is refused; at the tightest one allowed: the error
-                            over it, and motions that are worse than a scaled_error of 1 allows and do not say so
+    single precision        a tolerance that float32 cannot reach is refused; at the tightest allowed one: the error
+                            over it, and the number of motions that are worse than a scaled_error of 1 allows without
+                            saying so
 
-Ready for a machine with one GPU; `--small` is for any other, and for the tests. Float64 is on throughout: float32 is
-asked for by the arrays.
+It is meant for a machine with one GPU; `--small` is for any other machine, and for the tests. Float64 is always
+enabled: the arrays select float32.
 
     python benchmarks/on_gpu.py [--small] [--json FILE] [--only TEXT]
 """
@@ -32,7 +34,7 @@ import warnings
 from pathlib import Path
 from typing import NamedTuple
 
-# Each measurement has the device to itself, one after the other: none may keep what it does not use.
+# Measurements run one after the other and need the whole device, so none may reserve memory that it does not use.
 os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
 
 import diffrax  # noqa: E402
@@ -50,7 +52,7 @@ jax.config.update("jax_enable_x64", True)
 
 END, START, SAMPLE, REPEATS, EXACT = 10.0, 1.0, 64, 9, 1e-12
 ERROR = {"float64": {"motions": 1e-7, "gradient": 1e-5}, "float32": {"motions": 1e-3, "gradient": 1e-2}}
-# Half decades, down to what a dtype allows.
+# Half decades, down to the limit of each dtype.
 TOLERANCES = {"float64": np.geomspace(1e-3, 1e-12, 19), "float32": np.geomspace(1e-2, 10**-5.5, 8)}
 GRAVITY, RADIUS, NEURONS = 9.8125, 0.75, 12
 LANES = {"beads": 100_000, "network": 100_000, "rods": 10_000}
@@ -59,9 +61,9 @@ OPTIONS = {"small": False}
 
 
 class Problem(NamedTuple):
-    """One motion, by its numbers `p` (shared by all lanes) and `x` (of its lane), as L and as a field by hand.
+    """One motion with parameters `p` (shared by all lanes) and `x` (of its lane), as L and as a field by hand.
 
-    `start(p, x)` is q and v; `exact(p, x)` the state at the end, or None; `weigh` is what makes radians of a state.
+    `start(p, x)` is q and v; `exact(p, x)` the state at the end, or None; `weigh` converts a state to radians.
     """
 
     system: lj.System
@@ -74,25 +76,25 @@ class Problem(NamedTuple):
 
 
 def network(p, psi):
-    """One hidden layer in sin ψ and cos ψ; a gradient of it is one of more than 24 numbers."""
+    """One hidden layer in sin ψ and cos ψ; its gradient has more than 24 numbers."""
     return jnp.dot(p["out"], jnp.tanh(p["sin"] * jnp.sin(psi) + p["cos"] * jnp.cos(psi) + p["shift"])) + p["top"]
 
 
 def weights():
-    """Of the network, 49 numbers, small beside m g a."""
+    """The 49 weights of the network; its output is small compared with m g a."""
     random = np.random.default_rng(0)
     of = lambda size: size * random.normal(size=NEURONS)
     return {"out": of(0.1), "sin": of(1.0), "cos": of(1.0), "shift": of(0.3), "top": np.array(0.0)}
 
 
 def bead_lagrangian(t, q, v, params):
-    """The scene's with m = 1, and the network as a potential where there is one."""
+    """The scene's L with m = 1, and the network, if there is one, as a potential."""
     added = network(params["network"], q) if "network" in params else 0.0
     return bead_on_hoop.lagrangian(t, q, v, params | {"m": 1.0}) - added
 
 
 def bead_field(t, y, params):
-    """The derivative of L by hand, that of the network by `jax.grad`, as one would."""
+    """The acceleration derived by hand, with the derivative of the network by `jax.grad`."""
     psi, rate = y
     a = params["a"]
     acceleration = jnp.sin(psi) * (params["omega"] ** 2 * jnp.cos(psi) - params["g"] / a)
@@ -109,7 +111,7 @@ def rod_field(t, y, params):
 
 
 def rod_exact(p, x):
-    """A bead on a hoop at rest, in Cartesian coordinates."""
+    """The motion of a bead on a hoop at rest, in Cartesian coordinates."""
     psi, rate = bead_on_hoop.exact_motion(p | {"a": x, "omega": 0.0}, START, END)
     out, along = jnp.stack([jnp.sin(psi), -jnp.cos(psi)]), jnp.stack([jnp.cos(psi), jnp.sin(psi)])
     return x * out, x * rate * along
@@ -124,7 +126,7 @@ def problem(name, lanes):
         at = lambda p, x: (x * jnp.stack([jnp.sin(START), -jnp.cos(START)]).astype(x.dtype), jnp.zeros(2, x.dtype))
         weigh = lambda p, x: (1 / x, 1 / (x * natural))
         return Problem(system, rod_field, at, rod_exact, {"g": np.array(GRAVITY)}, np.linspace(0.5, 2.0, lanes), weigh)
-    # The homoclinic orbit through START is at 1 / cos(START / 2) = 1.14: near it no two motions stay together.
+    # The homoclinic orbit through START is at 1 / cos(START / 2) = 1.14: near it neighbouring motions separate.
     speeds = np.concatenate([np.linspace(0.5, 1.0, lanes // 2), np.linspace(1.3, 3.0, lanes - lanes // 2)])
     p = {"g": np.array(GRAVITY), "a": np.array(RADIUS)} | ({"network": weights()} if name == "network" else {})
     at = lambda p, x: (jnp.full((), START, x.dtype), jnp.zeros((), x.dtype))
@@ -134,7 +136,7 @@ def problem(name, lanes):
 
 
 def named(p, x):
-    """All numbers of a lane by name: a bead's own is ω, a rod's its length `x`."""
+    """All parameters of a lane by name: `x` is a bead's ω, or a rod's length."""
     return p | ({"omega": x} if "a" in p else {"x": x})
 
 
@@ -153,7 +155,7 @@ def end_of_ours(case, tolerance, p, x):
 
 
 def end_by_hand(case, tolerance, p, x):
-    """As diffrax is used: everything but the field as it comes."""
+    """The final state by diffrax with its defaults and the field by hand."""
     ys = diffrax.diffeqsolve(
         diffrax.ODETerm(case.field), diffrax.Dopri8(), 0.0, END, None, case.start(p, x), args=named(p, x),
         stepsize_controller=diffrax.PIDController(rtol=tolerance, atol=tolerance), max_steps=4096,
@@ -168,7 +170,7 @@ def of_all(case, end, what):
     if what == "motions":
         return lanes
     size = lambda tolerance, p, x: sum(jnp.sum(y**2) for y in jax.tree.leaves(lanes(tolerance, p, x)))
-    # Of a network's case it is the network that is learned.
+    # In the case with a network, the gradient is with respect to the network.
     if "network" in case.p:
         known = {name: value for name, value in case.p.items() if name != "network"}
         of_network = lambda tolerance, learned, x: size(
@@ -185,21 +187,21 @@ def sample_of(case):
 
 
 def reference(case, what):
-    """What is right, in float64: by the closed form, or by diffrax at its tightest."""
+    """The reference in float64: the closed form, or diffrax at its tightest tolerance."""
     right = end_by_hand if case.exact is None else lambda case, tolerance, p, x: case.exact(p, x)
     if case.exact is None or what == "motions":
         return jax.jit(of_all(case, right, what))(EXACT, case.p, case.x)
-    # Tangents of a lane: the arithmetic-geometric mean is no function for reverse mode.
+    # Forward mode in each lane: the arithmetic-geometric mean is unsuitable for reverse mode.
     square = lambda p, x: sum(jnp.sum(y**2) for y in case.exact(p, x))
     by_p, by_x = jax.jit(jax.vmap(jax.jacfwd(square, (0, 1)), (None, 0)))(case.p, case.x)
     return jax.tree.map(lambda y: jnp.sum(y, axis=0), by_p), by_x
 
 
 def error(case, what, found, right):
-    """Largest error: of a state in radians, of each number of a gradient over the largest of its kind."""
+    """The largest error: of a state in radians, of each number of a gradient relative to the largest of its kind."""
     if what == "gradient":
         of = lambda a, b: np.max(np.abs(np.asarray(a, float) - b)) / np.max(np.abs(b)) if np.any(b) else 0.0
-        # A network's last shift leaves no trace in the motion; its numbers are judged together.
+        # A network's last bias does not affect the motion, so its numbers are judged together.
         if "network" in case.p:
             found, right = (np.concatenate([np.ravel(y) for y in jax.tree.leaves(x)]) for x in (found, right))
         return float(max(map(of, jax.tree.leaves(found), jax.tree.leaves(right))))
@@ -214,7 +216,7 @@ def in_radians(case, found, right):
 
 
 def settled(case, dtype, what, who):
-    """(tolerance, error): the loosest from which on the sample is right to what is asked for, or the tightest."""
+    """(tolerance, error): the loosest tolerance below which the sample is within `ERROR`, or the tightest."""
     few = sample_of(case)
     program, right = jax.jit(of_all(few, who, what)), reference(few, what)
     arguments = in_dtype((few.p, few.x), dtype)
@@ -228,7 +230,7 @@ def settled(case, dtype, what, who):
 
 
 def in_dtype(tree, dtype):
-    """The tree on the device."""
+    """The tree in a dtype, on the device."""
     return jax.tree.map(lambda y: jnp.asarray(y, dtype), tree)
 
 
@@ -263,7 +265,7 @@ def measured(name, dtype, what, who, small=False, clock="perf_counter"):
 
 
 def single_precision(name, small=False):
-    """Float32: is what it cannot reach refused; the tightest allowed tolerance, the error there, and silent lanes."""
+    """Float32: whether unreachable tolerances are refused; the tightest allowed one, its error, and silent lanes."""
     case = sample_of(problem(name, (SMALL if small else LANES)[name]))
     p, x = in_dtype((case.p, case.x), "float32")
     try:
@@ -278,17 +280,17 @@ def single_precision(name, small=False):
         found = jax.jit(lanes)(jnp.asarray(tolerance, "float32"), p, x)
     right = reference(case, "motions")
     worst = np.max(in_radians(case, jax.tree.map(lambda y: y[:, -1], (found.q, found.v)), right), axis=0)
-    said = np.asarray(found.scaled_error) > 1
+    reported = np.asarray(found.scaled_error) > 1
     return {
         "refused": refused, "tolerance": tolerance, "error": float(np.max(worst)),
-        # Within a factor of ten, as an estimate may be off.
-        "silent": int(np.sum((worst > 10 * EXPECTED * tolerance) & ~said)), "said": int(np.sum(said)),
+        # An estimate may be off by a factor of ten.
+        "silent": int(np.sum((worst > 10 * EXPECTED * tolerance) & ~reported)), "said": int(np.sum(reported)),
         "lanes": len(case.x),
     }  # fmt: skip
 
 
 def elsewhere(function, *arguments):
-    """`function` of this module in a process of its own."""
+    """Run `function` of this module in a separate process."""
     return in_new_process(
         f"import json, sys\nsys.path.insert(0, {str(Path(__file__).parent)!r})\nimport on_gpu\n"
         f"print(json.dumps(on_gpu.{function}(*{arguments!r})))"
@@ -296,7 +298,7 @@ def elsewhere(function, *arguments):
 
 
 def rows(wanted):
-    """Each case in both precisions; then what float32 says of itself."""
+    """Each case in both precisions; then the checks of single precision."""
     small = OPTIONS["small"]
     clock = "process_time" if CLOCK["seconds"] is time.process_time else "perf_counter"
     cases = [
@@ -324,7 +326,7 @@ def beside(title, ours, theirs):
     """The rows of one case."""
     if not (ours["reached"] and ours["finite"]):
         yield row(f"{title}: right to what is asked for", 0, 1, better="more", error=ours["error"])
-    # Where diffrax does not get there its time says nothing.
+    # If diffrax does not reach the error, its time says nothing.
     target = 1.0 if theirs["reached"] else None
     yield row(
         f"{title}: ours / diffrax", ours["next"] / theirs["next"], target, ms=1e3 * ours["next"],

@@ -1,12 +1,13 @@
-"""Of which order is each method, as measured on outputs between its steps?
+"""Which order does each method have, measured on outputs between its steps?
 
     python benchmarks/orders.py --json benchmarks/results/orders.json
 
-A double pendulum in its angles, and as two masses on rods, whose constraints every step returns to. For Nyström's
-methods, which take no accelerations that see velocities, the ends of eight orbits of Hénon and Heiles: one alone
-scatters by 1. Constant steps; the order is the slope of the logarithm of the error (its mean over the orbits) over
-that of the step, against SciPy's DOP853 at a tolerance of 2.5e-14. Met where it is the claimed one within 0.35; within
-1 for Nyström's, whose steps are a good part of a period. The slow tests measure the same with misprints as twins:
+The motions are a double pendulum in its angles, and as two masses on rods, with a projection onto the constraints after
+every step. For Nyström methods, which do not allow accelerations that depend on velocities, they are eight orbits of
+Hénon and Heiles, judged at their ends: the order of a single orbit scatters by 1. Steps are constant; the order is the
+slope of the logarithm of the error (its mean over the orbits) over that of the step, against SciPy's DOP853 at a
+tolerance of 2.5e-14. The target is the claimed order within 0.35, or within 1 for Nyström methods, whose steps are a
+large part of a period. The slow tests measure the same with misprinted tableaus as twins:
 `tests/motion/test_orders.py`, `tests/numerics/test_nystrom.py`, `tests/numerics/test_radau.py`.
 
 Source: Hairer, Nørsett & Wanner, *Solving ODEs I*, §II.3-II.5, II.14; Hénon & Heiles, *Astron. J.* 69 (1964) 73.
@@ -31,10 +32,10 @@ jax.config.update("jax_enable_x64", True)
 P = {"m1": 1.0, "m2": 0.625, "l1": 1.25, "l2": 0.875, "g": 9.8125}
 ANGLES, RATES = np.array([0.7, 0.8]), np.array([-1.3, -0.4])
 OUTPUTS = np.concatenate([[0.0], np.linspace(0.3, 8.0, 28) + 0.013 * np.sin(7 * np.arange(28.0))])
-# A constant step leaves an implicit method no error estimate to take its root finder's tolerance from.
+# With constant steps an implicit method has no tolerance from which to derive that of its root finder.
 NEWTON = optx.Newton(rtol=1e-10, atol=1e-12, norm=optx.max_norm)
 RADAU5 = lj.Radau5(root_finder=SimplifiedNewton(rtol=1e-12, atol=1e-12))
-# Name, method, claimed order, steps in a unit of time.
+# Name, method, claimed order, steps per unit of time.
 GENERAL = [
     ("lj.Tsit5", lj.Tsit5(), 5, (112, 160, 224)),
     ("lj.Dopri8", lj.Dopri8(), 8, (18, 22, 28)),
@@ -50,7 +51,7 @@ NYSTROM = [
 
 
 def by_angles(t, q, v, params):
-    """Two rods end to end, by their angles from the vertical."""
+    """Two rods end to end, in their angles from the vertical."""
     m1, m2, l1, l2, g = (params[name] for name in ("m1", "m2", "l1", "l2", "g"))
     kinetic = 0.5 * (m1 + m2) * (l1 * v[0]) ** 2 + 0.5 * m2 * (l2 * v[1]) ** 2
     coupling = m2 * l1 * l2 * v[0] * v[1] * jnp.cos(q[0] - q[1])
@@ -58,13 +59,13 @@ def by_angles(t, q, v, params):
 
 
 def henon_heiles(t, q, v, params):
-    """A star in a galaxy's plane: cubic terms that couple two equal oscillators."""
+    """A star in a galaxy's plane: two equal oscillators coupled by cubic terms."""
     x, y = q
     return 0.5 * v @ v - (0.5 * (x**2 + y**2) + x**2 * y - y**3 / 3)
 
 
 def points(angles, rates):
-    """Positions and velocities of the masses, from (..., 2) angles and their rates."""
+    """Positions and velocities of the masses from (..., 2) angles and their rates."""
     length = np.array([P["l1"], P["l2"]])[:, None]
     rods = length * np.stack([np.sin(angles), -np.cos(angles)], axis=-1)
     moves = length * np.stack([np.cos(angles), np.sin(angles)], axis=-1) * rates[..., None]
@@ -88,7 +89,7 @@ def exact(equation, q, v, ts):
 
 
 def measured(system, motions, method, steps, ts):
-    """The slope of the error, and the least error, from pairs of a start and the exact states at ts."""
+    """The slope of the error, and the least error, from pairs of an initial state and the exact states at ts."""
     errors = np.zeros((len(steps), len(motions)))
     for i, n in enumerate(steps):
         for j, (start, right) in enumerate(motions):
@@ -102,7 +103,7 @@ def measured(system, motions, method, steps, ts):
 
 
 def rows(wanted):
-    """The order of each method, on each form of the motion that it takes."""
+    """The order of each method, on each form of the motion that it supports."""
     angles = exact(textbook, ANGLES, RATES, OUTPUTS)
     rods = points(ANGLES, RATES), points(*angles)
     pull = lambda t, y: [*y[2:], -y[0] - 2 * y[0] * y[1], -y[1] - y[0] ** 2 + y[1] ** 2]
@@ -124,5 +125,5 @@ def rows(wanted):
 
 
 if __name__ == "__main__":
-    warnings.simplefilter("ignore", lj.AccuracyWarning)  # Euler's steps are as wrong as they should be.
+    warnings.simplefilter("ignore", lj.AccuracyWarning)  # Euler's steps are expected to be inaccurate.
     main(rows, __doc__)

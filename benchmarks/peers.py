@@ -1,10 +1,10 @@
-"""The problems of `against_peers.py` and `sweep.py`, set up in other tools as their users would.
+"""The problems of `against_peers.py` and `sweep.py`, set up in other tools as their users would do it.
 
 Each function takes the problem and returns `prepare(tolerance)`, which returns a function without arguments that solves
-it from the start and returns the final state. What a user does once (building, compiling) is done outside that. Each
-raises ImportError where its tool is missing.
+it from the start and returns the final state. Work that a user does once (building, compiling) is done outside that
+function. Each raises ImportError if its tool is missing.
 
-Those of lanes solve one problem for many values of one parameter, each to its own end: `parameters` and `ends` are
+Functions for lanes solve one problem for many values of one parameter, each to its own end: `parameters` and `ends` are
 arrays (lanes,), an acceleration gets the lane's parameter as its last argument, and states are (2, lanes).
 """
 
@@ -36,7 +36,7 @@ except ImportError:
 
 
 def needs(module, name):
-    """Refuse where a tool is not installed."""
+    """Raise ImportError if a tool is not installed."""
     if module is None:
         raise ImportError(f"{name} is not installed")
 
@@ -62,7 +62,7 @@ def diffrax_as_shipped(field, y0, end):
 
 
 def numba_dopri8(acceleration, q, v, end):
-    """Dopri8 with step size control on two numbers, as one writes it by hand: stages one after the other, no arrays.
+    """Dopri8 with step size control on two numbers, as one would write it by hand: explicit stages, no arrays.
 
     `acceleration(q, v)` is compiled by numba. Tableau, error norm and controller are those of diffrax.
     """
@@ -73,7 +73,7 @@ def numba_dopri8(acceleration, q, v, end):
 
 
 def numba_dopri8_lanes(acceleration, q, v, ends, parameters):
-    """The same one lane after the other, in one loop that numba compiles too; `acceleration(q, v, parameter)`."""
+    """The same for one lane after the other, in one loop that numba compiles too; `acceleration(q, v, parameter)`."""
     needs(numba, "numba")
     solve = _numba_solver(acceleration)
 
@@ -114,7 +114,7 @@ def _numba_solver(acceleration):
 
 
 def _written_out(tableau, acceleration):
-    """One step as a function of scalars, its source written from the tableau: zeros of it cost nothing."""
+    """One step as a function of scalars, its source generated from the tableau, so that its zeros cost nothing."""
 
     def combination(weights, of):
         return " + ".join(f"{float(w)!r} * {of}{j}" for j, w in enumerate(weights) if w)
@@ -187,7 +187,7 @@ def heyoka_lanes(acceleration, q, v, ends, parameters):
     """heyoka's Taylor integrator in batches as wide as the processor's registers; `acceleration(q, v, module, par)`."""
     needs(heyoka, "heyoka")
     lanes, wide = len(ends), heyoka.recommended_simd_size()
-    # The last batch is filled with lanes from the front.
+    # The last batch is padded with the first lanes.
     padded = np.resize(np.arange(lanes), (-(-lanes // wide), wide))
 
     def prepare(tolerance):
@@ -249,7 +249,7 @@ def idas(masses, potential, constraints, q, v, end):
         "alg": casadi.jtimes(g, x, a) + casadi.jtimes(rate, x, u),
     }
     start = np.concatenate([q, v])
-    # The equations are linear in the multipliers: one step of Newton's method finds those of the start.
+    # The equations are linear in the multipliers: one Newton step finds the initial ones.
     state = [problem["x"], multipliers]
     linear = [casadi.jacobian(problem["alg"], multipliers), casadi.substitute(problem["alg"], multipliers, 0)]
     matrix, rest = (np.array(x) for x in casadi.Function("start", state, linear)(start, 0))
@@ -269,7 +269,7 @@ class MuJoCoChain:
     def __init__(self, links, g, timestep=1e-5):
         needs(mujoco, "mujoco")
         body = '<body pos="0 0 {}"><joint type="hinge" axis="0 1 0"/>{}'
-        # A point has no inertia; MuJoCo wants a little.
+        # A point has no inertia, but MuJoCo requires a little.
         point = '<inertial pos="0 0 -1" mass="1" diaginertia="1e-10 1e-10 1e-10"/>'
         bodies = "".join(body.format(-1 if i else 0, point) for i in range(links)) + "</body>" * links
         option = f'<option timestep="{timestep}" gravity="0 0 {-g}"><flag contact="disable"/></option>'
@@ -279,13 +279,13 @@ class MuJoCoChain:
         self.data = mujoco.MjData(self.model)
 
     def set(self, angles, rates):
-        """Put the chain into a state given by the absolute angles."""
+        """Set the state of the chain, given by the absolute angles."""
         self.data.qpos[:], self.data.qvel[:] = np.diff(angles, prepend=0.0), np.diff(rates, prepend=0.0)
         self.data.time = 0.0
         mujoco.mj_forward(self.model, self.data)
 
     def accelerations(self):
-        """Of the absolute angles."""
+        """The accelerations of the absolute angles."""
         return np.cumsum(self.data.qacc)
 
     def steps(self, count):

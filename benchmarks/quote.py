@@ -1,4 +1,4 @@
-"""Write the README's tables, of errors and run times and of speeds, from `benchmarks/results/`.
+"""Write the README's tables of errors over run times and of speeds from `benchmarks/results/`.
 
 python benchmarks/quote.py
 """
@@ -8,7 +8,7 @@ from pathlib import Path
 
 HERE = Path(__file__).parent
 README = HERE.parent / "README.md"
-# Motions in `work_precision.json`, and what the README calls them.
+# Motions in `work_precision.json`, and their names in the README.
 MOTIONS = {
     "sphere_geodesic, embedded": "great circle on a sphere, in space, 1 multiplier",
     "rolling_hoop": "hoop rolling off a cylinder, 2 multipliers",
@@ -18,7 +18,7 @@ MOTIONS = {
     "Cartesian pendulum": "pendulum on a rod, 1 multiplier",
 }
 ERRORS = ("1e-04", "1e-06", "1e-08", "1e-10")
-# File of results, row in it, and what the README calls it.
+# File of results, row in it, and its name in the README.
 QUOTED = [
     ("against_peers", "bead: lagjax / numba Dopri8", "bead on a hoop, 100 periods / numba, written by hand"),
     ("against_peers", "bead: lagjax / diffrax as shipped", "the same / diffrax, acceleration by hand"),
@@ -69,7 +69,7 @@ def rows(file: str) -> list[dict]:
 
 
 def quoted(readme: str) -> str:
-    """The README with the tables in their places."""
+    """The README with the tables inserted."""
     for name, table in (("accuracy", accuracy()), ("speed", speed())):
         begin, end = f"<!-- {name} -->\n", f"<!-- end of {name} -->"
         before, rest = readme.split(begin)

@@ -1,19 +1,19 @@
-"""How soon does the picture follow a slider? `lj.interact` in JupyterLab, and the page of a sweep, in a real browser.
+"""How soon does a picture follow its slider? `lj.interact` in JupyterLab, and the page of a sweep, in a real browser.
 
-A bead on a turning hoop, 30 units of time, 601 outputs, drawn as a curve. In a browser without a window the slider has
-the focus, and a key is pressed as a person presses it. What is measured, in wall time inside the browser, begins with
-the key and ends when the browser has painted the new picture: the notebook's messages to the kernel and back, the solve
-and the drawing are all in it. "whole": the part of the presses after which also axes and ticks had to be drawn again.
-Then 100 presses come in one go, as from a hand that drags: no queue may form, and the last value must be
-the one that stays.
+The motion is that of a bead on a rotating hoop, 30 units of time, 601 outputs, drawn as a curve. In a headless browser
+the slider has the focus, and a key is pressed as a user would. The measured wall time inside the browser starts with
+the key and ends when the browser has painted the new picture: it includes the notebook's messages to the kernel and
+back, the solve and the drawing. "whole" is the share of presses after which axes and ticks had to be drawn again too.
+Then 100 presses come at once, like a dragging hand: no queue may form, and the last value must be the one shown at the
+end.
 
-In this process: the processor time of one value, and of its parts. In the browser runs also the processor time of all
-processes a press; that of the browser is spent on several cores, also after the picture is there.
+In this process, the processor time of one value and of its parts is measured. In the browser runs it is the processor
+time of all processes per press; the browser uses several cores, and continues after the picture is shown.
 
     python benchmarks/slider_response.py [--json FILE] [--only TEXT]
 
-Needs Chromium or Chrome, and the extra `notebook`. On a machine that others use, wall times say how busy it is: the
-load is written beside them.
+Needs Chromium or Chrome, and the extra `notebook`. On a shared machine, wall times depend on its load, which is
+therefore recorded.
 """
 
 import json
@@ -45,11 +45,11 @@ run = lambda point: lj.integrate(bead, point["start"], 0.0, {"omega": point["ome
 knobs = lj.interact(run, {"omega": (0.0, 4.0, 0.02), "start": (0.1, 3.0)}, start={"omega": 0.6}, progress=False)
 """
 PRESSES, DRAGGED = 60, 100
-# What JupyterLab shows of the lines.
+# The element in which JupyterLab shows the curves.
 PICTURE = ".widget-gridbox .widget-html-content"
-# Nothing of the user's own settings is read or written.
+# Variables that keep the run from reading or writing the user's own settings.
 OF_JUPYTER = ("JUPYTER_CONFIG_DIR", "JUPYTER_RUNTIME_DIR", "IPYTHONDIR", "JUPYTERLAB_SETTINGS_DIR")
-# From the key to the end of the frame that shows the new picture: its scripts, layout and painting are done then.
+# Times from the key to the end of the frame that shows the new picture, after scripts, layout and painting.
 WATCH = """
 (() => {
   window.times = []; window.pressed = 0; window.told = () => {};
@@ -64,7 +64,7 @@ WATCH = """
 
 
 def rows(wanted):
-    """The kernel's part, the browser's whole, and the page's."""
+    """The rows of the kernel, of the whole path in the browser, and of the page."""
     space = {}
     exec(CELL, space)
     if wanted("kernel"):
@@ -78,7 +78,7 @@ def rows(wanted):
 
 
 def in_this_process(knobs):
-    """Processor time a value."""
+    """Processor time per value."""
     values = np.linspace(0.6, 1.8, 61)
     wholes, times = [], []
     for omega in values:
@@ -99,7 +99,7 @@ def in_this_process(knobs):
 
 
 def milliseconds(function, repeats=30):
-    """Processor time of one call."""
+    """Processor time of one call, in milliseconds."""
     began = time.process_time()
     for _ in range(repeats):
         function()
@@ -142,7 +142,7 @@ def in_the_notebook():
 
 
 def wait_for(port, seconds=120.0):
-    """Wait until somebody listens."""
+    """Wait until a server listens on a port."""
     until = time.monotonic() + seconds
     while True:
         try:
@@ -155,7 +155,7 @@ def wait_for(port, seconds=120.0):
 
 
 def in_the_page(run):
-    """The page of a sweep over as many values."""
+    """The page of a sweep over the same number of values."""
     with tempfile.TemporaryDirectory() as folder, Browser() as browser:
         file = Path(folder, "sweep.html")
         axes = {"start": np.array([1.5]), "omega": np.arange(0.0, 4.01, 0.02)}
@@ -167,7 +167,7 @@ def in_the_page(run):
 
 
 def processor_time(*roots):
-    """Milliseconds of processor time of some processes and all that they started, as Linux tells it."""
+    """Milliseconds of processor time of some processes and all that they started, as reported by Linux."""
     parents, spent = {}, {}
     for file in Path("/proc").glob("[0-9]*/stat"):
         try:
@@ -181,7 +181,7 @@ def processor_time(*roots):
 
 
 def measured(page, what, picture, slider, target, roots):
-    """Rows: one press after another, and many in one go."""
+    """Rows for single presses one after another, and for many at once."""
     page.run(WATCH.replace("PICTURE", picture))
     page.run(f"document.querySelector({json.dumps(slider)}).focus()")
     page.press("ArrowRight")
@@ -190,13 +190,13 @@ def measured(page, what, picture, slider, target, roots):
     spent = [processor_time(root) for root in roots]
     for _ in range(PRESSES):
         page.press("ArrowRight")
-        # Nobody asks meanwhile, which would take the browser's time.
+        # No polling in the meantime, which would use the browser's time.
         page.run("times.some(([key]) => key === pressed) || new Promise(done => { window.told = done; })")
         time.sleep(0.05)
     spent = [(processor_time(root) - before) / PRESSES for root, before in zip(roots, spent)]
     more = dict(zip(("browser", "server and kernel"), spent))
     yield row(f"{what}: ms of processor time a press, all processes", sum(spent), **more)
-    # A page may draw several times for one key: the last counts.
+    # A page may draw several times for one key: the last drawing counts.
     last = {pressed: seen - pressed for pressed, seen in page.run("times")}
     times = sorted(last.values())
     load = {"load": os.getloadavg()[0]}

@@ -26,7 +26,7 @@ SIDES, CALLS, DECIDED = (316, 317), 5, 1e-12
 
 
 def rows(wanted):
-    """The map on a grid that crosses both critical lines."""
+    """The rows of the map, on a grid that crosses both critical lines."""
     over_K, over_k = (np.geomspace(0.05, 20.0, count) for count in SIDES)
     call = lambda: lj.sweep(
         lambda point: is_held(point["over_K"], point["over_k"]), {"over_K": over_K, "over_k": over_k}, progress=False

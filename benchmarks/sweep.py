@@ -1,17 +1,17 @@
-"""How fast is a sweep, and what does it lose?
+"""How fast is a sweep, and what does it lose when it is killed?
 
-    trajectories/s   the bead on a rotating hoop at 1,000 speeds of the hoop, 100 of its own periods each, ours over
-                     another's; both as loose as the error asked for allows on every lane (`loosest`)
-    spread lanes     speeds from 0.5 to 20 for one span of time, beside the sum of what each takes alone
-    short lanes      a sweep with statuses, labels and progress, beside a loop over a bare `jax.vmap`
-    layout           `integrate` under `vmap` beside everything one lane after the other
-    killed           a sweep with a store, by SIGKILL, and begun again: points that were computed twice, in blocks
-    store            the full check of a store of a million numbers beside writing it; seconds to open it
-    memory           of a process with a sweep of 10 million numbers
+    trajectories/s   the bead on a rotating hoop at 1,000 speeds of the hoop, 100 of its own periods each: our rate over
+                     that of another tool, both as loose as the required error allows on every lane (`loosest`)
+    spread lanes     speeds from 0.5 to 20 for one span of time, compared with the sum of the times of each alone
+    short lanes      a sweep with statuses, labels and progress, compared with a loop over a bare `jax.vmap`
+    layout           `integrate` under `vmap`, compared with one lane after the other
+    killed           a sweep with a store, killed by SIGKILL and started again: points computed twice, in blocks
+    store            the full check of a store of a million numbers, compared with writing it; seconds to open it
+    memory           the peak memory of a process with a sweep of 10 million numbers
 
-The error is that of angle and rate against elliptic functions, in radians, the largest over lanes and outputs. Sweeps
-have one worker, but where two cores are asked for; pin the process to one core for all the other rows. What is timed is
-a compiled sweep that runs all its points again. A tool that is not installed is skipped by name (`peers.py`).
+The error is the largest over lanes and outputs of angle and rate, in radians, against elliptic functions. Sweeps have
+one worker, except for the row with two cores; pin the process to one core for all other rows. The timing is of a
+compiled sweep that runs all its points again. A tool that is not installed is skipped and named (`peers.py`).
 
     python benchmarks/sweep.py [--json FILE] [--only TEXT]
 """
@@ -42,20 +42,21 @@ jax.config.update("jax_enable_x64", True)
 LANES, CHUNK, PERIODS, OUTPUTS, START = 1000, 250, 100, 100, 1.0
 PARAMS = bead_on_hoop.PARAMS
 BELOW = PARAMS["g"] / PARAMS["a"]
-# Of the natural rate. The homoclinic orbit through START is at 1 / cos(START / 2) = 1.14, where periods are infinite.
+# Relative to the natural rate. The homoclinic orbit through START is at 1 / cos(START / 2) = 1.14, with infinite
+# period.
 SPEEDS = np.concatenate([np.linspace(0.5, 1.0, LANES // 4), np.linspace(1.3, 3.0, LANES - LANES // 4)])
 OMEGA = math.sqrt(BELOW) * SPEEDS
 ENDS = PERIODS * np.asarray(bead_on_hoop.exact_period(PARAMS | {"omega": OMEGA}, START))
 ERROR, SMALL_ERROR = 1e-6, 1e-10
 SPREAD, SPAN = np.linspace(0.5, 20.0, LANES), 20.0
 SHORT, SHORT_CHUNK = 100_000, 1000
-# Enough for several blocks, and a kill inside of one.
+# Enough points for several blocks, and the share after which it is killed, inside a block.
 STORED, STORED_SPAN, KILLED_AT = 10_000, 100.0, 0.4
 MANY = 10**7
 
 
 def released(omega, ts, **settings):
-    """ψ and ψ' at all times but the first, by our default from the Lagrangian."""
+    """ψ and ψ' at all times except the first, by our default method from the Lagrangian."""
     trajectory = lj.integrate(
         bead_on_hoop.system, START, 0.0, PARAMS | {"omega": omega}, ts=ts, throw=False, **settings
     )  # fmt: skip
@@ -63,7 +64,7 @@ def released(omega, ts, **settings):
 
 
 def error(state, omega=OMEGA, ends=ENDS):
-    """How far (ψ, ψ'), each (lanes,) or (lanes, outputs), are off at equidistant outputs."""
+    """The error of (ψ, ψ'), each (lanes,) or (lanes, outputs), at equidistant outputs."""
     q, v = (np.reshape(x, (len(omega), -1)) for x in state)
     params = PARAMS | {"omega": omega[:, None]}
     ts = np.reshape(ends, (-1, 1)) * np.linspace(0.0, 1.0, q.shape[1] + 1)[1:]
@@ -73,7 +74,7 @@ def error(state, omega=OMEGA, ends=ENDS):
 
 
 def by_sweep(outputs=1, tolerances=LADDER, **settings):
-    """`prepare(tolerance)` for a sweep: compiled once, with the tolerances as an axis of which one is run again."""
+    """`prepare(tolerance)` for a sweep compiled once, with the tolerances as an axis; it runs one of them again."""
     tolerances, lanes = np.asarray(tolerances), np.stack([OMEGA, ENDS], axis=1)
 
     def run(point):
@@ -108,7 +109,7 @@ def rate_rows(wanted):
     tolerances = {e: Once(lambda e=e: loosest(of_ladder.it, error, e)[1]) for e in (ERROR, SMALL_ERROR)}
 
     def ours(allowed=ERROR, **settings):
-        # What is timed is a sweep of these lanes and no more: how it runs may depend on how many there are.
+        # Time a sweep of exactly these lanes, since their number may affect how it runs.
         tolerance = tolerances[allowed].it
         solve = by_sweep(tolerances=[tolerance], **settings)(tolerance)
         return solve, tolerance, error(solve())
@@ -177,7 +178,7 @@ def spread_rows(wanted):
 
 
 def short_rows(wanted):
-    """Lanes that take so little that everything around them shows."""
+    """Lanes so short that all overhead shows."""
     what = f"{SHORT:,} short lanes: sweep / bare vmap"
     if not wanted(what):
         return
@@ -211,15 +212,15 @@ def stored(path, log):
     omegas = np.resize(OMEGA, STORED)
     with open(log, "ab", buffering=0) as file:
 
-        def told(number):
+        def logged(number):
             file.write(np.asarray(number).tobytes())
             return number
 
         def run(point):
             shape = jax.ShapeDtypeStruct((), point["number"].dtype)
-            number = jax.pure_callback(told, shape, point["number"], vmap_method="expand_dims")
+            number = jax.pure_callback(logged, shape, point["number"], vmap_method="expand_dims")
             ts = np.array([0.0, STORED_SPAN])
-            # XLA leaves out a call of the host whose result nothing depends on.
+            # XLA would drop a host call whose result is unused.
             return released(point["omega"] + 0.0 * number, ts, rtol=1e-10, atol=1e-10)
 
         axes = {"omega": omegas, "number": np.arange(STORED)}
@@ -227,14 +228,14 @@ def stored(path, log):
 
 
 def elsewhere(code):
-    """A process of its own that runs some code with this module as `sweep`."""
-    # What a killed process leaves is told by a process of Python's that outlives it.
+    """A separate process that runs some code with this module as `sweep`."""
+    # Python's resource tracker outlives a killed process and would warn about what it left behind.
     command = [sys.executable, "-W", "ignore:resource_tracker", "-c", f"import sweep; {code}"]
     return subprocess.Popen(command, cwd=Path(__file__).parent, stdout=subprocess.PIPE, text=True)
 
 
 def killed_rows(wanted):
-    """A sweep that is killed and begun again."""
+    """A sweep that is killed and started again."""
     what = "killed: points computed twice / a block"
     if not wanted(what):
         return
@@ -257,7 +258,7 @@ def killed_rows(wanted):
 
 
 def store_rows(wanted):
-    """A million numbers: checked whole, and only looked at, beside written."""
+    """A million numbers: the full check and a quick opening, compared with writing."""
     what = "store of 1e6 points: full check / writing"
     if not wanted(what):
         return
@@ -289,8 +290,8 @@ def many():
         float(np.max(np.abs(period * np.sqrt(BELOW - omega**2) / (2 * np.pi) - 1)))
         for period, omega in zip(np.split(swept.values, 100), np.split(omegas, 100))
     )
-    told = dict(line.split(":") for line in Path("/proc/self/status").read_text().splitlines())
-    return int(told["VmHWM"].split()[0]) * 1024 / 1e9, swept.seconds, off
+    status = dict(line.split(":") for line in Path("/proc/self/status").read_text().splitlines())
+    return int(status["VmHWM"].split()[0]) * 1024 / 1e9, swept.seconds, off
 
 
 def memory_rows(wanted):

@@ -1,11 +1,11 @@
-"""Does the accuracy of the default depend on the user's units? All scenes in other units of length and of time.
+"""Does the accuracy of the default method depend on the user's units? All scenes in other units of length and time.
 
-    metres to micrometres, to gigametres       lengths are a million times larger, a billion times smaller numbers
+    metres to micrometres, to gigametres       lengths become a million times larger, a billion times smaller numbers
     seconds to years, to nanoseconds           likewise times
 
-The same motion is integrated with nothing but `ts` given, and its error against the scene's own closed form is compared
-with that in the scene's units; what is right to the tolerance is right. What is no length, an angle, stays as it is.
-The twin gives `atol`, 1e-9 of whatever the unit is: it has to miss. Exit status 1 where a target is missed.
+The same motion is integrated with only `ts` given, and its error against the scene's own closed form is compared with
+that in the scene's units; an error within the tolerance always counts as right. Angles are not rescaled. The twin
+passes `atol`, 1e-9 of whatever the unit is, and must miss. The exit status is 1 if a target is missed.
 
     python benchmarks/units.py [--json FILE] [--twin]
 """
@@ -25,7 +25,7 @@ from lagjax.scenes import SCENES
 jax.config.update("jax_enable_x64", True)
 
 YEAR = 365.25 * 24 * 3600
-# The unit of length in units of the old one, and of time.
+# The new units of length and time, in units of the old ones.
 UNITS = {
     "micrometres": (1e-6, 1.0),
     "gigametres": (1e9, 1.0),
@@ -34,14 +34,14 @@ UNITS = {
     "micrometres, years": (1e-6, YEAR),
     "gigametres, nanoseconds": (1e9, 1e-9),
 }
-# A coordinate that is no length, by its name; one without a name is an angle in all scenes.
+# Names of coordinates that are not lengths; a coordinate without a name is an angle in all scenes.
 ANGLES = {"theta", "phi", "psi"}
 RTOL, AT_MOST = 1e-9, 10.0
 TWIN = "--twin"
 
 
 class Units(NamedTuple):
-    """Of each coordinate, like q, and of time."""
+    """The units of each coordinate, with the structure of q, and of time."""
 
     of_q: object
     of_t: float
@@ -52,7 +52,7 @@ class Units(NamedTuple):
 
 
 class Rescaled(NamedTuple):
-    """A function of (t, q, v, params) that reads its arguments in other units; of (t, q, params) for positions."""
+    """A function of (t, q, v, params), or (t, q, params), that takes its arguments in other units."""
 
     function: object
     units: Units
@@ -70,7 +70,7 @@ def _times(y, units):
 
 
 def in_units(system, units):
-    """The same system, of numbers in other units."""
+    """The same system for numbers in other units."""
     constraints = {
         name: lj.Holonomic(lambda t, q, p, g=c.g: g(t * units.of_t, _times(q, units.of_q), p))
         if isinstance(c, lj.Holonomic)
@@ -83,7 +83,7 @@ def in_units(system, units):
 
 
 def units_of(run, of_length, of_time):
-    """Those of a scene's motion."""
+    """The units of a scene's motion."""
     q0 = jax.tree.map(lambda x: np.asarray(x, float), run.q0)
     if isinstance(q0, dict):
         return Units({name: 1.0 if name in ANGLES else of_length for name in q0}, of_time)
@@ -91,12 +91,12 @@ def units_of(run, of_length, of_time):
 
 
 def solved(run, units=None, **options):
-    """The motion of a scene, integrated in other units, in those of the scene."""
+    """The motion of a scene, integrated in other units and converted back."""
     to = lambda y, c: jax.tree.map(lambda y, c: np.asarray(y, float) / c, y, c)
     units = units or units_of(run, 1.0, 1.0)
     of_q, of_t, of_v = *units, units.of_v
     system = in_units(run.system, units)
-    # The guards of the scenes look at multipliers alone, which stay as they are.
+    # The guards of the scenes depend only on multipliers, which do not change.
     traj = lj.integrate(
         system, to(run.q0, of_q), to(run.v0, of_v), run.params, ts=run.ts / of_t, events=run.events, **options
     )
@@ -105,7 +105,7 @@ def solved(run, units=None, **options):
 
 
 def rows(wanted, options, missing):
-    """How many times larger the error is in other units, and how many times the steps."""
+    """The ratio of the error in other units to that in the scene's units, and the ratio of the steps."""
     for name, scene in SCENES.items():
         for run in scene.runs():
             if not wanted(f"{name}, {run.name}"):

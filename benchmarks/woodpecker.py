@@ -1,9 +1,9 @@
-"""The derivative of the woodpecker's period by friction and stiffness, in both modes: minutes of compiling, no test.
+"""The derivative of the woodpecker's period by friction and stiffness, in both modes. It compiles too long for a test.
 
     python benchmarks/woodpecker.py [--mode forward|reverse]
 
-The cycle moves with them: dT/dp = T_p - T_a r_p / r_a, with a the angle at which the jammed bird turns, and r what it
-gains in a period.
+The cycle changes with them: dT/dp = T_p - T_a r_p / r_a, with a the angle at which the jammed bird turns, and r the
+speed that it gains in a period.
 """
 
 import argparse
@@ -17,19 +17,19 @@ import numpy as np
 from lagjax.scenes.woodpecker import PARAMS, TURN, lap, motion
 
 jax.config.update("jax_enable_x64", True)
-# Differences of the independent computation, `tests/scenes/woodpecker_by_events.py`, at steps of 1e-5.
+# Finite differences of the independent computation `tests/scenes/woodpecker_by_events.py`, with steps of 1e-5.
 INDEPENDENT = {"mu": -0.61604757, "c": -10.2963651}
 
 
 def of_parameters(given):
-    """The period and what the bird gains, of (turn, mu, c)."""
+    """The period and the speed that the bird gains, as functions of (turn, mu, c)."""
     turn, mu, c = given
     found = lap(motion(PARAMS | {"mu": mu, "c": c}, np.array([0.0, 0.18]), turn, estimate_error=False))
     return jnp.stack([found.period, found.gained])
 
 
 def main():
-    """Print the derivatives beside the independent ones, and fail where they differ by more than 1e-6."""
+    """Print the derivatives next to the independent ones, and fail if they differ by more than 1e-6."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--mode", choices=("forward", "reverse"), default="forward")
     mode = parser.parse_args().mode

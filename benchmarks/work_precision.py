@@ -1,13 +1,13 @@
-"""Which explicit method reaches an error soonest, and is the default the one?
+"""Which explicit method reaches an error soonest, and is it the default?
 
-Motions of the six scenes and the pendulum in Cartesian coordinates, over tens of periods where a closed form says where
-they end: every method at half decades of tolerance, from 1e-4 on, until its error stays below the smallest asked for.
-Of each method the fastest solve within an error counts. Errors are those of coordinates and velocities at the end, each
-relative to its largest value on the way. Where there is no closed form the reference is SciPy's DOP853 at 3e-14 on
-equations derived by hand (`by_hand.py`), and errors are relative to the largest number of the state.
+Motions of the six scenes and the pendulum in Cartesian coordinates, over tens of periods. Every method runs at half
+decades of tolerance, from 1e-4 on, until its error stays below the smallest required one; its fastest solve within an
+error counts. Errors are those of coordinates and velocities at the end, each relative to its largest value during the
+motion. The reference is a closed form; if there is none, it is SciPy's DOP853 at 3e-14 on equations derived by hand
+(`by_hand.py`), and errors are relative to the largest number of the state.
 
-The default wins where it is at most a tenth slower than the fastest. All methods run through `lj.integrate`, at one
-tolerance in turn; times are of compiled solves, medians.
+The default wins if it is at most a tenth slower than the fastest. All methods run through `lj.integrate`, alternately
+at each tolerance; times are medians of compiled solves.
 
     python benchmarks/work_precision.py [--json FILE] [--only TEXT] [--plot FILE]
 """
@@ -40,7 +40,7 @@ DEFAULT = "default"
 
 
 class Motion(NamedTuple):
-    """A motion from `ts[0]` to `ts[1]`; `exact(t)` is (q, v), at the end and, where it is known, on the way."""
+    """A motion from `ts[0]` to `ts[1]`; `exact(t)` is (q, v) at the end and, if known, at other times."""
 
     system: lj.System
     params: Any
@@ -60,7 +60,7 @@ class Point(NamedTuple):
 
 
 def solves_of(motion):
-    """Solves by the default, by diffrax's explicit methods and by our others, by name."""
+    """Solves by name: the default, diffrax's explicit methods and our other ones."""
     default = program(motion, None)
     chosen = default(LADDER[0]).static.method
     found = {DEFAULT: default}
@@ -78,7 +78,7 @@ def geodesic():
 
 
 def embedded_geodesic():
-    """Twenty times around, over both poles, held on the sphere."""
+    """Twenty times around, over both poles, constrained to the sphere."""
     params = sphere_geodesic.PARAMS
     start = sphere_geodesic.start_towards(params, 0.5, 0.0, 0.25, np.pi)
     exact = lambda s: sphere_geodesic.exact_embedded(*start, np.atleast_1d(s))
@@ -128,12 +128,12 @@ def in_field(name):
     start, as_state = ravel_pytree((q0, v0))
     field = jax.jit(lambda t, y: ravel_pytree((as_state(y)[1], case.by_hand(t, *as_state(y), case.params)[0]))[0])
     right = scipy_dop853(lambda t, y: np.asarray(field(t, y)), np.asarray(start), end)(3e-14)()
-    # One vector, and so one scale for all of it.
+    # The state is one vector, so it has one scale.
     return Motion(case.system, case.params, q0, v0, np.array([0.0, end]), lambda t: right)
 
 
 def wedge():
-    """Uniform acceleration, which every method has without error."""
+    """Uniform acceleration, which every method integrates without error."""
     params, end = sliding_wedge.PARAMS, 0.75
     start = sliding_wedge.start_on_incline(params, X=0.25, X_rate=0.5, along=0.125, along_rate=-0.75)
     exact = lambda t: sliding_wedge.exact_motion(params, *start, t)
@@ -192,8 +192,8 @@ MOTIONS = {
 def error_of(motion):
     """The largest relative error of a trajectory's end."""
     right = jax.tree.leaves(motion.exact(motion.ts[1]))
-    way = jax.tree.leaves(motion.exact(np.linspace(*motion.ts, 500)))
-    scales = [float(np.max(np.abs(x))) or 1.0 for x in way]
+    on_the_way = jax.tree.leaves(motion.exact(np.linspace(*motion.ts, 500)))
+    scales = [float(np.max(np.abs(x))) or 1.0 for x in on_the_way]
 
     def error(trajectory):
         found = jax.tree.leaves(jax.tree.map(lambda x: np.asarray(x[-1]), (trajectory.q, trajectory.v)))
@@ -217,7 +217,7 @@ def program(motion, method):
 
 
 def curves(motion, solves):
-    """The points of each method, down the ladder until two in a row are below the smallest error asked for."""
+    """The points of each method, down the ladder until two in a row are below the smallest required error."""
     error, found = error_of(motion), {name: [] for name in solves}
     for tolerance in LADDER:
         active = [name for name, points in found.items() if not finished(points)]
@@ -231,18 +231,18 @@ def curves(motion, solves):
 
 
 def finished(points):
-    """Whether a method need not go on, or takes too long to."""
+    """Whether a method is done or takes too long."""
     within = len(points) > 1 and all(point.error <= LEVELS[-1] for point in points[-2:])
     return within or (points and points[-1].median > SLOWEST)
 
 
 def soonest(points, level):
-    """The least of a method's medians and minima within an error; infinite where there is none."""
+    """The smallest median and minimum of a method's times within an error; infinite if there is none."""
     return [min((getattr(p, kind) for p in points if p.error <= level), default=np.inf) for kind in ("median", "least")]
 
 
 def rows(wanted, drawn):
-    """Default over fastest, for each motion and error; the curves are kept in `drawn`."""
+    """The default's time over the fastest, for each motion and error; `drawn` collects the curves."""
     for name, build in MOTIONS.items():
         if not any(wanted(f"{name}, error {level:.0e}") for level in LEVELS):
             continue
@@ -262,7 +262,7 @@ def rows(wanted, drawn):
 
 
 def draw(path, drawn):
-    """Error over run time, one panel a motion."""
+    """Draw error over run time, one panel per motion."""
     columns = min(4, len(drawn))
     figure, axes = plt.subplots(-(-len(drawn) // columns), columns, figsize=(4 * columns, 11), squeeze=False)
     for panel in axes.flat[len(drawn) :]:

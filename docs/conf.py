@@ -1,6 +1,7 @@
-"""The site: `python -m sphinx -W docs docs/_build/html` builds it there, without network; extra `docs`.
+"""The site: `python -m sphinx -W docs docs/_build/html` builds it in that folder, without network access; needs the
+extra `docs`.
 
-What is generated (the pages of public names, errors, results, notebooks) is written into folders that git ignores.
+Generated pages (public names, errors, results, notebooks) are written into folders that git ignores.
 """
 
 import sys
@@ -37,7 +38,7 @@ html_static_path = ["_static"]
 html_css_files = ["site.css"]
 html_copy_source = False
 html_show_sourcelink = False
-# Pages without others beside them; and one whose list would fold with a toggle that has no name for those who hear it.
+# Pages without neighbours; and one whose list would fold with a toggle that has no name for screen readers.
 html_sidebars = {name: [] for name in ("index", "first-ten-minutes", "gallery", "generated/measured/*")}
 html_theme_options = {
     "navigation_with_keys": False,
@@ -54,7 +55,7 @@ html_theme_options = {
 myst_enable_extensions = ["colon_fence", "dollarmath"]
 myst_heading_anchors = 3
 nb_execution_mode = "off"
-# Scripts for widgets, which would come from the network.
+# No scripts for widgets: they would come from the network.
 nb_ipywidgets_js = {}
 copybutton_prompt_text = r">>> |\.\.\. |\$ "
 copybutton_prompt_is_regexp = True

@@ -2,9 +2,9 @@
 
     python docs/gallery.py [NAME ...]
 
-writes `docs/gallery/NAME.png`, all where none is named. Scenes draw themselves (`SCENE.picture`). Of a mechanism there
-is the motion on the left, as stills from light to dark, and on the right what is known of it as a formula (dots:
-computed).
+writes `docs/gallery/NAME.png`, or all pictures if no name is given. Scenes draw themselves (`SCENE.picture`). The
+picture of a mechanism shows its motion on the left, as stills from light to dark, and a closed form of it on the right
+(dots: computed).
 """
 
 import io
@@ -26,7 +26,7 @@ STILLS, COLOURS = 9, 128
 
 
 def moved(mechanism, end=None, count=121):
-    """The motion, its times, and numbers in place of arrays."""
+    """The times, and q, v and multipliers of the motion as NumPy arrays."""
     ts = np.linspace(0.0, mechanism.end if end is None else end, count)
     traj = lj.integrate(mechanism.system, mechanism.q0, mechanism.v0, mechanism.params, ts=ts, rtol=1e-8)
     return ts, *jax.tree.map(np.asarray, (traj.q, traj.v, traj.multipliers))
@@ -42,7 +42,7 @@ def stills(axis, lines, count):
 
 
 def compared(axis, x, known, found, formula, **labels):
-    """A closed form as a curve, and what was computed as dots on it."""
+    """A closed form as a curve, and the computed values as dots on it."""
     axis.plot(x, known, label=formula, **plot.style(1))
     axis.plot(x[::6], found[::6], "o", color=plot.COLOURS[0], markersize=3, label="computed")
     axis.set(**labels)
@@ -50,7 +50,7 @@ def compared(axis, x, known, found, formula, **labels):
 
 
 def path(*points):
-    """Points (T, 2), or one for all times, as a polyline (T, points, 2)."""
+    """Points, each (T, 2) or (2,) if it is fixed, as a polyline (T, points, 2)."""
     length = max(np.ndim(p) > 1 and len(p) or 1 for p in points)
     return np.stack([np.broadcast_to(np.asarray(p, float), (length, 2)) for p in points], axis=1)
 
@@ -61,7 +61,7 @@ def unit(angle):
 
 
 def draw_andrews(left, right):
-    """The four ways to the point P; the energy that the motor has given."""
+    """The four chains to the point P; the energy that the motor has supplied."""
     p, (ts, q, v, _) = andrews.PARAMS, moved(andrews.MECHANISM)
     a, b, c = ([p["x" + k], p["y" + k]] for k in "abc")
     crank = p["rr"] * unit(q.beta)
@@ -81,13 +81,13 @@ def draw_andrews(left, right):
 
 
 def draw_car_axis(left, right):
-    """Axle and springs; the wheel on the road, and the length that the axle keeps."""
+    """Axle and springs; the slope of the left spring and of the road."""
     p, (ts, q, _, _) = car_axis.PARAMS, moved(car_axis.MECHANISM, count=301)
     wheel = np.stack(car_axis.road(ts, p), axis=1)
     l, r = np.stack([q.xl, q.yl], axis=1), np.stack([q.xr, q.yr], axis=1)
     stills(left, [path(l, r), path([0, 0], l), path(wheel, r)], len(ts))
     left.set(title="A stiff axle on two springs", xlabel="x / m", ylabel="y / m")
-    # The left spring stands at right angles to the road.
+    # The left spring is at right angles to the road.
     slope = -q.xl / q.yl
     road = np.asarray(p["r"] * np.sin(p["omega"] * ts))
     compared(right, ts, road / np.sqrt(p["L"] ** 2 - road**2), slope, "tan of the road's angle",
@@ -102,7 +102,7 @@ def slider(q, left, count):
 
 
 def draw_slider_crank(left, right):
-    """Thrown and left alone: the energy gives the speed of the crank."""
+    """Thrown and then moving freely: the energy gives the speed of the crank."""
     p, (ts, q, v, _) = slider_crank.PARAMS, moved(slider_crank.MECHANISM, end=0.05)
     slider(q, left, len(ts))
     left.set(title="Thrown, and left alone")
@@ -140,11 +140,11 @@ def draw_n_four_bar(left, right):
 
 
 def draw_bricard(left, right):
-    """Six links that move although the count says that they cannot."""
+    """Six links that move although the count of degrees of freedom says that they cannot."""
     ts, q, _, _ = moved(bricard.MECHANISM, end=9.0)
     ends = jax.vmap(lambda q: bricard.closed(q, bricard.PARAMS))(q)
     points, axes = (np.asarray(x) for x in ends)
-    # Seen along (1, 1, 1) turned a little.
+    # The view is along (1, 1, 1), turned a little.
     view = np.linalg.qr(np.array([[1.0, 0.9, 1.2], [0.0, 1.0, 0.2], [0.1, 0.0, 1.0]]).T)[0][:, 1:]
     loop = np.concatenate([points, points[:, :1]], axis=1) @ view
     stills(left, [loop], len(ts))
@@ -205,7 +205,7 @@ def draw_fekete(left, right):
 
 
 def draw_woodpecker():
-    """A lap of the toy, and the beginning of the next."""
+    """One lap of the toy, and the beginning of the next."""
     ts = np.linspace(0.0, 0.18, 721)
     traj = woodpecker.motion(woodpecker.PARAMS, ts, rtol=1e-8, estimate_error=False)
     fig, axes = plot.figure(1, 2, size=(4.6, 3.4))
@@ -236,7 +236,7 @@ def picture(name):
 
 
 def save(fig, file):
-    """Write a picture with a palette."""
+    """Write a picture, reduced to a palette."""
     written = io.BytesIO()
     fig.savefig(written, format="png", dpi=100)
     image = Image.open(written).convert("RGB")

@@ -16,13 +16,13 @@ from nbclient import NotebookClient
 from PIL import Image
 
 FOLDER = Path(__file__).parent.parent / "notebooks"
-# The figures have few colours; so many are enough for their antialiased edges.
+# The figures have few colours; this many are enough for their antialiased edges.
 COLOURS = 128
 METER = "application/vnd.jupyter.widget-view+json"
 
 
 def smaller(png: str) -> str:
-    """A picture of a cell's output with a palette, in base64."""
+    """A PNG in base64, reduced to a palette."""
     image = Image.open(io.BytesIO(base64.b64decode(png))).convert("RGB")
     written = io.BytesIO()
     image.quantize(COLOURS, dither=Image.Dither.NONE).save(written, "png", optimize=True)
@@ -30,21 +30,21 @@ def smaller(png: str) -> str:
 
 
 def execute(script: Path) -> None:
-    """Run one script cell by cell in a kernel of its own, and write the notebook beside it."""
+    """Run one script cell by cell in its own kernel, and write the notebook next to it."""
     notebook = jupytext.read(script)
     began = time.perf_counter()
     settings = {"kernel_name": "python3", "resources": {"metadata": {"path": FOLDER}}, "store_widget_state": False}
     NotebookClient(notebook, timeout=600, **settings).execute()
     took = time.perf_counter() - began
     for cell in notebook.cells:
-        # When each cell ran differs from run to run.
+        # The times at which cells ran differ from run to run.
         cell.metadata.pop("execution", None)
         if "outputs" in cell:
-            # A meter that was shown while something took long shows nothing in a copy.
+            # A progress meter shows nothing in a stored copy.
             cell.outputs = [output for output in cell.outputs if METER not in output.get("data", {})]
         for output in cell.get("outputs", ()):
             if "image/png" in output.get("data", {}):
-                # Sliders need a kernel; of them the picture stays.
+                # Sliders need a kernel; keep only their picture.
                 output["data"].pop("application/vnd.jupyter.widget-view+json", None)
                 output["data"]["image/png"] = smaller(output["data"]["image/png"])
     notebook.metadata.pop("widgets", None)
@@ -55,7 +55,7 @@ def execute(script: Path) -> None:
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("names", nargs="*", help="beginnings of the notebooks' names; all where none is given")
+    parser.add_argument("names", nargs="*", help="beginnings of the notebooks' names; all if none is given")
     names = tuple(parser.parse_args().names) or ("",)
     for script in sorted(FOLDER.glob("*.py")):
         if script.name.startswith(names):

@@ -14,7 +14,7 @@ jax.config.update("jax_enable_x64", True)
 
 
 def hoop(axis):
-    """Forces on a hoop that rolls off a cylinder, up to where it lets go, with Goldstein's formulas."""
+    """Forces on a hoop that rolls off a cylinder, until it lets go, with Goldstein's formulas."""
     params, ts = rolling_hoop.PARAMS, np.linspace(0.0, 2.4, 121)
     motion = rolling_hoop.roll(params, 1.45, 0.0, ts)
     angle = np.degrees(np.asarray(motion.q["theta"]))
@@ -28,7 +28,7 @@ def hoop(axis):
 
 
 def pitchfork(axis):
-    """Where a damped bead on a rotating hoop comes to rest, over the speed, with the equilibrium angle."""
+    """The angle at which a damped bead on a rotating hoop comes to rest, over the speed, with the equilibrium angle."""
     params = bead_on_hoop.PARAMS | {"b": 2.0}
     critical = float(bead_on_hoop.natural_rate(params))
 
@@ -46,7 +46,7 @@ def pitchfork(axis):
 
 
 def fitted(axis):
-    """A swing with friction, measured with errors and a gap, and what `lj.fit` makes of it."""
+    """A swing with friction, measured with errors and a gap, and its fit by `lj.fit`."""
     swing = lj.System(
         lambda t, q, v, p: 0.5 * v**2 + p["w2"] * jnp.cos(q), dissipation=lambda t, q, v, p: 0.5 * p["c"] * v**2
     )

@@ -14,7 +14,7 @@
 # %% [markdown]
 # # A pendulum in ten lines
 #
-# Does the period that comes out of a Lagrangian, and its derivative, agree with the elliptic integral?
+# Do the period computed from a Lagrangian, and its derivative, agree with the elliptic integral?
 
 # %%
 import diffrax
@@ -38,20 +38,21 @@ traj = lj.integrate(pendulum, start, 0.0, params, ts=jnp.linspace(0.0, 6.0, 121)
 traj
 
 # %% [markdown]
-# The answer prints its own quality. It also plots itself.
+# The result reports its own accuracy when printed. It can also plot itself.
 
 # %%
 traj.plot()
 
 # %% [markdown]
-# And it plays: say where its points are, and they are linked in order. The last one leaves a trail.
+# It can also be animated: give the positions of its points. They are connected in order, and the last one leaves a
+# trail.
 
 # %%
 traj.animate(lambda t, q, params: [(0.0, 0.0), (params["l"] * jnp.sin(q), -params["l"] * jnp.cos(q))])
 
 # %% [markdown]
-# A quarter of the period ends where the angle crosses zero: an event. Its time has a derivative with respect to
-# everything that went in; gravity shortens the period as $\mathrm{d}T/\mathrm{d}g = -T/(2g)$.
+# A quarter of the period ends when the angle crosses zero: this is an event. Its time can be differentiated with
+# respect to every input; gravity shortens the period as $\mathrm{d}T/\mathrm{d}g = -T/(2g)$.
 
 # %%
 bottom = diffrax.Event(lambda t, y, params, **kwargs: y[0])

@@ -59,8 +59,8 @@ length, weight = params["R"] + params["a"], params["m"] * params["g"]
 # %% [markdown]
 # ## The normal force goes through zero
 #
-# The constraints hold as long as they are asked to. So let the hoop roll from near the top down to the side and look
-# at the forces that this takes.
+# The model keeps the constraints satisfied at all times. So let the hoop roll from near the top down to the side and
+# look at the forces that this requires.
 
 
 # %%
@@ -108,12 +108,12 @@ axis.legend(fontsize=9, frameon=False, loc="lower left")
 fig
 
 # %% [markdown]
-# The multipliers lie on their closed forms. A cylinder pushes; it cannot pull. At 30° $\lambda$ becomes negative, and
-# the hoop leaves.
+# The multipliers agree with their closed forms. A cylinder pushes; it cannot pull. At 30° $\lambda$ becomes negative,
+# and the hoop leaves.
 #
 # The solution that this notebook follows says that the formula for $\lambda$ gives a negative value "at the bottom,
-# when $\theta = 0$". Negative it is, but $\theta = 0$ is not the bottom: the centre's height is $r \sin\theta$. Ask
-# at both places for the force that it would take to hold the hoop there.
+# when $\theta = 0$". The value is negative, but $\theta = 0$ is not the bottom: the centre's height is $r \sin\theta$.
+# Compute at both places the force that would hold the hoop there.
 
 # %%
 names = {"the side": 0.0, "the bottom": -np.pi / 2}
@@ -130,10 +130,10 @@ for name, angle in names.items():
 #
 # ## The departure is an event
 #
-# With the constraints used up, $r = R + a$ and $\dot\phi = -(R + a)\,\dot\theta/a$, the Lagrangian has $\theta$
-# alone, with the inertia $2 m (R + a)^2$, and the normal force is $N = m g\sin\theta - m (R + a)\,\dot\theta^2$. The
+# After the constraints $r = R + a$ and $\dot\phi = -(R + a)\,\dot\theta/a$ are inserted, the Lagrangian contains only
+# $\theta$, with the inertia $2 m (R + a)^2$, and the normal force is $N = m g\sin\theta - m (R + a)\,\dot\theta^2$. The
 # departure is the event $N = 0$. (A hoop that slides has the inertia $m (R + a)^2$, and friction with the coefficient
-# $c$ drags its centre with $c N$. That will be needed below; one sweep has all departures.)
+# $c$ drags its centre with $c N$. That will be needed below; one sweep computes all departures.)
 
 
 # %%
@@ -177,9 +177,9 @@ print(f"from the top the hoop leaves at {np.degrees(left['theta']):.9f} degrees"
 # %% [markdown]
 # ## From rest at the top it never leaves
 #
-# The same solution starts the hoop "from rest at the top". There it would stay. Released from rest at a tilt $\delta$
-# it leaves at $\sin\theta_d = \frac{1}{2}\cos\delta$, after a time that grows as $\ln(1/\delta)$. Thirty degrees is a
-# limit.
+# The same solution starts the hoop "from rest at the top". There it would stay forever. Released from rest at a tilt
+# $\delta$ it leaves at $\sin\theta_d = \frac{1}{2}\cos\delta$, after a time that grows as $\ln(1/\delta)$. Thirty
+# degrees is only a limit.
 
 # %%
 times = exact.departure_time(params | {"beta": 1.0}, tilts)
@@ -197,8 +197,9 @@ fig
 # %% [markdown]
 # ## The gap opens slowly
 #
-# Without constraints the same Lagrangian is free flight. With $\lambda = 0$ it starts with the velocity *and* the
-# radial acceleration of the rolling motion, so that the gap opens only as $t^3$. Watch the force, not the distance.
+# Without constraints the same Lagrangian describes free flight. Because $\lambda = 0$, the flight starts with the
+# velocity *and* the radial acceleration of the rolling motion, so the gap opens only as $t^3$. Watch the force, not the
+# distance.
 
 # %%
 free = lj.System(lagrangian)
@@ -232,9 +233,9 @@ fig
 # %% [markdown]
 # ## With real friction it slips first
 #
-# Thirty degrees needs friction without limit. Near the departure $\mu$ is finite and $\lambda$ is no longer there to
-# support it: $\mu/\lambda = \cos\theta\,/\,[2\,(2\sin\theta - 1)] \to \infty$. A surface with the coefficient $c$
-# gives way where this ratio is $c$,
+# Reaching thirty degrees needs unlimited friction. Near the departure $\mu$ is finite and $\lambda$ is no longer there
+# to support it: $\mu/\lambda = \cos\theta\,/\,[2\,(2\sin\theta - 1)] \to \infty$. On a surface with the coefficient $c$
+# the hoop starts to slip where this ratio is $c$,
 #
 # $$\sin\theta_s = \frac{8c^2 + \sqrt{1 + 12c^2}}{1 + 16c^2},$$
 #
@@ -283,9 +284,8 @@ fig
 # %% [markdown]
 # ## Rolls, slips, flies: one motion
 #
-# That took an equation derived by hand. The multipliers can do it alone: each phase is a system with its own
-# constraints, friction is a force that depends on a multiplier, and switches end a phase where a guard goes through
-# zero.
+# That needed an equation derived by hand. The multipliers make it unnecessary: each phase is a system with its own
+# constraints, friction is a force that depends on a multiplier, and a switch ends a phase when a guard crosses zero.
 
 
 # %%
@@ -337,9 +337,9 @@ fig
 
 # %% [markdown]
 # With $c = 1/4$ the hoop slips at 65.70° and leaves at 36.63°; with $c = 1$ at 43.05° and 32.43°. "This is the angle
-# at which the hoop falls from the cylinder, $\theta = 30°$", says the solution. For every finite coefficient that
-# fails: the hoop leaves between 30° and 41.81°, because the normal force goes to zero; and it slips before, because
-# friction goes with it.
+# at which the hoop falls from the cylinder, $\theta = 30°$", says the solution. For every finite coefficient this is
+# wrong: the hoop leaves between 30° and 41.81°, because the normal force goes to zero; and it slips before that,
+# because the friction force goes to zero with it.
 
 # %%
 on_the_way, rate = (np.asarray(x["theta"]) for x in (rolled.q, rolled.v))

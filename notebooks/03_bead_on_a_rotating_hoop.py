@@ -50,9 +50,9 @@ unit = float(np.sqrt(params["g"] / params["a"]))  # ω0, rad/s
 # %% [markdown]
 # ## One valley becomes two
 #
-# What does not contain $\dot\psi$ in $L$ is minus an effective potential,
-# $V_\mathrm{eff} = -m g a\cos\psi - \frac{1}{2} m a^2\omega^2 \sin^2\psi$. Above $\omega_0$ the bottom is a hill,
-# between two valleys at $\cos\alpha = \omega_0^2/\omega^2$.
+# The terms of $L$ without $\dot\psi$ are minus an effective potential,
+# $V_\mathrm{eff} = -m g a\cos\psi - \frac{1}{2} m a^2\omega^2 \sin^2\psi$. Above $\omega_0$ the bottom is a maximum
+# between two minima at $\cos\alpha = \omega_0^2/\omega^2$.
 
 # %%
 psi = np.linspace(-np.pi, np.pi, 361)
@@ -70,8 +70,8 @@ fig
 # %% [markdown]
 # ## A pitchfork
 #
-# With some friction the bead comes to rest. 46 beads, each released at rest at 0.5 rad on one side or the other of a
-# hoop with its own speed, and where they are 40 s later:
+# With some friction the bead comes to rest. Here are 46 beads, each released at rest at 0.5 rad on one side or the
+# other of a hoop with its own speed, and their positions 40 s later:
 
 # %%
 speeds = np.concatenate([np.linspace(0.1, 0.9, 9), np.linspace(1.12, 2.5, 14)])
@@ -106,9 +106,9 @@ fig
 # %% [markdown]
 # ## Three kinds of motion
 #
-# Without friction, at $\omega = 1.66\,\omega_0$: about one valley, through both, and over the top. What tells them
-# apart is the Jacobi integral $h = \frac{1}{2} m a^2\dot\psi^2 + V_\mathrm{eff}$: below $-m g a$, between, and above
-# $+m g a$.
+# Without friction, at $\omega = 1.66\,\omega_0$, the bead moves about one valley, through both, or over the top. The
+# Jacobi integral $h = \frac{1}{2} m a^2\dot\psi^2 + V_\mathrm{eff}$ distinguishes them: below $-m g a$, between, and
+# above $+m g a$.
 
 # %%
 starts = {
@@ -157,8 +157,8 @@ fig
 # ## At the critical speed nothing is harmonic
 #
 # The same solution takes small oscillations for harmonic "if the angular velocity is not larger than
-# $\omega_0^2 = g/a$". That allows $\omega = \omega_0$, and compares a velocity with the square of one. A harmonic
-# period does not depend on the amplitude. Half a period is the time until the bead rests again:
+# $\omega_0^2 = g/a$". That allows $\omega = \omega_0$, and compares a velocity with the square of a velocity. A
+# harmonic period does not depend on the amplitude. Half a period is the time until the bead rests again:
 
 # %%
 rests = diffrax.Event(lambda t, y, params, **kwargs: y[1], direction=False)
@@ -186,14 +186,14 @@ axis.legend(fontsize=9, frameon=False)
 fig
 
 # %% [markdown]
-# Below $\omega_0$ the period levels off, at $1/\sqrt{1 - \omega^2/\omega_0^2}$ times the pendulum's. At $\omega_0$ it
-# never does: it is $10.488\,/\,(\omega_0\psi_m)$, as for a restoring force with the cube of the angle. So the
-# condition is $\omega < \omega_0$.
+# Below $\omega_0$ the period levels off at small amplitudes, at $1/\sqrt{1 - \omega^2/\omega_0^2}$ times that of the
+# pendulum. At $\omega_0$ it does not: it is $10.488\,/\,(\omega_0\psi_m)$, as for a restoring force proportional to the
+# cube of the angle. So the condition is $\omega < \omega_0$.
 #
 # ## What the motor does
 #
-# Let $\theta$, the hoop's own angle, be a coordinate, and $\theta - \omega t = 0$ a constraint. Its multiplier is the
-# motor's torque $\tau$.
+# Let the hoop's own angle $\theta$ be a coordinate, and let $\theta - \omega t = 0$ be a constraint. Its multiplier is
+# the motor's torque $\tau$.
 
 
 # %%
@@ -238,18 +238,18 @@ right.legend(fontsize=9, frameon=False, loc="upper right")
 fig
 
 # %% [markdown]
-# The energy is not constant, $h = E - \omega L_z$ is, and the motor makes up the difference.
+# The energy is not constant, but $h = E - \omega L_z$ is, and the motor supplies the difference.
 #
 # The solution calls $p_\psi$ "proportional to the angular momentum component $L_z$". It is not:
 # $p_\psi = m a^2\dot\psi$ is the component along the horizontal normal of the hoop, $L_z = m a^2\omega\sin^2\psi$,
-# and the motor's torque changes the second alone. (Nor does $\partial L/\partial\dot\psi \ne 0$ show that $p_\psi$
+# and the motor's torque changes only the second. (Nor does $\partial L/\partial\dot\psi \ne 0$ show that $p_\psi$
 # changes, as is said there; $\partial L/\partial\psi \ne 0$ does.)
 #
 # ## Fast rotation
 #
-# Then $\alpha \to 90°$. "The mass stays in the center of the hoop", says the solution, for $\omega^2 \gg a/g$. But
-# $a/g$ is the square of a time: it is $\omega^2 \gg g/a$; and the bead stays at the *height* of the centre, on the
-# rim.
+# For fast rotation $\alpha \to 90°$. "The mass stays in the center of the hoop", says the solution, for
+# $\omega^2 \gg a/g$. But $a/g$ is the square of a time: it is $\omega^2 \gg g/a$; and the bead stays at the *height* of
+# the centre, on the rim.
 
 # %%
 for name in ("10", "100"):

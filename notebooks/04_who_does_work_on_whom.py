@@ -49,10 +49,10 @@ s, c = np.sin(alpha), np.cos(alpha)
 rest = {"X": 0.0, "x": 0.0, "y": 0.0}
 
 # %% [markdown]
-# ## The books of the normal force
+# ## The work of the normal force
 #
-# Released from rest. The power of the normal force on the particle is $\mathbf N\cdot\mathbf v$, that on the wedge
-# $-\mathbf N\cdot\mathbf V$: action and reaction.
+# The particle is released from rest. The power of the normal force on the particle is $\mathbf N\cdot\mathbf v$, that
+# on the wedge $-\mathbf N\cdot\mathbf V$: action and reaction.
 
 # %%
 ts = jnp.linspace(0.0, 0.75, 31)
@@ -70,7 +70,7 @@ traj
 # $$\frac{\mathrm{d}W_m}{\mathrm{d}t} = +\,\lambda g t\,\sin^2\alpha\cos\alpha\,\frac{m/M}{1 + (m/M)\sin^2\alpha},$$
 #
 # and for the wedge $\mathrm{d}W_M/\mathrm{d}t = \mathbf N\cdot\mathbf V$, which is the same with a minus. It checks
-# that their sum vanishes, and so it does, since both signs are wrong. Energy can tell: the integral of
+# that the sum vanishes, which it does although both signs are wrong. The energy reveals the error: the integral of
 # $\mathrm{d}W_M/\mathrm{d}t$ is the kinetic energy of the wedge, which started from rest.
 
 # %%
@@ -94,9 +94,9 @@ for i, (axis, name) in enumerate(zip(axes[0], power)):
 fig
 
 # %% [markdown]
-# The wedge recedes, so that the angle between the normal force and the particle's velocity is more than 90°: the
+# The wedge recedes, so the angle between the normal force and the particle's velocity is more than 90°: the
 # wedge takes 2.285 J from the particle in 0.75 s. The energy ledger integrates the power of every force, by coordinate,
-# and has the same books. It never asks the energy, so that what does not add up would show in its last line.
+# and gives the same numbers. It does not use the energy itself, so an inconsistency would show in its last line.
 
 # %%
 ledger = lj.energy_ledger(traj)
@@ -105,8 +105,8 @@ ledger
 # %% [markdown]
 # ## Who gets the energy?
 #
-# When the particle has fallen by $y$, energy $m g y$ has been set free. How much of it has the wedge? A sweep over
-# the mass ratio and the angle, one second of each.
+# When the particle has fallen by $y$, the energy $m g y$ has been released. How much of it does the wedge have? This is
+# a sweep over the mass ratio and the angle, with one second of motion each.
 
 
 # %%
@@ -157,15 +157,15 @@ fig
 # %% [markdown]
 # With $u = m/M$ the share is $u\cos^2\alpha\,/\,[(1 + u)(1 + u\sin^2\alpha)]$. For a given angle it is largest at
 # $M = m\sin\alpha$, the dashed line, where it is $(1 - \sin\alpha)/(1 + \sin\alpha)$, the thin lines: 70 per cent at
-# 10°, 33 at 30° and 7 at 60°. A light wedge shoots away but carries nothing; a heavy one stays.
+# 10°, 33 at 30° and 7 at 60°. A light wedge moves away fast but carries little energy; a heavy one hardly moves.
 #
 # ## Two formulas that fail
 #
 # The solution says that for $M \gg m$ the acceleration along the incline *approximates* $g\sin\alpha$. In the
-# laboratory it *is* $g\sin\alpha$, for every $M$: the normal force has no part along the incline. What tends to
-# $g\sin\alpha$ is the acceleration relative to the wedge.
+# laboratory it *is* $g\sin\alpha$, for every $M$: the normal force has no component along the incline. The acceleration
+# relative to the wedge is what tends to $g\sin\alpha$.
 #
-# And it derives $p_x = m\dot x + M\dot X = 0$ once more from "$a_y = a_x(1 + m/M)/\tan\alpha$". That is right with
+# It also derives $p_x = m\dot x + M\dot X = 0$ a second time from "$a_y = a_x(1 + m/M)/\tan\alpha$". That is right with
 # $\cdot\tan\alpha$ and wrong with $/\tan\alpha$, except at 45°, where nobody would notice.
 
 
@@ -191,8 +191,8 @@ right.legend(fontsize=9, frameon=False)
 fig
 
 # %% [markdown]
-# Without any mass the wedge is still a constraint, though the mass matrix is then singular: the particle falls
-# freely, and the wedge is out of its way with $g\cot\alpha$.
+# A wedge without mass is still a constraint, although the mass matrix is then singular: the particle falls freely, and
+# the wedge moves out of its way with the acceleration $g\cot\alpha$.
 
 # %%
 massless, forces = lj.accelerations(wedge, 0.0, rest, rest, params | {"M": 0.0})

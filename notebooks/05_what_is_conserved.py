@@ -16,9 +16,9 @@
 #
 # Every symmetry of a Lagrangian conserves something (Noether): a translation a component of momentum, a rotation one of
 # angular momentum, time the energy. Which symmetries does a system have? `lj.symmetries` finds them, `lj.is_symmetry`
-# tests one that is claimed, and `lj.noether_charge` is what it conserves, as a function of the state.
+# tests a claimed one, and `lj.noether_charge` gives the conserved quantity as a function of the state.
 #
-# First the particle of Goldstein's Exercise 2-19, that falls through the gravitational field of a fixed mass
+# We start with the particle of Goldstein's Exercise 2-19, which falls through the gravitational field of a fixed mass
 # distribution. Per unit of its mass, $L = \frac{1}{2}|\mathbf v|^2 - \Phi(\mathbf q)$. Seven potentials $\Phi$, of a
 # plane, a half plane, a circular cylinder, infinite or finite, an elliptic cylinder, a dumbbell and a helix, are in
 # `lagjax.scenes`. Units here: $G = 1$.
@@ -55,9 +55,9 @@ params = masses.PARAMS | {"helix": masses.PARAMS["helix"] | {"h": 1.7}}
 # %% [markdown]
 # ## Symmetries, found
 #
-# At many states around a given one each motion of a basis (shifts, rotations, boosts, time) would change its charge at
-# some rate. The combinations of which all rates vanish are the symmetries: a null space, with a gap of its singular
-# values that says how surely.
+# `lj.symmetries` has a basis of transformations (shifts, rotations, boosts, time). At many states around a given one it
+# computes the rate at which the charge of each would change. The symmetries are the combinations for which all rates
+# vanish: a null space. The gap in the singular values says how certain it is.
 
 # %%
 found = {name: lj.symmetries(systems[name], *masses.ORBITS[name][:2], params[name]) for name in systems}
@@ -65,13 +65,14 @@ for name in ("plane", "helix"):
     print(found[name], "\n")
 
 # %% [markdown]
-# The helix has a screw: turn it by an angle $\varepsilon$ and it looks displaced along $z$ by $h\varepsilon/2\pi$, with
-# $h$ its pitch. What is conserved is $h\,p_z + 2\pi L_z$. (The solution that this notebook follows speaks of a
-# translation by $h$ with a rotation by $2\pi$, and prints $h\,p_z + L_z$. But a rotation by $2\pi$ does nothing at all,
-# and a translation by $h$ alone is a step, not a motion: it has no constant.)
+# The helix has a screw symmetry: turn it by an angle $\varepsilon$ and it looks displaced along $z$ by
+# $h\varepsilon/2\pi$, with $h$ its pitch. The conserved quantity is $h\,p_z + 2\pi L_z$. (The solution that this
+# notebook follows speaks of a translation by $h$ with a rotation by $2\pi$, and prints $h\,p_z + L_z$. But a rotation
+# by $2\pi$ does nothing at all, and a translation by $h$ alone is a discrete step, not a continuous motion: it
+# conserves nothing.)
 #
-# The constants of all seven, beside how much each changes on an orbit without any symmetry of its own, relative to its
-# largest value:
+# The table shows the constants of all seven, and how much each changes on an orbit without any symmetry of its own,
+# relative to its largest value:
 
 # %%
 G = lj.Generator
@@ -107,11 +108,11 @@ axis.grid(False)
 fig
 
 # %% [markdown]
-# "Constant" is a change below $10^{-6}$, the error of the integration; everything else moves by 4 % or more. It is what
-# was found. Two remarks on the list that the solution gives:
+# "Constant" means a change below $10^{-6}$, the error of the integration; everything else changes by 4 % or more. This
+# agrees with the symmetries found. Two remarks on the list that the solution gives:
 #
 # - The half plane's force is infinite. The solution treats it like the rest. A strip of the width $W$ pulls along $y$
-#   with $2 G\sigma\ln W$, which has no limit for $W \to \infty$; what remains without this uniform pull has one, and
+#   with $2 G\sigma\ln W$, which has no limit for $W \to \infty$; without this uniform pull the rest has a limit, and
 #   the symmetry of the half plane.
 # - $E$ belongs to the list everywhere: "only $p_x$", as the solution says, is $p_x$ and $E$. And along a direction of
 #   free flight a boost conserves $t\,p_x - x$, the place where the particle was at $t = 0$.
@@ -130,10 +131,10 @@ for power in (10, 20, 40):
     )
 
 # %% [markdown]
-# ## A claim, tested
+# ## Testing a claim
 #
 # Is the printed combination conserved? No, and `is_symmetry` says how fast it changes at the state that it was given:
-# its rate is predicted from the symmetry that is missing. Integrated along the orbit, that is the change itself.
+# the rate follows from the missing symmetry. Integrated along the orbit, it gives the change itself.
 
 # %%
 q, v, duration = masses.ORBITS["helix"]
@@ -165,10 +166,10 @@ axis.legend(fontsize=9, frameon=False, loc="center left", bbox_to_anchor=(1.0, 0
 fig
 
 # %% [markdown]
-# ### Let the potential say the factor
+# ### Find the factor from the potential
 #
-# In a sweep over the pitch, with left-handed helices among them, $h < 0$: for which $f$ is $h\,p_z + f L_z$ a symmetry?
-# The residual of the test says it, and it needs no orbit.
+# For which $f$ is $h\,p_z + f L_z$ a symmetry? This is a sweep over the pitch $h$, including left-handed helices with
+# $h < 0$. The residual of the test answers it, without any orbit.
 
 
 # %%
@@ -190,9 +191,9 @@ axis.legend(fontsize=9, frameon=False, loc="center left", bbox_to_anchor=(1.0, 0
 fig
 
 # %% [markdown]
-# ## Constraints, and frames that turn
+# ## Constraints, and rotating frames
 #
-# A constraint must allow the displacement, too. On the sliding wedge neither the momentum of the particle nor that of
+# A constraint must allow the displacement too. On the sliding wedge neither the momentum of the particle nor that of
 # the wedge is conserved, but their horizontal sum is, and with it the motion of the center of mass:
 
 # %%
@@ -205,9 +206,10 @@ both = lj.noether_charge(wedge.system, G.shift({"X": 1.0, "x": 1.0}))
 slide.plot(charges={"p_X": momenta["X"], "p_x": momenta["x"], "p_X + p_x": both})
 
 # %% [markdown]
-# Two springs on rails that turn with $\omega$ (scene `cross_rails`). In the frame of the rails nothing depends on time,
-# and the Jacobi integral stays. In the laboratory it is the energy, and does not stay, as the motor works; but time and
-# rotation together are a symmetry. It is the same constant: $h' = E - \omega L_z$.
+# The next system has two springs on rails that turn with $\omega$ (scene `cross_rails`). In the frame of the rails
+# nothing depends on time, and the Jacobi integral is constant. In the laboratory the Jacobi integral is the energy,
+# which is not constant because the motor does work; but a time shift combined with a rotation is a symmetry. It gives
+# the same constant: $h' = E - \omega L_z$.
 
 # %%
 at_lab = rails.to_lab(rails.PARAMS, 0.0, rails.Q0, rails.V0)
@@ -221,7 +223,7 @@ in_lab = laboratory[name](0.0, *at_lab, rails.PARAMS)
 print(f"the same number: {in_frame:.12f} and {in_lab:.12f}")
 
 # %% [markdown]
-# The equations of motion in the frame of the rails, with Coriolis' force and the centrifugal one, are read back from
+# `lj.latex` derives the equations of motion in the frame of the rails, with the Coriolis and centrifugal forces, from
 # the program that computes them:
 
 # %%
@@ -229,14 +231,13 @@ equations = lj.latex(rails.rotating_system, rails.Q0, rails.V0, rails.PARAMS)
 equations
 
 # %% [markdown]
-# ## Two constants from no symmetry of space
+# ## Two constants that come from no spatial symmetry
 #
-# Noether's list is not complete: `symmetries` looks among motions of points, and finds none of these. Inside the
-# elliptic cylinder $\Phi$ is quadratic, and the energies of the motions along $x$ and $y$ are constant one by one. The
+# Noether's list is not complete: `symmetries` searches among motions of points and finds none of these. Inside the
+# elliptic cylinder $\Phi$ is quadratic, and the energies of the motions along $x$ and $y$ are separately constant. The
 # dumbbell's two balls alone, on a rod without mass, are Euler's problem of two centres:
-# $(\mathbf r_1\times\mathbf v)\cdot(\mathbf r_2\times\mathbf v) + 2cG\,(M_2\cos\theta_2 - M_1\cos\theta_1)$ is
-# constant, until the rod is given a mass. (Outside the ellipse, the expressions for the two energies are those of the
-# inside.)
+# $(\mathbf r_1\times\mathbf v)\cdot(\mathbf r_2\times\mathbf v) + 2cG\,(M_2\cos\theta_2 - M_1\cos\theta_1)$ is constant
+# if the rod has no mass. (Outside the ellipse, the expressions for the two energies are those of the inside.)
 
 # %%
 ellipse = params["elliptic cylinder"]

@@ -56,7 +56,7 @@ start = {"R": 1.0, "r": 0.125}, {"R": 0.25, "r": -0.5}  # m, m/s
 # %% [markdown]
 # ## One motion, two frames
 #
-# Integrated once in each, and compared.
+# The motion is integrated once in each frame, and the results are compared.
 
 # %%
 ts = jnp.linspace(0.0, 2 * 2 * jnp.pi / params["omega"], 201)
@@ -81,13 +81,14 @@ right.legend(fontsize=9, frameon=False, loc="upper center", ncols=2)
 fig
 
 # %% [markdown]
-# The equilibrium position "is not $R_0$, but a smaller length", says the solution that this notebook follows. It is
-# the other way: the carriage circles about $R_0\,/\,(1 - m\omega^2/K) = 0.889$ m, and $R_0 = 0.75$ m.
+# The equilibrium position "is not $R_0$, but a smaller length", says the solution that this notebook follows. The
+# opposite is true: the carriage circles about $R_0\,/\,(1 - m\omega^2/K) = 0.889$ m, and $R_0 = 0.75$ m.
 #
 # ## Three energies
 #
-# The energy $E = T + V$ is what the laboratory's Lagrangian calls its Jacobi integral; the turning one's is $h'$. The
-# solution prints $h' = E - m\omega(R\dot r - \dot R r) - \frac{1}{2}m\omega^2(r^2 + R^2)$, which makes a third.
+# The Jacobi integral of the Lagrangian in the laboratory is the energy $E = T + V$; that of the rotating frame is $h'$.
+# The solution prints $h' = E - m\omega(R\dot r - \dot R r) - \frac{1}{2}m\omega^2(r^2 + R^2)$, which is a third
+# quantity.
 
 # %%
 E = in_lab.jacobi_integral()
@@ -107,14 +108,14 @@ axis.legend(fontsize=9, frameon=False, loc="center left", bbox_to_anchor=(1.0, 0
 fig
 
 # %% [markdown]
-# The factor of the last term is 1 and not ½. Then $h' = E - \omega L_z$: what the rails' torque adds to $\omega L_z$
-# it adds to the energy.
+# The factor of the last term is 1 and not ½. Then $h' = E - \omega L_z$: the torque of the rails adds the same amount
+# to $\omega L_z$ and to the energy.
 #
-# ## A check that cannot see
+# ## A check that cannot detect the error
 #
-# The solution's equations of motion have $-m\omega\dot R$ and $+m\omega\dot r$ for the Coriolis force, half of what
-# it is. They are Lagrange's equations of a Lagrangian with half of the mixed term. Does the conservation of $h'$
-# reveal the error?
+# The solution's equations of motion have $-m\omega\dot R$ and $+m\omega\dot r$ for the Coriolis force, half of the
+# correct value. They are the Lagrange equations of a Lagrangian with half of the mixed term. Does the conservation of
+# $h'$ reveal the error?
 
 
 # %%
@@ -144,14 +145,14 @@ for axis in axes[0]:
 fig
 
 # %% [markdown]
-# It does not: Coriolis' force does no work, whatever its factor. Compared with the laboratory, where there is no such
-# force at all, the printed equations are wrong by 17 cm within a second.
+# It does not: the Coriolis force does no work, whatever its factor. Compared with the laboratory frame, where there is
+# no such force, the printed equations are wrong by 17 cm within a second.
 #
 # ## Fast rails
 #
 # The centrifugal force overcomes a spring at $\omega^2 = k/m$ and $\omega^2 = K/m$. Is the carriage lost above these
 # speeds? The solution has it "pushed against the rotation axis". A sweep over both springs, at $\omega = 2.5$ rad/s,
-# asks how far away it is after 40 s, with either Coriolis force:
+# shows how far away it is after 40 s, with each of the two Coriolis forces:
 
 # %%
 squared = params["m"] * params["omega"] ** 2
@@ -187,11 +188,11 @@ axes[0, 1].legend(fontsize=9, loc="center left", bbox_to_anchor=(1.0, 0.5), fram
 fig
 
 # %% [markdown]
-# Between the critical speeds the carriage leaves, outwards. Above *both* it is held again, by Coriolis' force alone,
-# about $R = -R_0/(m\omega^2/K - 1)$, on the other side of the axis. The printed equations lose it in most of this
-# quadrant. The two frequencies are the roots of
+# Between the critical speeds the carriage moves away outwards. Above *both* it is held again, by the Coriolis force
+# alone, about $R = -R_0/(m\omega^2/K - 1)$, on the other side of the axis. The printed equations lose it in most of
+# this quadrant. The two frequencies are the roots of
 # $\Omega^4 - (\kappa + \mathrm K + 2\omega^2)\,\Omega^2 + (\kappa - \omega^2)(\mathrm K - \omega^2) = 0$ with
-# $\kappa = k/m$, $\mathrm K = K/m$; and stable is $(1 - m\omega^2/K)(1 - m\omega^2/k) > 0$.
+# $\kappa = k/m$, $\mathrm K = K/m$; and the motion is stable where $(1 - m\omega^2/K)(1 - m\omega^2/k) > 0$.
 #
 # "The springs are softened by the rotation" is half of the truth: the slow mode softens, the fast one stiffens.
 

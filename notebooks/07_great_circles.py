@@ -16,12 +16,12 @@
 #
 # The shortest path between two points of a sphere is an arc of a great circle (Goldstein, Derivation 2-4). With the
 # colatitude $\psi$ and the azimuth $\theta$, $\mathbf r = R\,(\sin\psi\cos\theta, \sin\psi\sin\theta, \cos\psi)$,
-# there are three ways to ask a Lagrangian for it:
+# there are three Lagrangians for it:
 #
-# - length itself, $l = R\int f\,\mathrm d\theta$ with $f = \sqrt{\sin^2\psi + \psi'^2}$: $\theta$ plays the part of
+# - length itself, $l = R\int f\,\mathrm d\theta$ with $f = \sqrt{\sin^2\psi + \psi'^2}$: $\theta$ plays the role of
 #   time;
 # - the kinetic energy of a free particle in $\psi$ and $\theta$: the arc length $s$ is time;
-# - a free particle in space, held on the sphere by a constraint.
+# - a free particle in space that a constraint keeps on the sphere.
 
 # %%
 import jax
@@ -91,12 +91,13 @@ axis.legend(fontsize=9, frameon=False, title="inclination", loc="center left", b
 fig
 
 # %% [markdown]
-# All are great circles, also those with $A^2 + B^2 = \tan^2 i > 1$; the bound would forbid every inclination above
-# 45°. The lines gather into a step as $i \to 90°$, and a meridian, $i = 90°$, is no function of $\theta$ at all.
+# All solutions are great circles, also those with $A^2 + B^2 = \tan^2 i > 1$; the bound would forbid every inclination
+# above 45°. The lines gather into a step as $i \to 90°$, and a meridian, $i = 90°$, is not a function of $\theta$ at
+# all.
 #
 # The same solution prints the first line of Lagrange's equation as
 # $\frac{\mathrm d}{\mathrm d\theta}\frac{\partial f}{\partial\psi'} - \frac{\partial f}{\partial\psi'}$; the last
-# term is $\partial f/\partial\psi$. A great circle is the judge:
+# term is $\partial f/\partial\psi$. A great circle decides which is right:
 
 
 # %%
@@ -116,8 +117,8 @@ print({name: f"{value:.1e}" for name, value in worst.items()})
 # %% [markdown]
 # ## Past the pole
 #
-# A great circle that passes the pole at the small distance $\varepsilon$, from one radian before to one radian after.
-# How many steps does each form take, at most 4096, and how far from its place does it arrive?
+# Follow a great circle that passes the pole at the small distance $\varepsilon$, from one radian before to one radian
+# after. How many steps does each form take (at most 4096), and how large is the error at the end?
 
 
 # %%
@@ -177,13 +178,14 @@ left.legend(fontsize=9, frameon=False)
 fig
 
 # %% [markdown]
-# With $\theta$ as time everything happens in a jump, and $\psi' = \mathrm d\psi/\mathrm d\theta$ is of the order of
-# $1/\varepsilon$ before and after it: six digits of the end are lost at $\varepsilon = 10^{-4}$, and nearer to the
-# pole it gives up. With $\psi$ and $\theta$ as coordinates of the free particle it is $\theta$ that jumps,
-# $\dot\theta = \sin\varepsilon/\sin^2\psi$; the steps follow it, ever more of them, as $\ln(1/\varepsilon)$. In space
-# nothing happens at all: eight steps, since the pole is a point like any other.
+# With $\theta$ as time the whole passage happens in a short interval, and $\psi' = \mathrm d\psi/\mathrm d\theta$ is of
+# the order of $1/\varepsilon$ before and after it: at $\varepsilon = 10^{-4}$ the end has lost six digits, and nearer
+# to the pole the integration fails. With $\psi$ and $\theta$ as coordinates of the free particle $\theta$ jumps,
+# $\dot\theta = \sin\varepsilon/\sin^2\psi$; the integration resolves this with more and more steps, as
+# $\ln(1/\varepsilon)$. In space nothing special happens: it takes eight steps, since the pole is a point like any
+# other.
 #
-# At the pole itself the first two have a singular mass matrix. They are refused, and say so:
+# At the pole itself the first two have a singular mass matrix. They are refused with a message:
 
 # %%
 refused = {}
@@ -198,10 +200,10 @@ for name, system, q, v in (
         print(f"{name}: {str(error).splitlines()[0]}")
 
 # %% [markdown]
-# ## In space the multiplier knows the curvature
+# ## In space the multiplier gives the curvature
 #
 # $\ddot{\mathbf r} = 2\lambda\,\mathbf r$ with $\lambda = -1/(2R^2)$ at unit speed: the sphere's pull on the
-# particle. Once around, over both poles, along a meridian that has no $A$ and $B$:
+# particle. This motion goes once around, over both poles, along a meridian, for which $A$ and $B$ do not exist:
 
 # %%
 once = jnp.linspace(0.0, 2 * jnp.pi, 49)
@@ -213,10 +215,10 @@ print(f"comes back to its start to {closes:.0e}; multiplier {orbit.multipliers['
 # %% [markdown]
 # ## Stationary is not shortest
 #
-# The solution looks for "the path with minimum length", and Lagrange's equation gives any *stationary* one. Displace
+# The solution looks for "the path with minimum length", but Lagrange's equation gives any *stationary* one. Displace
 # an arc of the angle $S$ sideways by $\epsilon\sin(\pi s/S)$: its length changes by
-# $\frac{1}{4}S\,[(\pi/S)^2 - 1]\,\epsilon^2$, and beyond half a turn it becomes shorter. Past the antipode a great
-# circle is a saddle.
+# $\frac{1}{4}S\,[(\pi/S)^2 - 1]\,\epsilon^2$, and beyond half a turn it becomes shorter. Past the antipode the length
+# of a great circle is a saddle point.
 
 # %%
 amplitude = jnp.linspace(-0.5, 0.5, 41)

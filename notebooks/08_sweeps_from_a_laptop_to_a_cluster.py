@@ -15,8 +15,8 @@
 # # Sweeps, from a laptop to a cluster
 #
 # A bead lies on a hoop that turns with the angular velocity $\omega$, at the angle $\psi_0$ from the bottom, and is
-# pushed upwards with one and the same velocity. For which $\omega$ and $\psi_0$ does it go over the top? Lengths are in
-# radii of the hoop, times in $\sqrt{a/g}$. The [page on sweeps](../docs/from-a-laptop-to-a-cluster.md) goes on from
+# always pushed upwards with the same velocity. For which $\omega$ and $\psi_0$ does it go over the top? Lengths are in
+# radii of the hoop, times in $\sqrt{a/g}$. The [page on sweeps](../docs/from-a-laptop-to-a-cluster.md) continues from
 # here to several devices and hosts.
 
 # %%
@@ -45,8 +45,8 @@ axes = {"omega": np.linspace(0.0, 4.0, 61), "start": np.linspace(0.02, np.pi - 0
 # %% [markdown]
 # ## One call
 #
-# `run` is one motion, an ordinary function of one point; `sweep` calls it at all points of the grid. This one is given
-# few steps, on purpose.
+# `run` computes one motion and is an ordinary function of one point; `sweep` calls it at all points of the grid. Here
+# the number of steps is limited too strictly on purpose.
 
 
 # %%
@@ -62,17 +62,17 @@ hasty = lj.sweep(run_with(250), axes, progress=False)
 print(hasty)
 
 # %% [markdown]
-# ## What failed says so
+# ## Failed points are reported
 #
-# A point that fails does not stop the others. Its value is NaN, grey in the map, and `status` keeps the reason; the
-# last angle is drawn in turns.
+# A point that fails does not stop the others. Its value is NaN (grey in the map), and `status` records the reason; the
+# last angle is drawn in units of full turns.
 
 # %%
 turns = lambda angle: angle / (2 * np.pi)
 hasty.plot(turns)
 
 # %% [markdown]
-# `resweep` runs those points again, with other settings, and keeps the rest.
+# `resweep` runs those points again with other settings and keeps the rest.
 
 # %%
 swept = hasty.resweep(run_with(4096))
@@ -82,8 +82,8 @@ print(swept)
 # ## Who goes over the top
 #
 # A bead that goes over the top has a last angle beyond $\pi$. In the frame of the hoop
-# $h = \frac{1}{2}\dot\psi^2 - \frac{1}{2}\omega^2\sin^2\psi - \cos\psi$ is constant, and 1 for a bead at rest on
-# top: the black line, $h = 1$, should part the two. The map is computed from motion alone.
+# $h = \frac{1}{2}\dot\psi^2 - \frac{1}{2}\omega^2\sin^2\psi - \cos\psi$ is constant, and it is 1 for a bead at rest on
+# top: the black line, $h = 1$, should separate the two cases. The map itself is computed only from motions.
 
 # %%
 over = swept.values > np.pi
@@ -104,12 +104,12 @@ fig.colorbar(shown, label="turns after 40 units of time")
 fig
 
 # %% [markdown]
-# The faster the hoop, the nearer to the top must the bead start: from the side of a fast hoop the push has to carry it
-# inwards, against what drives it outwards. Near the bottom it fails at any speed, for want of height.
+# The faster the hoop, the nearer to the top the bead must start: from the side of a fast hoop the push has to carry it
+# inwards, against the centrifugal force. Near the bottom it fails at any speed, because it does not reach the height.
 #
 # ## With names
 #
-# `to_xarray` gives values, statuses and axes with their names (with xarray: `pip install "lagjax[data]"`).
+# `to_xarray` gives values, statuses and axes with their names (it needs xarray: `pip install "lagjax[data]"`).
 
 # %%
 data = swept.to_xarray()
@@ -120,9 +120,9 @@ print(f"at omega = {float(one.omega):.2f} the first start that goes over: {float
 # %% [markdown]
 # ## A store on disk, and a process that dies
 #
-# With `store=` blocks of points are written as they are finished. Here three processes share the sweep, and of these
-# only the first lives: it does its `part`, every third block. What is on disk can be looked at by anybody, also while
-# others write.
+# With `store=` blocks of points are written when they are finished. Here three processes share the sweep, and only the
+# first survives: it computes its `part`, every third block. Any process can read what is on disk, even while others
+# write.
 
 # %%
 folder = tempfile.TemporaryDirectory()
@@ -134,8 +134,8 @@ print(on_disk.counts())
 on_disk.plot()
 
 # %% [markdown]
-# The same call without `part` does what is missing. So it does after Ctrl-C, a crash or a power cut: what was finished
-# is not computed again. Called once more it finds all of it done.
+# The same call without `part` computes what is missing. This also works after Ctrl-C, a crash or a power cut: finished
+# blocks are not computed again. A further call finds everything done.
 
 # %%
 rest = lj.sweep(run, axes, store=store, progress=False)
@@ -143,7 +143,7 @@ again = lj.sweep(run, axes, store=store, progress=False)
 print(f"computed by the first process {first.ran}, by the second {rest.ran}, by the last call {again.ran}")
 
 # %% [markdown]
-# A store remembers what it belongs to, and refuses another sweep.
+# A store records which sweep it belongs to, and refuses another one.
 
 # %%
 try:

@@ -12,11 +12,11 @@
 # ---
 
 # %% [markdown]
-# # Which numbers of a double pendulum does its motion show?
+# # Which parameters of a double pendulum does its motion determine?
 #
-# Two arms swing freely, and a camera or an encoder writes down two angles. The arms have masses, lengths, moments of
-# inertia; the motion does not show them. Angles are absolute, $\pi$ hangs down. With $B$ the second arm's moment of
-# inertia about its joint, the Lagrangian has five coefficients and friction in the two joints two more:
+# Two arms swing freely, and a camera or an encoder records two angles. The arms have masses, lengths and moments of
+# inertia, but the motion does not determine them. Angles are absolute, $\pi$ hangs down. With $B$ the second arm's
+# moment of inertia about its joint, the Lagrangian has five coefficients and friction in the two joints two more:
 #
 # $$L = \tfrac12 A\dot\theta_1^2 + \tfrac12 B\dot\theta_2^2 + C\dot\theta_1\dot\theta_2\cos(\theta_1-\theta_2)
 # - D\cos\theta_1 - E\cos\theta_2, \qquad R = \tfrac12 k_1\dot\theta_1^2 + \tfrac12 k_2(\dot\theta_2-\dot\theta_1)^2$$
@@ -105,8 +105,8 @@ fig
 # %% [markdown]
 # ## Before anything is fitted
 #
-# Seven coefficients in SI units, and a record of this kind: what will it tell? `identifiability` needs the times and a
-# guess, not the measured values. The first two seconds are enough to ask.
+# There are seven coefficients in SI units. Which of them will a record of this kind determine? `identifiability` needs
+# the times and a guess, not the measured values. The first two seconds are enough for this question.
 
 # %%
 early = t < t[0] + 2.0
@@ -115,13 +115,13 @@ asked = lj.identifiability(pendulum, first, coefficients, **solve)
 print(asked)
 
 # %% [markdown]
-# Six ratios of seven numbers: $L$ and $R$ times any factor give the same motion. So $B$ is held at 1, and the other six
-# are what there is to be found. How many kilograms the arms have takes a balance, not a camera.
+# The record determines six ratios of the seven numbers: multiplying $L$ and $R$ by any factor gives the same motion. So
+# $B$ is fixed at 1, and the other six are fitted. To find the masses of the arms you need a balance, not a camera.
 #
 # ## The fit, in windows
 #
-# Every guess is 15 to 20 % off, those of friction by a factor of two. The record is cut into windows of 0.6 s, each of
-# which starts from a state of its own; the coefficients are those of all of them.
+# Every guess is 15 to 20 % off, those of friction by a factor of two. The record is cut into windows of 0.6 s. Each
+# window has its own initial state, and all share the coefficients.
 
 # %%
 off = {"A": 1.2, "C": 0.85, "D": 1.2, "E": 0.85, "k1": 2.0, "k2": 2.0}
@@ -131,8 +131,8 @@ found = lj.fit(pendulum, record, guess, free=list(off), units=units, window=0.6,
 print(found)
 
 # %% [markdown]
-# Residuals as large as the errors of the measurements, and as white: nothing of the motion is left over. Against the
-# numbers that made the record:
+# The residuals are as large as the measurement errors, and as white: they contain nothing of the motion any more. Here
+# are the results next to the numbers that made the record:
 
 # %%
 truth = np.array([published[name] for name in found.names])
@@ -153,7 +153,8 @@ fig
 # %% [markdown]
 # ## Why windows
 #
-# The same coefficients, and one start for all of the record: the fitted motion goes on from the first window.
+# Here are the same coefficients with one initial state for the whole record: the fitted motion continues from the first
+# window.
 
 # %%
 alone = found.motion(ts=t)
@@ -172,10 +173,10 @@ axis.legend(fontsize=9, frameon=False, loc="center right")
 fig
 
 # %% [markdown]
-# The motion is chaotic: the small error of the start grows until the phase is lost, and what was measured later says
-# nothing about that start any more. A fit with one start for all 20 s would look for its minimum among countless
-# others. A window must be shorter than that time; how long, depends on how wildly the arms swing. Within a window the
-# motion is as tame as any other.
+# The motion is chaotic: the small error of the initial state grows until the phase is lost, and later measurements say
+# nothing about that state any more. A fit with one initial state for all 20 s would have to find its minimum among
+# countless others. A window must be shorter than that time; how long it may be depends on how violently the arms swing.
+# Within a window the motion behaves as well as any other.
 
 # %%
 assert asked.rank == 6 and asked.combined() == ["A/B", "A/C", "A/D", "A/E", "A/k1", "A/k2"]

@@ -14,9 +14,9 @@
 # %% [markdown]
 # # Can a network learn a potential from motion?
 #
-# A unit mass moves along a line in a potential that nobody knows. What is measured is where it is. In $L = \frac{1}{2}
-# \dot q^2 - V(q)$ a small network takes the place of $V$, and its weights are fitted as masses or lengths would be.
-# The motion is integrated from $L$, so nothing needs to be differentiated twice in the data.
+# A unit mass moves along a line in an unknown potential. Its position is measured. In
+# $L = \frac{1}{2} \dot q^2 - V(q)$ a small network replaces $V$, and its weights are fitted as masses or lengths would
+# be. The motion is integrated from $L$, so the data need not be differentiated twice.
 
 # %%
 import warnings
@@ -53,8 +53,8 @@ network = eqx.nn.MLP("scalar", "scalar", 10, 1, jnp.tanh, key=jax.random.key(0))
 # %% [markdown]
 # ## Six records
 #
-# The truth is a double well of depth 1/4. Six motions of 6 s from different starts, 201 times each, with errors of
-# 0.002: about one valley, about the other, and through both.
+# The truth is a double well of depth 1/4. There are six motions of 6 s from different starts, each measured at 201
+# times with errors of 0.002: about one valley, about the other, and through both.
 
 # %%
 starts = [(-1.7, 0.0), (1.6, 0.0), (0.1, 0.0), (-0.4, 0.0), (0.7, 0.9), (-1.2, -0.3)]
@@ -76,12 +76,13 @@ fig
 # %% [markdown]
 # ## Training is a fit
 #
-# Windows of 1 s, each from a state of its own, keep the search out of wrong minima; windows of 2 s see the potential
-# better, and go on from what the first fit found. A prior on the weights (0 ± 10) keeps them from running away. The
-# method is that for masses and lengths, Levenberg-Marquardt.
+# Windows of 1 s, each with its own initial state, keep the search out of wrong minima; windows of 2 s are more
+# sensitive to the potential, and continue from the result of the first fit. A prior on the weights (0 ± 10) keeps them
+# from diverging. The method is the same as for masses and lengths, Levenberg-Marquardt.
 #
-# Single weights mean nothing: neurons can be exchanged, and a constant added to $V$ leaves no trace in the motion. So
-# the warnings that some are not determined, and that the search still moves them, are no news here, and are not shown.
+# Single weights mean nothing: neurons can be exchanged, and a constant added to $V$ does not change the motion. So
+# warnings that some weights are not determined, and that the search still moves them, are expected here and are not
+# shown.
 
 # %%
 warnings.filterwarnings("ignore", category=lj.FitWarning)
@@ -94,8 +95,8 @@ for fit in (first, found):
 print(found.identifiability)
 
 # %% [markdown]
-# The residuals are those of the measurements. And the potential? The constant is chosen so that the mean difference
-# over the visited range is zero.
+# The residuals are as large as the measurement errors. How good is the potential? The constant is chosen so that the
+# mean difference over the visited range is zero.
 
 # %%
 wide = np.linspace(-2.6, 2.6, 521)
@@ -121,14 +122,14 @@ right.set(xlabel="q", ylabel="|learned - truth| of V", title="Outside, wrong by 
 fig
 
 # %% [markdown]
-# How small the error is depends on where the search is stopped. These settings are the best of a handful that were
-# tried, with the truth in view; others whose residuals were as small were wrong by up to 3 %, most of it at the rim of
+# The size of the error depends on where the search is stopped. These settings are the best of a few that were tried,
+# chosen with knowledge of the truth; others with equally small residuals were wrong by up to 3 %, mostly at the edge of
 # the visited range, where a record only turns around.
 #
 # ## A motion that was not in the records
 #
-# From $q = -1$ with the velocity 0.9, and five times as long as a record. It has a constant energy, without having been
-# told of energies: any network gives some Lagrangian without time in it.
+# This motion starts from $q = -1$ with the velocity 0.9 and is five times as long as a record. Its energy is constant,
+# although nothing was said about energy in training: any network gives some Lagrangian that does not depend on time.
 
 # %%
 long = np.linspace(0.0, 30.0, 601)
@@ -154,17 +155,18 @@ right.legend(fontsize=9, frameon=False, loc="lower left")
 fig
 
 # %% [markdown]
-# Outside of the visited range nothing was measured, and the network goes on as its neurons happen to: its walls are
-# others, and so is the motion from $q = 2.5$. Energy is conserved there as well. That a model conserves
-# energy does not say that it is right.
+# Outside the visited range nothing was measured, and the network extrapolates arbitrarily: its walls are different, and
+# so is the motion from $q = 2.5$. Energy is conserved there as well. A model that conserves energy is not therefore
+# right.
 
 # %% [markdown]
 # ## Where is it wrong?
 #
-# Nobody who needs a network has the truth to lay beside it. But other networks can be laid beside it: the same fits
-# from other random weights. Where the records decide, all come to the same accelerations (to compare potentials would
-# not do: each has a constant of its own). Where nothing was measured, each goes on in its own way. One that does not
-# come down to the errors of measurement has not converged, and is left out; that needs no truth either.
+# If you need a network, you do not have the truth to compare with. But you can compare with other networks: the same
+# fits from other random weights. Where the records determine the motion, all networks give the same accelerations
+# (potentials cannot be compared: each has its own constant). Where nothing was measured, each extrapolates differently.
+# A network whose residuals do not reach the measurement errors has not converged and is left out; that needs no truth
+# either.
 
 # %%
 fits = [found]
@@ -200,14 +202,15 @@ right.legend(fontsize=9, frameon=False, loc="upper left")
 fig
 
 # %% [markdown]
-# The spread says where, and about how much: over the whole range it ranks the errors well, since it rises by a factor
-# of a thousand where the records end, and begins to rise before, at the rim. It is no error bar. Within the visited
-# range it hardly ranks the small errors that are left, and what all members get wrong alike does not show in it.
+# The spread shows where the network is wrong, and roughly by how much: over the whole range it ranks the errors well,
+# since it rises by a factor of a thousand where the records end, and starts to rise before that, at the edge. It is not
+# an error bar. Within the visited range it hardly ranks the small remaining errors, and it does not show errors that
+# all members share.
 #
 # ## A record that leaves
 #
-# One more record can say the same. It was held back; it starts where the others were, at $q = -1$, but with the
-# velocity 2, which takes it beyond them. `free=[]` fits nothing but the start of each window of 1 s.
+# One more record can show the same. It was held back; it starts where the others were, at $q = -1$, but with the
+# velocity 2, which carries it beyond them. `free=[]` fits only the initial state of each window of 1 s.
 
 # %%
 beyond = lj.integrate(truth, -1.0, 2.0, ts=ts, **tight)
@@ -237,10 +240,9 @@ below.set(xlabel="t / s", ylabel="residual / sigma", title="Lines: a new start o
 fig
 
 # %% [markdown]
-# In windows that stay inside, or step out for a moment at one end, the residuals are errors of measurement. In the two
-# that are outside for longer they are up to 30 sigma, and follow a curve. So it is with any record that is held back,
-# and no ensemble is needed; but the ensemble says where to expect it before there is such a record, and so where the
-# next one should go.
+# In windows that stay inside, or leave briefly at one end, the residuals are measurement errors. In the two windows
+# that are outside for longer they reach 30 sigma and follow a curve. Any held-back record shows this without an
+# ensemble; but the ensemble says where to expect it before there is such a record, and so where to measure next.
 
 # %%
 assert 0.8 < found.chi2 / found.freedom < 1.15 and len(found.names) == 31

@@ -14,8 +14,8 @@
 # %% [markdown]
 # # Your own system: a checklist
 #
-# How does one know that a system of one's own is the one that was meant? Here it is a ladder that slides down a wall.
-# Each step below asks one thing more of it; at the end stands what errors look like, and what they ask for.
+# How do you know that your system is the one you meant? The example is a ladder that slides down a wall. Each step
+# below checks one more thing; the end shows what error messages look like and what they ask for.
 
 # %%
 import warnings
@@ -44,8 +44,8 @@ params = {"m": 10.0, "l": 2.5, "g": 9.81}
 # %% [markdown]
 # ## 1. Is it the system that I meant?
 #
-# `explain` counts freedoms and reads the mass matrix. A ladder on a wall and a floor has one freedom; two would mean
-# that a constraint is missing, none that one is too many.
+# `explain` counts degrees of freedom and analyses the mass matrix. A ladder on a wall and a floor has one degree of
+# freedom; two would mean that a constraint is missing, none that there is one too many.
 
 # %%
 q0, v0 = {"x": 0.9, "y": 2.3, "angle": 1.2}, {"x": 0.0, "y": 0.0, "angle": 0.0}
@@ -55,8 +55,8 @@ explained
 # %% [markdown]
 # ## 2. A start that satisfies the constraints
 #
-# The centre above is a guess: `explain` says by how much it is off. With the angle held, the nearest state on the
-# constraints is unique.
+# The centre above is a guess: `explain` says by how much it violates the constraints. If the angle is held, the nearest
+# state that satisfies the constraints is unique.
 
 # %%
 q0, v0 = lj.consistent_state(ladder, 0.0, q0, v0, params, hold="angle")
@@ -65,10 +65,10 @@ a, forces = lj.accelerations(ladder, 0.0, q0, v0, params)
 print(f"angular acceleration {a['angle']:.6f}, by hand {-0.75 * 9.81 / 2.5 * np.cos(1.2):.6f}")
 
 # %% [markdown]
-# ## 3. Integrate, and look at what it says of itself
+# ## 3. Integrate, and look at the reported accuracy
 #
-# The residual says whether the constraints held, the change of the Jacobi integral (here the energy: nothing depends on
-# time) whether the motion is accurate. Both are relative, and both at round-off here.
+# The residual shows whether the constraints were satisfied; the change of the Jacobi integral (here the energy, because
+# nothing depends on time) shows whether the motion is accurate. Both are relative, and both are at round-off here.
 
 # %%
 ts = jnp.linspace(0.0, 1.2, 61)
@@ -79,7 +79,7 @@ traj
 traj.plot()
 
 # %% [markdown]
-# A wrong sign is seen sooner in a film than in a table.
+# You notice a wrong sign sooner in an animation than in a table.
 
 # %%
 traj.animate(
@@ -91,10 +91,10 @@ traj.animate(
 )
 
 # %% [markdown]
-# ## 4. The same in other coordinates
+# ## 4. Compare with other coordinates
 #
-# The angle alone describes the ladder too. Nothing was copied from the first description but the numbers, so that a
-# mistake in either shows.
+# The angle alone describes the ladder too. Only the numbers were copied from the first description, so a mistake in
+# either one shows.
 
 
 # %%
@@ -111,9 +111,9 @@ print(f"the two differ by {apart:.1e}")
 # %% [markdown]
 # ## 5. Halve the tolerance
 #
-# The change is about the error of the first answer. Each output is the end of a step: 61 of them would hide how long
-# steps may be, so this asks for the last alone. The default method is too good for such a short fall to show anything;
-# with one of order 5 there is something to see.
+# The change is about the error of the first answer. Each output is the end of a step: 61 outputs would hide how long
+# the steps may be, so this requests only the last one. The default method is too accurate to show anything in such a
+# short fall, so this uses a method of order 5.
 
 
 # %%
@@ -130,16 +130,16 @@ for tolerance in (1e-4, 1e-6, 1e-8):
     print(f"{tolerance:.0e}: halved it changes by {halved[-1][0]:.1e}; the error was {halved[-1][1]:.1e}")
 
 # %% [markdown]
-# What is narrower than a step is passed over, and no tolerance tells: a push of a tenth of a second within a hundred, a
-# thin barrier. `max_step=` is the longest step (no step is longer than the time between two outputs either), and
-# `jump_ts=` names the times at which a force is switched. Where something narrow may be, compare with a `max_step` of
-# its width.
+# A step can jump over anything narrower than itself, whatever the tolerance: a push of a tenth of a second within a
+# hundred, or a thin barrier. `max_step=` is the longest step (no step is longer than the time between two outputs
+# either), and `jump_ts=` gives the times at which a force is switched. If there may be something narrow, compare with a
+# `max_step` of its width.
 
 # %% [markdown]
-# ## 6. A gradient against a difference
+# ## 6. Compare a gradient with a finite difference
 #
-# The angle at the end, by gravity. A difference of two motions keeps about half of the digits. (Through constraints the
-# gradient is asked for in the same way, and takes longer to compile.)
+# Differentiate the final angle with respect to gravity. A difference of two motions keeps about half of the digits.
+# (With constraints you request the gradient in the same way, and it takes longer to compile.)
 
 # %%
 gradient = jax.jacfwd(angle_at_the_end)(9.81)
@@ -148,11 +148,11 @@ difference = (angle_at_the_end(9.81 + step) - angle_at_the_end(9.81 - step)) / (
 print(f"gradient {gradient:.9f}, difference {difference:.9f}")
 
 # %% [markdown]
-# ## 7. Something known by hand
+# ## 7. Check a number known by hand
 #
 # Every system has a number that can be worked out on paper. The wall can only push, and its multiplier is its force:
-# where it vanishes the ladder leaves the wall, which is when its top has come down by a third. After that the
-# constraint pulls, which a wall does not.
+# when it vanishes the ladder leaves the wall, which happens when its top has come down by a third. After that the
+# constraint pulls, which a wall cannot do.
 
 # %%
 force = np.asarray(traj.multipliers["wall"])
@@ -163,11 +163,11 @@ leaves_at = np.polyval(np.polyfit(force[part], height[part], 3), 0.0)
 print(f"the wall is left at {leaves_at:.6f} of the first height")
 
 # %% [markdown]
-# ## 8. Slips that only you can see
+# ## 8. Mistakes that only you can see
 #
-# $L = T + V$ in place of $T - V$ is a Lagrangian, too: that of a ladder that falls upwards. Its Jacobi integral is as
-# constant as the right one, so that nothing in the print tells. What tells is a sign that is known by hand: let go at
-# rest, everything goes to where V is lower.
+# $L = T + V$ instead of $T - V$ is a Lagrangian too: that of a ladder that falls upwards. Its Jacobi integral is as
+# constant as the right one, so the printed result does not show the mistake. A sign known by hand does: released from
+# rest, everything moves to where V is lower.
 
 
 # %%
@@ -183,9 +183,9 @@ print(f"angular acceleration at rest: {of_rest(one_angle):.3f} with T - V, {of_r
 print(f"change of the Jacobi integral with T + V: {climbed.drift():.0e}")
 
 # %% [markdown]
-# An angle is in radians. 60.0, meant in degrees, is nine turns and a half: a motion like any other, somewhere else. A
-# place that is known by hand tells, or the film: here the height of the centre at the start. `explain` tells the angles
-# of more than a turn.
+# Angles are in radians. 60.0, meant in degrees, is nine and a half turns: this gives an ordinary motion in the wrong
+# place. A position known by hand shows it (here the height of the centre at the start), or the animation. `explain`
+# reports angles of more than a full turn.
 
 # %%
 by_hand = 2.5 * np.sqrt(3) / 2
@@ -193,8 +193,8 @@ for start in (60.0, np.radians(60.0)):
     print(f"angle {start:.4g}: the centre is at {params['l'] * np.sin(start):+.3f}, by hand at {by_hand:+.3f}")
 
 # %% [markdown]
-# A force given in place of Rayleigh's function R, whose force is $-\partial R / \partial v$, is seen: no
-# dissipation changes its sign with the velocity.
+# If you give a force instead of Rayleigh's function R, whose force is $-\partial R / \partial v$, lagjax notices: no
+# dissipation function changes its sign with the velocity.
 
 # %%
 dragged = lj.System(by_its_angle, dissipation=lambda t, q, v, params: -3.0 * v)
@@ -206,7 +206,7 @@ print(told[0].message)
 # %% [markdown]
 # ## What errors look like
 #
-# Each says what happened, the usual cause, and the fix. These are the commonest.
+# Each message says what happened, the usual cause, and the fix. These are the most common ones.
 
 
 # %%
@@ -230,8 +230,8 @@ says(lambda: move(method=diffrax.Dopri5))
 
 
 # %% [markdown]
-# In the functions: NumPy, which knows no derivatives; an `if`; arguments in another order; an equation in place of its
-# residual.
+# Mistakes in the functions: NumPy, which has no derivatives; an `if`; arguments in the wrong order; an equation instead
+# of its residual.
 
 
 # %%
@@ -251,7 +251,8 @@ says(lambda: move(lj.System(lambda q, v, t, params: 0.5 * v**2), 1.0, 0.0))
 says(lambda: move(lj.System(lagrangian, {"floor": lj.Holonomic(lambda t, q, params: q["y"] == 0.0)})))
 
 # %% [markdown]
-# In the mechanics: a start off the constraints, a coordinate without kinetic energy, two constraints that disagree.
+# Mistakes in the mechanics: a start that violates the constraints, a coordinate without kinetic energy, two constraints
+# that contradict each other.
 
 # %%
 late = lj.Holonomic(lambda t, q, params: q["x"] - params["l"] * jnp.cos(q["angle"]) - 0.1 * t**2)
@@ -261,16 +262,16 @@ says(lambda: lj.accelerations(massless, 0.0, {"a": 1.0, "b": 0.5}, {"a": 0.0, "b
 says(lambda: lj.accelerations(lj.System(lagrangian, {"wall": wall, "late": late}), 0.0, q0, v0, params))
 
 # %% [markdown]
-# A tolerance that the numbers cannot reach: without `jax_enable_x64` everything is in single precision.
+# A tolerance below the precision of the numbers: without `jax_enable_x64` everything is in single precision.
 
 # %%
 single = lambda tree: jax.tree.map(np.float32, tree)
 says(lambda: move(q0=single(q0), v0=single(v0), rtol=1e-10))
 
 # %% [markdown]
-# The numbers above: one freedom, energy and constraints kept to round-off, two descriptions that agree to 12 digits,
-# changes that are about the errors, a gradient that agrees with the difference to six digits, and a wall that is left
-# at two thirds of the height.
+# The numbers above: one degree of freedom, energy and constraints kept to round-off, two descriptions that agree to 12
+# digits, changes that are about the size of the errors, a gradient that agrees with the difference to six digits, and a
+# ladder that leaves the wall at two thirds of the height.
 
 # %%
 assert explained.degrees_of_freedom == 1

@@ -14,9 +14,9 @@
 # %% [markdown]
 # # Billiards, bounces and a toy woodpecker
 #
-# A motion in phases: each phase is a `lj.System` with constraints and forces of its own, and a `lj.Switch` leads from
-# one to the next where a guard crosses zero. Times of switches are found to the accuracy of the solve, velocities jump
-# by the laws of impact, and derivatives go through all of it.
+# A motion can have several phases: each phase is a `lj.System` with its own constraints and forces, and a `lj.Switch`
+# leads from one to the next when a guard crosses zero. Switching times are found to the accuracy of the solve,
+# velocities jump by the laws of impact, and derivatives work through all of it.
 
 # %%
 import jax
@@ -34,8 +34,8 @@ matplotlib.rcParams["savefig.dpi"] = 90  # small pictures
 # %% [markdown]
 # ## A ball that comes to rest
 #
-# It falls in air, and loses $1 - e^2$ of its energy at every impact. There would be infinitely many of them in a finite
-# time: `rest=` names the phase in which it stays once they have become too slow to matter.
+# The ball falls in air and loses $1 - e^2$ of its energy at every impact. There would be infinitely many impacts in a
+# finite time: `rest=` names the phase in which the ball stays once they have become too slow to matter.
 
 
 # %%
@@ -63,8 +63,8 @@ bounced
 lj.explain(ball, 0.0, 1.0, 0.0, air)
 
 # %% [markdown]
-# The **energy ledger** says where the energy went: it integrates the power of every force, and compares with what the
-# energy did. What is left over, the closure, is the error of the motion.
+# The **energy ledger** shows where the energy went: it integrates the power of every force and compares the sum with
+# the change of the energy. The difference, the closure, is the error of the motion.
 
 # %%
 ledger = lj.energy_ledger(bounced)
@@ -74,7 +74,7 @@ ledger
 ledger.plot()
 
 # %% [markdown]
-# A drag of the wrong sign is seen at once:
+# A drag force with the wrong sign shows at once:
 
 # %%
 wrong = lj.System(falling, dissipation=lambda *state: -drag(*state))
@@ -85,7 +85,7 @@ lj.energy_ledger(bounced, lj.Hybrid({"flying": wrong, "lying": lying}, [bounce],
 #
 # On an elliptic table the product of the angular momenta about the two foci never changes; it is as regular as a
 # motion can be. A stadium, two half circles joined by straight sides, is chaotic (Bunimovich 1979). The derivative of
-# the state by the initial direction tells them apart: it goes through every bounce.
+# the state with respect to the initial direction distinguishes them: it works through every bounce.
 
 
 # %%
@@ -136,9 +136,9 @@ fig
 
 
 # %% [markdown]
-# On the ellipse the derivative grows along a straight line, on the stadium by ten in every three bounces. No
-# computation follows a game there for long, and the derivative says how long: an error of $10^{-9}$ at the start is as
-# large as the table after thirty bounces. The error estimate says the same.
+# On the ellipse the derivative grows linearly, on the stadium by a factor of ten in every three bounces. No computation
+# can follow a game there for long, and the derivative says for how long: an error of $10^{-9}$ at the start is as large
+# as the table after thirty bounces. The error estimate says the same.
 
 # %%
 for name, game in games.items():
@@ -152,10 +152,10 @@ print(
 # %% [markdown]
 # ## A toy woodpecker
 #
-# The bird hangs by a spring on a sleeve that is a little wider than its pole. When the bird swings out, an edge of the
-# sleeve jams; when it swings back the sleeve slips and falls, until an edge jams again, and the beak hits the pole
-# (Glocker 1995). `lagjax.scenes.woodpecker` has it in four phases with friction: in the impacts, and on the multiplier
-# of the contact.
+# The bird hangs by a spring from a sleeve that is a little wider than its pole. When the bird swings out, an edge of
+# the sleeve jams; when it swings back the sleeve slips and falls, until an edge jams again, and the beak hits the pole
+# (Glocker 1995). `lagjax.scenes.woodpecker` models it in four phases with friction, both in the impacts and as a force
+# that depends on the contact's multiplier.
 
 # %%
 toy = woodpecker.motion(woodpecker.PARAMS, np.linspace(0.0, 0.18, 361), estimate_error=False)

@@ -12,11 +12,11 @@
 # ---
 
 # %% [markdown]
-# # What to measure next, and how sure one may be
+# # What to measure next, and how certain the result is
 #
 # A pendulum swings in air, and three seconds of it have been measured. How strong is the friction? The record says
-# little: it is short. Before the next run is made one can say which run would tell, and when to look at it. And after
-# it: is the ± of a fit all there is to say of what the data know?
+# little, because it is short. Before the next run we can compute which run would determine it, and at which times to
+# measure. After the run there is another question: does the ± of a fit describe everything that the data say?
 #
 # $$L = \tfrac12\dot\theta^2 + \omega^2\cos\theta, \qquad R = \tfrac12 c\,\dot\theta^2$$
 
@@ -59,12 +59,12 @@ found = lj.fit(pendulum, record, {"w2": 7.0, "c": 0.1}, progress=False)
 print(found)
 
 # %% [markdown]
-# ## Which run would tell
+# ## Which run would determine it
 #
-# Ten seconds more can be measured, with forty samples again, from any angle. `identifiability` is given one `Record`
-# for each angle: its times and its start, which will be as unknown as the first one's. What will be measured does not
-# matter, so there are zeros in them. Nothing is fitted; the slopes of the motion at the estimate say how large the ±
-# of `c` will be.
+# Ten more seconds can be measured, with forty samples again, from any angle. `identifiability` gets one `Record` for
+# each angle: its times and its initial state, which will be as unknown as that of the first run. The measured values do
+# not matter, so they are zeros. Nothing is fitted; the derivatives of the motion at the estimate say how large the ± of
+# `c` will be.
 
 # %%
 long = np.linspace(0.0, 10.0, 40)
@@ -85,14 +85,14 @@ axis.set_title("A run from near the top tells thirty times more than a small swi
 fig
 
 # %% [markdown]
-# A small swing shows friction by how much lower it comes back. In a large one the period depends on the amplitude:
-# what friction takes away changes the rhythm, and a rhythm can be timed over many turns. Nearest to the top it depends
-# on it most; how exactly the bob was let go there does not matter, since the start is found with the rest.
+# In a small swing friction shows only in the decrease of the amplitude. In a large swing the period depends on the
+# amplitude: friction changes the period, which can be timed over many oscillations. The dependence is strongest nearest
+# to the top; how exactly the bob was released there does not matter, since the initial state is fitted too.
 #
-# ## And when to look
+# ## When to measure
 #
-# Of the run from 2.0 only a few times matter. `at_best(k)` finds which: one time of a set after the other is
-# exchanged for a better one.
+# Only a few times of the run from 2.0 matter. `at_best(k)` finds them by exchanging one time of a set after the other
+# for a better one.
 
 # %%
 run = told["from 2.0"]
@@ -114,7 +114,7 @@ fig
 # %% [markdown]
 # ## The run is made
 #
-# With the record of the second run the ± is what it was said to be.
+# With the record of the second run the ± is as predicted.
 
 # %%
 records = [record, lj.Record(long, q=measured(long, 2.0, 1), q0=2.0, v0=0.0, sigma=sigma)]
@@ -122,19 +122,19 @@ both = lj.fit(pendulum, records, found.params, progress=False)
 print(f"c = {both.params['c']:.5f} ± {both.sd[0]:.5f}; foretold ± {run.sd:.5f}, before ± {found.sd[0]:.5f}")
 
 # %% [markdown]
-# ## All of the distribution
+# ## The whole distribution
 #
-# A ± belongs to a normal distribution, and that of Gauss and Newton looks at first derivatives only. `laplace` takes
-# the true second ones, and says where these differ. Here they do not: 80 samples with small errors.
+# A ± belongs to a normal distribution, and the Gauss-Newton approximation uses only first derivatives. `laplace` uses
+# the true second derivatives and says where the two differ. Here they do not: there are 80 samples with small errors.
 
 # %%
 print(both.laplace())
 
 # %% [markdown]
-# It is different where data are few and rough. Without friction, let go at rest from an unknown angle, seen four
-# times with errors of 0.2 rad: a faster pendulum on a larger swing does nearly the same. All of that is known
-# exactly: the motion from rest is $\theta(t) = 2\arcsin(k\,\mathrm{cd}(\omega t, k))$ with $k = \sin(\theta_0/2)$,
-# and a sum over a grid of two numbers is the posterior.
+# This changes with few and noisy data. Take a pendulum without friction, released at rest from an unknown angle and
+# measured four times with errors of 0.2 rad: a faster pendulum with a larger swing moves nearly the same. Everything is
+# known exactly here: the motion from rest is $\theta(t) = 2\arcsin(k\,\mathrm{cd}(\omega t, k))$ with
+# $k = \sin(\theta_0/2)$, and a sum over a grid of two numbers is the posterior.
 
 # %%
 free_swing = lj.System(lagrangian)
@@ -155,9 +155,9 @@ exact = np.exp(-0.5 * (squares - squares.min()))
 exact /= exact.sum()
 
 # %% [markdown]
-# The same by a sampler. `log_posterior` is a plain function of the unknowns; `standardised` makes of it one of a
-# vector in which each unknown has about the size one and none depends on another, as NUTS likes it. The run begins at
-# its first time, when nothing is measured yet; it is known to begin at rest.
+# Now the same with a sampler. `log_posterior` is a plain function of the unknowns; `standardised` turns it into a
+# function of a vector whose entries have about unit size and are about uncorrelated, which suits NUTS. The run begins
+# at its first time, when nothing is measured yet; it is known to begin at rest.
 
 # %%
 seen = lj.Record(np.append(0.0, ts), q=np.append(np.nan, data), q0=2.0, v0=0.0, hold_v=True, sigma=rough)
@@ -206,8 +206,8 @@ right.legend(fontsize=9, frameon=False)
 fig
 
 # %% [markdown]
-# The distribution is bent; the sampler follows it, and the normal one has its peak and its curvature there. In
-# numbers, with the Monte-Carlo error of the sampler from its effective sample size:
+# The distribution is curved. The sampler follows it, and the normal distribution has the same peak and the same
+# curvature at the peak. In numbers, with the Monte-Carlo error of the sampler from its effective sample size:
 
 # %%
 size = lambda x: float(blackjax.diagnostics.effective_sample_size(jnp.asarray(x)[None]))

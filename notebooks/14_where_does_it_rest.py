@@ -15,8 +15,8 @@
 # # Where does it rest?
 #
 # A bead on a hoop rests at the bottom, until the hoop turns too fast. An arch carries its load, until it snaps. A top
-# sleeps upright, until friction has slowed it too much. Each "until" is a number, and a Lagrangian knows it:
-# `lj.equilibria` finds where a system rests, `lj.continue_equilibria` what becomes of that as a parameter changes.
+# sleeps upright, until friction has slowed it too much. Each "until" is a number that follows from the Lagrangian:
+# `lj.equilibria` finds where a system rests, and `lj.continue_equilibria` how that changes with a parameter.
 
 # %%
 import jax
@@ -43,12 +43,13 @@ rests = lj.equilibria(hoop, params, starts=np.linspace(-3.0, 3.1, 20))
 rests
 
 # %% [markdown]
-# Twenty starts, four places: the bottom, the top, and the tilt to either side, with $\cos\alpha = g/(a\omega^2)$.
+# Twenty starts lead to four equilibria: the bottom, the top, and the tilt to either side, with
+# $\cos\alpha = g/(a\omega^2)$.
 #
 # ## How fast is too fast?
 #
-# Followed from a slow hoop on, the bottom loses its stability at one speed, and there two branches leave it. They are
-# followed too.
+# Followed from slow rotation upwards, the bottom loses its stability at one speed, where two branches leave it. These
+# are followed too.
 
 # %%
 faster = lj.continue_equilibria(hoop, params | {"omega": 1.0}, 0.0, along="omega", to=8.0)
@@ -57,7 +58,7 @@ faster.plot()
 
 # %% [markdown]
 # The critical speed is not read off a grid. It is the solution of a larger system of equations that is regular there,
-# and so it has all its digits, and derivatives by every other parameter:
+# so it is accurate to all digits and can be differentiated with respect to every other parameter:
 # $\omega_c = \sqrt{g/a}$, $\;\partial\omega_c/\partial a = -\frac{1}{2}\sqrt{g/a^3}$.
 
 # %%
@@ -68,15 +69,15 @@ print(f"omega_c      {float(critical.parameter):.15g}   exact {speed:.15g}")
 print(f"d omega_c/da {float(critical.derivative['a']):.15g}   exact {slope:.15g}")
 
 # %% [markdown]
-# Coming down along the tilt, no eigenvalue changes its sign: one only touches zero, and the branch turns back. A fold
-# looks alike. The determinant of the equations with the branch's tangent tells them apart.
+# Following the tilted branch downwards, no eigenvalue changes its sign: one only touches zero, and the branch turns
+# back. A fold looks the same. The determinant of the equations, extended by the branch's tangent, distinguishes them.
 
 # %%
 slower = lj.continue_equilibria(hoop, params | {"omega": 8.0}, 1.3, along="omega", to=1.0)
 print(slower)
 
 # %% [markdown]
-# ## A load that an arch carries
+# ## The load that an arch carries
 #
 # Two elastic bars lean against each other, and a load presses their joint down (von Mises' truss). The load rises to a
 # fold, where the arch snaps through to hang below. With $l_0$ the length of a bar at rest, and $a$ half the span, it
@@ -101,9 +102,9 @@ arch.plot()
 # %% [markdown]
 # ## Two critical speeds
 #
-# The carriage on rotating cross-rails has two springs. Where the weaker one balances the centrifugal force there is a
-# line of places to rest; where the stronger one does, the place of rest goes to infinity. Between the two speeds it is
-# unstable.
+# The carriage on rotating cross-rails has two springs. At the speed where the weaker one balances the centrifugal force
+# there is a line of equilibria; where the stronger one does, the equilibrium goes to infinity. Between the two speeds
+# it is unstable.
 
 # %%
 rails = cross_rails.PARAMS
@@ -114,12 +115,12 @@ print(cross)
 cross.plot()
 
 # %% [markdown]
-# ## A column that follows, and one that does not
+# ## A column under a follower force, and under a weight
 #
-# Two links stand on each other with springs in their joints. Pressed by a weight they buckle: a pitchfork, with the
-# first of two shapes. Pressed by a force that follows the outer link (a rocket's thrust) they never do: no equilibrium
-# changes, and nothing that asks for equilibria alone would see the end of it. It begins to flutter. With damping in the
-# joints it does so *earlier*: at $Pl/c = 41/28$ in place of $7/2 - \sqrt 2$ where that is small (Ziegler, 1952).
+# Two links stand on each other with springs in their joints. Under a weight they buckle: a pitchfork, with the first of
+# two shapes. Under a force that follows the outer link (a rocket's thrust) they never buckle: no equilibrium changes,
+# and a search for equilibria alone would not find the loss of stability. The column begins to flutter. With damping in
+# the joints it does so *earlier*: at $Pl/c = 41/28$ instead of $7/2 - \sqrt 2$ if the damping is small (Ziegler, 1952).
 
 
 # %%
@@ -164,10 +165,11 @@ axes[0, 0].legend(fontsize=8, frameon=False, loc="center left")
 fig
 
 # %% [markdown]
-# ## A top asleep
+# ## A sleeping top
 #
-# Upright, a spinning top is a steady motion, in coordinates that are regular there: two tilts and the spin, which is
-# cyclic. Its rate is the parameter. At $\omega_c = 2\sqrt{M g l\,I_1}/I_3$ two frequencies meet, and the top wakes.
+# An upright spinning top is a steady motion, in coordinates that are regular there: two tilts and the spin, which is
+# cyclic. The spin rate is the parameter. At $\omega_c = 2\sqrt{M g l\,I_1}/I_3$ two frequencies meet, and the top
+# becomes unstable.
 
 
 # %%
@@ -188,8 +190,8 @@ print(f"it wakes at {float(spun.critical[0].parameter):.14g}, exact {wakes:.14g}
 # %% [markdown]
 # ## A map
 #
-# Inside of a program equilibria are functions of their parameters, with derivatives, and may be swept: where does the
-# bead rest on 10,000 hoops? The white line is $\omega^2 = g/a$.
+# Inside a program equilibria are differentiable functions of their parameters, and can be swept: where does the bead
+# rest on 10,000 hoops? The white line is $\omega^2 = g/a$.
 
 # %%
 speeds, radii = np.linspace(1.0, 8.0, 100), np.linspace(0.2, 2.0, 100)

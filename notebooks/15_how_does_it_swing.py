@@ -18,8 +18,8 @@
 #
 # $$M\ddot\xi + (G + D)\dot\xi + (K + N)\xi = 0,$$
 #
-# and its roots say whether it swings, decays or runs away. `lj.linearise` finds the matrices from $L$, and
-# `lj.normal_modes` what they mean.
+# and the roots say whether it oscillates, decays or diverges. `lj.linearise` computes the matrices from $L$, and
+# `lj.normal_modes` the modes.
 
 # %%
 import time
@@ -57,11 +57,11 @@ def modes_of(params):
 modes_of(params)
 
 # %% [markdown]
-# A carriage on rails that turn: two springs, and a Coriolis force that couples them. "The springs are softened by the
-# rotation", says the solution that these notebooks follow. At rest the carriage swings with 4 and 6.325 rad/s. One of
-# its modes is slower now, the other one is faster.
+# The first system is a carriage on rotating rails, with two springs and a Coriolis force that couples them. "The
+# springs are softened by the rotation", says the solution that these notebooks follow. Without rotation the carriage
+# oscillates with 4 and 6.325 rad/s. With rotation one of its modes is slower and the other one is faster.
 #
-# Both coordinates move in each mode, a quarter of a period apart: the carriage goes around ellipses.
+# Both coordinates move in each mode, a quarter of a period apart: the carriage moves on ellipses.
 
 # %%
 slow, fast = modes_of(params)
@@ -73,8 +73,8 @@ fast.animate(lambda t, q, params: (q["R"], q["r"]), amplitude=0.1, trail=2.0)
 # %% [markdown]
 # ## Two critical speeds
 #
-# All speeds at once, by `vmap`. Growth is drawn upward, and frequencies are orange where the energy of a mode is
-# negative.
+# `vmap` computes all speeds at once. Growth rates are drawn upward, and frequencies are orange where the energy of a
+# mode is negative.
 
 # %%
 speeds = np.linspace(0.0, 10.0, 801)
@@ -97,8 +97,9 @@ fig
 
 # %% [markdown]
 # Above both speeds no mode grows, although both springs together push outward: the Coriolis force alone holds the
-# carriage. The energy of the slow mode is negative there. So whatever takes energy makes it grow, and `verdict` says
-# "gyroscopically stabilised" in place of "stable". Is it true? The same with a little friction on the rails:
+# carriage. The energy of the slow mode is negative there. So anything that removes energy makes it grow, and `verdict`
+# says "gyroscopically stabilised" instead of "stable". To check this, here is the same with a little friction on the
+# rails:
 
 # %%
 rubbed = lj.System(rails_lagrangian, dissipation=lambda t, q, v, p: 0.5 * p["c"] * (v["R"] ** 2 + v["r"] ** 2))
@@ -144,10 +145,10 @@ axis.set(
 fig
 
 # %% [markdown]
-# ## On a surface: the force of the constraint has a stiffness
+# ## On a surface: the constraint force has a stiffness
 #
-# A pendulum in $x$ and $y$ on a rod. Its $L$ has no stiffness whatever: $\frac{1}{2}(\dot x^2 + \dot y^2) - gy$. The
-# rod's force has, because its direction turns: with its multiplier $\lambda = -g/2l$, $K = -\lambda\,\partial^2 g$.
+# Take a pendulum in $x$ and $y$ on a rod. Its $L$ has no stiffness: $\frac{1}{2}(\dot x^2 + \dot y^2) - gy$. The rod's
+# force has one, because its direction turns: with its multiplier $\lambda = -g/2l$, $K = -\lambda\,\partial^2 g$.
 
 # %%
 rod = lj.Holonomic(lambda t, q, p: q["x"] ** 2 + q["y"] ** 2 - p["l"] ** 2)
@@ -161,10 +162,10 @@ print(f"λ = {small.multipliers['rod']:.4f}, K = {small.stiffness[0, 0]:.4f}, "
 # %% [markdown]
 # ## A rolling coin
 #
-# A coin on its edge falls over, unless it rolls. It touches the ground at $(x, y)$, heads for the angle yaw, leans, and
-# has turned by spin. Rolling constrains its velocities, $\dot x = r\dot\psi\cos\varphi$ and
-# $\dot y = r\dot\psi\sin\varphi$, and not its positions. Its leaning obeys, with $A$, $C$ the moments about a diameter
-# and about the axle,
+# A coin on its edge falls over unless it rolls. It touches the ground at $(x, y)$, heads in the direction yaw, leans,
+# and has turned by spin. Rolling constrains its velocities, $\dot x = r\dot\psi\cos\varphi$ and
+# $\dot y = r\dot\psi\sin\varphi$, and not its positions. Its lean angle obeys, with $A$, $C$ the moments about a
+# diameter and about the axle,
 #
 # $$\lambda^2\,(A + mr^2) = mgr - \frac{C\,(C + mr^2)}{A}\,\Omega^2,$$
 #
@@ -196,7 +197,7 @@ print(f"critical: {critical:.3f} rad/s, {critical * r:.3f} m/s")
 rolls(1.5 * critical)
 
 # %% [markdown]
-# Zero roots are named, and are no instability: the coin may roll faster, in another direction, from elsewhere.
+# Zero roots are named and are not instabilities: the coin may roll faster, in another direction, or from another place.
 
 # %%
 ratio = np.linspace(0.0, 2.0, 201)

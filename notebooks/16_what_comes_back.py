@@ -14,8 +14,9 @@
 # %% [markdown]
 # # What comes back?
 #
-# Some motions return to their start, and all is then known of them. `lj.periodic_orbit` finds them, `lj.floquet` says
-# whether their neighbours stay near, and `lj.lyapunov_exponents` what becomes of motions that never come back.
+# Some motions return to their start; one period then describes them completely. `lj.periodic_orbit` finds them,
+# `lj.floquet` says whether neighbouring motions stay near, and `lj.lyapunov_exponents` describes motions that never
+# return.
 
 # %%
 import jax
@@ -31,10 +32,10 @@ jax.config.update("jax_enable_x64", True)
 matplotlib.rcParams["savefig.dpi"] = 90  # small pictures
 
 # %% [markdown]
-# ## A cycle that attracts
+# ## An attracting cycle
 #
-# Van der Pol's oscillator is fed where it is slow and braked where it is far out. From a guess of its size and period,
-# Newton's method on the flow finds the cycle; the period is known to 16 digits, 6.663286859323130.
+# Van der Pol's oscillator gains energy at small deflections and loses it at large ones. From a guess of its size and
+# period, Newton's method on the flow finds the cycle; the period is known to 16 digits, 6.663286859323130.
 
 
 # %%
@@ -55,9 +56,10 @@ multipliers = lj.floquet(cycle)
 multipliers
 
 # %% [markdown]
-# One multiplier is 1 because the cycle may be entered anywhere. The other says that after one period a neighbour is
-# nearer by a factor of a thousand. Their product has to be $\exp\oint \mu(1 - q^2)\,dt$, by Liouville's formula, which
-# is integrated beside. Derivatives are those of the implicit function theorem:
+# One multiplier is 1 because the cycle may start at any of its points. The other says that after one period a
+# neighbouring motion is nearer by a factor of a thousand. By Liouville's formula their product must be
+# $\exp\oint \mu(1 - q^2)\,dt$, which is integrated along with the motion. Derivatives come from the implicit function
+# theorem:
 
 
 # %%
@@ -80,11 +82,12 @@ axis.set(xlabel="q", ylabel="v", title="Two motions that join the cycle")
 fig
 
 # %% [markdown]
-# ## A pendulum that stands
+# ## A pendulum that stands upright
 #
-# A pendulum whose pivot is shaken up and down can stand upright (Stephenson 1908, Kapitza 1951). At rest in a driven
-# system there is no orbit to look for: the state of rest comes back after any period of the drive. With
-# $a = -4g/(l\Omega^2)$ and $q = 2A/l$ small motions obey Mathieu's equation, and it stands where $a > a_0(q)$.
+# A pendulum whose pivot is shaken up and down can stand upright (Stephenson 1908, Kapitza 1951). For an equilibrium of
+# a driven system no orbit has to be found: the state of rest returns after every period of the drive. With
+# $a = -4g/(l\Omega^2)$ and $q = 2A/l$ small motions obey Mathieu's equation, and the pendulum stands where
+# $a > a_0(q)$.
 
 
 # %%
@@ -109,8 +112,8 @@ for rate in (0.999 * edge, 1.001 * edge):
     print(f"Ω = {rate:.3f}: {upright(rate).verdict}")
 
 # %% [markdown]
-# All of Mathieu's equation at once, $\ddot x + (a - 2q\cos 2t)\,x = 0$: a sweep over twenty thousand systems, a verdict
-# each. The lines are its characteristic values; they are nowhere used.
+# Now the whole stability chart of Mathieu's equation, $\ddot x + (a - 2q\cos 2t)\,x = 0$: a sweep over twenty thousand
+# systems with one verdict each. The lines are the characteristic values; the computation does not use them.
 
 
 # %%
@@ -137,10 +140,10 @@ axis.grid(False)
 fig
 
 # %% [markdown]
-# ## What does not come back
+# ## Motions that do not return
 #
-# A star in a galaxy, in the model of Hénon and Heiles (1964). A Poincaré section shows where motions of one energy pass
-# $x = 0$: some draw curves, one fills an area. At the centres of the curves are motions that come back.
+# A star moves in a galaxy, in the model of Hénon and Heiles (1964). A Poincaré section shows where motions of one
+# energy pass $x = 0$: some draw curves, one fills an area. At the centres of the curves are periodic motions.
 
 
 # %%
@@ -195,8 +198,8 @@ right.legend(fontsize=9, frameon=False)
 fig
 
 # %% [markdown]
-# On a curve the mean growth falls like $1/t$: neighbours part like $t$, and the exponent is zero. In the area it stays.
-# Its uncertainty is that of a motion of this length, by the spread of its parts.
+# On a curve the mean growth rate falls like $1/t$: neighbouring motions separate like $t$, and the exponent is zero. In
+# the area it stays positive. Its uncertainty, for a motion of this length, is estimated from the spread of its parts.
 
 # %%
 for name, found in parting.items():

@@ -15,7 +15,7 @@
 # # Turn the knobs: how fast must one shake a pendulum for it to stand on its head?
 #
 # The pivot of a pendulum is shaken up and down, $y = A\cos\omega t$. $\theta$ is its tilt from the *upper* vertical,
-# from which it usually falls. Lengths are in lengths of the rod, times in $\sqrt{l/g}$.
+# from which it usually falls. Lengths are in units of the rod's length, times in $\sqrt{l/g}$.
 
 # %%
 import jax
@@ -48,9 +48,9 @@ def run(point):
 # %% [markdown]
 # ## Sliders
 #
-# `run` is an ordinary function of one point, as `lj.sweep` takes it. `lj.interact` compiles it once, and draws it again
-# wherever the sliders are: in a notebook that runs, drag $\omega$ to 8. (Needs `pip install "lagjax[interact]"`. In the
-# hosted copy of this notebook the sliders are a picture.)
+# `run` is an ordinary function of one point, as for `lj.sweep`. `lj.interact` compiles it once and redraws the result
+# whenever a slider moves: in a running notebook, drag $\omega$ to 8. (This needs `pip install "lagjax[interact]"`. In
+# the hosted copy of this notebook the sliders are a picture.)
 
 # %%
 knobs = lj.interact(
@@ -62,17 +62,19 @@ knobs = lj.interact(
 knobs
 
 # %% [markdown]
-# It falls over, and goes around. Faster, it stands, and sways about the top. Knobs can be turned by a program, too:
+# The pendulum falls over and goes around. With faster shaking it stands and sways about the top. A program can turn the
+# knobs too:
 
 # %%
 fallen, standing = (float(knobs.set(omega=omega).result["farthest"]) for omega in (6.0, 10.0))
 print(f"farthest from the top: {fallen:.2f} rad at omega = 6, {standing:.2f} rad at omega = 10")
 
 # %% [markdown]
-# ## A page for those who have no Python
+# ## A page that needs no Python
 #
 # `swept.to_html("shaken.html")` writes the swept motions into one file, with the same sliders, that works in any
-# browser, without Python and without a network. It is below, too, with a film: play it, and turn $\omega$ meanwhile.
+# browser, without Python and without a network. It is also shown below, with an animation: play it, and change $\omega$
+# meanwhile.
 
 
 # %%
@@ -94,8 +96,8 @@ page
 #
 # Averaged over the shaking, the pendulum sees the potential $\cos\theta + \frac{1}{4} A^2\omega^2\sin^2\theta$
 # (Landau and Lifshitz, §30): the top is a valley for $A^2\omega^2 > 2$, and holds a tilt $\theta_0$ for
-# $A^2\omega^2 \cos\theta_0 > 2$. That takes the shaking for small; the sweep does not, and waits until the pendulum has
-# fallen below the horizontal, or stood for 60 units of time.
+# $A^2\omega^2 \cos\theta_0 > 2$. That assumes small shaking; the sweep does not, and waits until the pendulum has
+# fallen below the horizontal or has stood for 60 units of time.
 
 # %%
 axes = {"A": np.array([0.05, 0.1, 0.2, 0.3]), "A omega": np.linspace(1.38, 1.5, 121)}
@@ -124,8 +126,8 @@ panels[0, 0].legend(fontsize=8, frameon=False)
 fig
 
 # %% [markdown]
-# The nearer to the border, the longer it takes to fall; up to $A = 0.1$ the border is the averaged one within a fifth
-# of a percent, at $A = 0.3$ it is one percent beyond.
+# The nearer to the border, the longer the pendulum takes to fall; up to $A = 0.1$ the border agrees with the averaged
+# one within a fifth of a percent, at $A = 0.3$ it is one percent beyond it.
 
 # %%
 assert fallen > np.pi / 2 and standing < 0.35

@@ -1,4 +1,4 @@
-"""Code such as `lj.fit` in a text leads to the page of that name."""
+"""Link code such as `lj.fit` in a text to the page of that name."""
 
 import re
 
@@ -11,7 +11,7 @@ NAME = re.compile(r"lj\.(\w+)\b")
 
 
 def link(app, doctree, docname):
-    """Wrap each such piece of code that is not already part of a link or a title, or on its own page."""
+    """Link each such piece of code, unless it is part of a link or a title, or stands on its own page."""
     for literal in list(doctree.findall(nodes.literal)):
         found = NAME.match(literal.astext())
         if not found or found[1] not in lagjax.__all__:
@@ -28,6 +28,6 @@ def link(app, doctree, docname):
 
 
 def setup(app):
-    """Run when all pages are known."""
+    """Run after all pages are known."""
     app.connect("doctree-resolved", link)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

@@ -1,6 +1,6 @@
 """A page for each public name, in the sections of `lagjax/__init__.py`: signature, docstring, example, errors.
 
-The docstrings are Markdown with examples as in the interpreter; doctest has run these (`pytest lagjax`).
+The docstrings are Markdown with doctest examples, which `pytest lagjax` runs.
 """
 
 import ast
@@ -17,14 +17,14 @@ import lagjax
 
 FOLDER = Path(__file__).parent.parent / "api"
 INIT = Path(lagjax.__file__)
-# Whose example shows an object that no function is annotated to return.
+# The function whose example shows an object that no function is annotated to return.
 SHOWN_BY = {
     "Crossings": "Crossing", "Snapshot": "integrate", "Explanation": "explain", "Switches": "touches",
     "Routhian": "routhian", "Branch": "continue_equilibria", "Critical": "continue_equilibria", "Mode": "normal_modes",
     "CriticalOrbit": "continue_orbits",
     "Status": "sweep", "Knobs": "interact", "HybridTrajectory": "touches",
 }  # fmt: skip
-# Of names whose docstring has no room for one.
+# Examples for names whose docstring has no room for one.
 EXAMPLES = {
     "scenes": """
 >>> import lagjax as lj
@@ -37,7 +37,7 @@ RAISE_IT = """
 >>> import warnings
 >>> import lagjax as lj
 >>> with warnings.catch_warnings():
-...     warnings.simplefilter("error", lj.{name})  # in here it is raised
+...     warnings.simplefilter("error", lj.{name})  # raise it instead of showing it
 ...     warnings.warn("for example", lj.{name})
 Traceback (most recent call last):
 {module}.{name}: for example
@@ -61,7 +61,7 @@ def sections() -> dict[str, list[str]]:
 
 
 def page_of(name: str) -> str:
-    """The file of a name: `fit` and `Fit` must differ where the case of letters does not count."""
+    """The file name of a page: `fit` and `Fit` must differ on file systems that ignore case."""
     twins = [other for other in lagjax.__all__ if other.lower() == name.lower()]
     return name if len(twins) == 1 or name.islower() else f"{name.lower()}-class"
 
@@ -87,7 +87,7 @@ def example(docstring: str) -> str:
 
 
 def signature(thing, name: str, method: bool = False) -> str:
-    """`name(arguments)` with defaults, without types: the docstring says more than these."""
+    """`name(arguments)` with defaults, without types: the docstring says more than the types."""
     try:
         found = inspect.signature(thing)
     except (TypeError, ValueError):
@@ -95,7 +95,7 @@ def signature(thing, name: str, method: bool = False) -> str:
     kept = [p.replace(annotation=p.empty) for p in found.parameters.values()]
     if method and kept and kept[0].name in ("self", "cls"):
         kept = kept[1:]
-    # The repr of an object has an address in it; a short one is a default that can be typed.
+    # Keep a default only if its repr is short and without a memory address, so that a reader could type it.
     kept = [
         p if len(repr(p.default)) < 40 and " at 0x" not in repr(p.default) else p.replace(default=...) for p in kept
     ]
@@ -117,7 +117,7 @@ def makers(cls: type) -> list[str]:
 
 
 def members(cls: type) -> list[str]:
-    """Directives for the documented methods and properties that a class of ours defines or inherits from ours."""
+    """Directives for the documented methods and properties that a lagjax class defines or inherits from one."""
     parts = []
     for name, member in inspect.getmembers_static(cls):
         owner = next((base for base in cls.__mro__ if name in vars(base)), object)
@@ -135,14 +135,14 @@ def members(cls: type) -> list[str]:
 
 
 def added_example(thing, name: str) -> str:
-    """An example that is not in a docstring; a test runs these."""
+    """An example that is not in a docstring; a test runs it."""
     if inspect.isclass(thing) and issubclass(thing, Warning):
         return RAISE_IT.format(name=name, module=thing.__module__)
     return EXAMPLES.get(name, "")
 
 
 def borrowed(thing, name: str) -> str:
-    """The example of the function that makes such an object, or one added here."""
+    """The example of the function that returns such an object, or one added here."""
     if added := added_example(thing, name):
         return f"\n{markdown(added)}\n"
     maker = SHOWN_BY.get(name) or next(iter(makers(thing)), None)
@@ -190,8 +190,8 @@ def page(name: str) -> str:
 
 
 def index(groups: dict[str, list[str]]) -> str:
-    """The list of all names with what each says of itself in one line."""
-    parts = ["# Reference\n", "`import lagjax as lj`; the names stand in the order of the physics.\n"]
+    """The list of all names with the first line of each docstring."""
+    parts = ["# Reference\n", "`import lagjax as lj`; the names are in the order of the physics.\n"]
     for title, names in groups.items():
         parts.append(f"## {title}\n")
         for name in names:

@@ -1,7 +1,7 @@
-"""What lagjax says when something is wrong, read off its code: every message, by theme, with a link to each.
+"""The page of every error message and warning of lagjax, read from its code: grouped by theme, with a link to each.
 
-A message is text of three parts: what happened, the usual cause, the fix. Where numbers and names stand in one, the
-page has an ellipsis.
+A message has three parts: what happened, the usual cause, the fix. The page shows an ellipsis for numbers and names
+that are inserted.
 """
 
 import ast
@@ -14,7 +14,7 @@ import lagjax
 
 ROOT = Path(lagjax.__file__).parent
 PAGE = Path(__file__).parent.parent / "generated" / "errors.md"
-# Folder or module, and what it is about; the first that fits counts.
+# Folder or module, and its theme; the first match counts.
 THEMES = {
     "mechanics/hybrid": "Phases, contacts and impacts",
     "motion/contacts": "Phases, contacts and impacts",
@@ -40,8 +40,8 @@ THEMES = {
     "fitting": "Fits",
     "learned": "Learned models",
     "comparison": "Error against run time",
-    "exchange": "In and out",
-    "interactive": "Knobs",
+    "exchange": "Input and output",
+    "interactive": "Sliders",
     "plot": "Pictures",
     "animation": "Pictures",
     "pages": "Pictures",
@@ -50,16 +50,16 @@ ORDER = list(dict.fromkeys([*("A system and its Lagrangian", "States and constra
 ELSEWHERE = "Elsewhere"
 INTRO = """# What went wrong
 
-Every message that lagjax can give, as it stands in the code: what happened, the usual cause, the fix. Search this page
-(or the site) for words of yours; `…` stands for names and numbers of your system. Errors are raised where values are
-looked at, outside of `jit`; in a batch or a sweep a failed motion keeps its reason in `traj.result` or `swept.status`
-instead.
+Every message that lagjax can give, as written in the code: what happened, the usual cause, the fix. Search this page
+(or the site) for words of your message; `…` stands for names and numbers of your system. Errors are raised outside of
+`jit`, where values are known; in a batch or a sweep a failed motion records its reason in `traj.result` or
+`swept.status` instead.
 
 """
 
 
 def text_of(node: ast.expr) -> str | None:
-    """A string expression as text, with an ellipsis for what is put into it; None for what is no string."""
+    """A string expression as text, with an ellipsis for inserted values; None if it is not a string."""
     if isinstance(node, ast.Constant) and isinstance(node.value, str):
         return node.value
     if isinstance(node, ast.JoinedStr):
@@ -78,7 +78,7 @@ def text_of(node: ast.expr) -> str | None:
 
 
 def telling(text: str) -> str:
-    """The first line of a message that has words of its own, and is not all put together elsewhere; or nothing."""
+    """The first line of a message with words of its own, not only inserted text; empty if there is none."""
     lines = [re.sub("^…?(Usual cause|Fix): …?", "", line) for line in text.split("\n")]
     return next((line for line in lines if len(re.findall("[a-z]{3,}", line)) > 1), "").strip()
 
@@ -92,13 +92,13 @@ def kind_of(node: ast.Call) -> str:
 
 
 def messages(source: str) -> list[tuple[str, str]]:
-    """(kind, text) of each message in a module: raised, warned of, or made by a function and raised by another."""
-    found, seen = [], set()
+    """(kind, text) of each message in a module: raised, warned of, or built in one function and raised elsewhere."""
+    found, known = [], set()
 
     def add(kind, text):
         text = text and re.sub(r"…(?:\s?…)+", "…", text).strip()
-        if text and telling(text) and text not in seen:
-            seen.add(text)
+        if text and telling(text) and text not in known:
+            known.add(text)
             found.append((kind, text))
 
     tree = ast.parse(source)
@@ -129,12 +129,12 @@ def messages(source: str) -> list[tuple[str, str]]:
 
 
 def theme_of(module: str) -> str:
-    """The heading under which the messages of a module stand."""
+    """The heading above the messages of a module."""
     return next((theme for begin, theme in THEMES.items() if module.startswith(begin)), ELSEWHERE)
 
 
 def anchor(text: str, taken: set[str]) -> str:
-    """A name for a message that stays while its first words do."""
+    """An anchor name for a message, which does not change as long as its first words do not."""
     words = re.findall(r"[a-z0-9]+", text.lower())[:7]
     name = base = "-".join(words)
     number = 2
@@ -145,7 +145,7 @@ def anchor(text: str, taken: set[str]) -> str:
 
 
 def title(line: str) -> str:
-    """The first sentence of a message, or what fits on a line or two of it."""
+    """The first sentence of a message, shortened to a line or two."""
     parts = re.split(r"(?<=[a-z)'…])([.:;] )", line)
     ends = (i for i in range(1, len(parts) + 1, 2) if len(re.findall("[a-z]{3,}", "".join(parts[:i]))) > 2)
     short = "".join(parts[: next(ends, len(parts))]).rstrip(":.")
@@ -153,10 +153,10 @@ def title(line: str) -> str:
 
 
 def entry(kind: str, text: str, taken: set[str]) -> str:
-    """One message as Markdown: its first line that says something is its heading."""
+    """One message as Markdown: its first line with words of its own is the heading."""
     first = telling(text)
     name = anchor(first, taken)
-    # A heading is a line of text: what is code or a formula to Markdown must not become so.
+    # Escape characters that Markdown would read as code or a formula.
     heading = re.sub(r"([\\`*_{}\[\]<>#$|])", r"\\\1", title(first))
     shown = f"```text\n{kind + ': ' if kind else ''}{text}\n```\n"
     return f"({name})=\n### {heading}\n\n{shown}"

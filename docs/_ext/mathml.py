@@ -1,4 +1,4 @@
-"""Formulas as MathML, written by docutils while the site is built: no script, no fonts, nothing from the network."""
+"""Formulas as MathML, written by docutils while the site is built: no scripts, no fonts, no network access."""
 
 import re
 
@@ -8,11 +8,11 @@ from docutils.utils.math.latex2mathml import tex2mathml
 from sphinx.util import logging
 
 logger = logging.getLogger(__name__)
-# What docutils does not know, in what it knows.
+# Commands that docutils does not know, written with ones that it knows.
 SPELT_OUT = {r"\tfrac": r"\frac", r"\dfrac": r"\frac", r"\lvert": "|", r"\rvert": "|", "°": r"^{\circ}"}
-# Between a function and its argument it sets no space.
+# docutils puts no space between a function and its argument.
 FUNCTION = re.compile(r"\\(?:sin|cos|tan|cot|ln|log|exp|arcsin|arccos|arctan)(?=\\[a-zA-Z]| +\\?[a-zA-Z])")
-# It takes the 12 of `\frac12` for one number.
+# docutils reads the 12 of `\frac12` as one number.
 SHORT_FRACTION = re.compile(r"\\frac\s*(\w)\s*(\w)")
 
 
@@ -25,7 +25,7 @@ def converted(source: str, block: bool) -> str:
 
 
 def mathml(translator, node, block: bool) -> str:
-    """The formula of a node; one that docutils cannot read is a warning, and so an error of the build."""
+    """The formula of a node; if docutils cannot read it, a warning fails the build."""
     source = node.astext().strip()
     try:
         return converted(source, block)
@@ -41,7 +41,7 @@ def inline(translator, node):
 
 
 def displayed(translator, node):
-    """A formula on lines of its own, which scroll by themselves where the page is narrow."""
+    """A displayed formula, which scrolls on its own if the page is narrow."""
     translator.body.append('<div class="formula" tabindex="0" role="region" aria-label="Formula">')
     translator.body.append(mathml(translator, node, block=True) + "</div>\n")
     raise nodes.SkipNode

@@ -1,7 +1,6 @@
-"""The notebooks as pages, with the outputs that are stored in them; nothing is executed here.
+"""The notebooks as pages with their stored outputs; nothing is executed here.
 
-A figure is described to those who cannot see it by the metadata `alt` of its cell, or else by the words that its code
-writes into it: titles and labels.
+The alternative text of a figure is the metadata `alt` of its cell, or else the titles and labels in its code.
 """
 
 import ast
@@ -15,8 +14,8 @@ FOLDER = Path(__file__).parent.parent / "notebooks"
 SOURCE = Path(__file__).parents[2] / "notebooks"
 INDEX = """# Notebooks
 
-One question each, with its Lagrangian in the first lines. They are shown with the outputs that are stored in them; the
-tests run them.
+Each notebook answers one question and starts with its Lagrangian. The pages show the stored outputs; the tests run
+the notebooks.
 
 ```{toctree}
 :maxdepth: 1
@@ -35,7 +34,7 @@ def words(code: str) -> str:
 
 
 def with_alt_texts(notebook: dict, name: str) -> dict:
-    """Each cell that shows a picture says in words what it is."""
+    """Give each cell that shows a picture an alternative text."""
     heading = name
     for cell in notebook["cells"]:
         text = "".join(cell["source"])
@@ -43,14 +42,14 @@ def with_alt_texts(notebook: dict, name: str) -> dict:
             headings = re.findall(r"^#+ (.*)", text, re.MULTILINE)
             heading = headings[-1] if headings else heading
         elif any("image/png" in output.get("data", {}) for output in cell["outputs"]):
-            said = words(text) or "drawn by " + text.strip().splitlines()[-1]
-            alt = cell["metadata"].get("alt") or f"Figure, {heading}: {said}"
+            description = words(text) or "drawn by " + text.strip().splitlines()[-1]
+            alt = cell["metadata"].get("alt") or f"Figure, {heading}: {description}"
             cell["metadata"]["mystnb"] = {"image": {"alt": alt.replace("$", "")}}
     return notebook
 
 
 def without_widgets(notebook: dict) -> dict:
-    """Sliders need a running Python and scripts from the network: the text beside them stays, but of a meter."""
+    """Remove sliders, which need a running Python and scripts from the network; keep their text, except for meters."""
     notebook["metadata"].pop("widgets", None)
     for cell in notebook["cells"]:
         kept = []
@@ -75,7 +74,7 @@ def generate(app):
 
 
 def point_to_pages(app, docname, source):
-    """Links of a text to a notebook of the repository lead to its page."""
+    """Point links to a notebook of the repository to its page."""
     source[0] = source[0].replace("](../notebooks/", "](notebooks/")
 
 

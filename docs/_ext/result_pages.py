@@ -1,4 +1,4 @@
-"""Accuracy, speed and orders, from `benchmarks/results/*.json`: all that was measured, with what is missed."""
+"""Accuracy, speed and orders, from `benchmarks/results/*.json`: everything measured, missed targets included."""
 
 import ast
 import importlib.util
@@ -12,18 +12,18 @@ RESULTS, FOLDER = ROOT / "benchmarks" / "results", Path(__file__).parent.parent 
 INTRO = """# Accuracy and speed
 
 All numbers come from `benchmarks/results/`, which the scripts in `benchmarks/` write; this page and those below it are
-made from these files. A target is what the project set itself before measuring. What is missed stands here too.
+made from these files. Targets were set before measuring. Missed targets are listed here too.
 
 ## Error against run time
 
-Milliseconds to an error, motions over tens of periods, the default method, one core; errors of the last state against
-closed forms (helix: SciPy).
+Milliseconds to reach an error; motions over tens of periods, default method, one core; errors of the last state against
+closed forms (for the helix: against SciPy).
 
 """
 ORDERS = """# Orders, as measured
 
 The order of each method with constant steps, on outputs between its steps, from `benchmarks/results/orders.json`. The
-slow tests assert the same, with misprints in a tableau as twins that they must see: `tests/motion/test_orders.py`,
+slow tests assert the same, and must fail for tableaus with misprints: `tests/motion/test_orders.py`,
 `tests/numerics/test_nystrom.py`, `tests/numerics/test_radau.py`, `tests/numerics/test_runge_kutta.py`.
 
 | method | motion | claimed | measured | least error |
@@ -48,7 +48,7 @@ def plain(text) -> str:
 
 
 def line(row: dict) -> str:
-    """One row of results as one of a table."""
+    """One row of results as a row of a table."""
     if row["value"] is None:
         return f"| {plain(row['what'])} | not measured: {plain(row.get('skipped', ''))} | | |"
     target = row.get("target")
@@ -63,7 +63,7 @@ def table(rows: list[dict]) -> str:
 
 
 def one_file(name: str, found: dict) -> str:
-    """The page of one file of results, under the question of the script that wrote it."""
+    """The page of one file of results, with the question of the script that wrote it as its title."""
     script = ROOT / "benchmarks" / f"{name}.py"
     question = (ast.get_docstring(ast.parse(script.read_text())) or "") if script.exists() else ""
     versions = ", ".join(f"{package} {version}" for package, version in found.get("versions", {}).items())
@@ -83,15 +83,15 @@ def generate(app):
     parts = [
         INTRO,
         quoted.accuracy(),
-        "\n## Speed beside others\n\nRatios of run times (where the target is ≥: of rates) at",
+        "\n## Speed compared with others\n\nRatios of run times (of rates if the target is ≥) at",
     ]
-    parts += [" equal error, one core, medians.\n\n", quoted.speed(), "\n## What is missed\n\n"]
+    parts += [" equal error, one core, medians.\n\n", quoted.speed(), "\n## Missed targets\n\n"]
     total = sum(len(found["rows"]) for found in files.values())
     parts.append(f"{sum(map(len, missed.values()))} of {total} rows miss their target.\n\n")
     for name, rows in missed.items():
         if rows:
             parts.append(f"From [`{name}.json`]({name}.md):\n\n{table(rows)}\n")
-    parts.append("## All that was measured\n\n```{toctree}\n:maxdepth: 1\n\n" + "\n".join(files) + "\n```\n")
+    parts.append("## All measurements\n\n```{toctree}\n:maxdepth: 1\n\n" + "\n".join(files) + "\n```\n")
     write(FOLDER / "index.md", "".join(parts))
     clear(FOLDER, {"index.md"} | {f"{name}.md" for name in files})
     rows = files["orders"]["rows"] if "orders" in files else []

@@ -1,4 +1,4 @@
-"""Writing a generated page only where it has changed, so that a second build is a short one."""
+"""Write a generated page only if it has changed, so that a second build is short."""
 
 from pathlib import Path
 

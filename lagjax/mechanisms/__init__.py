@@ -1,7 +1,7 @@
-"""Well-known multibody and DAE test problems, each with a motion that is known independently.
+"""Well-known multibody and DAE test problems, each with an independently known motion.
 
-Each module holds the physics and the equations in the symbols of its source; `MECHANISM` gathers what to integrate
-and where it must end. `MECHANISMS` has them by name.
+Each module contains the physics and the equations in the symbols of its source; `MECHANISM` defines what to integrate
+and where the motion must end. `MECHANISMS` lists them by name.
 """
 
 from lagjax.mechanisms import (

@@ -83,7 +83,7 @@ def lagrangian(t, q, v, params):
 
 
 def loops(t, q, params):
-    """The point P, by the crank and rod, less P by each of the three other ways: six equations."""
+    """The point P from crank and rod, minus P from each of the three other chains: six equations."""
     p = params
     rod, link4, link6 = q.beta + q.theta, q.phi + q.delta, q.omega + q.epsilon
     x = p["rr"] * jnp.cos(q.beta) - p["d"] * jnp.cos(rod)

@@ -1,4 +1,4 @@
-"""The rectangular Bricard mechanism: six links, six hinges, and it moves although the count says that it cannot.
+"""The rectangular Bricard mechanism: six links and six hinges, mobile although the count of freedoms says it is not.
 
 Five rods of length l and the ground form a closed chain. The two hinges of a link are at right angles to it and to
 each other, and the handedness alternates along the chain. The start is six edges of a cube: P_0 = (0, 0, 0),
@@ -6,12 +6,12 @@ P_1 = (1, 0, 0), P_2 = (1, -1, 0), P_3 = (1, -1, 1), P_4 = (0, -1, 1), P_5 = (0,
 u_0 ... u_5 along y, z, x, y, z, x. The rod i goes from P_i to P_(i+1), the ground from P_5 to P_0.
 
 Natural coordinates: the points P_1 ... P_4 and the unit vectors u_1 ... u_4, 24 in all (both ends of the ground are
-fixed). A rod is rigid, and its two hinges are where they are, if for i = 0 ... 4
+fixed). A rod is rigid with its two hinges fixed in it if for i = 0 ... 4
 
     |r_i|² = l²,    r_i·u_i = 0,    r_i·u_(i+1) = 0,    u_i·u_(i+1) = 0,    |u_i|² = 1 (i = 1 ... 4)
 
-with r_i = P_(i+1) - P_i: 24 equations for 24 coordinates. Only 23 are independent: one follows from the others, no
-particular one, and one degree of freedom remains. Grübler's count for a spatial chain of six hinges gives none.
+with r_i = P_(i+1) - P_i: 24 equations for 24 coordinates. Only 23 are independent: one, no particular one, follows from
+the others, and one degree of freedom remains. Grübler's count for a spatial chain of six hinges gives none.
 
 A rod of square section has a width a, and so a second moment m a²/12, along each of its two hinges' axes,
 
@@ -23,7 +23,7 @@ Hinge angles: α_0 = α_2 = α_4 = θ and α_1 = α_3 = α_5 = φ, which turn r_
 
     cos θ + cos φ + cos θ cos φ = 0
 
-(`chain` builds it). This is a closed curve, the motion has one coordinate on it, and the tests integrate that.
+(`chain` builds it). This is a closed curve; the motion has one coordinate along it, which the tests integrate.
 
 Source: González et al., *Multibody System Dynamics* 16 (2006) 179, and the IFToMM library, A04 (section 0.1 m:
 Simbody's and Exudyn's models); Chen, You & Tarnai, *Int. J. Solids Struct.* 42 (2005) 2287 (closure).
@@ -42,7 +42,7 @@ from lagjax.mechanisms.natural import rod_kinetic_energy, squared_distance
 
 
 class Chain(NamedTuple):
-    """The hinges' points and axes that move, each (4, 3)."""
+    """Points and axes of the moving hinges, each (4, 3)."""
 
     points: Float[Array, "4 3"]
     axes: Float[Array, "4 3"]
@@ -54,7 +54,7 @@ HANDS = (1, -1, 1, -1, 1)
 
 
 def closed(q, params):
-    """All six points and axes, (6, 3) each: those of the ground included."""
+    """All six points and axes, (6, 3) each, including those of the ground."""
     length = params["l"]
     first, last = jnp.zeros((1, 3), q.points.dtype), jnp.stack([0.0 * length, 0.0 * length, length])[None]
     points = jnp.concatenate([first, q.points, last])
@@ -99,12 +99,12 @@ def unit_axes(t, q, params):
 
 
 def closure(theta, phi):
-    """Zero where the chain with these hinge angles closes."""
+    """Zero if the chain with these hinge angles closes."""
     return jnp.cos(theta) + jnp.cos(phi) + jnp.cos(theta) * jnp.cos(phi)
 
 
 def chain(theta, phi, params):
-    """The chain from its hinge angles, starting at the ground: a `Chain`, with P_5 and u_5 as it arrives there."""
+    """The chain built from its hinge angles, starting at the ground: a `Chain`, and the resulting P_5 and u_5."""
     rod, axis, point = jnp.array([0.0, 0.0, -1.0]), jnp.array([0.0, 1.0, 0.0]), jnp.zeros(3)
     points, axes = [], []
     for i, hand in enumerate(HANDS):
@@ -138,7 +138,7 @@ MECHANISM = Mechanism(
         axes=np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]),
     ),
     v0=Chain(points=np.zeros((4, 3)), axes=np.zeros((4, 3))),
-    # 10 s in the library: there it stands almost still, at the cube, and no velocity is left to compare.
+    # The library uses 10 s, when it is almost at rest at the cube and has no velocity to compare.
     end=9.0,
     freedom=1,
     reference=(

@@ -1,6 +1,6 @@
 """The car axis: a rigid axle on two stiff springs, driven over a bumpy road. Stiff, and driven by its constraint.
 
-The left wheel stands at (0, 0), the right one at (x_b, y_b)(t), which rolls over waves of height r:
+The left wheel stands at (0, 0); the right one, at (x_b, y_b)(t), rolls over waves of height r:
 
     y_b = r sin ω t,    x_b = √(L² - y_b²)
 
@@ -9,7 +9,7 @@ Above each wheel a spring of stiffness 1/ε² and rest length L0 carries half of
 
     (xl - xr)² + (yl - yr)² = L²,     xl x_b + yl y_b = 0
 
-The source multiplies the equations by ε², and so do we (its multipliers are then ours, sign included):
+The source multiplies the equations by ε², and so do we (so its multipliers equal ours, including the sign):
 
     L = ½ k (ẋl² + ẏl² + ẋr² + ẏr²) - ½ (|l| - L0)² - ½ (|r| - L0)² - k g (yl + yr),    k = ½ M ε²
 

@@ -1,4 +1,4 @@
-"""The plane double pendulum by its masses' Cartesian coordinates: two lengths held, two degrees of freedom.
+"""The plane double pendulum in Cartesian coordinates of its masses: two constant lengths, two degrees of freedom.
 
     L = ½ m1 |ṙ1|² + ½ m2 |ṙ2|² - g (m1 y1 + m2 y2),      |r1|² = l1²,    |r2 - r1|² = l2²
 
@@ -7,7 +7,7 @@ In the angles from the vertical, Δ = θ1 - θ2, the equations that give the ref
     (m1 + m2) l1 θ̈1 + m2 l2 θ̈2 cos Δ + m2 l2 θ̇2² sin Δ + (m1 + m2) g sin θ1 = 0
     l2 θ̈2 + l1 θ̈1 cos Δ - l1 θ̇1² sin Δ + g sin θ2 = 0
 
-Released at rest with both rods horizontal.
+It is released at rest with both rods horizontal.
 
 Source: Landau & Lifshitz, *Mechanics*, §5, Problem 1.
 """

@@ -1,6 +1,6 @@
-"""The slider-crank with a prescribed crank angle: driven by a constraint that depends on time, and nothing left free.
+"""The slider-crank with a prescribed crank angle: driven by a time-dependent constraint, without any degree of freedom.
 
-The bodies and hinges of `slider_crank.py`, and a motor that turns the crank at the constant rate Ω:
+The bodies and hinges are those of `slider_crank.py`, and a motor turns the crank at the constant rate Ω:
 
     θ1 = Ω t
 
@@ -8,7 +8,7 @@ Seven equations for seven coordinates: the motion is kinematics. With θ = Ω t,
 
     x3 = l1 cos θ + l2 cos θ2,        ẋ3 = -Ω (l1 sin θ + l2 w sin θ2),     w = dθ2/dθ = -ρ cos θ / cos θ2
 
-What is left to find is the motor's torque. It is the multiplier λ of the drive, and it does the work
+Only the motor's torque is unknown. It is the multiplier λ of the drive, and its power is
 
     λ Ω = d/dt (½ J Ω² + V)   so that   λ = ½ J'(Ω t) Ω² + V'(Ω t)
 

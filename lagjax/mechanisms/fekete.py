@@ -1,6 +1,6 @@
 """Fekete points: twenty particles on a sphere push each other apart until they rest.
 
-Particles p_i of unit mass on the unit sphere, with a logarithmic potential between each two and friction α:
+Particles p_i of unit mass on the unit sphere, with a logarithmic potential between each pair and friction α:
 
     L = ½ Σ |ṗ_i|² + Σ_(i<j) log |p_i - p_j|,     R = ½ α Σ |ṗ_i|²,     |p_i|² = 1
 
@@ -11,7 +11,7 @@ p_i·(p_i - p_j) = ½ |p_i - p_j|², every multiplier is
 
     λ_i = -(N - 1)/4
 
-whatever the arrangement. The start is four rings of 3, 7, 6 and 4 points, at rest. 60 coordinates, 20 equations.
+for any arrangement. The start is four rings of 3, 7, 6 and 4 points, at rest. 60 coordinates, 20 equations.
 
 Source: Shub & Smale, *J. Complexity* 9 (1993) 4 (the points); Mazzia & Magherini, *Test Set for Initial
 Value Problem Solvers* (Bari), problem "fekete" (there with a second set of multipliers, in index 2).
@@ -28,7 +28,7 @@ PARAMS = {"alpha": 0.5}
 
 
 def lagrangian(t, q, v, params):
-    """Unit masses with a logarithmic potential between each two, from p (N, 3)."""
+    """Unit masses at p (N, 3), with a logarithmic potential between each pair."""
     first, second = np.triu_indices(q.shape[0], 1)
     return 0.5 * jnp.sum(v**2) + 0.5 * jnp.sum(jnp.log(jnp.sum((q[first] - q[second]) ** 2, axis=1)))
 
@@ -45,7 +45,7 @@ def sphere(t, q, params):
 
 system = System(lagrangian, {"sphere": Holonomic(sphere)}, dissipation=friction)
 
-# Points, latitude and offset of longitude of each ring, and the number of its first point.
+# For each ring: number of points, latitude, offset of longitude, and index of its first point.
 RINGS = ((3, 3 / 8, 1 / 13, 1), (7, 1 / 8, 1 / 29, 1), (6, -2 / 15, 1 / 7, 1), (4, -3 / 10, 1 / 17, 0))
 
 
@@ -99,5 +99,5 @@ MECHANISM = Mechanism(
     reference=(REST, np.zeros((20, 3))),
     origin="RADAU5 at tolerance 1e-12 (Bari test set)",
     digits=10,
-    # The velocity's reference is zero: its error is absolute there.
+    # The reference velocity is zero, so its error is absolute.
 )

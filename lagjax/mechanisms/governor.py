@@ -1,4 +1,4 @@
-"""Watt's flyball governor with stiff links: a shaft that turns freely, two hinged rods with balls, and a slider.
+"""Watt's flyball governor with stiff links: a freely turning shaft, two hinged rods with balls, and a slider.
 
 The shaft turns by ψ about z. Two rods of mass m and length l are hinged to its top at
 
@@ -11,14 +11,14 @@ rod's middle to the slider at ±b e:
     L = ½ I ψ̇² + ½ m_s ż² + Σ [½ M |Ċ|² + m (|Ȧ|² + Ȧ·Ċ + |Ċ|²)/6]
         - g [m_s z + Σ (M z_C + ½ m (h + z_C))] - ½ k Σ (s - l0)²,          R = ½ c Σ ṡ²
 
-with s the length of a spring; I is of shaft and slider about the axis. ψ, z, C, D are eight coordinates; each rod
-keeps its length and stays in the plane (n = (-sin ψ, cos ψ, 0)):
+with s the length of a spring and I the inertia of shaft and slider about the axis. ψ, z, C, D are eight coordinates;
+each rod keeps its length and stays in the plane (n = (-sin ψ, cos ψ, 0)):
 
     |C - A|² = l²,    C·n = 0,        |D - B|² = l²,    D·n = 0
 
-Four degrees of freedom, of which two stay unexcited by symmetry: with both rods at the angle α below the horizontal,
-p = ∂L/∂ψ̇ is constant and the reference integrates two equations for (α, z). The springs' relaxation rate is about
-c/m_s, 10⁴ times that of the motion. The rods are slender here (their section would add 10⁻⁶ of the inertia).
+There are four degrees of freedom, two of which are not excited, by symmetry: with both rods at the angle α below the
+horizontal, p = ∂L/∂ψ̇ is constant and the reference integrates two equations for (α, z). The springs' relaxation rate
+is about c/m_s, 10⁴ times that of the motion. The rods are slender here (their section would add 10⁻⁶ of the inertia).
 
 Source: González et al., *Multibody System Dynamics* 16 (2006) 179, and the IFToMM library, A05
 (the hinges' offset b and the rods below the horizontal: as in Exudyn's model of it).
@@ -46,7 +46,7 @@ class Parts(NamedTuple):
     D: Float[Array, "3"]
 
 
-# Density 3000 kg/m³: shaft and rods 1 x 0.01 x 0.01 m, slider a cube of 0.1 m; `I` is that of shaft and slider.
+# Density 3000 kg/m³: shaft and rods 1 x 0.01 x 0.01 m, slider a cube of 0.1 m; `I` includes shaft and slider.
 PARAMS = {
     "I": 0.3 * 0.01**2 / 6 + 3.0 * 0.1**2 / 6, "slider": 3.0, "rod": 0.3, "ball": 5.0, "l": 1.0, "b": 0.05, "h": 1.0,
     "k": 8e5, "c": 4e4, "l0": 0.5, "g": 9.81,
@@ -107,7 +107,7 @@ system = System(
     lagrangian, {"rod_lengths": Holonomic(rod_lengths), "rod_planes": Holonomic(rod_planes)}, dissipation=dissipation
 )
 
-# Rods 30 degrees below the horizontal, springs at rest, all turning with the shaft at 2 π rad/s.
+# Rods 30 degrees below the horizontal, springs at their rest length, everything turning with the shaft at 2 π rad/s.
 REACH = 0.05 + 0.5 * 3.0**0.5
 RATE = 2 * np.pi
 

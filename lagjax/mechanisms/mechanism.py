@@ -1,4 +1,4 @@
-"""What a test problem consists of."""
+"""The parts of a test problem."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -11,12 +11,12 @@ from lagjax.mechanics.system import System
 class Mechanism:
     """A mechanism with a known motion: what to integrate, and where it must end.
 
-    - `name`, `title`, `source`: what it is called and where it is from.
+    - `name`, `title`, `source`: its names and its origin.
     - `system`, `params`, `q0`, `v0`, `end`: the motion from (q0, v0) at t = 0 to t = `end`.
-    - `reference`: (q, v) at `end`, like (q0, v0), or None; `origin`: who computed it, and how; `digits`: how many
-      of its digits, relative to the largest coordinate and the largest velocity, are trusted.
-    - `freedom`: degrees of freedom, away from singular positions. Where more constraints are given than
-      coordinates minus this, they are redundant.
+    - `reference`: (q, v) at `end`, with the structure of (q0, v0), or None; `origin`: who computed it, and how;
+      `digits`: how many of its digits are reliable, relative to the largest coordinate and the largest velocity.
+    - `freedom`: degrees of freedom away from singular positions. Constraints beyond the number of coordinates minus
+      this are redundant.
     """
 
     name: str

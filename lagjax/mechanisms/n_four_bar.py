@@ -4,17 +4,17 @@ N + 1 legs of length l stand side by side on A_i = (i l, 0); N couplers join the
 
     |B_i - A_i|² = l²  (i = 0 ... N),      |B_i - B_(i-1)|² = l²  (i = 1 ... N)
 
-2 (N + 1) coordinates, 2N + 1 equations, one degree of freedom. With uniform rods of mass m (`natural.py`)
+These are 2 (N + 1) coordinates and 2N + 1 equations: one degree of freedom. With uniform rods of mass m (`natural.py`)
 
     L = Σ_legs (m |Ḃ_i|²/6 - ½ m g y_i)
       + Σ_couplers (m (|Ḃ_(i-1)|² + Ḃ_(i-1)·Ḃ_i + |Ḃ_i|²)/6 - ½ m g (y_(i-1) + y_i))
 
-As long as it stays a ladder all legs have one angle φ, all B_i the velocity l φ̇, and
+As long as it stays a ladder, all legs have the same angle φ, all B_i the velocity l φ̇, and
 
     (N + (N + 1)/3) l φ̈ = -(N + (N + 1)/2) g cos φ
 
-a pendulum. Where the legs lie down (φ = 0 or π) all rods are in one line: the rows of A are dependent, and each
-four-bar could go on as an antiparallelogram: the degrees of freedom are N + 1 at that instant.
+which is a pendulum. When the legs are horizontal (φ = 0 or π) all rods are in one line: the rows of A are dependent,
+and each four-bar could continue as an antiparallelogram, so there are N + 1 degrees of freedom at that instant.
 
 Source: González, Dopico, Lugrís & Cuadrado, *Multibody System Dynamics* 16 (2006) 179, and the IFToMM library of
 computational benchmark problems, A02 (N = 40 there; N = 2, as here, in OpenSim's collection of them).
@@ -57,7 +57,7 @@ system = System(lagrangian, {"legs": Holonomic(legs), "couplers": Holonomic(coup
 def n_four_bar(windows: int, end: float = 10.0, head=None, velocity=None) -> Mechanism:
     """The benchmark with N = `windows`: legs upright, all heads at 1 m/s to the right.
 
-    `head` and `velocity`, where known: of B_0 at `end`; every other B_i is i lengths to the right of it.
+    `head` and `velocity` are those of B_0 at `end`, if known; every other B_i is i lengths to the right of it.
     """
     heads = np.stack([np.arange(windows + 1.0), np.ones(windows + 1)], axis=1)
     return Mechanism(

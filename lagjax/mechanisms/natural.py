@@ -1,10 +1,10 @@
-"""Natural coordinates: a slender rod by its two ends.
+"""Natural coordinates: a slender rod described by its two ends.
 
 A uniform rod of mass m from P to Q has the velocity (1 - s) Ṗ + s Q̇ at the fraction s of its length, so
 
     T = ½ m ∫ |(1 - s) Ṗ + s Q̇|² ds = m (|Ṗ|² + Ṗ·Q̇ + |Q̇|²) / 6
 
-constant in the coordinates: no mass matrix to recompute, and constraints at most quadratic.
+The mass matrix is constant, so it is never recomputed, and constraints are at most quadratic.
 
 Source: García de Jalón & Bayo, *Kinematic and Dynamic Simulation of Multibody Systems* (1994).
 """

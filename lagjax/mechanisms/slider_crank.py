@@ -1,4 +1,4 @@
-"""The slider-crank: two rigid bodies and a block in a plane, each with all of its own coordinates.
+"""The slider-crank: two rigid bodies and a block in a plane, each described by all of its own coordinates.
 
     crank   (x1, y1, θ1)   mass m1, inertia J1 about its centre, length l1, turns about O
     rod     (x2, y2, θ2)   mass m2, inertia J2, length l2, hinged to the crank's end and to the block
@@ -19,8 +19,8 @@ One degree of freedom is left. With sin θ2 = -ρ sin θ1, ρ = l1/l2, and w = d
     J = J1 + m1 l1²/4 + J2 w² + m2 [(l1 sin θ1 + ½ l2 w sin θ2)² + ¼ l1² cos² θ1] + m3 (l1 sin θ1 + l2 w sin θ2)²
     V = ½ (m1 + m2) g l1 sin θ1
 
-which gives the reference. Masses and lengths are those of Simeon's slider-crank (whose rod is elastic, whose
-crank is driven and which has no gravity); here it is thrown at the same speed and left alone.
+This equation gives the reference. Masses and lengths are those of Simeon's slider-crank (with an elastic rod, a driven
+crank and no gravity); here it starts at the same speed and then moves freely.
 
 Source: Simeon, *Math. Modelling of Systems* 2 (1996) 1; Bari test set, problem "crank" (the numbers).
 """
@@ -65,7 +65,7 @@ def lagrangian(t, q, v, params):
 
 
 def half(body, length):
-    """From the centre of a body to its far end."""
+    """The vector from the centre of a body to its far end."""
     return 0.5 * length * jnp.stack([jnp.cos(body.angle), jnp.sin(body.angle)])
 
 

@@ -1,8 +1,8 @@
 """Worked systems: Lagrangian, parameters, initial state, exact results, source.
 
-Each module holds the Lagrangian as a reader of the source would write it, `PARAMS`, an initial state, the
-exact results that the tests and the main job compare with, and `MISPRINTS`: where the source is wrong and what
-is right. `SCENE` gathers them for `python -m lagjax`.
+Each module contains the Lagrangian as a reader of the source would write it, `PARAMS`, an initial state, the
+exact results for the tests and the main job, and `MISPRINTS`: errors of the source with their corrections. `SCENE`
+collects them for `python -m lagjax`.
 """
 
 from lagjax.scenes import (

@@ -17,9 +17,9 @@ Released from rest at ψ_m, x = tan(ψ/2) is elliptic. With s = sin(ψ_m/2), c =
     G < 0  about α:             x = tan(ψ_m/2) dn(√M t | D/M),  m1 = -c² G / M,      T = 2 K / √M
     G = 0  homoclinic:          x = tan(ψ_m/2) sech(√(ω² - ω0²) t)
 
-where D = G + ω² s² = ω0² - ω² cos ψ_m, M = s² (ω0² + ω² s²) and m1 = 1 - m, which is formed without cancellation and
-is all that the arithmetic-geometric mean needs: K = π / (2 agm(1, √m1)). The second form holds for the inner turning
-point (m < 0) as for the outer one.
+where D = G + ω² s² = ω0² - ω² cos ψ_m, M = s² (ω0² + ω² s²) and m1 = 1 - m. m1 is computed without cancellation, and
+the arithmetic-geometric mean needs nothing else: K = π / (2 agm(1, √m1)). The second form holds for the inner turning
+point (m < 0) and for the outer one.
 """
 
 import functools
@@ -91,7 +91,7 @@ damped_system = System(lagrangian, dissipation=friction)
 
 
 class Balance(NamedTuple):
-    """What one state carries: energy, Jacobi integral, angular momenta, the motor's torque and power, normal forces."""
+    """One state: energy, Jacobi integral, angular momenta, the motor's torque and power, normal forces."""
 
     E: jax.Array
     h: jax.Array
@@ -138,7 +138,7 @@ def equilibrium_angle(params):
 
 
 def short_of_horizontal(params):
-    """π/2 - α = arcsin(ω0²/ω²): what is left of it for fast rotation."""
+    """π/2 - α = arcsin(ω0²/ω²): how far below the horizontal the bead rests, accurate for fast rotation."""
     return jnp.arcsin(params["g"] / (params["a"] * params["omega"] ** 2))
 
 
@@ -167,16 +167,16 @@ def growth(square):
 
 
 def lag_behind_hoop(params):
-    """ω - Ω about α, as ω0⁴ / (ω² (ω + Ω)): at ω = 1e6 the difference itself would be lost in round-off."""
+    """ω - Ω about α, computed as ω0⁴ / (ω² (ω + Ω)): at ω = 1e6 round-off would swamp the difference itself."""
     below, omega = params["g"] / params["a"], params["omega"]
     return below**2 / (omega**2 * (omega + frequency(small_motion(params).alpha)))
 
 
 def libration(params, psi):
-    """Whether a bead released from rest at ψ goes through the bottom; rate, m and m1 of its elliptic functions."""
+    """Does a bead released from rest at ψ go through the bottom? Also rate, m and m1 of its elliptic functions."""
     below, squared = params["g"] / params["a"], params["omega"] ** 2
     s2, c2 = jnp.sin(0.5 * psi) ** 2, jnp.cos(0.5 * psi) ** 2
-    # ω0² - ω² c², written so that it keeps its digits at ω = ω0.
+    # ω0² - ω² c², written so that it does not cancel at ω = ω0.
     gap = (below - squared) + squared * s2
     D, M = gap + squared * s2, s2 * (below + squared * s2)
     through = gap > 0
@@ -236,7 +236,7 @@ HALF_PERIOD = diffrax.Event(lambda t, y, params, **kwargs: y[1], direction=False
 def swing(params, psi, longest, tolerance=1e-10):
     """Release the bead at rest at ψ and stop where it comes to rest again, half a period later.
 
-    Started on the side (+ψ or -ψ) from which it moves towards larger angles, and for `longest` at most.
+    It starts on the side (+ψ or -ψ) from which it moves towards larger angles, and moves for `longest` at most.
     """
     start = jnp.where(params["omega"] ** 2 * jnp.cos(psi) > params["g"] / params["a"], psi, -psi)
     ts = jnp.stack([jnp.zeros_like(start), jnp.asarray(longest, start.dtype)])
@@ -245,7 +245,7 @@ def swing(params, psi, longest, tolerance=1e-10):
 
 
 def settled(params, psi, time, tolerance=1e-9):
-    """Where a bead with friction (params["b"]) ends up, released at rest at ψ."""
+    """Where a bead with friction (params["b"]), released at rest at ψ, ends up."""
     ts = jnp.stack([jnp.zeros_like(time), time])
     return integrate(damped_system, psi, jnp.zeros_like(psi), params, ts=ts, rtol=tolerance, atol=tolerance).end.q
 
@@ -302,11 +302,11 @@ def cases():
     params = PARAMS | {"omega": 2.5}
     quarter = exact_period(params, np.pi - 2.0**-16) / 4
     fall = swing(params, np.pi - 2.0**-16, quarter, 1e-12).end
-    # π - 2^-16 itself carries eleven digits of the distance from the top, the time to the bottom its logarithm.
+    # π - 2^-16 gives eleven digits of the distance from the top; the time to the bottom depends on its logarithm.
     error = abs(float(fall.q / fall.v / quarter))
     rows.append(Case("from 2^-16 off the top", f"at the bottom after T/4 = {float(quarter):.6g} s", error, 1e-9))
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", EventWarning)  # The guard is zero all along, which is told.
+        warnings.simplefilter("ignore", EventWarning)  # The event function is zero all the time, which gives a warning.
         still = swing(PARAMS, 0.0, 1000.0)
     error = abs(float(still.end.q)) + (0.0 if float(still.end.t) == 1000.0 else np.inf)
     rows.append(Case("at rest on the unstable bottom", "stays for 1000 s: no spurious departure", error, 0.0))
@@ -345,7 +345,7 @@ def _pitchfork_case():
 
 
 @functools.cache
-def _branches():  # for the case and for the picture
+def _branches():  # for the case and the picture
     return continue_equilibria(system, PARAMS | {"omega": 0.5}, 0.0, along="omega", to=9.0)
 
 
@@ -357,7 +357,7 @@ def _critical_case():
 
 
 @functools.cache
-def _settling():  # for the case and for the picture; clear of ω0 itself, where friction needs for ever
+def _settling():  # for the case and the picture; not too near ω0, where settling takes infinitely long
     speeds = np.append(np.linspace(0.1, 0.92, 9), np.linspace(1.12, 2.45, 14))
     starts = np.where(np.arange(speeds.size) % 2, 0.5, -0.5)
     return speeds, starts, pitchfork(natural_rate(PARAMS) * speeds, starts)

@@ -1,10 +1,10 @@
-"""The equations of motion of the scenes as a careful person derives them: what our own are compared with.
+"""The equations of motion of the scenes, derived by hand with care; lagjax's own are compared with them.
 
 Each function returns accelerations like q and multipliers by constraint name, as `lj.accelerations` does. They are
-functions of the whole state: a hoop's r is taken from q although the contact holds it at R + a, so that they agree with
-the equations from L off the constraints too. Divisions by what does not change stand where a compiler can move them out
-of a loop. The potentials' gradients use what their derivation offers and differentiation cannot know: inside the
-logarithms and square roots terms cancel, and by Gauss's theorem a field is a surface integral.
+functions of the whole state: a hoop's r is taken from q although the contact holds it at R + a, so they agree with the
+equations from L even if the constraints are violated. Divisions by constants are written so that a compiler can move
+them out of a loop. The potentials' gradients use simplifications that differentiation cannot find: terms inside the
+logarithms and square roots cancel, and by Gauss's theorem a field is a surface integral.
 """
 
 import jax.numpy as jnp
@@ -26,7 +26,7 @@ def on_sphere(t, q, v, params):
 
 
 def rolling(t, q, v, params):
-    """r̈ = 0, and the rolling eliminated: (r² + β l²) θ̈ = -r (g cos θ + 2 ṙ θ̇)."""
+    """r̈ = 0, with the rolling constraint eliminated: (r² + β l²) θ̈ = -r (g cos θ + 2 ṙ θ̇)."""
     m, l, beta, g = params["m"], params["R"] + params["a"], params["beta"], params["g"]
     r = q["r"]
     theta = -r * (g * jnp.cos(q["theta"]) + 2 * v["r"] * v["theta"]) / (r**2 + beta * l**2)
@@ -41,7 +41,7 @@ def bead(t, q, v, params):
 
 
 def driven_bead(t, q, v, params):
-    """θ̈ = 0, and the motor's torque is the change of m a² sin²ψ θ̇."""
+    """θ̈ = 0, and the motor's torque is the rate of change of m a² sin²ψ θ̇."""
     s, c = jnp.sin(q["psi"]), jnp.cos(q["psi"])
     psi = s * (v["theta"] ** 2 * c - params["g"] / params["a"])
     torque = (2 * params["m"] * params["a"] ** 2) * s * c * v["psi"] * v["theta"]
@@ -49,7 +49,7 @@ def driven_bead(t, q, v, params):
 
 
 def rails_in_the_lab(t, q, v, params):
-    """Two springs that turn."""
+    """Two rotating springs."""
     K, k = params["K"] / params["m"], params["k"] / params["m"]
     c, s = jnp.cos(params["omega"] * t), jnp.sin(params["omega"] * t)
     along, across = K * (q["x"] * c + q["y"] * s - params["R0"]), k * (q["y"] * c - q["x"] * s)
@@ -88,7 +88,7 @@ def field_of_cylinder(q, params):
 
 
 def field_of_finite_cylinder(q, params):
-    """-G ρ ∮ n dS / |r' - r|: along z from the lids, across from the side. Not for far away."""
+    """-G ρ ∮ n dS / |r' - r|: the z component from the lids, the others from the side. Inaccurate far away."""
     a, b, x, y, z = params["a"], params["b"], q["x"], q["y"], q["z"]
     angles, weights = potentials.clustered_nodes(96, 1e-4)
     azimuth = jnp.arctan2(y, x)
@@ -117,7 +117,7 @@ def field_of_elliptic_cylinder(q, params):
 
 
 def field_of_dumbbell(q, params):
-    """Two balls as points, or inside as springs; and a rod, whose Φ depends on the sum of distances from its ends."""
+    """Two balls (points outside, springs inside) and a rod, whose Φ depends on the sum of distances from its ends."""
     x, y, z, c, half = q["x"], q["y"], q["z"], params["c"], 0.5 * params["length"]
     s2, radius = x**2 + y**2, params["radius"]
 
@@ -135,7 +135,7 @@ def field_of_dumbbell(q, params):
 
 
 def field_of_helix(q, params):
-    """The derivative of the sum over turns: by A² under the integral, and of A² by the coordinates."""
+    """The derivative of the sum over turns with respect to A², times the derivative of A² by the coordinates."""
     a, h, x, y = params["a"], params["h"], q["x"], q["y"]
     angles, weights = potentials.clustered_nodes(256, 0.1)
     wire = 2 * jnp.pi / h * q["z"] - angles

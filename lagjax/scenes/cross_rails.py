@@ -7,7 +7,7 @@ the second (k, rest length zero) along r; x = R cos ωt - r sin ωt, y = R sin �
       = ½ m ((Ṙ - ω r)² + (ṙ + ω R)²) - ½ K (R - R0)² - ½ k r²
 
 The first form depends on time, so its energy function is E = T + V and not conserved; the second does not, and its
-Jacobi integral is h' = E - ω L_z. The rails' torque τ keeps the books, and Coriolis enters with the factor 2:
+Jacobi integral is h' = E - ω L_z. The rails' torque τ makes the difference, and the Coriolis terms have a factor 2:
 
     R̈ = 2 ω ṙ + ω² R - (K/m) (R - R0),    r̈ = -2 ω Ṙ + ω² r - (k/m) r
     τ = dL_z/dt = r (K (R - R0) - k R),    dE/dt = ω τ                                        (15)
@@ -16,8 +16,8 @@ These are linear: z = (R, r, Ṙ, ṙ) obeys ż = B z + e. With κ = k/m and Κ 
 
     Ω⁴ - (κ + Κ + 2 ω²) Ω² + (κ - ω²) (Κ - ω²) = 0,    discriminant (κ - Κ)² + 8 ω² (κ + Κ) >= 0
 
-so that they are real: the motion is stable iff (1 - m ω²/K) (1 - m ω²/k) > 0, below both critical speeds or above
-both. The even powers of B have two eigenvalues only, and Sylvester's formula gives the matrix exponential,
+so they are real: the motion is stable iff (1 - m ω²/K) (1 - m ω²/k) > 0, below both critical speeds or above
+both. The even powers of B have only two eigenvalues, and Sylvester's formula gives the matrix exponential,
 
     z(t) = C(t) z0 + S(t) (B z0 + e) + V(t) B e,    C, S, V = cos Ωt, sin(Ωt)/Ω, (1 - cos Ωt)/Ω²  at  Ω² = -B²,
 
@@ -45,10 +45,10 @@ from lagjax.sweeps import sweep
 PARAMS = {"m": 0.5, "K": 20.0, "k": 8.0, "R0": 0.75, "omega": 2.5}
 Q0 = {"R": 1.0, "r": 0.125}
 V0 = {"R": 0.25, "r": -0.5}
-# Farther away than this the carriage is no longer held.
+# A carriage farther away than this is no longer held.
 LEAVES = 1000.0
 
-# Powers of Ω²t² kept where it is below SERIES_BELOW: 0.1⁷/14! is below round-off.
+# Number of terms in the series in Ω²t², used below SERIES_BELOW: 0.1⁷/14! is below round-off.
 SERIES_TERMS = 7
 SERIES_BELOW = 0.1
 
@@ -70,7 +70,7 @@ MISPRINTS = (
 
 
 def lab_lagrangian(t, q, v, params):
-    """L in x, y: explicit time, because the springs turn."""
+    """L in x, y: depends on time explicitly, because the springs turn."""
     m, K, k, R0 = params["m"], params["K"], params["k"], params["R0"]
     c, s = jnp.cos(params["omega"] * t), jnp.sin(params["omega"] * t)
     stretch, across = q["x"] * c + q["y"] * s - R0, -q["x"] * s + q["y"] * c
@@ -78,7 +78,7 @@ def lab_lagrangian(t, q, v, params):
 
 
 def rotating_lagrangian(t, q, v, params):
-    """L in R, r: no time, but terms linear in the velocities."""
+    """L in R, r: independent of time, but with terms linear in the velocities."""
     m, K, k, R0, omega = params["m"], params["K"], params["k"], params["R0"], params["omega"]
     speed_squared = (v["R"] - omega * q["r"]) ** 2 + (v["r"] + omega * q["R"]) ** 2
     return 0.5 * m * speed_squared - 0.5 * K * (q["R"] - R0) ** 2 - 0.5 * k * q["r"] ** 2
@@ -89,7 +89,7 @@ rotating_system = System(rotating_lagrangian)
 
 
 def to_lab(params, t, q, v):
-    """(x, y) and its rate from (R, r) and its rate."""
+    """(x, y) and their rates from (R, r) and their rates."""
     omega = params["omega"]
     c, s = jnp.cos(omega * t), jnp.sin(omega * t)
     along, across = v["R"] - omega * q["r"], v["r"] + omega * q["R"]
@@ -100,7 +100,7 @@ def to_lab(params, t, q, v):
 
 
 def to_rotating(params, t, q, v):
-    """(R, r) and its rate from (x, y) and its rate."""
+    """(R, r) and their rates from (x, y) and their rates."""
     omega = params["omega"]
     c, s = jnp.cos(omega * t), jnp.sin(omega * t)
     R, r = q["x"] * c + q["y"] * s, -q["x"] * s + q["y"] * c
@@ -108,7 +108,7 @@ def to_rotating(params, t, q, v):
 
 
 class Balance(NamedTuple):
-    """What one state carries: energy, Jacobi integral, angular momentum, the rails' torque and its power."""
+    """Quantities of one state: energy, Jacobi integral, angular momentum, the rails' torque and its power."""
 
     E: jax.Array
     h: jax.Array
@@ -120,7 +120,7 @@ class Balance(NamedTuple):
 def balance(params, q, v) -> Balance:
     """E, h' = E - ω L_z, L_z, τ = r (K (R - R0) - k R) and dE/dt = ω τ, from the rotating coordinates.
 
-    h' is formed as ½m(Ṙ² + ṙ²) + V - ½mω²(R² + r²), its own expression.
+    h' is computed independently of E and L_z, as ½m(Ṙ² + ṙ²) + V - ½mω²(R² + r²).
     """
     m, K, k, R0, omega = params["m"], params["K"], params["k"], params["R0"], params["omega"]
     V = 0.5 * K * (q["R"] - R0) ** 2 + 0.5 * k * q["r"] ** 2
@@ -148,7 +148,7 @@ class Squares(NamedTuple):
 
 
 def mode_squares(params) -> Squares:
-    """Ω² of both modes: the slow one as c / Ω_fast², so that it keeps its digits near a critical speed."""
+    """Ω² of both modes: the slow one as c / Ω_fast², so that it does not cancel near a critical speed."""
     half_sum, root, product = _characteristic(params)
     fast = half_sum + 0.5 * root
     return Squares(fast=fast, slow=product / fast)
@@ -205,7 +205,7 @@ def exact_motion(params, q0, v0, t):
     push = jnp.stack([zero, zero, Kappa * params["R0"], zero])
     fast, slow = mode_squares(params)
     difference = _characteristic(params)[1]
-    difference = jnp.where(difference > 0, difference, 1.0)  # zero only where B² = -Ω², and its factor is zero
+    difference = jnp.where(difference > 0, difference, 1.0)  # zero only if B² = -Ω², where its factor is zero too
     z = 0.0
     for vector, at_fast, at_slow in zip((start, rate(start) + push, rate(push)), _waves(fast, t), _waves(slow, t)):
         rest = (rate(rate(vector)) + fast * vector) / difference
@@ -215,7 +215,7 @@ def exact_motion(params, q0, v0, t):
 
 
 def _waves(square, t):
-    """cos Ωt, sin(Ωt)/Ω and (1 - cos Ωt)/Ω² for Ω² of either sign; a series where Ωt is small."""
+    """cos Ωt, sin(Ωt)/Ω and (1 - cos Ωt)/Ω² for Ω² of either sign, by a series if Ωt is small."""
     y = square * t**2
     small = jnp.abs(y) < SERIES_BELOW
     series = [t**j * jnp.polyval(_coefficients(j), jnp.where(small, y, 0.0)) for j in range(3)]
@@ -238,7 +238,7 @@ def _coefficients(j):
 
 
 def runs():
-    """The same motion in both frames, and one above both critical speeds."""
+    """The same motion in both frames, and a motion above both critical speeds."""
     ts, above = np.linspace(0.0, 100.0, 11), PARAMS | {"omega": 8.0}
     return [
         _run("rotating frame, omega = 2.5", rotating_system, PARAMS, ts, by_hand.rails_rotating),
@@ -248,7 +248,7 @@ def runs():
 
 
 def _run(name, system, params, ts, acceleration=None):
-    """Compared in the coordinates of the system; the invariant is h' in either."""
+    """A run whose error is measured in the coordinates of its system; the invariant is h' in both frames."""
     in_lab = system is lab_system
     start = to_lab(params, 0.0, Q0, V0) if in_lab else (Q0, V0)
 
@@ -278,7 +278,7 @@ def cases():
         _case("K/k = 2.5e6, stiff", {"K": 2e7}, 1.0),
         _case("K = k, R0 = 0, isotropic", {"K": 8.0, "R0": 0.0, "omega": 3.0}, 20.0),
     ]
-    # At t = 1e6 the clock itself resolves 1e-10 s, and the angle ω t as little.
+    # At t = 1e6 the time itself has a resolution of only 1e-10 s, and so has the angle ω t.
     late = 1e6 + np.array([0.0, 5.0])
     end = integrate(lab_system, *to_lab(PARAMS, late[0], Q0, V0), PARAMS, ts=late, rtol=1e-12, atol=1e-12).end
     error = relative_error(to_rotating(PARAMS, late[1], end.q, end.v), exact_motion(PARAMS, Q0, V0, 5.0))
@@ -298,7 +298,7 @@ def _case(name, change, time):
 
 def _verdict(params):
     slow = float(mode_squares(params).slow)
-    # √(K/m) as a double is off by a last digit, which makes a frequency of 1e-8 of nothing.
+    # The rounding of √(K/m) alone would give a frequency of 1e-8 instead of zero.
     if abs(slow) < 1e-9:
         return "growth as a power of t"
     return f"slow mode {np.sqrt(slow):.4g} rad/s" if slow > 0 else f"growth rate {np.sqrt(-slow):.4g} per s"
@@ -318,7 +318,7 @@ def stability_map(over_K, over_k, **settings):
 
 @functools.cache
 def _mapped():
-    """144 pairs of springs and what became of each, for the case and for the picture."""
+    """144 pairs of springs and the final distance of each, for the case and the picture."""
     sides = np.geomspace(0.08, 12.5, 12)
     return *np.meshgrid(sides, sides, indexing="ij"), stability_map(sides, sides)
 
@@ -334,17 +334,17 @@ def is_held(over_K, over_k):
 
 
 def _modes_case():
-    """The closed form at random points, as many as the picture has."""
+    """Compare with the closed form at random points, as many as the picture has."""
     over_K, over_k = np.exp(np.random.default_rng(0).uniform(np.log(0.05), np.log(20.0), (2, 60, 60)))
     wrong = int(np.sum(is_held(over_K, over_k) != ((1 - over_K) * (1 - over_k) > 0)))
     return Case("3,600 pairs of springs", "stability by normal modes", float(wrong), 0.0)
 
 
 def _map_case():
-    """The whole plane, above both critical speeds too, where the rotation alone holds the carriage."""
+    """The whole plane, including above both critical speeds, where the rotation alone holds the carriage."""
     (over_K, over_k, swept), squared = _mapped(), PARAMS["m"] * PARAMS["omega"] ** 2
     stable = np.asarray(is_stable(PARAMS | {"K": squared / over_K, "k": squared / over_k}))
-    # A motion that failed is NaN, and would pass for one that leaves.
+    # A failed motion is NaN and would be counted as one that leaves.
     wrong = int(np.sum(((swept.values < LEAVES) != stable) | ~swept.ok))
     return Case("144 pairs of springs", f"stability by integration of {swept.ok.sum()} motions", float(wrong), 0.0)
 
@@ -373,7 +373,7 @@ def _draw_path(axis):
 
 
 def _draw_map(axis):
-    """Regions by the verdict of normal modes, and what 144 pairs of springs do, integrated for 40 s."""
+    """Regions by the verdict of normal modes, and the motions of 144 pairs of springs, integrated for 40 s."""
     low, high = 0.05, 20.0
     x, y = np.meshgrid(*2 * [np.geomspace(low, high, 60)])
     axis.contourf(x, y, is_held(x, y), [0.5, 1.5], colors=[plot.COLOURS[2]], alpha=0.25)

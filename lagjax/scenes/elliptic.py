@@ -1,4 +1,4 @@
-"""Elliptic functions by the arithmetic-geometric mean, differentiable, without loss of digits at either end."""
+"""Elliptic functions by the arithmetic-geometric mean: differentiable, no loss of digits near m = 0 or m = 1."""
 
 import jax.numpy as jnp
 
@@ -16,7 +16,7 @@ def agm(a, b):
 def jacobi_elliptic(u, m, m1):
     """sn, cn and dn of u for m < 1, given with its complement m1 = 1 - m > 0 (Abramowitz & Stegun 16.4).
 
-    Only m1 enters the recursion, so that m near 1 costs no digits; m may be negative.
+    Only m1 enters the recursion, so no digits are lost for m near 1; m may be negative.
     """
     a, b = jnp.ones_like(m1), jnp.sqrt(m1)
     ratios = []

@@ -1,7 +1,7 @@
 """Conserved momenta in the field of seven mass distributions (Goldstein, Exercise 2-19; source §4).
 
 A particle of unit mass in Cartesian coordinates, L = ½ |v|² - Φ(q), with the potentials of
-`lagjax.scenes.potentials`. A symmetry of the masses is one of Φ and of L; Noether's theorem gives
+`lagjax.scenes.potentials`. A symmetry of the masses is also a symmetry of Φ and of L; Noether's theorem gives
 
     translation along x, y, z   ->  p_x, p_y, p_z
     rotation about z            ->  L_z = x ẏ - y ẋ
@@ -13,13 +13,13 @@ A particle of unit mass in Cartesian coordinates, L = ½ |v|² - Φ(q), with the
     c cylinder            p_z, L_z, E             g helix               h p_z + 2π L_z, E
     d finite cylinder     L_z, E
 
-Three more, from no symmetry of space: inside the elliptic cylinder Φ is a quadratic form, and the energies of
+Three more come from no spatial symmetry: inside the elliptic cylinder Φ is a quadratic form, and the energies of
 the motions along x and y are separately conserved; the dumbbell with a massless rod is Euler's problem of two
 centres, with the integral (r1 x v)·(r2 x v) + 2 c G (M2 cos θ2 - M1 cos θ1), r1 and r2 from the balls' centres.
 
-Inside: c oscillates with √(2πGρ) in any direction, e with √(4πGρ b/(a+b)) along x and √(4πGρ a/(a+b)) along y.
-A circular orbit around c has the speed a √(2πGρ) at every radius. Falling through a from z = 0 with speed w, the
-particle is back, with the same velocity, after 4 w/(2πGσ).
+Inside c the particle oscillates with √(2πGρ) in any direction, inside e with √(4πGρ b/(a+b)) along x and √(4πGρ
+a/(a+b)) along y. A circular orbit around c has the speed a √(2πGρ) at every radius. Falling through a from z = 0 with
+speed w, the particle is back, with the same velocity, after 4 w/(2πGσ).
 """
 
 import diffrax
@@ -92,7 +92,7 @@ def vector(x, y, z):
     return {"x": x, "y": y, "z": z}
 
 
-# Orbits without any symmetry of their own that keep away from kinks and singular lines: q0, v0, duration.
+# Orbits without any symmetry of their own that avoid kinks and singular lines: q0, v0, duration.
 ORBITS = {
     "plane": (vector(0.5, -0.25, 1.5), vector(0.25, 0.5, 1.0), 1.0),
     "half plane": (vector(0.5, -0.5, 1.5), vector(0.25, 0.5, 1.0), 1.0),
@@ -107,7 +107,7 @@ INSIDE = vector(0.75, 0.25, 0.0), vector(0.5, -0.5, 0.25)
 
 
 def charges(name, q, v, params) -> dict[str, jax.Array]:
-    """Momenta and energy at one state; for the helix also the screw's charge, right and as printed."""
+    """Momenta and energy at one state; for the helix also the screw's charge, correct and as printed."""
     p_z, L_z = v["z"], q["x"] * v["y"] - q["y"] * v["x"]
     energy = 0.5 * (v["x"] ** 2 + v["y"] ** 2 + v["z"] ** 2) + POTENTIALS[name](q, params)
     found = {"p_x": v["x"], "p_y": v["y"], "p_z": p_z, "L_z": L_z, "E": energy}
@@ -123,12 +123,12 @@ def bounce_period(params, speed):
 
 
 def inside_frequency(params):
-    """√(2πGρ): every motion across the axis inside the circular cylinder."""
+    """√(2πGρ): the frequency of every motion perpendicular to the axis inside the circular cylinder."""
     return jnp.sqrt(2 * jnp.pi * params["G"] * params["rho"])
 
 
 def circular_speed(params):
-    """a √(2πGρ) around the circular cylinder, at every radius s >= a."""
+    """a √(2πGρ): the speed of a circular orbit around the circular cylinder, at every radius s >= a."""
     return params["a"] * inside_frequency(params)
 
 
@@ -227,7 +227,7 @@ def charges_along(name, trajectory):
 
 
 def cases():
-    """Kinks, surfaces, rims, wires, and the limits of each shape."""
+    """Kinks, surfaces, rims, wires, and the limiting cases of each shape."""
     return [
         _plane_case(),
         _strip_case(),
@@ -241,7 +241,7 @@ def cases():
 
 
 def fall_onto_plane(params, speed, tolerance=1e-10):
-    """From the highest point until the plane is met with this speed, by an event: a quarter of a bounce."""
+    """Fall from the highest point until an event finds the plane, reached with this speed: a quarter of a bounce."""
     height = speed**2 / (4 * np.pi * params["G"] * params["sigma"])
     start = vector(0.0, 0.0, height), vector(0.25, 0.5, 0.0)
     event = diffrax.Event(lambda t, y, params, **kwargs: y[0]["z"], direction=False)
@@ -347,14 +347,14 @@ def _symmetries_case():
 
 
 def found_conserved(name) -> list[str]:
-    """What `symmetries` finds, in the words of `CONSERVED`; boosts along free directions left out."""
+    """What `symmetries` finds, with the names of `CONSERVED`; boosts along free directions are left out."""
     q, v, _ = ORBITS[name]
     words = {"Jacobi integral": "E", f"h p_z + 2π L_z with h = {PARAMS['helix']['h']:g}": "h p_z + 2 pi L_z"}
     return [words.get(key, key) for key in symmetries(SYSTEMS[name], q, v, PARAMS[name]).steady]
 
 
 def picture():
-    """A generic orbit around the helix: what is conserved, and what is not."""
+    """A generic orbit around the helix: conserved quantities and others."""
     orbit = helix_orbit(PARAMS["helix"])
     a, h = PARAMS["helix"]["a"], PARAMS["helix"]["h"]
     fig, axes = plot.figure(1, 2, size=(4.6, 3.8))

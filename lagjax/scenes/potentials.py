@@ -13,22 +13,22 @@ e  elliptic cylinder a, b, ρ:      confocal coordinate λ: x²/(a² + λ) + y²
 f  balls M1, M2 at z = ±c, a rod:  -G m/ℓ ln[(e1 + e2 + ℓ)/(e1 + e2 - ℓ)], e1 and e2 to the ends of the rod
 g  helix of radius a and pitch h:  Φ = -G λ ∫ (1/D - 1/D_axis) ds over the wire (below)
 
-The half plane's force is infinite. A strip 0 < y < W has a finite one; what is left of it as W → ∞, without
-a constant and a uniform pull 2Gσ ln W along y, is (b): only p_x and E are conserved, with or without the pull.
+The half plane's force is infinite. A strip 0 < y < W has a finite one; its limit for W → ∞, after subtracting a
+constant and a uniform pull 2Gσ ln W along y, is (b): only p_x and E are conserved, with or without the pull.
 
 (d) Gauss's theorem on ∇'·(r' - r)/|r' - r| = 2/|r' - r| turns the volume integral into one over the surface.
-The two radial integrals over the lids and the one along the side are elementary; one periodic integral is
-left. With d² = s² + a² - 2 a s cos φ, φ measured from the particle, and D(ζ) = ∮ a(a - s cos φ)/(√(d² + ζ²) + |ζ|) dφ:
+The two radial integrals over the lids and the one along the side are elementary; one periodic integral remains.
+With d² = s² + a² - 2 a s cos φ, φ measured from the particle, and D(ζ) = ∮ a(a - s cos φ)/(√(d² + ζ²) + |ζ|) dφ:
 
     Φ = -½ G ρ {(b - z) D(z - b) + (b + z) D(z + b) + ∮ a(a - s cos φ)[asinh((b - z)/d) + asinh((b + z)/d)] dφ}
 
-(g) Let the particle see the wire point that is the height h x below it, |x| < ∞; k = 2π/h, χ = φ - k z:
+(g) Parametrise the wire by the height h x of the particle above the wire point, |x| < ∞; k = 2π/h, χ = φ - k z:
 
     Φ = -G λ_z ∫ dx [1/√(A² + h² x²) - 1/√(a² + h² x²)] h,   A² = s² + a² - 2 a s cos(χ + 2π x),   λ_z = λ √(1 + k² a²)
 
 The turns x = t - n are summed over n at fixed t: directly near the particle, by the Euler-Maclaurin formula
-about half-integers far from it. The sum is periodic and analytic in t, so that the trapezoidal rule over one
-turn converges geometrically. Φ depends on s and χ alone with any number of nodes: the screw symmetry is exact.
+about half-integers far from it. The sum is periodic and analytic in t, so the trapezoidal rule over one turn converges
+geometrically. For any number of nodes Φ depends only on s and χ: the screw symmetry is exact.
 
 Nodes. A periodic integrand with all its singularities on the imaginary axis, none nearer than `nearest`, is
 integrated best with nodes equally spaced in x, where dφ/dx is Jacobi's dn: a sum of hyperbolic secants. The
@@ -46,7 +46,7 @@ import numpy as np
 BERNOULLI = (1 / 6, -1 / 30, 1 / 42, -1 / 30, 5 / 66, -691 / 2730)
 # Turns summed directly on each side: with six terms of Euler-Maclaurin for the rest, an error of 1e-13.
 DIRECT_TURNS = 8
-# Beyond this many radii the surface integral of (d) cancels; its multipoles to l = 4 are exact to 1e-12.
+# Beyond this many radii the surface integral of (d) loses digits; multipoles to l = 4 have an error of 1e-12.
 FAR = 100.0
 
 
@@ -83,7 +83,7 @@ def cylinder(q, params):
 
 
 def finite_cylinder(q, params, nodes=96, nearest=1e-4):
-    """(d) The circular cylinder |z| < b. Its field is right to `nearest`/10 on the side itself."""
+    """(d) The circular cylinder |z| < b. On the side itself its field has an error of `nearest`/10."""
     a, b = params["a"], params["b"]
     r2 = q["x"] ** 2 + q["y"] ** 2 + q["z"] ** 2
     far = r2 > FAR**2 * (a**2 + b**2)
@@ -96,7 +96,7 @@ def finite_cylinder(q, params, nodes=96, nearest=1e-4):
 def elliptic_cylinder(q, params):
     """(e) The infinite elliptic cylinder with semi-axes a along x, b along y; Φ = 0 on the axis."""
     a, b, x2, y2 = params["a"], params["b"], q["x"] ** 2, q["y"] ** 2
-    # λ² + p λ + r = 0, with r < 0 outside; the other form of its root where -p would cancel the square root.
+    # λ² + p λ + r = 0, with r < 0 outside; for p > 0 the other form of the root avoids cancellation.
     p = a**2 + b**2 - x2 - y2
     r = a**2 * b**2 - x2 * b**2 - y2 * a**2
     outside = r < 0
@@ -116,7 +116,7 @@ def dumbbell(q, params):
     balls = _ball(s2 + (z - params["c"]) ** 2, params["M1"], params["radius"])
     balls += _ball(s2 + (z + params["c"]) ** 2, params["M2"], params["radius"])
     ends = jnp.sqrt(s2 + (z - length / 2) ** 2) + jnp.sqrt(s2 + (z + length / 2) ** 2)
-    # 2 atanh(ℓ/(e1 + e2)) keeps its digits far away, where the quotient in the logarithm tends to one.
+    # 2 atanh(ℓ/(e1 + e2)) stays accurate far away, where the quotient in the logarithm tends to one.
     rod = -2 * params["rod"] / length * jnp.arctanh(length / ends)
     return params["G"] * (balls + rod)
 
@@ -124,9 +124,9 @@ def dumbbell(q, params):
 def helix(q, params, nodes=256, nearest=0.1):
     """(g) The infinite wire x + i y = a exp(2πi z/h), right-handed for h > 0; Φ = 0 on the axis.
 
-    By default the field is right to 1e-12 at distances from the wire above a/10 where h >= a, above a/4 where
-    h = a/2. Nearer, `nearest` = distance/√(h² + 4π² a²) gathers the nodes next to the particle. For a tight helix
-    `nearest=None` spaces them equally, with an error of about exp(-2π nodes distance/√(h² + 4π² a²)).
+    By default the error of the field is 1e-12 at distances from the wire above a/10 if h >= a, above a/4 if h = a/2.
+    For smaller distances `nearest` = distance/√(h² + 4π² a²) concentrates the nodes next to the particle. For a tight
+    helix `nearest=None` spaces them equally, with an error of about exp(-2π nodes distance/√(h² + 4π² a²)).
     """
     a, h = params["a"], params["h"]
     angles, weights = uniform_nodes(nodes) if nearest is None else clustered_nodes(nodes, nearest)
@@ -163,13 +163,13 @@ def clustered_nodes(count, nearest) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _absolute(x):
-    """|x|, with the derivative 0 at 0: JAX's own takes the one from above."""
+    """|x|, with the derivative 0 at 0: that of `jnp.abs` is 1 there."""
     return x * jnp.sign(x)
 
 
 def _finite_cylinder_near(q, a, b, angles, weights):
     x, y, z = q["x"], q["y"], q["z"]
-    # Where the nodes lie does not change the integral: they turn with the particle, without a derivative.
+    # The position of the nodes does not change the integral, so they turn with the particle without a derivative.
     azimuth = jax.lax.stop_gradient(jnp.arctan2(y, x))
     c, s = jnp.cos(azimuth + angles), jnp.sin(azimuth + angles)
     d2 = (x - a * c) ** 2 + (y - a * s) ** 2
@@ -182,7 +182,7 @@ def _finite_cylinder_near(q, a, b, angles, weights):
         distance = sign * height
         root = jnp.sqrt(d2 + height**2)
         lid = jnp.sum(surface / (root + distance))
-        # asinh(|ζ|/d), with the root that the lid needs as well; log1p because far away it is small.
+        # asinh(|ζ|/d), using the root that the lid needs too; log1p because it is small far away.
         side = jnp.sum(surface * jnp.log1p(distance / d * (1 + distance / (root + d))))
         return height * lid + sign * side
 

@@ -7,7 +7,7 @@ and the hoop's own angle φ; moment of inertia I = β m a², β = 1 for the hoop
     f₁ = r - (R + a) = 0                         contact, multiplier λ: the normal force       (1)
     f₂ = (R + a) θ̇ + a φ̇ = 0                     rolling, multiplier μ: the friction force     (2)
 
-With l = R + a and w² = g / ((1 + β) l), eliminating r and φ as the source does for β = 1:
+With l = R + a and w² = g / ((1 + β) l), and after eliminating r and φ as the source does for β = 1:
 
     θ̈ = -w² cos θ,    θ̇² = θ̇₀² + 2 w² (sin θ₀ - sin θ)                                         (10), (11)
     λ = m g [(3 + β) sin θ - 2 sin θ₀] / (1 + β) - m l θ̇₀²,    μ = β m g cos θ / (1 + β)       (12)
@@ -26,7 +26,7 @@ and with y = sin²(χ/2) the time to the tilt χ is a symmetric integral of Carl
     t = (1/2w) ∫ dy / √(y (1 - y) (y - y₀))
       = (√(y - y₀) / w) R_F(y₀ (1 - y₀), y (1 - y₀), y₀ (1 - y))
 
-which keeps its digits where the Legendre form cancels: starts very close to the top.
+which stays accurate for starts very close to the top, where the Legendre form cancels.
 """
 
 from typing import NamedTuple
@@ -50,9 +50,9 @@ from lagjax.scenes import by_hand
 PARAMS = {"m": 1.25, "R": 1.0, "a": 0.25, "g": 9.8125, "beta": 1.0}
 TOP = np.pi / 2
 BOTTOM = -np.pi / 2
-# I / (m a²) of what may roll; the point slides without friction.
+# I / (m a²) of the rolling bodies; the point slides without friction.
 SHAPES = {"hoop": 1.0, "disk": 0.5, "sphere": 0.4, "shell": 2.0 / 3.0, "point": 0.0}
-# Of every batch of `departures` in the main job, so that it compiles once.
+# The size of every batch of `departures` in the main job, so that it compiles once.
 LANES = len(SHAPES) + 5
 
 MISPRINTS = (
@@ -89,7 +89,7 @@ system = System(lagrangian, constraints={"contact": Holonomic(contact), "rolling
 in_flight = System(lagrangian)
 
 
-# The hoop leaves where the normal force falls through zero.
+# The hoop leaves when the normal force falls through zero.
 DEPARTURE = {"departure": Crossing(lambda t, q, v, multipliers, params: multipliers["contact"], direction=-1)}
 
 
@@ -102,10 +102,10 @@ def start(params, theta, theta_rate=0.0):
 
 
 def roll(params, theta, theta_rate, ts, **options):
-    """Roll from `theta` until the normal force vanishes, or to the end of `ts`; returns a `Trajectory`.
+    """Roll from `theta` until the normal force vanishes, or to the end of `ts`; return a `Trajectory`.
 
-    **Raises:** `ValueError` where the hoop is not pressed against the cylinder at the start (an event finds
-    zeros of λ, and would find none where λ is negative from the beginning).
+    **Raises:** `ValueError` if the hoop is not pressed against the cylinder at the start (the event finds zeros of λ,
+    and would find none if λ is negative from the beginning).
     """
     q, v = start(params, theta, theta_rate)
     force = float(accelerations(system, ts[0], q, v, params)[1]["contact"])
@@ -144,7 +144,7 @@ def exact_multipliers(params, theta, theta0, theta_rate0=0.0) -> Multipliers:
 
 
 def departure_sine(params, theta0, theta_rate0=0.0):
-    """sin θ_d; the hoop is in flight from the start where this is not below sin θ₀."""
+    """sin θ_d; if it is not below sin θ₀, the hoop is in flight from the start."""
     beta, l = params["beta"], params["R"] + params["a"]
     return (2 * jnp.sin(theta0) + (1 + beta) * l * theta_rate0**2 / params["g"]) / (3 + beta)
 
@@ -175,7 +175,7 @@ def period(params, theta0):
 
 
 class Flight(NamedTuple):
-    """The centre's position and velocity, and the spin φ̇, which stays as it is."""
+    """The centre's position and velocity, and the spin φ̇, which is constant."""
 
     x: jax.Array
     y: jax.Array
@@ -185,7 +185,7 @@ class Flight(NamedTuple):
 
 
 def leaving(params, theta0, theta_rate0=0.0) -> Flight:
-    """The state at the departure, on the right side: there (R + a) θ̇² = g sin θ."""
+    """The state at the departure on the right side, where (R + a) θ̇² = g sin θ."""
     l, sine = params["R"] + params["a"], departure_sine(params, theta0, theta_rate0)
     cosine, speed = jnp.sqrt(1 - sine**2), jnp.sqrt(params["g"] * l * sine)
     return Flight(l * cosine, l * sine, speed * sine, -speed * cosine, speed / params["a"])
@@ -206,7 +206,7 @@ def time_to_floor(params, left: Flight):
 
 
 def flight_in_polar(left: Flight, params):
-    """A state in flight in the coordinates of the Lagrangian, as (q, v)."""
+    """A state of the flight in the coordinates of the Lagrangian, as (q, v)."""
     r = jnp.hypot(left.x, left.y)
     q = {"r": r, "theta": jnp.arctan2(left.y, left.x), "phi": 0.0}
     v = {
@@ -218,7 +218,7 @@ def flight_in_polar(left: Flight, params):
 
 
 def runs():
-    """Down to the departure; the flight after it; and a hoop held to the cylinder, about the bottom."""
+    """A hoop down to its departure; the flight after it; and a hoop held to the cylinder, about the bottom."""
     return [_down(1.25), _in_the_air(), _about_the_bottom(BOTTOM + 1.0, periods=20, outputs=8)]
 
 
@@ -229,8 +229,8 @@ def _down(theta0):
 
     def error(trajectory):
         end = (trajectory.end.t, trajectory.end.q["theta"])
-        seen = jax.tree.map(lambda x: x[:4], (trajectory.q, trajectory.v))
-        return max(relative_error(seen, exact_motion(PARAMS, theta0, ts[:4])), relative_error(end, (until, angle)))
+        attached = jax.tree.map(lambda x: x[:4], (trajectory.q, trajectory.v))
+        return max(relative_error(attached, exact_motion(PARAMS, theta0, ts[:4])), relative_error(end, (until, angle)))
 
     q0, v0 = start(PARAMS, theta0)
     measured = "q, v, and the time and angle of the departure"
@@ -263,7 +263,7 @@ def _about_the_bottom(theta0, periods, outputs):
 
 @compiled
 def departures(params, theta, theta_rate, tolerance, until):
-    """Roll a batch of starts, each with its own tolerance, until it leaves or `until`: (t, θ, left?, θ on the way)."""
+    """Roll a batch of starts, each with its own tolerance, until departure or `until`: (t, θ, left?, θ on the way)."""
 
     def lane(params, theta, theta_rate, tolerance, until):
         q, v = start(params, theta, theta_rate)
@@ -284,7 +284,7 @@ def batch(starts, until=10.0):
 def cases():
     """Starts near and on the top, on the other side, uphill, too fast; other bodies; a hundred swings."""
     starts = {
-        # Projection onto the contact alone needs some inertia in φ: 2^-40 stands for the point's 0.
+        # Projection onto the constraints needs some inertia in φ: 2^-40 replaces the point's 0.
         **{f"{name}, from rest at 1.25": (beta or 2.0**-40, 1.25, 0.0, 1e-10) for name, beta in SHAPES.items()},
         "on the left, from rest at pi - 1.25": (1.0, np.pi - 1.25, 0.0, 1e-10),
         "pushed downhill, rate -1.5": (1.0, 1.25, -1.5, 1e-10),
@@ -312,9 +312,9 @@ def cases():
 
 
 def _top(lanes=LANES):
-    """An equilibrium. The double nearest to π/2 is 6e-17 short of it, which grows like cosh(w t): 1e-8 in 10 s."""
-    # A batch of its own, of the size already compiled: optimistix's bisection raises for a lane without an event
-    # in a batch where others have one.
+    """An equilibrium. The double nearest to π/2 is 6e-17 below it; this error grows like cosh(w t), to 1e-8 in 10 s."""
+    # This needs its own batch, of the size already compiled: optimistix's bisection raises for a lane without an event
+    # if other lanes of its batch have one.
     _, angles, left, _ = departures(*batch([(1.0, TOP, 0.0, 1e-10)] * lanes))
     off = np.inf if left[0] else abs(float(angles[0]) - TOP)
     return Case("at rest on the top for 10 s", "stays; pi/2 is rounded, and that grows", off, 1e-7)
@@ -347,7 +347,7 @@ def _hundred_swings():
 
 
 def picture():
-    """The hoop on its way, and why it leaves: the normal force of five bodies, and the friction it would take."""
+    """The path of the hoop, and why it leaves: the normal force of five bodies, and the friction that rolling needs."""
     fig, axes = plot.figure(1, 2, size=(4.9, 4.0))
     _draw_path(axes[0, 0])
     axis, weight = axes[0, 1], PARAMS["m"] * PARAMS["g"]
@@ -368,7 +368,7 @@ def picture():
 
 def _draw_path(axis):
     theta0 = TOP - 2.0**-3
-    # As many lanes as in the cases, for which it is compiled.
+    # The batch has as many lanes as in the cases, so it is already compiled.
     rolled = departures(*batch([(1.0, theta0, 0.0, 1e-9)] * LANES, until=2.0))
     time, last, _, theta = (np.asarray(x)[0] for x in rolled)
     theta = np.append(theta[np.isfinite(theta)], last)

@@ -65,7 +65,7 @@ class Exact(NamedTuple):
 
 
 def exact_accelerations(params) -> Exact:
-    """Ẍ, ẍ, ÿ, λ and the acceleration along the wedge, in closed form (also for M = 0, α = 0, α = π/2)."""
+    """Ẍ, ẍ, ÿ, λ and the acceleration along the wedge in closed form, valid for M = 0, α = 0, α = π/2 too."""
     m, M, g = params["m"], params["M"], params["g"]
     s, c = jnp.sin(params["alpha"]), jnp.cos(params["alpha"])
     D = M + m * s**2
@@ -84,7 +84,7 @@ def exact_motion(params, q0, v0, t):
 
 
 def start_on_incline(params, X=0.0, X_rate=0.0, along=0.0, along_rate=0.0):
-    """The state with the particle at distance `along` down the incline, in the relative speed `along_rate`."""
+    """The state with the particle at the distance `along` down the incline, with the relative speed `along_rate`."""
     s, c = np.sin(params["alpha"]), np.cos(params["alpha"])
     q = {"X": X, "x": X + along * c, "y": along * s}
     v = {"X": X_rate, "x": X_rate + along_rate * c, "y": along_rate * s}
@@ -114,7 +114,7 @@ def _run(name, q0, v0, ts):
         return relative_error((trajectory.q, trajectory.v), exact_motion(PARAMS, q0, v0, ts))
 
     words = "q and v against uniform acceleration"
-    # Which every method has without error.
+    # Every method integrates uniform acceleration without error, so the run is not drawn.
     return Run(name, system, PARAMS, q0, v0, ts, error, words, drawn=False)
 
 
@@ -147,7 +147,7 @@ def cases():
 
 
 def _worst(got, exact):
-    """The largest relative error, number by number: a tiny acceleration counts as much as a large one."""
+    """The largest relative error of a single number: a tiny acceleration counts as much as a large one."""
     return max(abs(float(a) - float(b)) / (abs(float(b)) or 1.0) for a, b in zip(got, exact))
 
 

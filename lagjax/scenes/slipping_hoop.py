@@ -1,7 +1,7 @@
-"""The hoop that slips before it leaves: what friction makes of `rolling_hoop` (source §2).
+"""The hoop that slips before it leaves: `rolling_hoop` with limited friction (source §2).
 
-The friction that rolling needs grows beyond every coefficient before the hoop leaves (`rolling_hoop.MISPRINTS`). With
-Coulomb's friction, coefficient μ, it is a motion in phases,
+Before the hoop leaves, the friction that rolling needs exceeds what any coefficient allows (`rolling_hoop.MISPRINTS`).
+With Coulomb friction of the coefficient μ the motion has phases,
 
     rolls  ->  slips  ->  flies  ->  lies        f₂ < 0 while it slips, and friction is μ λ forward
 
@@ -32,7 +32,7 @@ from lagjax.scenes import rolling_hoop
 from lagjax.scenes.rolling_hoop import contact, in_flight, lagrangian, rolling
 
 PARAMS = rolling_hoop.PARAMS | {"mu": 0.25}
-# Where a motion from rest at the top is taken up: at the top itself it stays.
+# The angle at which a motion from rest at the top is started: at the top itself it would stay.
 FIRST = 1.5
 
 
@@ -43,7 +43,7 @@ def friction(t, q, v, multipliers, params):
 
 
 def height(t, q, params):
-    """Of the hoop above the ground on which the cylinder lies."""
+    """The height of the hoop above the ground on which the cylinder lies."""
     return q["r"] * jnp.sin(q["theta"]) + params["R"] - params["a"]
 
 
@@ -62,7 +62,7 @@ hybrid = Hybrid(
 
 
 def roll_and_slip(params, ts, **options) -> HybridTrajectory:
-    """The motion from rest at the top, taken up at `FIRST` with the speed that it has there."""
+    """The motion from rest at the top, started at `FIRST` with the speed that it has there."""
     rate = rolling_hoop.exact_rate(params, FIRST, rolling_hoop.TOP)
     return _in_phases(*rolling_hoop.start(params, FIRST, rate), params, ts=ts, **options)
 
@@ -74,7 +74,7 @@ def _in_phases(*motion, **options) -> HybridTrajectory:
 
 
 class Friction(NamedTuple):
-    """In closed form: the angles at which it slips and leaves; speed and spin there, and where it lands."""
+    """The angles at which the hoop slips and leaves; its speed and spin as it leaves, and where it lands."""
 
     slips: float
     leaves: float
@@ -111,7 +111,7 @@ def _root(function, low, high) -> float:
 
 
 def seen(params) -> Friction:
-    """The same as `exact`, integrated at rtol 1e-11."""
+    """The same as `exact`, but by integration with rtol 1e-11."""
     switches = roll_and_slip(params, np.array([0.0, 3.0]), rtol=1e-11, estimate_error=False).switches
     (slip, left, down), rate = switches.q["theta"][:3], switches.v["theta"][1]
     spin, l = switches.v["phi"][1], params["R"] + params["a"]
@@ -119,7 +119,7 @@ def seen(params) -> Friction:
 
 
 def cases():
-    """Friction from little to much; a disk, a sphere, a shell; none at all; and too little to begin to roll."""
+    """Friction from weak to strong; a disk, a sphere, a shell; no friction; and too little to start rolling."""
     many = {f"mu = {mu:g}": {"mu": mu} for mu in (0.0625, 0.25, 1.0, 4.0, 16.0)}
     many |= {f"a {name}, mu = 0.25": {"beta": rolling_hoop.SHAPES[name]} for name in ("disk", "sphere", "shell")}
     rows = []
@@ -132,7 +132,7 @@ def cases():
 
 
 def _without_friction():
-    """It slides from the top on, does not turn, and leaves where its height has fallen by a third."""
+    """The hoop slides from the top on, does not turn, and leaves when its height has fallen by a third."""
     params = PARAMS | {"mu": 0.0}
     rate = rolling_hoop.exact_rate(params | {"beta": 0.0}, FIRST, rolling_hoop.TOP)
     q, v = rolling_hoop.start(params, FIRST, rate)
@@ -153,7 +153,7 @@ def _too_little_to_roll():
 
 
 def picture():
-    """Where it slips and leaves, over the coefficient of friction; and how near to rolling it still is."""
+    """The angles of slipping and leaving over the friction coefficient, and how near to rolling the hoop still is."""
     fig, axes = plot.figure(1, 2, size=(4.9, 3.8))
     lines, marks = np.geomspace(0.05, 20.0, 121), 2.0 ** np.arange(-4.0, 4.1, 0.5)
     curves, points = (
@@ -182,7 +182,7 @@ def picture():
 SCENE = Scene(
     name="slipping_hoop",
     title="The same hoop with friction: it rolls, slips, flies and lands",
-    source="source document §2, with Coulomb's friction in place of rolling at any price",
+    source="source document §2, with Coulomb friction instead of unlimited friction",
     misprints=rolling_hoop.MISPRINTS[1:2],
     runs=tuple,
     cases=cases,

@@ -1,6 +1,6 @@
 """Geodesics on a sphere (Goldstein, Derivation 2-4; source §1).
 
-ψ is the colatitude, θ the azimuth: r = R (sin ψ cos θ, sin ψ sin θ, cos ψ). Lengths are stationary twice over.
+ψ is the colatitude, θ the azimuth: r = R (sin ψ cos θ, sin ψ sin θ, cos ψ). There are two formulations.
 
 As in the source, with θ as the independent variable (t = θ, q = ψ, v = ψ' = dψ/dθ):
 
@@ -22,8 +22,8 @@ with δ = (ψ₂ - ψ₁)/2, σ = (ψ₁ + ψ₂)/2, d = (θ₂ - θ₁)/2,
     p₂ - p₁ = 2 (cos σ sin δ cos d, sin σ cos δ sin d, -sin σ sin δ)
     l = R atan2(|p₁ × p₂|, p₁ · p₂) = 2 R atan2(|p₂ - p₁|, |p₂ + p₁|)
 
-All are products: no digits are lost for points close together, near a pole or nearly antipodal, once the sums of
-angles are carried with their round-off. (arccos(p₁ · p₂) loses all of them below 1e-8.)
+All are products: no digits are lost for points close together, near a pole or nearly antipodal, provided that the sums
+of angles are carried with their round-off. (arccos(p₁ · p₂) loses all of them below 1e-8.)
 """
 
 from typing import NamedTuple
@@ -44,7 +44,7 @@ from lagjax.scenes import by_hand
 PARAMS = {"R": 2.5}
 # The end points of the generic arc: ψ₁, θ₁, ψ₂, θ₂.
 ENDS = (0.875, 0.25, 1.75, 1.625)
-# How often the runs go around.
+# Number of turns in the runs.
 TURNS = 20
 
 MISPRINTS = (
@@ -80,9 +80,9 @@ embedded = System(free_particle, constraints={"sphere": Holonomic(sphere)})
 class GreatCircle(NamedTuple):
     """The plane through two points, and their minor arc.
 
-    `A`, `B`: cot ψ = A cos θ + B sin θ; infinite for a meridian. `normal`: p₁ × p₂, upwards where θ increases from
-    the first to the second point; `angle`: the arc in radians. `vertex_*` is the point nearest to the pole,
-    `mid_*` the middle of the arc; colatitude and azimuth each.
+    `A`, `B`: cot ψ = A cos θ + B sin θ; infinite for a meridian. `normal`: p₁ × p₂, upwards if θ increases from the
+    first to the second point; `angle`: the arc in radians. `vertex_*` is the point nearest to the pole, `mid_*` the
+    middle of the arc; colatitude and azimuth each.
     """
 
     A: jax.Array
@@ -99,12 +99,12 @@ class GreatCircle(NamedTuple):
 def great_circle(psi1, theta1, psi2, theta2) -> GreatCircle:
     """The great circle through two points.
 
-    **Raises:** `ValueError` where they coincide or are antipodal to round-off: every plane through one contains
-    the other. Their distance is still determined: `distance`.
+    **Raises:** `ValueError` if they coincide or are antipodal to round-off: every plane through one contains the other.
+    Their distance is still determined: `distance`.
     """
     circle = plane_and_arc(psi1, theta1, psi2, theta2)
     angle, round_off = float(circle.angle), 4 * np.finfo(float).eps
-    # π is rounded: beyond half a turn the points themselves are known to round-off only.
+    # π is rounded: beyond half a turn the points themselves are known only to round-off.
     blur = round_off if abs(theta2 - theta1) > np.pi else 0.0
     if angle <= blur or angle >= np.pi - round_off:
         how = "coincide" if angle < 1 else "are antipodal"
@@ -123,7 +123,7 @@ def distance(params, psi1, theta1, psi2, theta2):
 
 @jax.jit
 def plane_and_arc(psi1, theta1, psi2, theta2) -> GreatCircle:
-    """As `great_circle`, without its refusals."""
+    """Like `great_circle`, but without refusing any points."""
     sum_of_psi, difference_of_psi = _sum(psi1, psi2), _sum(psi2, -psi1)
     turn, twice_mean = _sum(theta2, -theta1), _sum(theta1, theta2)
     sin_sigma, cos_sigma = _half(sum_of_psi)
@@ -162,7 +162,7 @@ def _sum(a, b):
 
 
 def _half(angle):
-    """Sine and cosine of half an angle given with its round-off."""
+    """Sine and cosine of half an angle that is given with its round-off."""
     x, rest = 0.5 * angle[0], 0.5 * angle[1]
     sine, cosine = jnp.sin(x), jnp.cos(x)
     return sine + rest * cosine, cosine - rest * sine
@@ -243,7 +243,7 @@ def _generic():
 
 def _over_the_poles():
     q0, v0 = start_towards(PARAMS, 0.5, 0.0, 0.25, np.pi)
-    # Eighths of a turn come by in turn.
+    # Outputs are 5/8 of a turn apart, so they visit every eighth of a turn.
     ts = np.linspace(0.0, 2 * np.pi * TURNS * PARAMS["R"], 33)
 
     def error(trajectory):
@@ -255,7 +255,7 @@ def _over_the_poles():
 
 @compiled
 def arrivals(q0, v0, arc):
-    """Where a batch of starts in r is after its arc lengths: (N, 3)."""
+    """The end points (N, 3) of a batch of starts in r after their arc lengths."""
     ends = lambda q, v, s: integrate(
         embedded, q, v, PARAMS, ts=jnp.stack([0 * s, s]), rtol=1e-10, atol=1e-10, throw=False
     ).q[-1]
@@ -287,10 +287,10 @@ WIDE = (1.0, 0.0, 1.25, 4.5)
 
 
 def cases():
-    """Poles, meridians, the equator, close and nearly antipodal points; both forms; what cannot be answered."""
+    """Poles, meridians, the equator, close and nearly antipodal points; both forms; refused inputs."""
     starts = [start_towards(PARAMS, *ends) for ends in ARCS.values()]
     arcs = [distance(PARAMS, *ends) for ends in ARCS.values()]
-    # Backwards along the great circle: the other way round to the same point.
+    # Backwards along the great circle: the long way to the same point.
     q, v = start_towards(PARAMS, *WIDE)
     starts.append((q, -v))
     arcs.append(2 * np.pi * PARAMS["R"] - distance(PARAMS, *WIDE))
@@ -307,13 +307,13 @@ def cases():
 
 
 def _over_azimuth_cases():
-    """θ as independent variable, where it can be: ψ at the second end."""
+    """θ as the independent variable, where this is possible: ψ at the second end."""
     arcs = {name: ARCS[name] for name in ARCS if name not in ("along a meridian", "over the pole", "from the pole")}
     arcs = arcs | {"more than pi of azimuth": WIDE}
     circles = [great_circle(*ends) for ends in arcs.values()]
     theta1, psi2, theta2 = (np.array(column) for column in list(zip(*arcs.values()))[1:])
     A, B = (jnp.stack(column) for column in list(zip(*circles))[:2])
-    # Next to the pole ψ itself is small, and so must be its absolute tolerance.
+    # Next to the pole ψ itself is small, so its absolute tolerance must be small too.
     got = colatitudes(*exact_over_azimuth(A, B, theta1), theta1, theta2, 1e-10 * np.minimum(1.0, psi2))
     happened = {"more than pi of azimuth": "the major arc: stationary, not the shortest"}
     return [
@@ -351,7 +351,7 @@ def _thousand_turns():
 
 
 def picture():
-    """Great circles over the azimuth, as integrated; and that an arc longer than half a turn is a saddle."""
+    """Integrated great circles over the azimuth, and the saddle of an arc longer than half a turn."""
     fig, axes = plot.figure(1, 2, size=(4.8, 3.6))
     axis, theta = axes[0, 0], np.linspace(-np.pi, np.pi, 25)
     fine = np.linspace(-np.pi, np.pi, 361)

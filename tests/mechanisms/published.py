@@ -1,6 +1,6 @@
-"""Equations of the test problems as their sources print them, and reduced equations of our own, in NumPy and SciPy.
+"""Equations of the test problems as printed in their sources, and our own reduced equations, in NumPy and SciPy.
 
-Nothing here uses lagjax: it is what lagjax is compared with.
+Nothing here uses lagjax: these are the references for lagjax.
 """
 
 import mpmath
@@ -66,7 +66,7 @@ def andrews(q, v, p):
 
 
 def andrews_end(q0, v0, end, p, rtol=1e-13):
-    """(q, v) at `end` by DOP853 on the printed equations, the constraint taken at acceleration level."""
+    """(q, v) at `end` by DOP853 on the printed equations, with the constraint at acceleration level."""
 
     def field(t, y):
         q, v = y[:7], y[7:]
@@ -153,7 +153,7 @@ def governor_end(end, p, method="Radau", rtol=1e-12):
     J, moment = 2 * (m / 3 + M) * l**2, (m / 2 + M) * l
 
     def spin(angle):
-        """Inertia about the shaft, and its slope."""
+        """Inertia about the shaft, and its derivative."""
         sin, cos = np.sin(angle), np.cos(angle)
         inertia = I + 2 * (m * (b**2 + b * l * cos + (l * cos) ** 2 / 3) + M * (b + l * cos) ** 2)
         return inertia, -2 * l * sin * (m * (b + 2 * l * cos / 3) + 2 * M * (b + l * cos))
@@ -172,7 +172,7 @@ def governor_end(end, p, method="Radau", rtol=1e-12):
         return [turn, rate, slide, acceleration, -g - 2 * force * by_z / ms]
 
     start = [0.0, np.pi / 6, 0.5, 0.0, 0.0]
-    # Nothing depends on ψ, and Radau's difference step for its column of zeros grows until it overflows.
+    # Nothing depends on ψ, so Radau's difference step for its column of zeros grows until it overflows.
     with np.errstate(over="ignore"):
         psi, angle, z, rate, slide = solve_ivp(field, (0, end), start, method, rtol=rtol, atol=rtol / 10).y[:, -1]
     turn, reach = momentum / spin(angle)[0], b + l * np.cos(angle)

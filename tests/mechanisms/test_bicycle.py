@@ -12,7 +12,7 @@ SPEED, SMALL = 5.0, 1e-6
 
 
 def disturbed(params, roll, steer, roll_rate, steer_rate):
-    """A state near running straight, consistent but for squares: the wheels turn the frame, tipping moves the hub."""
+    """A state near straight running, consistent to first order: the wheels turn the frame, tipping moves the hub."""
     q, v = bicycle.straight(SPEED, roll_rate)
     yaw_rate = (SPEED * steer + params["trail"] * steer_rate) * np.cos(params["tilt"]) / params["wheelbase"]
     return q | {"roll": roll, "steer": steer}, v | {"steer": steer_rate, "yaw": yaw_rate}
@@ -38,7 +38,7 @@ def test_it_runs_straight_and_obeys_the_published_linear_equations():
 
     assert np.max(left(bicycle.PARAMS)) < 1e-4
     assert np.max(left(bicycle.PARAMS | {"trail": 0.1})) > 1e-2
-    # Straight ahead nothing pushes but gravity: 94 kg stand on two contacts.
+    # In straight running only gravity acts: 94 kg stand on two contacts.
     a, forces = respond(*bicycle.straight(SPEED), bicycle.PARAMS)
     assert max(abs(float(x)) for x in a.values()) < 1e-9
     np.testing.assert_allclose(np.sum(forces["contact"]), -94 * bicycle.PARAMS["g"], rtol=1e-12)

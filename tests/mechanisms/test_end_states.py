@@ -1,4 +1,4 @@
-"""Where the default method ends, at three tolerances: within ten of them of the reference, on the constraints.
+"""The default method ends within ten tolerances of the reference and on the constraints, at three tolerances.
 
 Slow: each mechanism compiles its own program (4 to 12 s), used for all tolerances and parameters.
 """
@@ -17,15 +17,15 @@ pytestmark = pytest.mark.slow
 
 TOLERANCES = (1e-6, 1e-8, 1e-10)
 WITHIN = 10.0
-# Measured and above ten tolerances. The ladder's errors are the problem's own
-# at the looser two: the one pendulum in its angle is off by 420 and 180 rtol there.
+# Measured errors above ten tolerances. At the looser two the ladder's errors belong to the problem itself: the single
+# pendulum in its angle is off by 420 and 180 rtol there.
 MISSED = {
     ("car_axis", 1e-6): "velocity 23 rtol: an oscillation of 45 rad/s, whose velocity error is 45 position errors",
     ("n_four_bar", 1e-6): "position 17 rtol, velocity 67 rtol after ten singular positions",
     ("n_four_bar", 1e-8): "position 14 rtol, velocity 57 rtol after ten singular positions",
     ("n_four_bar", 1e-10): "position 530 rtol, velocity 2200 rtol after ten singular positions",
 }
-# No drive, no dissipation: the Jacobi integral stays.
+# No drive, no dissipation: the Jacobi integral is constant.
 CONSERVATIVE = ("andrews", "bricard", "double_pendulum", "n_four_bar", "slider_crank")
 
 
@@ -39,14 +39,14 @@ def run(mechanism, rtol, params=None, end=None):
 
 
 def relative_errors(traj, reference):
-    """Of the last positions and the last velocities, each relative to the largest; absolute where all rests."""
+    """The errors of the final positions and velocities, each relative to the largest; absolute if all are at rest."""
     last = [stacked(jax.tree.map(lambda x: x[-1], part)) for part in (traj.q, traj.v)]
     wanted = [np.ravel(part) if isinstance(part, np.ndarray) else stacked(part) for part in reference]
     return np.array([np.max(np.abs(x - y)) / (np.max(np.abs(y)) or 1.0) for x, y in zip(last, wanted)])
 
 
 def reference_of(mechanism):
-    """The stored end; for Andrews' at 1e-10 the recomputed one, since the published one has nine digits."""
+    """The stored end; for Andrews' mechanism at 1e-10 the recomputed one, since the published one has nine digits."""
     if mechanism is andrews.MECHANISM:
         start = stacked(mechanism.q0), stacked(mechanism.v0)
         return published.andrews_end(*start, mechanism.end, mechanism.params)
@@ -57,7 +57,7 @@ def reference_of(mechanism):
 def test_end_state(name):
     """Positions and velocities at the end are within ten tolerances, or known to miss; constraints and energy hold.
 
-    A known miss that no longer misses fails too: it is then to be taken off the list.
+    A known miss that is now within ten tolerances fails too, and must be removed from the list.
     """
     mechanism, missed = MECHANISMS[name], {}
     for rtol in TOLERANCES:
@@ -82,7 +82,7 @@ def test_end_state(name):
     ],
 )
 def test_end_state_depends_on_the_parameters(name, parameter):
-    """Twin: one parameter off by a hundredth, and the end is missed by a thousand tolerances."""
+    """Twin: with one parameter off by a hundredth, the end is missed by a thousand tolerances."""
     mechanism = MECHANISMS[name]
     traj = run(mechanism, 1e-8, mechanism.params | {parameter: 1.01 * mechanism.params[parameter]})
     assert np.max(relative_errors(traj, mechanism.reference)) > 1e3 * 1e-8
@@ -98,7 +98,7 @@ def test_andrews_published_end():
     [(andrews, -1.0, ("loops",), 1e-6), (car_axis, 1.0, ("upright", "axle"), 1e-8)],
 )
 def test_multipliers_of_the_source(module, sign, names, digits):
-    """λ at the end is the source's: Andrews' (six good digits) with its sign reversed, the car axis's as it is."""
+    """λ at the end is the source's: for Andrews (six digits) with the sign reversed, for the car axis unchanged."""
     traj = run(module.MECHANISM, 1e-10)
     ours = np.concatenate([np.ravel(traj.multipliers[name][-1]) for name in names])
     theirs = np.array(module.SOURCE_MULTIPLIERS[-1] if module is andrews else module.SOURCE_MULTIPLIERS)
@@ -114,7 +114,7 @@ def test_andrews_multipliers_at_the_start():
 @pytest.mark.exhaustive
 @pytest.mark.parametrize("rtol", TOLERANCES)
 def test_ladder_before_it_lies_down(rtol):
-    """The chain of four-bars ends where the elliptic functions do, before the first singular position."""
+    """The chain of four-bars agrees with the elliptic functions before the first singular position."""
     mechanism = n_four_bar.MECHANISM
     traj = run(mechanism, rtol, end=0.5)
     assert float(traj.residual()) <= 1e-12
@@ -124,7 +124,7 @@ def test_ladder_before_it_lies_down(rtol):
 
 @pytest.mark.parametrize("rtol", exhaustive_but((1e-8,), (*TOLERANCES, 1e-12)))
 def test_singular_position_is_passed_or_reported(rtol):
-    """Through the first singular position the end is right, or the integration says that it failed."""
+    """After the first singular position the end is right, or the integration reports that it failed."""
     mechanism = n_four_bar.MECHANISM
     traj = lj.integrate(
         mechanism.system, mechanism.q0, mechanism.v0, mechanism.params,
@@ -136,7 +136,7 @@ def test_singular_position_is_passed_or_reported(rtol):
 
 @pytest.mark.exhaustive
 def test_motor_of_the_driven_crank():
-    """At all times the motion is the closed form's, and the drive's multiplier is the motor's torque."""
+    """At all times the motion is that of the closed form, and the drive's multiplier is the motor's torque."""
     mechanism = driven_crank.MECHANISM
     ts = np.linspace(0.0, mechanism.end, 33)
     traj = lj.integrate(mechanism.system, mechanism.q0, mechanism.v0, mechanism.params, ts=ts, rtol=1e-8, atol=1e-8)
@@ -148,5 +148,5 @@ def test_motor_of_the_driven_crank():
 
 @pytest.mark.exhaustive
 def test_fekete_multipliers():
-    """At rest every multiplier is -(N - 1)/4, whatever the arrangement."""
+    """At rest every multiplier is -(N - 1)/4, for any arrangement."""
     np.testing.assert_allclose(run(fekete.MECHANISM, 1e-10).multipliers["sphere"][-1], -19 / 4, rtol=1e-12)

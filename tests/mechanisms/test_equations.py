@@ -1,4 +1,4 @@
-"""The mechanisms' equations: against those that the sources print, and their count of independent constraints."""
+"""The mechanisms' equations agree with the printed ones of the sources, and so does the number of constraints."""
 
 import equinox as eqx
 import jax
@@ -19,7 +19,7 @@ def stacked(tree):
 
 @eqx.filter_jit
 def matrices(system, t, q, v, params):
-    """M, F, A and gamma as lagjax finds them."""
+    """M, F, A and gamma from lagjax."""
     (x, unflatten), (u, _) = coordinates.flatten(q), coordinates.flatten(v)
     linear = mass_and_forcing(system, t, x, u, params, unflatten)
     rows = constraints.acceleration_rows(system, t, x, u, params, unflatten)
@@ -69,7 +69,7 @@ def test_car_axis_against_the_printed_equations():
     v = rng.uniform(-1, 1, 4)
     mass, force, jacobian, gamma = equations(car_axis.MECHANISM, t, car_axis.Ends(*q), car_axis.Ends(*v))
     k, f, g, G = published.car_axis(t, q, params)
-    # The source has the upright spring first, we have the names in order: axle, upright.
+    # The source lists the upright spring first, lagjax the names in order: axle, upright.
     g, G = g[::-1], G[::-1]
     assert_close(mass, k * np.eye(4))
     assert_close(force, f)
@@ -86,7 +86,7 @@ def test_car_axis_against_the_printed_equations():
 
 @pytest.mark.parametrize("name", sorted(MECHANISMS))
 def test_degrees_of_freedom(name):
-    """The start satisfies both levels, the constraints leave the stated freedom, and M is definite on the rest."""
+    """The start satisfies both levels, the constraints leave the stated freedoms, and M is definite on them."""
     mechanism = MECHANISMS[name]
     mass, _, jacobian, _ = equations(mechanism)
     _, values, directions = np.linalg.svd(jacobian)
@@ -102,7 +102,7 @@ def test_degrees_of_freedom(name):
 
 
 def test_bricard_has_one_constraint_too_many():
-    """24 equations, 23 independent; without any one length, hinge or axis of the dependent set, still 23."""
+    """24 equations, 23 independent; without any one equation of the dependent set still 23."""
     _, _, jacobian, _ = equations(MECHANISMS["bricard"])
     assert jacobian.shape == (24, 24)
     left, values, _ = np.linalg.svd(jacobian)

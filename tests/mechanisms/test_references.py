@@ -1,4 +1,4 @@
-"""The stored end states are what independent integrations give, to the digits that they claim."""
+"""The stored end states agree with independent integrations to the digits that they claim."""
 
 import jax
 import jax.numpy as jnp
@@ -22,7 +22,7 @@ from tests.mechanisms.test_equations import stacked
 
 
 def assert_reference(mechanism, q, v):
-    """Stored and recomputed ends agree to the stored number of digits, positions and velocities apart."""
+    """Stored and recomputed ends agree to the stored number of digits, separately for positions and velocities."""
     for stored, computed in zip(mechanism.reference, (q, v)):
         stored = stacked(stored)
         assert np.max(np.abs(stored - np.ravel(computed))) <= 10.0**-mechanism.digits * np.max(np.abs(stored))
@@ -80,7 +80,7 @@ def test_driven_crank():
 
 
 def test_fekete():
-    """The published rest is one: no tangential force on any particle, and λ = -19/4; the start is not."""
+    """The published rest state is one: no tangential force on any particle, and λ = -19/4; the start is not."""
     mechanism = fekete.MECHANISM
 
     def forces(points):
@@ -100,7 +100,7 @@ def test_governor():
 
 
 def bricard_end(end, params, rtol=3e-14):
-    """(q, v) at `end` from the one equation of motion on the curve of closed chains, by arc length in (θ, φ)."""
+    """(q, v) at `end` from a single equation of motion on the curve of closed chains, by arc length in (θ, φ)."""
     shape = lambda y: bricard.chain(y[0], y[1], params)[0]
     squares = lambda x, y: jnp.sum(x * y)
 
@@ -109,7 +109,7 @@ def bricard_end(end, params, rtol=3e-14):
         return jnp.stack([-slope[1], slope[0]]) / jnp.sqrt(slope @ slope)
 
     def inertia(y):
-        """Twice the kinetic energy at unit speed: centres of mass, turning of slender rods, and their section."""
+        """Twice the kinetic energy at unit speed: centres of mass, rotation of slender rods, and their section."""
         rate = jax.jvp(shape, (y,), (tangent(y),))[1]
         points = jnp.concatenate([jnp.zeros((1, 3)), rate.points, jnp.zeros((1, 3))])
         centres, turns = 0.5 * (points[1:] + points[:-1]), points[1:] - points[:-1]
@@ -136,7 +136,7 @@ def bricard_end(end, params, rtol=3e-14):
 
 @pytest.mark.slow
 def test_bricard():
-    """One equation on the curve of closed chains gives the stored end, on the way back in the second swing."""
+    """The equation on the curve of closed chains gives the stored end, on the way back in the second swing."""
     mechanism = bricard.MECHANISM
     assert_reference(mechanism, *bricard_end(mechanism.end, mechanism.params))
 

@@ -20,7 +20,7 @@ from tests.tiers import exhaustive_but
 SLOW, FAST, CRITICAL = scene.PARAMS | {"omega": 2.5}, scene.PARAMS, scene.CRITICAL
 STATE = (1.25, -2.0)
 
-# Periods by (params, the point of release at rest); measured as well as evaluated.
+# Periods by (params, the point of release at rest), both measured and evaluated.
 PERIODS = {
     **{f"s3.w=2.5.T(psi_m={psi})": (SLOW, psi) for psi in (0.5, 1.0, 2.0, 3.0)},
     "s3.w=0.T(psi_m=1.0)": (SLOW | {"omega": 0.0}, 1.0),
@@ -30,7 +30,7 @@ PERIODS = {
 }
 TURNING = {f"s3.w=6.other_turning({psi})": psi for psi in (1.0, 0.5, 0.0009765625)}
 OUTER = reference("s3.w=6.other_turning(1.0)")
-# Motions by (params, point of release, time): the keys of ψ, and of ψ̇ where there is one.
+# Motions by (params, point of release, time): the keys of ψ, and of ψ̇ if there is one.
 MOTIONS = {
     "s3.w=2.5.psi(t=1.0;start rest 1.0)": (SLOW, 1.0, 1.0, "s3.w=2.5.psidot(t=1.0;start rest 1.0)"),
     "s3.w=2.5.psi(t=3.0;start rest 2.0)": (SLOW, 2.0, 3.0, "s3.w=2.5.psidot(t=3.0;start rest 2.0)"),
@@ -49,7 +49,7 @@ def _work(psi, psi_rate):
 
 
 def _single_evaluations():
-    """Every key of the section, from a closed form."""
+    """The value of every key of the section, from a closed form."""
     state = scene.balance(FAST, *STATE)
     slow, fast = scene.small_motion(SLOW), scene.small_motion(FAST)
     values = {
@@ -113,7 +113,7 @@ def _lanes(params, psi, psi_rate, ends, tolerance=1e-10):
 
 
 def test_every_reference_value():
-    """Each key of the section agrees with its closed form to 1e-12, and none is left out."""
+    """Each key of the section agrees with its closed form to 1e-12, and none is omitted."""
     values = _single_evaluations()
     assert set(values) == set(keys("s3"))
     for key, value in values.items():
@@ -121,7 +121,7 @@ def test_every_reference_value():
 
 
 def test_misprints_are_seen():
-    """The source's p_ψ for L_z, its harmonic motion at ω = ω0 and its bead in the center all miss."""
+    """The source's p_ψ for L_z, its harmonic motion at ω = ω0 and its bead in the center are all wrong."""
     psi_acceleration = accelerations(scene.system, 0.0, *STATE, FAST)[0]
     _, rate = jax.jvp(lambda *y: scene.balance(FAST, *y), STATE, (STATE[1], float(psi_acceleration)))
     torque = reference("s3.state.torque")
@@ -135,7 +135,7 @@ def test_misprints_are_seen():
 
 
 def test_jacobi_functions_against_scipy():
-    """sn, cn, dn and K agree with scipy's, also for m near 1 by the complement, and for m < 0."""
+    """sn, cn, dn and K agree with scipy's, also for m near 1 given by its complement, and for m < 0."""
     m1 = np.array([0.5, 1e-3, 1.0, 1e-12, 1e-30])
     u = np.linspace(-3.0, 3.0, 13)[:, None]
     got = jacobi_elliptic(u, (1 - m1)[None], m1[None])
@@ -149,7 +149,7 @@ def test_jacobi_functions_against_scipy():
 
 
 def test_exact_motion_obeys_equation_13():
-    """The closed form is a solution: ψ̈ = sin ψ (ω² cos ψ - ω0²) in each regime; a term less is seen."""
+    """The closed form is a solution: ψ̈ = sin ψ (ω² cos ψ - ω0²) in each regime; a missing term is detected."""
     for params, psi in ((SLOW, 2.0), (FAST, 1.0), (FAST, OUTER), (FAST, 2.5), (CRITICAL, 1.0)):
         t = jnp.linspace(0.1, 2.0, 5)
         at = lambda t: scene.exact_motion(params, psi, t)
@@ -162,25 +162,25 @@ def test_exact_motion_obeys_equation_13():
 
 @pytest.mark.exhaustive
 def test_measured_periods():
-    """Periods measured by an event on ψ̇ at tolerance 1e-10 are those of the elliptic integrals to 1e-9, but for one."""
+    """Periods measured by an event on ψ̇ at tolerance 1e-10 are right to 1e-9, with one exception."""
     params = _stacked([params for params, _ in PERIODS.values()])
     psi = jnp.array([psi for _, psi in PERIODS.values()])
     exact = np.array([reference(key) for key in PERIODS])
     end = jax.jit(jax.vmap(lambda p, psi, longest: scene.swing(p, psi, longest).end))(params, psi, 0.75 * exact)
     error = dict(zip(PERIODS, np.abs(2 * end.t / exact - 1)))
-    # Of this amplitude, 2^-10, the absolute tolerance of 1e-10 is 1e-7; cases() has it to 2e-11 at 1e-12.
+    # The absolute tolerance of 1e-10 is 1e-7 of this amplitude, 2^-10; cases() reaches 2e-11 at 1e-12.
     assert error.pop("s3.crit(g=12,a=.75,w=4).T(psi_m=0.0009765625)") < 1e-8
     assert max(error.values()) < 1e-9, error
     turned = dict(zip(PERIODS, np.asarray(end.q)))
     for key, start in TURNING.items():
         measured = turned[f"s3.w=6.T_alpha(turning {start})"]
         assert float(measured) == pytest.approx(reference(key), rel=1e-9), key
-    # Twin: half the small-amplitude period, which a bead released at 1.0 does not have.
+    # Twin: a bead released at 1.0 does not have the small-amplitude period.
     assert abs(float(2 * end.t[1]) * reference("s3.w=2.5.Omega_bottom") / (2 * np.pi) - 1) > 1e-3
 
 
 def test_integrated_motions():
-    """ψ, ψ̇, the motor's work, the homoclinic orbit and the period of rotation are reached to 1e-9 at 1e-10."""
+    """ψ, ψ̇, the motor's work, the homoclinic orbit and the rotation period are right to 1e-9 at rtol 1e-10."""
     lanes = [(params, psi, 0.0, t) for params, psi, t, _ in MOTIONS.values()]
     lanes += [(FAST, reference("s3.w=6.homoclinic_outer"), 0.0, 0.5)]
     for key, params in ROTATIONS.items():
@@ -194,13 +194,13 @@ def test_integrated_motions():
     last = len(MOTIONS)
     assert float(_work(q[last - 1], v[last - 1])) == pytest.approx(reference(WORK), rel=1e-9)
     assert float(q[last]) == pytest.approx(reference(HOMOCLINIC), rel=1e-9)
-    # A full turn after one period: what is missing, over the rate, is the error of the period.
+    # A full turn after one period: the missing angle divided by the rate is the error of the period.
     late = (2 * np.pi - q[last + 1 :]) / v[last + 1 :] / jnp.array(ends)[last + 1 :]
     assert np.max(np.abs(late)) < 1e-9
 
 
 def test_torque_is_the_multiplier():
-    """The motor's multiplier is τ = 2 m a² ω sin ψ cos ψ ψ̇ = dL_z/dt and ω τ = dE/dt; a flipped sign is seen."""
+    """The motor's multiplier is τ = 2 m a² ω sin ψ cos ψ ψ̇ = dL_z/dt and ω τ = dE/dt; a flipped sign is detected."""
     rng = np.random.default_rng(3)
     for psi, psi_rate, omega in rng.uniform(-3.0, 3.0, (6, 3)):
         params = FAST | {"omega": omega}
@@ -219,7 +219,7 @@ def test_torque_is_the_multiplier():
 
 
 def test_normal_forces_are_multipliers():
-    """In spherical coordinates with r = a as a constraint, its multiplier is N_r, and the motor's a sin ψ N_perp."""
+    """In spherical coordinates with the constraint r = a, its multiplier is N_r, and the motor's is a sin ψ N_perp."""
 
     def lagrangian(t, q, v, params):
         speed_squared = v["r"] ** 2 + (q["r"] * v["psi"]) ** 2 + (q["r"] * jnp.sin(q["psi"]) * v["theta"]) ** 2
@@ -275,7 +275,7 @@ def _driven(periods, tolerance):
 
 @pytest.mark.exhaustive
 def test_constraint_holds_for_twenty_periods():
-    """The hoop's angle stays on ω t to 1e-12, and h = E - ω L_z is kept, where E itself is not."""
+    """The hoop's angle stays on ω t to 1e-12, and h = E - ω L_z is constant, unlike E itself."""
     trajectory = _driven(np.linspace(0.0, 20.3, 11), 1e-10)
     assert float(trajectory.residual()) <= 1e-12
     state = scene.balance(SLOW, trajectory.q["psi"], trajectory.v["psi"])
@@ -285,7 +285,7 @@ def test_constraint_holds_for_twenty_periods():
 
 @pytest.mark.slow
 def test_constraint_holds_for_a_thousand_periods():
-    """After 1,000 natural periods the residual is at most 1e-12, the phase of the bead right to 1e-6."""
+    """After 1,000 natural periods the residual is at most 1e-12, and the phase of the bead is right to 1e-6."""
     trajectory = _driven(np.linspace(0.0, 1000.3, 11), 1e-12)
     assert float(trajectory.residual()) <= 1e-12
     got = trajectory.q["psi"], trajectory.v["psi"]
@@ -306,7 +306,7 @@ def _final(params):
 
 
 def _driven_final(params):
-    """The same of the driven bead, and the motor's multiplier."""
+    """The same for the driven bead, and the motor's multiplier."""
     start, ts = scene.driven_start(params, 1.0), jnp.array([0.0, 1.25])
     end = integrate(scene.driven_system, *start, params, ts=ts, rtol=1e-10, atol=1e-10).end
     return jnp.stack([end.q["psi"], end.v["psi"], end.multipliers["motor"]])
@@ -319,7 +319,7 @@ def _check_gradient(derivative, function):
     exact = jax.jacfwd(_exact_final)(params)
     largest = max(float(jnp.max(jnp.abs(column))) for column in exact.values())
     for name, column in exact.items():
-        # The state does not depend on m: its zero is held to the size of the other columns.
+        # The state does not depend on m: its zero is compared with the size of the other columns.
         expected = column[: got[name].size]
         np.testing.assert_allclose(got[name], expected, rtol=1e-6, atol=1e-9 * largest, err_msg=name)
     return exact
@@ -334,9 +334,9 @@ def test_reverse_gradient_of_state():
 @pytest.mark.slow
 @pytest.mark.parametrize("derivative", exhaustive_but((jax.jacrev,), (jax.jacfwd, jax.jacrev)))
 def test_gradient_of_torque(derivative):
-    """So do the driven bead's state and the motor's torque, in both modes; the torque's explicit ω is in it."""
+    """So do the driven bead's state and the motor's torque, in both modes, including the torque's explicit ω."""
     exact = _check_gradient(derivative, _driven_final)
-    # Twin: the gradient through the state alone is another.
+    # Twin: the gradient through the state alone differs.
     explicit = _exact_final(FAST)[2] / FAST["omega"]
     assert abs(float(explicit)) > 1e-3 * abs(float(exact["omega"][2]))
 

@@ -1,4 +1,4 @@
-"""What other tools integrate beside ours: accelerations and multipliers by hand are those of the Lagrangians."""
+"""Accelerations and multipliers by hand, which other tools integrate, equal those from the Lagrangians."""
 
 import jax
 import numpy as np
@@ -8,7 +8,7 @@ import lagjax as lj
 from lagjax.scenes import SCENES
 
 RUNS = [(name, run) for name, scene in SCENES.items() for run in scene.runs() if run.by_hand is not None]
-# One of each kind: on a surface, rolling and in a moving frame. `python -m lagjax` compares the errors of all.
+# One run of each kind: on a surface, rolling and in a moving frame. `python -m lagjax` compares the errors of all.
 SHOWN = {"embedded, over both poles", "20 swings", "rotating frame, omega = 2.5"}
 
 
@@ -26,7 +26,7 @@ def flat(tree):
     ],
 )
 def test_by_hand(run):
-    """At the start and at a state on the way; twin: of a state and parameters that are a little off they differ."""
+    """They agree at the start and at a later state; twin: for slightly different states and parameters they differ."""
     traj = lj.integrate(run.system, run.q0, run.v0, run.params, ts=np.array([0.0, 0.37]) + run.ts[0], rtol=1e-12)
     of_motion = lambda y, i: jax.tree.map(lambda x: np.asarray(x)[i], y)
     for i in (0, 1):

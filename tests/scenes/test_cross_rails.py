@@ -1,4 +1,4 @@
-"""The carriage on the rotating rails: two frames, modes and stability, the books of energy, gradients."""
+"""The carriage on the rotating rails: two frames, modes and stability, the energy balance, gradients."""
 
 import jax
 import jax.numpy as jnp
@@ -48,7 +48,7 @@ def _motion_values(motion):
 
 
 def _single_evaluations():
-    """Every key of the section, from a closed form."""
+    """The value of every key of the section, from a closed form."""
     values = _motion_values(lambda params, t: scene.exact_motion(params, Q0, V0, t))
     for speed in ("2.5", "8"):
         books = scene.balance(AT[speed], Q0, V0)
@@ -92,7 +92,7 @@ def _solve(system, q0, v0, params, ts, tolerance):
 
 
 def test_every_reference_value():
-    """Each key of the section agrees with its closed form to 1e-12, and none is left out."""
+    """Each key of the section agrees with its closed form to 1e-12, and none is omitted."""
     values = _single_evaluations()
     assert set(values) == set(keys("s6"))
     for key, value in values.items():
@@ -111,7 +111,7 @@ def _integrated_errors(tolerance):
 
 
 def test_integrated_motions():
-    """Every state, energy and power after 1 s and 10 s is reached to 1e-9 at tolerance 1e-10, and not at 1e-8."""
+    """Every state, energy and power after 1 s and 10 s is right to 1e-9 at tolerance 1e-10, but not at 1e-8."""
     assert max(_integrated_errors(1e-10).values()) < 1e-9
     assert max(_integrated_errors(1e-8).values()) > 1e-9
 
@@ -141,7 +141,7 @@ def test_exact_motion_is_the_matrix_exponential():
 
 @pytest.mark.slow
 def test_frames_agree_after_a_hundred_turns():
-    """x, y and R, r, integrated apart for 100 turns at 5e-13, are the same motion to 1e-9; factor 1 is another."""
+    """x, y and R, r, integrated separately for 100 turns at 5e-13, agree to 1e-9; with the factor 1 they do not."""
     ts = np.linspace(0.0, 100 * 2 * np.pi / PARAMS["omega"], 11)
     lab = _solve(scene.lab_system, *scene.to_lab(PARAMS, 0.0, Q0, V0), PARAMS, ts, 5e-13)
     rotating = _solve(scene.rotating_system, Q0, V0, PARAMS, ts, 5e-13)
@@ -152,7 +152,7 @@ def test_frames_agree_after_a_hundred_turns():
     back = scene.to_rotating(PARAMS, lab.t, *scene.to_lab(PARAMS, lab.t, rotating.q, rotating.v))
     assert relative_error(back, (rotating.q, rotating.v)) < 1e-12
     assert relative_error(in_lab, scene.to_lab(PARAMS, lab.t, wrong.q, wrong.v)) > 0.1
-    # What cannot see it: the factor-1 equations keep h' as well as the right ones do.
+    # h' cannot detect it: the factor-1 equations conserve h' as well as the right ones do.
     for trajectory in (rotating, wrong):
         h = scene.balance(PARAMS, trajectory.q, trajectory.v).h
         assert np.ptp(h) < 1e-10 * np.max(np.abs(h))
@@ -182,7 +182,7 @@ def test_books_balance_at_random_states():
 
 
 def test_lab_lagrangian_and_printed_kinetic_energy():
-    """The two forms of L are one function of the motion, m included; T without m is seen."""
+    """The two forms of L are the same function of the motion, including m; T without m is detected."""
     t, params = 0.7, PARAMS
     q, v = scene.to_lab(params, t, Q0, V0)
     L = scene.rotating_lagrangian(t, Q0, V0, params)
@@ -194,7 +194,7 @@ def test_lab_lagrangian_and_printed_kinetic_energy():
 
 
 def test_equations_and_equilibrium():
-    """The accelerations have the factor 2; R_eq is a solution, longer than R0 below K/m, and beyond the axis above."""
+    """The accelerations have the factor 2; R_eq is a solution, above R0 below K/m, and beyond the axis above K/m."""
     for params in (PARAMS, AT["8"]):
         omega, m = params["omega"], params["m"]
         a, _ = accelerations(scene.rotating_system, 0.0, Q0, V0, params)
@@ -209,7 +209,7 @@ def test_equations_and_equilibrium():
 
 
 def test_no_turning_and_backward_turning():
-    """At ω = 0 the springs swing apart and h' = E; -ω mirrors r and L_z, which +ω does not."""
+    """At ω = 0 the springs oscillate independently and h' = E; -ω mirrors r and L_z, which +ω does not."""
     still = PARAMS | {"omega": 0.0}
     q, _ = scene.exact_motion(still, Q0, V0, 1.5)
     fast, slow = np.sqrt(40.0), 4.0
@@ -247,7 +247,7 @@ def test_modes_and_verdict():
 
 
 def test_slow_mode_near_a_critical_speed():
-    """Next to ω² = k/m the slow mode keeps its digits; the difference of half sum and root has lost them."""
+    """Next to ω² = k/m the slow mode is accurate, while the difference of half sum and root has lost its digits."""
     for step in (-(2.0**-44), 2.0**-44):
         params = PARAMS | {"omega": 4.0 * (1 + step)}
         with mpmath.workdps(60):
@@ -266,7 +266,7 @@ def test_escape_at_the_critical_speed():
     q, _ = scene.exact_motion(AT["critical"], Q0, V0, t)
     a, b = scene.escape(PARAMS)
     second = 2 * (q["R"][1] - 2 * q["R"][0]) / (t[1] ** 2 - 2 * t[0] ** 2)
-    # The oscillation left over is of order one in 1e9.
+    # The remaining oscillation is of order one in 1e9.
     assert float(second) == pytest.approx(float(a), rel=1e-6)
     assert float((q["r"][1] - q["r"][0]) / (t[1] - t[0])) == pytest.approx(float(b), rel=1e-4)
 
@@ -298,12 +298,12 @@ def test_forward_gradient():
 
 @pytest.mark.slow
 def test_reverse_gradient():
-    """So it has in reverse mode."""
+    """The same holds in reverse mode."""
     _check_gradient(jax.jacrev)
 
 
 def test_exact_gradient_at_critical_speeds():
-    """The exact motion is smooth in ω through the critical speed k/m: its derivative is the difference quotient's."""
+    """The exact motion is smooth in ω through the critical speed k/m: its derivative is the difference quotient."""
     at = lambda omega: scene.exact_motion(PARAMS | {"omega": omega}, Q0, V0, 1.0)[0]["r"]
     slope = float(jax.grad(at)(4.0))
     step = 2.0**-14

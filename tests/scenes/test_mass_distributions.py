@@ -14,10 +14,10 @@ from tests.references import keys, reference
 from tests.tiers import exhaustive_but
 
 NAMES = tuple(scene.POTENTIALS)
-# Other tests share the compiled orbits of the rest.
+# Other tests share the compiled orbits of the other fields.
 COMPILED_ONLY_HERE = ("plane", "half plane", "finite cylinder", "helix")
 HELIX_POINTS = ((1.5, 0.75, 2.0), (0.5, 0.75, 2.0), (1.25, 3.0, 0.5), (0.75, 1.0, 8.0))
-# For s > a the reference took K_n where K_n' belongs (mpmath's besselk ignores derivative=1): checked below.
+# For s > a the reference used K_n instead of K_n' (mpmath's besselk ignores derivative=1): checked below.
 WRONG = {"s4g.dPhi/ds(s=1.5,chi=0.75,h=2)": (1.5, 0.75, 2.0), "s4g.dPhi/ds(s=1.25,chi=3,h=0.5)": (1.25, 3.0, 0.5)}
 
 value_and_gradient = jax.jit(lambda name, q, params: _both(name)(q, params), static_argnums=0)
@@ -28,14 +28,14 @@ def _both(name):
 
 
 def _cylindrical(name, s, z, params, azimuth=0.625):
-    """Φ, and the force towards larger s and z, at an azimuth that favours no axis."""
+    """Φ, and the force towards larger s and z, at a generic azimuth."""
     c, n = np.cos(azimuth), np.sin(azimuth)
     phi, g = value_and_gradient(name, scene.vector(s * c, s * n, z), params)
     return phi, -(c * g["x"] + n * g["y"]), -g["z"]
 
 
 def _screw(s, chi, h):
-    """Φ and its derivatives along s, φ and z, at a height that favours no turn."""
+    """Φ and its derivatives along s, φ and z, at a generic height."""
     z, params = 0.375, scene.PARAMS["helix"] | {"h": h}
     angle = chi + 2 * np.pi * z / h
     c, n = np.cos(angle), np.sin(angle)
@@ -44,11 +44,11 @@ def _screw(s, chi, h):
 
 
 def _potentials_and_fields():
-    """Key: (value, the size that its error is relative to)."""
+    """A dictionary of key: (value, the size relative to which its error is measured)."""
     params, got = scene.PARAMS, {}
 
     def put(names, values):
-        # A component is as good as the field: one that nearly vanishes is a sum that cancels.
+        # Errors of a component are relative to the field: a component that nearly vanishes is a sum that cancels.
         field = float(np.linalg.norm(values[1:]))
         for i, (name, value) in enumerate(zip(names, values, strict=True)):
             got[name] = (float(value), field if i else abs(float(value)))
@@ -103,13 +103,13 @@ def _elementary():
 
 
 def _solve(name, q0, v0, duration, change=None):
-    """Nine outputs always, so that each system is compiled once."""
+    """Integrate with always nine outputs, so that each system is compiled once."""
     params, ts = scene.PARAMS[name] | (change or {}), np.linspace(0.0, duration, 9)
     return integrate(scene.SYSTEMS[name], q0, v0, params, ts=ts, rtol=1e-10, atol=1e-10)
 
 
 def test_every_reference_value():
-    """Potentials, fields, frequencies and speeds agree with all values of §4 to 1e-12; two of those are wrong."""
+    """Potentials, fields, frequencies and speeds agree with all values of §4 to 1e-12, except two wrong ones."""
     got = _potentials_and_fields()
     got |= {key: (float(value), float(value)) for key, value in _elementary().items()}
     assert set(got) == set(keys("s4"))
@@ -126,7 +126,7 @@ def _bessel_slope(s, chi, h, derivative):
 
 @pytest.mark.parametrize("key", WRONG)
 def test_the_slope_outside_the_helix(key):
-    """∂Φ/∂s for s > a is the Bessel series with K_n'; the reference's value is the same series with K_n."""
+    """∂Φ/∂s for s > a is the Bessel series with K_n'; the reference value is the same series with K_n."""
     point = WRONG[key]
     with mpmath.workdps(30):
         slope = float(_bessel_slope(*point, lambda n, x: -mpmath.besselk(n - 1, x) - n / x * mpmath.besselk(n, x)))
@@ -137,7 +137,7 @@ def test_the_slope_outside_the_helix(key):
 
 
 def test_more_nodes_change_nothing_and_few_are_not_enough():
-    """The periodic integrals have converged with the nodes that they have by default, and not with 24."""
+    """The periodic integrals have converged with the default number of nodes, but not with 24."""
     for name, q, near in (
         ("finite cylinder", scene.vector(1.0, 0.875, 0.5), 1e-6),
         ("helix", scene.vector(0.75, 0.5, 0.25), 0.05),
@@ -149,7 +149,7 @@ def test_more_nodes_change_nothing_and_few_are_not_enough():
 
 
 def test_close_to_the_wire_the_nodes_must_gather():
-    """At 0.001 a from the wire 256 gathered nodes agree with 1200; as many equal ones do not."""
+    """At 0.001 a from the wire 256 clustered nodes agree with 1200; the same number of equidistant ones does not."""
     at = jax.jit(potentials.helix, static_argnums=(2, 3))
     q, params = scene.vector(1.001, 0.0, 0.0), scene.PARAMS["helix"]
     fine = at(q, params, 1200, 1e-6)
@@ -257,7 +257,7 @@ def test_noether_table(name):
 
 @pytest.mark.slow
 def test_screw_charge_and_its_misprint():
-    """h p_z + 2π L_z is kept for both hands (h < 0: left); h p_z + L_z moves at O(1), and so does the wrong hand."""
+    """h p_z + 2π L_z is constant for both hands (h < 0: left); h p_z + L_z changes by O(1), so does the wrong hand."""
     q0, v0, _ = scene.ORBITS["helix"]
     for h in (2.0, -2.0):
         orbit = _solve("helix", q0, v0, 8.0, {"h": h})
@@ -281,7 +281,7 @@ def test_screw_symmetry_of_the_potential():
 
 @pytest.mark.exhaustive
 def test_bounce_through_the_plane():
-    """The fall onto the kink takes a quarter of the period 4 w/(2πGσ), and ends with the speed w."""
+    """The fall onto the kink takes a quarter of the period 4 w/(2πGσ) and ends with the speed w."""
     for speed in (2.0, 0.5):
         fall = scene.fall_onto_plane(scene.PARAMS["plane"], speed)
         period = float(scene.bounce_period(scene.PARAMS["plane"], speed))
@@ -291,7 +291,7 @@ def test_bounce_through_the_plane():
 
 
 def test_inside_the_ellipse():
-    """The motion is two oscillations; E_x and E_y are kept separately, and outside they are not."""
+    """The motion is two oscillations; E_x and E_y are separately constant inside, but not outside."""
     params = scene.PARAMS["elliptic cylinder"]
     inside = _solve("elliptic cylinder", *scene.INSIDE, 4.0)
     exact = scene.exact_inside_ellipse(params, *scene.INSIDE, np.linspace(0.0, 4.0, 9))
@@ -303,7 +303,7 @@ def test_inside_the_ellipse():
 
 
 def test_inside_and_around_the_cylinder():
-    """Inside: an ellipse in the time 2π/√(2πGρ); outside: a circle at speed a √(2πGρ), whatever its radius."""
+    """Inside: an ellipse in the time 2π/√(2πGρ); outside: a circle at speed a √(2πGρ) for any radius."""
     params = scene.PARAMS["cylinder"]
     speed = float(scene.circular_speed(params))
     starts = [
@@ -318,7 +318,7 @@ def test_inside_and_around_the_cylinder():
     for q0, v0, period in starts:
         orbit = _solve("cylinder", q0, v0, period)
         end = jax.tree.map(lambda x: float(x[-1]), (orbit.q, orbit.v))
-        # Relative to the size of the orbit: what returns to zero has no size of its own.
+        # Errors are relative to the size of the orbit, since some numbers return to zero.
         assert max(abs(a - b) for a, b in zip(jax.tree.leaves(end), jax.tree.leaves((q0, v0)))) < 5e-9
         early = jax.tree.map(lambda x: float(x[-2]), orbit.q)
         assert max(abs(early[k] - q0[k]) for k in "xy") > 0.1
@@ -339,7 +339,7 @@ def test_euler_integral():
 @pytest.mark.slow
 @pytest.mark.parametrize("mode", exhaustive_but((jax.grad,), (jax.jacfwd, jax.grad)))
 def test_gradient_of_the_final_state(mode):
-    """A final state inside the ellipse by G, ρ, a, b: reverse and forward mode against the closed form."""
+    """The gradient of a final state inside the ellipse by G, ρ, a, b: both modes against the closed form."""
     params = jax.tree.map(jnp.asarray, scene.PARAMS["elliptic cylinder"])
     q0, v0 = scene.INSIDE
 

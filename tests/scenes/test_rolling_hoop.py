@@ -16,7 +16,7 @@ from tests.tiers import exhaustive_but
 TOP, PARAMS = hoop.TOP, hoop.PARAMS
 HOOP_REST = "s2.hoop.theta0=1.25."
 
-# Slipping and sliding friction come later; the energy check is a residue of the reference's own computation.
+# Other tests cover slipping and sliding friction; the energy check belongs to the reference's own computation.
 EXCLUDED = {key for key in keys("s2") if "fric" in key} | {"s2.hoop.energy_check"}
 
 
@@ -63,7 +63,7 @@ def single_evaluations():
 
 
 def rolled(params, ts, theta=1.25, theta_rate=0.0):
-    """The hoop held to the cylinder, at the tolerance at which it is judged."""
+    """The hoop held to the cylinder, at the tolerance of the tests."""
     q, v = hoop.start(params, theta, theta_rate)
     return integrate(hoop.system, q, v, params, ts=ts, rtol=1e-10, atol=1e-10)
 
@@ -75,12 +75,12 @@ def test_closed_forms_match_the_references():
 
 
 def test_every_key_is_checked():
-    """No key of §2 is left out but those of slipping."""
+    """No key of §2 is omitted except those of slipping."""
     assert set(single_evaluations()) == set(keys("s2")) - EXCLUDED
 
 
 def test_the_source_is_wrong_where_said():
-    """λ is -mg on the side and -3mg at the bottom; friction has no finite bound; 30° is for the top only."""
+    """λ is -mg on the side and -3mg at the bottom; friction has no finite bound; 30° holds only from the top."""
     weight = PARAMS["m"] * PARAMS["g"]
     assert hoop.exact_multipliers(PARAMS, 0.0, TOP).contact == pytest.approx(-weight)
     assert hoop.exact_multipliers(PARAMS, hoop.BOTTOM, TOP).contact == pytest.approx(-3 * weight)
@@ -108,7 +108,7 @@ def test_multipliers_from_the_lagrangian():
 
 @pytest.mark.slow
 def test_motion_and_departure_when_integrated():
-    """θ(0.5), θ̇(0.5), the time and angle of the departure to 1e-9, and NaN after it."""
+    """θ(0.5), θ̇(0.5) and the time and angle of the departure are right to 1e-9, and outputs after it are NaN."""
     down, *_ = hoop.runs()
     tolerance = {"rtol": 1e-10, "atol": 1e-10}
     got = hoop.roll(PARAMS, 1.25, 0.0, down.ts, **tolerance)
@@ -137,7 +137,7 @@ def test_departures_of_other_starts():
         "s2.hoop.tdep.start_theta0=1.25": (1.0, np.pi - 1.25, 0.0, 1e-10),
         "s2.hoop.tdep.start_pi/2-2^-10": (1.0, TOP - 2.0**-10, 0.0, 1e-12),
         "s2.sphere.tdep.start_pi/2-2^-10": (0.4, TOP - 2.0**-10, 0.0, 1e-12),
-        # A tilt of 2^-20 is carried by θ to 1e-10 of itself at best: the tolerance has to follow.
+        # θ represents a tilt of 2^-20 to 1e-10 of itself at best, so the tolerance must be tighter.
         "s2.hoop.tdep.start_pi/2-2^-20": (1.0, TOP - 2.0**-20, 0.0, 1e-13),
         "s2.sphere.tdep.start_pi/2-2^-20": (0.4, TOP - 2.0**-20, 0.0, 1e-13),
         "downhill": (1.0, 1.25, -1.5, 1e-10),
@@ -198,7 +198,7 @@ def test_swings_about_the_bottom():
 
 @pytest.mark.slow
 def test_a_thousand_swings_stay_on_the_constraints():
-    """1,000 natural periods: residuals below 1e-12, phase and energy by accumulation only."""
+    """1,000 natural periods: residuals stay below 1e-12; errors of phase and energy only accumulate."""
     theta0 = hoop.BOTTOM + 1.0
     ts = np.linspace(0.0, 1000 * hoop.period(PARAMS, theta0), 201)
     got = rolled(PARAMS, ts, theta0)
@@ -220,7 +220,7 @@ def exact_final(params):
 @pytest.mark.slow
 @pytest.mark.parametrize("mode", exhaustive_but((jax.jacrev,), (jax.jacfwd, jax.jacrev)))
 def test_gradients(mode):
-    """∂(θ, λ)/∂(m, R, a, g, β) at t = 0.5 against the exact one to 1e-6."""
+    """∂(θ, λ)/∂(m, R, a, g, β) at t = 0.5 agrees with the exact one to 1e-6."""
     ts = np.array([0.0, 0.5])
 
     def final(params):
@@ -274,7 +274,7 @@ def test_gradients_of_the_departure_time():
 
 
 def test_the_scene_is_complete():
-    """Each case passes but the costly ones, which other tests cover; the misprints are all told."""
+    """Each case passes except the costly ones, which other tests cover; all misprints are listed."""
     assert len(hoop.MISPRINTS) == 5
     assert hoop._no_inertia().passed
     assert hoop._refusal("", 1.25, -3.0).passed

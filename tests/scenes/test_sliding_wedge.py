@@ -22,14 +22,15 @@ CASES = {
     "alpha=2^-20,m/M=2^40": {"alpha": 2.0**-20, "m": 2.0**40, "M": 1.0},
     "alpha=pi/2-2^-30 (exact real)": {"alpha": np.pi / 2 - 2.0**-30},
 }
-# What round-off forbids. P_m = λ (ẋ sin α - ẏ cos α) cancels: by M/m for a light particle, by 1/α and α for an extreme
-# angle; it is checked through -P_M below, which does not cancel. cos(π/2 - 2^-30) of the nearest double is off by
-# 7e-8 of itself (π/2 is not a double), and with it all that goes with cos α; the power goes with its square.
+# Limits due to round-off. P_m = λ (ẋ sin α - ẏ cos α) cancels: by M/m for a light particle, by 1/α and α for an extreme
+# angle; it is checked through -P_M below, which does not cancel. cos(π/2 - 2^-30) of the nearest double has a relative
+# error of 7e-8 (π/2 is not a double), and so has everything proportional to cos α; the power is proportional to its
+# square.
 NOT_AT_1E_12 = {"alpha=pi/2-2^-30 (exact real)": 2e-7}
 
 
 def at_the_start(params):
-    """Accelerations and multipliers there."""
+    """Accelerations and multipliers at the start."""
     start = 0.0, wedge.Q0, wedge.V0
     return equations_of(wedge.system, *start, params).accelerations(*start)
 
@@ -50,7 +51,7 @@ def named(a, multipliers, params):
 
 @pytest.mark.parametrize("case", CASES)
 def test_extreme_accelerations(solved, case):
-    """Accelerations, normal force and power at both ends of m/M and α, 1e-12 but where round-off forbids."""
+    """Accelerations, normal force and power at both ends of m/M and α, to 1e-12 except where round-off forbids it."""
     got = named(*solved[case], PARAMS | CASES[case])
     for name, value in got.items():
         allowed = NOT_AT_1E_12.get(case, 1e-12)
@@ -107,7 +108,7 @@ def test_motion(motions):
         "l(t)": q["y"] / s,
         "P_m(t)=dW_m/dt": on_particle,
         "P_M(t)=dW_M/dt": on_wedge,
-        # Work-energy: the normal force does what gravity's m g y does not.
+        # Work-energy theorem: the normal force does the work that gravity's m g y does not.
         "W_m(0..t)": kinetic_m - m * g * q["y"],
         "W_M(0..t)": kinetic_M,
         "T_m(t)": kinetic_m,
@@ -128,7 +129,7 @@ def test_motion(motions):
 
 @pytest.mark.slow
 def test_signs_of_the_work(motions):
-    """The normal force brakes the particle and drives the wedge; the source's signs are both the other way."""
+    """The normal force brakes the particle and drives the wedge; both signs of the source are wrong."""
     traj = motions["rest"]
     on_particle, on_wedge = wedge.power_of_normal_force(PARAMS, traj.v, traj.multipliers["incline"])
     assert float(on_particle[-1]) < 0 < float(on_wedge[-1])
@@ -188,7 +189,7 @@ def exact_outcome(params):
 @pytest.mark.slow
 @pytest.mark.parametrize("mode", exhaustive_but((jax.jacrev,), (jax.jacfwd, jax.jacrev)))
 def test_gradients(mode):
-    """Final position and normal force by m, M, α and g, forward and reverse, to 1e-6 of the exact gradient."""
+    """Gradients of final position and normal force by m, M, α and g agree in both modes with the exact ones to 1e-6."""
     exact = jax.jacfwd(exact_outcome)(PARAMS)
     got = mode(jax.jit(outcome))(PARAMS)
     for name in PARAMS:
@@ -205,7 +206,7 @@ def test_constraint_holds_for_a_thousand_drops():
 
 
 def test_every_reference_value_is_checked():
-    """All keys of §5 stand in the tests above."""
+    """The tests above check all keys of §5."""
     source = Path(__file__).read_text()
     for key in keys("s5"):
         name = key.removeprefix("s5.")

@@ -1,4 +1,4 @@
-"""The hoop with friction: slips, leaves and lands where the closed forms have it, for coefficients from 1/16 to 16."""
+"""The hoop with friction: slips, leaves and lands where the closed forms say, for coefficients from 1/16 to 16."""
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +14,7 @@ COEFFICIENTS = (0.0625, 0.125, 0.25, 0.5, 1.0, 2.0, 4.0, 16.0)
 
 
 def test_closed_forms():
-    """Against the reference to its last digits; twin: another moment of inertia slips and leaves elsewhere."""
+    """They agree with the reference to its last digits; twin: another moment of inertia slips and leaves elsewhere."""
     for mu in COEFFICIENTS:
         found = exact(PARAMS | {"mu": mu})
         np.testing.assert_allclose(found.slips, float(reference(f"s2.fric={mu}.slip_theta_rad")), rtol=1e-13)
@@ -44,7 +44,7 @@ def test_it_slips_leaves_and_lands():
 
 @pytest.mark.exhaustive
 def test_derivative_of_the_departure():
-    """d(angle)/dμ where it leaves, in both modes, against the closed form's; each compiles for minutes."""
+    """d(angle)/dμ at the departure agrees in both modes with the closed form; each compiles for minutes."""
     until_it_flies = lj.Hybrid(dict(zip(hybrid.names[:3], hybrid.systems)), hybrid.switches[:3], most_switches=3)
     start = rolling_hoop.start(PARAMS, FIRST, rolling_hoop.exact_rate(PARAMS, FIRST, rolling_hoop.TOP))
 

@@ -30,7 +30,7 @@ def ends_of(pair):
 
 
 def single_evaluations():
-    """Every key, with the value that the scene gives; the inputs are used, not checked."""
+    """Every key with the scene's value; the inputs are used, not checked."""
     got = {}
     for pair in PAIRS:
         circle = geodesic.great_circle(*ends_of(pair))
@@ -50,19 +50,19 @@ def single_evaluations():
 
 
 def test_great_circles_match_the_references():
-    """Plane, length, middle and vertex to 1e-12 for all pairs: no input is too ill-conditioned for the formulas."""
+    """Plane, length, middle and vertex agree to 1e-12 for all pairs: the formulas handle ill-conditioned inputs."""
     for key, value in single_evaluations().items():
         assert float(value) == pytest.approx(reference(key), rel=1e-12, abs=0), key
 
 
 def test_every_key_is_checked():
-    """No key of §1 is left out: what is not compared is an input."""
+    """No key of §1 is omitted: keys that are not compared are inputs."""
     assert set(single_evaluations()) | {pair + ".inputs" for pair in PAIRS} == set(keys("s1"))
 
 
 @pytest.mark.parametrize("pair", ["s1.tiny_sep", "s1.near_pole", "s1.near_antipodal_1e-12"])
 def test_textbook_formulas_lose_what_ours_keep(pair):
-    """arccos(p₁·p₂) has no digit of a short length, and p₁ × p₂ from rounded points none of a near-antipodal plane."""
+    """arccos(p₁·p₂) loses all digits of a short length, and p₁ × p₂ of rounded points of a near-antipodal plane."""
     psi1, theta1, psi2, theta2 = ends_of(pair)
     one, two = (np.asarray(geodesic.cartesian({"R": 1.0}, *p)) for p in ((psi1, theta1), (psi2, theta2)))
     normal = np.cross(one, two)
@@ -76,7 +76,7 @@ def test_textbook_formulas_lose_what_ours_keep(pair):
     [(1.0, 0.5, 1.0, 0.5), (1.0, 0.5, 1.0, 0.5 + 2 * np.pi), (0.0, 0.25, 0.0, 2.0)],
 )
 def test_coincident_points_have_no_plane(ends):
-    """The same point twice, once around, or the pole under two azimuths: length zero, no plane."""
+    """The same point twice, once around, or the pole with two azimuths has length zero and no plane."""
     with pytest.raises(ValueError, match="coincide: the plane.*not determined"):
         geodesic.great_circle(*ends)
     assert float(geodesic.distance(PARAMS, *ends)) < 1e-14
@@ -84,7 +84,7 @@ def test_coincident_points_have_no_plane(ends):
 
 @pytest.mark.parametrize("ends", [(0.0, 0.0, np.pi, 1.0), (0.75, 0.25, np.pi - 0.75, 0.25 + np.pi)])
 def test_antipodal_points_have_no_plane(ends):
-    """Antipodal points to round-off: length π R, no plane."""
+    """Points that are antipodal to round-off have the length π R and no plane."""
     with pytest.raises(ValueError, match="are antipodal: the plane.*not determined"):
         geodesic.great_circle(*ends)
     assert float(geodesic.distance(PARAMS, *ends)) == pytest.approx(np.pi * R, rel=1e-15)
@@ -113,7 +113,7 @@ def test_lagranges_equation_of_the_arc_length():
 
 
 def test_over_the_azimuth():
-    """ψ(θ), ψ'(θ) and Clairaut's constant to 1e-9 along the generic arc; another plane is told apart."""
+    """ψ(θ), ψ'(θ) and Clairaut's constant are right to 1e-9 along the generic arc; another plane is detected."""
     run, _ = geodesic.runs()
     ts = np.array([run.ts[0], 1.25, run.ts[1]])
     got = integrate(geodesic.over_azimuth, run.q0, run.v0, PARAMS, ts=ts, rtol=1e-10, atol=1e-10)
@@ -126,12 +126,12 @@ def test_over_the_azimuth():
 
 
 def test_embedded_path_and_multiplier():
-    """Around over both poles: r, dr/ds, and λ = -1/(2R²) to 1e-9, residual below 1e-12."""
+    """Around over both poles r, dr/ds and λ = -1/(2R²) are right to 1e-9, with residuals below 1e-12."""
     _, run = geodesic.runs()
     got = integrate(geodesic.embedded, run.q0, run.v0, PARAMS, ts=run.ts, rtol=1e-10, atol=1e-10)
     assert run.error(got) <= run.required
     assert np.allclose(got.multipliers["sphere"], geodesic.exact_multiplier(PARAMS), rtol=1e-9)
-    # With the constraint's own sign turned, or |r| for |r|², λ would be +1/(2R²) or -1/R.
+    # With the sign of the constraint flipped, or |r| instead of |r|², λ would be +1/(2R²) or -1/R.
     assert not np.allclose(got.multipliers["sphere"], -1 / R, rtol=1e-3)
     assert float(got.residual()) <= 1e-12
     # Over the pole the azimuth jumps by π: the path is smooth in r all the same.
@@ -139,7 +139,7 @@ def test_embedded_path_and_multiplier():
 
 
 def test_refused_cases():
-    """The pole is refused over the azimuth, by the coordinate's name; what is not refused, but should be, fails."""
+    """Over the azimuth the pole is refused with the coordinate's name; a missing refusal fails."""
     case = geodesic._at_the_pole()
     assert case.passed and "'q'" in case.happened
     assert not geodesic._undetermined("", geodesic.ENDS).passed
@@ -147,7 +147,7 @@ def test_refused_cases():
 
 @pytest.mark.exhaustive
 def test_a_thousand_turns():
-    """1,000 turns leave the sphere by less than 1e-12, and the phase is off by no more than tolerances add up to."""
+    """After 1,000 turns the distance from the sphere is below 1e-12, the phase error within the added tolerances."""
     case = geodesic._thousand_turns()
     assert case.error <= 1e-12
     q0, v0 = geodesic.start_towards(PARAMS, *geodesic.ENDS)
@@ -157,7 +157,7 @@ def test_a_thousand_turns():
 
 
 def test_the_major_arc_is_a_saddle():
-    """More than half a turn: displaced sideways it gets shorter, by the second variation; the minor arc longer."""
+    """A displaced arc of more than half a turn is shorter, by the second variation; a displaced minor arc is longer."""
     major = reference("s1.dtheta>pi.major_arc_length") / R
     second = jax.jit(jax.hessian(lambda x: geodesic.varied_length(major, x)))(0.0)
     assert float(second) == pytest.approx(reference("s1.dtheta>pi.second_variation_coeff"), rel=1e-12)
@@ -203,7 +203,7 @@ def test_gradients_embedded():
     for mode in (jax.jacfwd, jax.jacrev):
         got = jax.jit(mode(final))(R)
         assert np.allclose(got, expected, rtol=1e-6, atol=0)
-        # A start that is held while R grows would have another gradient.
+        # If the start did not move with R, the gradient would differ.
         assert not np.allclose(got[:3], unit * np.cos(3.0 / R), rtol=1e-2, atol=0)
 
 

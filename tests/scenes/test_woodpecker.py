@@ -12,7 +12,7 @@ NAMES = ("y", "sleeve", "bird")
 
 
 def test_the_independent_cycle():
-    """The other computation: where the bird turns, the period, and what happens in it.
+    """The independent computation: where the bird turns, the period, and the switches in it.
 
     Twin: without friction in the impacts the bird turns elsewhere.
     """
@@ -28,7 +28,7 @@ def test_the_independent_cycle():
 
 @pytest.mark.slow
 def test_the_cycle():
-    """Times, states and impulses of all switches of a period, and no beak in the pole. Twin: a stiffer spring's."""
+    """Times, states and impulses of all switches of a period, and a beak that stays outside. Twin: a stiffer spring."""
     traj = motion(PARAMS, TS, rtol=1e-11, estimate_error=False)
     expected, switches = by_events.changes(PARAMS, TURN), traj.switches
     t = np.asarray(switches.t)[: len(switches)]

@@ -1,7 +1,7 @@
-"""The woodpecker toy once more, by means that share nothing with lagjax.
+"""A second computation of the woodpecker toy that shares nothing with lagjax.
 
 Each mode of each of the three contacts is a linear equation z' = A z, z = (q, q', 1), solved by exponentials of A; its
-guards are looked at every `STEP` and then enclosed by Brent's method, and impacts are solved by trying their modes.
+guards are evaluated every `STEP`, their zeros then found by Brent's method, and impacts solved by trying their modes.
 """
 
 from typing import NamedTuple
@@ -53,7 +53,7 @@ class Toy:
             push, forces = np.zeros((3, 7)), np.zeros((2, 7))
             if contact is not None:
                 directions = np.stack([self.normal[contact], self.along[contact]], axis=1)
-                # What keeps its acceleration zero: both, or the normal one alone.
+                # Directions with zero acceleration: both, or only the normal one.
                 still = directions if side == 0 else directions[:, :1]
                 acts = np.eye(2) if side == 0 else np.array([[1.0], [-side * self.mu]])
                 matrix = still.T @ self.inverse @ directions @ acts
@@ -65,7 +65,7 @@ class Toy:
         return self.known[contact, side]
 
     def guards(self, contact, side):
-        """What is above zero as long as a mode lasts."""
+        """Functions that are positive as long as a mode lasts."""
         if contact is None:
             return {name: lambda z, name=name: self.far[name] + self.normal[name] @ z[:3] for name in self.far}
         normal, along = self.mode(contact, side)[1]
@@ -76,7 +76,7 @@ class Toy:
         return leaves | {name: lambda z, s=s: (self.mu * normal + s * along) @ z for name, s in cone.items()}
 
     def hit(self, contact, z):
-        """The state after an impact, and the side to which it slides: that of the modes which its laws allow."""
+        """The state after an impact, and the side to which it slides, from the mode that the impact laws allow."""
         both = np.stack([self.normal[contact], self.along[contact]], axis=1)
         before = both.T @ z[3:6]
         for side in (0, 1, -1):
@@ -90,7 +90,7 @@ class Toy:
         raise AssertionError("an impact without a solution")
 
     def closed(self, contact, side, z):
-        """The mode of a contact that is closed and slides to a side, or not."""
+        """The mode of a closed contact that slides to a side, or sticks."""
         if side == 0:
             normal, along = self.mode(contact, 0)[1] @ z
             if normal > 0 and abs(along) <= self.mu * normal:
@@ -104,7 +104,7 @@ class Toy:
         before = {name: guard(z) for name, guard in guards.items()}
         for k in range(int(until / STEP)):
             after = exact @ z
-            # A contact that has just let go, or begun to, is at zero there.
+            # The guard of a contact that has just opened or closed is zero.
             crossed = [name for name, guard in guards.items() if guard(after) < 0 and (k or before[name] > 1e-15)]
             if crossed:
                 root = lambda name: optimize.brentq(
@@ -116,7 +116,7 @@ class Toy:
         return None
 
     def changed(self, mode, t, why, z):
-        """The mode after a guard is zero."""
+        """The mode after a guard reaches zero."""
         if why in self.normal:
             z, side = self.hit(why, z)
             return Change(t, why, (None, 0) if self.restitution[why] else self.closed(why, side, z), z)
@@ -128,7 +128,7 @@ class Toy:
 
 
 def changes(p, turn, slips=2, impact_mu=None) -> list[Change]:
-    """All changes of the jammed toy from where its bird turns until it has slipped so many times."""
+    """All changes of the jammed toy from where its bird turns until it has slipped `slips` times."""
     toy, mode, t, found = Toy(p, impact_mu), ("lower", 0), 0.0, []
     z = np.array([0.0, -(p["r_M"] - p["r_0"]) / p["h_M"], turn, 0.0, 0.0, 0.0, 1.0])
     while sum(change.why == "slides" for change in found) < slips:
@@ -146,7 +146,7 @@ def lap(p, turn, impact_mu=None) -> tuple[float, float]:
 
 
 def cycle(p, near, impact_mu=None) -> tuple[float, float]:
-    """Where the bird of the jammed toy turns on the cycle, and the period."""
+    """The angle at which the bird of the jammed toy turns on the cycle, and the period."""
     gained = lambda turn: lap(p, turn, impact_mu)[1]
     turn = float(np.asarray(optimize.brentq(gained, near - 0.005, near + 0.005, xtol=1e-15, rtol=1e-15)))
     return turn, lap(p, turn, impact_mu)[0]
