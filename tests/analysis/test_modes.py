@@ -166,7 +166,7 @@ def rails_by_hand(omega):
     return jnp.sqrt(jnp.stack(cross_rails.mode_squares(cross_rails.PARAMS | {"omega": omega}))[::-1])
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_derivatives_of_the_rails():
     """First and second derivatives by ω, forward and reverse; those of shapes against finite differences."""
     got = lambda omega: rails(cross_rails.PARAMS | {"omega": omega}).frequency

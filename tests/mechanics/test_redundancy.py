@@ -144,7 +144,7 @@ def test_report_of_a_state_with_other_velocities():
     assert "contradict each other" in str(lj.explain(against, *STATE).problem)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("mode", exhaustive_but((jax.jacrev,), (jax.jacfwd, jax.jacrev)))
 def test_derivatives_of_shared_multipliers(mode):
     """Accelerations and shortest multipliers have the derivatives of their closed forms, in lanes too."""

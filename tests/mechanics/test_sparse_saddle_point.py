@@ -159,7 +159,7 @@ def test_derivatives_in_both_modes():
         )
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_second_derivatives_and_lanes():
     """Forward-over-forward derivatives and a batch agree with the dense equations."""
     system, q, v, params = chain(8)

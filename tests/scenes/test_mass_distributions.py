@@ -244,7 +244,7 @@ def test_field_through_the_lid():
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[pytest.mark.slow] if name in COMPILED_ONLY_HERE else []) for name in NAMES]
+    "name", [pytest.param(name, marks=[pytest.mark.exhaustive] if name in COMPILED_ONLY_HERE else []) for name in NAMES]
 )
 def test_noether_table(name):
     """Along a generic orbit each charge of the table is constant to 1e-9, and every other momentum is not."""
@@ -336,7 +336,7 @@ def test_euler_integral():
             assert scene.drift(scene.euler_integral(params | {"M1": -2.0}, orbit.q, orbit.v)) > 1e-2
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("mode", exhaustive_but((jax.grad,), (jax.jacfwd, jax.grad)))
 def test_gradient_of_the_final_state(mode):
     """The gradient of a final state inside the ellipse by G, ρ, a, b: both modes against the closed form."""

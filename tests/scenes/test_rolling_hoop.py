@@ -217,7 +217,7 @@ def exact_final(params):
     return jnp.stack([theta, hoop.exact_multipliers(params, theta, 1.25).contact])
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("mode", exhaustive_but((jax.jacrev,), (jax.jacfwd, jax.jacrev)))
 def test_gradients(mode):
     """∂(θ, λ)/∂(m, R, a, g, β) at t = 0.5 agrees with the exact one to 1e-6."""

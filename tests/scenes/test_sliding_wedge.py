@@ -186,7 +186,7 @@ def exact_outcome(params):
     return jnp.stack([0.25 + 0.125 * c + (0.5 - 0.75 * c) * T + 0.5 * a.x * T**2, a.incline])
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("mode", exhaustive_but((jax.jacrev,), (jax.jacfwd, jax.jacrev)))
 def test_gradients(mode):
     """Gradients of final position and normal force by m, M, α and g agree in both modes with the exact ones to 1e-6."""

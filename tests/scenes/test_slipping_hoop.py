@@ -26,7 +26,7 @@ def test_closed_forms():
     assert abs(exact(PARAMS | {"beta": 0.5}).slips - exact(PARAMS).slips) > 0.01
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_it_slips_leaves_and_lands():
     """Angles, speeds, spins and places for all coefficients, by one program, to 1e-9."""
     l = PARAMS["R"] + PARAMS["a"]

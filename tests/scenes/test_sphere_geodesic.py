@@ -185,7 +185,7 @@ def test_gradients_over_the_azimuth(mode):
     assert not np.allclose(got, jax.grad(exact)(state, 1), rtol=1e-2, atol=0)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_gradients_embedded():
     """∂(r, λ)/∂R after s = 3, forward and in reverse, against the exact one to 1e-6."""
     unit, towards = (np.asarray(x) for x in geodesic.start_towards({"R": 1.0}, *geodesic.ENDS))

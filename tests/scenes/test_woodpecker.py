@@ -26,7 +26,7 @@ def test_the_independent_cycle():
     assert abs(by_events.lap(PARAMS, turn, impact_mu=0.0)[1]) > 0.1
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_the_cycle():
     """Times, states and impulses of all switches of a period, and a beak that stays outside. Twin: a stiffer spring."""
     traj = motion(PARAMS, TS, rtol=1e-11, estimate_error=False)
