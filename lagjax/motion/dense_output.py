@@ -46,7 +46,7 @@ LANES = 256
 
 
 class Known(NamedTuple):
-    """The instants from which a motion can be continued, in the order of its run: outputs, and the states after switches.
+    """The instants from which a motion can be continued, in the order of its run: outputs and states after switches.
 
     `phase`: the number of the phase that begins or goes on there; None for a motion without phases.
     """

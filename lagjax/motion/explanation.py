@@ -32,7 +32,7 @@ class Explanation:
     """What a system amounts to at one state; it prints itself.
 
     - `coordinates`: their names; `equations`: the name of each constraint equation.
-    - `degrees_of_freedom`: velocities left free, the number of coordinates less that of independent constraint equations.
+    - `degrees_of_freedom`: velocities left free: coordinates minus independent constraint equations.
     - `position_freedoms`: positions left free; more than the former if some constraints restrict only velocities.
     - `dependent`: each dependent equation, followed by those of which it is a combination.
     - `structure`: what holds at every state, a `Structure`; None for large systems and long programs.
@@ -158,7 +158,7 @@ class _Place(NamedTuple):
 
 
 def _on_the_constraints(system, s) -> _Place:
-    """Find the nearest state on the constraints; off them, dependent constraints contradict each other by the distance."""
+    """Find the nearest state on the constraints; off them, dependent constraints contradict each other that much."""
     tolerance = jnp.asarray(ROUNDED, s.t.dtype)
     equations = equations_of(system, *s)
     if within(equations, *s[:3], tolerance, tolerance):

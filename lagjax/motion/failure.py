@@ -84,8 +84,8 @@ def _too_many(trajectory):
     said = f"there were {count} switches until t = {last:.9g}, and one more exceeds most_switches = {count}.\n"
     if gaps.size and np.all(gaps <= AT_ONE_TIME * max(abs(last), 1e-300)):
         return said + (
-            f"Usual cause: no phase lasts: the last switches, {names}, happen at one time, as each guard is below zero in "
-            "the phase that the other leads to.\n"
+            f"Usual cause: no phase lasts: the last switches, {names}, happen at one time, as each guard is below zero "
+            "in the phase that the other leads to.\n"
             "Fix: add a phase for what happens there (a contact that stays, a joint that sticks); look at the guards "
             "at the last state, in traj.switches with throw=False."
         )

@@ -161,7 +161,7 @@ def _points(name, value):
         raise ValueError(
             f"positions(t, q, params) must return points of the plane, but returned {shape}{_of(name)}.\n"
             "Usual cause: three coordinates in space, an angle in place of a point, or a coordinate of shape (1,).\n"
-            'Fix: return (x, y), points (k, 2) that are linked in order, or such points by name: {"rod": [(0, 0), (x, y)]}.'
+            'Fix: return (x, y), points (k, 2) linked in order, or such points by name: {"rod": [(0, 0), (x, y)]}.'
         )
     return x.reshape(-1, 2)
 
@@ -180,8 +180,8 @@ def _check_dense(positions, t, q, v, params, points):
     missed = max(np.abs(guessed[name] - known[name]).max() for name in known)
     if missed > MAY_MISS * size:
         raise ValueError(
-            f"{len(t)} outputs are too few to draw what happens between them: interpolated from every other one, the rest "
-            f"would be misplaced by {missed / size:.0%} of the picture.\n"
+            f"{len(t)} outputs are too few to draw what happens between them: interpolated from every other one, the "
+            f"rest would be misplaced by {missed / size:.0%} of the picture.\n"
             "Usual cause: fewer than about ten outputs for each oscillation.\n"
             f"Fix: ts=jnp.linspace({t[0]:.6g}, {t[-1]:.6g}, {8 * len(t) + 1})."
         )

@@ -39,7 +39,7 @@ FEW, UNCOUNTED = 4, 0.2
 MANY, FIRST = 3.0, 0.7
 # `max_step` limits the steps if their mean is above this share of it.
 LIMITED = 0.7
-# Round-off adds at least this many units of a number's last place, times the square root of the number of steps.
+# Round-off adds at least this many round-offs of a number, times the square root of the number of steps.
 ROUND_OFF = 3.0
 
 
@@ -99,7 +99,7 @@ def _closer(xp, settings, steps, end, ts):
 
 
 def _compared(xp, first, second, ts) -> Trajectory:
-    """Return the first trajectory with the difference of the two as its errors, enlarged by the least effect of round-off."""
+    """Return the first trajectory with its errors: the difference of the two, plus the least effect of round-off."""
     steps = xp.asarray(second.stats["num_accepted_steps"])
     share = ROUND_OFF * np.finfo(ts.dtype).eps * xp.sqrt(1.0 + steps)
     x, y = _columns(xp, first), _columns(xp, second)

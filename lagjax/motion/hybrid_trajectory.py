@@ -30,7 +30,7 @@ class Switches(eqx.Module):
 
     - `t` (S,): their times, `[t]`; NaN beyond the last one. S is `most_switches` of the `lj.Hybrid`.
     - `way` (S,): which of the hybrid's switches each is, and `to` (S,): the number of the next phase; -1 beyond the
-      last one. `names`: the names of all phases; `ways`: for each of the hybrid's switches, that of the phase it leaves.
+      last one. `names`: the names of all phases; `ways`: for each of the hybrid's switches, the phase it leaves.
     - `q`, `v`: the states before them, each leaf with a leading axis S; `q_after`, `v_after`: those after them.
     - `impulse`: the jump of the momentum, like v, `[L] [t]/[q]`; zero where nothing jumps.
     - `count`: how many there were.
