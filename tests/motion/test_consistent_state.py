@@ -167,9 +167,9 @@ def test_a_held_coordinate_that_a_constraint_fixes():
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-12), held, found)
     length = np.hypot(1.5, 0.25)
     np.testing.assert_allclose([held[0]["y"], held[0]["z"]], [1.5 / length, 0.25 / length], atol=1e-12)
-    with pytest.raises(ValueError, match="with 'x' held: at the best one constraint 'wall' = 0.3"):
+    with pytest.raises(ValueError, match="with 'x' held: at the best state reached, constraint 'wall' = 0.3"):
         lj.consistent_state(alone, 0.0, on_it | {"x": 0.3}, moving, None, hold="x")
-    with pytest.raises(ValueError, match="with 'x' held: at the best one constraint d/dt 'wall' = -0.75"):
+    with pytest.raises(ValueError, match="with 'x' held: at the best state reached, constraint d/dt 'wall' = -0.75"):
         lj.consistent_state(both, 0.0, on_it, moving | {"x": 0.25}, None, hold="x")
     slope = jax.jacfwd(lambda y: lj.consistent_state(both, 0.0, on_it | {"y": y}, moving, None, hold="x")[0]["z"])(1.5)
     np.testing.assert_allclose(slope, -1.5 * 0.25 / length**3, atol=1e-9)

@@ -138,7 +138,7 @@ def test_recorded_until_a_terminal_one():
 
 def test_more_than_are_kept():
     """The count goes on, the first are kept, and it is said."""
-    with pytest.warns(lj.EventWarning, match="happened 8 times, and the first 6 are kept"):
+    with pytest.warns(lj.EventWarning, match="happened 8 times, but only the first 6 are kept"):
         found = swing(0.0, 1.0, 0.3, [0.0, 10.0, 25.0]).events["level"]
     assert int(found.count) == 8 and found.t.shape == (6,)
     assert "8, of which the first 6" in repr(found)

@@ -150,7 +150,7 @@ def test_motions_in_phases():
     found = traj.at(t)
     np.testing.assert_allclose(found.q, height, atol=1e-8)
     np.testing.assert_allclose(found.v, speed - 10.0 * (t - since), atol=1e-7)
-    with pytest.raises(TypeError, match="looks at its switches"):
+    with pytest.raises(TypeError, match="needs the values of its switches"):
         jax.jit(lambda traj: traj.at(0.3))(traj)
 
 
@@ -159,7 +159,7 @@ def test_what_cannot_be_continued():
     with pytest.raises(ValueError, match="outputs are off the constraints"):
         rotate(drift="none").at(0.3)
     planned = dict(method=lj.Tsit5(), stepsize_controller=diffrax.StepTo(TS))
-    with pytest.raises(ValueError, match="StepTo has a plan"):
+    with pytest.raises(ValueError, match="StepTo plans the steps"):
         swing(**planned, throw=False).at(0.3)
 
 

@@ -124,9 +124,9 @@ def test_outputs_too_far_apart(traj):
 def test_no_time_to_play(traj):
     """A film of no length, or one that never ends."""
     for seconds in (0.0, -1.0, np.inf, np.nan):
-        with refused("is no film"):
+        with refused("is not a film"):
             traj.animate(bob, seconds=seconds)
-    with refused("is no film"):
+    with refused("is not a film"):
         traj.animate(bob, trail=-1.0)
 
 
