@@ -89,7 +89,7 @@ def _at_the_end(account):
     for which, group in (("q", slice(0, n)), ("v", slice(n, None))):
         relative = last[group] / np.where(account.size[group] > 0, account.size[group], 1.0)
         i = int(np.argmax(relative))
-        parts.append(f"{last[group][i]:.0e} in {which}" + (f" ({found.names[i]})" if n > 1 else ""))
+        parts.append(f"{last[group][i]:.0e} in {which}" + (f" ({account.names[i]})" if n > 1 else ""))
     return f"about {' and '.join(parts)} at the end"
 
 
@@ -129,7 +129,7 @@ def _chosen_by(trajectory, accepted):
         return "stability, not the tolerance: the system is stiff; method=lj.Radau5() takes longer steps"
     if len(account.names) == 2:
         return "the tolerance"
-    return f"the tolerance, most likely of {found.names[int(np.argmax(np.median(found.amplified, axis=0)))]}"
+    return f"the tolerance, most likely of {account.names[int(np.argmax(np.median(account.amplified, axis=0)))]}"
 
 
 def warning_of(trajectory) -> str:
@@ -143,9 +143,9 @@ def warning_of(trajectory) -> str:
     span, steps = abs(float(account.t[-1] - account.t[0])), int(trajectory.stats["num_accepted_steps"])
     cause, fix = _cause(trajectory, account, row, column, rtol)
     return (
-        f"over a time of {span:.6g} ({steps} steps) the error of '{found.names[column]}' grows to about {error:.1g}, "
+        f"over a time of {span:.6g} ({steps} steps) the error of '{account.names[column]}' grows to about {error:.1g}, "
         f"while {'a turn' if turn else 'the largest value'} is {size:.3g}: {_left(error, size)}. From t = {since:.6g} "
-        f"on it is larger than {_expected(size, found.limit[column])} at rtol = {rtol:.1g}.\n"
+        f"on it is larger than {_expected(size, account.limit[column])} at rtol = {rtol:.1g}.\n"
         f"Usual cause: {cause}.\nFix: {fix}."
     )
 
@@ -171,7 +171,7 @@ def _cause(trajectory, account, row, column, rtol):
     if peaks.max() > PEAK:
         i = int(np.argmax(peaks))
         return (
-            f"the motion passes near a singularity: {found.names[len(found.names) // 2 + i]} grows to {peaks[i]:.2g} "
+            f"the motion passes near a singularity: {account.names[len(account.names) // 2 + i]} grows to {peaks[i]:.2g} "
             "times its median, and digits lost there do not come back",
             f"{tighter}, or coordinates that are regular there",
         )
