@@ -171,8 +171,8 @@ def _cause(trajectory, account, row, column, rtol):
     if peaks.max() > PEAK:
         i = int(np.argmax(peaks))
         return (
-            f"the motion passes near a singularity: {account.names[len(account.names) // 2 + i]} grows to {peaks[i]:.2g} "
-            "times its median, and digits lost there do not come back",
+            f"the motion passes near a singularity: {account.names[len(account.names) // 2 + i]} grows to "
+            f"{peaks[i]:.2g} times its median, and digits lost there do not come back",
             f"{tighter}, or coordinates that are regular there",
         )
     times = account.amplified[row, column]

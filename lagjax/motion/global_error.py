@@ -47,7 +47,7 @@ def steps_to_repeat(estimate: bool | None, controller, progress: bool) -> np.nda
     """Return the most steps of a motion to be integrated again; raise if `estimate` is not None, True or False."""
     if not (estimate is None or isinstance(estimate, (bool, np.bool_))):
         raise TypeError(
-            f"estimate_error must be True, False or None, not {asked!r}.\nFix: estimate_error=True, or leave it out."
+            f"estimate_error must be True, False or None, not {estimate!r}.\nFix: estimate_error=True, or leave it out."
         )
     ours = controller is None or _fixed(controller)
     by_default = STEPS_AT_MOST if is_eager() and ours and not progress else 0
