@@ -1,4 +1,4 @@
-"""The front door: a trajectory from a system and an initial state.
+"""The main entry: a trajectory from a system and an initial state.
 
     check the arguments  ->  one compiled solve by diffrax  ->  say what went wrong, if anything did
 
