@@ -350,5 +350,5 @@ def test_degrees():
     """`explain` tells angles of more than a turn; twin: a length of as much, and smaller angles, are no matter."""
     system = lj.System(lambda t, q, v, params: 0.5 * (v["a"] ** 2 + v["x"] ** 2) + jnp.cos(q["a"]) - q["x"] ** 2)
     said = lambda a, x: str(lj.explain(system, 0, {"a": a, "x": x}, {"a": 0, "x": 0}))
-    assert re.search(r"angles +in radians: a = 90 is 14.3 turns; of degrees jnp.radians\(...\)", said(90, 90))
+    assert re.search(r"angles +in radians: a = 90 is 14.3 turns; for degrees use jnp.radians\(...\)", said(90, 90))
     assert "radians" not in said(1, 90)

@@ -1,4 +1,4 @@
-"""What a motion has to say about its own error and its own cost, in words: for `print` and for the warning."""
+"""Describe the error and the cost of a motion in words: for `print` and for the warning."""
 
 from typing import NamedTuple
 
@@ -9,25 +9,25 @@ from lagjax.mechanics import coordinates
 from lagjax.motion.accuracy import AMPLIFIED, DIGITS_LEFT, EXPECTED, allowed, angle_mask, columns, of_a_step, sizes_of
 from lagjax.motion.tolerances import TURN
 
-# A velocity that grows to so many times its median has passed near a singularity.
+# A motion whose velocity grows to this many times its median has passed near a singularity.
 PEAK = 30.0
-# Steps from one output to the next up to which the outputs have chosen them, and from which on they have not.
+# Steps per output: up to BY_OUTPUTS the outputs have chosen the steps, above NOT_BY_OUTPUTS they have not.
 BY_OUTPUTS, NOT_BY_OUTPUTS = 1.2, 4.0
-# The number of steps grows with the tolerance as the order says; by a share of that where stability limits them, and by
-# more where a second run had its longest step halved.
+# Growth of the number of steps at a tighter tolerance, relative to what the order predicts: below BY_STABILITY if
+# stability limits the steps, above BY_LONGEST if the second run had its longest step halved.
 BY_STABILITY, BY_LONGEST = 0.35, 1.6
-# Steps of which the first, which find their length, are few.
+# Among more steps than this the first ones, which search for their length, are few.
 ENOUGH = 40
-# A tolerance from which round-off is not far.
+# A tolerance below this many round-offs is close to round-off.
 NEAR_ROUND_OFF = 1e3
 
 
 class Account(NamedTuple):
-    """Errors of all coordinates, then of all velocities, beside what they are measured by; rows are outputs.
+    """The errors of all coordinates, then of all velocities, and what they are compared with; rows are outputs.
 
     - `names`: as the user would write them; `t` (T,): the outputs that were reached.
-    - `error`, `size`, `limit`: (T, 2n), and (2n,) for the largest values and for what is allowed.
-    - `amplified` (T, 2n): the errors in units of what the tolerances of all steps until then add up to.
+    - `value`, `error` (T, 2n); `size` (2n,): the largest values; `limit` (2n,): the allowed errors.
+    - `amplified` (T, 2n): the errors in units of the sum of the tolerances of all steps so far.
     """
 
     names: list[str]
@@ -40,41 +40,41 @@ class Account(NamedTuple):
 
     @property
     def excess(self) -> np.ndarray:
-        """Errors in units of what is allowed."""
+        """The errors in units of the allowed ones."""
         return self.error / np.where(self.limit > 0, self.limit, 1.0)
 
 
 def account_of(trajectory) -> Account | None:
-    """The account of one motion that is known; None where there is no estimate."""
+    """Return the account of one motion that is not traced; None if there is no estimate."""
     if trajectory.error is None or np.isnan(float(trajectory.error.steps)) or not int(trajectory.error.steps):
         return None
     t = np.asarray(trajectory.t)
-    value, error = (columns(np, (of.q, of.v), rows=len(t)) for of in (trajectory, trajectory.error))
+    value, error = (columns(np, (x.q, x.v), rows=len(t)) for x in (trajectory, trajectory.error))
     reached = np.isfinite(value).all(axis=1) & ~np.isnan(error).any(axis=1)
     if reached.sum() < 2:
         return None
     t, value, error = t[reached], value[reached], error[reached]
     names = coordinates.names(jax.tree.map(lambda x: np.asarray(x)[0], trajectory.q))
     tolerance = tuple(np.asarray(x) for x in trajectory.tolerance)
-    seen, span, steps = (
+    largest, span, steps = (
         abs(value).max(axis=0).reshape(2, -1),
         abs(t[-1] - t[0]),
         int(trajectory.stats["num_accepted_steps"]),
     )
-    size = sizes_of(np, seen, angle_mask(trajectory), span, steps, len(trajectory.t))
+    size = sizes_of(np, largest, angle_mask(trajectory), span, steps, len(trajectory.t))
     limit, step, size = allowed(np, size, span, tolerance).ravel(), of_a_step(size, tolerance).ravel(), size.ravel()
     amplified = error / (step * np.maximum(1.0, steps * abs(t - t[0]) / span)[:, None])
     return Account([*names, *(f"v of {name}" for name in names)], t, value, error, size, limit, amplified)
 
 
 def of_error(trajectory) -> list[tuple[str, str]]:
-    """The lines of a printed trajectory about its error."""
+    """Return the lines of a printed trajectory about its error."""
     if trajectory.error is None:
         return []
     times = {name: np.asarray(x)[~np.isnan(np.asarray(x))] for name, x in trajectory.error.events.items()}
     of_times = [(f"error of '{name}'", _of_times(x)) for name, x in times.items() if len(x)]
-    found = account_of(trajectory)
-    return of_times if found is None else [("error", _at_the_end(found) + _lost(trajectory, found)), *of_times]
+    account = account_of(trajectory)
+    return of_times if account is None else [("error", _at_the_end(account) + _lost(trajectory, account)), *of_times]
 
 
 def _of_times(errors):
@@ -82,31 +82,31 @@ def _of_times(errors):
     return lost if np.isinf(errors).any() else f"up to {errors.max():.0e} in its times"
 
 
-def _at_the_end(found):
-    """The coordinate and the velocity that have lost most."""
-    n, last = len(found.names) // 2, found.error[-1]
+def _at_the_end(account):
+    """Name the coordinate and the velocity with the largest relative errors."""
+    n, last = len(account.names) // 2, account.error[-1]
     parts = []
     for which, group in (("q", slice(0, n)), ("v", slice(n, None))):
-        relative = last[group] / np.where(found.size[group] > 0, found.size[group], 1.0)
+        relative = last[group] / np.where(account.size[group] > 0, account.size[group], 1.0)
         i = int(np.argmax(relative))
-        parts.append(f"{last[group][i]:.0e} in {which}" + (f" ({found.names[i]})" if n > 1 else ""))
+        parts.append(f"{last[group][i]:.0e} in {which}" + (f" ({account.names[i]})" if n > 1 else ""))
     return f"about {' and '.join(parts)} at the end"
 
 
-def _lost(trajectory, found):
-    """How many digits the motion itself has cost."""
+def _lost(trajectory, account):
+    """Say how many digits were lost because the motion itself amplifies errors."""
     if trajectory.static.how.steps != "tolerance":
         return ""
-    column = int(np.argmax(found.amplified[-1]))
-    times = found.amplified[-1, column]
+    column = int(np.argmax(account.amplified[-1]))
+    times = account.amplified[-1, column]
     if not times > AMPLIFIED:
         return ""
-    since = found.t[np.argmax(found.amplified[:, column] > np.sqrt(AMPLIFIED))]
+    since = account.t[np.argmax(account.amplified[:, column] > np.sqrt(AMPLIFIED))]
     return f"; the motion's own sensitivity has cost {np.log10(times):.0f} digits since t = {since:.4g}"
 
 
 def of_cost(trajectory) -> list[tuple[str, str]]:
-    """The lines of a printed trajectory about what it cost, and what chose its steps."""
+    """Return the lines of a printed trajectory about its cost, and about what determined its steps."""
     accepted, rejected = (int(trajectory.stats[f"num_{kind}_steps"]) for kind in ("accepted", "rejected"))
     evaluations = trajectory.static.how.evaluations
     each = "" if evaluations is None else f"; {evaluations * (accepted + rejected):,} evaluations of the equations"
@@ -115,37 +115,37 @@ def of_cost(trajectory) -> list[tuple[str, str]]:
 
 
 def _chosen_by(trajectory, accepted):
-    how, found = trajectory.static.how, account_of(trajectory)
-    if how.steps != "tolerance" or found is None:
+    how, account = trajectory.static.how, account_of(trajectory)
+    if how.steps != "tolerance" or account is None:
         return ""
-    an_output = accepted / (len(found.t) - 1)
-    if an_output <= BY_OUTPUTS:
+    per_output = accepted / (len(account.t) - 1)
+    if per_output <= BY_OUTPUTS:
         return "the outputs: fewer of them cost less"
     growth = how.order * np.log10(int(trajectory.error.steps) / accepted)
-    tells = accepted > ENOUGH and an_output > NOT_BY_OUTPUTS
+    tells = accepted > ENOUGH and per_output > NOT_BY_OUTPUTS
     if tells and growth > BY_LONGEST:
         return "max_step"
     if tells and growth < BY_STABILITY and how.evaluations is not None:
         return "stability, not the tolerance: the system is stiff; method=lj.Radau5() takes longer steps"
-    if len(found.names) == 2:
+    if len(account.names) == 2:
         return "the tolerance"
-    return f"the tolerance, most likely of {found.names[int(np.argmax(np.median(found.amplified, axis=0)))]}"
+    return f"the tolerance, most likely of {account.names[int(np.argmax(np.median(account.amplified, axis=0)))]}"
 
 
 def warning_of(trajectory) -> str:
-    """What is lost, in which coordinate, from when on; the cause, and what helps."""
-    found = account_of(trajectory)
-    assert found is not None
-    row, column = np.unravel_index(np.argmax(found.excess), found.excess.shape)
-    since = found.t[np.argmax(found.excess[:, column] > 1)]
-    size, error, turn = found.size[column], found.error[row, column], found.size[column] == TURN
+    """Return the warning: the coordinate that lost digits, how many, from when on, the cause, and the fix."""
+    account = account_of(trajectory)
+    assert account is not None
+    row, column = np.unravel_index(np.argmax(account.excess), account.excess.shape)
+    since = account.t[np.argmax(account.excess[:, column] > 1)]
+    size, error, turn = account.size[column], account.error[row, column], account.size[column] == TURN
     rtol = float(np.asarray(trajectory.tolerance[0])[0])
-    span, steps = abs(float(found.t[-1] - found.t[0])), int(trajectory.stats["num_accepted_steps"])
-    cause, fix = _cause(trajectory, found, row, column, rtol)
+    span, steps = abs(float(account.t[-1] - account.t[0])), int(trajectory.stats["num_accepted_steps"])
+    cause, fix = _cause(trajectory, account, row, column, rtol)
     return (
-        f"over a time of {span:.6g} ({steps} steps) the error of '{found.names[column]}' grows to about {error:.1g}, "
-        f"where {'a turn' if turn else 'the largest value'} is {size:.3g}: {_left(error, size)}. From t = {since:.6g} "
-        f"on it is more than {_expected(size, found.limit[column])} at rtol = {rtol:.1g}.\n"
+        f"over a time of {span:.6g} ({steps} steps) the error of '{account.names[column]}' grows to about {error:.1g}, "
+        f"while {'a turn' if turn else 'the largest value'} is {size:.3g}: {_left(error, size)}. From t = {since:.6g} "
+        f"on it is larger than {_expected(size, account.limit[column])} at rtol = {rtol:.1g}.\n"
         f"Usual cause: {cause}.\nFix: {fix}."
     )
 
@@ -156,32 +156,32 @@ def _left(error, size):
 
 
 def _expected(size, limit):
-    return "three digits allow" if limit >= 0.999 * DIGITS_LEFT * size else f"{EXPECTED:,.0f} tolerances"
+    return "three correct digits allow" if limit >= 0.999 * DIGITS_LEFT * size else f"{EXPECTED:,.0f} tolerances"
 
 
-def _cause(trajectory, found, row, column, rtol):
+def _cause(trajectory, account, row, column, rtol):
     how, dtype = trajectory.static.how, np.asarray(trajectory.t).dtype
-    tighter = f"rtol={max(rtol / 1e3, 1e2 * float(np.finfo(dtype).eps)):.0e}, and atol as much"
+    tighter = f"rtol={max(rtol / 1e3, 1e2 * float(np.finfo(dtype).eps)):.0e}, and atol smaller by as much"
     if how.steps == "fixed":
         return "fixed steps that are too long", "a shorter dt0, or leave stepsize_controller out"
     round_off = rtol < NEAR_ROUND_OFF * np.finfo(dtype).eps
-    speeds = abs(found.value[:, len(found.names) // 2 :])
+    speeds = abs(account.value[:, len(account.names) // 2 :])
     typical = np.median(speeds, axis=0)
     peaks = speeds.max(axis=0) / np.where(typical > 0, typical, np.inf)
     if peaks.max() > PEAK:
         i = int(np.argmax(peaks))
         return (
-            f"the motion passes near a singularity: {found.names[len(found.names) // 2 + i]} grows to {peaks[i]:.2g} "
-            "times its median, and what is lost there is not found again",
+            f"the motion passes near a singularity: {account.names[len(account.names) // 2 + i]} grows to "
+            f"{peaks[i]:.2g} times its median, and digits lost there do not come back",
             f"{tighter}, or coordinates that are regular there",
         )
-    times = found.amplified[row, column]
+    times = account.amplified[row, column]
     if times > AMPLIFIED:
         return (
             f"the motion itself amplifies errors, here {times:.0e} times (a chaotic or an unstable motion, or a phase "
-            "that runs away over many periods)",
-            f"{'float64 where this is float32' if round_off else tighter}, which gains some digits for some time; "
-            "beyond that look at what does not depend on one motion: averages, sections, energies",
+            "error that grows over many periods)",
+            f"{'float64 where this is float32' if round_off else tighter}, which keeps more digits for some time; "
+            "beyond that, study what does not depend on a single motion: averages, sections, energies",
         )
     if round_off:
         return "round-off: the tolerance is near its limit", "a shorter span, or float64 where this is float32"

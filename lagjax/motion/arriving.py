@@ -1,11 +1,11 @@
 """Steps that end where outputs are wanted.
 
 An output inside a step costs a step of its own, or a polynomial of lower order than the method. Here the step before an
-output is shortened to end there, or the last two are made equal; the size that was proposed before is kept for the step
-after it. Outputs then cost nothing but the steps they shorten.
+output is shortened to end there, or the last two are made equal; the size proposed before is kept for the step after
+it. Outputs then cost nothing apart from the steps that they shorten.
 
 Times at which a force jumps are ends of steps, too, and each step stays on its own side of them: it begins and ends a
-few units of round-off beside a jump, so that the function is not asked at the jump itself.
+few units of round-off away from a jump, so that the force is never evaluated at the jump itself.
 """
 
 import diffrax
@@ -18,17 +18,17 @@ from jaxtyping import Array, Float
 from lagjax.mechanics.equations import Equations
 from lagjax.motion.tolerances import Weighing
 
-# The first step as it is proposed, and no longest one. Infinite, the share of an empty pause would be no number.
+# `shares` with the first step as proposed, and no longest one; an infinite share of an empty interval would be NaN.
 WHOLE_STEPS = 1.0, 1e30
-# The distance kept from a jump, in round-offs of the time: a user computes the same time in two ways.
-BESIDE = 4
+# The distance kept from a jump, in round-offs of the time: a user may compute the same time in two ways.
+MARGIN = 4
 
 
 class Arriving(diffrax.AbstractStepSizeController):
     """Wrap `controller`: each of the increasing times `ts` is the end of a step.
 
-    `shares`: of the first step that is proposed, that which is taken; and of the time from one of `ts` to the next, the
-    longest step.
+    `shares`: the part of the proposed first step that is taken; and the longest step, as a part of the interval between
+    two of `ts`.
     """
 
     controller: diffrax.PIDController | Weighing
@@ -36,19 +36,19 @@ class Arriving(diffrax.AbstractStepSizeController):
     shares: Float[Array, " 2"]
 
     def wrap(self, direction):
-        """The same for time in this direction, which is always forward."""
+        """Wrap the inner controller likewise; `ts` stay, since time always runs forward here."""
         return Arriving(self.controller.wrap(direction), self.ts, self.shares)
 
     def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
-        """The first step."""
+        """Choose the first step."""
         proposed, state = self.controller.init(terms, t0, t1, y0, dt0, args, func, error_order)
         index, step = jnp.minimum(1, self.ts.size - 1), self.shares[0] * (proposed - t0)
         return self._toward(index, t0, step), (state, index, step)
 
     def adapt_step_size(self, t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state):
-        """Whether to keep a step, and the next one."""
+        """Decide whether to keep a step, and choose the next one."""
         state, index, before = controller_state
-        # Times asked for may be closer than the least step, which is no reason to give up.
+        # Output times may be closer together than the least step; that must not end the solve.
         least = self.controller.dtmin
         judged = t1 if least is None else jnp.maximum(t1, t0 + 2 * least)
         keep, next_t0, next_t1, jumped, state, result = self.controller.adapt_step_size(
@@ -56,7 +56,7 @@ class Arriving(diffrax.AbstractStepSizeController):
         )
         proposed = next_t1 - next_t0
         next_t0 = next_t0 if least is None else jnp.where(keep, t1, t0)
-        # A step that was shortened says nothing against the size that had been proposed.
+        # That a step was shortened is no reason to reduce the size proposed before it.
         proposed = jnp.where(keep, jnp.maximum(proposed, jnp.where(t1 - t0 < before, before, 0.0)), proposed)
         index = jnp.where(keep & (t1 >= self.ts[index]), jnp.minimum(index + 1, self.ts.size - 1), index)
         return keep, next_t0, self._toward(index, next_t0, proposed), jumped, (state, index, proposed), result
@@ -70,26 +70,26 @@ class Arriving(diffrax.AbstractStepSizeController):
 
 
 def together(ts: Float[Array, " T"], jump_ts: Float[Array, " J"]) -> Float[Array, " T+J"]:
-    """The increasing times `ts` and the jumps between the first and the last, each once; filled with the last."""
-    # Of equal times the jump is kept, for the derivative by it.
+    """Merge the increasing times `ts` and the jumps between the first and last, each once; pad with the last time."""
+    # If a jump and one of `ts` are equal, the jump is kept, for the derivative with respect to it.
     times = jnp.sort(jnp.concatenate([jnp.clip(jump_ts, ts[0], ts[-1]), ts]), stable=True)
-    again = jnp.concatenate([jnp.zeros_like(times[:1], bool), times[1:] == times[:-1]])
-    return jnp.sort(jnp.where(again, ts[-1], times), stable=True)
+    repeated = jnp.concatenate([jnp.zeros_like(times[:1], bool), times[1:] == times[:-1]])
+    return jnp.sort(jnp.where(repeated, ts[-1], times), stable=True)
 
 
 def between_jumps(t0, t1, jump_ts, made_jump):
-    """A step from t0 to t1 that touches no jump at its ends, and whether it starts at one."""
-    beside = _round_off(jnp.maximum(jnp.abs(t0), jnp.abs(t1)))
+    """Return the ends of the step from t0 to t1, moved off any jump, and whether it starts at one."""
+    margin = _round_off(jnp.maximum(jnp.abs(t0), jnp.abs(t1)))
     at = lambda t: jnp.any(t == jump_ts)
-    starts, ends, room = at(t0), at(t1), t1 - t0 > 4 * beside
-    t1 = jnp.where(ends & room, t1 - beside, t1)
-    return jnp.where(starts & room, t0 + beside, t0), t1, starts | made_jump
+    starts, ends, room = at(t0), at(t1), t1 - t0 > 4 * margin
+    t1 = jnp.where(ends & room, t1 - margin, t1)
+    return jnp.where(starts & room, t0 + margin, t0), t1, starts | made_jump
 
 
 def apart_from_jumps(equations: Equations, ts, jump_ts, q, v):
-    """The outputs; one at the time of a jump does not move with the jump, as the end of its step does.
+    """Return the outputs; one at the time of a jump must not move with the jump, although the end of its step does.
 
-    `late` is zero, and its derivative that of the difference.
+    `late` is zero, but its derivative is that of the difference of the two times.
     """
     same = ts[:, None] == jump_ts[None, :]
     late = jnp.where(jnp.any(same, axis=1), ts - jump_ts[jnp.argmax(same, axis=1)], 0.0)
@@ -100,4 +100,4 @@ def apart_from_jumps(equations: Equations, ts, jump_ts, q, v):
 
 
 def _round_off(t):
-    return BESIDE * np.finfo(t.dtype).eps * t
+    return MARGIN * np.finfo(t.dtype).eps * t

@@ -6,13 +6,13 @@ form, with the same accelerations and multipliers, for
     L'(τ, q, w) = L(-τ, q, -w)        Q'(τ, q, w) = Q(-τ, q, -w)        R'(τ, q, w) = -R(-τ, q, -w)
     g'(τ, q)    = g(-τ, q)          phi'(τ, q, w) = -phi(-τ, q, -w)
 
-(R and phi change their sign so that ∂R'/∂w = ∂R/∂v and ∂phi'/∂w = ∂phi/∂v.) What steps, projects and locates events
-then knows one direction of time alone, and who runs forward pays nothing. Times and velocities are reflected on the way
-in and on the way out, both exactly.
+(R and phi change their sign so that ∂R'/∂w = ∂R/∂v and ∂phi'/∂w = ∂phi/∂v.) The code that steps, projects and locates
+events then only needs one direction of time, and forward motions cost nothing extra. Times and velocities are reflected
+on the way in and on the way out, both exactly.
 
-The direction is part of the program: it has to be known when the program is traced. A sign as an argument would cost
-all who pass their times through `jit` (a pendulum of mass 1 takes 1.25 times as long with a mass that is the square of
-a sign).
+The direction is part of the program: it has to be known when the program is traced. A sign as an argument would slow
+down every motion whose times pass through `jit` (a pendulum of mass 1 takes 1.25 times as long with a mass that is the
+square of a sign).
 
 Source: Lamb & Roberts, Physica D 112 (1998) 1, §2 (reversing symmetries).
 """
@@ -34,7 +34,7 @@ from lagjax.motion.trajectory import Snapshot, Trajectory, pack
 
 
 class Reflected(eqx.Module):
-    """A function of (t, q, v, ...), or of (t, q, ...) alone, at the reflected time and velocities."""
+    """A function of (t, q, v, ...), or of (t, q, ...), evaluated at the reflected time and velocities."""
 
     function: Callable
     of_velocities: bool = eqx.field(static=True, default=True)
@@ -53,7 +53,7 @@ class Reflected(eqx.Module):
 
 
 class ReflectedCondition(eqx.Module):
-    """The condition of a `diffrax.Event` at the reflected time and velocities."""
+    """The condition of a `diffrax.Event`, evaluated at the reflected time and velocities."""
 
     condition: Callable
 
@@ -63,11 +63,11 @@ class ReflectedCondition(eqx.Module):
 
 
 def in_either_direction(system, q0, v0, params, ts, guards, settings, backward: bool) -> Trajectory:
-    """`trajectory_of`, for times that increase, or decrease."""
+    """Call `trajectory_of` for increasing or, if `backward`, decreasing times."""
     if not backward:
         return trajectory_of(system, q0, v0, params, ts, guards, settings)
     if guards is not None:
-        # Their directions stay: those along the run of the motion, as in SciPy.
+        # Directions of crossings stay: they are meant along the run of the motion, as in SciPy.
         guards = replace(guards, functions=tuple(map(Reflected, guards.functions)))
     reflected = trajectory_of(
         reflect_system(system), q0, _negative(v0), params, -ts, guards, _reflect_settings(settings)
@@ -80,7 +80,7 @@ def in_either_direction(system, q0, v0, params, ts, guards, settings, backward: 
 
 
 def runs_backward(ts) -> bool:
-    """Whether times decrease, as far as that is known already: while JAX is tracing them they are taken to increase."""
+    """Whether times decrease; while JAX is tracing them they are assumed to increase."""
     ts = ts if is_traced(ts) else np.asarray(ts)
     try:
         return bool(ts[-1] < ts[0])
@@ -89,7 +89,7 @@ def runs_backward(ts) -> bool:
 
 
 def reflect_system(system: System) -> System:
-    """The system whose motion forward is the motion of `system` backward."""
+    """Return the system whose forward motion is the backward motion of `system`."""
     constraints = {
         name: Holonomic(Reflected(c.g, of_velocities=False))
         if isinstance(c, Holonomic)
@@ -102,7 +102,7 @@ def reflect_system(system: System) -> System:
 
 
 def reflect_snapshot(snapshot: Snapshot) -> Snapshot:
-    """An instant of the reflected motion, or several, as instants of the motion itself."""
+    """Turn one or several instants of the reflected motion into instants of the motion itself."""
     return snapshot._replace(t=-snapshot.t, v=_negative(snapshot.v))
 
 

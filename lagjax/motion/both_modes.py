@@ -1,19 +1,19 @@
-"""A solve that can be differentiated forward and in reverse without being told which.
+"""A solve that can be differentiated forward and in reverse, without choosing one in advance.
 
-diffrax offers one derivative a solve: `ForwardMode` or `RecursiveCheckpointAdjoint`. Which one is wanted is
-known only when JAX pushes tangents through (`jacfwd`, Levenberg-Marquardt) or transposes them (`grad`).
+diffrax offers one kind of derivative for each solve: `ForwardMode` or `RecursiveCheckpointAdjoint`. Which one is needed
+is known only when JAX pushes tangents through (`jacfwd`, Levenberg-Marquardt) or transposes them (`grad`).
 The derivative of y = solve(x) is therefore bound as a linear map dx -> dy of its own: a primitive that is
-evaluated by forward mode and transposed by a replay of the steps (`pulled.py`); where few derivatives are asked for,
-by forward mode too, along each of them. Undifferentiated, there is no trace of it in the compiled program. With many
-numbers to differentiate by, the solve that gives the values records its steps, and the replay is of these.
+evaluated by forward mode and transposed by a replay of the steps (`pulled.py`), or, for few derivatives, by forward
+mode along each of them. If nothing is differentiated, it leaves no trace in the compiled program. With many numbers to
+differentiate by, the solve that computes the values records its steps, and these are replayed.
 
 Second derivatives by few numbers are those of this map, which is bilinear in dx and in the direction dz in which x
 moves:
 
     d(J dx) = H[dx, dz] + J d(dx)
 
-It is evaluated forward over forward, and bound as a linear map of (dz, d(dx)) in its turn: transposed, it is pushed
-along every axis of them. Those by many numbers are in `pulled.py`. So `jacfwd(jacfwd)`, `jvp(grad)`, `grad(grad)`,
+It is evaluated forward over forward, and itself bound as a linear map of (dz, d(dx)), which is transposed by pushing
+along each of their axes. Those by many numbers are in `pulled.py`. So `jacfwd(jacfwd)`, `jvp(grad)`, `grad(grad)`,
 `jacrev(jacrev)` and the other orders all work; third derivatives by many numbers are refused.
 """
 
@@ -37,22 +37,23 @@ from lagjax.motion.consistency import stopped
 from lagjax.motion.pulled import Push, pull, turned
 from lagjax.motion.replay import Replay
 
-# Up to this many derivatives of one number, pushing all of them forward is cheaper than one pull back through
-# checkpoints was, to run and to compile. Where a replay begins to be cheaper was not measured.
+# Up to this many derivatives of one number, pushing all of them forward was cheaper to run and to compile than one pull
+# back through checkpoints. From where on a replay is cheaper was not measured.
 PUSH_UP_TO = 24
 
 
 def solve_in_both_modes(solve: Callable, x: PyTree, fixed: PyTree, recorded: bool = True) -> PyTree:
-    """`solve(x, fixed, adjoint, differentiated)` for a diffrax adjoint, differentiable in both modes in `x`.
+    """Return the result of `solve(x, fixed, adjoint, differentiated)`, differentiable in both modes in `x`.
 
-    It returns its result and, where the adjoint is a `Replay`, a record of the motion for another one; else None. All
-    leaves of `x` are floating arrays, all leaves of `fixed` and of the result are arrays, and `solve` closes over no
-    traced value. `differentiated` says whether this solve is for a derivative; `recorded`, whether there is a record.
+    `solve` returns its result and a record of the motion, to be used by a later `Replay`, or None if the adjoint is not
+    a `Replay`. All leaves of `x` are floating arrays, all leaves of `fixed` and of the result are arrays, and `solve`
+    closes over no traced value. `differentiated`: whether this solve is for a derivative; `recorded`: whether there is
+    a record.
     """
     leaves, structure = jtu.tree_flatten((x, fixed))
     shapes = {}
 
-    def by(adjoint, differentiated, *leaves):
+    def solve_flat(adjoint, differentiated, *leaves):
         found = solve(*jtu.tree_unflatten(structure, leaves), adjoint, differentiated)
         shapes["y"], shapes[type(adjoint)] = map(jtu.tree_structure, found)
         return tuple(jtu.tree_leaves(part) for part in found)
@@ -61,24 +62,24 @@ def solve_in_both_modes(solve: Callable, x: PyTree, fixed: PyTree, recorded: boo
         leaves, record = operands[: structure.num_leaves], operands[structure.num_leaves :]
         if isinstance(adjoint, Replay):
             adjoint = replace(adjoint, record=jtu.tree_unflatten(shapes[Replay], record) if record else None)
-        return [y for y in by(adjoint, True, *leaves)[0] if _is_float(y)]
+        return [y for y in solve_flat(adjoint, True, *leaves)[0] if _is_float(y)]
 
-    # What is not differentiated is a program that others may look into, as they do with a call.
-    program = jax.make_jaxpr(lambda *leaves: by(diffrax.ForwardMode(), False, *leaves)[0])(*leaves)
-    with_record = jax.jit(partial(by, Replay(), True))
+    # Undifferentiated, the solve is a program that other transformations may look into, as into a call.
+    program = jax.make_jaxpr(lambda *leaves: solve_flat(diffrax.ForwardMode(), False, *leaves)[0])(*leaves)
+    with_record = jax.jit(partial(solve_flat, Replay(), True))
     no_steps = lambda *record: jtu.tree_unflatten(shapes[Replay], record).record.count == 0
-    of = _Solve(with_record if recorded else None, outputs, no_steps, len(jtu.tree_leaves(x)))
-    found = _solve_p.bind(*leaves, program=program, of=of)
+    rules = _Solve(with_record if recorded else None, outputs, no_steps, len(jtu.tree_leaves(x)))
+    found = _solve_p.bind(*leaves, program=program, rules=rules)
     return jtu.tree_unflatten(shapes["y"], found)
 
 
 @dataclass(frozen=True, eq=False)
 class _Solve:
-    """How to differentiate a solve, a function of arrays, by the first `size` of them.
+    """How to differentiate a solve, a function of arrays, with respect to the first `size` of them.
 
-    `recorded(*leaves)` gives the arrays of the result and those of the record, if there is one; `outputs(adjoint,
-    *leaves, *record)` the floating ones of the result, for a derivative; `no_steps(*record)` says whether the motion
-    was refused. `axes`: in lanes, of each array.
+    `recorded(*leaves)` gives the arrays of the result and of the record; None without a record. `outputs(adjoint,
+    *leaves, *record)` gives the floating arrays of the result, for a derivative; `no_steps(*record)` whether the motion
+    was refused. `axes`: the lane axis of each array; None without lanes.
     """
 
     recorded: Callable | None
@@ -88,18 +89,18 @@ class _Solve:
     axes: tuple | None = None
 
     def without_refused(self, leaves, record):
-        """The same arrays, where there is no motion without derivatives: those there may be infinite."""
+        """Return the arrays, without derivatives if the motion was refused, as these may be infinite."""
         if not record:
             return leaves
         none = self.no_steps(*record)
         none = none if self.axes is None else jnp.all(none.reshape(none.shape[0], -1), axis=1)
         still = lambda x: jnp.where(none.reshape(none.shape + (1,) * (x.ndim - none.ndim)), lax.stop_gradient(x), x)
-        # What lanes share stays one.
-        mine = [i < self.size and (self.axes is None or self.axes[i] == 0) for i in range(len(leaves))]
-        return [still(x) if m else x for x, m in zip(leaves, mine)]
+        # Arrays that all lanes share must not get a lane axis.
+        own = [i < self.size and (self.axes is None or self.axes[i] == 0) for i in range(len(leaves))]
+        return [still(x) if m else x for x, m in zip(leaves, own)]
 
     def in_lanes(self, axes, count):
-        """The same for lanes, with the results in front."""
+        """Return the same for lanes, whose axis comes first in the results."""
         lanes = lambda function: jax.vmap(function, axes, axis_size=count)
 
         def outputs(adjoint, *operands):
@@ -110,26 +111,26 @@ class _Solve:
         return _Solve(recorded, outputs, self.no_steps, self.size, tuple(axes))
 
 
-def _solved(*leaves, program, of):
+def _solved(*leaves, program, rules):
     return jaxpr_as_fun(program)(*leaves)
 
 
-def _solved_shapes(*leaves, program, of):
+def _solved_shapes(*leaves, program, rules):
     return program.out_avals
 
 
-def _solved_jvp(primals, tangents, *, program, of):
-    # What is not moved is a constant: a tangent of zeros would go through every step.
-    moved = [i for i in range(of.size) if not isinstance(tangents[i], ad.Zero)]
+def _solved_jvp(primals, tangents, *, program, rules):
+    # Arrays without a tangent are constants: a tangent of zeros would be carried through every step.
+    moved = [i for i in range(rules.size) if not isinstance(tangents[i], ad.Zero)]
     zero = lambda y: ad.Zero(jax.typeof(y).to_tangent_aval())
-    if of.recorded is None or not moved or _are_few(primals[i] for i in moved):
-        # By itself, so that a second derivative finds this rule again.
-        values, record = _solve_p.bind(*primals, program=program, of=of), []
+    if rules.recorded is None or not moved or _are_few(primals[i] for i in moved):
+        # Bind the primitive, so that a second derivative finds this rule again.
+        values, record = _solve_p.bind(*primals, program=program, rules=rules), []
     else:
-        values, record = of.recorded(*primals)
+        values, record = rules.recorded(*primals)
     if not moved:
         return values, [zero(y) for y in values]
-    # The record says where the motion is replayed, and is no function of that.
+    # The record only says around which motion to replay; it is not differentiated.
     leaves = [*primals, *stopped(record)]
     order = moved + [i for i in range(len(leaves)) if i not in moved]
     place = [order.index(i) for i in range(len(leaves))]
@@ -137,7 +138,7 @@ def _solved_jvp(primals, tangents, *, program, of):
     def outputs(adjoint, *operands):
         operands = [operands[i] for i in place]
         leaves, record = operands[: len(primals)], operands[len(primals) :]
-        return of.outputs(adjoint, *of.without_refused(leaves, record), *record)
+        return rules.outputs(adjoint, *rules.without_refused(leaves, record), *record)
 
     shapes = tuple((y.shape, y.dtype) for y in values if _is_float(y))
     params = dict(outputs=outputs, shapes=shapes, size=len(moved), many=False)
@@ -145,12 +146,12 @@ def _solved_jvp(primals, tangents, *, program, of):
     return values, [next(dy) if _is_float(y) else zero(y) for y in values]
 
 
-def _solved_batched(operands, axes, *, program, of):
+def _solved_batched(operands, axes, *, program, rules):
     count = next(x.shape[axis] for x, axis in zip(operands, axes) if axis is not None)
     front = [x if axis is None else jnp.moveaxis(x, axis, 0) for x, axis in zip(operands, axes)]
     axes = [None if axis is None else 0 for axis in axes]
     lanes = jax.make_jaxpr(jax.vmap(jaxpr_as_fun(program), axes, axis_size=count))(*front)
-    found = _solve_p.bind(*front, program=lanes, of=of.in_lanes(axes, count))
+    found = _solve_p.bind(*front, program=lanes, rules=rules.in_lanes(axes, count))
     return found, [0] * len(found)
 
 
@@ -162,10 +163,10 @@ def _is_float(x):
     return jnp.issubdtype(x.dtype, jnp.inexact)
 
 
-# The operands of the derivative are the leaves of x, of what is fixed, and of dx; `size` is the count of the
-# first and the last. `outputs(adjoint, *x, *fixed)` gives the floating leaves of the result; their `shapes`
-# are those of their tangents, and known without tracing. With `many`, each dx has a leading axis of directions,
-# and so has each result.
+# The operands of the derivative are the leaves of x, of what is fixed, and of dx; `size` is the number of leaves of x
+# and of dx. `outputs(adjoint, *x, *fixed)` gives the floating leaves of the result; `shapes`, which are also those of
+# their tangents, are known without tracing. With `many`, each dx has a leading axis of directions, and so has each
+# result.
 
 
 def _split(operands, size):
@@ -191,23 +192,23 @@ def _tangent_jvp(primals, tangents, **params):
     push = partial(turned, Push(len(x), params["outputs"]), shapes=params["shapes"])
     if not params["many"]:
         return values, push(primals, tangents)
-    # The directions are lanes.
-    count, here = len(primals) - len(dx), lambda t: not isinstance(t, ad.Zero)
+    # Directions are treated as lanes.
+    count, moves = len(primals) - len(dx), lambda t: not isinstance(t, ad.Zero)
     axes = [None] * count + [0] * len(dx)
-    moving = [t for t in tangents if here(t)]
+    moving = [t for t in tangents if moves(t)]
 
     def along(primals, moving):
         moving = iter(moving)
         each = [
-            next(moving) if here(t) else ad.Zero(jax.typeof(x).to_tangent_aval()) for x, t in zip(primals, tangents)
+            next(moving) if moves(t) else ad.Zero(jax.typeof(x).to_tangent_aval()) for x, t in zip(primals, tangents)
         ]
         return [ad.instantiate_zeros(d) for d in push(primals, each)]
 
-    return values, jax.vmap(along, (axes, [axis for axis, t in zip(axes, tangents) if here(t)]))(list(primals), moving)
+    return values, jax.vmap(along, (axes, [axis for axis, t in zip(axes, tangents) if moves(t)]))(list(primals), moving)
 
 
 def _linear(function, points, tangents, values):
-    """The derivative of `function` along `tangents`, as a linear map of these that can be transposed; and `values`."""
+    """Return `values`, and the derivative of `function` along `tangents`, as a linear map that can be transposed."""
     moved = [i for i, tangent in enumerate(tangents) if not isinstance(tangent, ad.Zero)]
     if not moved:
         return values, [ad.Zero(value.aval.to_tangent_aval()) for value in map(jnp.asarray, values)]
@@ -258,7 +259,7 @@ def _pushed_batched(operands, axes, *, along, size):
 
 
 def _along_axes(like, wanted, push, cotangents):
-    """The derivatives along the axes of all that is wanted, and their products with the cotangents."""
+    """Push along the axes of all wanted arrays, and return the products of these derivatives with the cotangents."""
     sizes = [a.size if w else 0 for a, w in zip(like, wanted)]
     starts, total = np.cumsum([0, *sizes]), sum(sizes)
     if not total:
@@ -283,15 +284,15 @@ def _tangent_transpose(cotangents, *operands, outputs, shapes, size, many):
         cotangents = [ad.instantiate_zeros(ct) for ct in cotangents]
         along = lambda cotangents: _pull_by_pushing(x, fixed, wanted, cotangents, **params)
     else:
-        asked = tuple(not isinstance(ct, ad.Zero) for ct in cotangents)
-        cotangents = tuple(ct for ct, a in zip(cotangents, asked) if a)
-        along = lambda cotangents: pull(x, fixed, cotangents, which=(wanted, asked), outputs=outputs)
+        nonzero = tuple(not isinstance(ct, ad.Zero) for ct in cotangents)
+        cotangents = tuple(ct for ct, n in zip(cotangents, nonzero) if n)
+        along = lambda cotangents: pull(x, fixed, cotangents, which=(wanted, nonzero), outputs=outputs)
     found = iter(jax.vmap(along)(cotangents) if many else along(cotangents))
     return [None] * (len(operands) - size) + [next(found) if w else None for w in wanted]
 
 
 def _pull_by_pushing(x, fixed, wanted, cotangents, **params):
-    """The derivatives along the axes of all that is wanted, and their products with the cotangents."""
+    """Push along the axes of all wanted arrays, and return the products of these derivatives with the cotangents."""
     push = lambda *axes: _tangent_p.bind(*x, *fixed, *axes, many=True, **params)
     return _along_axes(x, wanted, push, cotangents)
 
@@ -306,20 +307,20 @@ def _tangent_batched(operands, axes, *, outputs, shapes, size, many):
     ]
     params = dict(outputs=outputs, shapes=shapes, size=size, many=many)
     if not any(batched_x + batched_fixed):
-        # Many directions at one point: the solve itself is not repeated.
+        # Many directions at one point: do not repeat the solve itself.
         dx = widen(dx, batched_dx)
         if many:
             dx = [d.reshape(-1, *d.shape[2:]) for d in dx]
         dy = _tangent_p.bind(*x, *fixed, *dx, **{**params, "many": True})
         dy = [d.reshape(lanes, -1, *d.shape[1:]) for d in dy] if many else dy
         return dy, [0] * len(dy)
-    # Lanes: the same solve at many points, one direction each; a tangent has the shape of its primal. What is shared by
-    # all, a network, is not repeated: products with it are of matrices then, and so are those that make its gradient.
-    apart = [many or a or b for a, b in zip(batched_x, batched_dx)]
-    x, dx = (widen(y, [b or not a for b, a in zip(have, apart)]) for y, have in ((x, batched_x), (dx, batched_dx)))
-    along = lambda dx: _lanes(x, fixed, dx, apart, batched_fixed, lanes, params)
+    # Lanes: the same solve at many points, one direction each; a tangent has the shape of its primal. Arrays shared by
+    # all lanes, such as a network's, are not repeated: products with them, and for their gradient, are matrix products.
+    per_lane = [many or a or b for a, b in zip(batched_x, batched_dx)]
+    x, dx = (widen(y, [b or not a for b, a in zip(have, per_lane)]) for y, have in ((x, batched_x), (dx, batched_dx)))
+    along = lambda dx: _lanes(x, fixed, dx, per_lane, batched_fixed, lanes, params)
     if many:
-        # One direction after the other of each lane.
+        # The directions of each lane one after the other.
         dy = lax.map(along, [jnp.moveaxis(d, 1, 0) for d in dx])
         dy = [jnp.moveaxis(d, 0, 1) for d in dy]
     else:
@@ -327,8 +328,8 @@ def _tangent_batched(operands, axes, *, outputs, shapes, size, many):
     return dy, [0] * len(dy)
 
 
-def _lanes(x, fixed, dx, apart, batched_fixed, lanes, params):
-    in_axes = [0 if here else None for here in (*apart, *batched_fixed)]
+def _lanes(x, fixed, dx, per_lane, batched_fixed, lanes, params):
+    in_axes = [0 if here else None for here in (*per_lane, *batched_fixed)]
     outputs, shapes = params["outputs"], params["shapes"]
 
     def lane_outputs(adjoint, *operands):

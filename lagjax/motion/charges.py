@@ -1,7 +1,7 @@
-"""What is drawn of a trajectory, and of what it conserves.
+"""The curves that are drawn of a trajectory and of its conserved charges.
 
-Some charges show in the structure of a system: the momenta of coordinates that neither L nor a constraint contains, and
-the Jacobi integral where nothing depends on time. `lj.symmetries` finds the others.
+Some charges follow from the structure of a system: the momenta of coordinates that neither L nor a constraint contains,
+and the Jacobi integral if nothing depends on time. `lj.symmetries` finds the others.
 """
 
 from collections.abc import Callable, Mapping
@@ -21,9 +21,9 @@ PANEL, LONG = "change of charges", 28
 
 
 def panels(trajectory, charges) -> dict[str, dict[str, np.ndarray]]:
-    """The curves of a trajectory, by panel: coordinates, velocities, multipliers, and charges where they are asked for.
+    """Return the curves of a trajectory, by panel: coordinates, velocities, multipliers, and charges if requested.
 
-    `charges`: whether to draw what is known to be conserved; or functions of (t, q, v, params), by name.
+    `charges`: whether to draw the charges known to be conserved; or functions of (t, q, v, params), by name.
     """
     found = {"q": curves(trajectory.q), "v": curves(trajectory.v)}
     if trajectory.multipliers:
@@ -32,7 +32,7 @@ def panels(trajectory, charges) -> dict[str, dict[str, np.ndarray]]:
         }
     if charges is not False and charges is not None:
         drawn = changes(trajectory, charges)
-        # Longer ones would leave no room for the curves.
+        # Longer names would leave no room for the curves.
         short = [name.split(" with ")[0] for name in drawn]
         short = [name if len(name) <= LONG else f"{name[:LONG]}…" for name in short]
         found[PANEL] = dict(zip(short if len(set(short)) == len(short) else drawn, drawn.values()))
@@ -40,26 +40,26 @@ def panels(trajectory, charges) -> dict[str, dict[str, np.ndarray]]:
 
 
 def changes(trajectory, charges) -> dict[str, np.ndarray]:
-    """How much each charge differs from its first value, (T,), relative to the largest of its terms on the way."""
+    """Return the change of each charge since its first value, (T,), relative to its largest term on the motion."""
     of_system = charges is True
     functions = known_charges(trajectory) if of_system else _by_name(charges)
     if not functions:
         raise ValueError(
-            "nothing is known to be conserved: there is no coordinate without which L and the constraints are written, "
-            "or a force acts, and the Jacobi integral may change.\n"
+            "nothing is known to be conserved: L and the constraints contain every coordinate, or a force acts, and "
+            "the Jacobi integral may change.\n"
             "Fix: traj.plot(charges=lj.symmetries(system, q, v, params)), which finds further symmetries, or functions "
             "of (t, q, v, params) by name."
         )
     values = _along(functions, trajectory.t, trajectory.q, trajectory.v, trajectory.params)
     found = {}
-    # Compiled programs sort their results.
+    # Compiled programs sort the keys of their results.
     for name in functions:
         value, size = values[name]
         value, size = np.asarray(value), np.asarray(size)
         if value.ndim != 1:
             raise ValueError(
-                f"charge '{name}' must be one number, and has shape {value.shape[1:]}.\n"
-                "Usual cause: momentum of all coordinates, like q.\nFix: one entry of it."
+                f"charge '{name}' must be one number, but has shape {value.shape[1:]}.\n"
+                "Usual cause: the momentum of all coordinates, with the structure of q.\nFix: return one entry of it."
             )
         scale = max(np.nanmax(size), np.nanmax(np.abs(value)))
         found[name] = (value - value[0]) / (scale if scale > 0 else 1.0)
@@ -67,13 +67,13 @@ def changes(trajectory, charges) -> dict[str, np.ndarray]:
 
 
 def known_charges(trajectory) -> dict[str, NoetherCharge]:
-    """The charges that the structure of a system shows."""
+    """Return the charges that follow from the structure of the system."""
     system, params = trajectory.system, trajectory.params
     first = jax.tree.map(lambda x: np.asarray(x)[0], (trajectory.t, trajectory.q, trajectory.v))
     state = coordinates.state(*first, params)
     if isinstance(system, Hybrid):
         raise ValueError(
-            "what is conserved in all phases of a motion is not known.\n"
+            "it is not known what a motion conserves in all its phases.\n"
             'Fix: traj.plot(charges={"name": function}) with functions of (t, q, v, params), or draw one phase.'
         )
     found = [Generator.shift(name) for name in conserved_momenta(system, *state)]
@@ -89,14 +89,14 @@ def _by_name(charges) -> dict[str, Callable]:
         found = {getattr(charges, "__name__", "charge"): charges}
     else:
         raise TypeError(
-            f"charges are true, or functions by name, not {type(charges).__name__}.\n"
+            f"charges must be True, or functions by name, not {type(charges).__name__}.\n"
             'Fix: charges={"L_z": lj.noether_charge(system, lj.Generator.rotation("z"))}.'
         )
     for name, charge in found.items():
         if not callable(charge):
             raise TypeError(
                 f"charge '{name}' must be a function of (t, q, v, params), not {type(charge).__name__}.\n"
-                "Fix: the function itself, not its value."
+                "Fix: pass the function itself, not its value."
             )
     return found
 

@@ -27,8 +27,8 @@ from lagjax.mechanics.compiled import compiled
 from lagjax.mechanics.diagnosis import equation_names
 from lagjax.mechanics.equations import Equations, equations_of
 
-# With the matrix kept, an iteration multiplies the residual by about the first one: one is enough from 1e-8 of the
-# size of the state, and a crude fixed step of 0.1 takes eight.
+# With a fixed matrix, an iteration multiplies the residual by about the initial one: one iteration is enough if that is
+# below 1e-8 of the size of the state; a crude fixed step of 0.1 takes eight.
 ITERATIONS = 12
 ONE_IS_ENOUGH_BELOW = 1e-8
 
@@ -42,7 +42,7 @@ class Projected(NamedTuple):
 
 
 def returned(equations: Equations, t, q, v, rtol, atol) -> Projected:
-    """A state moved onto the constraints; NaN where equations that are taken for regular do not do."""
+    """Return the state moved onto the constraints; NaN if equations assumed regular turn out singular."""
     if equations.are_taken_for_regular:
         return Projected(*equations.projected(t, q, v), jnp.asarray(True))
     return to_manifold(equations, t, q, v, rtol, atol)
@@ -50,16 +50,16 @@ def returned(equations: Equations, t, q, v, rtol, atol) -> Projected:
 
 @compiled
 def to_manifold(equations: Equations, t, q, v, rtol, atol) -> Projected:
-    """The nearest state that satisfies all constraints, for a state near it: Newton with a fixed matrix.
+    """Return the nearest state that satisfies all constraints, for a state near it: Newton with a fixed matrix.
 
-    It holds where a displacement of `atol + rtol |y|` makes up for what is left of each residual, also of those
-    constraints that depend on others; `rtol` and `atol` are one number, or one for q and one for v.
+    `holds` is true if a displacement of `atol + rtol |y|` accounts for what is left of each residual, including those
+    of dependent constraints; `rtol` and `atol` are one number, or one for q and one for v.
     """
     x, unflatten = coordinates.flatten(q)
     u, _ = coordinates.flatten(v)
-    # Not differentiated: where the residual vanishes the derivative of the matrix does not count.
-    still, at = stopped(equations), stopped((t, q, v))
-    displacement, slope = still.displacement(*at), still.row_sizes(*at)
+    # Not differentiated: where the residual vanishes, the derivative of the matrix does not contribute.
+    frozen, at = stopped(equations), stopped((t, q, v))
+    displacement, slope = frozen.displacement(*at), frozen.row_sizes(*at)
     of_q, of_v = _allowed(jnp.abs(jnp.concatenate([x, u])), rtol, atol)
     system, params = equations.system, equations.params
     live = (system, t, params)
@@ -83,7 +83,7 @@ def to_manifold(equations: Equations, t, q, v, rtol, atol) -> Projected:
 
 
 def _newton(residual: Callable, problem: PyTree, y, displacement, slope):
-    """Iterate `y - displacement(r(problem, y))`; only the last iteration is differentiated, enough where r vanishes."""
+    """Iterate `y - displacement(r(problem, y))`; differentiate only the last iteration, enough where r vanishes."""
     fixed, start = stopped((problem, y))
 
     def size(r):
@@ -101,15 +101,15 @@ def _newton(residual: Callable, problem: PyTree, y, displacement, slope):
     r = residual(fixed, start)
     first = size(r)
     _, near, _ = lax.while_loop(unfinished, iterate, (0, start, r))
-    # The value of `near`, the derivative of y.
+    # This has the value of `near` and the derivative of y.
     y = near + (y - start)
     return y - displacement(residual(problem, y))
 
 
 def velocity_change(system, t, q, v, params, change):
-    """The least change of the velocities, in the metric of M, that changes the residuals of all constraints by so much.
+    """Return the least change of v, in the metric of M, that changes the residuals of all constraints by `change`.
 
-    `change` (m,): of `constraints.velocity_residual`. Returns what is like v, to be added to it.
+    `change` (m,): that of `constraints.velocity_residual`. The result has the structure of v, to be added to it.
     """
     _, unflatten = coordinates.flatten(v)
     displacement = equations_of(system, t, q, v, params).displacement(t, q, v)
@@ -117,15 +117,15 @@ def velocity_change(system, t, q, v, params, change):
 
 
 def stopped(tree):
-    """`tree` without derivatives."""
+    """Return `tree` without derivatives."""
     return jax.tree.map(lambda leaf: lax.stop_gradient(leaf) if eqx.is_array(leaf) else leaf, tree)
 
 
 def worst_residual(system, t, q, v, params):
-    """The largest residual along a trajectory, of positions and velocities, relative to its size.
+    """Return the largest relative residual along a trajectory, of positions and velocities.
 
-    A residual counts as its size over `Σ_j |A_ij| Q`, Q the largest coordinate on the trajectory (the largest
-    velocity for the velocity level): what a displacement as large as the motion would make of it.
+    A residual is taken relative to `Σ_j |A_ij| Q`, with Q the largest coordinate on the trajectory (the largest
+    velocity for the velocity level): to the residual that a displacement as large as the motion would cause.
     """
     equations = equations_of(system, *jax.tree.map(lambda x: x[0], (t, q, v)), params)
     residual, slope, size = jax.vmap(partial(residuals_and_slopes, equations))(t, q, v)
@@ -135,24 +135,24 @@ def worst_residual(system, t, q, v, params):
 
 
 def level_size(size):
-    """The largest coordinate and the largest velocity: one zero sets no scale."""
+    """Return the largest coordinate and the largest velocity; a single coordinate may be zero and sets no scale."""
     return jnp.max(size.reshape(2, -1), axis=1)
 
 
 def within(equations: Equations, t, q, v, rtol, atol) -> Bool[Array, ""]:
-    """Whether a displacement of `atol + rtol |y|` makes up for every residual, of positions and velocities."""
+    """Whether a displacement of `atol + rtol |y|` accounts for every residual, of positions and velocities."""
     residual, slope, size = residuals_and_slopes(equations, t, q, v)
     return jnp.all(jnp.abs(residual) <= slope @ _allowed(size, rtol, atol))
 
 
 def _allowed(size, rtol, atol):
-    """The displacement that counts as none, of coordinates and of velocities, for a state of these sizes."""
+    """Return the displacements of coordinates and of velocities that count as zero, for a state of these sizes."""
     return jnp.broadcast_to(atol, 2) + jnp.broadcast_to(rtol, 2) * level_size(size)
 
 
 @compiled
 def residuals_and_slopes(equations: Equations, t, q, v):
-    """Residuals of both levels, the sums of their slopes over q and over v (two columns), and `|(q, v)|`."""
+    """Return the residuals of both levels, the sums of their slopes over q and over v (two columns), and `|(q, v)|`."""
     system, params = equations.system, equations.params
     x, unflatten = coordinates.flatten(q)
     u, _ = coordinates.flatten(v)

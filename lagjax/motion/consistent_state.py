@@ -5,12 +5,12 @@ Nearest in the metric of the mass matrix M of the given state: the stationary po
     ½ (x - x0)ᵀ M (x - x0) + μᵀ g(t, x)        then        ½ (u - u0)ᵀ M (u - u0) + νᵀ phi(t, x, u)
 
 for positions x and velocities u; `g` and `phi` are called `r(y)` below. Held coordinates leave the problem: their rows
-and columns become those of the unit matrix. A constraint of which nothing is left then depends on what is held: it is
-no equation for the others, and holds at the end or does not.
+and columns become those of the unit matrix. A constraint whose row vanishes then depends only on held coordinates: it
+is not an equation for the others, and at the end it holds or it does not.
 
-Newton's method for a stationary point finds whichever is near, a farthest point as well as a nearest. So a
-state that satisfies the constraints is looked for first, by steps shortest in M; it is its own nearest point, with
-μ = 0. From there the target is moved to x0 in stages, and the stationary point followed.
+Newton's method for a stationary point finds one nearby, which may be a farthest point instead of a nearest. So the
+first step is to find some state that satisfies the constraints, by steps that are shortest in M; it is its own nearest
+point, with μ = 0. From there the target is moved to x0 in stages, and the stationary point followed.
 
 Source: Nocedal & Wright, *Numerical Optimization*, §18.1 (Newton-KKT) and §11.3 (continuation).
 """
@@ -36,7 +36,7 @@ from lagjax.numerics.rank import DEPENDENT_BELOW, independent_rows
 
 TO_REACH = 40
 STAGES, PER_STAGE = 16, 3
-# A step of full length may overshoot far from the manifold: the best of these is taken.
+# Far from the manifold a full step may overshoot: the best of these fractions is taken.
 FRACTIONS = np.array([1.0, 0.5, 0.2, 0.05])
 
 
@@ -65,9 +65,9 @@ def consistent_state(system, t, q, v, params, hold: str | Iterable[str] = ()):
 
     **Raises:**
 
-    - `ValueError` where no consistent state is reached, with the residual by constraint name (while JAX is tracing the
+    - `ValueError` if no consistent state is reached, with the residual by constraint name (while JAX is tracing, the
       values are NaN instead).
-    - `ValueError` for a name in `hold` that is no coordinate.
+    - `ValueError` for a name in `hold` that is not a coordinate.
     - `TypeError`, `ValueError` for a state of the wrong shape or dtype.
 
     Source: Hairer, Lubich & Wanner, *Geometric Numerical Integration*, Eq. (IV.4.3).
@@ -87,7 +87,7 @@ def consistent_state(system, t, q, v, params, hold: str | Iterable[str] = ()):
 
 
 def free_coordinates(q, hold) -> np.ndarray:
-    """Which coordinates may move, (n,) booleans."""
+    """Return which coordinates may move, (n,) booleans."""
     names = coordinates.names(q)
     if isinstance(hold, Mapping):
         hold = [name for name, held in hold.items() if held]
@@ -96,19 +96,19 @@ def free_coordinates(q, hold) -> np.ndarray:
     unknown = hold - set(names) - {name.split("[")[0] for name in names}
     if unknown:
         raise ValueError(
-            f"hold names {listed(sorted(map(str, unknown)))}, and the coordinates are {listed(names)}.\n"
+            f"hold names {listed(sorted(map(str, unknown)))}, but the coordinates are {listed(names)}.\n"
             "Fix: hold the coordinates by these names."
         )
     return ~held
 
 
 def _unreachable(system, s, q, v, held):
-    found = coordinates.State(s.t, q, v, s.params)
+    best = coordinates.State(s.t, q, v, s.params)
     tolerance = _round_off(s.t)
     among = f" with {listed(held)} held" if len(held) else ""
     return (
-        f"no consistent state was found near q = {describe(s.q)}{among}: at the best one constraint "
-        f"{departures(system, found, tolerance, tolerance)}.\n"
+        f"no consistent state was found near q = {describe(s.q)}{among}: at the best state reached, constraint "
+        f"{departures(system, best, tolerance, tolerance)}.\n"
         "Usual cause: constraints that contradict each other, too much held, or a start too far from the manifold.\n"
         "Fix: hold less, start nearer, or check each constraint with lj.constraint_residual(system, t, q, v, params)."
     )
@@ -139,7 +139,7 @@ def _consistent_state(system, t, q, v, params, free):
 
 
 def _nearest(residual: Callable, problem, y0, metric, free):
-    """The stationary point of `½ (y - y0)ᵀ M (y - y0) + μᵀ r(y)` near y0."""
+    """Return the stationary point of `½ (y - y0)ᵀ M (y - y0) + μᵀ r(y)` near y0."""
     metric = jnp.where(free[:, None] & free[None, :], metric, jnp.diag(jnp.where(free, 0.0, 1.0)))
     n, fixed, fixed_metric, start = y0.size, stopped(problem), *stopped((metric, y0))
     residual = _two_or_more(residual)
@@ -150,12 +150,12 @@ def _nearest(residual: Callable, problem, y0, metric, free):
         size = lambda rows: jnp.max(jnp.abs(lax.stop_gradient(rows)), axis=1)
         return jnp.where((size(left) > DEPENDENT_BELOW[np.dtype(y0.dtype)] * size(rows))[:, None], left, 0.0)
 
-    def solved_with(rows, dependent_below=None):
+    def usable_rows(rows, dependent_below=None):
         return independent_rows(rows, dependent_below) & jnp.any(rows != 0, axis=1)
 
     def to_displacement(y, dependent_below=None):
         rows = rows_at(fixed, y)
-        return displacement_map(fixed_metric, rows, solved_with(rows, dependent_below))
+        return displacement_map(fixed_metric, rows, usable_rows(rows, dependent_below))
 
     def shortest_step(y, dependent_below):
         slope = jnp.sum(jnp.abs(rows_at(fixed, y)), axis=1)
@@ -164,7 +164,7 @@ def _nearest(residual: Callable, problem, y0, metric, free):
         left = jax.vmap(lambda y: jnp.max(jnp.abs(residual(fixed, y)) / jnp.where(slope > 0, slope, 1.0)))(trials)
         return trials[jnp.argmin(jnp.where(jnp.isfinite(left), left, jnp.inf))], None
 
-    # Off the manifold dependent rows disagree by about the distance, which is not known to begin with.
+    # Off the manifold dependent rows disagree by about the distance to it, which is unknown at first.
     thresholds = jnp.maximum(0.1 * 0.25 ** jnp.arange(TO_REACH), DEPENDENT_BELOW[np.dtype(y0.dtype)])
     reached, _ = lax.scan(shortest_step, start, thresholds.astype(y0.dtype))
 
@@ -172,8 +172,8 @@ def _nearest(residual: Callable, problem, y0, metric, free):
         curvature = jax.jacfwd(lambda y: multipliers @ rows_at(fixed, y))(y)
         curvature = jnp.where(free[:, None] & free[None, :], curvature, 0.0)
         rows = rows_at(fixed, y)
-        independent = solved_with(rows)
-        # In full, also of more equations than coordinates: the multipliers of all of them are unknowns.
+        independent = usable_rows(rows)
+        # The full matrix, even for more equations than coordinates: all multipliers are unknowns.
         rows = jnp.where(independent[:, None], rows, 0.0)
         return jnp.block([[fixed_metric + curvature, rows.T], [rows, jnp.diag(jnp.where(independent, 0.0, 1.0))]])
 
@@ -185,7 +185,7 @@ def _nearest(residual: Callable, problem, y0, metric, free):
         target = reached + share * (start - reached)
         for _ in range(PER_STAGE):
             y, multipliers = state
-            independent = solved_with(rows_at(fixed, y))
+            independent = usable_rows(rows_at(fixed, y))
             left = equations(fixed, fixed_metric, target, y, multipliers)
             left = left.at[n:].set(jnp.where(independent, left[n:], 0.0))
             step = dense.solve(newton_matrix(y, multipliers), left)
@@ -195,13 +195,13 @@ def _nearest(residual: Callable, problem, y0, metric, free):
     zero = jnp.zeros_like(residual(fixed, start))
     shares = (jnp.arange(STAGES, dtype=y0.dtype) + 1) / STAGES
     (y, multipliers), _ = lax.scan(follow, (reached, zero), shares)
-    found = jnp.all(jnp.isfinite(y))
-    y, multipliers = jnp.where(found, y, reached), jnp.where(found, multipliers, zero)
-    # The nearest point, with its derivatives by everything: one Newton step more, by the implicit function theorem.
+    finite = jnp.all(jnp.isfinite(y))
+    y, multipliers = jnp.where(finite, y, reached), jnp.where(finite, multipliers, zero)
+    # One more Newton step gives the nearest point all its derivatives, by the implicit function theorem.
     inverted = lax.stop_gradient(dense.inverse(newton_matrix(y, multipliers)))
     y, multipliers, reached = stopped((y, multipliers, reached))
     nearest = y - (inverted @ equations(problem, metric, y0, y, multipliers))[:n]
-    # Where the path to it was lost, the point reached by shortest steps, with the derivatives of a step.
+    # If the path to it was lost, the result is the point reached by shortest steps, with the derivatives of one step.
     near = reached + (y0 - start)
     near = near - lax.stop_gradient(to_displacement(reached)) @ residual(problem, near)
     length = lambda y: (y - start) @ fixed_metric @ (y - start)
@@ -211,7 +211,7 @@ def _nearest(residual: Callable, problem, y0, metric, free):
 
 
 def _two_or_more(residual):
-    """The same equations, with one more that restricts nothing beside a single one: that alone is never left out."""
+    """Pad a single equation with one that restricts nothing: a single equation would never be left out."""
 
     def padded(problem, y):
         found = residual(problem, y)

@@ -1,4 +1,4 @@
-"""Switches of contacts, ready made: what touches, lets go, slips and sticks.
+"""Ready-made guards for contacts that touch, let go, slip and stick.
 
     touches    a gap closes, with an impact in the metric of M
     releases   a multiplier, the force of a contact, reaches zero
@@ -23,7 +23,7 @@ from lagjax.motion.switching import OfPhases, Plastic
 
 
 class Touches(eqx.Module):
-    """A gap that closes, as a guard; `reset` is its impact."""
+    """The guard of a gap that closes; `reset` is its impact."""
 
     gap: Callable
     reset: OfPhases
@@ -38,7 +38,7 @@ def touches(
     friction: Callable | ArrayLike | None = None,
     sliding: Callable | None = None,
 ) -> Touches:
-    """A guard for `lj.Switch`: a gap closes; and the impact that goes with it.
+    """A guard for `lj.Switch`: a gap closes, with an impact.
 
     >>> import jax.numpy as jnp
     >>> import lagjax as lj
@@ -48,7 +48,7 @@ def touches(
     >>> print(f"{traj.q[-1]:.6f} {traj.switches.v_after[0]:.6f} {traj.switches.impulse[0]:.6f}")
     1.250000 5.000000 15.000000
 
-    With friction, a block that falls with (x, y) velocities (4, -10) loses 0.2 (1 + 0.5) 10 of its 4:
+    With friction, a block that falls with (x, y) velocities (4, -10) loses 0.2 (1 + 0.5) 10 of its horizontal 4:
 
     >>> block = lj.System(lambda t, q, v, params: 0.5 * jnp.sum(v**2) - 10.0 * q[1])
     >>> rough = touches(lambda t, q, params: q[1], 0.5, friction=0.2, sliding=lambda t, q, v, params: v[0])
@@ -59,20 +59,20 @@ def touches(
 
     **Arguments:**
 
-    - `gap`: `gap(t, q, params)`, above zero as long as nothing touches, of any unit; a distance where there is
-      friction, `[sliding] [t]`.
+    - `gap`: `gap(t, q, params)`, above zero as long as nothing touches, of any unit; with friction it must be
+      a distance, `[sliding] [t]`.
     - `restitution`: the speed at which the gap opens after the impact over that at which it closed: a number, or a
-      function of the closing speed. The impulse acts along the gap's gradient, and so the velocities change by the
-      least in the metric of M that the constraints of the phase allow. None: the velocities become the nearest, in that
-      metric, that the constraints of the *next* phase allow (a perfectly plastic impact, which sticks where they do).
+      function of the closing speed. The impulse acts along the gap's gradient, so that the velocities change as
+      little, in the metric of M, as the constraints of the phase allow. None: the velocities become the nearest, in
+      that metric, that the constraints of the *next* phase allow (a perfectly plastic impact, which sticks if they do).
     - `friction`: the coefficient of friction in the impact, a number or a function of `params`; without one it is
-      smooth. The contact sticks, or slides with the impulse of friction on the cone; see `impacts.py`. What the next
-      phase is depends on that, and the phases say it: go to the one that slides, whose own guard, `lj.sticks`, ends it
-      at once where nothing slides in its direction.
+      smooth. The contact sticks, or slides with the impulse of friction on the cone; see `impacts.py`. The guards of
+      the phases decide between these: let the switch go to the phase that slides; its own guard, `lj.sticks`, ends that
+      at once if the contact does not slide in its direction.
     - `sliding`: `sliding(t, q, v, params)`, the velocity at which the contact slides, linear in v.
 
-    **Raises:** `TypeError` for a gap, or a sliding velocity, that is no function; `ValueError` for friction without a
-    sliding velocity or without a restitution, and for a sliding velocity that is not one number, or not linear in v.
+    **Raises:** `TypeError` for a gap, or a sliding velocity, that is not a function; `ValueError` for friction without
+    a sliding velocity or a restitution, and for a sliding velocity that is not one number, or not linear in v.
 
     Source: Glocker, *Set-Valued Force Laws*, §6; for friction Pfeiffer & Glocker, *Multibody Dynamics with Unilateral
     Contacts*, §8, with Newton's law in place of Poisson's and no tangential restitution.
@@ -87,7 +87,7 @@ def touches(
     if friction is None or sliding is None:
         given, missing = ("friction", "sliding") if sliding is None else ("sliding", "friction")
         raise ValueError(
-            f"{given} is given and {missing} is not: friction in an impact needs a coefficient and a velocity.\n"
+            f"{given} is given, but {missing} is not: friction in an impact needs a coefficient and a velocity.\n"
             'Fix: lj.touches(gap, 0.5, friction=0.3, sliding=lambda t, q, v, params: v["x"]).'
         )
     if not callable(sliding):
@@ -97,14 +97,14 @@ def touches(
         )
     if restitution is None:
         raise ValueError(
-            "friction in an impact needs a restitution: without one the impact makes the velocities what the next "
-            "phase allows, whatever friction could do.\nFix: lj.touches(gap, restitution=0.0, friction=...)."
+            "friction in an impact needs a restitution: without one, the constraints of the next phase fix the "
+            "velocities after the impact, whatever the friction.\nFix: lj.touches(gap, restitution=0.0, friction=...)."
         )
     return Touches(gap, Impact(gap, _number(restitution), _number(friction), sliding))
 
 
 class Releases(eqx.Module):
-    """The multiplier of a contact, as a guard; `reset` opens the contact by a round-off."""
+    """The multiplier of a contact as a guard; `reset` opens the contact with a speed of a few round-offs."""
 
     contact: str = eqx.field(static=True)
     takes: tuple[str, ...] = eqx.field(static=True, default=WITH_MULTIPLIERS)
@@ -125,18 +125,18 @@ def releases(contact: str) -> Releases:
     Switch('on the ground' -> 'flying', with a reset)
 
     **Arguments:** `contact`: the name of a constraint of one equation, written so that its multiplier is above zero as
-    long as it pushes: as a gap, λ > 0 pushes along +∂g/∂q.
+    long as it pushes: written as a gap, since λ > 0 pushes along +∂g/∂q.
 
-    The reset opens the contact at a speed of some round-offs: it parts from zero with no speed and no acceleration, and
-    a guard of the next phase, `lj.touches` of the same gap, would have it closed for ever.
+    The reset opens the contact with a speed of a few round-offs: otherwise its gap would leave zero without speed and
+    acceleration, and for a guard of the next phase, `lj.touches` of the same gap, it would stay closed for ever.
 
-    **Raises:** `ValueError`, by `lj.integrate`, where the phase has no such constraint, or it has several equations.
+    **Raises:** `ValueError`, by `lj.integrate`, if the phase has no such constraint, or if that has several equations.
     """
     return Releases(contact)
 
 
 class Slips(eqx.Module):
-    """How far the force that holds is inside the cone of friction, as a guard."""
+    """A guard: how far the force that holds a contact is inside the cone of friction."""
 
     held: str = eqx.field(static=True)
     on: str = eqx.field(static=True)
@@ -161,13 +161,13 @@ def slips(held: str, on: str, coefficient: Callable | ArrayLike, side: int = 0) 
 
     **Arguments:**
 
-    - `held`: the name of the velocity constraint that keeps the contact from sliding. It is to be the sliding velocity
-      itself, as its multiplier is then the force of friction.
-    - `on`: the name of the contact, whose multiplier is the normal force: `g` a length.
+    - `held`: the name of the velocity constraint that keeps the contact from sliding. It must be the sliding velocity
+      itself, so that its multiplier is the force of friction.
+    - `on`: the name of the contact, whose multiplier is the normal force: its `g` must be a length.
     - `coefficient`: of static friction, a number or a function of `params`.
-    - `side`: 1 or -1 where only a multiplier above or below zero counts: to slide in two directions are two phases.
+    - `side`: 1 or -1 if only a multiplier above or below zero counts: sliding in the two directions takes two phases.
 
-    **Raises:** `ValueError` for another side; and, by `lj.integrate`, where the phase has no constraint of these names.
+    **Raises:** `ValueError` for another side; and, by `lj.integrate`, if the phase has no constraint of these names.
     """
     if side not in (-1, 0, 1):
         raise ValueError(f"side must be 1, -1, or 0 for both, not {side!r}.")
@@ -175,7 +175,7 @@ def slips(held: str, on: str, coefficient: Callable | ArrayLike, side: int = 0) 
 
 
 class Sticks(eqx.Module):
-    """A sliding speed, as a guard."""
+    """A sliding speed as a guard."""
 
     sliding: Callable
 
@@ -188,17 +188,17 @@ class Sticks(eqx.Module):
 
 
 def sticks(sliding: Callable) -> Sticks:
-    """A guard for `lj.Switch`: what slides comes to rest.
+    """A guard for `lj.Switch`: a contact stops sliding.
 
     >>> import lagjax as lj
     >>> lj.Switch("slides", to="sticks", when=sticks(lambda t, q, v, params: v["x"] - params["belt"]))
     Switch('slides' -> 'sticks')
 
     **Arguments:** `sliding`: `sliding(t, q, v, params)`, the sliding velocity in the direction in which its phase
-    slides, above zero there. Where friction does not hold what came to rest, the next phase ends at once by its own
-    `lj.slips(..., side=...)`, and it slides on, or the other way.
+    slides, above zero there. If friction cannot hold the contact then, the next phase ends at once by its own
+    `lj.slips(..., side=...)`, and the contact slides on, or the other way.
 
-    **Raises:** as `lj.Switch`, where it does not return one number.
+    **Raises:** as `lj.Switch`, if it does not return one number.
     """
     return Sticks(sliding)
 
@@ -207,16 +207,16 @@ def _multiplier(multipliers, name, many=False):
     if name not in multipliers:
         raise ValueError(
             f"there is no constraint '{name}' in this phase; there {'are ' if multipliers else 'is '}"
-            f"{', '.join(map(repr, multipliers)) or 'none'}.\nFix: the name under which it stands in constraints=."
+            f"{', '.join(map(repr, multipliers)) or 'none'}.\nFix: use its name in constraints=."
         )
     found = multipliers[name]
     if jnp.size(found) != 1 and not many:
-        raise ValueError(f"constraint '{name}' has {jnp.size(found)} equations, and a contact one.")
+        raise ValueError(f"constraint '{name}' has {jnp.size(found)} equations, but a contact has one.")
     return found if many else jnp.reshape(found, ())
 
 
 def _length(x):
-    """The length of a vector, whose derivative at zero is zero."""
+    """Return the length of a vector; its derivative at zero is zero."""
     if x.size == 1:
         return jnp.abs(x[0])
     square = jnp.sum(x**2)
@@ -224,5 +224,5 @@ def _length(x):
 
 
 def _number(x):
-    """A number as an array, which is no part of a program; a function as it is."""
+    """Return a number as an array, so that no program is compiled for its value; a function unchanged."""
     return x if callable(x) or isinstance(x, jax.Array) else np.asarray(x, float)

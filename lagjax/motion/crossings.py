@@ -1,4 +1,4 @@
-"""Events: functions of the state that cross zero, and what is known of each crossing.
+"""Events: functions of the state that cross zero, and the record of each crossing.
 
 A guard `g(t, q, v, params)` says where something happens: an apex (`v["y"]`), a floor (`q["y"]`), a section of phase
 space, a contact that lets go (its multiplier). `watching.py` follows its sign along the motion.
@@ -31,7 +31,7 @@ from lagjax.mechanics.pickling import check_functions
 from lagjax.mechanics.system import System
 from lagjax.mechanics.warned import warn
 
-# The operations of a guard that is compiled once for all places where it is looked at.
+# A guard of more operations is compiled once for all places where it is evaluated.
 LONG = 100
 DIRECTIONS = {None: 0, 0: 0, 1: 1, -1: -1}
 
@@ -51,17 +51,17 @@ class Crossing(eqx.Module):
 
     **Arguments:**
 
-    - `guard`: `guard(t, q, v, params)` -> a number, of any unit, or true and false; or, where it takes five arguments,
+    - `guard`: `guard(t, q, v, params)` -> a number, of any unit, or true and false; or, if it takes five arguments,
       `guard(t, q, v, multipliers, params)`, with the multipliers by constraint name. What it closes over is
       differentiated too.
     - `direction`: 1 for crossings from below zero to above, -1 for those from above, 0 for both; along the run of the
-      motion, also where that runs backward.
+      motion, even if that runs backward.
     - `terminal`: end the motion at the first one (`traj.end`, and NaN in the outputs after it).
-    - `most`: how many crossings are kept; more are counted, and said. Of a terminal one, one is.
+    - `most`: how many crossings are kept; further ones are counted, with a warning. A terminal event keeps one.
 
     A start on the surface is not a crossing; leaving it and coming back is one.
 
-    **Raises:** `TypeError`, `ValueError` for a guard that cannot be called so, and for other directions.
+    **Raises:** `TypeError`, `ValueError` for a guard that cannot be called like this, and for other directions.
     """
 
     guard: Callable
@@ -92,11 +92,11 @@ class Crossing(eqx.Module):
 
 
 class Crossings(eqx.Module):
-    """The crossings of one guard that a motion came to, in the order of time; it prints itself.
+    """The crossings of one guard in a motion, in order of time; it prints itself.
 
     - `t` (K,): their times, `[t]`; NaN beyond the last one. K is `most` of the `Crossing`.
     - `q`, `v`: the states there, each leaf with a leading axis K; `multipliers` by constraint name, likewise.
-    - `count`: how many there were, also of those that were not kept.
+    - `count`: how many there were, including those that were not kept.
     - `uncertain`: whether some may be missing: the guard touched zero within round-off, or changed too fast between
       steps to be followed.
 
@@ -111,11 +111,11 @@ class Crossings(eqx.Module):
     uncertain: Bool[Array, ""]
 
     def with_states(self, q, v) -> "Crossings":
-        """The same with q and v in another structure."""
+        """Return the same with q and v in another structure."""
         return Crossings(self.t, q, v, self.multipliers, self.count, self.uncertain)
 
     def found(self) -> "Crossings":
-        """The same without the room that was not used, in NumPy. Not while JAX is tracing."""
+        """Return the same without the unused places, in NumPy. Not while JAX is tracing."""
         kept = np.isfinite(np.asarray(self.t))
         of_rows = (self.t, self.q, self.v, self.multipliers)
         return Crossings(*jax.tree.map(lambda x: np.asarray(x)[kept], of_rows), self.count, self.uncertain)
@@ -129,7 +129,7 @@ class Crossings(eqx.Module):
         return f"Crossings: {self.in_words()}"
 
     def in_words(self) -> str:
-        """How many, and the first of their times, on one line."""
+        """Return the number of crossings and the first of their times, on one line."""
         times = np.asarray(self.t)[np.isfinite(np.asarray(self.t))]
         shown = ", ".join(f"{t:.9g}" for t in times[:4]) + (", ..." if len(times) > 4 else "")
         count = int(self.count)
@@ -139,9 +139,10 @@ class Crossings(eqx.Module):
 
 
 class Kind(NamedTuple):
-    """What of a guard is not a function: see `Crossing`; `long` where it takes long to compile; what it has `read`.
+    """The static properties of a guard: see `Crossing`. `long`: it takes long to compile.
 
-    `holds`: it is taken to be above zero at the start, also where it is not, and is then crossed there.
+    `read`: the values that it reads from outside. `holds`: it is assumed to be above zero at the start; if it is not,
+    it counts as crossed there.
     """
 
     name: str
@@ -155,11 +156,11 @@ class Kind(NamedTuple):
 
 
 class Guards(eqx.Module):
-    """All guards of a motion as one function to as many numbers."""
+    """All guards of a motion as one function that returns a number for each."""
 
     functions: tuple[Callable, ...]
     kinds: tuple[Kind, ...] = eqx.field(static=True)
-    # In a system of numbers: puts q, and v, back into the user's structure.
+    # For states that are tuples of numbers: puts q, or v, back into the user's structure.
     together: Callable | None = eqx.field(static=True, default=None)
 
     @property
@@ -180,20 +181,20 @@ class Guards(eqx.Module):
 
     @property
     def owners(self) -> np.ndarray:
-        """Of each place where a crossing is kept, its guard."""
+        """The index of the guard for each place where a crossing is kept."""
         return np.repeat(np.arange(len(self.kinds)), [kind.most for kind in self.kinds])
 
     @property
     def ranks(self) -> np.ndarray:
-        """And which of its guard's crossings, from the first on, is kept there."""
+        """For each of these places, which of its guard's crossings is kept there, counted from zero."""
         return np.concatenate([np.arange(kind.most) for kind in self.kinds])
 
     def in_numbers(self, unflatten: Callable) -> "Guards":
-        """The same for states that are tuples of numbers."""
+        """Return the same for states that are tuples of numbers."""
         return Guards(self.functions, self.kinds, lambda numbers: unflatten(jnp.stack(numbers)))
 
     def __call__(self, t, q, v, multipliers, params) -> tuple[Float[Array, ""], ...]:
-        """The value of each; a condition that is true or false is one or minus one."""
+        """Return the value of each guard; true counts as one, false as minus one."""
         q, v = (q, v) if self.together is None else (self.together(q), self.together(v))
         of = lambda kind: (t, q, v, multipliers, params) if kind.takes_multipliers else (t, q, v, params)
         return tuple(_number(f(*of(kind)), t) for f, kind in zip(self.functions, self.kinds))
@@ -215,7 +216,7 @@ def _number(value, t):
 
 
 def crossings_of(events: Any, event: Any) -> dict[str, Crossing]:
-    """What is asked for as `events`, and by the conditions of `event`, by name; raise where either is no event."""
+    """Return the crossings in `events` and those for the conditions of `event`, by name; raise for anything else."""
     if events is not None and not isinstance(events, Mapping):
         raise TypeError(
             f"events must be given by name, not as {type(events).__name__}.\n"
@@ -224,7 +225,7 @@ def crossings_of(events: Any, event: Any) -> dict[str, Crossing]:
     for name, crossing in (events or {}).items():
         if not isinstance(crossing, Crossing):
             raise TypeError(
-                f"event '{name}' is {type(crossing).__name__}.\n"
+                f"event '{name}' must be a lj.Crossing, not {type(crossing).__name__}.\n"
                 f'Fix: "{name}": lj.Crossing(lambda t, q, v, params: q["y"]).'
             )
     found = dict(sorted((events or {}).items()))
@@ -233,7 +234,7 @@ def crossings_of(events: Any, event: Any) -> dict[str, Crossing]:
     if not isinstance(event, diffrax.Event):
         raise TypeError(
             f"event must be a diffrax.Event, not {type(event).__name__}.\n"
-            "Usual cause: the condition itself.\n"
+            "Usual cause: its condition was passed instead.\n"
             'Fix: events={"down": lj.Crossing(lambda t, q, v, params: q["y"])}.'
         )
     of_diffrax = {None: 0, True: 1, False: -1}
@@ -244,21 +245,21 @@ def crossings_of(events: Any, event: Any) -> dict[str, Crossing]:
             name = "event" + jtu.keystr(path)
             if name in found:
                 raise ValueError(
-                    f"two events have the name '{name}': that of the diffrax.Event is given here.\n"
-                    "Fix: another name in events=, or give both there, as lj.Crossing."
+                    f"two events have the name '{name}', which lagjax gives to the diffrax.Event.\n"
+                    "Fix: use another name in events=, or give both there, as lj.Crossing."
                 )
             found[name] = Crossing(Condition(condition), of_diffrax[direction])
     return found
 
 
 def asks_diffrax(condition: Callable) -> bool:
-    """Whether the condition of a `diffrax.Event` needs what diffrax alone knows, as `diffrax.steady_state_event`."""
+    """Whether the condition of a `diffrax.Event` needs arguments that only diffrax has (`steady_state_event`)."""
     parameters = inspect.signature(condition).parameters.values()
     return any(p.kind is p.KEYWORD_ONLY and p.default is p.empty for p in parameters)
 
 
 def left_to_diffrax(event: diffrax.Event | None) -> diffrax.Event | None:
-    """The event of those conditions that ask diffrax, at ends of steps; None where there are none."""
+    """Return the event of the conditions that only diffrax can evaluate, at ends of steps; None if there are none."""
     if event is None:
         return None
     asking = [condition for condition in jtu.tree_leaves(event.cond_fn, is_leaf=callable) if asks_diffrax(condition)]
@@ -266,13 +267,13 @@ def left_to_diffrax(event: diffrax.Event | None) -> diffrax.Event | None:
 
 
 def guards_of(crossings: Mapping[str, Crossing], system: System, start: State, holds: bool = False) -> Guards | None:
-    """The guards of all crossings, called once on shapes; None where there are none. `start` is the first state."""
+    """Return the guards of all crossings, called once on shapes; None without crossings. `start`: the first state."""
     if not crossings:
         return None
     functions, of_guards = [], []
     for name, crossing in crossings.items():
         guard, read = first_guard_alike(crossing.guard) if is_eager() else (crossing.guard, read_by(crossing.guard))
-        examine = partial(_looked_at, name, guard, system, start)
+        examine = partial(_examined, name, guard, system, start)
         takes, multipliers, long = remembered(system, (guards_of, guard, read, kinds(start)), examine)
         given = dict(zip(OF_STATE, start)) | {"multipliers": multipliers}
         functions.append(lift_function(guard, tuple(given[name] for name in takes)))
@@ -281,13 +282,13 @@ def guards_of(crossings: Mapping[str, Crossing], system: System, start: State, h
     return Guards(tuple(functions), tuple(of_guards))
 
 
-def _looked_at(name, guard, system, start):
-    """What a guard takes, multipliers for it, and whether it takes long to compile; raise where it is none."""
+def _examined(name, guard, system, start):
+    """Return a guard's arguments, zero multipliers, and whether it takes long to compile; raise if it is no guard."""
     takes, multipliers = takes_of(guard), zero_multipliers(system, start)
     given = dict(zip(OF_STATE, start)) | {"multipliers": multipliers}
     call = Call("guard", guard, takes, f" of event '{name}'")
     _check(call, given)
-    # The equations give the multipliers.
+    # Multipliers require the equations, which take long to compile.
     return takes, multipliers, takes == WITH_MULTIPLIERS or _length(call, given) > LONG
 
 
@@ -303,10 +304,10 @@ def _check(call, given):
     shape, dtype = getattr(value, "shape", ()), getattr(value, "dtype", np.dtype(type(value)))
     if shape != () or not (jnp.issubdtype(dtype, jnp.floating) or jnp.issubdtype(dtype, jnp.bool_)):
         raise ValueError(
-            f"{call} must return one real number, or true or false, and returned "
+            f"{call} must return one real number, or true or false, but returned "
             f"{'nothing' if value is None else f'shape {shape}, {dtype}'}.\n"
-            "Usual cause: a vector left as it is, or a function without return.\n"
-            "Fix: return one coordinate of it, and give each of several an event of its own."
+            "Usual cause: a whole vector, or a function without return.\n"
+            "Fix: return one coordinate of it; several coordinates need an event each."
         )
 
 
@@ -315,7 +316,7 @@ class EventWarning(UserWarning):
 
 
 def warn_of_events(events: Mapping[str, Crossings]):
-    """Warn where crossings may be missing, and where there were more than are kept."""
+    """Warn if crossings may be missing, and if there were more than are kept."""
     for name, found in events.items():
         if bool(found.uncertain):
             warn(
@@ -323,12 +324,12 @@ def warn_of_events(events: Mapping[str, Crossings]):
                 "fast between steps to be followed.\n"
                 "Usual cause: a guard that is zero all along (a conserved quantity), grazes its surface, or oscillates "
                 "far faster than the motion.\n"
-                "Fix: shift the level of the guard a little; or let the motion take shorter steps, max_step=.",
+                "Fix: shift the level of the guard a little; or make the motion take shorter steps, max_step=.",
                 EventWarning,
             )
         elif int(found.count) > found.t.shape[-1] > 1:
             warn(
-                f"event '{name}' happened {int(found.count)} times, and the first {found.t.shape[-1]} are kept.\n"
+                f"event '{name}' happened {int(found.count)} times, but only the first {found.t.shape[-1]} are kept.\n"
                 f"Fix: lj.Crossing(..., most={int(found.count)}), or terminal=True to end at the first.",
                 EventWarning,
             )

@@ -1,4 +1,4 @@
-"""The curves of a trajectory, by the user's names: what is drawn of it."""
+"""The curves that are drawn of a trajectory, by the user's names."""
 
 import jax
 import numpy as np
@@ -7,16 +7,16 @@ from lagjax.mechanics import coordinates
 
 
 def curves(tree):
-    """One curve a coordinate, by the user's names."""
+    """Return one curve for each coordinate, by the user's names."""
     first = jax.tree.map(lambda x: np.asarray(x[0]), tree)
     columns = np.stack([np.ravel(x) for x in _rows(tree)])
     return dict(zip(coordinates.names(first), columns.T))
 
 
 def finite(*curves):
-    """Those places of curves where all of them are."""
-    there = np.isfinite(curves).all(axis=0)
-    return tuple(x[there] for x in curves)
+    """Return the curves at the places where all are finite."""
+    all_finite = np.isfinite(curves).all(axis=0)
+    return tuple(x[all_finite] for x in curves)
 
 
 def _rows(tree):
@@ -25,7 +25,7 @@ def _rows(tree):
 
 
 def columns(values):
-    """The columns of an array, with what their names end in."""
+    """Return the columns of an array, each with the suffix of its name."""
     values = np.asarray(values)
     if values.ndim == 1:
         return [("", values)]

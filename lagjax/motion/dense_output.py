@@ -1,13 +1,13 @@
-"""The motion between outputs: the method's own steps from the output before.
+"""The motion between outputs, by steps of the method itself from the output before.
 
-A trajectory keeps what was asked for, and outputs are ends of steps. A polynomial through them would have an order of
-its own, and be wrong where the motion turned between two of them. So the motion is continued from the last output
-before the time that is asked for, by the method, the tolerances and the longest step that it was integrated with: what
-comes out has the order of the method and satisfies the constraints. It costs one short solve for each time, which is
+A trajectory keeps only the requested outputs, and outputs are ends of steps. A polynomial through them would have an
+order of its own, and be wrong if the motion turned between two of them. So the motion is continued from the last output
+before the requested time, with the method, the tolerances and the longest step that it was integrated with: the result
+has the order of the method and satisfies the constraints. It costs one short solve for each time; the program is
 compiled once for a system and then serves all times and all of its trajectories.
 
-At an output it is that output. There a solve would have nothing to do and no derivative by the time: one step of the
-classical Runge-Kutta method of length zero has the first four of them.
+At the time of an output the result is that output. A solve of length zero would have no derivative with respect to
+time; a step of length zero of the classical Runge-Kutta method has the first four of them.
 """
 
 from functools import partial
@@ -34,21 +34,21 @@ from lagjax.motion.results import ENDED_WELL, in_words
 from lagjax.motion.solve import Settings
 from lagjax.motion.trajectory import Snapshot, Trajectory
 
-# Controllers that can begin anywhere. Others have a plan of their own for the whole motion.
+# Controllers that can begin at any time; others plan the steps of the whole motion.
 BEGIN_ANYWHERE = type(None), diffrax.PIDController, diffrax.ConstantStepSize, diffrax.ClipStepSizeController
-# Times are the same where they are so near to each other, in round-offs: a user computes the end of a motion anew.
+# Times within this many round-offs are the same: a user may compute the end of a motion in another way.
 SAME = 4
-# An output is continued by this part of the motion where nothing is asked of that.
+# If the result is the output itself, the continuation, which is not used, is this part of the motion long.
 ASIDE = 1e-6
 MAX_STEPS = 2**20
-# Times that are solved for side by side: 7 microseconds each, and 20 one after the other, where a step is enough.
+# The number of times solved for in one batch: each then takes 7 microseconds, or 20 alone, if one step is enough.
 LANES = 256
 
 
 class Known(NamedTuple):
-    """Where a motion can be continued from, in the order of its run: outputs, and the states after switches.
+    """The instants from which a motion can be continued, in the order of its run: outputs and states after switches.
 
-    `phase`: the number of the phase that begins or goes on there; None of a motion without phases.
+    `phase`: the number of the phase that begins or goes on there; None for a motion without phases.
     """
 
     at: Snapshot
@@ -57,7 +57,7 @@ class Known(NamedTuple):
 
 
 def at(trajectory: Trajectory, t: ArrayLike) -> Snapshot:
-    """The motion at times of any shape: see `Trajectory.at`."""
+    """Return the motion at times of any shape: see `Trajectory.at`."""
     _check_can_be_continued(trajectory)
     dtype = trajectory.t.dtype
     t = _times(t, dtype)
@@ -74,31 +74,31 @@ def at(trajectory: Trajectory, t: ArrayLike) -> Snapshot:
     found = jax.tree.map(np.array, nodes._replace(t=times))
     between = np.flatnonzero(nodes.t != times)
     for phase in [None] if known.phase is None else np.unique(np.asarray(known.phase)[index[between]]):
-        mine = between if phase is None else between[np.asarray(known.phase)[index[between]] == phase]
-        if mine.size:
-            _fill(found, mine, trajectory, phase, jax.tree.map(lambda x, mine=mine: x[mine], nodes), times[mine])
+        rows = between if phase is None else between[np.asarray(known.phase)[index[between]] == phase]
+        if rows.size:
+            _fill(found, rows, trajectory, phase, jax.tree.map(lambda x, rows=rows: x[rows], nodes), times[rows])
     return jax.tree.map(lambda x: jnp.asarray(x.reshape(t.shape + x.shape[1:])), found)
 
 
-def _fill(found, mine, trajectory, phase, nodes, times):
-    """Write what the motion is at some times, all in one phase, beside what is known already."""
+def _fill(found, rows, trajectory, phase, nodes, times):
+    """Write the motion at `times`, all in one phase, into the rows `rows` of `found`."""
     system = trajectory.system if phase is None else trajectory.system.systems[phase]
     multipliers = {name: x for name, x in nodes.multipliers.items() if name in system.constraints}
-    # Of few sizes, for each of which a program is compiled.
+    # Padded to one of a few sizes, since a program is compiled for each size.
     count = filled_up(len(times)) if len(times) <= LANES else LANES * filled_up(-(-len(times) // LANES))
     fill = np.minimum(np.arange(count), len(times) - 1)
     nodes, times = jax.tree.map(lambda x: x[fill], (nodes._replace(multipliers=multipliers), times))
     of_system = system, trajectory.params, trajectory.asked, trajectory.tolerance
     new, result = _continue_all(*of_system, nodes, times, trajectory.static.how.backward)
-    new, result = jax.tree.map(lambda x: np.asarray(x)[: mine.size], (new, result))
+    new, result = jax.tree.map(lambda x: np.asarray(x)[: rows.size], (new, result))
     # Not `ended_well`, which would compile a comparison for each number of times.
     well = np.isin(result._value, [int(good._value) for good in ENDED_WELL])
     if not well.all():
         _raise_not_continued(nodes.t, times, result._value, int(np.argmin(well)))
     for name, x in found.multipliers.items():
-        x[mine] = new.multipliers[name] if name in multipliers else np.nan
+        x[rows] = new.multipliers[name] if name in multipliers else np.nan
     for old, x in zip(jax.tree.leaves((found.q, found.v)), jax.tree.leaves((new.q, new.v))):
-        old[mine] = x
+        old[rows] = x
 
 
 def _known_of(trajectory) -> Known:
@@ -115,13 +115,13 @@ def _known_of(trajectory) -> Known:
     )
     phase = np.concatenate([np.asarray(trajectory.phase)[reached], np.asarray(s.to)[:count]])
     is_output = np.arange(len(phase)) < reached.sum()
-    # An output at the time of a switch is before it.
+    # An output at the time of a switch comes before it.
     order = np.lexsort((np.arange(len(phase)), both.t))
     return Known(jax.tree.map(lambda x: x[order], both), is_output[order], phase[order])
 
 
 def _before(known: Known, t, backward: bool):
-    """The number of the last place from which the motion is continued to each time, which is the time itself if it can.
+    """Return for each time the index of the last instant, at or before it, from which the motion can be continued.
 
     A switch does not count at its own time, when the motion is still before it.
     """
@@ -137,11 +137,11 @@ def _before(known: Known, t, backward: bool):
 
 
 def _traced(trajectory, t):
-    """The same in a program: NaN where there is no motion."""
+    """Return the motion at t in a traced program: NaN where there is no motion."""
     if isinstance(trajectory.system, Hybrid):
         raise TypeError(
-            "at(t) of a motion in phases looks at its switches, and this one is being traced, or a batch.\n"
-            "Fix: ask one motion outside of the program; or give these times to lj.integrate as ts."
+            "at(t) of a motion in phases needs the values of its switches, but this one is being traced, or a batch.\n"
+            "Fix: call at(t) of one motion outside the program; or give these times to lj.integrate as ts."
         )
     of_one = partial(_at_one, trajectory)
     for _ in range(t.ndim):
@@ -162,7 +162,7 @@ def _at_one(trajectory, t):
     slack = _slack(first, trajectory.t[-1])
     inside = (sign * (t - first) >= -slack) & (sign * (last - t) >= -slack)
     low, high = jnp.minimum(first, last), jnp.maximum(first, last)
-    # Not `clip`, which has half of the derivative at its ends.
+    # Not `clip`, whose derivative is one half at its ends.
     near = jnp.where(t < low, low, jnp.where(t > high, high, t))
     known = _known_of(trajectory)
     index = _before(known, lax.stop_gradient(near), trajectory.static.how.backward)
@@ -171,14 +171,14 @@ def _at_one(trajectory, t):
     aside = node.t + sign * ASIDE * lax.stop_gradient(jnp.abs(trajectory.t[-1] - first))
     of_system = trajectory.system, trajectory.params, trajectory.asked, trajectory.tolerance
     found, _ = _continued(*of_system, node, jnp.where(exact, aside, near), trajectory.static.how.backward)
-    # The time that is asked for, also where it is a round-off beyond the end.
+    # The requested time, even if it is a round-off beyond the end.
     there = _of_length_zero(trajectory.system, trajectory.params, node, jnp.where(exact, t, node.t))
     chosen = jax.tree.map(lambda a, b: jnp.where(inside, jnp.where(exact, a, b), jnp.nan), there, found)
     return chosen._replace(t=t)
 
 
 def _continued(system, params, asked, tolerance, node: Snapshot, t, backward):
-    """The motion at t, continued from a node, and how that went."""
+    """Continue the motion from a node to t; return it there, and the result."""
     rtol, atol = tolerance
     by_size = atol.ndim == 2
     settings = Settings(
@@ -212,7 +212,7 @@ def _continue_all(system, params, asked, tolerance, nodes, times, backward):
 
 
 def _of_length_zero(system, params, node: Snapshot, t):
-    """The node itself, with its derivatives by t there: t is its time."""
+    """Return the node itself, with its derivatives with respect to t, which equals its time."""
     h = t - node.t
 
     def rate(dt, y):
@@ -230,7 +230,7 @@ def _of_length_zero(system, params, node: Snapshot, t):
     if not node.multipliers:
         return Snapshot(t, q, v, {})
     _, multipliers = accelerations(system, t, q, v, params)
-    # What was computed at the output, bit for bit.
+    # The multipliers as computed at the output, bit for bit.
     exactly = lambda known, x: known + (x - lax.stop_gradient(x))
     known = jax.tree.map(lax.stop_gradient, node.multipliers)
     return Snapshot(t, q, v, jax.tree.map(exactly, known, multipliers))
@@ -239,20 +239,20 @@ def _of_length_zero(system, params, node: Snapshot, t):
 def _check_can_be_continued(trajectory):
     if isinstance(trajectory.system, Hybrid) and trajectory.t.ndim > 1:
         raise ValueError(
-            f"this is a batch of motions in phases, of shape {trajectory.t.shape[:-1]}: ask one of them.\n"
+            f"this is a batch of motions in phases, of shape {trajectory.t.shape[:-1]}: at(t) needs one of them.\n"
             "Fix: jax.tree.map(lambda x: x[0], traj).at(t)"
         )
     asked = trajectory.asked
     instead = "Fix: give these times to lj.integrate as ts."
     if asked.drift == "baumgarte" or asked.drift == "none" and _has_constraints(trajectory.system):
         raise ValueError(
-            f'of a motion with drift="{asked.drift}" at(t) is not known: its outputs are off the constraints, and no '
-            f"motion starts there.\n{instead}"
+            f'at(t) is not available for a motion with drift="{asked.drift}": its outputs are off the constraints, '
+            f"and no motion can start there.\n{instead}"
         )
     if not isinstance(asked.stepsize_controller, BEGIN_ANYWHERE):
         raise ValueError(
-            f"{type(asked.stepsize_controller).__name__} has a plan for the whole motion, which cannot be continued "
-            f"from an output in its midst.\n{instead}"
+            f"{type(asked.stepsize_controller).__name__} plans the steps of the whole motion, which cannot be "
+            f"continued from an output in the middle.\n{instead}"
         )
 
 
@@ -268,7 +268,7 @@ def _check_ended(trajectory, t):
         where = f"t = {t[beyond].flat[0]:.9g}" if np.any(beyond) else "this time"
         raise ValueError(
             f"the motion ended at t = {end:.9g} ({in_words(trajectory.result._value)}), before {where}.\n"
-            "Fix: times up to traj.end.t; what went wrong is in traj.result, and an event ends a motion where its "
+            "Fix: times up to traj.end.t; traj.result says what went wrong, and an event ends a motion if its "
             "lj.Crossing is terminal."
         )
 
@@ -281,7 +281,7 @@ def _times(t, dtype):
 
 
 def _check_inside(t, first, last):
-    """Raise for a time that no motion between these comes to."""
+    """Raise for a time outside the motion from `first` to `last`."""
     low, high = np.min(np.minimum(first, last)), np.max(np.maximum(first, last))
     slack = _slack(low, high)
     with np.errstate(invalid="ignore"):

@@ -23,7 +23,7 @@ from lagjax.motion.phase_graph import HybridExplanation, explained
 from lagjax.motion.solve import nystrom_for
 from lagjax.numerics.rank import independent_rows
 
-# A state is taken for one on the constraints that was rounded, and moved there, where it is this near.
+# A state this near to the constraints is taken for a rounded state on them, and moved there.
 ROUNDED = 1e-4
 
 
@@ -32,9 +32,9 @@ class Explanation:
     """What a system amounts to at one state; it prints itself.
 
     - `coordinates`: their names; `equations`: the name of each constraint equation.
-    - `degrees_of_freedom`: velocities left free, coordinates less independent constraint equations.
-    - `position_freedoms`: positions left free; more than the former where velocities alone are constrained.
-    - `dependent`: each dependent equation, followed by those that it is a combination of.
+    - `degrees_of_freedom`: velocities left free: coordinates minus independent constraint equations.
+    - `position_freedoms`: positions left free; more than the former if some constraints restrict only velocities.
+    - `dependent`: each dependent equation, followed by those of which it is a combination.
     - `structure`: what holds at every state, a `Structure`; None for large systems and long programs.
     - `mass_matrix`: its definiteness in words; `problem`: why the equations fail there, or None.
     """
@@ -56,12 +56,12 @@ class Explanation:
 
 @overload
 def explain(system: System, t, q, v, params=None) -> Explanation:
-    """Of one system."""
+    """Explain one system."""
 
 
 @overload
 def explain(system: Hybrid, t, q, v, params=None) -> HybridExplanation:
-    """Of a motion in phases."""
+    """Explain a motion in phases."""
 
 
 def explain(system, t, q, v, params=None):
@@ -84,8 +84,8 @@ def explain(system, t, q, v, params=None):
       cyclic in L         x, y
       solved              2 accelerations and 2 multipliers by elimination without the zeros
 
-    **Arguments:** `t` scalar, `q` and `v` alike, `params` as the system takes it. A state off the constraints is moved
-    onto them first, and told where it was not near: dependent constraints agree only there.
+    **Arguments:** `t` scalar, `q` and `v` alike, `params` as the system takes it. A state off the constraints is first
+    moved onto them, as dependent constraints agree only there; the result says so if it was not near.
 
     **Returns:** an `Explanation`; of a `Hybrid` a `HybridExplanation`: its phases, each explained, and its graph.
 
@@ -118,7 +118,7 @@ def _explain(system: System, s: coordinates.State) -> Explanation:
         rows.append(("off the constraints", place.off))
     rows.append(("coordinates", f"{len(names)}: {', '.join(names)}"))
     if turned := _in_turns(system, s, names):
-        rows.append(("angles", f"in radians: {turned}; of degrees jnp.radians(...)"))
+        rows.append(("angles", f"in radians: {turned}; for degrees use jnp.radians(...)"))
     if equations:
         kinds = {name: "position" if isinstance(c, Holonomic) else "velocity" for name, c in system.constraints.items()}
         rows.append(("constraints", ", ".join(f"'{name}' ({kind})" for name, kind in kinds.items())))
@@ -150,7 +150,7 @@ def _explain(system: System, s: coordinates.State) -> Explanation:
 
 
 class _Place(NamedTuple):
-    """The state to judge at, what the given one violates, and why there is none on the constraints."""
+    """The state to examine, the constraints that the given one violates, and why no state on them was found."""
 
     state: coordinates.State
     off: str = ""
@@ -158,7 +158,7 @@ class _Place(NamedTuple):
 
 
 def _on_the_constraints(system, s) -> _Place:
-    """The nearest state on the constraints: off them, dependent constraints contradict each other by that much."""
+    """Find the nearest state on the constraints; off them, dependent constraints contradict each other that much."""
     tolerance = jnp.asarray(ROUNDED, s.t.dtype)
     equations = equations_of(system, *s)
     if within(equations, *s[:3], tolerance, tolerance):
@@ -169,18 +169,18 @@ def _on_the_constraints(system, s) -> _Place:
         q, v = consistent_state(system, *s)
     except ValueError as error:
         return _Place(s, f"by {off}, and no state near it is on them", str(error))
-    return _Place(s._replace(q=q, v=v), f"by {off} as given; all that is said here is of the nearest state on them")
+    return _Place(s._replace(q=q, v=v), f"by {off} as given; everything here describes the nearest state on them")
 
 
 def _in_turns(system, s, names):
-    """Angles of more than a turn, which may have been meant in degrees, in words."""
+    """List angles of more than a turn, which may have been meant in degrees."""
     x, _ = coordinates.flatten(s.q)
     large = np.abs(np.asarray(x)) > 2 * np.pi
     if not large.any():
         return ""
     leaves = zip(jax.tree.leaves(angles(system, *s)), jax.tree.leaves(s.q))
     is_angle = np.concatenate([np.full(np.size(leaf), angle) for angle, leaf in leaves])
-    found = [(name, float(y)) for name, y, told in zip(names, x, large & is_angle) if told]
+    found = [(name, float(y)) for name, y, show in zip(names, x, large & is_angle) if show]
     return ", ".join(f"{name} = {y:.6g} is {y / (2 * np.pi):.3g} turns" for name, y in found)
 
 
@@ -212,7 +212,7 @@ def _of_structure(found):
 
 
 def _how_solved(equations, found):
-    """What the compiled program does at each evaluation."""
+    """Say what the compiled program does at each evaluation."""
     if not equations.are_written or found is None:
         return str(equations.form)
     n = sum(map(len, found.blocks))

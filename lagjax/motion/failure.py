@@ -1,4 +1,4 @@
-"""A motion that failed, in the user's words."""
+"""The error message of a failed motion, in the user's terms."""
 
 from typing import NoReturn
 
@@ -18,12 +18,12 @@ from lagjax.motion.stopped_early import stopped_early
 from lagjax.motion.tolerances import tolerances_at
 from lagjax.motion.trajectory import Trajectory, pack
 
-# Switches at times that differ by less than this part of the last time are at one time.
+# Switches at times that differ by less than this part of the last time are simultaneous.
 AT_ONE_TIME = 1e-12
 
 
 def raise_failure(trajectory: Trajectory, start: State, settings: Settings) -> NoReturn:
-    """Raise what went wrong; `start` is the first state."""
+    """Raise the error of a failed motion; `start` is its first state."""
     if isinstance(trajectory, HybridTrajectory):
         _raise_in_phase(trajectory, start, settings)
     _raise(trajectory, start, settings)
@@ -50,10 +50,10 @@ def _raise_in_phase(trajectory, start, settings) -> NoReturn:
     if is_among(result, [RESULTS.guard_not_seen]):
         raise RuntimeError(
             f"a guard of phase '{hybrid.names[trajectory.last_phase()]}' is below zero at t = "
-            f"{float(trajectory.end.t):.9g}, and was not seen to cross it.\n"
-            "Usual cause: its phase began with the guard at zero, and with a rate of zero but for round-off: a body "
-            "that rests on what it is taken to fly above.\n"
-            "Fix: a phase for that, with the constraint that holds it: lj.Switch(..., rest=name), or start=name."
+            f"{float(trajectory.end.t):.9g}, but no crossing of zero was found.\n"
+            "Usual cause: its phase began with the guard at zero, and with a rate that is only round-off: a body that "
+            "rests on what its phase lets it fly above.\n"
+            "Fix: add a phase for that, with the constraint that holds it: lj.Switch(..., rest=name), or start=name."
         )
     if is_among(result, [RESULTS.reset_not_finite]):
         raise RuntimeError(_no_state_after(trajectory))
@@ -81,20 +81,20 @@ def _too_many(trajectory):
     t, count = np.asarray(switches.t)[: len(switches)], len(switches)
     gaps, last = np.diff(t[-4:]), float(t[-1])
     names = " -> ".join(trajectory.system.names[i] for i in _phases_along(trajectory)[-4:])
-    said = f"there were {count} switches until t = {last:.9g}, and another one: most_switches = {count}.\n"
+    said = f"there were {count} switches until t = {last:.9g}, and one more exceeds most_switches = {count}.\n"
     if gaps.size and np.all(gaps <= AT_ONE_TIME * max(abs(last), 1e-300)):
         return said + (
-            f"Usual cause: no phase lasts: the last switches, {names}, are at one time, each guard being below zero in "
-            "the phase that the other leads to.\n"
-            "Fix: a phase for what happens there (a contact that stays, a joint that sticks); look at the guards at "
-            "the last state, traj.switches with throw=False."
+            f"Usual cause: no phase lasts: the last switches, {names}, happen at one time, as each guard is below zero "
+            "in the phase that the other leads to.\n"
+            "Fix: add a phase for what happens there (a contact that stays, a joint that sticks); look at the guards "
+            "at the last state, in traj.switches with throw=False."
         )
     ratio = gaps[-1] / gaps[-2] if gaps.size > 1 and gaps[-2] > 0 else 1.0
     if 0 < ratio < 1 and gaps.size > 2 and abs(gaps[-2] / gaps[-3] - ratio) < 0.1 * ratio:
         return said + (
-            f"Usual cause: infinitely many of them in finite time: each takes {ratio:.3g} of the time of the one "
-            f"before, so that they come to rest at about t = {last + gaps[-1] * ratio / (1 - ratio):.6g}.\n"
-            'Fix: a phase that stays, and lj.Switch(..., rest="lying") to go there; or ts that end before.'
+            f"Usual cause: infinitely many switches in finite time: each takes {ratio:.3g} of the time of the "
+            f"one before, so that the motion comes to rest at about t = {last + gaps[-1] * ratio / (1 - ratio):.6g}.\n"
+            'Fix: add a phase of rest, with lj.Switch(..., rest="lying") to go there; or ts that end before.'
         )
     return said + (
         f"Usual cause: a long motion.\nFix: lj.Hybrid(..., most_switches={10 * count}), or ts that end before."
@@ -112,13 +112,14 @@ def _no_state_after(trajectory):
     )
     if getattr(switch.reset, "friction", None) is not None:
         return said + (
-            "Usual cause: a contact that jams. The gap and the constraints settle how it slides, whatever friction "
-            "does, and friction exceeds what pushes the contact together: there is no impulse that does both.\n"
+            "Usual cause: a contact that jams. The gap and the constraints fix how it slides, whatever friction does, "
+            "and friction exceeds the force that pushes the contact together: no impulse satisfies both.\n"
             "Fix: less friction, or a plastic impact onto a phase in which the contact holds: lj.touches(gap)."
         )
     return said + (
-        "Usual cause: a reset that divides by what is zero there, or takes a root of it; constraints of the next phase "
-        "that cannot be met.\nFix: look at reset(t, q, v, params) at that state, traj.switches with throw=False."
+        "Usual cause: a reset that divides by something that is zero there, or takes its root; or constraints of the "
+        "next phase that cannot be satisfied.\n"
+        "Fix: look at reset(t, q, v, params) at that state, in traj.switches with throw=False."
     )
 
 
@@ -138,7 +139,7 @@ def _below_zero(hybrid, start):
             found.append(f"that of {switch.in_words()} is {float(value):.6g}")
     return (
         f"a guard of phase '{hybrid.names[first]}' is below zero at the start: {'; '.join(found)}.\n"
-        "Usual cause: a motion that starts in the wrong phase, or a guard with the other sign: it is above zero as "
-        "long as the phase lasts.\n"
+        "Usual cause: a motion that starts in the wrong phase, or a guard with the wrong sign: it must be above zero "
+        "as long as the phase lasts.\n"
         "Fix: lj.integrate(..., start=name), or -guard."
     )

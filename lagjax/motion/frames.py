@@ -1,10 +1,10 @@
-"""A motion at instants of one's own: between outputs by cubic Hermite interpolation of q, with v as its slope.
+"""A motion at the times of film frames: between outputs by cubic Hermite interpolation of q, with v as its slope.
 
     q(t_i + s h) = (1 + 2 s)(1 - s)² q_i + s² (3 - 2 s) q_{i+1} + h s (1 - s)² v_i - h s² (1 - s) v_{i+1}
 
 The values at outputs are exact; between them the error falls with the fourth power of their distance, which is enough
-for pictures where outputs are dense. Whether they are is seen by leaving every other one out: what the rest then make
-of it is wrong by about sixteen times the error.
+for pictures if outputs are dense. To check this, every other output is left out and interpolated from the rest: it is
+then wrong by about sixteen times the error.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -17,14 +17,14 @@ from lagjax.mechanics.in_words import Call, check_arguments
 
 # Without every other output the picture may be wrong by this share of its size: with all of them by a hundredth.
 MAY_MISS = 0.16
-# How long a motion plays at least and at most, in seconds, where nothing else is said.
+# The shortest and the longest film, in seconds, if the user does not give its length.
 SHORTEST, LONGEST = 2.0, 20.0
 
 
 def film(
     traj, positions: Callable, seconds: float | None, rate: float, trail: float, ended_by_event: bool
 ) -> Animation:
-    """The frames of one trajectory, as they are drawn."""
+    """Return the frames of one trajectory as they are drawn."""
     _check_positions(positions)
     t, q, v = _reached(traj, ended_by_event)
     at, kept = _frames(t[0], t[-1], seconds, rate, trail)
@@ -36,9 +36,9 @@ def film(
 def film_of_lanes(
     trajs: list, positions: Callable, seconds: float | None, rate: float, trail: float, by_event: Sequence[bool]
 ) -> tuple[np.ndarray, dict[str, np.ndarray], int]:
-    """The frames of several trajectories (None: of a lane without one) at shared times, as `animation.film` takes them.
+    """Return frames of several trajectories (None for a lane without one) at shared times, for `animation.film`.
 
-    A motion that ends before the others stays where it ended; one that does not come to three outputs is NaN.
+    A motion that ends before the others stays where it ended; one with fewer than three outputs is NaN.
     """
     _check_positions(positions)
     lanes = []
@@ -79,19 +79,19 @@ def _check_positions(positions):
 
 
 def _frames(start, end, seconds, rate, trail):
-    """The times of the frames, and how many the trail keeps."""
+    """Return the times of the frames, and how many frames the trail keeps."""
     seconds = float(np.clip(abs(end - start), SHORTEST, LONGEST)) if seconds is None else seconds
     count = round(seconds * rate) + 1 if np.isfinite(seconds * rate) else 0
     if count < 2 or not trail >= 0:
         raise ValueError(
-            f"seconds = {seconds:g} at rate = {rate:g} frames a second, with a trail of {trail:g} s, is no film.\n"
+            f"seconds = {seconds:g} at rate = {rate:g} frames a second, with a trail of {trail:g} s, is not a film.\n"
             "Fix: traj.animate(positions, seconds=10.0), and a trail of zero or more seconds."
         )
     return np.linspace(start, end, count), int(min(trail * rate, count))
 
 
 def hermite(t, q, v, at):
-    """q at the times `at`, from values and slopes at the times t; each leaf (T, ...) becomes (len(at), ...)."""
+    """Return q at the times `at`, from values and slopes at the times t; each leaf (T, ...) becomes (len(at), ...)."""
     if t[-1] < t[0]:
         t, q, v = jax.tree.map(lambda x: x[::-1], (t, q, v))
     i = np.clip(np.searchsorted(t, at, side="right") - 1, 0, len(t) - 2)
@@ -106,9 +106,9 @@ def hermite(t, q, v, at):
 
 
 def _reached(traj, ended_by_event):
-    """Times, q and v of the outputs that the motion came to, and of the event that ended it.
+    """Return times, q and v of the outputs that the motion reached, and of the event that ended it.
 
-    Where it failed the last state is left out: in a collapse its velocity is too large for interpolation.
+    If it failed, the last state is left out: when steps collapse, its velocity is too large for interpolation.
     """
     outputs, end = (traj.t, traj.q, traj.v), (traj.end.t, traj.end.q, traj.end.v)
     outputs, end = jax.tree.map(np.asarray, (outputs, end))
@@ -118,7 +118,7 @@ def _reached(traj, ended_by_event):
         t, q, v = jax.tree.map(lambda x, last: np.concatenate([x, last[None]]), (t, q, v), end)
     if len(t) < 3:
         raise ValueError(
-            f"there are {len(t)} states to draw, and a film needs at least three.\n"
+            f"there are {len(t)} states to draw, but a film needs at least three.\n"
             "Usual cause: ts of two times, or a motion that failed at its start (see traj.result).\n"
             "Fix: ts=jnp.linspace(t0, t1, 201)."
         )
@@ -126,7 +126,7 @@ def _reached(traj, ended_by_event):
 
 
 def drawn(positions, t, q, params) -> dict[str, np.ndarray]:
-    """What `positions` makes of each state: by name, (T, k, 2)."""
+    """Return the points that `positions` gives for each state: by name, (T, k, 2)."""
     frames = []
     for i, now in enumerate(t):
         found = positions(now, jax.tree.map(lambda x: x[i], q), params)
@@ -151,17 +151,17 @@ def drawn(positions, t, q, params) -> dict[str, np.ndarray]:
 
 
 def _points(name, value):
-    """One point or several as (k, 2), or an error."""
+    """Return one point or several as (k, 2), or raise."""
     try:
         x = np.asarray(value, float)
         shape = f"an array of shape {x.shape}"
     except (TypeError, ValueError):
-        x, shape = np.zeros(0), f"a {type(value).__name__} that is no array of numbers"
+        x, shape = np.zeros(0), f"a {type(value).__name__} that is not an array of numbers"
     if x.shape[-1:] != (2,) or x.ndim > 2 or x.size == 0:
         raise ValueError(
-            f"positions(t, q, params) must return points of the plane, and returned {shape}{_of(name)}.\n"
+            f"positions(t, q, params) must return points of the plane, but returned {shape}{_of(name)}.\n"
             "Usual cause: three coordinates in space, an angle in place of a point, or a coordinate of shape (1,).\n"
-            'Fix: return (x, y), points (k, 2) that are linked in order, or these by name: {"rod": [(0, 0), (x, y)]}.'
+            'Fix: return (x, y), points (k, 2) linked in order, or such points by name: {"rod": [(0, 0), (x, y)]}.'
         )
     return x.reshape(-1, 2)
 
@@ -171,7 +171,7 @@ def _of(name):
 
 
 def _check_dense(positions, t, q, v, params, points):
-    """Raise where the outputs are too far apart for what is drawn between them."""
+    """Raise if the outputs are too far apart to interpolate between them."""
     every_other, skipped = slice(None, None, 2), slice(1, len(t) - 1, 2)
     half = lambda tree: jax.tree.map(lambda x: x[every_other], tree)
     guessed = drawn(positions, t[skipped], hermite(t[every_other], half(q), half(v), t[skipped]), params)
@@ -180,8 +180,8 @@ def _check_dense(positions, t, q, v, params, points):
     missed = max(np.abs(guessed[name] - known[name]).max() for name in known)
     if missed > MAY_MISS * size:
         raise ValueError(
-            f"{len(t)} outputs are too few to draw what happens between them: from every other one, the rest would be "
-            f"misplaced by {missed / size:.0%} of the picture.\n"
-            "Usual cause: fewer than about ten outputs an oscillation.\n"
+            f"{len(t)} outputs are too few to draw what happens between them: interpolated from every other one, the "
+            f"rest would be misplaced by {missed / size:.0%} of the picture.\n"
+            "Usual cause: fewer than about ten outputs for each oscillation.\n"
             f"Fix: ts=jnp.linspace({t[0]:.6g}, {t[-1]:.6g}, {8 * len(t) + 1})."
         )

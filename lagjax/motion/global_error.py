@@ -1,12 +1,13 @@
-"""How wrong a motion is: the same motion once more, ten times more precisely.
+"""The error of a motion, estimated by integrating it a second time, ten times more precisely.
 
-A tolerance bounds the error of a step; what a motion makes of these errors, no method knows. The same compiled program
-run with tolerances ten times tighter has a tenth of the error, so that the difference of the two is the error of the
-first, but for a tenth of it. Also where the motion amplifies errors until nothing is left, since it amplifies the
-difference alike, and round-off, which differs in the two as the steps do.
+A tolerance bounds the error of a step; no method knows how large the motion lets these errors grow. The same compiled
+program with tolerances ten times tighter has a tenth of the error, so that the difference of the two runs is the error
+of the first, to within a tenth of it. This holds even if the motion amplifies errors until no digits are left, since it
+amplifies the difference alike, and for round-off, which differs between the runs as their steps do.
 
-Where something else chooses the steps, both runs would take the same ones. Fixed steps are halved, and so are those
-that `max_step` shortens; outputs are reached in one step more than there were; the first step is a shorter one.
+If something else than the tolerance determined the steps, both runs would take the same ones. So fixed steps are
+halved, and so is `max_step` if it limits them; outputs are reached in one step more than before; the first step is
+shorter.
 
 Source: Hairer, Nørsett & Wanner, *Solving ODEs I*, §II.4 (global error by a second tolerance).
 """
@@ -29,33 +30,33 @@ from lagjax.motion.trajectory import Trajectory
 # The tightest tolerance that is not below round-off.
 ROUND_OFFS = 8
 TIGHTER = 10.0
-# A motion of more steps is not integrated again unless that is asked for.
+# A motion of more steps is integrated again only if the user requests it.
 STEPS_AT_MOST = 20_000
-# Steps from one output to the next up to which outputs may have chosen them. The first steps are short: so much of a
-# step to an output does not count.
-FEW, BUT_FOR = 4, 0.2
-# The least steps to an output where most take more, and the share of the first step that is taken.
+# Up to FEW steps per output, outputs may have determined the steps. Since the first steps are short, this share of a
+# step per output is not counted.
+FEW, UNCOUNTED = 4, 0.2
+# The least number of steps per output if there were more than FEW, and the share of the first step that is taken.
 MANY, FIRST = 3.0, 0.7
-# Steps that are nearly as long as `max_step` all the way.
+# `max_step` limits the steps if their mean is above this share of it.
 LIMITED = 0.7
-# Of the size of a number and the square root of the steps: what round-off adds at least.
+# Round-off adds at least this many round-offs of a number, times the square root of the number of steps.
 ROUND_OFF = 3.0
 
 
-def steps_to_repeat(asked: bool | None, controller, progress: bool) -> np.ndarray:
-    """The most steps of a motion that is integrated again; raise where `asked` is neither None, True nor False."""
-    if not (asked is None or isinstance(asked, (bool, np.bool_))):
+def steps_to_repeat(estimate: bool | None, controller, progress: bool) -> np.ndarray:
+    """Return the most steps of a motion to be integrated again; raise if `estimate` is not None, True or False."""
+    if not (estimate is None or isinstance(estimate, (bool, np.bool_))):
         raise TypeError(
-            f"estimate_error must be True, False or None, not {asked!r}.\nFix: estimate_error=True, or leave it out."
+            f"estimate_error must be True, False or None, not {estimate!r}.\nFix: estimate_error=True, or leave it out."
         )
     ours = controller is None or _fixed(controller)
     by_default = STEPS_AT_MOST if is_eager() and ours and not progress else 0
     limits = {None: by_default, True: np.iinfo(np.int32).max, False: 0}
-    return np.asarray(limits[None if asked is None else bool(asked)], np.int32)
+    return np.asarray(limits[None if estimate is None else bool(estimate)], np.int32)
 
 
 def with_errors(run: Callable, first: Trajectory, settings, ts) -> Trajectory:
-    """A trajectory with its errors by `run(settings)`, where it is short enough; not while JAX is tracing."""
+    """Return the trajectory with its errors by `run(settings)`, if it is short enough; not while JAX is tracing."""
     if not is_among(first.result, ENDED_WELL):
         return _unknown(first, first.result)
     steps = int(first.stats["num_accepted_steps"])
@@ -65,7 +66,7 @@ def with_errors(run: Callable, first: Trajectory, settings, ts) -> Trajectory:
 
 
 def with_errors_inside(run: Callable, first: Trajectory, settings, ts) -> Trajectory:
-    """The same in a program, through which no derivatives go."""
+    """Do the same in a traced program, without derivatives of the errors."""
     if not _can_be_closer(settings):
         return _unknown(first)
     known, settings, ts = stopped((first, settings, ts))
@@ -83,35 +84,35 @@ def _can_be_closer(settings):
 
 
 def _closer(xp, settings, steps, end, ts):
-    """The settings of a second run, after a first one of so many steps to the time `end`."""
+    """Return the settings of the second run, after a first one of `steps` steps to the time `end`."""
     if settings.controller is not None:
         return replace(settings, dt0=settings.dt0 / 2)
-    # Below round-off the other way: the difference is then what the looser run is off, and more than this one.
+    # Looser if tighter would be below round-off: the difference is then the error of the second run, the larger one.
     scale = xp.where(settings.rtol / TIGHTER >= ROUND_OFFS * np.finfo(ts.dtype).eps, 1 / TIGHTER, TIGHTER)
-    an_output = steps / xp.maximum(1, xp.sum(ts < end))
+    per_output = steps / xp.maximum(1, xp.sum(ts < end))
     limited = steps * settings.max_step * LIMITED <= end - ts[0]
     longest = xp.where(limited, settings.max_step / 2, settings.max_step)
-    pieces = xp.where(an_output <= FEW, xp.maximum(1, xp.ceil(an_output - BUT_FOR)) + 1, MANY)
+    pieces = xp.where(per_output <= FEW, xp.maximum(1, xp.ceil(per_output - UNCOUNTED)) + 1, MANY)
     values = settings.rtol * scale, settings.atol * scale, longest, xp.stack([xp.asarray(FIRST), 1 / pieces])
     rtol, atol, longest, shares = (x.astype(ts.dtype) for x in values)
     return replace(settings, rtol=rtol, atol=atol, max_step=longest, shares=shares)
 
 
 def _compared(xp, first, second, ts) -> Trajectory:
-    """The first trajectory with what the two differ by, and with what round-off adds at least."""
+    """Return the first trajectory with its errors: the difference of the two, plus the least effect of round-off."""
     steps = xp.asarray(second.stats["num_accepted_steps"])
     share = ROUND_OFF * np.finfo(ts.dtype).eps * xp.sqrt(1.0 + steps)
     x, y = _columns(xp, first), _columns(xp, second)
     if xp is jnp or np.isnan(y).any():
-        # After its end the second run, which an event may have ended a little sooner, stays there.
+        # The second run, which an event may have ended a little sooner, keeps its last state after its end.
         well = ended_well(second.result) if xp is jnp else is_among(second.result, ENDED_WELL)
         y = xp.where(xp.isnan(y) & well, _columns(xp, second.end), y)
-    # NaN where nothing was reached, which comes last.
+    # Outputs that were not reached are NaN, and come last.
     sizes = np.fmax.accumulate(abs(x)) if xp is np else lax.cummax(jnp.nan_to_num(abs(x)))
     errors = (abs(x - y) + share * sizes).astype(ts.dtype)
     of_times = lambda name, found: _of_times(xp, xp.asarray(found.t), xp.asarray(second.events[name].t), share)
     times = {name: of_times(name, found) for name, found in first.events.items()}
-    found = Errors(*_in_their_places(errors, first), times, second.result, steps)
+    found = Errors(*_like_trajectory(errors, first), times, second.result, steps)
     of_motion = lambda row: row[: 2 * sum(np.size(x) for x in jax.tree.leaves(first.end.q))].reshape(2, -1)
     worst = of_motion(np.fmax.reduce(errors) if xp is np else jnp.nanmax(errors, axis=0))
     excess = scaled_error(xp, worst, of_motion(sizes[-1]), first, ts, tuple(map(xp.asarray, first.tolerance)))
@@ -125,11 +126,11 @@ def _unknown(first, result=RESULTS.not_estimated) -> Trajectory:
 
 
 def _columns(xp, of):
-    """Coordinates, velocities and multipliers in columns, a row an instant."""
+    """Return coordinates, velocities and multipliers as columns, one row for each instant."""
     return columns(xp, (of.q, of.v, of.multipliers), rows=np.size(of.t))
 
 
-def _in_their_places(errors, first):
+def _like_trajectory(errors, first):
     leaves, structure = jax.tree.flatten((first.q, first.v, first.multipliers))
     ends = np.cumsum([x.size // len(errors) for x in leaves])
     parts = (errors[:, end - x.size // len(errors) : end].reshape(x.shape) for x, end in zip(leaves, ends))

@@ -19,18 +19,18 @@ from lagjax.motion.consistency import worst_residual
 from lagjax.motion.crossings import Crossings
 from lagjax.motion.trajectory import Trajectory, jacobi_and_scale
 
-# Of an output that was not reached, and of the room for switches that did not come.
+# The phase of an output that was not reached, and the number in unused places for switches.
 NO_PHASE = -1
 # The name under which switches are among the events of a motion.
 SWITCHES = "switches"
 
 
 class Switches(eqx.Module):
-    """The switches of a motion, in the order of time; it prints itself.
+    """The switches of a motion, in order of time; it prints itself.
 
     - `t` (S,): their times, `[t]`; NaN beyond the last one. S is `most_switches` of the `lj.Hybrid`.
     - `way` (S,): which of the hybrid's switches each is, and `to` (S,): the number of the next phase; -1 beyond the
-      last one. `names`: those of all phases, and `ways` the names of those that each of the hybrid's switches leaves.
+      last one. `names`: the names of all phases; `ways`: for each of the hybrid's switches, the phase it leaves.
     - `q`, `v`: the states before them, each leaf with a leading axis S; `q_after`, `v_after`: those after them.
     - `impulse`: the jump of the momentum, like v, `[L] [t]/[q]`; zero where nothing jumps.
     - `count`: how many there were.
@@ -54,7 +54,7 @@ class Switches(eqx.Module):
     ways: tuple[str, ...] = eqx.field(static=True)
 
     def as_crossings(self) -> Crossings:
-        """The same as crossings of one guard, with the states before them."""
+        """Return the switches as crossings of one guard, with the states before them."""
         return Crossings(self.t, self.q, self.v, {}, self.count, self.uncertain)
 
     def __len__(self):
@@ -69,7 +69,7 @@ class Switches(eqx.Module):
         return "\n".join(["Switches: " + self.in_words(), *self._rows()])
 
     def in_words(self) -> str:
-        """How many."""
+        """Return the number of switches, and whether some may be missing."""
         return f"{int(self.count)}" + ("; some may be missing" if bool(self.uncertain) else "")
 
     def _rows(self):
@@ -86,7 +86,7 @@ class HybridTrajectory(Trajectory):
     - `multipliers`: of all phases by constraint name; NaN where the phase has no such constraint.
     - `end`: the last instant; where the motion ended on a switch, the state after it.
     - `jacobi_integral()`, `residual()`: of each output's own phase. `drift()` is NaN: over all phases, in which forces
-      and impacts do work, there is nothing that must stay.
+      and impacts do work, nothing has to be conserved.
     """
 
     phase: Int[Array, " T"] = eqx.field(kw_only=True)
@@ -110,7 +110,7 @@ class HybridTrajectory(Trajectory):
         return _of_phases(_integral, self)
 
     def drift(self) -> Float[Array, ""]:
-        """Not known."""
+        """Return NaN: nothing is known to be conserved over all phases."""
         return jnp.full_like(self.scaled_error, jnp.nan)
 
     def residual(self) -> Float[Array, ""]:
@@ -157,7 +157,7 @@ def _integral(system, t, q, v, params):
 
 
 def _of_phases(function, trajectory):
-    """`function(system, t, q, v, params)` of all outputs, each by the system of its own phase."""
+    """Return `function(system, t, q, v, params)` at all outputs, each with the system of its own phase."""
     found = jnp.full_like(trajectory.t, jnp.nan)
     for i, system in enumerate(trajectory.system.systems):
         values = function(system, trajectory.t, trajectory.q, trajectory.v, trajectory.params)
@@ -171,8 +171,8 @@ def _residual_in(system: System, i, trajectory):
 
 @compiled
 def _worst(system, i, phase, t, q, v, params):
-    mine = phase == i
-    # Other outputs are taken where the phase was first: they say nothing of it.
-    at = jnp.where(mine, jnp.arange(phase.size), jnp.argmax(mine))
+    in_phase = phase == i
+    # Outputs of other phases are replaced by the first of this phase, which does not change the maximum.
+    at = jnp.where(in_phase, jnp.arange(phase.size), jnp.argmax(in_phase))
     t, q, v = jax.tree.map(partial(jnp.take, indices=at, axis=0), (t, q, v))
-    return lax.cond(jnp.any(mine), lambda: worst_residual(system, t, q, v, params), lambda: jnp.zeros_like(t[0]))
+    return lax.cond(jnp.any(in_phase), lambda: worst_residual(system, t, q, v, params), lambda: jnp.zeros_like(t[0]))

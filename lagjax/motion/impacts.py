@@ -1,30 +1,31 @@
-"""Impacts: what a gap that closes makes of the velocities, with Coulomb's friction or without.
+"""Impacts: the velocities after a gap has closed, with Coulomb's friction or without.
 
 The impulse of a contact acts along the gradients of its gap g and of its sliding velocity γ_T, and constraints that
-hold before the impact hold on, with impulses of their own:
+hold before the impact keep holding, with impulses of their own:
 
     M Δv = A_Nᵀ Λ_N + A_Tᵀ Λ_T + A_heldᵀ Λ_held,    A_held Δv = 0,    A_N = ∂g/∂q,    A_T = ∂γ_T/∂v
 
-Normally Newton's law holds, A_N Δv = (1 + e) |γ_N| = c. Along the contact friction opposes what slides after it,
+In the normal direction Newton's law holds, A_N Δv = (1 + e) |γ_N| = c. Along the contact, friction opposes the sliding
+velocity γ_T' after the impact,
 
     sticks:    γ_T' = 0,         |Λ_T| ≤ μ Λ_N
     slides:    ± γ_T' > 0,       Λ_T = ∓ μ Λ_N
 
-Let d_N and d_T be the least changes of the velocities, in the metric of M, that change γ_N by one, and γ_T by one with
-γ_N as it is. Then, with γ₀ the sliding velocity after the impact without friction,
+Let d_N and d_T be the least changes of the velocities, in the metric of M, that change γ_N by one, and γ_T by one at
+constant γ_N. Then, with γ₀ the sliding velocity after the impact without friction,
 
     Δv = c d_N + σ d_T,    γ_T' = γ₀ + σ,    Λ_T = h σ,    Λ_N = c n - k Λ_T
     n = d_Nᵀ M d_N,    h = d_Tᵀ M d_T,    k = A_T d_N,    γ₀ = γ_T + c k
 
-It sticks with σ = -γ₀ where that is in the cone. Else it slides to the side s of γ₀, Λ_T = -s μ c n / (1 - s μ k). With
-Λ_T = -ρ μ Λ_N, γ_T' falls strictly from ρ = -1 to 1 as long as Λ_N > 0, so that there is one solution and no other;
-where that denominator is not above zero friction jams the contact before it slides, and what sticks is in the cone.
-Unlike the forces of a motion (`reactions.py`) an impact with Newton's law knows no paradox, but for a contact whose
-sliding is settled by the gap and the constraints, γ_T' = γ₀ whatever friction does. Where friction would then exceed
-what pushes there is no impulse, and the velocities are NaN.
+The contact sticks, with σ = -γ₀, if that is in the cone. Otherwise it slides to the side s of γ₀, with
+Λ_T = -s μ c n / (1 - s μ k). For Λ_T = -ρ μ Λ_N, γ_T' falls strictly from ρ = -1 to 1 as long as Λ_N > 0, so that there
+is exactly one solution; if that denominator is not above zero, friction jams the contact before it slides, and sticking
+is in the cone. Unlike the forces of a motion (`reactions.py`), an impact with Newton's law has no paradox, except for a
+contact whose sliding velocity is fixed by the gap and the constraints, γ_T' = γ₀ whatever friction does. If friction
+would then exceed what pushes the contact together, there is no impulse, and the velocities are NaN.
 
 The energy changes by ½ Λ_N (γ_N + γ_N') + ½ Λ_T (γ_T + γ_T'). Without restitution, or where k is zero (a ball), it
-never grows. With restitution it may, in an impact that turns the sliding around: Newton's law is then at fault (Kane).
+never grows. With restitution it may, in an impact that reverses the sliding: the fault is then in Newton's law (Kane).
 
 Source: Pfeiffer & Glocker, *Multibody Dynamics with Unilateral Contacts*, ch. 7 and 8; Glocker, *Set-Valued Force
 Laws*, §6; Kane, *A dynamics puzzle* (1984), on the energy.
@@ -48,16 +49,16 @@ from lagjax.mechanics.system import System
 from lagjax.motion.consistency import stopped, velocity_change
 from lagjax.motion.switching import OfPhases
 
-# The names of a gap and of a sliding velocity among the constraints of a phase.
+# Names reserved for a contact's gap and sliding velocity among the constraints of a phase.
 GAP, SLIDING = "lagjax gap", "lagjax sliding"
-# What d_T changes beside γ_T, relative to its size, where γ_T depends on the gap and the constraints.
+# γ_T depends on the gap and the constraints if d_T changes these, relative to its size, by more than this.
 DEPENDENT = 1e-6
-# Round-offs of the speed at which a contact parts that lets go.
+# A contact that lets go separates at least this fast, in round-offs of its speed.
 OPENS = 64
 
 
 class Impact(OfPhases):
-    """An impact with a restitution, and friction where it has a coefficient: see `lj.touches`."""
+    """An impact with a restitution, and with friction if it has a coefficient: see `lj.touches`."""
 
     gap: Callable
     restitution: Callable | ArrayLike
@@ -65,7 +66,7 @@ class Impact(OfPhases):
     sliding: Callable | None = None
 
     def between(self, before: System, after: System) -> Callable:
-        """The velocities after it: what holds in the phase before holds on, and only the contact's velocities jump."""
+        """Return the reset: constraints of the phase before keep holding, and only the contact's velocities jump."""
         return _Rebound(self, before)
 
 
@@ -77,7 +78,7 @@ class _Rebound(eqx.Module):
     def __call__(self, t, q, v, params):
         gap, e = self.impact.gap, self.impact.restitution
         _, opening = jax.jvp(lambda t, q: gap(t, q, params), (t, q), (jnp.ones_like(t), v))
-        # What opens is not hit.
+        # A contact that is opening receives no impulse.
         closing = jnp.maximum(-opening, 0.0)
         jump = (1 + (e(closing) if callable(e) else e)) * closing
         by_gap, _ = self._unit({GAP: Holonomic(gap)}, t, q, v, params)
@@ -86,24 +87,24 @@ class _Rebound(eqx.Module):
             return after
         _check_sliding(self.impact.sliding, t, q, v, params)
         both = {GAP: Holonomic(gap), SLIDING: Nonholonomic(self.impact.sliding)}
-        along, alone = self._unit(both, t, q, v, params)
-        return _moved(after, self._slowed(t, q, v, params, jump, by_gap, along, alone), along)
+        along, independent = self._unit(both, t, q, v, params)
+        return _moved(after, self._friction_change(t, q, v, params, jump, by_gap, along, independent), along)
 
     def _unit(self, contact, t, q, v, params):
-        """The least change of the velocities that changes the residual that is last in `contact` by one and no other;
-        whether there is one. All others are those of the contact, and of the constraints that hold."""
+        """Return the least change of the velocities that changes the residual of the last entry of `contact` by one,
+        but no other residual, of `contact` or of the constraints that hold; and whether there is such a change."""
         before = self.before
         system = System(before.lagrangian, before.constraints | contact, before.force, before.dissipation)
         x, unflatten = coordinates.flatten(q)
-        change = _of(list(contact)[-1], constraints.shapes(system, t, q, v, params)).astype(x.dtype)
+        change = _equations_of(list(contact)[-1], constraints.shapes(system, t, q, v, params)).astype(x.dtype)
         found = velocity_change(system, t, q, v, params, jnp.asarray(change))
         rows = constraints.jacobian(system, t, x, coordinates.flatten(v)[0], params, unflatten)
         d = coordinates.flatten(found)[0]
         off = jnp.abs(rows @ d - change) > DEPENDENT * (change + jnp.abs(rows) @ jnp.abs(d))
         return found, ~jnp.any(off)
 
-    def _slowed(self, t, q, v, params, jump, by_gap, along, alone):
-        """σ, the change of the sliding velocity by friction."""
+    def _friction_change(self, t, q, v, params, jump, by_gap, along, independent):
+        """Return σ, the change of the sliding velocity by friction."""
         mu, sliding = self.impact.friction, self.impact.sliding
         assert sliding is not None
         mu = mu(params) if callable(mu) else mu
@@ -113,20 +114,20 @@ class _Rebound(eqx.Module):
         speed, k = jax.jvp(lambda v: sliding(t, q, v, params), (v,), (by_gap,))
         smooth = speed + jump * k
         room = 1 - mu * k * jnp.sign(smooth)
-        holds = h * jnp.abs(smooth) <= mu * (jump * n + k * h * smooth)
-        # Where these are not above zero it sticks, or nothing changes.
+        sticks = h * jnp.abs(smooth) <= mu * (jump * n + k * h * smooth)
+        # If these are not above zero, the contact sticks or nothing changes.
         scale = jnp.where((room > 0) & (h > 0), room * h, 1.0)
-        slid = jnp.where(holds, -smooth, -jnp.sign(smooth) * mu * jump * n / scale)
-        return jnp.where(alone, slid, jnp.where((room > 0) | (jump == 0), 0.0, jnp.nan))
+        change_by_friction = jnp.where(sticks, -smooth, -jnp.sign(smooth) * mu * jump * n / scale)
+        return jnp.where(independent, change_by_friction, jnp.where((room > 0) | (jump == 0), 0.0, jnp.nan))
 
 
 class Opening(OfPhases):
-    """What opens a contact of the phase before, which has no force left, by less than anything else does."""
+    """A reset that opens a contact of the phase before, whose force has reached zero, at a negligible speed."""
 
     contact: str = eqx.field(static=True)
 
     def between(self, before: System, after: System) -> Callable:
-        """The velocities after it."""
+        """Return the reset of the velocities."""
         return _Opened(before, self.contact)
 
 
@@ -139,16 +140,16 @@ class _Opened(eqx.Module):
         x, unflatten = coordinates.flatten(q)
         u, _ = coordinates.flatten(v)
         sizes = jnp.abs(constraints.jacobian(self.before, t, x, u, params, unflatten)) @ jnp.abs(u)
-        mine = _of(self.contact, constraints.shapes(self.before, t, q, v, params))
+        mine = _equations_of(self.contact, constraints.shapes(self.before, t, q, v, params))
         opening = constraints.velocity_residual(self.before, t, x, u, params, unflatten)
-        # Of a body at rest, too, the speed is above zero.
+        # The speed must be above zero for a body at rest, too.
         least = OPENS * jnp.finfo(x.dtype).eps * sizes + jnp.sqrt(jnp.finfo(x.dtype).tiny)
         change = stopped(jnp.where(mine, jnp.maximum(least - opening, 0.0), 0.0))
         return _moved(v, 1.0, velocity_change(self.before, t, q, v, params, change))
 
 
-def _of(name, shapes):
-    """Which equations of all constraints, which have these shapes, are those of this name."""
+def _equations_of(name, shapes):
+    """Return which of the equations of all constraints, with these shapes, belong to the constraint `name`."""
     return np.concatenate([np.full(math.prod(shape), other == name) for other, shape in shapes.items()])
 
 
@@ -157,12 +158,12 @@ def _moved(v, size, along):
 
 
 def _check_sliding(sliding, t, q, v, params):
-    """Raise where a sliding velocity is not one number, or not linear in v."""
+    """Raise if a sliding velocity is not one number, or not linear in v."""
     found = shape_of(sliding, t, q, v, params)
     shape = getattr(found, "shape", () if isinstance(found, float | int) else None)
     if shape != ():
         raise ValueError(
-            f"sliding(t, q, v, params) must return one number, and returned {shape or type(found).__name__}.\n"
+            f"sliding(t, q, v, params) must return one number, but returned {shape or type(found).__name__}.\n"
             "Usual cause: the velocity of a point in space.\n"
             "Fix: its component along the contact, in the plane of the motion."
         )
@@ -171,7 +172,7 @@ def _check_sliding(sliding, t, q, v, params):
     program = jax.make_jaxpr(slope)(u).jaxpr
     if depends(program, program.invars):
         raise ValueError(
-            "sliding(t, q, v, params) must be linear in v, and its slope depends on v.\n"
-            "Usual cause: a speed, jnp.abs or a length of it.\n"
+            "sliding(t, q, v, params) must be linear in v, but its slope depends on v.\n"
+            "Usual cause: a speed, jnp.abs of the velocity or its length.\n"
             'Fix: the velocity with its sign, v["x"] - params["R"] * v["phi"].'
         )

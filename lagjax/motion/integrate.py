@@ -1,9 +1,9 @@
-"""The front door: a trajectory from a system and an initial state.
+"""The main entry: a trajectory from a system and an initial state.
 
     check the arguments  ->  one compiled solve by diffrax  ->  say what went wrong, if anything did
 
-All looking at values happens outside the compiled program (`motion/solve.py`), so that it can be cached,
-batched and differentiated.
+Values are examined only outside the compiled program (`motion/solve.py`), so that it can be cached, batched and
+differentiated.
 """
 
 from collections.abc import Mapping, Sequence
@@ -84,61 +84,61 @@ def integrate(
       method, not an interpolation. (Decreasing times have to be known while JAX is tracing: a NumPy array.)
     - `rtol`, `atol`: tolerances of the local error of each coordinate and velocity, `atol + rtol |y|`. `rtol` is 1e-9
       by default in float64, 1e-5 in float32. Without `atol` each number is judged by its own size, whatever the units
-      (`lagjax/motion/tolerances.py`): at zero crossings by the end of the step, at rest by what it moves in a step, and
-      what dies out over three decades. Give `atol` where small numbers do not matter, such as the stretching of a stiff
-      spring. A pair is one for coordinates, `[q]`, and one for velocities, `[q]/[t]`. Of an angle (a coordinate that is
-      seen through sines and cosines alone) at most one turn counts as its size.
+      (`lagjax/motion/tolerances.py`): at a zero crossing by its size at the end of the step, at rest by its change in a
+      step, and a decaying one over three decades. Give `atol` if small numbers do not matter, such as the stretching of
+      a stiff spring. A pair is one for coordinates, `[q]`, and one for velocities, `[q]/[t]`. The size of an angle (a
+      coordinate that enters only through sines and cosines) counts at most as one turn.
 
     **Other arguments:**
 
-    - `method`: any diffrax solver. By default `lj.Nystrom12()` where there are no constraints and accelerations do not
+    - `method`: any diffrax solver. By default `lj.Nystrom12()` if there are no constraints and accelerations do not
       depend on velocities (`lj.explain` says so), `lj.Nystrom8()` if L has a network in it, else `lj.Dopri8()`: the
       fastest way to an error between 1e-4 and 1e-10 on nearly all scenes (`benchmarks/results/work_precision.json`).
-      With these and with `lj.Tsit5()` small systems run on equations that are written out number by number, and so
-      they do with `diffrax.Dopri8()` and `diffrax.Tsit5()`, which are taken for ours; diffrax's other methods take 2
-      to 10 times longer. For stiff systems `lj.Radau5()` where something decays fast, and
-      `lj.Radau5(step_powers=(0, 1))` where springs are stiff and their oscillation does not matter.
+      With these and with `lj.Tsit5()` small systems run on equations that are written out number by number, as they
+      also do with `diffrax.Dopri8()` and `diffrax.Tsit5()`, which are treated as ours; diffrax's other methods take 2
+      to 10 times longer. For stiff systems use `lj.Radau5()` if something decays fast, and
+      `lj.Radau5(step_powers=(0, 1))` if springs are stiff and their oscillation does not matter.
     - `stepsize_controller`: any diffrax controller, in place of `diffrax.PIDController(rtol, atol)`.
     - `dt0`: the length of the first step, `[t]`; needed with `diffrax.ConstantStepSize()`.
-    - `max_step`: the longest step, `[t]`. Adaptive steps pass over what is narrower than they are, such as a short push
-      or a thin barrier, and nothing tells: no step is longer than this, nor than the time between two outputs.
-    - `jump_ts` (J,): times at which a force jumps or has a kink, in any order, `[t]`. They become ends of steps, which
-      stay on their side of them; derivatives by these times are right.
+    - `max_step`: the longest step, `[t]`. Adaptive steps may miss what is narrower than they are, such as a short push
+      or a thin barrier, without a warning. No step is longer than this, nor than the time between two outputs.
+    - `jump_ts` (J,): times at which a force jumps or has a kink, in any order, `[t]`. They become ends of steps, and
+      each step stays on one side of them; derivatives with respect to these times are right.
     - `events`: by name, a `lj.Crossing` each: where a function of the state crosses zero, recorded in `traj.events` or
-      ending the motion. Crossings are found also inside steps, several in one, and located to round-off: such a step
-      is taken in parts, which end there, and its controller is asked once. What jumps over zero at a switch of a
-      `Hybrid`, as a velocity does in an impact, does not cross it.
+      ending the motion. Crossings are also found inside steps, several in one, and located to round-off: such a step
+      is taken in parts that end there, but its controller sees it as one. A value that jumps over zero at a switch of
+      a `Hybrid`, as a velocity does in an impact, does not cross it.
     - `event`: a `diffrax.Event` that ends the motion; its condition takes `(t, (q, v), params, **kwargs)`. It is found
-      as `events` are, under the name "event".
+      like `events`, under the name "event".
     - `adjoint`: any diffrax adjoint. Without one, forward and reverse mode both work; so they do with `lj.Replay`,
       which says how much memory reverse mode may use.
-    - `max_steps`: the largest number of steps, accepted and rejected, those that look for events among them.
-    - `throw`: raise where the integration fails. With `throw=False` the trajectory carries the reason in
+    - `max_steps`: the largest number of steps, accepted and rejected, including those that search for events.
+    - `throw`: raise if the integration fails. With `throw=False` the trajectory carries the reason in
       `result` and NaN from there on.
-    - `progress`: True: show a progress meter. By default only the wait for the compiler, where somebody may look.
+    - `progress`: True shows a progress meter. By default only the wait for the compiler is shown, if someone may look.
     - `estimate_error`: whether to integrate a second time, more precisely, to say in `traj.error` how wrong the motion
-      may be. By default where nothing is traced, steps are chosen by lagjax or fixed, and there are at most 20,000. It
-      compiles nothing there and costs 1.2 to 2 times the solve; inside `jit`, `vmap`, a sweep and derivatives it is one
-      more solve in the program, through which no derivatives go. What a method damps in both runs alike, as
-      `lj.Radau5(step_powers=(0, 1))` does fast oscillations, it cannot see.
+      may be. The default is to do so if nothing is traced, steps are chosen by lagjax or fixed, and there are at most
+      20,000. It then compiles nothing and costs 1.2 to 2 times the solve; inside `jit`, `vmap`, a sweep and derivatives
+      it is one more solve in the program, which is not differentiated. It cannot see what a method damps in both runs
+      alike, as `lj.Radau5(step_powers=(0, 1))` damps fast oscillations.
     - `start`: the name of the phase of a `Hybrid` in which the motion starts; by default its first one.
-    - `drift`: `"project"` (return to the constraints after every step; the default where there are any),
+    - `drift`: `"project"` (return to the constraints after every step; the default if there are any),
       `"baumgarte"` (feedback at 50 decays a time span), or `"none"`.
 
     **Returns:** a `Trajectory`; of a `Hybrid` a `HybridTrajectory`, with the phases and switches.
 
     **Raises:**
 
-    - `TypeError`, `ValueError` for arguments of the wrong kind, shape or dtype; `ts` that goes to and fro; a
-      tolerance below the dtype's reach.
+    - `TypeError`, `ValueError` for arguments of the wrong kind, shape or dtype; `ts` that is not monotonic; a
+      tolerance below the dtype's resolution.
     - `ValueError` for a start off the constraints, or one where L or its equations are singular or not finite.
-    - `RuntimeError` where the integration stops early: `max_steps` reached, or a step size that collapsed.
-    - Warns (`lj.AccuracyWarning`) where `scaled_error` is above 1: where the estimated error is more than 10,000
-      tolerances or leaves fewer than three digits; without an estimate, where the Jacobi integral must be constant
-      and changed by 1000 tolerances, or by less over thousands of steps, or by 1e-5 with fixed steps. In lanes look at
-      that.
-    - Warns of what is hardly ever meant: a `dissipation` that is odd in v, as a force is; once in a process
-      (`lj.PrecisionWarning`), float32 because nothing else was asked for.
+    - `RuntimeError` if the integration stops early: `max_steps` reached, or a step size that collapsed.
+    - Warns (`lj.AccuracyWarning`) if `scaled_error` is above 1: if the estimated error is more than 10,000 tolerances
+      or leaves fewer than three digits; without an estimate, if the Jacobi integral must be constant and changed by
+      1000 tolerances, or by less over thousands of steps, or by 1e-5 with fixed steps. For batches look at
+      `scaled_error` yourself.
+    - Warns of what is hardly ever intended: a `dissipation` that is odd in v, as a force is; once in a process
+      (`lj.PrecisionWarning`), float32 that is used only because nothing else was requested.
 
     Order and accuracy: those of `method`; `tests/motion/test_orders.py` measures them.
 
@@ -194,7 +194,7 @@ def integrate(
 def _raise_or_warn(trajectory, start, settings):
     """Raise or warn in the user's words; while tracing, at run time with the result's own message."""
     if coordinates.is_traced(trajectory):
-        # Who watches is told by the report.
+        # A caller that watches learns the result from the report.
         return trajectory if WATCHED.value or SILENT.value else raise_at_run_time(trajectory)
     result = trajectory.result
     if not is_among(result, ENDED_WELL):

@@ -1,7 +1,7 @@
-"""A trajectory with its names: an xarray.Dataset.
+"""A trajectory as an xarray.Dataset, with the user's names.
 
-Variables are named as in the trajectory (`q.x`, `v.x`), multipliers as their constraints. The dimension of outputs is
-`t`; the axes of a coordinate that is an array have its name and a number, `r_0`, and q and v share them.
+Variables are named as in the trajectory (`q.x`, `v.x`), multipliers like their constraints. The dimension of outputs is
+`t`; the axes of an array coordinate are named after it with a number, `r_0`, and q and v share them.
 """
 
 from collections.abc import Sequence
@@ -12,7 +12,7 @@ import numpy as np
 
 from lagjax.motion.results import in_words
 
-# What a trajectory has of each motion, beside its outputs.
+# The counts that a trajectory keeps for each motion.
 COUNTS = "num_steps", "num_accepted_steps", "num_rejected_steps"
 
 
@@ -26,12 +26,12 @@ def import_xarray():
 
 
 def dataset(trajectory, dims: Sequence[str] | None = None, under: str = ""):
-    """A trajectory, or a batch of them, as an `xarray.Dataset`.
+    """Return a trajectory, or a batch of them, as an `xarray.Dataset`.
 
     **Arguments:** `dims`: the names of a batch's axes, which come first; by default "batch", or "batch_0" and so on.
-    `under`: what every name begins with, as `"motion."`, where several trajectories share a dataset.
+    `under`: the prefix of every name, such as `"motion."`, if several trajectories share a dataset.
 
-    **Raises:** `ImportError` without xarray; `ValueError` for as many names as there are no axes.
+    **Raises:** `ImportError` without xarray; `ValueError` if there are not as many names as axes.
     """
     xarray = import_xarray()
     lead, variables = dims_of(trajectory, dims), {}
@@ -61,21 +61,21 @@ def dataset(trajectory, dims: Sequence[str] | None = None, under: str = ""):
 
 
 def dims_of(trajectory, dims: Sequence[str] | None = None) -> tuple[str, ...]:
-    """The names of the axes of a batch."""
+    """Return the names of the axes of a batch."""
     count = np.ndim(trajectory.t) - 1
     if dims is None:
         return () if count == 0 else ("batch",) if count == 1 else tuple(f"batch_{i}" for i in range(count))
     dims = (dims,) if isinstance(dims, str) else tuple(dims)
     if len(dims) != count:
         raise ValueError(
-            f"dims has {len(dims)} names, {', '.join(map(repr, dims))}, and this trajectory {count} axes in front of "
-            f"its outputs.\nFix: dims={tuple(f'axis_{i}' for i in range(count))}."
+            f"dims has {len(dims)} names, {', '.join(map(repr, dims))}, but this trajectory has {count} axes in front "
+            f"of its outputs.\nFix: dims={tuple(f'axis_{i}' for i in range(count))}."
         )
     return dims
 
 
 def outputs(trajectory):
-    """What there is at each output: (name, names of the axes behind the outputs, values)."""
+    """Yield what is known at each output: (name, names of the axes after the outputs, values)."""
     lead = np.ndim(trajectory.t)
     for which in ("q", "v"):
         for path, x in jax.tree_util.tree_leaves_with_path(getattr(trajectory, which)):
@@ -93,7 +93,7 @@ def outputs(trajectory):
 
 
 def of_motions(trajectory):
-    """What there is of each motion as a whole, likewise."""
+    """Yield what is known of each motion as a whole, likewise."""
     yield "result", (), np.asarray(trajectory.result._value)
     yield "end", (), np.asarray(trajectory.end.t)
     yield "scaled_error", (), np.asarray(trajectory.scaled_error)
@@ -104,7 +104,7 @@ def of_motions(trajectory):
 
 
 def parameters(trajectory):
-    """The parameters that are arrays of a batch, likewise."""
+    """Yield the parameters that are arrays, of a batch, likewise."""
     lead = np.ndim(trajectory.t) - 1
     for path, x in jax.tree_util.tree_leaves_with_path(trajectory.params):
         if isinstance(x, (jax.Array, np.ndarray)):
@@ -113,7 +113,7 @@ def parameters(trajectory):
 
 
 def attributes(trajectory) -> dict[str, Any]:
-    """How it was integrated, and of one motion its result and the parameters that are numbers."""
+    """Return how it was integrated and, for one motion, its result and the parameters that are numbers."""
     rtol, atol = (np.asarray(x) for x in trajectory.tolerance)
     lead = np.ndim(trajectory.t) - 1
     found: dict[str, Any] = {"method": trajectory.static.method, "drift": trajectory.asked.drift}
@@ -124,20 +124,20 @@ def attributes(trajectory) -> dict[str, Any]:
         for path, x in jax.tree_util.tree_leaves_with_path(trajectory.params):
             if isinstance(x, (bool, int, float, str, np.generic, np.ndarray, jax.Array)):
                 if np.ndim(x) <= 1 and np.size(x) <= 64:
-                    # NetCDF has no place for true and false.
+                    # NetCDF cannot store booleans.
                     x = np.asarray(x, int) if np.asarray(x).dtype == bool else np.asarray(x)
                     found[named("params", path)] = x.tolist()
     return found
 
 
 def named(which: str, path) -> str:
-    """The name of a leaf of `which`."""
+    """Return the name of a leaf of `which`."""
     inner = jax.tree_util.keystr(path, simple=True, separator=".")
     return f"{which}.{inner}" if which and inner else which or inner
 
 
 def axes(name: str, x, lead: int) -> tuple[str, ...]:
-    """The names of the axes behind the first so many."""
+    """Return the names of the axes of x after the first `lead` ones."""
     return tuple(f"{name}_{i}" for i in range(np.ndim(x) - lead))
 
 

@@ -1,12 +1,12 @@
-"""The energy of a motion, and who paid for it.
+"""The energy of a motion, and what changed it.
 
 Along any motion of `d/dt ∂L/∂v - ∂L/∂q = Q - ∂R/∂v + Aᵀ λ` the Jacobi integral h = v·p - L changes by
 
     dh/dt = Q·v - (∂R/∂v)·v + λ·(A v) - ∂L/∂t
 
-one term each for the force, the dissipation, the constraints and explicit time. Their works are integrated for
-themselves (`works.py`), and nothing of h goes into them, so that what is left of the balance, the closure, judges the
-motion, the multipliers and the forces together.
+one term each for the force, the dissipation, the constraints and explicit time. Their works are integrated separately
+(`works.py`), without using h, so that the remainder of the balance, the closure, tests the motion, the multipliers and
+the forces together.
 
 Source: Goldstein, *Classical Mechanics*, Eq. (2.53), (2.54) and §2.7.
 """
@@ -25,28 +25,28 @@ from lagjax.motion.hybrid_trajectory import HybridTrajectory
 from lagjax.motion.trajectory import Trajectory
 from lagjax.motion.works import DISSIPATION, FORCE, TIME, Motion, Work, constraint_in_words
 
-# Quadrature may be wrong by so many tolerances of the largest energy.
+# Quadrature may be wrong by this many tolerances of the largest energy.
 QUADRATURE = 3.0
 # Terms that cancel to this, in units of the last place, are equal.
 ROUND_OFFS = 1e3
 
 
 class EnergyLedger(eqx.Module):
-    """The energy of a motion and what changed it; it prints itself as a table, and draws itself.
+    """The energy of a motion and what changed it; it prints itself as a table and can be plotted.
 
-    - `t` (T,): the outputs that were reached, and the end where it lies beyond them.
+    - `t` (T,): the outputs that were reached, and the end if it lies beyond them.
     - `jacobi_integral` (T,): h = v·p - L, `[L]`.
     - `kinetic`, `potential` (T,): T₂, the part of L of second degree in v, and V = -L at v = 0, with h = T₂ + V; None
-      where L has other terms than those up to second degree. In coordinates that move, V holds the centrifugal part,
+      if L has terms other than up to second degree. In coordinates that move, V contains the centrifugal part,
       and h is not the energy: on a hoop that turns at ω it is E - ω L_z.
-    - `works`: by source a `Work`: "force", "dissipation", "explicit time", as far as the system has them.
-    - `constraints`: by name a `Work`, of the force Aᵀ λ. In all coordinates together one that neither moves nor is
-      inhomogeneous in v does none.
-    - `impacts` (S,): by how much h jumped at each switch of a `lj.Hybrid`, at the times `impact_times`; `switches`:
-      from which phase to which; `impact_total` (T,): their sum until each output.
-    - `closure` (T,): the change of h less all works and jumps, `[L]`; `scale`: the largest energy on the motion, by
-      which it is judged; `allowed`: 100 tolerances.
-    - `quadrature`: the error of the works, relative to `scale`, as quadrature estimates it.
+    - `works`: a `Work` for each source: "force", "dissipation", "explicit time", as far as the system has them.
+    - `constraints`: by name a `Work`, of the force Aᵀ λ. Summed over all coordinates, the work of a constraint that
+      neither moves nor is inhomogeneous in v is zero.
+    - `impacts` (S,): the jump of h at each switch of a `lj.Hybrid`, at the times `impact_times`; `switches`: from
+      which phase to which; `impact_total` (T,): the sum of the jumps until each output.
+    - `closure` (T,): the change of h less all works and jumps, `[L]`; `scale`: the largest energy on the motion, to
+      which it is compared; `allowed`: 100 tolerances.
+    - `quadrature`: the estimated error of the works by quadrature, relative to `scale`.
     """
 
     t: np.ndarray
@@ -71,16 +71,16 @@ class EnergyLedger(eqx.Module):
 
     @property
     def closes(self) -> bool:
-        """Whether that is below what the tolerance lets expect."""
+        """Whether the relative closure is no larger than `allowed`."""
         return self.relative_closure <= self.allowed
 
     def sources(self) -> Iterator[tuple[str, Work]]:
-        """All sources of work, with their names in words."""
+        """Yield all sources of work, with their names in words."""
         yield from self.works.items()
         yield from ((constraint_in_words(name), work) for name, work in self.constraints.items())
 
     def plot(self):
-        """Draw the work of each source and the jumps, stacked, against time, beside the change of the Jacobi integral.
+        """Draw the work of each source and the jumps, stacked, against time, with the change of the Jacobi integral.
 
         **Returns:** a matplotlib `Figure`. **Raises:** `ImportError` without matplotlib.
         """
@@ -113,20 +113,20 @@ class EnergyLedger(eqx.Module):
             line("", heads),
             *(line(name, row) for (name, _), row in zip(rows, cells)),
             f"  {'closure':<{width}}  {self.relative_closure:.0e} of the largest energy, {self.scale:.6g}{verdict}",
-            *(f"  {said}" for said in self._odd()),
+            *(f"  {note}" for note in self._odd()),
         ])  # fmt: skip
 
     def _number(self, x):
-        """A number, or none where it is round-off."""
+        """Return a number in words; round-off as 0."""
         return f"{float(x):+.8g}" if abs(x) > ROUND_OFFS * np.finfo(self.t.dtype).eps * self.scale else "0"
 
     def _odd(self):
-        """What sources do that they hardly ever should."""
+        """Yield notes on sources that behave as they hardly ever should."""
         noise = self.allowed * self.scale
         forward = self.t[-1] > self.t[0]
         given = self.works[DISSIPATION].total[-1] if DISSIPATION in self.works else 0.0
         if forward and given > noise:
-            yield f"NOTE: the dissipation gave {given:.3g}, and it should only take. Is its sign right?"
+            yield f"NOTE: the dissipation gave {given:.3g}, but it should only take energy. Is its sign right?"
 
 
 def energy_ledger(trajectory: Trajectory, system: System | Hybrid | None = None) -> EnergyLedger:
@@ -142,22 +142,23 @@ def energy_ledger(trajectory: Trajectory, system: System | Hybrid | None = None)
 
     **Arguments:**
 
-    - `trajectory`: one motion, whose values are known.
+    - `trajectory`: one motion, outside of traced code.
     - `system`: the system whose forces are accounted for; by default that of the motion. With another one, the closure
-      says whether the motion is one of it.
+      says whether the motion is also one of that system.
 
     **Returns:** an `EnergyLedger`. Print it, or `.plot()` it.
 
-    **Raises:** `TypeError` for what is no trajectory, or is being traced; `ValueError` for a batch, for one that did
-    not get beyond its start, and where the motion cannot be run again.
+    **Raises:** `TypeError` for anything but a trajectory, and for one that is being traced; `ValueError` for a batch,
+    for one that did not get beyond its start, and if the motion cannot be run again.
 
-    The motion is run again, with 15 outputs in each interval: two to six times its own time, and a program of its own.
+    The motion is run again, with 15 outputs in each interval, in a program of its own, which takes two to six times the
+    time of the motion.
 
     Source: Goldstein, Eq. (2.54): dh/dt = -∂L/∂t, with the forces that L does not contain.
     """
     if not isinstance(trajectory, Trajectory) or coordinates.is_traced(trajectory):
         raise TypeError(
-            f"a ledger is made of a motion that was computed, not of {_kind(trajectory)}.\n"
+            f"a ledger needs a motion that was computed, not {_kind(trajectory)}.\n"
             "Fix: lj.energy_ledger(lj.integrate(...)), outside jax.jit and jax.vmap."
         )
     if np.ndim(trajectory.t) != 1:
@@ -168,7 +169,7 @@ def energy_ledger(trajectory: Trajectory, system: System | Hybrid | None = None)
     accounted = trajectory.system if system is None else system
     if isinstance(accounted, Hybrid) != isinstance(trajectory, HybridTrajectory):
         raise TypeError(
-            "a motion in phases is accounted for by a lj.Hybrid, and another one by a lj.System, not "
+            "a motion in phases is accounted for by a lj.Hybrid, any other one by a lj.System, not "
             f"{type(accounted).__name__}.\nFix: leave system out, or give one like traj.system."
         )
     return _ledger(Motion(trajectory, accounted))
@@ -181,15 +182,15 @@ def _ledger(motion: Motion) -> EnergyLedger:
     scale = max(float(np.max(size)), np.finfo(float).tiny)
     works, error = motion.works(QUADRATURE * max(rtol, np.finfo(h.dtype).eps) * scale)
     total = sum((work.total for work in works.values()), np.zeros(len(h)))
-    fallen = np.array([np.sum(jumps[: motion.switches_until(row)]) for row in range(len(h))])
+    jumped = np.array([np.sum(jumps[: motion.switches_until(row)]) for row in range(len(h))])
     split = bool(np.all(np.abs(h - kinetic - potential) <= ROUND_OFFS * np.finfo(h.dtype).eps * size))
     names = {name: constraint_in_words(name) for system in motion.systems for name in system.constraints}
     return EnergyLedger(
         t=motion.t, jacobi_integral=h, kinetic=kinetic if split else None, potential=potential if split else None,
         works={name: works[name] for name in (FORCE, DISSIPATION, TIME) if name in works},
         constraints={name: works[words] for name, words in names.items()},
-        impact_times=motion.switch_times, impacts=jumps, switches=motion.ways(), impact_total=fallen,
-        closure=h - h[0] - total - fallen, scale=scale, allowed=100 * rtol, quadrature=error / scale,
+        impact_times=motion.switch_times, impacts=jumps, switches=motion.ways(), impact_total=jumped,
+        closure=h - h[0] - total - jumped, scale=scale, allowed=100 * rtol, quadrature=error / scale,
     )  # fmt: skip
 
 

@@ -2,13 +2,13 @@
 
 A leg is a motion of its phase's system that ends where one of the phase's guards crosses zero from above, with the
 outputs that lie in it. Which leg comes next is known at run time, so that all phases are in one loop; in a batch each
-phase is solved for all lanes that are in it, and lanes that are not stand still. What is differentiated are the legs:
-the time and the state at a crossing carry their derivatives (`crossing_times.py`) into the start of the next one, which
-is the saltation matrix.
+phase is solved for all lanes that are in it, while the others stand still. The legs are what is differentiated: the
+time and the state at a crossing carry their derivatives (`crossing_times.py`) into the start of the next leg, which is
+the saltation matrix.
 
-A guard is taken to be above zero where its phase begins. One that is at zero there and goes down, however slowly, or
-is below zero, is crossed at once, in a leg of no length: two guards at one time, friction that does not hold where
-sliding stops.
+A guard is assumed to be above zero where its phase begins. If it is zero there and falls, however slowly, or is below
+zero, it is crossed at once, in a leg of no length: this handles two guards at one time, and friction that cannot hold a
+contact that has stopped sliding.
 
 Source: Hiskens & Pai, IEEE Trans. Circuits Syst. I 47 (2000) 204 (trajectory sensitivities through switches).
 """
@@ -40,11 +40,11 @@ from lagjax.motion.results import RESULTS
 from lagjax.motion.sight import uneven
 from lagjax.motion.trajectory import Snapshot
 
-# What a guard may be below zero where a motion starts, in tolerances of what it is made of.
+# How far below zero a guard may be where a motion starts, in tolerances of its terms.
 NOT_BELOW = 1e2
-# What a leg gives at its outputs.
+# The fields that a leg gives at its outputs.
 ROWS = "q", "v", "multipliers"
-# Times so near to each other, in units of what can be told apart, are one.
+# Times within this many resolutions of time are simultaneous.
 AT_ONCE = 4
 
 
@@ -53,7 +53,7 @@ class Phase(NamedTuple):
 
     `switches` (k,): their numbers in the hybrid; `targets` (k, 2): the next phase, and that of rest; `resets`:
     `reset(t, q, v, multipliers, params)` -> (q, v), and whether the motion comes to rest there; `events`: the names of
-    the guards after those of switches, which are recorded.
+    the recorded events, whose guards come after those of switches.
     """
 
     guards: Guards | None
@@ -73,17 +73,17 @@ class Rows(NamedTuple):
 
 
 class Way(NamedTuple):
-    """How far the legs have come: the state from which the next one starts, and what is known of all before.
+    """How far the legs have come: the state from which the next one starts, and the results of all before.
 
-    `going`: whether there is a next one. `events`: what was recorded. `seen`: how large coordinates and velocities have
-    been, (2, n); `least`: the sizes below which numbers were nothing.
+    `continues`: whether there is a next one. `events`: the recorded crossings. `sizes_so_far`: the largest coordinates
+    and velocities, (2, n); `least`: the sizes below which numbers counted as zero.
     """
 
     t: Float[Array, ""]
     q: PyTree[Float[Array, "..."]]
     v: PyTree[Float[Array, "..."]]
     phase: Int[Array, ""]
-    going: Bool[Array, ""]
+    continues: Bool[Array, ""]
     rows: Rows
     switches: Switches
     events: dict[str, Crossings]
@@ -97,21 +97,21 @@ class Way(NamedTuple):
 
 
 def solved_in_legs(hybrid: Hybrid, q0, v0, params, ts, phases, settings, adjoint):
-    """The fields of the trajectory, as `one_solve.solved` has them, with the phase of each output and the switches."""
+    """Return the fields of the trajectory, like `one_solve.solved`, with the phase of each output and the switches."""
     first = _first_leg(hybrid, q0, v0, params, ts, phases[0], settings)
 
-    def onward(way: Way) -> Way:
+    def next_legs(way: Way) -> Way:
         for i in range(len(hybrid.systems)):
-            mine = way.going & (way.phase == i)
-            leg = lambda way, i=i, mine=mine: _leg(hybrid, i, mine, way, params, ts, phases[i], settings, adjoint)
-            way = lax.cond(eqxi.unvmap_any(mine), leg, lambda way: way, way)
+            here = way.continues & (way.phase == i)
+            leg = lambda way, i=i, here=here: _leg(hybrid, i, here, way, params, ts, phases[i], settings, adjoint)
+            way = lax.cond(eqxi.unvmap_any(here), leg, lambda way: way, way)
         return way
 
     if isinstance(adjoint, diffrax.ForwardMode):
-        way = lax.while_loop(lambda way: way.going, onward, first)
+        way = lax.while_loop(lambda way: way.continues, next_legs, first)
     else:
-        # Each turn takes every lane one leg further, at least.
-        step = lambda way, _: (lax.cond(eqxi.unvmap_any(way.going), onward, lambda way: way, way), None)
+        # Each turn takes every lane at least one leg further.
+        step = lambda way, _: (lax.cond(eqxi.unvmap_any(way.continues), next_legs, lambda way: way, way), None)
         way, _ = lax.scan(step, first, None, length=hybrid.most_switches + 1)
     rows = way.rows
     return {
@@ -151,21 +151,21 @@ def _first_leg(hybrid, q0, v0, params, ts, phase, settings):
     zero, least = jnp.asarray(0), jnp.zeros((2, n), dtype) if settings.by_size else settings.atol
     stats = {name: zero for name in ("num_steps", "num_accepted_steps", "num_rejected_steps")}
     return Way(
-        t=ts[0], q=q0, v=v0, phase=jnp.asarray(hybrid.first, jnp.int32), going=jnp.asarray(True), rows=rows,
+        t=ts[0], q=q0, v=v0, phase=jnp.asarray(hybrid.first, jnp.int32), continues=jnp.asarray(True), rows=rows,
         switches=switches, events=nothing(phase.guards, phase.events, q0, v0, start.multipliers), end=start,
         stats=stats, sizes_so_far=_sizes(q0, v0), least=least, scaled_error=jnp.zeros((), dtype),
         settled=jnp.asarray(True), result=RESULTS.successful,
     )  # fmt: skip
 
 
-def _leg(hybrid, i, mine, way: Way, params, ts, phase: Phase, settings, adjoint) -> Way:
-    """The way with one more leg, in the phase i, of those lanes that are in it."""
+def _leg(hybrid, i, in_phase, way: Way, params, ts, phase: Phase, settings, adjoint) -> Way:
+    """Return the way after one more leg in phase i, for the lanes in `in_phase`."""
     system = hybrid.systems[i]
-    # Outputs that are past would cost a step each: those ahead come first, filled up by the last. Who is elsewhere
-    # stands still.
+    # Past outputs would cost a step each: those ahead come first, padded with the last. Lanes in other phases stand
+    # still.
     place, past = jnp.arange(ts.shape[0]), jnp.sum(ts <= way.t)
     ahead = jnp.where(place == 0, way.t, ts[jnp.minimum(place + past - 1, ts.shape[0] - 1)])
-    times = jnp.where(mine, ahead, way.t)
+    times = jnp.where(in_phase, ahead, way.t)
     settings = settings if system.constraints else replace(settings, drift="none")
     found = apart(solved, system, way.q, way.v, params, times, phase.guards, settings, adjoint, way.sizes_so_far)
     result, end, onward = found["result"], found["end"], jnp.asarray(False)
@@ -173,8 +173,8 @@ def _leg(hybrid, i, mine, way: Way, params, ts, phase: Phase, settings, adjoint)
     if phase.guards is not None and phase.switches:
         crossings = [found["events"][kind.name] for kind in phase.guards.kinds]
         when = jnp.stack([jnp.where(jnp.isfinite(x.t[0]), x.t[0], jnp.inf) for x in crossings])
-        uncertain = mine & jnp.any(jnp.stack([x.uncertain for x in crossings[: len(phase.switches)]]))
-        ending = apart(_ending, phase, result, end, when, mine, way, params, resolution(ts), settings.rtol)
+        uncertain = in_phase & jnp.any(jnp.stack([x.uncertain for x in crossings[: len(phase.switches)]]))
+        ending = apart(_ending, phase, result, end, when, in_phase, way, params, resolution(ts), settings.rtol)
         result, end, onward = ending.result, ending.end, ending.onward
         after, target, switches = apart(_switched, system, ending, params, phase, way)
         switches = eqx.tree_at(lambda s: s.uncertain, switches, switches.uncertain | uncertain)
@@ -187,8 +187,8 @@ def _leg(hybrid, i, mine, way: Way, params, ts, phase: Phase, settings, adjoint)
     least = way.least if not settings.by_size else jnp.maximum(way.least, stopped(found["tolerance"][1]))
     further = Way(
         t=jnp.where(onward, end.t, way.t), q=_where(onward, after.q, way.q), v=_where(onward, after.v, way.v),
-        phase=jnp.where(onward, target, way.phase), going=onward & (end.t < ts[-1]),
-        rows=_filled(way.rows, mine & known, rows, i), switches=switches,
+        phase=jnp.where(onward, target, way.phase), continues=onward & (end.t < ts[-1]),
+        rows=_filled(way.rows, in_phase & known, rows, i), switches=switches,
         events=with_those_of(found["events"], way.events),
         end=_where(onward, end._replace(q=after.q, v=after.v), end),
         stats={name: n + found["stats"][name] for name, n in way.stats.items()},
@@ -196,11 +196,11 @@ def _leg(hybrid, i, mine, way: Way, params, ts, phase: Phase, settings, adjoint)
         scaled_error=jnp.maximum(way.scaled_error, found["scaled_error"]),
         settled=way.settled & found["settled"], result=result,
     )  # fmt: skip
-    return _where(mine, further, way)
+    return _where(in_phase, further, way)
 
 
 class Ending(NamedTuple):
-    """How a leg ends: whether another one follows, and by which of the phase's switches; where; and the result."""
+    """How a leg ends: `onward`: whether another one follows; `first`: by which of the phase's switches; the result."""
 
     onward: Bool[Array, ""]
     first: Int[Array, ""]
@@ -208,36 +208,36 @@ class Ending(NamedTuple):
     result: Any
 
 
-def _ending(phase: Phase, result, end: Snapshot, when, mine, way: Way, params, resolution, rtol) -> Ending:
-    """What ends a leg; `when`: the times at which its guards cross, infinite of those that do not."""
+def _ending(phase: Phase, result, end: Snapshot, when, in_phase, way: Way, params, resolution, rtol) -> Ending:
+    """Find out what ends a leg; `when`: the times at which its guards cross, infinite for those that do not."""
     assert phase.guards is not None
     count, at_one_time, at_start = len(phase.switches), AT_ONCE * resolution, way.switches.count == 0
     # An event that ends the motion at the time of a switch comes first.
     ending = jnp.where(phase.guards.terminal, when, jnp.inf)[count:]
     when = when[:count]
     by_event = jnp.any(ending <= jnp.min(when) + at_one_time)
-    switched = mine & (result == RESULTS.event_occurred) & ~by_event
+    switched = in_phase & (result == RESULTS.event_occurred) & ~by_event
     at_once = switched & (end.t - way.t <= at_one_time)
-    # What happens at once happens where the leg begins, and its time moves as that does.
+    # A switch at once happens where the leg begins, so that its time has the derivatives of that.
     t, q, v = _where(at_once, (way.t, way.q, way.v), (end.t, end.q, end.v))
     end = Snapshot(t, q, v, end.multipliers)
     is_below = _is_below(end, params, phase.guards, count, rtol)
     refused, full = at_once & at_start & is_below, way.switches.count >= way.switches.t.shape[0]
     onward = switched & ~refused & ~full
     failed = RESULTS.where(refused, RESULTS.guard_below_zero, RESULTS.too_many_switches)
-    unseen = (result == RESULTS.successful) & is_below
-    result = RESULTS.where(unseen, RESULTS.guard_not_seen, RESULTS.where(switched, failed, result))
+    missed = (result == RESULTS.successful) & is_below
+    result = RESULTS.where(missed, RESULTS.guard_not_seen, RESULTS.where(switched, failed, result))
     result = RESULTS.where(onward, RESULTS.successful, result)
     first = jnp.argmax(when <= jnp.min(when) + at_one_time)
     return Ending(onward, first, end, result)
 
 
 def _is_below(end: Snapshot, params, guards: Guards, count: int, rtol):
-    """Whether one of the first guards is below zero, by more than errors make it."""
+    """Whether one of the first `count` guards is below zero by more than errors can cause."""
     state = stopped(tuple(end))
     value = lambda *state: jnp.stack(guards(*state, stopped(params))[:count])
-    g, off = jax.jvp(value, state, uneven(state))
-    return jnp.any(g < -NOT_BELOW * rtol[0] * jnp.abs(off))
+    g, terms = jax.jvp(value, state, uneven(state))
+    return jnp.any(g < -NOT_BELOW * rtol[0] * jnp.abs(terms))
 
 
 def _reached(q):
@@ -245,7 +245,7 @@ def _reached(q):
 
 
 def _filled(rows: Rows, known, found, i) -> Rows:
-    """The outputs with those of a leg in the phase i where they are `known`."""
+    """Return the outputs, with those of a leg in phase i where they are `known`."""
     put = lambda all, new: jax.tree.map(lambda x, y: jnp.where(_like(known, x), y.astype(x.dtype), x), all, new)
     multipliers = {name: put(x, found["multipliers"].get(name, x)) for name, x in rows.multipliers.items()}
     return Rows(put(rows.q, found["q"]), put(rows.v, found["v"]), multipliers, jnp.where(known, i, rows.phase))
@@ -260,7 +260,7 @@ class After(NamedTuple):
 
 
 def _switched(system, ending: Ending, params, phase: Phase, way: Way):
-    """The state after the switch that comes first of a phase's, and the record with it."""
+    """Return the state after the phase's first switch, the next phase, and the record with that switch."""
     onward, first, end, _ = ending
     states = [After(*reset(end.t, end.q, end.v, end.multipliers, params)) for reset in phase.resets]
     after = jax.tree.map(lambda *x: _one_of(first, x), *states)

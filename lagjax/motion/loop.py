@@ -1,4 +1,4 @@
-"""diffrax's loop: how a motion is stepped through, with outputs at given times and guards followed on the way."""
+"""Stepping through a motion by diffrax's loop, with outputs at given times and with guards followed on the way."""
 
 import importlib.util
 from dataclasses import replace
@@ -32,16 +32,16 @@ from lagjax.numerics.radau import Radau5
 from lagjax.numerics.runge_kutta import ExplicitRungeKutta
 from lagjax.numerics.simplified_newton import SimplifiedNewton, with_tolerances
 
-# The packages whose checks are known to pass: `solve` looks at what they are about.
-LOOKED_AT = {"lagjax", "diffrax", "optimistix"}
+# Packages whose checks at run time are known to pass, since `solve` examines their subjects itself.
+CHECKED_PACKAGES = {"lagjax", "diffrax", "optimistix"}
 # Baumgarte's feedback decays a violation by e this many times over the time span.
 BAUMGARTE_DECAYS = 50.0
 
 
 class Solution(NamedTuple):
-    """What the loop came to: times that it reached (infinite elsewhere), states there, its last time and state, (1,).
+    """The result of the loop: times that it reached (infinite elsewhere), states there, its last time and state, (1,).
 
-    `located`: where guards are zero; None without guards. `record`: of the steps, where they can be replayed.
+    `located`: where guards are zero; None without guards. `record`: that of the steps, if they can be replayed.
     """
 
     reached: Float[Array, " T"]
@@ -56,44 +56,44 @@ class Solution(NamedTuple):
 def solution_of(
     equations: Equations, start: State, y0, refused, scales: Scales | None, ts, guards, settings, adjoint
 ) -> Solution:
-    """Step through a motion by diffrax; where `refused`, end within a few steps. Without `scales` by `atol`."""
+    """Step through a motion by diffrax; if `refused`, end within a few steps. Without `scales` by `atol` alone."""
     problem = (equations, start, y0, refused, scales)
     if guards is None or isinstance(adjoint, diffrax.ForwardMode):
         return _loop(*problem, settings, ts, adjoint, guards)
-    # In reverse mode diffrax differentiates outputs alone: once the crossings' times are known, they are outputs.
-    found = _loop(*stopped((*problem, settings, ts)), diffrax.ForwardMode(), stopped(guards))
-    end = jnp.minimum(found.end[0][0], first_end(guards, found.located.t))
-    times = jnp.concatenate([ts, found.located.t])
+    # In reverse mode diffrax differentiates only outputs: crossings, once their times are known, become outputs.
+    first = _loop(*stopped((*problem, settings, ts)), diffrax.ForwardMode(), stopped(guards))
+    end = jnp.minimum(first.end[0][0], first_end(guards, first.located.t))
+    times = jnp.concatenate([ts, first.located.t])
     times = jnp.minimum(jnp.where(jnp.isfinite(times), times, end), end)
     order = jnp.argsort(times)
     without = eqx.tree_at(lambda s: s.event, settings, None, is_leaf=lambda x: x is None)
-    again = _loop(*problem, without, times[order], adjoint, repeated=True)
+    second = _loop(*problem, without, times[order], adjoint, repeated=True)
     place, bent = jnp.argsort(order), not isinstance(adjoint, Replay) or adjoint.bent
     of_outputs, of_crossings = (
-        jax.tree.map(lambda x: x[place[part]], again.outputs) for part in (slice(ts.size), slice(ts.size, None))
+        jax.tree.map(lambda x: x[place[part]], second.outputs) for part in (slice(ts.size), slice(ts.size, None))
     )
-    return found._replace(
-        reached=jnp.where(jnp.isfinite(again.reached[place[: ts.size]]), found.reached, jnp.inf),
+    return first._replace(
+        reached=jnp.where(jnp.isfinite(second.reached[place[: ts.size]]), first.reached, jnp.inf),
         outputs=of_outputs,
-        end=again.end,
-        located=at_known_times(guards, equations, resolution(ts), found.located, of_crossings, bent),
+        end=second.end,
+        located=at_known_times(guards, equations, resolution(ts), first.located, of_crossings, bent),
     )
 
 
-def _followed(adjoint, settings):
-    """The adjoint; of a motion that is not stepped from output to output diffrax's own for a replay of its steps."""
-    can = _arriving(settings) and not settings.progress
-    return diffrax.RecursiveCheckpointAdjoint() if isinstance(adjoint, Replay) and not can else adjoint
+def _possible_adjoint(adjoint, settings):
+    """Return the adjoint; diffrax's own instead of a `Replay` if a motion is not stepped from output to output."""
+    replayable = _arriving(settings) and not settings.progress
+    return diffrax.RecursiveCheckpointAdjoint() if isinstance(adjoint, Replay) and not replayable else adjoint
 
 
 def _loop(equations, start, y0, refused, scales, settings, ts, adjoint, guards=None, repeated=False):
-    adjoint = _followed(adjoint, settings)
+    adjoint = _possible_adjoint(adjoint, settings)
     feedback = BAUMGARTE_DECAYS / (ts[-1] - ts[0]) if settings.drift == "baumgarte" else None
     fast, written = None, equations.written
     if written is not None and feedback is None:
         unrolled = written.equations.length <= settings.unroll_up_to
         fast = settings.method if unrolled else _in_a_loop(settings.method, adjoint)
-    # BacksolveAdjoint integrates a larger state backwards: it takes the bare method, and no end beside the outputs.
+    # BacksolveAdjoint integrates a larger state backwards: it takes the bare method, and outputs but no separate end.
     bare = isinstance(adjoint, diffrax.BacksolveAdjoint)
     settings = eqx.tree_at(lambda s: s.method, settings, _with_root_finder(settings, scales))
     controller = _controller(equations, start, ts, settings, scales, bare, repeated)
@@ -110,7 +110,7 @@ def _loop(equations, start, y0, refused, scales, settings, ts, adjoint, guards=N
         terms, solver, ts[0], ts[-1], settings.dt0, y0, start.params, saveat, controller, _by_position(settings.event),
     )  # fmt: skip
     solve = partial(_diffeqsolve, max_steps=settings.max_steps, adjoint=adjoint, progress=settings.progress)
-    own = lambda: _own_calls_of_the_host(equations, terms, start, guards, settings, controller)
+    calls_python = lambda: _user_calls_python(equations, terms, start, guards, settings, controller)
     if isinstance(adjoint, Replay):
         assert isinstance(controller, Arriving)
         first, after = (jnp.searchsorted(ts, ts, side=side) for side in ("left", "right"))
@@ -118,10 +118,10 @@ def _loop(equations, start, y0, refused, scales, settings, ts, adjoint, guards=N
             terms, solver, controller, ts, first, after, ts[0], ts[-1], settings.dt0, y0, start.params
         )  # fmt: skip
         problem = with_room(problem, settings.memory)
-        return _replayed(replayed(problem, settings.max_steps, not own(), adjoint), ts)
-    # Reverse mode has to look inside.
+        return _replayed(replayed(problem, settings.max_steps, not calls_python(), adjoint), ts)
+    # Reverse mode needs the operations inside, so the solve is then not wrapped.
     if isinstance(adjoint, diffrax.ForwardMode):
-        reached, outputs, *rest = one_function(solve, *arguments, checked=not own(), in_blocks=True)
+        reached, outputs, *rest = one_function(solve, *arguments, checked=not calls_python(), in_blocks=True)
     else:
         reached, outputs, *rest = solve(*arguments)
     assert reached is not None and outputs is not None
@@ -148,13 +148,13 @@ def _diffeqsolve(terms, solver, t0, t1, dt0, y0, args, saveat, controller, event
     return solution.ts, solution.ys, solution.stats, solution.result, located
 
 
-def _own_calls_of_the_host(equations, terms, start, guards, settings, controller):
+def _user_calls_python(equations, terms, start, guards, settings, controller):
     """Whether the user's functions, method or controller may call Python at run time, if only to check something.
 
-    What is left then are diffrax's checks. They are about the times and the first step, which `solve` looks at.
+    If not, only diffrax's checks are left. They concern the times and the first step, which `solve` examines itself.
     """
     parts = (settings.method, settings.controller)
-    if any(part is not None and type(part).__module__.split(".")[0] not in LOOKED_AT for part in parts):
+    if any(part is not None and type(part).__module__.split(".")[0] not in CHECKED_PACKAGES for part in parts):
         return True
     (t, q, v, params), written = start, equations.written
     if written is None:
@@ -175,7 +175,7 @@ def _own_calls_of_the_host(equations, terms, start, guards, settings, controller
 
 
 def method_alone(settings, method):
-    """A method as a motion is stepped with it, on equations that are not written out."""
+    """Return a method as it steps a motion on equations that are not written out."""
     return _in_a_loop(_with_root_finder(replace(settings, method=method), None), diffrax.ForwardMode())
 
 
@@ -205,7 +205,7 @@ def _solver(equations, fast, feedback, refused, settings, adjoint):
 
 
 def _in_a_loop(method, adjoint):
-    """The method with a loop over its stages, of the kind that the derivative needs."""
+    """Return the method with a loop over its stages, of the kind that the derivative needs."""
     if isinstance(method, Nystrom) or isinstance(method, ExplicitRungeKutta) and isinstance(adjoint, Replay):
         return replace(method, in_a_loop=True)
     # A subclass may have a tableau of its own, which diffrax's implementation does not know.
@@ -217,7 +217,7 @@ def _in_a_loop(method, adjoint):
 
 
 def _arriving(settings):
-    # A controller of the user's chooses its steps itself; a condition that asks diffrax may ask it for the tolerances.
+    # A user's controller chooses its steps itself; a condition for diffrax may read the controller's tolerances.
     return settings.controller is None and settings.event is None
 
 
@@ -243,12 +243,12 @@ def _controller(equations, start, ts, settings, scales, bare, repeated):
 
 
 def resolution(ts):
-    """How near to each other two times can be told apart."""
+    """Return the smallest difference of two times that can be told apart."""
     return 4 * jnp.finfo(ts.dtype).eps * jnp.maximum(jnp.abs(ts[0]), jnp.abs(ts[-1]))
 
 
 def _by_position(event):
-    """The user's event, whose conditions get by position what diffrax passes by name: there it may be `params`."""
+    """Return the user's event with `args` by position: diffrax passes it by name, but a user may call it `params`."""
     if event is None:
         return None
     wrap = lambda condition: lambda t, y, args, **kwargs: condition(t, y, args, **kwargs)

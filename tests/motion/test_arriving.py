@@ -1,4 +1,4 @@
-"""Outputs at the ends of steps: exact there, and costing only the steps that they shorten."""
+"""Outputs are ends of steps: they are exact, and cost only the steps that they shorten."""
 
 import diffrax
 import jax.numpy as jnp
@@ -17,7 +17,7 @@ def run(ts, **options):
 
 @pytest.mark.slow
 def test_outputs_are_those_of_one_solve():
-    """Twelve uneven outputs, one just after another, agree with another method's; the first is the start."""
+    """Twelve uneven outputs, two of them close together, agree with another method's; the first is the start."""
     ts = np.concatenate([[0.0, 1e-9], np.sort(np.random.default_rng(1).uniform(0.0, 8.0, 9)), [8.0]])
     found, exact = run(ts), run(ts, method=lj.Tsit5(), max_steps=2**22)
     np.testing.assert_allclose(found.q, exact.q, atol=3e-9)
@@ -26,7 +26,7 @@ def test_outputs_are_those_of_one_solve():
 
 @pytest.mark.slow
 def test_outputs_shorten_few_steps():
-    """Each output adds one step at most, and a few of them none but their own."""
+    """Each output adds at most one step, whether there are few or many of them."""
     steps = lambda count: int(run(np.linspace(0.0, 8.0, count)).stats["num_steps"])
     alone, few, many = steps(2), steps(6), steps(101)
     assert few <= alone + 5
@@ -34,7 +34,7 @@ def test_outputs_shorten_few_steps():
 
 
 def test_the_size_proposed_before_is_kept():
-    """After a step shortened to an output the next one is as long as had been proposed."""
+    """After a step shortened to an output, the next one is as long as was proposed before."""
     controller = Arriving(
         diffrax.PIDController(rtol=1e-6, atol=1e-6), jnp.array([0.0, 1.0, 1.001, 5.0]), jnp.array(WHOLE_STEPS)
     )

@@ -1,4 +1,4 @@
-"""Times that decrease: against SciPy, against the way there, through events, derivatives and lanes."""
+"""Decreasing times: compared with SciPy and with the forward motion, through events, derivatives and batches."""
 
 import diffrax
 import jax
@@ -15,7 +15,7 @@ TIGHT = {"rtol": 1e-11, "atol": 1e-11}
 
 
 def sledge_lagrangian(t, q, v, params):
-    """A sledge on a slope, pushed along x in the rhythm of t."""
+    """A sledge on a slope, pushed along x periodically in t."""
     kinetic = 0.5 * params["m"] * (v["x"] ** 2 + v["y"] ** 2) + 0.5 * v["angle"] ** 2
     return kinetic + (params["m"] * params["g"] + params["push"] * jnp.sin(3.0 * t)) * q["x"]
 
@@ -40,7 +40,7 @@ SLEDGE = {"m": 1.5, "g": 2.0, "push": 0.75, "c": 0.5}
 
 
 def test_a_driven_and_damped_pendulum():
-    """Backward in time damping drives: states agree with SciPy's, and forward again the motion returns."""
+    """Backward in time damping adds energy: states agree with SciPy's, and a forward run returns to the start."""
     solve_ivp = pytest.importorskip("scipy.integrate").solve_ivp
     system = lj.System(
         lambda t, q, v, params: 0.5 * v**2 + params["k"] * jnp.cos(q) + jnp.sin(2.0 * t) * q,
@@ -87,7 +87,7 @@ def test_against_scipy():
 
 @pytest.mark.slow
 def test_each_part_is_reflected():
-    """The reflected system has the accelerations and multipliers of the system; each sign that is left out, others."""
+    """The reflected system has the system's accelerations and multipliers; with any one sign left out it has not."""
     state = {"x": 0.1, "y": 0.2, "angle": 0.7}, {"x": 0.9 * np.cos(0.7), "y": 0.9 * np.sin(0.7), "angle": 0.6}
     negative = jax.tree.map(lambda x: -x, state[1])
     right = lj.accelerations(sledge, 1.3, *state, SLEDGE)
@@ -117,7 +117,7 @@ def test_each_part_is_reflected():
     ids=str,
 )
 def test_there_and_back(options):
-    """A rod pendulum forward, and from its end backward to where it began, with its multipliers."""
+    """A rod pendulum runs forward, and from its end backward to its start, with the same multipliers."""
     there = lj.integrate(rod_pendulum, *HORIZONTAL, PARAMS, ts=DOWN[::-1], rtol=1e-9, atol=1e-9, **options)
     back = lj.integrate(rod_pendulum, there.end.q, there.end.v, PARAMS, ts=DOWN, rtol=1e-9, atol=1e-9, **options)
     motions = ((traj.q, traj.v, traj.multipliers) for traj in (there, back))
@@ -128,7 +128,7 @@ def test_there_and_back(options):
 
 @pytest.mark.exhaustive
 def test_fixed_steps_backward():
-    """A controller of the user's is turned around with the times: 200 steps of 0.01."""
+    """A user's controller is reversed together with the times: 200 steps of 0.01."""
     traj = lj.integrate(pendulum, 0.5, 1.0, PARAMS, ts=DOWN, dt0=0.01, stepsize_controller=diffrax.ConstantStepSize())
     assert int(traj.stats["num_steps"]) == 200
     np.testing.assert_allclose(traj.q, lj.integrate(pendulum, 0.5, 1.0, PARAMS, ts=DOWN).q, atol=1e-8)
@@ -165,7 +165,7 @@ def test_derivatives_and_lanes_backward():
     for derivative in (jax.grad, jax.jacfwd, lambda f: jax.jit(jax.grad(f)), lambda f: jax.jacfwd(jax.jacfwd(f))):
         found, expected = derivative(first)(x), derivative(exact)(x)
         jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-8), found, expected)
-    # By the times themselves, and many starts at once.
+    # With respect to the times themselves, and for a batch of starts.
     by_time = jax.grad(first)(x | {"t": 2.0})["t"]
     np.testing.assert_allclose(by_time, jax.grad(exact)(x | {"t": 2.0})["t"], atol=1e-9)
     lanes = jax.vmap(lambda q: first(x | {"q": q}))(jnp.linspace(0.0, 1.0, 5))
@@ -173,7 +173,7 @@ def test_derivatives_and_lanes_backward():
 
 
 def test_a_direction_that_is_not_known():
-    """Times that decrease, made while JAX is tracing, are refused and told how to pass."""
+    """Decreasing times that are only known at run time are refused; the message says how to pass them."""
     run = jax.jit(lambda end: lj.integrate(pendulum, 0.5, 1.0, PARAMS, ts=jnp.stack([2.0, end]), throw=False).result)
     assert run(0.0) == lj.RESULTS.unordered and "NumPy array" in lj.RESULTS[run(0.0)]
     assert run(2.5) == lj.RESULTS.successful
@@ -181,7 +181,7 @@ def test_a_direction_that_is_not_known():
 
 @pytest.mark.exhaustive
 def test_times_closed_over_inside_jit():
-    """Arrays of JAX's that a traced function closes over are looked at beforehand, in both directions."""
+    """The direction of JAX arrays that a traced function closes over is known while tracing."""
     for ts in (jnp.asarray(DOWN), jnp.asarray(DOWN[::-1])):
         run = lambda q: lj.integrate(pendulum, q, 1.0, PARAMS, ts=ts).q
         np.testing.assert_allclose(jax.jit(run)(0.5), run(0.5), atol=1e-9)
@@ -189,7 +189,7 @@ def test_times_closed_over_inside_jit():
 
 @pytest.mark.slow
 def test_a_backward_motion_is_drawn():
-    """Interpolated between outputs as forward: the film of a motion is that of its way back, reversed."""
+    """The film of a backward motion is the film of the forward motion, reversed."""
     positions = lambda t, q, params: (jnp.sin(q), -jnp.cos(q))
     back = lj.integrate(pendulum, 0.5, 1.0, PARAMS, ts=np.linspace(2.0, 0.0, 201))
     there = lj.integrate(pendulum, back.q[-1], back.v[-1], PARAMS, ts=np.linspace(0.0, 2.0, 201))

@@ -1,4 +1,4 @@
-"""Bad input gets an error in the user's words: what happened, the usual cause, the fix."""
+"""Bad input raises an error in the user's terms: what happened, the usual cause, the fix."""
 
 import diffrax
 import jax
@@ -19,13 +19,13 @@ def refusal(kind, *parts):
 
 
 def test_wrong_structure():
-    """v without one of q's coordinates."""
+    """v lacks one of q's coordinates."""
     with refusal(ValueError, "structure of q", "theta"):
         lj.integrate(sphere, {"psi": 1.0, "theta": 0.0}, {"psi": 0.0}, ts=TS)
 
 
 def test_wrong_shape():
-    """v of another shape than q, by name."""
+    """v has another shape than q: the message names the coordinate."""
     with refusal(ValueError, "'y'", r"\(2,\)"):
         lj.integrate(rod_pendulum, {"x": 1.0, "y": np.zeros(2)}, {"x": 0.0, "y": 0.0}, PARAMS, ts=TS)
 
@@ -37,14 +37,14 @@ def test_lagrangian_not_scalar():
 
 
 def test_force_of_another_structure():
-    """A force that does not look like q."""
+    """A force with another structure than q."""
     system = lj.System(lambda t, q, v, params: 0.5 * v**2, force=lambda t, q, v, params: jnp.zeros(3))
     with refusal(ValueError, "like q"):
         lj.integrate(system, 0.0, 1.0, ts=TS)
 
 
 def test_no_numbers_in_the_start():
-    """A condition, text, a function: by name, with what may have been meant."""
+    """A condition, text or a function as a coordinate is named, with what may have been meant."""
     for start, words in ((True, "'psi' of q is bool"), ("1.0", "'1.0'"), (lambda: 1.0, "a function"), ({1.0}, "{1.0}")):
         with refusal(TypeError, words, "Usual cause"):
             lj.integrate(sphere, {"psi": start, "theta": 0.0}, {"psi": 0.0, "theta": 1.0}, ts=TS)
@@ -54,33 +54,33 @@ def test_no_numbers_in_the_start():
 
 
 def test_float32_out_of_reach():
-    """A tolerance below float32's round-off, with the switch to float64."""
+    """A tolerance below float32's round-off is refused, with the switch to float64 as the fix."""
     with refusal(ValueError, "rtol = 1e-09", "float32", "jax_enable_x64"):
         lj.integrate(pendulum, np.float32(1.0), np.float32(0.0), PARAMS, ts=TS, rtol=1e-9)
 
 
 def test_tolerance_out_of_reach_in_float64():
-    """Even float64 has an end."""
+    """A tolerance below float64's round-off is refused, too."""
     with refusal(ValueError, "rtol = 1e-17", "float64"):
         lj.integrate(pendulum, 1.0, 0.0, PARAMS, ts=TS, rtol=1e-17)
 
 
 def test_nan_from_the_lagrangian():
-    """L is NaN at the start, though its derivatives are finite: log of a negative number."""
+    """L is NaN at the start, although its derivatives are finite: the log of a negative number."""
     system = lj.System(lambda t, q, v, params: 0.5 * v**2 + jnp.log(q))
     with refusal(ValueError, "L is nan", "q = -1"):
         lj.integrate(system, -1.0, 1.0, ts=TS)
 
 
 def test_nan_in_a_derivative():
-    """L is finite and its derivative is not: sqrt at zero, by coordinate."""
+    """L is finite but its derivative is not: sqrt at zero; the message names the coordinate."""
     system = lj.System(lambda t, q, v, params: 0.5 * (v["a"] ** 2 + v["b"] ** 2) - jnp.sqrt(q["b"]))
     with refusal(ValueError, "coordinate 'b'", "sqrt"):
         lj.integrate(system, {"a": 1.0, "b": 0.0}, {"a": 0.0, "b": 0.0}, ts=TS)
 
 
 def test_nan_in_the_start():
-    """A NaN coordinate, by name."""
+    """A NaN coordinate is named."""
     with refusal(ValueError, "'theta' of v0 is nan"):
         lj.integrate(sphere, {"psi": 1.0, "theta": 0.0}, {"psi": 0.0, "theta": np.nan}, ts=TS)
 
@@ -104,7 +104,7 @@ def test_missing_velocity():
 
 @pytest.mark.slow
 def test_constraint_without_a_derivative():
-    """A constraint that is a square has no derivative where it holds: named, and not taken for a redundant one."""
+    """A squared constraint has no derivative where it holds: it is named, and does not count as redundant."""
     rod = rod_pendulum.constraints["rod"]
     assert isinstance(rod, lj.Holonomic)
     squared = lj.Holonomic(lambda t, q, params: rod.g(t, q, params) ** 2)
@@ -117,7 +117,7 @@ def test_constraint_without_a_derivative():
 
 
 def test_start_off_the_constraint():
-    """An inconsistent start: positions and velocities, with the remedy."""
+    """An inconsistent start is refused, with the residuals of positions and velocities and with the remedy."""
     q0, v0 = {"x": 1.3, "y": 0.1}, {"x": 0.2, "y": -1.0}
     with refusal(ValueError, "off the constraints", "'rod' = 0.138", "d/dt 'rod'", "consistent_state"):
         lj.integrate(rod_pendulum, q0, v0, PARAMS, ts=TS)
@@ -125,7 +125,7 @@ def test_start_off_the_constraint():
 
 @pytest.mark.slow
 def test_the_remedy_for_a_start_off_the_constraint():
-    """What the message advises cures it; twin: without it the same start is refused, above."""
+    """The advised remedy works; twin: without it the same start is refused, above."""
     q0, v0 = {"x": 1.3, "y": 0.1}, {"x": 0.2, "y": -1.0}
     traj = lj.integrate(rod_pendulum, *lj.consistent_state(rod_pendulum, 0.0, q0, v0, PARAMS), PARAMS, ts=TS)
     assert float(traj.residual()) < 1e-14
@@ -133,7 +133,7 @@ def test_the_remedy_for_a_start_off_the_constraint():
 
 @pytest.mark.slow
 def test_a_constraint_may_have_any_name():
-    """A name with a bracket in it is not taken for an index."""
+    """A constraint's name that contains a bracket is not mistaken for an index."""
     system = lj.System(rod_pendulum.lagrangian, {"rod[left]": rod_pendulum.constraints["rod"]})
     with refusal(ValueError, r"d/dt 'rod\[left\]' = 1"):
         lj.integrate(system, {"x": 1.25, "y": 0.0}, {"x": 0.4, "y": 0.0}, PARAMS, ts=TS)
@@ -163,7 +163,7 @@ def test_unreachable_constraint():
     ],
 )
 def test_times(ts, words):
-    """ts that goes to and fro, or is no vector."""
+    """`ts` that is not monotonic, or is not a vector."""
     with refusal(ValueError, words):
         lj.integrate(pendulum, 1.0, 0.0, PARAMS, ts=ts)
 
@@ -180,7 +180,7 @@ OPTIONS = {
 
 @pytest.mark.parametrize("name", OPTIONS)
 def test_options_of_another_kind(name):
-    """Text for a number, a float for a count, a class for an instance: by the option's name, before anything runs."""
+    """Text for a number, a float for a count, a class for an instance: the option is named before anything runs."""
     given, kind, words = OPTIONS[name]
     with refusal(kind, name, words):
         lj.integrate(pendulum, 1.0, 0.0, PARAMS, ts=TS, **{name: given})
@@ -188,7 +188,7 @@ def test_options_of_another_kind(name):
 
 @pytest.mark.parametrize("name", ("dt0", "max_step"))
 def test_lengths_of_steps(name):
-    """dt0 and max_step that are not positive; while tracing, in the result."""
+    """`dt0` and `max_step` that are not positive are refused; while tracing, in the result."""
     with refusal(ValueError, f"{name} must be one positive number, not -0.1", "where ts decreases"):
         lj.integrate(pendulum, 1.0, 0.0, PARAMS, ts=TS, **{name: -0.1})
     run = jax.jit(lambda x: lj.integrate(pendulum, 1.0, 0.0, PARAMS, ts=TS, throw=False, **{name: x}).result)
@@ -196,14 +196,14 @@ def test_lengths_of_steps(name):
 
 
 def test_times_of_jumps():
-    """jump_ts that is no vector of finite times."""
+    """`jump_ts` that is not a vector of finite times."""
     for jump_ts, words in ((np.ones((2, 2)), "vector of times"), ([0.5, np.nan], "NaN or infinity"), (["a"], "vector")):
         with refusal(ValueError, "jump_ts", words):
             lj.integrate(pendulum, 1.0, 0.0, PARAMS, ts=TS, jump_ts=jump_ts)
 
 
 def test_limits_on_steps_that_another_controller_chooses():
-    """max_step and jump_ts beside a controller, with what the controller itself takes."""
+    """`max_step` and `jump_ts` together with a controller: the message says what the controller takes instead."""
     given = {"stepsize_controller": diffrax.PIDController(rtol=1e-6, atol=1e-6)}
     with refusal(ValueError, "max_step", "dtmax"):
         lj.integrate(pendulum, 1.0, 0.0, PARAMS, ts=TS, **given, max_step=0.1)
@@ -226,33 +226,33 @@ def test_solver_for_split_fields():
 
 
 def test_adjoint_that_leaves_the_constraints():
-    """BacksolveAdjoint on a constrained system would be silently wrong."""
+    """BacksolveAdjoint is refused for a constrained system, where it would be silently wrong."""
     with refusal(ValueError, "BacksolveAdjoint"):
         lj.integrate(rod_pendulum, *HORIZONTAL, PARAMS, ts=TS, adjoint=diffrax.BacksolveAdjoint())
 
 
 @pytest.mark.slow
 def test_max_steps():
-    """Where it stopped, after how many steps, how many are missing, and what to do."""
+    """The message says where the motion stopped, after how many steps, how many are missing, and what to do."""
     with refusal(RuntimeError, "stopped at t = 0", "max_steps = 4", r"needs \d more", r"max_steps=\d+, or"):
         lj.integrate(pendulum, 1.0, 0.0, PARAMS, ts=TS, max_steps=4)
 
 
 def test_singularity_on_the_way():
-    """A fall into the centre ends with the state where it happened, not with max_steps."""
+    """A fall into the centre is reported with the state where it happened, not as `max_steps`."""
     kepler = lj.System(lambda t, q, v, params: 0.5 * v**2 + 1 / q)
     with refusal(RuntimeError, "stopped at t = 1.1107", "(singularity|not finite|L is)"):
         lj.integrate(kepler, 1.0, 0.0, ts=np.array([0.0, 2.0]))
 
 
 def test_not_a_system():
-    """The Lagrangian itself in place of the system."""
+    """The Lagrangian itself is passed instead of the system."""
     with refusal(TypeError, "lj.System"):
         lj.integrate(pendulum.lagrangian, 1.0, 0.0, PARAMS, ts=TS)
 
 
 def test_called_lagrangian_and_bare_constraint():
-    """System refuses a value for a function and a constraint without its kind."""
+    """`System` refuses a value instead of a function, and a constraint without a kind."""
     with refusal(TypeError, "lagrangian must be a function"):
         lj.System(3.0)
     with refusal(TypeError, "'rod'", "lj.Holonomic"):
@@ -266,7 +266,7 @@ def test_called_lagrangian_and_bare_constraint():
 
 
 def test_unknown_drift():
-    """A misspelt option."""
+    """A misspelt option is refused."""
     with pytest.raises(ValueError, match="drift"):
         lj.integrate(rod_pendulum, *HORIZONTAL, PARAMS, ts=TS, drift="projct")
 

@@ -1,4 +1,4 @@
-"""What a call costs beside its motion: nothing is traced twice, and nothing robust compiled before it is needed."""
+"""The overhead of a call: nothing is traced twice, and the robust solve is compiled only if it is needed."""
 
 import subprocess
 import sys
@@ -23,14 +23,14 @@ drop = lj.System(lambda t, q, v, p: 0.5 * p["m"] * v**2 - p["m"] * GRAVITY * q)
 
 
 def traces(call):
-    """What a call returns, and how often it had JAX trace something."""
+    """Return the result of a call, and how often JAX traced something in it."""
     before = len(traced)
     found = call()
     return found, len(traced) - before
 
 
 def test_a_second_call_traces_nothing():
-    """Whatever the numbers are made of; but where a global has changed, all is traced anew."""
+    """Numbers of any type trace nothing new; but after a global has changed, everything is traced again."""
     fall = lambda q0, m, ts: lj.integrate(drop, q0, 0.0, {"m": m}, ts=ts).q[-1]
     assert fall(1.0, 2.0, [0.0, 0.5, 1.0]) == pytest.approx(1.0 - 9.81 / 2, abs=1e-8)
     for q0, m, ts in (
@@ -46,14 +46,14 @@ def test_a_second_call_traces_nothing():
 
 
 def falling(g, shift=0.0):
-    """A system of functions made anew each time, with what they close over in a list, too."""
+    """Return a system of newly made functions, which also close over a list."""
     kept = [g]
     return lj.System(lambda t, q, v, p: 0.5 * p["m"] * v**2 - p["m"] * kept[0] * (q - shift)), kept
 
 
 @pytest.mark.slow
 def test_the_same_program_serves():
-    """Whole numbers after floats, other numbers of outputs, functions that mean the same; not those that do not."""
+    """One program serves whole numbers, any number of outputs, and functions that mean the same, but no others."""
     at = np.linspace(0.0, 1.0, 100)
     fall = lambda system, m=2.0, ts=at, **kw: np.asarray(lj.integrate(system, 1.0, 0.0, {"m": m}, ts=ts, **kw).q)
     (first, kept), (again, kept_too) = falling(9.81), falling(9.81)
@@ -67,7 +67,7 @@ def test_the_same_program_serves():
         np.testing.assert_array_equal(fall(again), expected)
         np.testing.assert_array_equal(fall(again, events=floor()), with_event)
     assert not count and not np.isfinite(with_event[-1])
-    # Twins: another constant, another level, and one that has changed since, are others.
+    # Twins: another constant, another level, or a constant that has since changed, give another motion.
     assert fall(falling(1.62)[0])[-1] == pytest.approx(1.0 - 1.62 / 2)
     ended = lj.integrate(again, 1.0, 0.0, {"m": 2.0}, ts=at, events=floor(0.5)).end
     assert float(ended.t) == pytest.approx(np.sqrt(1 / 9.81))
@@ -79,7 +79,7 @@ def test_the_same_program_serves():
 
 
 def test_a_whole_number_that_counts_stays_whole():
-    """Where a float is no index; the same number elsewhere is still taken for the float that was there before."""
+    """A whole number used as an index stays whole; elsewhere it is treated as the float that was passed before."""
     table = jnp.array([1.0, 4.0, 9.0])
     spring = lj.System(lambda t, q, v, p: 0.5 * v**2 - 0.5 * p["k"] * table[p["which"]] * q**2)
     swing = lambda k, which: float(lj.integrate(spring, 1.0, 0.0, {"k": k, "which": which}, ts=TS).q[-1])
@@ -91,7 +91,7 @@ def test_a_whole_number_that_counts_stays_whole():
 
 
 def test_another_function_is_looked_at():
-    """Shapes that were found in order once are not those of another start."""
+    """That shapes were once found correct says nothing about another start."""
     lj.integrate(pendulum, 0.5, 0.0, PARAMS, ts=TS)
     with pytest.raises(ValueError, match="energies left unsummed"):
         lj.integrate(pendulum, np.array([0.5, 0.5]), np.zeros(2), PARAMS, ts=TS)
@@ -99,7 +99,7 @@ def test_another_function_is_looked_at():
 
 @pytest.mark.slow
 def test_equations_are_taken_for_regular_first():
-    """A rod is; a rod that is there twice is not, and the same motion is found the robust way."""
+    """A rod is regular; a rod given twice is not, and the robust solve finds the same motion."""
     once = lj.integrate(rod_pendulum, *HORIZONTAL, PARAMS, ts=TS)
     irregular = lambda: sum(getattr(program, "regular", True) is None for program in kept._programs.values())
     before = irregular()
@@ -110,7 +110,7 @@ def test_equations_are_taken_for_regular_first():
     np.testing.assert_allclose(both.multipliers["rod"], 0.5 * once.multipliers["rod"], atol=1e-7)
 
 
-# In a process of its own: in another one maps come and go for other reasons.
+# In a process of its own, since memory maps come and go for other reasons, too.
 MANY = """
 import gc, sys
 import jax
@@ -124,7 +124,7 @@ used = []
 for i in [*range(6), 0]:
     system = lj.System(lambda t, q, v, p, g=1.0 + i: 0.5 * p["m"] * v**2 - p["m"] * g * q)
     last = lj.integrate(system, 1.0, 0.0, {"m": 2.0}, ts=np.linspace(0.0, 1.0, 8)).q[-1]
-    # What was dropped is compiled again.
+    # A dropped program is compiled again.
     assert abs(float(last) - (1.0 - (1.0 + i) / 2)) < 1e-8
     gc.collect()
     used.append(share_used() * int(LIMIT.read_text()))
@@ -134,14 +134,14 @@ print(used[5] - used[2])
 
 @pytest.mark.exhaustive
 def test_programs_of_many_systems_are_dropped():
-    """Memory maps stay as they are; the twin, which keeps all, takes more for each."""
+    """The number of memory maps stays constant; the twin, which keeps all programs, needs more for each."""
     grown = lambda kept: float(subprocess.check_output([sys.executable, "-c", MANY, kept], text=True))
     assert grown("2") < 40 and grown("100") > 60
 
 
 @pytest.mark.slow
 def test_regular_and_robust_agree():
-    """On what is regular, to round-off; the twin's robust way is that of a program that JAX traces."""
+    """On regular equations both solves agree to round-off; a program that JAX traces uses the robust one."""
     at_once = lj.integrate(rod_pendulum, *HORIZONTAL, PARAMS, ts=TS, rtol=1e-12)
     traced = jax.jit(lambda p: lj.integrate(rod_pendulum, *HORIZONTAL, p, ts=TS, rtol=1e-12))(PARAMS)
     for one, other in zip(jax.tree.leaves((at_once.q, at_once.v, at_once.multipliers)),
@@ -150,7 +150,7 @@ def test_regular_and_robust_agree():
 
 
 def test_where_nothing_is_traced():
-    """Not inside any of JAX's transformations, also where a function does not see it in its arguments."""
+    """`is_eager` is false inside all of JAX's transformations, even if no argument is traced."""
     seen = []
     look = lambda x: (seen.append(is_eager()), x)[1]
     look(1.0)
@@ -164,7 +164,7 @@ def test_where_nothing_is_traced():
 
 @pytest.mark.slow
 def test_lanes_of_what_functions_close_over():
-    """Numbers that L and a guard close over, batched without `jit`: each lane has its own. Twin: its neighbour's."""
+    """Batched numbers that L and a guard close over, without `jit`: each lane uses its own. Twin: its neighbour's."""
 
     def falls(g, level):
         stone = lj.System(lambda t, q, v, p: 0.5 * v**2 - g * q)

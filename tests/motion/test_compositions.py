@@ -1,7 +1,7 @@
-"""JAX's transformations around a motion, in combination: each gives what pushing tangents forward gives.
+"""Combinations of JAX's transformations around a motion: each agrees with pushing tangents forward.
 
-Thirty-three numbers of a small network in L are more than are pushed forward where reverse mode asks for it, so that
-these are the derivatives that learned Lagrangians have. Each combination is reduced to one number along directions
+The small network in L has thirty-three numbers, too many to be pushed forward in reverse mode, so that these are the
+derivatives that learned Lagrangians have. Each combination is reduced to one number along directions
 u and w, which stay the same: a slope g·u, or a curvature u·H·w, which two pushes give.
 """
 
@@ -37,18 +37,18 @@ floor = lj.Crossing(lambda t, q, v, p: q, direction=-1)
 
 
 def of_free(p):
-    """All outputs of one coordinate have a part in it."""
+    """All outputs of one coordinate contribute."""
     return jnp.sum(lj.integrate(free, 0.5, 0.0, p, ts=TS, rtol=1e-10).q ** 2)
 
 
 def of_held(p):
-    """Also the multipliers."""
+    """The multipliers contribute, too."""
     traj = lj.integrate(held, {"x": 1.0, "y": 0.0}, {"x": 0.0, "y": 0.5}, p, ts=TS, rtol=1e-10)
     return jnp.sum(traj.q["x"] ** 2) + jnp.sum(traj.multipliers["rod"])
 
 
 def of_stiff(p):
-    """By an implicit method."""
+    """An implicit method."""
     return jnp.sum(lj.integrate(stiff, 0.5, 0.0, p, ts=TS, rtol=1e-9, method=lj.Radau5()).q ** 2)
 
 
@@ -59,7 +59,7 @@ def of_event(p):
 
 
 MOTIONS = {"free": of_free, "held": of_held, "stiff": of_stiff, "event": of_event}
-# Each twice: at p, and at 1.1 p.
+# Two lanes each: at p, and at 1.1 p.
 LANES = np.array([1.0, 1.1])
 SLOPES = {
     "grad": lambda f: jax.grad(f)(P) @ U,
@@ -108,7 +108,7 @@ SLOW = {
 
 
 def pushed(function, composition):
-    """The same number by pushing tangents forward."""
+    """Return the same number by pushing tangents forward."""
     at = lambda s: lambda p: jax.jvp(function, (s * p,), (s * U,))[1]
     points = LANES if composition in OF_LANES or composition in OF_LANES_TWICE else [1.0]
     if composition in SLOPES or composition in OF_LANES:
@@ -117,7 +117,7 @@ def pushed(function, composition):
 
 
 def cases():
-    """Every motion with every composition, in the tier that its time allows."""
+    """Yield every motion with every composition, in the tier that its duration allows."""
     for motion in MOTIONS:
         for composition in ALL:
             case = motion, composition
@@ -134,7 +134,7 @@ def test_compositions(motion, composition):
 
 @pytest.mark.slow
 def test_third_derivatives_are_refused():
-    """In one sentence; twin: two derivatives are not, above."""
+    """A third derivative is refused with a clear message; twin: second derivatives work, above."""
     twice = lambda p: jax.jvp(jax.grad(of_free), (p,), (W,))[1] @ U
     with pytest.raises(NotImplementedError, match="(?s)a third derivative.*Fix: jax.jvp of jax.jvp"):
         jax.jvp(twice, (P,), (U,))
@@ -142,7 +142,7 @@ def test_third_derivatives_are_refused():
 
 @pytest.mark.slow
 def test_a_second_derivative_is_of_one_run(monkeypatch):
-    """Compiled again a motion may take other steps, as here by force; twin: tangents of another run than the values."""
+    """Values and tangents are of one run, even if each compilation takes other steps, as here. Twin: of two runs."""
     first, traced = recording._first, []
 
     def other_each_time(problem):

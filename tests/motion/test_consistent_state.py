@@ -1,4 +1,4 @@
-"""The nearest consistent state: nearest, with coordinates held, differentiable, and honest where there is none."""
+"""The nearest consistent state: it is the nearest, can hold coordinates, is differentiable, and fails openly."""
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +13,7 @@ MASSES = np.array([2.0, 0.5])
 
 
 def lagrangian(t, q, v, params):
-    """A particle whose inertia differs along its two axes: its metric is not Euclid's."""
+    """A particle whose inertia differs along its two axes: its metric is not Euclidean."""
     return 0.5 * (params["m"][0] * v["x"] ** 2 + params["m"][1] * v["y"] ** 2)
 
 
@@ -28,7 +28,7 @@ FAR = (0.5, {"x": 3.0, "y": 2.0}, {"x": 1.0, "y": -2.0})
 
 
 def nearest_by_angle(t, q, v, params):
-    """The same point from the ellipse's angle, by Newton on d(distance²)/d(angle) = 0, and its velocity by hand."""
+    """The same point by Newton on d(distance²)/d(angle) = 0 for the ellipse's angle, and its velocity by hand."""
     a = params["a"] + t
     point = lambda angle: jnp.stack([a * jnp.cos(angle), jnp.sin(angle)])
     given = jnp.stack([q["x"], q["y"]])
@@ -45,7 +45,7 @@ def nearest_by_angle(t, q, v, params):
 
 
 def flat(state):
-    """(q, v) as one vector."""
+    """Return (q, v) as one vector."""
     q, v = state
     return jnp.stack([q["x"], q["y"], v["x"], v["y"]])
 
@@ -65,7 +65,7 @@ def test_nearest_in_the_metric_of_the_masses():
 @pytest.mark.slow
 @pytest.mark.parametrize("mode", exhaustive_but((jax.jacrev,), (jax.jacfwd, jax.jacrev)))
 def test_derivatives_by_everything(mode):
-    """Its derivatives by time, state and parameters are those of the one-angle solution, also from far off."""
+    """Derivatives by time, state and parameters are those of the one-angle solution, even from far off."""
     ours = lambda t, q, v, params: flat(lj.consistent_state(on_ellipse, t, q, v, params))
     got = mode(ours, argnums=(0, 1, 2, 3))(*FAR, PARAMS)
     expected = jax.jacfwd(nearest_by_angle, argnums=(0, 1, 2, 3))(*FAR, PARAMS)
@@ -110,7 +110,7 @@ def test_random_starts_reach_the_manifold_in_lanes():
     np.testing.assert_allclose(residual, 0.0, atol=1e-13)
     masses = {"crank": 1.0, "rod": 3.0, "slider": 2.0}
     pull = {name: masses[name] * (q[name] - guesses[name]) for name in masses}
-    # Stationary: no pull along the one free direction (1, rod', slider') of the mechanism.
+    # Stationary: no pull along the only free direction (1, rod', slider') of the mechanism.
     rod_rate = -jnp.cos(q["crank"]) / (2.5 * jnp.cos(q["rod"]))
     slider_rate = -jnp.sin(q["crank"]) - 2.5 * jnp.sin(q["rod"]) * rod_rate
     along = pull["crank"] + rod_rate * pull["rod"] + slider_rate * pull["slider"]
@@ -119,7 +119,7 @@ def test_random_starts_reach_the_manifold_in_lanes():
 
 @pytest.mark.slow
 def test_unreachable_is_an_error_with_the_residual_by_name():
-    """A coordinate held where the constraint cannot be met, a contradiction, and a wrong name: each says so."""
+    """A held coordinate that violates a constraint, contradictory constraints, and a wrong name are each reported."""
     state = {"x": 3.0, "y": 0.5}, {"x": 0.0, "y": 0.0}
     with pytest.raises(ValueError, match=r"(?s)'x' held.*'ellipse' = [\d.]+.*Fix:"):
         lj.consistent_state(on_ellipse, 0.0, *state, PARAMS, hold="x")
@@ -144,7 +144,7 @@ def test_redundant_constraints_are_no_obstacle():
 @pytest.mark.slow
 @pytest.mark.parametrize("factors", exhaustive_but(((1,),), ((1,), (1, 2))), ids=["once", "twice"])
 def test_one_coordinate(factors):
-    """More equations than coordinates: the place and the velocity of what holds it."""
+    """One coordinate with one or two equations gets the position and velocity that these prescribe."""
     holds = lambda factor: lj.Holonomic(lambda t, q, params: factor * (q - jnp.sin(t)))
     held = lj.System(lambda t, q, v, params: 0.5 * v**2, {str(factor): holds(factor) for factor in factors})
     q, v = lj.consistent_state(held, 0.5, 2.0, 0.3, None)
@@ -153,7 +153,7 @@ def test_one_coordinate(factors):
 
 @pytest.mark.exhaustive
 def test_a_held_coordinate_that_a_constraint_fixes():
-    """Where the value held is the one that is asked for, the constraint is one dependent equation more."""
+    """A held value that satisfies a constraint makes it a dependent equation; one that violates it is reported."""
     particle = lambda t, q, v, params: 0.5 * (v["x"] ** 2 + v["y"] ** 2 + v["z"] ** 2)
     wall = lj.Holonomic(lambda t, q, params: q["x"] - jnp.sin(t))
     sphere = lj.Holonomic(lambda t, q, params: q["x"] ** 2 + q["y"] ** 2 + q["z"] ** 2 - 1.0)
@@ -162,14 +162,14 @@ def test_a_held_coordinate_that_a_constraint_fixes():
     on_it = {"x": 0.0, "y": 1.5, "z": 0.25}
     q, v = lj.consistent_state(alone, 0.0, on_it, moving, None, hold="x")
     assert (q, v) == (on_it, moving)
-    # With the wall held or found, the nearest point of the sphere is the same.
+    # Whether x is held or found, the nearest point of the sphere is the same.
     found, held = (lj.consistent_state(both, 0.0, on_it, moving, None, hold=hold) for hold in ((), "x"))
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-12), held, found)
     length = np.hypot(1.5, 0.25)
     np.testing.assert_allclose([held[0]["y"], held[0]["z"]], [1.5 / length, 0.25 / length], atol=1e-12)
-    with pytest.raises(ValueError, match="with 'x' held: at the best one constraint 'wall' = 0.3"):
+    with pytest.raises(ValueError, match="with 'x' held: at the best state reached, constraint 'wall' = 0.3"):
         lj.consistent_state(alone, 0.0, on_it | {"x": 0.3}, moving, None, hold="x")
-    with pytest.raises(ValueError, match="with 'x' held: at the best one constraint d/dt 'wall' = -0.75"):
+    with pytest.raises(ValueError, match="with 'x' held: at the best state reached, constraint d/dt 'wall' = -0.75"):
         lj.consistent_state(both, 0.0, on_it, moving | {"x": 0.25}, None, hold="x")
     slope = jax.jacfwd(lambda y: lj.consistent_state(both, 0.0, on_it | {"y": y}, moving, None, hold="x")[0]["z"])(1.5)
     np.testing.assert_allclose(slope, -1.5 * 0.25 / length**3, atol=1e-9)

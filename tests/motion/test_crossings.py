@@ -17,7 +17,7 @@ G = 10.0
 ball = lj.System(lambda t, q, v, p: 0.5 * v**2 - G * q)
 HIT = diffrax.Event(lambda t, y, p, **kwargs: y[0], direction=False)
 oscillator = lj.System(lambda t, q, v, p: 0.5 * v**2 - 0.5 * q**2)
-# One program for most of what follows: all that differs is a number.
+# Most tests below share one program and differ only in numbers.
 EVENTS = {
     "level": lj.Crossing(lambda t, q, v, p: q - p["level"], terminal=False, most=6),
     "stop": lj.Crossing(lambda t, q, v, p: v - p["stop"], direction=-1),
@@ -27,21 +27,21 @@ doubt = pytest.warns(lj.EventWarning, match="may be missing")
 
 
 def swing(q0, v0, level, ts, stop=2.0, rtol=1e-9, **options):
-    """The oscillator of period 2π, its crossings of a level recorded; it stops where v falls below `stop`."""
+    """The oscillator of period 2π with recorded crossings of a level; it stops where v falls below `stop`."""
     params = {"level": level, "stop": stop}
     return lj.integrate(oscillator, q0, v0, params, ts=ts, events=EVENTS, rtol=rtol, atol=rtol, **options)
 
 
 def times(traj, name="level"):
-    """The times of what was found."""
+    """Return the times of the crossings that were found."""
     return traj.events[name].found().t
 
 
-# The plainest uses.
+# Basic use.
 
 
 def test_a_ball_bounces_fifty_times():
-    """The floor is met within the first step, and after each bounce down to heights of 1e-12: none is missed."""
+    """The floor is hit within the first step, and after each bounce down to heights of 1e-12: no hit is missed."""
     end = lj.integrate(ball, 0.0, 0.05, ts=jnp.array([0.0, 10.0]), event=HIT).end
     assert float(end.t) == pytest.approx(0.01, abs=1e-15)
     assert float(end.q) == pytest.approx(0.0, abs=1e-17)
@@ -64,17 +64,17 @@ def test_the_first_of_two_crossings_in_a_step_ends_the_motion():
     assert traj.events["event"].found().t.shape == (1,)
 
 
-# Where crossings lie.
+# The positions of crossings.
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("rtol", [1e-4, 1e-9, 1e-12])
 def test_levels_just_below_the_extremum(rtol):
-    """Two crossings in one step, from 0.3 to 1e-8 below the top; their times to what the motion's error lets expect."""
+    """Two crossings in one step, 0.3 to 1e-8 below the top, are found as precisely as the motion's error allows."""
     for below in 10.0 ** -np.arange(0.5, 8.5, 0.5):
         first = np.arcsin(1 - below)
         with warnings.catch_warnings():
-            # Above the top or below it: nearer than the tolerance that is not known.
+            # Closer than the tolerance it is unknown whether the level is above or below the top.
             warnings.simplefilter("default" if below > 100 * rtol else "ignore", lj.EventWarning)
             traj = swing(0.0, 1.0, 1 - below, [0.0, 3.0, 6.0], rtol=rtol)
         if below > 100 * rtol:
@@ -85,7 +85,7 @@ def test_levels_just_below_the_extremum(rtol):
 
 
 def test_a_start_on_the_guard_does_not_fire():
-    """Nor a hair to either side, nor at a top; the motion that comes back through it does."""
+    """A start within round-off of the guard, or at a top, is no crossing; coming back through the guard is one."""
     for hair in (0.0, 1e-16, -1e-16, 1e-15, -1e-15):
         traj = swing(0.5 * (1 + hair), np.sqrt(0.75), 0.5, [0.0, 3.0, 6.5])
         np.testing.assert_allclose(times(traj), [2 * np.pi / 3, 2 * np.pi], atol=1e-8)
@@ -93,13 +93,13 @@ def test_a_start_on_the_guard_does_not_fire():
         assert len(times(swing(1.0 + hair, 0.0, 1.0, [0.0, 3.0, 6.0]))) == 0
     with doubt:
         swing(1.0, 0.0, 1.0, [0.0, 3.0, 7.0])
-    # Twin: a start that is off by more is before the guard.
+    # Twin: a start that is off by more lies before the guard and crosses it.
     assert len(times(swing(0.5 * (1 - 1e-9), np.sqrt(0.75), 0.5, [0.0, 3.0, 6.5]))) == 3
 
 
 @pytest.mark.slow
 def test_a_guard_that_is_left_without_speed(monkeypatch):
-    """From zero as t³: left in the steps of the motion itself. Twin: without that rule by halves from the start."""
+    """A guard that leaves zero as t³ costs no extra steps. Twin: without the rule for it, bisection does."""
 
     def steps(guard):
         events = {"cubic": lj.Crossing(guard, direction=-1, terminal=False)}
@@ -109,12 +109,12 @@ def test_a_guard_that_is_left_without_speed(monkeypatch):
 
     assert steps(lambda t, q, v, p: q**3) < 20
     monkeypatch.setattr(pieces, "FLAT", -1.0)
-    # Another guard: the program of the first would serve an equal one.
+    # Another guard, since an equal one would reuse the first program.
     assert steps(lambda t, q, v, p: 2.0 * q**3) > 40
 
 
 def test_a_section_by_going_on_where_it_ended():
-    """Each turn ends once: ten tops are ten periods apart."""
+    """Each turn ends exactly once: ten tops are one period apart."""
     t, q, v = 0.0, 0.0, 1.0
     for turn in range(10):
         end = swing(q, v, 3.0, [t, t + 5.0, t + 10.0], stop=0.0).end
@@ -123,7 +123,7 @@ def test_a_section_by_going_on_where_it_ended():
 
 
 def test_recorded_until_a_terminal_one():
-    """Those in the step that ends the motion are known up to there, with the states; the outputs too."""
+    """In the step that ends the motion, crossings and outputs are recorded up to the end, with their states."""
     for end in (1.0, 1.5, 2.5, 3.1):
         traj = swing(0.0, 1.0, 0.9, [0.0, 1.2, 10.0], stop=np.cos(end))
         before = [t for t in (np.arcsin(0.9), np.pi - np.arcsin(0.9)) if t < end]
@@ -137,8 +137,8 @@ def test_recorded_until_a_terminal_one():
 
 
 def test_more_than_are_kept():
-    """The count goes on, the first are kept, and it is said."""
-    with pytest.warns(lj.EventWarning, match="happened 8 times, and the first 6 are kept"):
+    """All crossings are counted, the first ones are kept, and a warning says so."""
+    with pytest.warns(lj.EventWarning, match="happened 8 times, but only the first 6 are kept"):
         found = swing(0.0, 1.0, 0.3, [0.0, 10.0, 25.0]).events["level"]
     assert int(found.count) == 8 and found.t.shape == (6,)
     assert "8, of which the first 6" in repr(found)
@@ -147,7 +147,7 @@ def test_more_than_are_kept():
 
 
 def test_what_is_printed():
-    """How many, and when."""
+    """The number of crossings and their times are printed."""
     traj = swing(0.0, 1.0, 0.9, [0.0, 3.0, 6.0])
     assert repr(traj.events["level"]) == "Crossings: 2, at t = 1.11976951, 2.02182314"
     assert repr(traj.events["stop"]) == "Crossings: 0"
@@ -170,20 +170,20 @@ REFUSED = {
 
 @pytest.mark.parametrize("events, error, words", REFUSED.values(), ids=REFUSED)
 def test_refused_in_words(events, error, words):
-    """What is no event, and guards that cannot be called, before anything is compiled."""
+    """Anything but an event, and guards that cannot be called, are refused before anything is compiled."""
     with pytest.raises(error, match=words) as raised:
         lj.integrate(oscillator, 0.0, 1.0, {"level": 0.5}, ts=[0.0, 1.0], events=events)
     assert "Fix:" in str(raised.value) or isinstance(raised.value, KeyError)
 
 
 def test_one_name_for_two():
-    """An event called as that of diffrax is called here."""
+    """An event must not have the name that the diffrax.Event gets."""
     with pytest.raises(ValueError, match="two events have the name 'event'"):
         lj.integrate(ball, 0.0, 1.0, ts=[0.0, 1.0], events={"event": EVENTS["level"]}, event=HIT)
 
 
 def test_refused_crossings():
-    """Directions, numbers and guards that are none."""
+    """Wrong directions, numbers and guards are refused."""
     guard = lambda t, q, v, p: q
     for direction in (2, "up", True, 0.5):
         with pytest.raises(ValueError, match="direction"):
@@ -198,11 +198,11 @@ def test_refused_crossings():
             lj.integrate(oscillator, 0.0, 1.0, ts=[0.0, 1.0], event=event)
 
 
-# Slow: a program each.
+# Slow tests: each compiles a program.
 
 
 def at_ends_of_steps(begin, inner, off, end, h, touches, pieces=sight.pieces_of):
-    """The twin: nothing is known or in doubt between the ends of steps."""
+    """Return the pieces of a twin that looks only at the ends of steps."""
     found = pieces(begin, inner, off, end, h, touches)
     no = jnp.asarray(False)
     return found._replace(sign=[0.0 * h] * (len(found.sign) - 1) + found.sign[-1:], doubt=[no] * len(found.doubt))
@@ -210,19 +210,19 @@ def at_ends_of_steps(begin, inner, off, end, h, touches, pieces=sight.pieces_of)
 
 @pytest.mark.slow
 def test_twin_ends_of_steps(monkeypatch):
-    """Looking at the ends of steps alone misses both of two crossings in a step."""
+    """Looking only at the ends of steps misses two crossings in one step."""
     run = lambda guard: lj.integrate(
         oscillator, 0.0, 1.0, ts=[0.0, 6.0], events={"level": lj.Crossing(guard, terminal=False)}
     )
     assert len(times(run(lambda t, q, v, p: q - 0.99))) == 2
     monkeypatch.setattr(sight, "pieces_of", at_ends_of_steps)
-    # Another guard: the program of the first would serve an equal one.
+    # Another guard, since an equal one would reuse the first program.
     assert len(times(run(lambda t, q, v, p: q - 0.991))) == 0
 
 
 @pytest.mark.slow
 def test_lanes():
-    """Lanes with two crossings, with none, from a start on the guard, refused, and ended: each as if it were alone."""
+    """Lanes with two crossings, with none, started on the guard, refused, and ended give the same as single runs."""
     q0, v0 = jnp.array([0.0, 0.0, 0.5, jnp.nan, 0.0]), jnp.array([1.0, 0.1, 0.75**0.5, 1.0, 1.0])
     levels, stops = jnp.array([0.999999, 0.9, 0.5, 0.9, 0.5]), jnp.array([2.0, 2.0, 2.0, 2.0, 0.0])
     one = lambda *start: swing(*start[:3], jnp.array([0.0, 3.0, 6.0]), start[3], throw=False)
@@ -240,7 +240,7 @@ def test_lanes():
 
 @pytest.mark.slow
 def test_pendulum_by_its_elliptic_integral():
-    """A Poincaré section by going on where it ended, and one recorded; bottoms are half a period apart."""
+    """A Poincaré section by restarting at each end, and a recorded one; bottoms are half a period apart."""
     special = pytest.importorskip("scipy.special")
     half = 2 * special.ellipk(np.sin(0.75) ** 2) * np.sqrt(PARAMS["l"] / PARAMS["g"])
     bottom = {"bottom": lj.Crossing(lambda t, q, v, p: q)}
@@ -283,7 +283,7 @@ def test_multipliers_in_a_guard():
 
 @pytest.mark.slow
 def test_derivatives():
-    """Times and states at recorded and terminal crossings: forward and reverse, by all that they depend on."""
+    """Times and states at recorded and terminal crossings, forward and reverse, with respect to all their inputs."""
 
     def crossed(x, which=slice(2)):
         level = lambda t, q, v, p: q - x["level"]
@@ -321,7 +321,7 @@ def test_derivatives():
 
 @pytest.mark.exhaustive
 def test_derivative_by_many_numbers():
-    """Reverse mode through a recorded crossing, where the guard and L read forty numbers."""
+    """Reverse mode through a recorded crossing, with a guard and L that read forty numbers."""
     weights = jnp.linspace(0.5, 1.5, 40) / 40
     system = lj.System(lambda t, q, v, p: 0.5 * v**2 - 0.5 * jnp.sum(p) * q**2)
     events = {"level": lj.Crossing(lambda t, q, v, p: q - 0.5 * jnp.sum(p), terminal=False)}
@@ -332,21 +332,21 @@ def test_derivative_by_many_numbers():
     # At Σp = 1: t = (π - arcsin(w · w²/2)) / w with w² = Σp.
     by_sum = lambda s: (jnp.pi - jnp.arcsin(0.5 * s**1.5)) / jnp.sqrt(s)
     np.testing.assert_allclose(second(weights), by_sum(jnp.sum(weights)), rtol=1e-8)
-    # Its state there comes by other steps than its time, and is on the level to the tolerance.
+    # The state there is computed by other steps than the time, and is on the level only to the tolerance.
     for dt0 in (None, 0.05, 0.3):
         np.testing.assert_allclose(jax.grad(second)(weights, dt0), np.full(40, jax.grad(by_sum)(1.0)), rtol=1e-6)
 
 
 @pytest.mark.slow
 def test_what_jumps():
-    """A sign and a condition that is true or false cross where they jump, to the resolution of time."""
+    """A sign and a boolean condition cross where they jump, to the resolution of time."""
     events = {
         "early": lj.Crossing(lambda t, q, v, p: t > p, terminal=False),
         "sign": lj.Crossing(lambda t, q, v, p: jnp.sign(q - 0.9), terminal=False),
         "true": lj.Crossing(lambda t, q, v, p: q > 0.9, direction=-1, terminal=False),
     }
     with warnings.catch_warnings():
-        # Several in one step are found, and said to be doubtful.
+        # Several crossings in one step are found, with a warning that some may be missing.
         warnings.simplefilter("ignore", lj.EventWarning)
         traj = lj.integrate(oscillator, 0.0, 1.0, 0.123, ts=[0.0, 6.0], events=events)
     np.testing.assert_allclose(times(traj, "early"), [0.123], atol=1e-14)
@@ -369,7 +369,7 @@ SAID = {
 @pytest.mark.slow
 @pytest.mark.parametrize("name", exhaustive_but(("a touch", "by the state"), SAID))
 def test_found_or_said(name):
-    """What cannot be resolved is said, or it is found after all."""
+    """Crossings that cannot be resolved are either found after all, or a warning is given."""
     exact = {"far above": 3e3 * 6 // np.pi}.get(name)
     with warnings.catch_warnings(record=True) as raised:
         warnings.simplefilter("always")
@@ -398,7 +398,7 @@ OPTIONS = {
 @pytest.mark.slow
 @pytest.mark.parametrize("name", exhaustive_but(("Radau5",), OPTIONS))
 def test_methods_and_controllers(name):
-    """Two crossings near the top, and then the one that ends the motion, with any of them."""
+    """Any method or controller finds two crossings near the top, and then the one that ends the motion."""
     traj = swing(0.0, 1.0, 0.9999, [0.0, 1.2, 12.0], np.cos(2.5), rtol=1e-8, **OPTIONS[name])
     top = np.arcsin(0.9999)
     np.testing.assert_allclose(times(traj), [top, np.pi - top], atol=2e-5)
@@ -420,7 +420,7 @@ def test_constrained_whatever_keeps_it_there(drift):
 
 @pytest.mark.exhaustive
 def test_float32():
-    """In float32, to its own tolerance."""
+    """In float32 crossings are found to its own tolerance."""
     single = np.float32
     params = {"level": single(0.9), "stop": single(-0.9)}
     traj = lj.integrate(oscillator, single(0), single(1), params, ts=[0.0, 1.0, 6.0], events=EVENTS)
@@ -437,7 +437,7 @@ floor = {"floor": lj.Crossing(lambda t, q, v, p: q - p)}
 @pytest.mark.slow
 @pytest.mark.parametrize("level", [0.0, 1e-15, 1e-14, 1e-12, -1e-11])
 def test_at_the_last_time(level):
-    """A crossing at `ts[-1]` is found there, or by going on from there: q = 5 (1 - t²) is zero at 1."""
+    """A crossing at `ts[-1]` is found once, there or when continuing from there: q = 5 (1 - t²) is zero at 1."""
     first = lj.integrate(ball, 5.0, 0.0, level, ts=[0.0, 1.0], events=floor)
     found, end = int(first.events["floor"].count), first.end
     if not found:
@@ -449,7 +449,7 @@ def test_at_the_last_time(level):
 
 @pytest.mark.exhaustive
 def test_count_of_what_is_not_kept():
-    """Only crossings up to the end of the motion count, also where there is no room for them."""
+    """Only crossings up to the end of the motion count, even if there is no room to keep them."""
     events = EVENTS | {"level": lj.Crossing(lambda t, q, v, p: q - p["level"], terminal=False, most=1)}
     params = {"level": 0.9, "stop": np.cos(1.5)}
     found = lj.integrate(oscillator, 0.0, 1.0, params, ts=[0.0, 6.0], events=events).events["level"]

@@ -1,4 +1,4 @@
-"""Mass matrices that are singular or indefinite, coordinates that end: solved where possible, else refused by name."""
+"""Singular or indefinite mass matrices and singular coordinates: solved if possible, otherwise refused by name."""
 
 import itertools
 
@@ -18,7 +18,7 @@ def refused_in(kind, coordinate):
     return pytest.raises(kind, match=f"(?s)singular in coordinate '{coordinate}'.*Fix:")
 
 
-# A massless crank: M is singular, but definite on what the rod leaves free, except at its dead centres.
+# A massless crank: M is singular, but definite on the motions that the rod allows, except at its dead centres.
 
 
 def crank_lagrangian(t, q, v, params):
@@ -39,7 +39,7 @@ CRANK_TS = np.linspace(0.0, 6.0, 13)
 
 
 def crank_state(x, u):
-    """(q, v) of the crank with its slider at x, moving at u."""
+    """Return (q, v) of the crank with its slider at x, moving at u."""
     angle = np.arccos(x / CRANK["l"])
     return {"crank": angle, "x": x}, {"crank": -u / (CRANK["l"] * np.sin(angle)), "x": u}
 
@@ -53,14 +53,14 @@ def test_massless_crank():
     np.testing.assert_allclose(traj.q["x"], x, atol=1e-10)
     np.testing.assert_allclose(traj.q["crank"], np.arccos(x / CRANK["l"]), atol=1e-10)
     np.testing.assert_allclose(traj.multipliers["rod"], -CRANK["kappa"] * x, atol=1e-10)
-    # Without the rod's force the slider would swing at √(k/m): not what is seen.
+    # Twin: without the rod's force the slider would swing at √(k/m).
     slower = np.sqrt(CRANK["k"] / CRANK["m"])
     assert np.max(np.abs(x - 0.5 * np.cos(slower * CRANK_TS) - np.sin(slower * CRANK_TS) / slower)) > 0.5
 
 
 @pytest.mark.exhaustive
 def test_massless_crank_reaches_its_dead_centre():
-    """Faster, the slider reaches l, where nothing determines θ: the motion ends there, with time and place."""
+    """If faster, the slider reaches l, where nothing determines θ: the error gives the time and place."""
     speed = 2.5
     reach, phase = np.hypot(0.5, speed / CRANK_RATE), np.arctan2(speed / CRANK_RATE, 0.5)
     dead_centre = (phase - np.arccos(CRANK["l"] / reach)) / CRANK_RATE
@@ -78,26 +78,26 @@ def test_massless_crank_at_its_dead_centre():
 
 @pytest.mark.slow
 def test_massless_crank_does_not_start_at_its_dead_centre():
-    """Nor does it move from there."""
+    """A motion that starts at the dead centre is refused by name."""
     q0, v0 = {"crank": 0.0, "x": CRANK["l"]}, {"crank": 0.25, "x": 0.0}
     with refused_in(ValueError, "crank"):
         lj.integrate(crank, q0, v0, CRANK, ts=CRANK_TS, rtol=TIGHT, atol=TIGHT)
 
 
 def test_massless_crank_without_its_rod():
-    """Without the constraint nothing makes up for the missing mass: the accelerations are refused by name."""
+    """Without the constraint nothing replaces the missing mass: the accelerations are refused by name."""
     with refused_in(ValueError, "crank"):
         lj.accelerations(lj.System(crank_lagrangian), 0.0, *crank_state(0.5, 1.0), CRANK)
 
 
 @pytest.mark.slow
 def test_massless_crank_without_its_rod_does_not_start():
-    """Nor is it integrated."""
+    """Without its rod the crank is not integrated either."""
     with refused_in(ValueError, "crank"):
         lj.integrate(lj.System(crank_lagrangian), *crank_state(0.5, 1.0), CRANK, ts=CRANK_TS)
 
 
-# A charge by its proper time: M = m diag(-1, 1, 1) is indefinite. E along x, B along z, and a scalar field f x.
+# A charge in its proper time: M = m diag(-1, 1, 1) is indefinite. E along x, B along z, and a scalar field f x.
 
 
 def covariant_lagrangian(tau, q, u, params):
@@ -119,7 +119,7 @@ PROPER_TIMES = np.linspace(0.0, 4.0, 9)
 
 
 def four_velocity(ux, uy):
-    """u on the mass shell."""
+    """Return u on the mass shell."""
     return np.array([np.sqrt(1 + ux**2 + uy**2), ux, uy])
 
 
@@ -155,7 +155,7 @@ def by_name(values):
 
 
 def stacked(tree):
-    """Curves by name as one array."""
+    """Return curves, given by name, as one array."""
     return np.stack(list(tree.values()), axis=-1)
 
 
@@ -194,7 +194,7 @@ def test_charge_on_its_mass_shell():
 
 @pytest.mark.exhaustive
 def test_cyclotron_without_its_mass_shell():
-    """The indefinite M alone: radius γ m v / (e B), rate e B / (γ m) in the laboratory's time; η(u, u) stays."""
+    """With the indefinite M alone: radius γ m v / (e B), rate e B / (γ m) in laboratory time; η(u, u) is constant."""
     start = four_velocity(0.75, -1.25)
     run = lambda params: lj.integrate(
         charge, by_name(np.zeros(3)), by_name(start), params, ts=PROPER_TIMES, rtol=TIGHT, atol=TIGHT
@@ -212,7 +212,7 @@ def test_cyclotron_without_its_mass_shell():
     np.testing.assert_allclose(np.sum(np.array([-1, 1, 1]) * stacked(crossed.v) ** 2, axis=-1), -1.0, atol=1e-10)
 
 
-# The same charge by the time of the laboratory: L is not quadratic in v, M = ∂p/∂v grows as γ³.
+# The same charge in laboratory time: L is not quadratic in v, M = ∂p/∂v grows as γ³.
 
 
 def relativistic_lagrangian(t, q, v, params):
@@ -226,7 +226,7 @@ RELATIVISTIC = {"m": 1.5, "c": 2.0, "e": 0.75, "E": 0.0, "B": 0.0, "ux": -1.25, 
 
 
 def hyperbolic(params, t):
-    """Place in a uniform E: p grows in proportion to t, x = Δ(energy)/(e E), y by an inverse hyperbolic sine.
+    """Position in a uniform E: p grows in proportion to t, x = Δ(energy)/(e E), y by an inverse hyperbolic sine.
 
     Source: Landau & Lifshitz, *The Classical Theory of Fields*, §20.
     """
@@ -240,7 +240,7 @@ def hyperbolic(params, t):
 
 
 def gyrating(params, t):
-    """Place in a uniform B: a circle at the rate e B / (γ m)."""
+    """Position in a uniform B: a circle at the rate e B / (γ m)."""
     gamma = 1 / jnp.sqrt(1 - (params["ux"] ** 2 + params["uy"] ** 2) / params["c"] ** 2)
     rate = params["e"] * params["B"] / (gamma * params["m"])
     s, c = jnp.sin(rate * t) / rate, (1 - jnp.cos(rate * t)) / rate
@@ -249,7 +249,7 @@ def gyrating(params, t):
 
 @pytest.mark.exhaustive
 def test_relativistic_charge():
-    """Hyperbolic motion from γ = 1.5 to 4.5, and the circle in B, with their derivatives by every parameter."""
+    """Hyperbolic motion from γ = 1.5 to 4.5, and the circle in B, with derivatives with respect to every parameter."""
     t = jnp.asarray(12.0)
 
     def final(params):
@@ -268,7 +268,7 @@ def test_relativistic_charge():
         expected = jax.jacfwd(exact)(params, t)
         for name in set(params) - {absent}:
             np.testing.assert_allclose(slopes[name], expected[name], rtol=1e-9, atol=1e-9, err_msg=name)
-        # Without relativity the derivative by c would vanish.
+        # Without relativity the derivative with respect to c would vanish.
         assert np.max(np.abs(expected["c"])) > 0.1
 
 
@@ -276,7 +276,7 @@ def test_relativistic_charge():
 
 
 def proper_time(s, q, v, params):
-    """L = -(1 + k x) √(-η(v, v)): the same path at every pace."""
+    """L = -(1 + k x) √(-η(v, v)): the same path for every parametrisation."""
     return -(1 + params["k"] * q["x"]) * jnp.sqrt(v["t"] ** 2 - v["x"] ** 2 - v["y"] ** 2)
 
 
@@ -286,20 +286,20 @@ PACED = ({"t": 0.0, "x": 0.0, "y": 0.0}, {"t": 1.25, "x": 0.5, "y": 0.25})
 
 @pytest.mark.parametrize("k", [0.0, 0.5])
 def test_accelerations_of_an_arbitrary_parameter_are_refused(k):
-    """The pace is not determined, M is singular along v: the accelerations are refused by name."""
+    """The parametrisation is not determined, as M is singular along v: the accelerations are refused by name."""
     with refused_in(ValueError, "[txy]"):
         lj.accelerations(paced, 0.0, *PACED, {"k": k})
 
 
 @pytest.mark.slow
 def test_an_arbitrary_parameter_is_not_integrated():
-    """Nor is it integrated, with a force (k) or without: the error names a coordinate of the singular M."""
+    """It is not integrated either, with a force (k) or without: the error names a coordinate of the singular M."""
     for k in (0.0, 0.5):
         with refused_in((ValueError, RuntimeError), "[txy]"):
             lj.integrate(paced, *PACED, {"k": k}, ts=np.array([0.0, 1.0]), max_steps=256)
 
 
-# The azimuth ends at the poles of a sphere; great circles do not.
+# The azimuth is singular at the poles of a sphere; great circles are not.
 
 polar = lj.System(lambda t, q, v, params: 0.5 * (v["psi"] ** 2 + jnp.sin(q["psi"]) ** 2 * v["theta"] ** 2))
 embedded = lj.System(
@@ -324,7 +324,7 @@ def polar_state(miss, s):
 
 
 def test_a_start_at_the_pole_is_refused():
-    """At the pole nothing determines the azimuth: refused by its name, with Cartesian coordinates as the remedy."""
+    """At the pole nothing determines the azimuth: it is refused by name, with Cartesian coordinates as the remedy."""
     with pytest.raises(ValueError, match="(?s)singular in coordinate 'theta'.*azimuth at the pole.*Cartesian"):
         lj.accelerations(polar, 0.0, {"psi": 0.0, "theta": 0.25}, {"psi": 1.0, "theta": 0.0}, None)
 
@@ -338,7 +338,7 @@ def distance_to_great_circle(traj, miss):
 
 @pytest.mark.exhaustive
 def test_through_the_pole_or_not_at_all():
-    """A path that runs into the pole comes out on its great circle, to the tolerance, or ends there: never else."""
+    """A path into the pole continues on its great circle, to the tolerance, or ends at the pole; nothing else."""
     outcomes = []
     for miss, tol, first in itertools.product(NEAR_MISSES, (1e-6, 1e-9, 1e-12), (-1.0, -0.77, -1.31)):
         ts = np.array([first, -0.25, 0.5, 1.25])
@@ -349,7 +349,7 @@ def test_through_the_pole_or_not_at_all():
             assert distance_to_great_circle(traj, miss) < 20 * tol, (miss, tol, first)
         else:
             assert abs(float(traj.end.t)) < 1e-12 and abs(float(traj.end.q["psi"])) < 1e-12, (miss, tol, first)
-    # Both happen, and the error says where.
+    # Both outcomes occur, and the error says where.
     assert set(outcomes) == {True, False}
     with pytest.raises(RuntimeError, match=r"stopped at t = -?\d\.\d+e-14,(?s:.*)psi = \d\.\d+e-14, theta ="):
         lj.integrate(polar, *polar_state(1e-15, -1.0), ts=np.array([-1.0, -0.25, 0.5, 1.25]), rtol=1e-12, atol=1e-12)
@@ -357,7 +357,7 @@ def test_through_the_pole_or_not_at_all():
 
 @pytest.mark.slow
 def test_past_the_pole_with_fixed_steps_would_show():
-    """The comparison can fail: fixed steps too long for the passage leave the great circle."""
+    """Twin: fixed steps that are too long for the passage leave the great circle."""
     ts = np.array([-1.0, -0.25, 0.5, 1.25])
     traj = lj.integrate(
         polar, *polar_state(0.05, -1.0), ts=ts, dt0=0.125, stepsize_controller=diffrax.ConstantStepSize()
@@ -367,7 +367,7 @@ def test_past_the_pole_with_fixed_steps_would_show():
 
 @pytest.mark.slow
 def test_the_same_great_circle_in_cartesian_coordinates():
-    """On |q| = 1 there is no pole: straight through it, λ = -½, position and tension to the tolerance."""
+    """On |q| = 1 there is no pole: the motion passes through it, position and tension λ = -½ to the tolerance."""
     ts = np.linspace(-1.0, 1.25, 10)
     for miss in (0.0, 1e-12, 1e-6):
         start = great_circle(miss, np.array([-1.0, -1.0 + np.pi / 2]))

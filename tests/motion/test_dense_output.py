@@ -1,4 +1,4 @@
-"""The motion between outputs: its order, its constraints, its derivatives, and where there is none."""
+"""The motion between outputs: its order, its constraints, its derivatives, and where it is not available."""
 
 import copy
 
@@ -19,12 +19,12 @@ BETWEEN = np.array([3.3, 0.1, 1.7, 2.6])
 
 
 def pendulum(t, q, v, params):
-    """Of length and mass 1."""
+    """A pendulum of length and mass 1."""
     return 0.5 * v**2 + params["g"] * jnp.cos(q)
 
 
 def swing(q0=AMPLITUDE, g=1.0, ts=TS, **settings):
-    """The pendulum let go at `q0`."""
+    """The pendulum released at `q0`."""
     return lj.integrate(lj.System(pendulum), q0, 0.0, {"g": g}, ts=ts, **settings)
 
 
@@ -52,7 +52,7 @@ def rotate(ts=TS, g=1.0, **settings):
 
 
 def test_times_of_any_shape():
-    """Within the tolerance of the exact motion, in the order and shape that was asked for; at outputs bit for bit."""
+    """Within the tolerance of the exact motion, in the requested order and shape; at outputs bit for bit."""
     traj = swing()
     for t in (BETWEEN, BETWEEN.reshape(2, 2), 1.25, 2, [0.5, 0.75], np.zeros((0, 3))):
         found, (q, v) = traj.at(t), exact(t)
@@ -73,14 +73,14 @@ def errors_at_step(h):
 
 @pytest.mark.slow
 def test_order_of_the_method():
-    """Of order 5 with Dopri5, on a nonlinear motion; twin: the cubic through the outputs is of order 4."""
+    """With Dopri5 it has order 5 on a nonlinear motion; twin: the cubic through the outputs has order 4."""
     steps = 0.1 / 2.0 ** np.arange(3)
     of_at, of_cubic = np.polyfit(np.log(steps), np.log([errors_at_step(h) for h in steps]), 1)[0]
     assert abs(of_at - 5.0) < 0.35 and abs(of_cubic - 4.0) < 0.35
 
 
 def test_constraints_hold():
-    """Projected, with multipliers: Newton's law along the rod, 2 λ = -(v² - g y) for g = x² + y² - 1."""
+    """States are projected and have multipliers: Newton's law along the rod, 2 λ = -(v² - g y) for g = x² + y² - 1."""
     found = rotate().at(BETWEEN)
     q, v = exact(BETWEEN)
     np.testing.assert_allclose(found.q["x"], np.sin(q), atol=1e-8)
@@ -90,7 +90,7 @@ def test_constraints_hold():
 
 
 def test_backward():
-    """A motion that runs backward in time is continued backward, also from a copy of it."""
+    """A motion that runs backward in time is continued backward, even from a copy of the trajectory."""
     end_q, end_v = map(float, exact(4.0))
     traj = lj.integrate(lj.System(pendulum), end_q, end_v, {"g": 1.0}, ts=TS[::-1])
     np.testing.assert_allclose(traj.at(BETWEEN).q, exact(BETWEEN)[0], atol=1e-8)
@@ -100,7 +100,7 @@ def test_backward():
 
 
 def test_where_there_is_no_motion():
-    """Outside, and after an event: told with the reason, NaN in a program; at the end of the event it is known."""
+    """Times outside, or after an event, are refused with the reason, NaN in a program; the event itself is known."""
     lowest = lj.Crossing(lambda t, q, v, params: q)
     traj = swing(events={"lowest": lowest})
     end = float(ellipk(np.sin(AMPLITUDE / 2) ** 2))
@@ -117,7 +117,7 @@ def test_where_there_is_no_motion():
 
 @pytest.mark.slow
 def test_batches():
-    """Lanes first, each as it is alone; NaN where one has ended."""
+    """The lane axis comes first, each lane as in a single run; NaN where a lane has ended."""
     lanes = jax.vmap(lambda q0: swing(q0, events={"up": lj.Crossing(lambda t, q, v, params: q)}))(np.array([2.0, 3.1]))
     found = lanes.at(BETWEEN.reshape(2, 2))
     assert found.q.shape == found.t.shape == (2, 2, 2)
@@ -130,7 +130,7 @@ def test_batches():
 
 
 def ball(t, q, v, params):
-    """Under gravity."""
+    """A ball under gravity."""
     return 0.5 * v**2 - params["g"] * q
 
 
@@ -150,23 +150,23 @@ def test_motions_in_phases():
     found = traj.at(t)
     np.testing.assert_allclose(found.q, height, atol=1e-8)
     np.testing.assert_allclose(found.v, speed - 10.0 * (t - since), atol=1e-7)
-    with pytest.raises(TypeError, match="looks at its switches"):
+    with pytest.raises(TypeError, match="needs the values of its switches"):
         jax.jit(lambda traj: traj.at(0.3))(traj)
 
 
 def test_what_cannot_be_continued():
-    """Outputs off the constraints, and steps by a plan; what can is continued by its controller."""
+    """Outputs off the constraints and planned steps cannot be continued."""
     with pytest.raises(ValueError, match="outputs are off the constraints"):
         rotate(drift="none").at(0.3)
     planned = dict(method=lj.Tsit5(), stepsize_controller=diffrax.StepTo(TS))
-    with pytest.raises(ValueError, match="StepTo has a plan"):
+    with pytest.raises(ValueError, match="StepTo plans the steps"):
         swing(**planned, throw=False).at(0.3)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("of", [swing, rotate])
 def test_derivatives(of):
-    """By t the velocity, also at outputs and at both ends; by a parameter as central differences, in both modes."""
+    """The derivative by t is the velocity, also at outputs and ends; that by a parameter is the central difference."""
     x = lambda moment: jnp.sin(moment.q) if of is swing else moment.q["x"]
     place = lambda g, t: x(of(g=g).at(t))
     both, gradient = jax.jit(jax.jacfwd(place, argnums=(0, 1))), jax.jit(jax.grad(place))
@@ -181,7 +181,7 @@ def test_derivatives(of):
 
 @pytest.mark.slow
 def test_second_derivative_at_an_output():
-    """By t twice at an output, where no step is taken: the acceleration -g sin q. Twin: a straight line has none."""
+    """The second derivative by t at an output, where no step is taken, is the acceleration -g sin q, not zero."""
     traj = swing()
     for t in (0.0, float(TS[3])):
         twice = jax.grad(jax.grad(lambda t: traj.at(t).q))(t)
@@ -190,7 +190,7 @@ def test_second_derivative_at_an_output():
 
 
 def test_one_program_for_all_times():
-    """Another motion of the system, at other times, compiles nothing; twin: another number of them does."""
+    """Another motion of the system at other times compiles nothing; twin: many more times do."""
     swing().at([0.3, 0.5])
     other = swing(q0=1.0, g=2.0)
     with compiles() as again:

@@ -1,4 +1,4 @@
-"""Between outputs a motion is interpolated for pictures: exact at outputs, fourth order between, and never guessed."""
+"""Interpolation between outputs for films: exact at outputs, of fourth order between, and refused if too coarse."""
 
 import diffrax
 import jax
@@ -25,7 +25,7 @@ def bob(t, q, params):
 
 
 def refused(*parts):
-    """Expect an error that holds all parts and a fix."""
+    """Expect an error that contains all parts and a fix."""
     return pytest.raises(ValueError, match="(?s)" + "".join(f"(?=.*{part})" for part in (*parts, "Fix:")))
 
 
@@ -40,7 +40,7 @@ def test_exact_at_outputs_and_for_cubics():
     assert np.array_equal(same["a"], q["a"]) and np.array_equal(same["b"], q["b"])
     at = np.linspace(0.0, 1.1, 23)
     np.testing.assert_allclose(hermite(t, q, v, at)["a"], np.stack([at**3, 1 - at], axis=1), atol=1e-15)
-    # Twin: with wrong slopes it is not.
+    # Twin: with wrong slopes the cubic is not reproduced.
     assert np.max(np.abs(hermite(t, q, {"a": v["a"], "b": 0 * t}, at)["b"] - at**2)) > 1e-2
 
 
@@ -67,7 +67,7 @@ def test_frames_follow_the_motion(traj):
 
 @pytest.mark.slow
 def test_ends_where_an_event_ended_the_motion():
-    """The NaN after an event are cut off, and the last frame is the event."""
+    """NaN after an event are cut off, and the last frame is the event."""
     down = diffrax.Event(lambda t, y, params, **kwargs: y[0])
     traj = lj.integrate(pendulum, 1.0, 0.0, PARAMS, ts=DENSE, event=down)
     assert np.isnan(traj.q).any()
@@ -89,7 +89,7 @@ def test_a_motion_that_failed_plays_as_far_as_it_came():
 
 @pytest.mark.exhaustive
 def test_a_batch_is_animated_lane_by_lane():
-    """A batch says how to take a lane of it, and the lane plays."""
+    """The error for a batch says how to take one lane of it, and the lane can be animated."""
     batch = jax.vmap(lambda q0: lj.integrate(pendulum, q0, 0.0, PARAMS, ts=DENSE))(np.array([0.5, 1.0]))
     with refused("batch of shape", r"traj\).animate\(positions\)"):
         batch.animate(bob)
@@ -97,7 +97,7 @@ def test_a_batch_is_animated_lane_by_lane():
 
 
 def test_positions_that_are_no_points(traj):
-    """Three coordinates, a number, words, points that come and go, NaN: each by name and with a fix."""
+    """Three coordinates, a number, words, a changing number of points and NaN are refused by name, with a fix."""
     with refused(r"shape \(3,\) for 'bob'", "Usual cause"):
         traj.animate(lambda t, q, params: {"bob": (q, q, q)})
     with refused(r"shape \(\)"):
@@ -113,7 +113,7 @@ def test_positions_that_are_no_points(traj):
 
 
 def test_outputs_too_far_apart(traj):
-    """What happens between few outputs is not made up: refused, where the same motion with more plays."""
+    """A motion with too few outputs for interpolation is refused."""
     coarse = lj.integrate(pendulum, 1.0, 0.0, PARAMS, ts=np.linspace(0.0, 6.0, 7))
     with refused("7 outputs are too few", "% of the picture", r"jnp.linspace\(0, 6, 57\)"):
         coarse.animate(bob)
@@ -122,11 +122,11 @@ def test_outputs_too_far_apart(traj):
 
 
 def test_no_time_to_play(traj):
-    """A film of no length, or one that never ends."""
+    """A film of no length, or without an end, is refused."""
     for seconds in (0.0, -1.0, np.inf, np.nan):
-        with refused("is no film"):
+        with refused("is not a film"):
             traj.animate(bob, seconds=seconds)
-    with refused("is no film"):
+    with refused("is not a film"):
         traj.animate(bob, trail=-1.0)
 
 

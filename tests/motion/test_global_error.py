@@ -1,4 +1,4 @@
-"""Estimated errors against true ones: Kepler's motion, whose equation gives the place at any time, and chaos."""
+"""Estimated errors compared with true ones: Kepler's motion, whose position is known at any time, and chaos."""
 
 import warnings
 
@@ -18,7 +18,7 @@ swing = lj.System(lambda t, q, v, p: 0.5 * v**2 - p["g"] * (1 - jnp.cos(q)))
 
 
 def exact(t, e=ECCENTRICITY):
-    """The place and the velocity on an orbit with k = a = 1, by Newton's method for Kepler's equation."""
+    """Position and velocity on an orbit with k = a = 1, by Newton's method for Kepler's equation."""
     mean = np.asarray(t) % (2 * np.pi)
     anomaly = mean + e * np.sin(mean)
     for _ in range(20):
@@ -29,16 +29,16 @@ def exact(t, e=ECCENTRICITY):
 
 
 def orbit(ts, e=ECCENTRICITY, **settings):
-    """Some turns from the pericentre; what is said aloud is looked at elsewhere."""
+    """Some turns from the pericentre; other tests check the warnings."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", lj.AccuracyWarning)
         return lj.integrate(kepler, *exact(ts[0], e), {"k": 1.0}, ts=ts, **settings)
 
 
 def ratios(traj, e=ECCENTRICITY):
-    """True errors in units of the estimated ones, the largest of the coordinates, and of the velocities, each.
+    """Return true errors in units of the estimated ones: the largest of the coordinates, and of the velocities.
 
-    At the first outputs round-off is all that there is.
+    The first outputs are left out, as they only have round-off.
     """
     found = []
     for got, true, error in zip((traj.q, traj.v), exact(np.asarray(traj.t), e), (traj.error.q, traj.error.v)):
@@ -74,7 +74,7 @@ marked = lambda mark, *names: [pytest.param(name, marks=mark) for name in names]
     ],
 )
 def test_estimated_as_they_are(name):
-    """Within ten of the true errors nearly everywhere; a thousandth of the estimate would not be."""
+    """Estimates are within a factor of ten of the true errors nearly everywhere; twin: a thousandth of them is not."""
     ts, settings = (CASES | OTHERS)[name]
     found = ratios(orbit(ts, **settings))
     within = lambda x: np.mean((x > 0.1) & (x < 10.0))
@@ -84,7 +84,7 @@ def test_estimated_as_they_are(name):
 
 @pytest.mark.slow
 def test_steps_of_another_controller():
-    """How to make them shorter nobody knows: there is no estimate, also where one is asked for."""
+    """It is unknown how to shorten another controller's steps: there is no estimate, even if one is requested."""
     given = dict(stepsize_controller=diffrax.PIDController(rtol=1e-9, atol=1e-9), estimate_error=True)
     found = orbit(np.array([0.0, 10.0]), **given)
     assert bool(found.error.result == lj.RESULTS.not_estimated) and np.isnan(found.error.q["x"]).all()
@@ -93,7 +93,7 @@ def test_steps_of_another_controller():
 
 @pytest.mark.slow
 def test_times_of_events():
-    """Each crossing's time with its error."""
+    """Each crossing's time has an error estimate."""
     traj = orbit(np.array([0.0, 40.0]), rtol=1e-7, atol=1e-7, events={"up": near_pericentre})
     found = traj.events["up"]
     turns = 2 * np.pi * np.arange(1, int(found.count) + 1)
@@ -105,7 +105,7 @@ def test_times_of_events():
 
 
 def test_what_chaos_leaves():
-    """Where no digit is left, that is said, with the coordinate, the time and the cause; not where all are."""
+    """A warning with coordinate, time and cause appears if no digits are left, but not if all are."""
     lagrangian = lambda t, q, v, p: (
         v["a"] ** 2
         + 0.5 * v["b"] ** 2
@@ -123,12 +123,12 @@ def test_what_chaos_leaves():
     )
     short = run(1.0)
     assert short.scaled_error < 0.1 and short.error.q["b"][-1] < 1e-7 and "WARNING" not in repr(short)
-    # The Jacobi integral, which was all that was looked at before, sees nothing.
+    # The Jacobi integral does not reveal this error.
     assert long.drift() < 1e-7
 
 
 def test_passing_a_singularity():
-    """What is lost near it is said to be lost there."""
+    """The warning says that digits were lost near the singularity."""
     traj = orbit(np.linspace(0.0, 125.0, 201), e=0.999)
     assert traj.scaled_error > 1 and "near a singularity" in warning_of(traj)
 
@@ -139,7 +139,7 @@ def swung(g, **asked):
 
 
 def test_by_default():
-    """Where nothing is traced, if it is not refused; the motion is the same."""
+    """By default the error is estimated if nothing is traced; it can be switched off; the motion is the same."""
     eager, refused = swung(9.81), swung(9.81, estimate_error=False)
     assert refused.error is None and "  error  " not in repr(refused) and "  error  " in repr(eager)
     np.testing.assert_array_equal(refused.q, eager.q)
@@ -148,7 +148,7 @@ def test_by_default():
 
 @pytest.mark.slow
 def test_when_asked():
-    """In a program and in lanes as outside; derivatives are those of the motion alone."""
+    """Requested in a program or a batch, the estimate is the same; derivatives are only those of the motion."""
     inside = jax.jit(lambda g: swung(g, estimate_error=True))
     close = lambda found: np.testing.assert_allclose(found, swung(9.81).error.q, rtol=0.3)
     close(inside(9.81).error.q)
@@ -160,7 +160,7 @@ def test_when_asked():
 
 @pytest.mark.slow
 def test_what_cannot_be_estimated():
-    """NaN with its reason; the motion itself is kept."""
+    """Without an estimate it is NaN, with the reason; the motion itself is kept."""
     ts = np.array([0.0, 10.0])
     steps = int(orbit(ts).stats["num_steps"])
     short = orbit(ts, max_steps=steps + 3)
@@ -176,7 +176,7 @@ def test_what_cannot_be_estimated():
 
 @pytest.mark.slow
 def test_what_chose_the_steps():
-    """Outputs, tolerances, a longest step, stability; and how often the equations were asked."""
+    """Outputs, tolerance, longest step or stability are named; and the number of evaluations."""
     said = lambda traj: next(line for line in repr(traj).splitlines() if "steps chosen by" in line)
     dense = np.linspace(0.0, 2.0, 101)
     assert "the outputs" in said(lj.integrate(swing, 1.0, 0.0, {"g": 9.81}, ts=dense))

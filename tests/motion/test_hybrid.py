@@ -1,4 +1,4 @@
-"""Motions in phases: times of switches, states and derivatives across them, impacts, friction, and what is refused."""
+"""Motions in phases: times of switches, states and derivatives across them, impacts, friction, and refusals."""
 
 from functools import partial
 
@@ -29,7 +29,7 @@ PARAMS = {"g": G, "e": 0.5}
 
 
 def in_phases(*args, **options) -> lj.HybridTrajectory:
-    """`lj.integrate` of a hybrid system."""
+    """Call `lj.integrate` with a hybrid system."""
     traj = lj.integrate(*args, **options)
     assert isinstance(traj, lj.HybridTrajectory)
     return traj
@@ -42,7 +42,7 @@ def bounced(h=1.0, e=0.5, g=G, **options):
 
 
 def heights(t, h=1.0, e=0.5):
-    """Of the ball in closed form, for its first two flights after the fall."""
+    """The heights of the ball in closed form, for its first two flights after the fall."""
     first, speed = np.sqrt(2 * h / G), np.sqrt(2 * h * G)
     second = first + 2 * e * first
     flight = lambda s, v: v * s - 0.5 * G * s**2
@@ -80,7 +80,7 @@ RESTITUTION, LEVEL = 0.5, 0.0
 @pytest.mark.slow
 @pytest.mark.parametrize("ready_made", exhaustive_but((True,), (True, False)))
 def test_what_functions_read_may_change(monkeypatch, ready_made):
-    """A reset, a restitution and a gap that read globals, as cells of a notebook do: each call has their values."""
+    """A reset, a restitution and a gap that read globals, as in notebooks: each call uses their current values."""
     gap = lambda t, q, params: q - LEVEL
     if ready_made:
         switch = lj.Switch("flying", to="flying", when=lj.touches(gap, lambda speed: RESTITUTION + 0 * speed))
@@ -97,7 +97,7 @@ def test_what_functions_read_may_change(monkeypatch, ready_made):
 
 
 def made_again(e):
-    """All functions anew, as a cell of a notebook makes them that is run again."""
+    """Make all functions again, as running a notebook cell again does."""
     system = lj.System(lambda t, q, v, params: 0.5 * v**2 - params["g"] * q)
     flying = lj.Switch("flying", to="flying", when=lj.touches(lambda t, q, params: q, lambda speed: e + 0 * speed))
     return lj.Hybrid({"flying": system}, [flying], most_switches=4)
@@ -105,7 +105,7 @@ def made_again(e):
 
 @pytest.mark.slow
 def test_made_again_it_compiles_nothing():
-    """The same functions made anew mean the same program; twin: those with another number in them do not."""
+    """The same functions made again use the same program; twin: with another number in them they do not."""
     end = lambda e: float(in_phases(made_again(e), 1.0, 0.0, {"g": G}, ts=np.array([0.0, 1.0])).q[-1])
     np.testing.assert_allclose(end(0.5), heights(1.0), rtol=1e-8)
     with compiles() as found:
@@ -118,7 +118,7 @@ def test_made_again_it_compiles_nothing():
 
 @pytest.mark.slow
 def test_lanes_are_single_runs():
-    """Members of a batch that switch at different times and different numbers of times."""
+    """Lanes that switch at different times, and different numbers of times, agree with single runs."""
     hs = np.array([0.4, 1.0, 3.0, 6.0])
     together = jax.vmap(lambda h: bounced(h, estimate_error=False, throw=False))(hs)
     alone = [bounced(h, estimate_error=False, throw=False) for h in hs]
@@ -130,7 +130,7 @@ def test_lanes_are_single_runs():
 
 
 def test_said_by_name():
-    """Too many switches, those that come to rest, a guard with the other sign, and what is no hybrid."""
+    """Too many switches, a guard with the wrong sign, wrong phases and resets are refused."""
     with pytest.raises(RuntimeError, match="(?s)most_switches = 4.*each takes 0.5 of the time.*about t = 1.35457"):
         lj.integrate(bouncing, 1.0, 0.0, PARAMS, ts=np.array([0.0, 0.25, 0.5, 0.75, 3.0]))
     with pytest.raises(ValueError, match="guard of phase 'flying' is below zero at the start.*is -1"):
@@ -156,7 +156,7 @@ def test_said_by_name():
 
 @pytest.mark.slow
 def test_it_comes_to_rest():
-    """Infinitely many bounces end in the phase that stays; the time is that of the closed form, √(2h/g)(1+e)/(1-e)."""
+    """Infinitely many bounces end in the phase of rest, at the time in closed form, √(2h/g)(1+e)/(1-e)."""
     fall = lj.Switch("flying", to="flying", when=lj.touches(height, restitution=0.5), rest="lying", slower_than=1e-8)
     both = lj.Hybrid({"flying": ball, "lying": lying}, [fall], most_switches=60)
     traj = in_phases(both, 1.0, 0.0, {"g": G}, ts=np.linspace(0.0, 3.0, 7))
@@ -165,7 +165,7 @@ def test_it_comes_to_rest():
     np.testing.assert_allclose(traj.q[4:], 0.0, atol=1e-14)
     np.testing.assert_allclose(traj.multipliers["floor"][4:], G, rtol=1e-12)
     assert np.isnan(traj.multipliers["floor"][0])
-    # Without the phase that stays no phase lasts, and so it is called.
+    # Without a phase of rest no phase lasts, and the error says so.
     dead = lj.Hybrid({"flying": ball}, [lj.Switch("flying", to="flying", when=lj.touches(height, restitution=0.0))])
     with pytest.raises(RuntimeError, match="no phase lasts"):
         lj.integrate(dead, 1.0, 0.0, {"g": G}, ts=np.array([0.0, 1.0]))
@@ -173,12 +173,12 @@ def test_it_comes_to_rest():
 
 @pytest.mark.slow
 def test_between_walls():
-    """Without gravity dz_end/dz₀ = -1 after one elastic bounce, 1 after two; a thousand members by the closed form."""
+    """Without gravity dz_end/dz₀ = -1 after one elastic bounce, 1 after two; a thousand lanes have the closed form."""
     free = lj.System(lambda t, q, v, p: 0.5 * v**2)
     left, right = (lj.touches(gap, restitution=1.0) for gap in (height, lambda t, q, p: p["width"] - q))
     walls = lj.Hybrid({"free": free}, [lj.Switch("free", to="free", when=wall) for wall in (left, right)])
     end = lambda z, v: lj.integrate(walls, z, v, {"width": 1.0}, ts=np.array([0.0, 1.0]), estimate_error=False).q[-1]
-    # Lanes of derivatives, of members that bounce once and twice.
+    # Batched derivatives, of lanes that bounce once and of lanes that bounce twice.
     slopes = jax.vmap(jax.jacfwd(end))(np.array([0.3, 0.3]), np.array([1.0, 2.0]))
     np.testing.assert_allclose(slopes, [-1.0, 1.0], rtol=1e-12)
     z, v = np.linspace(0.1, 0.9, 1000), np.linspace(1.0, 9.0, 1000)
@@ -224,7 +224,7 @@ def throw(mu, hybrid=thrown, **options):
 
 @pytest.mark.slow
 def test_a_sphere_thrown_sliding():
-    """It rolls from t = 2 v₀/(7 μ g) on with 5 v₀/7; the other phase's multiplier is absent."""
+    """From t = 2 v₀/(7 μ g) on it rolls with 5 v₀/7; the other phase's multiplier is NaN."""
     when = 6.0 / (7 * G)
     for rtol in (1e-6, 1e-9, 1e-11):
         traj = throw(0.25, rtol=rtol)
@@ -232,7 +232,7 @@ def test_a_sphere_thrown_sliding():
         np.testing.assert_allclose(traj.v["x"][-1], 15 / 7, rtol=10 * rtol)
     np.testing.assert_allclose(traj.multipliers["ground"], 2.0 * G, rtol=1e-10)
     assert np.isnan(traj.multipliers["grip"][0]) and abs(traj.multipliers["grip"][-1]) < 1e-9
-    # Twin: friction that drives the sliding never lets it end.
+    # Twin: with friction that drives the sliding, it never ends.
     pushing = lambda t, q, v, multipliers, p: jax.tree.map(jnp.negative, coulomb(t, q, v, multipliers, p))
     driven = lj.System(sphere, {"ground": ground}, force=pushing)
     hybrid = lj.Hybrid({"slides": driven, "rolls": rolls}, thrown.switches)
@@ -333,18 +333,18 @@ def test_stick_and_slip():
 
 @pytest.mark.slow
 def test_a_body_that_rests_is_not_taken_to_fly():
-    """It would fall through what it rests on: nothing moves away from the guard, and that is said."""
+    """A body in a flying phase that rests on its support would fall through it: this is refused."""
     touching = lj.Hybrid({"flying": ball}, [lj.Switch("flying", to="flying", when=lj.touches(height, restitution=0.0))])
     ts = np.array([0.0, 1.0])
     with pytest.raises(RuntimeError, match="no phase lasts"):
         lj.integrate(touching, 0.0, 0.0, {"g": G}, ts=ts)
-    with pytest.raises(RuntimeError, match="not seen to cross it"):
+    with pytest.raises(RuntimeError, match="no crossing of zero was found"):
         lj.integrate(touching, 0.0, 1e-18, {"g": G}, ts=ts)
 
 
 @pytest.mark.slow
 def test_two_guards_at_once():
-    """A ball that falls into a corner: two walls at one time, one after the other."""
+    """A ball that hits a corner switches at both walls at one time, one after the other."""
     free = lj.System(lambda t, q, v, p: 0.5 * jnp.sum(v**2))
     walls = [lj.touches(lambda t, q, p, i=i: q[i], restitution=1.0) for i in (0, 1)]
     corner = lj.Hybrid({"free": free}, [lj.Switch("free", to="free", when=wall) for wall in walls])

@@ -1,4 +1,4 @@
-"""Events of a motion in phases: recorded through all of them, or ending the motion; forces that jump."""
+"""Events of a motion in phases: recorded in all of them, or ending the motion; and forces that jump."""
 
 import jax
 import jax.numpy as jnp
@@ -31,7 +31,7 @@ def bounced(height, **options):
 
 @pytest.mark.slow
 def test_recorded_through_all_phases():
-    """Apices after the first bounce and the second, in closed form; a velocity that jumps over zero is none of them."""
+    """Apices after the first two bounces agree with the closed form; a velocity that jumps over zero is not an apex."""
     traj = bounced(1.0, events={"apex": APEX})
     apex = traj.events["apex"]
     np.testing.assert_allclose(apex.t, [1.5 * FALL, 2.25 * FALL], rtol=1e-13)
@@ -47,7 +47,7 @@ def test_recorded_through_all_phases():
 
 @pytest.mark.exhaustive
 def test_ending_the_motion():
-    """In the first fall at 0.2; at the apex after it; at the floor before the switch. Twin: without them it goes on."""
+    """Events end the motion in the first fall, at the next apex, or at the floor before the switch."""
     at_height = lj.Crossing(lambda t, q, v, params: q - 0.2)
     at_apex = lj.Crossing(lambda t, q, v, params: v, direction=-1)
     first, second = (bounced(1.0, events={"ends": event}) for event in (at_height, at_apex))
@@ -62,7 +62,7 @@ def test_ending_the_motion():
 
 @pytest.mark.slow
 def test_forces_that_jump():
-    """A push upward from a time between two bounces on; twin: at another time."""
+    """A push upward from a time between two bounces on agrees with the closed form; twin: from another time on."""
     pushed = lj.System(falling, force=lambda t, q, v, params: jnp.where(t < params, 0.0, 20.0))
     system, ts = lj.Hybrid({"flying": pushed}, [floor], most_switches=3), np.array([0.0, 0.7, 0.8])
     q, v = SPEED * (0.6 - FALL) - G / 2 * (0.6 - FALL) ** 2, SPEED - G * (0.6 - FALL)
@@ -73,7 +73,7 @@ def test_forces_that_jump():
 
 
 def test_refused():
-    """Guards of multipliers, the name of the switches, and conditions that ask diffrax."""
+    """Guards with multipliers, the name of the switches, and conditions for diffrax are refused."""
     ts = np.array([0.0, 1.0])
     of_multipliers = lj.Crossing(lambda t, q, v, multipliers, params: v)
     with pytest.raises(ValueError, match="event 'push' takes multipliers"):

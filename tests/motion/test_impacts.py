@@ -201,9 +201,9 @@ def test_a_contact_that_jams_is_said():
 
 def test_said_by_name():
     """Invalid friction is refused by name."""
-    with pytest.raises(ValueError, match="friction is given and sliding is not"):
+    with pytest.raises(ValueError, match="friction is given, but sliding is not"):
         lj.touches(above, 0.5, friction=0.2)
-    with pytest.raises(ValueError, match="sliding is given and friction is not"):
+    with pytest.raises(ValueError, match="sliding is given, but friction is not"):
         lj.touches(above, 0.5, sliding=sliding)
     with pytest.raises(ValueError, match="(?s)needs a restitution.*restitution=0.0"):
         lj.touches(above, friction=0.2, sliding=sliding)
@@ -211,8 +211,8 @@ def test_said_by_name():
         lj.touches(above, 0.5, friction=0.2, sliding=1.0)  # pyright: ignore
     q, v = {"x": 0.0, "y": R, "phi": 0.0}, {"x": 1.0, "y": -1.0, "phi": 0.0}
     for wrong, said in (
-        (lambda t, q, v, p: jnp.stack([v["x"], v["y"]]), r"one number, and returned \(2,\)"),
-        (lambda t, q, v, p: jnp.abs(v["x"]), "linear in v, and its slope depends on v"),
+        (lambda t, q, v, p: jnp.stack([v["x"], v["y"]]), r"one number, but returned \(2,\)"),
+        (lambda t, q, v, p: jnp.abs(v["x"]), "linear in v, but its slope depends on v"),
     ):
         with pytest.raises(ValueError, match=said):
             impact(lj.touches(above, 0.5, friction=0.2, sliding=wrong), flying)(0.0, q, v, PARAMS)

@@ -43,7 +43,7 @@ def test_batches():
     np.testing.assert_array_equal(data["params.g"], [1.0, 10.0])
     named = lanes.to_xarray("g")
     assert named["q.a"].dims == ("g", "t") and named["params.w"].dims == ("g", "params.w_0")
-    with pytest.raises(ValueError, match="2 names, 'g', 'm', and this trajectory 1 axes"):
+    with pytest.raises(ValueError, match="2 names, 'g', 'm', but this trajectory has 1 axes"):
         lanes.to_xarray(("g", "m"))
     own = jax.tree.map(lambda x: x, lanes)
     own = own.__class__(**{**vars(own), "t": jnp.stack([lanes.t[0], 2 * lanes.t[1]])})

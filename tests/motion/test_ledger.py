@@ -217,12 +217,12 @@ def test_settings_are_those_of_the_motion():
 def test_bad_input():
     """Anything but a single computed motion is refused, with a remedy."""
     of = lambda q0: lj.integrate(DRAGGED, q0, 0.0, ts=np.array([0.0, 1.0]))
-    with pytest.raises(TypeError, match="made of a motion that was computed, not of float"):
+    with pytest.raises(TypeError, match="needs a motion that was computed, not float"):
         lj.energy_ledger(3.0)
     with pytest.raises(TypeError, match="one that JAX is tracing"):
         jax.jit(lambda q0: lj.energy_ledger(of(q0)).closure)(1.0)
     alone = of(1.0)
     with pytest.raises(ValueError, match="account for one lane"):
         lj.energy_ledger(jax.tree.map(lambda x: jnp.stack([x, x]), alone))
-    with pytest.raises(TypeError, match="another one by a lj.System"):
+    with pytest.raises(TypeError, match="any other one by a lj.System"):
         lj.energy_ledger(alone, lj.Hybrid({"falling": DRAGGED}))

@@ -207,7 +207,7 @@ def test_section_of_henon_and_heiles():
 @pytest.mark.slow
 def test_more_than_there_is_room_for():
     """Crossings that are not kept are warned of, printed and drawn; twin: no such note if there is room."""
-    with pytest.warns(lj.EventWarning, match="'section' happened 19 times, and the first 12 are kept"):
+    with pytest.warns(lj.EventWarning, match="'section' happened 19 times, but only the first 12 are kept"):
         section = orbit(0.125, span=120.0)
     assert int(section.count) == 19 and np.isfinite(section.t).all() and section.t.shape == (KEPT,)
     assert "19, of which the first 12 are kept" in repr(section)
