@@ -92,7 +92,7 @@ def animated(mode, positions: Callable, amplitude: float, seconds: float, rate: 
     count = round(seconds * rate) + 1 if np.isfinite(seconds * rate) else 0
     if count < 3 or not trail >= 0:
         raise ValueError(
-            f"seconds = {seconds:g} at rate = {rate:g} frames a second, with a trail of {trail:g} s, is no film.\n"
+            f"seconds = {seconds:g} at rate = {rate:g} frames a second, with a trail of {trail:g} s, is not a film.\n"
             "Fix: mode.animate(positions, seconds=6.0), and a trail of zero or more seconds."
         )
     s = mode.linearisation.state

@@ -102,7 +102,7 @@ def test_missing_velocity():
         lj.integrate(system, {"a": 1.0, "b": 0.5}, {"a": 0.0, "b": 0.0}, ts=TS)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_constraint_without_a_derivative():
     """A squared constraint has no derivative where it holds: it is named, and does not count as redundant."""
     rod = rod_pendulum.constraints["rod"]

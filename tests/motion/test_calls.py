@@ -51,7 +51,7 @@ def falling(g, shift=0.0):
     return lj.System(lambda t, q, v, p: 0.5 * p["m"] * v**2 - p["m"] * kept[0] * (q - shift)), kept
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_the_same_program_serves():
     """One program serves whole numbers, any number of outputs, and functions that mean the same, but no others."""
     at = np.linspace(0.0, 1.0, 100)

@@ -92,19 +92,7 @@ OF_LANES_TWICE = {
     ),
 }
 ALL = {**SLOPES, **OF_LANES, **CURVATURES, **OF_LANES_TWICE}
-SLOW = {
-    *(
-        ("free", name)
-        for name in (
-            "grad",
-            "grad of grad",
-            "vmap of jvp of grad",
-            "grad of vmap",
-            "grad of scan",
-        )
-    ),
-    ("stiff", "jvp of grad"),
-}
+SLOW = {("free", "grad of grad"), ("stiff", "jvp of grad")}
 
 
 def pushed(function, composition):
@@ -140,7 +128,7 @@ def test_third_derivatives_are_refused():
         jax.jvp(twice, (P,), (U,))
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_second_derivative_is_of_one_run(monkeypatch):
     """Values and tangents are of one run, even if each compilation takes other steps, as here. Twin: of two runs."""
     first, traced = recording._first, []

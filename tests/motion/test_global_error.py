@@ -146,7 +146,7 @@ def test_by_default():
     assert jax.eval_shape(swung, 9.81).error is None
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_when_asked():
     """Requested in a program or a batch, the estimate is the same; derivatives are only those of the motion."""
     inside = jax.jit(lambda g: swung(g, estimate_error=True))

@@ -171,7 +171,7 @@ def test_it_comes_to_rest():
         lj.integrate(dead, 1.0, 0.0, {"g": G}, ts=np.array([0.0, 1.0]))
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_between_walls():
     """Without gravity dz_end/dz₀ = -1 after one elastic bounce, 1 after two; a thousand lanes have the closed form."""
     free = lj.System(lambda t, q, v, p: 0.5 * v**2)
@@ -222,7 +222,7 @@ def throw(mu, hybrid=thrown, **options):
     return in_phases(hybrid, q0, v0, SPHERE | {"mu": mu}, ts=np.linspace(0.0, 1.0, 5), **options)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_sphere_thrown_sliding():
     """From t = 2 v₀/(7 μ g) on it rolls with 5 v₀/7; the other phase's multiplier is NaN."""
     when = 6.0 / (7 * G)

@@ -29,7 +29,7 @@ def bounced(height, **options):
     return traj
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_recorded_through_all_phases():
     """Apices after the first two bounces agree with the closed form; a velocity that jumps over zero is not an apex."""
     traj = bounced(1.0, events={"apex": APEX})
