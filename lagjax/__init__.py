@@ -94,8 +94,8 @@ if TYPE_CHECKING:
     from lagjax.analysis.symmetry import SymmetryTest, is_symmetry
 
     # In and out.
-    from lagjax.exchange.exported import export, result_codes
     from lagjax.exchange.from_sympy import from_sympy
+    from lagjax.exchange.standalone_programs import export, result_codes
 
     # Many motions, in a notebook.
     from lagjax.interactive.interact import Knobs, interact
@@ -124,8 +124,8 @@ LATER = {
     "lagjax.analysis.routh": "Routhian routhian",
     "lagjax.analysis.symmetries": "symmetries",
     "lagjax.analysis.symmetry": "SymmetryTest is_symmetry",
-    "lagjax.exchange.exported": "export result_codes",
     "lagjax.exchange.from_sympy": "from_sympy",
+    "lagjax.exchange.standalone_programs": "export result_codes",
     "lagjax.interactive.interact": "Knobs interact",
 }
 

@@ -14,7 +14,7 @@ from lagjax import plot
 from lagjax.mechanics import coordinates
 from lagjax.motion.trajectory import Trajectory
 from lagjax.pages import Page
-from lagjax.sweeps import exported, structures
+from lagjax.sweeps import structures, tables
 from lagjax.sweeps.axes import POINT, Axes
 from lagjax.sweeps.fingerprint import in_words as versions_in_words
 from lagjax.sweeps.fingerprint import named_leaves, versions
@@ -122,7 +122,7 @@ class Sweep:
 
         **Raises:** `ImportError` without xarray; `ValueError` for two values of one name.
         """
-        return exported.dataset(self)
+        return tables.dataset(self)
 
     def to_pandas(self, values: Callable | None = None):
         """A `pandas.DataFrame` with a row a point: the axes, what `run` returned, how the point went.
@@ -144,7 +144,7 @@ class Sweep:
 
         **Raises:** `ImportError` without pandas; `ValueError` where a point has more than a row has room for.
         """
-        return exported.frame(self, values)
+        return tables.frame(self, values)
 
     def plot(self, value: str | Callable | None = None):
         """Draw values over the axes: lines over one, a map over two, a map for each value of the first over three.

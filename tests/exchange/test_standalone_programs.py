@@ -13,7 +13,7 @@ import pytest
 from jax import export
 
 import lagjax as lj
-from lagjax.exchange.exported import plain
+from lagjax.exchange.standalone_programs import plain
 from tests.systems import HORIZONTAL, PARAMS, pendulum, rod_pendulum
 
 TS = np.linspace(0.0, 1.0, 5)
