@@ -152,7 +152,7 @@ def test_sweeps(stored, tmp_path):
         lane = lambda swept: jax.tree.map(lambda x: jnp.asarray(x[1]), swept.values["motion"])
         same(lane(found), lane(swept))
     if stored:
-        with pytest.raises(ValueError, match="what is in a store belongs to the run"):
+        with pytest.raises(ValueError, match="the values in a store belong to the run"):
             found.resweep(where=True)
     else:
         assert found.resweep(where=[True, False]).ran == 1
