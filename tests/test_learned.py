@@ -96,9 +96,9 @@ def test_other_mistakes():
     key = jax.random.key(0)
     with pytest.raises(ValueError, match="must be positive"):
         Network({"x": 0.0}, key=key)
-    with pytest.raises(ValueError, match="angles names 'y', and the coordinates are 'x'"):
+    with pytest.raises(ValueError, match="angles names 'y', but the coordinates are 'x'"):
         Network({"x": 1.0}, angles="y", key=key)
-    with pytest.raises(ValueError, match="takes 2 numbers, and was given 3"):
+    with pytest.raises(ValueError, match="takes 2 numbers, but was given 3"):
         Network(np.ones(2), key=key)(np.ones(3))
     with pytest.raises(ValueError, match="nothing to disagree"):
         disagreement(swing, [None], np.zeros(2), np.zeros(2))
