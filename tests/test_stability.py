@@ -1,4 +1,4 @@
-"""The stability report: its verdicts, what they rest on, and that no row is silently wrong."""
+"""The stability report: its verdicts, their basis, and that no row is silently wrong."""
 
 import json
 from dataclasses import replace
@@ -17,7 +17,7 @@ OUTCOME = Outcome("family", "name", "Dopri8", "3 steps", error=1e-9, allowed=1e-
 
 
 def fixed(step):
-    """A thousand fixed steps, of `step` over the oscillator's frequency."""
+    """A thousand fixed steps of length `step` divided by the oscillator's frequency."""
     options = {"stepsize_controller": diffrax.ConstantStepSize(), "dt0": np.asarray(step / oscillator.OMEGA)}
     ts = np.linspace(0.0, 1000 * step / oscillator.OMEGA, 3)
     params = {"omega": oscillator.OMEGA}
@@ -33,7 +33,7 @@ def detuned(q0, v0, params, ts):
 
 
 def test_each_verdict():
-    """One oscillator, four ends: accurate, degraded with a warning, refused with a reason, and silently wrong."""
+    """One oscillator, four outcomes: accurate, degraded with a warning, refused with a reason, and silently wrong."""
     accurate = fixed(0.25).attempt()
     assert (accurate.verdict, accurate.said) == (ACCURATE, "")
     # Beyond |R(ihω)| = 1 the amplitude grows: at first until the Jacobi integral shows it, then to infinity.
@@ -44,17 +44,17 @@ def test_each_verdict():
     assert refused.verdict == REFUSED and "nan" in refused.said
     unreachable = replace(fixed(0.25), tolerance=1e-20).attempt()
     assert unreachable.verdict == REFUSED and "below what float64 can reach" in unreachable.said
-    # Twins: a reference that is wrong, and an error that nothing can meet.
+    # Twins: a wrong reference, and an unreachable tolerance.
     assert replace(fixed(0.25), exact=detuned).attempt().verdict == SILENTLY_WRONG
     assert replace(accurate, allowed=1e-30, estimated=None).verdict == SILENTLY_WRONG
     assert [outcome.passed for outcome in (accurate, degraded, refused)] == [True] * 3
 
 
 def test_verdict_of_numbers():
-    """NaN is not accurate, a wrong derivative neither; a row that expects another verdict does not pass."""
+    """NaN and a wrong derivative are not accurate; a row with another verdict than expected does not pass."""
     assert OUTCOME.verdict == ACCURATE
     assert replace(OUTCOME, error=float("nan")).verdict == SILENTLY_WRONG
-    # An error that its own estimate tells is not silent; twin: one that is a hundred times as large.
+    # An error covered by its own estimate is not silent; twin: an error a hundred times as large.
     assert replace(OUTCOME, error=5e-8, estimated=1e-8).verdict == DEGRADED
     assert replace(OUTCOME, error=1e-6, estimated=1e-8).verdict == SILENTLY_WRONG
     assert replace(OUTCOME, lanes=1e-6).verdict == SILENTLY_WRONG
@@ -62,7 +62,7 @@ def test_verdict_of_numbers():
     assert replace(OUTCOME, gradient=float("nan")).verdict == SILENTLY_WRONG
     assert not replace(OUTCOME, expected=REFUSED).passed
     assert replace(OUTCOME, error=1.0, said="off").verdict == DEGRADED
-    # However long and however unstable: two digits must be left.
+    # However long and unstable the motion: two digits must be correct.
     assert replace(fixed(0.25), periods=1e30, amplification=1e10).allowed == 1e-2
 
 
@@ -75,13 +75,13 @@ def test_stability_function():
 
 
 class Known:
-    """A row whose outcome is given."""
+    """A row with a prescribed outcome."""
 
     def __init__(self, outcome):
         self.outcome = outcome
 
     def attempt(self):
-        """Nothing is integrated."""
+        """Return the outcome without integrating."""
         return self.outcome
 
 
@@ -96,7 +96,7 @@ class Known:
     ],
 )
 def test_exit_status(outcome, status, monkeypatch, tmp_path, capsys):
-    """`python -m lagjax stability` fails where a row is silently wrong or unexpected, and names it."""
+    """`python -m lagjax stability` fails if a row is silently wrong or unexpected, and names it."""
     monkeypatch.setattr(stability, "trials", lambda tier: [Known(outcome)])
     assert job.main(["stability", "-o", str(tmp_path)]) == status
     printed = capsys.readouterr().out
@@ -107,7 +107,7 @@ def test_exit_status(outcome, status, monkeypatch, tmp_path, capsys):
 
 
 def test_tiers(monkeypatch, tmp_path):
-    """By name the whole report is run, and few rows of it with --quick."""
+    """By name the whole report runs, with --quick only a few rows."""
     asked = []
     monkeypatch.setattr(stability, "trials", lambda tier: asked.append(tier) or [])
     monkeypatch.setattr(job, "SCENES", {})
@@ -118,7 +118,7 @@ def test_tiers(monkeypatch, tmp_path):
 
 @pytest.mark.slow
 def test_a_wrong_derivative_is_found():
-    """The derivative by the frequency counts: right it is accurate, twin: a reference that ignores ω is found out."""
+    """The derivative with respect to the frequency counts; twin: a reference that ignores ω is detected."""
     by_frequency = replace(fixed(0.25), along=(0.0, 0.0, {"omega": 1.0}))
     right = by_frequency.attempt()
     assert right.verdict == ACCURATE and right.gradient is not None and right.gradient < 1e-6
@@ -128,5 +128,5 @@ def test_a_wrong_derivative_is_found():
 
 
 def test_the_reduced_report_has_all_three_kinds():
-    """What the main job expects of its rows, and fails where one is otherwise: each kind is among it, none is open."""
+    """Every row of the main job has an expected verdict, and each kind of verdict occurs."""
     assert {row.expected for row in stability.trials(stability.REDUCED)} == {ACCURATE, DEGRADED, REFUSED}
