@@ -51,8 +51,8 @@ def main(arguments=None) -> int:
     folder = Path(options.output)
     folder.mkdir(parents=True, exist_ok=True)
     started = time.perf_counter()
-    beside = f"; {_at_a_time(options)} scenes at a time, which slow each other down" if _at_a_time(options) > 1 else ""
-    print(f"{_machine()}{beside}\n", flush=True)
+    note = f"; {_at_a_time(options)} scenes at a time, which slow each other down" if _at_a_time(options) > 1 else ""
+    print(f"{_machine()}{note}\n", flush=True)
     numbers, missed, rows = {}, [], None
     for name, part in zip(options.scenes, _parts(options, folder)):
         print(part.printed, end="\n\n", flush=True)
@@ -168,12 +168,12 @@ def _scene(scene, quick, folder) -> Part:
 
 def _run_scene(scene, quick):
     settings = QUICK if quick else FULL
-    runs, found, beside = scene.runs(), [], not quick
+    runs, found, with_others = scene.runs(), [], not quick
     for run in runs[:1] if quick else runs:
         _progress(f"{scene.name}: {run.name}")
         # Other tools are compared once per scene: they take as long as all other runs together.
-        found.append((run, report.work_precision(run, others=beside, **settings)))
-        beside = beside and run.by_hand is None
+        found.append((run, report.work_precision(run, others=with_others, **settings)))
+        with_others = with_others and run.by_hand is None
     _progress(f"{scene.name}: stiff and extreme cases")
     return found, scene.cases()
 

@@ -1,4 +1,4 @@
-"""Skips tests of optimisations (written-out programs, assumed regularity, freed programs) that `LAGJAX_PLAIN=1` turns off."""
+"""Skips tests of written-out programs, assumed regularity and freed programs if `LAGJAX_PLAIN=1` turns these off."""
 
 import pytest
 

@@ -23,10 +23,10 @@ STORE_GROUP = "lagjax"
 # The name of a trajectory's times, and the index of the parameters among its `arrays`.
 TIMES, PARAMS = "t", 1
 STATUS_LONG_NAMES = Status(
-    "how each point went",
-    "steps of all integrations of a point",
-    "worst error of a point, in units of what is allowed",
-    "worst constraint residual of a point, relative",
+    "how each point ended",
+    "total steps of all integrations of a point",
+    "worst error of a point, relative to the allowed error",
+    "worst relative constraint residual of a point",
 )
 
 
