@@ -1,7 +1,7 @@
 """lagjax: a differentiable Lagrangian integrator.
 
-Write a Lagrangian as a plain JAX function `L(t, q, v, params)`; everything else follows from it. The names
-below stand in the order of the physics. Worked systems are in `lagjax.scenes`.
+Write a Lagrangian as a plain JAX function `L(t, q, v, params)`; everything else follows from it. The names below
+are in the order of the physics. Worked systems are in `lagjax.scenes`.
 
     M a = F + Aᵀ λ      M = ∂²L/∂v∂v,   F = ∂L/∂q - ∂p/∂t - (∂p/∂q) v + Q - ∂R/∂v,   p = ∂L/∂v
     A a = gamma         A = ∂g/∂q (holonomic g = 0) or ∂phi/∂v (velocity constraint phi = 0)
@@ -22,7 +22,7 @@ from lagjax.mechanics.noether import NoetherCharge, noether_charge
 from lagjax.mechanics.system import System
 
 # isort: split
-# One state: what the Lagrangian and the constraints say about it.
+# One state: quantities from the Lagrangian and the constraints.
 from lagjax.mechanics.lagrangian import jacobi_integral, mass_matrix, momentum
 from lagjax.mechanics.multipliers import accelerations, constraint_force, constraint_residual
 from lagjax.motion.consistent_state import consistent_state
@@ -72,7 +72,7 @@ from lagjax.comparison.work_precision import work_precision
 if TYPE_CHECKING:
     from lagjax import scenes
 
-    # What a system is like.
+    # Analysis of a system.
     from lagjax.analysis.branches import Branch, Branches, Critical
     from lagjax.analysis.continuation import continue_equilibria
     from lagjax.analysis.continued_orbits import continue_orbits
@@ -93,9 +93,9 @@ if TYPE_CHECKING:
     from lagjax.analysis.symmetries import symmetries
     from lagjax.analysis.symmetry import SymmetryTest, is_symmetry
 
-    # In and out.
-    from lagjax.exchange.exported import export, result_codes
+    # Import and export.
     from lagjax.exchange.from_sympy import from_sympy
+    from lagjax.exchange.standalone_programs import export, result_codes
 
     # Many motions, in a notebook.
     from lagjax.interactive.interact import Knobs, interact
@@ -103,7 +103,7 @@ if TYPE_CHECKING:
 
 __version__ = "0.2.0"
 
-# What is imported when it is first asked for, by its module.
+# Names that are imported on first access, by module.
 LATER = {
     "lagjax.analysis.branches": "Branch Branches Critical",
     "lagjax.analysis.continuation": "continue_equilibria",
@@ -124,14 +124,14 @@ LATER = {
     "lagjax.analysis.routh": "Routhian routhian",
     "lagjax.analysis.symmetries": "symmetries",
     "lagjax.analysis.symmetry": "SymmetryTest is_symmetry",
-    "lagjax.exchange.exported": "export result_codes",
     "lagjax.exchange.from_sympy": "from_sympy",
+    "lagjax.exchange.standalone_programs": "export result_codes",
     "lagjax.interactive.interact": "Knobs interact",
 }
 
 
 def __getattr__(name: str):
-    """The worked systems and what a system is like, imported when they are first asked for."""
+    """The worked systems and the names in `LATER`, imported on first access."""
     if name == "scenes":
         return import_module("lagjax.scenes")
     for module, names in LATER.items():

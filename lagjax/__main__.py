@@ -4,6 +4,6 @@ import sys
 
 from lagjax.job import main
 
-# Its parts run in processes of their own, which import this file, too.
+# Parts of the job run in separate processes, which import this file as well.
 if __name__ == "__main__":
     sys.exit(main())

@@ -1,8 +1,8 @@
 """A film of points in the plane that plays in a notebook or a browser: one SVG, its numbers, and a short script.
 
-It needs no network, no encoder and no other file. Where scripts are not run (an untrusted notebook, a preview) the
-first frame stands there. Coordinates are whole tenths of a pixel in two bytes each. A film may have several lanes, of
-which the page shows one.
+It needs no network, no encoder and no other file. If scripts do not run (an untrusted notebook, a preview), the first
+frame is shown. Coordinates are integers in tenths of a pixel, with two bytes each. A film may have several lanes; the
+page shows one of them.
 """
 
 import html
@@ -16,22 +16,22 @@ from lagjax.pages import encoded, fragment, whole
 from lagjax.pages.page import in_bytes
 from lagjax.plot import COLOURS
 
-# The largest field of the picture in tenths of a pixel, and what stands around it: left, top, right, bottom.
+# The largest field of the picture in tenths of a pixel, and its margins: left, top, right, bottom.
 FIELD = (4200, 3600)
 MARGINS = (520, 80, 160, 440)
-# A direction in which little moves is shown at least as wide as this share of the other.
+# A direction with little motion is shown at least as wide as this fraction of the other direction.
 NARROWEST = 0.3
-# Points of longer lines are not marked: these are outlines.
+# Points of longer lines are not marked: such lines are outlines.
 MARKED_UP_TO = 8
-# A lane without a motion: what the script knows by this number.
+# The coordinate that marks a lane without a motion for the script.
 NOWHERE = -32768
 
 
 class Animation:
-    """A motion that plays itself in a notebook, and in a browser from the page that `save` writes.
+    """A motion that plays in a notebook, and in a browser from the page that `save` writes.
 
-    - `t` (F,): the time of each frame; `points`: by name, (F, k, 2), what is drawn.
-    - `rate`: frames a second; `trail`: how many frames behind a trail reaches.
+    - `t` (F,): the time of each frame; `points`: the points drawn, by name, (F, k, 2).
+    - `rate`: frames per second; `trail`: the length of a trail in frames.
 
     >>> import numpy as np
     >>> t = np.linspace(0.0, 1.0, 5)
@@ -60,7 +60,7 @@ class Animation:
 
 
 def film(t: np.ndarray, points: dict[str, np.ndarray], rate: float, trail: int) -> tuple[str, dict[str, Any]]:
-    """A film as HTML with its first frame, and what `film.js` plays it from.
+    """A film as HTML with its first frame, and the data from which `film.js` plays it.
 
     **Arguments:** `t` (F,); `points` by name, (N, F, k, 2) for N lanes, NaN in a lane without a motion; `rate`, `trail`
     as in `Animation`.
@@ -86,10 +86,10 @@ def film(t: np.ndarray, points: dict[str, np.ndarray], rate: float, trail: int) 
 
 
 def _field(points):
-    """The lower left corner and the size of what is shown, and tenths of a pixel to a unit, the same both ways."""
-    every = np.concatenate([x.reshape(-1, 2) for x in points.values()])
-    every = every[np.isfinite(every).all(axis=1)]
-    low, high = every.min(axis=0), every.max(axis=0)
+    """The lower left corner and the size of the field, and tenths of a pixel per unit, the same in both directions."""
+    all_points = np.concatenate([x.reshape(-1, 2) for x in points.values()])
+    all_points = all_points[np.isfinite(all_points).all(axis=1)]
+    low, high = all_points.min(axis=0), all_points.max(axis=0)
     size = high - low
     size = np.maximum(size, NARROWEST * size.max())
     size = 1.1 * np.where(size > 0, size, 1.0)
@@ -132,9 +132,9 @@ def _picture(parts, low, size, scale, words):
 def _part(i, points):
     """A trail, a line and its dots, which the script moves."""
     colour = _colour(i)
-    there = [(x, y) for x, y in points.tolist() if x != NOWHERE]
-    line = " ".join(f"{x} {y}" for x, y in there)
-    dots = "".join(f"M{x} {y}h0" for x, y in there)
+    shown = [(x, y) for x, y in points.tolist() if x != NOWHERE]
+    line = " ".join(f"{x} {y}" for x, y in shown)
+    dots = "".join(f"M{x} {y}h0" for x, y in shown)
     marks = f'<path d="{dots}" stroke="{colour}" stroke-width="110" stroke-linecap="round"/>'
     return (
         f'<g data-part="" fill="none" stroke="{colour}" stroke-linejoin="round">'
@@ -148,7 +148,7 @@ def _colour(i):
 
 
 def _ticks(low, high):
-    """Round numbers between two, three to six of them, and their labels."""
+    """Three to six round numbers between `low` and `high`, and their labels."""
     rough = (high - low) / 4
     power = 10.0 ** math.floor(math.log10(rough))
     step = min((m * power for m in (1, 2, 5, 10)), key=lambda step: abs(math.log(step / rough)))

@@ -1,10 +1,10 @@
 """`python -m lagjax`: every scene, checked, timed and drawn; then the stability report.
 
-For each scene: error against run time by method and tolerance, how long its first answer took, then what happened in
-stiff and extreme cases; work-precision diagrams and a picture as PNG, all numbers as JSON. `python -m lagjax stability`
-prints the whole stability report, the main job a part of it. The exit status is 1 where a scene misses its accuracy, or
-a row of the stability report is silently wrong or not as it should be. Scenes run side by side, one a core: they are
-mostly compiled, one thread each.
+For each scene: error against run time by method and tolerance, the time of the first answer, then the results of stiff
+and extreme cases; work-precision diagrams and a picture as PNG, all numbers as JSON. `python -m lagjax stability`
+prints the whole stability report, the main job only a part of it. The exit status is 1 if a scene misses its accuracy,
+or a row of the stability report is silently wrong or has another outcome than expected. Scenes run in parallel, one per
+core: most of their time is compilation, which uses one thread.
 """
 
 import argparse
@@ -38,7 +38,7 @@ QUICK = {"methods": {"Dopri8": Dopri8()}, "tolerances": (1e-6, 1e-10), "repeats"
 
 
 class Part(NamedTuple):
-    """A scene, or the stability report: what is printed of it, its numbers, and what was missed."""
+    """A scene, or the stability report: its printed text, its numbers, and the requirements it missed."""
 
     printed: str
     numbers: Any
@@ -51,8 +51,8 @@ def main(arguments=None) -> int:
     folder = Path(options.output)
     folder.mkdir(parents=True, exist_ok=True)
     started = time.perf_counter()
-    beside = f"; {_at_a_time(options)} scenes at a time, which disturb each other" if _at_a_time(options) > 1 else ""
-    print(f"{_machine()}{beside}\n", flush=True)
+    note = f"; {_at_a_time(options)} scenes at a time, which slow each other down" if _at_a_time(options) > 1 else ""
+    print(f"{_machine()}{note}\n", flush=True)
     numbers, missed, rows = {}, [], None
     for name, part in zip(options.scenes, _parts(options, folder)):
         print(part.printed, end="\n\n", flush=True)
@@ -72,7 +72,7 @@ def main(arguments=None) -> int:
 
 
 def _parts(options, folder) -> Iterator[Part]:
-    """All that was asked for, in that order; some at a time, each in a process of its own."""
+    """All requested parts, in order; several at a time, each in its own process."""
     tasks = [(name, options.quick, options.tier, folder) for name in options.scenes]
     at_a_time = _at_a_time(options)
     if at_a_time == 1:
@@ -87,7 +87,7 @@ def _parts(options, folder) -> Iterator[Part]:
             _progress("")
             yield part
     finally:
-        # What was interrupted does not begin the rest.
+        # After an interruption no further parts are started.
         pool.shutdown(cancel_futures=True)
 
 
@@ -96,7 +96,7 @@ def _at_a_time(options):
 
 
 def _part(name, quick, tier, folder) -> Part:
-    # The job is the application here: the library itself never sets JAX's options.
+    # The job is an application: the library itself never sets JAX's options.
     jax.config.update("jax_enable_x64", True)
     return _stability(tier) if name == STABILITY else _scene(SCENES[name], quick, folder)
 
@@ -116,25 +116,25 @@ def _parse(arguments):
     parser.add_argument(
         "--quick",
         action="store_true",
-        help="one run a scene, one method, two tolerances, no scene pictures, few stability rows; under a minute",
+        help="one run per scene, one method, two tolerances, no scene pictures, few stability rows; under a minute",
     )
     parser.add_argument(
         "-j", "--jobs", type=int, default=usable_cores(), metavar="N",
-        help="scenes at a time, each in a process of its own; by default one a core. Alone (-j 1) times vary less",
+        help="scenes at a time, each in its own process; by default one per core. With -j 1 times vary less",
     )  # fmt: skip
     options = parser.parse_args(arguments)
     unknown = [name for name in options.scenes if name not in (*SCENES, STABILITY)]
     if unknown:
         parser.error(f"no scene named {', '.join(unknown)}; there are: {', '.join(SCENES)}, and {STABILITY}")
-    asked = stability.FULL if options.scenes else stability.REDUCED
-    options.tier = stability.QUICK if options.quick else asked
+    tier = stability.FULL if options.scenes else stability.REDUCED
+    options.tier = stability.QUICK if options.quick else tier
     short = [name for name, scene in SCENES.items() if not (options.quick and scene.long)]
     options.scenes = options.scenes or [*short, STABILITY]
     return options
 
 
 def _stability(tier) -> Part:
-    """The stability report, with what is not as it should be."""
+    """The stability report, with the rows that do not have the expected outcome."""
     _progress("stability")
     rows, outcomes = stability.trials(tier), []
     for i, row in enumerate(rows):
@@ -153,7 +153,7 @@ def _stability(tier) -> Part:
 
 
 def _scene(scene, quick, folder) -> Part:
-    """A scene: checked, timed and drawn."""
+    """Check, time and draw a scene."""
     found, cases = _run_scene(scene, quick)
     _draw(scene, found, folder, with_picture=not quick)
     rows = [row for run, of_run in found for row in report.rows_of(run, of_run)]
@@ -168,12 +168,12 @@ def _scene(scene, quick, folder) -> Part:
 
 def _run_scene(scene, quick):
     settings = QUICK if quick else FULL
-    runs, found, beside = scene.runs(), [], not quick
+    runs, found, with_others = scene.runs(), [], not quick
     for run in runs[:1] if quick else runs:
         _progress(f"{scene.name}: {run.name}")
-        # Once a scene other tools are beside ours: they take as long as all of these.
-        found.append((run, report.work_precision(run, others=beside, **settings)))
-        beside = beside and run.by_hand is None
+        # Other tools are compared once per scene: they take as long as all other runs together.
+        found.append((run, report.work_precision(run, others=with_others, **settings)))
+        with_others = with_others and run.by_hand is None
     _progress(f"{scene.name}: stiff and extreme cases")
     return found, scene.cases()
 
@@ -186,7 +186,7 @@ def _draw(scene, found, folder, with_picture):
         print(f"no pictures: {error}", file=sys.stderr)
         return
     panels = [of_run.against_time(run.name) for run, of_run in found if run.drawn]
-    # Of motions that last no longer than a call, or have no error, there is nothing to see.
+    # Run times of motions shorter than a call, or without an error, are not drawn.
     if panels:
         plot.work_precision(panels).savefig(folder / f"{scene.name}_work_precision.png")
     if with_picture:
@@ -206,7 +206,7 @@ def _described(scene, rows, cases):
 
 
 def _progress(text):
-    """One line that is overwritten, on a terminal only."""
+    """Overwrite one line of text, only in a terminal."""
     if sys.stderr.isatty() and parent_process() is None:
         print(f"\r\033[K{text}", end="", file=sys.stderr, flush=True)
 

@@ -1,15 +1,15 @@
-"""For Lagrangians with a network in them: what saves from the known traps of learning one from motion.
+"""For Lagrangians that contain a network: tools against the known pitfalls of learning one from motion.
 
 `lj.fit` trains, with an optimiser of optax or by Levenberg-Marquardt; any module of equinox, or plain arrays in
-`params`, can be learned. What is here is only what goes wrong by itself otherwise:
+`params`, can be learned. This module only covers what otherwise goes wrong easily:
 
-- A force is a slope of L, so a network inside of it needs two continuous derivatives: `Network`.
-- A mass matrix M must stay regular on the way, and what takes energy away must not give any. Both are
+- A force is a slope of L, so a network in L needs two continuous derivatives: `Network`.
+- A mass matrix M must stay regular during training, and dissipation must never supply energy. Both use
 
       M = S (floor 1 + Λ Λᵀ) S,
 
-  Λ lower triangular with a positive diagonal, S² the typical sizes on the diagonal: `positive_definite`.
-- L and c L + dF(t, q)/dt have the same motions, so that two that were learned cannot be compared as functions:
+  with Λ lower triangular with a positive diagonal, and S² the typical sizes on the diagonal: `positive_definite`.
+- L and c L + dF(t, q)/dt have the same motions, so two learned Lagrangians cannot be compared as functions:
   `same_motion` and `disagreement` compare accelerations.
 """
 
@@ -27,14 +27,15 @@ from lagjax.mechanics.diagnosis import listed
 from lagjax.mechanics.lagrangian import mass_matrix
 from lagjax.mechanics.multipliers import accelerations
 
-# Where an activation is looked at, and what is a jump of its curvature there, as a part of the largest.
-LOOKED_AT, NEAR, JUMP = np.concatenate([np.linspace(-8.0, 8.0, 1601), [-1e3, 1e3]]), 1e-5, 0.01
-# Accelerations that differ by less, relative to their size, are the same; so are ratios of mass matrices.
-SAME = 1e-6
+# The points at which an activation is checked, the distance over which its curvature may not jump, and the size of a
+# jump relative to the largest curvature.
+CHECKED_AT, DISTANCE, JUMP = np.concatenate([np.linspace(-8.0, 8.0, 1601), [-1e3, 1e3]]), 1e-5, 0.01
+# Accelerations and ratios of mass matrices that differ by less than this, relative to their size, count as the same.
+SAME_BELOW = 1e-6
 
 
 class Network(eqx.Module):
-    """A smooth network of coordinates, for a part of a Lagrangian: a potential, say.
+    """A smooth network of coordinates, for a part of a Lagrangian such as a potential.
 
     >>> import jax
     >>> import lagjax as lj
@@ -42,23 +43,23 @@ class Network(eqx.Module):
     >>> print(potential({"angle": 0.3, "height": 20.0}))
     0.0
 
-    It is an `equinox.nn.MLP` of the coordinates, each over its typical size, and of angles their sine and cosine, so
-    that it is the same after a whole turn. (A network of the angle itself, after a turn, is outside of what it has
-    seen.) It begins as zero: the motion from which training starts is that of what is known. Only the weights of `mlp`
-    are numbers that a fit finds.
+    It is an `equinox.nn.MLP` of the coordinates, each divided by its typical size, and of the sine and cosine of
+    angles, so that it is the same after a whole turn. (A network of the angle itself would be outside its training data
+    after a turn.) It is zero at first, so training starts from the motion of the known part. A fit changes only the
+    weights of `mlp`.
 
     **Arguments:**
 
-    - `sizes`: the typical size of each coordinate, in the structure of what the network is called with.
+    - `sizes`: the typical size of each coordinate, in the structure of the argument of the network.
     - `key`: a key of `jax.random`. `width`, `depth`: of the hidden layers.
     - `out`: how many numbers it returns; a scalar by default.
-    - `angles`: the names of coordinates that are angles, in radians, as `lj` writes them: `"angle"`, `["q[0]"]`.
-    - `activation`: with two continuous derivatives, as `jnp.tanh`, `jax.nn.softplus`, `jax.nn.silu`.
-    - `first`: how large the weights of the last layer are at first, relative to those that equinox draws.
+    - `angles`: the names of coordinates that are angles, in radians, as `lj` prints them: `"angle"`, `["q[0]"]`.
+    - `activation`: a function with two continuous derivatives, such as `jnp.tanh`, `jax.nn.softplus`, `jax.nn.silu`.
+    - `first`: the initial size of the weights of the last layer, relative to those drawn by equinox.
 
-    **Raises:** `ValueError` for an activation without curvature (`relu`), with a jump in it (`elu`), or that overflows
-    (`log(1 + exp(x))`, which is `jax.nn.softplus` written out); for a size that is not positive; for a name that no
-    coordinate has.
+    **Raises:** `ValueError` for an activation without curvature (`relu`), with a jump in its curvature (`elu`), or that
+    overflows (`log(1 + exp(x))` instead of `jax.nn.softplus`); for a size that is not positive; for a name that is not
+    a coordinate.
     """
 
     mlp: eqx.nn.MLP
@@ -80,15 +81,15 @@ class Network(eqx.Module):
         names = coordinates.names(sizes)
         flat = [float(x) for leaf in jax.tree.leaves(sizes) for x in np.ravel(leaf)]
         if not all(np.isfinite(x) and x > 0 for x in flat):
-            raise ValueError(f"typical sizes must be positive, not {flat}.\nFix: 1.0 where nothing is known.")
+            raise ValueError(f"typical sizes must be positive, not {flat}.\nFix: 1.0 for unknown sizes.")
         angles = [angles] if isinstance(angles, str) else list(angles)
-        # An array of angles by its name, too.
-        called = [{name, name.partition("[")[0]} for name in names]
-        wrong = [angle for angle in angles if not any(angle in x for x in called)]
-        if wrong:
-            raise ValueError(f"angles names {listed(wrong)}, and the coordinates are {listed(names)}.")
+        # An array of angles may also be given by its name alone.
+        accepted_names = [{name, name.partition("[")[0]} for name in names]
+        unknown = [angle for angle in angles if not any(angle in x for x in accepted_names)]
+        if unknown:
+            raise ValueError(f"angles names {listed(unknown)}, but the coordinates are {listed(names)}.")
         _check_activation(activation)
-        self.sizes, self.angular = tuple(flat), tuple(not x.isdisjoint(angles) for x in called)
+        self.sizes, self.angular = tuple(flat), tuple(not x.isdisjoint(angles) for x in accepted_names)
         mlp = eqx.nn.MLP(len(flat) + sum(self.angular), out or "scalar", width, depth, activation, key=key)
         last = lambda mlp: (mlp.layers[-1].weight, mlp.layers[-1].bias)
         self.mlp = eqx.tree_at(last, mlp, tuple(first * x for x in last(mlp)))
@@ -97,19 +98,19 @@ class Network(eqx.Module):
         """The network at coordinates `q`: a scalar, or `(out,)`."""
         x, _ = coordinates.flatten(q)
         if x.shape != (len(self.sizes),):
-            raise ValueError(f"this network takes {len(self.sizes)} numbers, and was given {x.size}.")
-        of = [
+            raise ValueError(f"this network takes {len(self.sizes)} numbers, but was given {x.size}.")
+        inputs = [
             part
             for i, (size, angular) in enumerate(zip(self.sizes, self.angular))
             for part in ((jnp.sin(x[i]), jnp.cos(x[i])) if angular else (x[i] / size,))
         ]
-        return self.mlp(jnp.stack(of))
+        return self.mlp(jnp.stack(inputs))
 
 
 def positive_definite(
     numbers: Float[ArrayLike, " k"], sizes: ArrayLike = 1.0, floor: float = 1e-3
 ) -> Float[Array, "n n"]:
-    """Return a positive definite matrix made of any numbers: a mass matrix, or one of damping.
+    """Return a positive definite matrix made of any numbers, for a mass or damping matrix.
 
     >>> import jax.numpy as jnp
     >>> print(positive_definite(jnp.array([0.0, 0.0, 0.5]), sizes=jnp.array([1.0, 4.0]), floor=0.0))
@@ -117,18 +118,18 @@ def positive_definite(
      [1. 5.]]
 
     `M = S (floor 1 + Λ Λᵀ) S`: the first n numbers x make the diagonal of Λ, `(x + √(x² + 4))/2`, which is 1 at 0 and
-    neither reaches zero nor overflows; the others stand below it, row by row. S² has the `sizes` on its diagonal, to
-    which M is near where all numbers are zero. Whatever the numbers are, no direction has less than `floor` of its
-    size, so that the accelerations stay finite while a network that gives the numbers is being trained.
+    neither reaches zero nor overflows; the others are the entries below it, row by row. S² has the `sizes` on its
+    diagonal; M is close to S² if all numbers are zero. Whatever the numbers are, no direction has less than `floor` of
+    its size, so that accelerations stay finite while a network that returns the numbers is trained.
 
-    For `R = ½ vᵀ D(q) v` with such a D, which may have `floor=0.0`, the power `-vᵀ D v` is never positive. Where D is
-    to depend on v, give the force `-D(q, v) v`; R would have the force `-∂R/∂v`, which may then push.
+    For `R = ½ vᵀ D(q) v` with such a D, which may have `floor=0.0`, the power `-vᵀ D v` is never positive. If D depends
+    on v, use the force `-D(q, v) v` instead; the force `-∂R/∂v` of R could then supply energy.
 
     **Arguments:** `numbers` (n(n+1)/2,), or a scalar for n = 1; `sizes`, one or (n,), in the unit of the diagonal.
 
     **Returns:** (n, n), symmetric.
 
-    **Raises:** `ValueError` for another number of them.
+    **Raises:** `ValueError` for a wrong number of `numbers`.
 
     Source: Pinheiro & Bates, *Stat. Comput.* 6 (1996) 289 (parametrisations by Cholesky).
     """
@@ -136,13 +137,13 @@ def positive_definite(
     n = int((np.sqrt(8 * numbers.size + 1) - 1) / 2)
     if n * (n + 1) // 2 != numbers.size or n == 0:
         raise ValueError(
-            f"a symmetric matrix of n rows has n(n+1)/2 numbers (1, 3, 6, 10, ...), and there are {numbers.size}.\n"
+            f"a symmetric matrix of n rows needs n(n+1)/2 numbers (1, 3, 6, 10, ...), but there are {numbers.size}.\n"
             "Fix: lj.learned.Network(..., out=n * (n + 1) // 2)."
         )
     sizes = jnp.broadcast_to(jnp.asarray(sizes, numbers.dtype), (n,))
     x = numbers[:n]
     root = jnp.sqrt(x**2 + 4)
-    # Of a large negative number the sum would be what rounding leaves. (`minimum` has half a slope at 0.)
+    # For a large negative x the sum would be only round-off. (`minimum` would have half a slope at 0.)
     diagonal = jnp.where(x > 0, (x + root) / 2, 2 / (root - jnp.where(x > 0, 0.0, x)))
     triangle = jnp.diag(diagonal).at[np.tril_indices(n, -1)].set(numbers[n:])
     scale = jnp.sqrt(sizes)
@@ -151,11 +152,11 @@ def positive_definite(
 
 @dataclass(frozen=True)
 class SameMotion:
-    """Whether two systems mean the same motion.
+    """Whether two systems have the same motion.
 
-    - `differences` (N,): of the accelerations at each state, relative to their typical size.
+    - `differences` (N,): the differences of the accelerations at each state, relative to their typical size.
     - `same`: whether they are all below 1e-6. `worst`: the state with the largest.
-    - `ratio`: M of the other over M of the first, where that is one number; else NaN.
+    - `ratio`: M of the other system divided by M of the first, if that is one number; else NaN.
     """
 
     differences: Float[np.ndarray, " N"]
@@ -163,11 +164,11 @@ class SameMotion:
 
     @property
     def same(self) -> bool:
-        return bool(np.all(self.differences < SAME))
+        return bool(np.all(self.differences < SAME_BELOW))
 
     @property
     def worst(self) -> int:
-        # Where one is not finite, that.
+        # A difference that is not finite counts as the largest.
         return int(np.argmax(np.where(np.isfinite(self.differences), self.differences, np.inf)))
 
     def __repr__(self):
@@ -176,7 +177,7 @@ class SameMotion:
             return f"SameMotion: NO, accelerations differ by up to {size} of their size, most at state {self.worst}"
         if np.isnan(self.ratio):
             return "SameMotion: yes, by Lagrangians whose mass matrices are not proportional"
-        return f"SameMotion: yes; the other L is {self.ratio:.6g} times the first, but for a total derivative"
+        return f"SameMotion: yes; the other L is {self.ratio:.6g} times the first, up to a total derivative"
 
 
 def same_motion(
@@ -189,17 +190,17 @@ def same_motion(
     >>> swing = lj.System(lambda t, q, v, params: 0.5 * v**2 + jnp.cos(q))
     >>> disguised = lj.System(lambda t, q, v, params: 1.5 * v**2 + 3.0 * jnp.cos(q) + v * jnp.exp(q) - 7.0)
     >>> same_motion(swing, disguised, jnp.linspace(-1.0, 1.0, 5), jnp.linspace(2.0, 0.0, 5))
-    SameMotion: yes; the other L is 3 times the first, but for a total derivative
+    SameMotion: yes; the other L is 3 times the first, up to a total derivative
 
-    The motion does not tell L from `c L + dF(t, q)/dt`: a number times L, a constant, what is linear in v and has no
-    curl. So L, V or weights that were learned say nothing where they stand side by side; accelerations do.
+    The motion does not distinguish L from `c L + dF(t, q)/dt`: a multiple of L, an added constant, or added terms that
+    are linear in v without a curl. So comparing learned L, V or weights says nothing; comparing accelerations does.
 
     **Arguments:** two systems with the same coordinates; states `q`, `v`, leaves (N, ...), at `t`, one or (N,); the
     parameters of each.
 
     **Returns:** a `SameMotion`.
 
-    **Raises:** as `lj.accelerations`.
+    **Raises:** the errors of `lj.accelerations`.
 
     Source: Goldstein, §1.4 and derivation 8 of chapter 1 (total derivatives).
     """
@@ -209,12 +210,12 @@ def same_motion(
     size = np.where(size > 0, size, np.maximum(np.sqrt(np.mean(b**2, axis=0)), np.finfo(a.dtype).tiny))
     differences = np.max(np.abs(a - b) / size, axis=1)
     ratio = np.sum(m * other_m) / np.sum(m * m)
-    proportional = np.max(np.abs(other_m - ratio * m)) < SAME * np.max(np.abs(other_m))
+    proportional = np.max(np.abs(other_m - ratio * m)) < SAME_BELOW * np.max(np.abs(other_m))
     return SameMotion(differences, float(ratio) if proportional else np.nan)
 
 
 def disagreement(system, members: Sequence[PyTree], q, v, t: ArrayLike = 0.0) -> PyTree[Float[Array, "N ..."]]:
-    """Return how far the accelerations of several trained models are apart: where they have not seen enough.
+    """Return the spread of the accelerations of several trained models, which is large where they lack data.
 
     >>> import jax.numpy as jnp
     >>> import lagjax as lj
@@ -222,8 +223,8 @@ def disagreement(system, members: Sequence[PyTree], q, v, t: ArrayLike = 0.0) ->
     >>> print(disagreement(spring, [{"k": 1.0}, {"k": 3.0}], jnp.array([0.0, 0.5, 2.0]), jnp.zeros(3)))
     [0.         0.70710678 2.82842712]
 
-    Members that start from other weights, or see other records, agree where the data decide and go apart where they do
-    not. It is the spread that is left, not the error: what all members leave out does not show.
+    Members trained from different weights, or on different records, agree where the data determine them and differ
+    elsewhere. This is their spread, not their error: effects that all members lack do not show.
 
     **Arguments:** the `system` with parameters of each of two `members` or more; states as for `same_motion`.
 
@@ -235,7 +236,7 @@ def disagreement(system, members: Sequence[PyTree], q, v, t: ArrayLike = 0.0) ->
     """
     if len(members) < 2:
         raise ValueError(
-            "one model has nothing to disagree with.\nFix: several fits, with other keys of their networks."
+            "a single model has nothing to disagree with.\nFix: several fits, with different keys of their networks."
         )
     times = jnp.broadcast_to(jnp.asarray(t, jnp.result_type(float)), (jnp.shape(jax.tree.leaves(q)[0])[0],))
     each = lambda params: jax.vmap(lambda t, q, v: accelerations(system, t, q, v, params)[0])(times, q, v)
@@ -257,17 +258,17 @@ def _at_states(system, t, q, v, params):
 def _check_activation(activation):
     with jax.ensure_compile_time_eval():
         curvature = jax.vmap(jax.grad(jax.grad(lambda x: activation(x))))
-        at = np.asarray(curvature(jnp.asarray(LOOKED_AT)))
-        beside = np.asarray(curvature(jnp.asarray(LOOKED_AT + NEAR)))
+        at = np.asarray(curvature(jnp.asarray(CHECKED_AT)))
+        nearby = np.asarray(curvature(jnp.asarray(CHECKED_AT + DISTANCE)))
     if not np.all(np.isfinite(at)):
         raise ValueError(
-            f"the activation {activation!r:.60} has no finite curvature at {LOOKED_AT[~np.isfinite(at)][0]:g}.\n"
+            f"the activation {activation!r:.60} has no finite curvature at {CHECKED_AT[~np.isfinite(at)][0]:g}.\n"
             "Usual cause: log(1 + exp(x)), which overflows.\nFix: jax.nn.softplus, jnp.tanh, jax.nn.silu."
         )
     largest = np.max(np.abs(at))
-    if largest == 0 or np.max(np.abs(beside - at)) > JUMP * largest:
+    if largest == 0 or np.max(np.abs(nearby - at)) > JUMP * largest:
         raise ValueError(
             f"the activation {activation!r:.60} is not smooth: its second derivative is zero, or jumps.\n"
-            "Then forces jump, where a method loses its order, and a mass matrix that is made of it is singular.\n"
+            "Forces would jump, so that a method loses its order, and a mass matrix made of it would be singular.\n"
             "Fix: jnp.tanh, jax.nn.softplus, jax.nn.silu."
         )

@@ -1,17 +1,17 @@
-"""The lines that show how far long work has come, and what it waits for.
+"""Progress bars for long work, and messages about long waits.
 
-Short work shows nothing, nor is anything shown where nobody looks.
+Short work shows nothing, and nothing is shown outside of terminals and notebooks.
 """
 
 import threading
 from contextlib import contextmanager, nullcontext
 
-# Seconds after which what takes so long is announced, and between two looks at the clock then.
+# Seconds of waiting before a message is shown, and between two updates of it.
 LONG, TICK = 0.5, 1.0
 
 
 class Silent(nullcontext):
-    """A meter that shows nothing: where tqdm is not installed."""
+    """A meter that shows nothing, used if tqdm is not installed."""
 
     disable = True
 
@@ -19,14 +19,14 @@ class Silent(nullcontext):
         super().__init__(self)
 
     def update(self, count):
-        """Nothing."""
+        """Do nothing."""
 
     def refresh(self):
-        """Nothing."""
+        """Do nothing."""
 
 
 def meter(progress: bool | None, **settings):
-    """A context that takes `update(count)`; `settings` go to tqdm. `progress` None: shown where somebody looks."""
+    """A context with `update(count)`; `settings` go to tqdm. `progress` None: shown in terminals and notebooks."""
     try:
         from tqdm.auto import tqdm
     except ImportError:
@@ -37,17 +37,17 @@ def meter(progress: bool | None, **settings):
 
 @contextmanager
 def waiting(progress: bool | None, words: str):
-    """Say in `words` what is waited for, and how long by now; until it is done, or the event that this gives is set."""
+    """Show `words` and the time waited so far, until the context ends or the event that it yields is set."""
     done = threading.Event()
 
-    def tell():
+    def show():
         if done.wait(LONG):
             return
         with meter(progress, desc=words, bar_format="{desc}, {elapsed}", leave=False, delay=0.0, position=0) as shown:
             while not done.wait(TICK):
                 shown.refresh()
 
-    thread = threading.Thread(target=tell, daemon=True)
+    thread = threading.Thread(target=show, daemon=True)
     if progress is not False:
         thread.start()
     try:

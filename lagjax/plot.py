@@ -1,4 +1,4 @@
-"""One look for every picture. Needs matplotlib (`pip install "lagjax[plot]"`)."""
+"""All plots, in one style. Needs matplotlib (`pip install "lagjax[plot]"`)."""
 
 import io
 from collections.abc import Sequence
@@ -10,7 +10,7 @@ import numpy as np
 # Okabe & Ito's colours: distinct to colour-blind readers and in grey print, with a marker and dash each.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 DASHES = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (8, 2)), (0, (1, 1)))
-# The box of words that stand on marks.
+# The box behind text that overlaps marks.
 ON_MARKS = {"facecolor": "white", "alpha": 0.85, "edgecolor": "none", "pad": 1.5}
 MARKERS = ("o", "s", "^", "D", "v", "P", "X")
 
@@ -21,7 +21,7 @@ def figure(rows=1, columns=1, size=(4.6, 3.2), **options):
     from matplotlib.figure import Figure
 
     fig = Figure(figsize=(size[0] * columns, size[1] * rows), layout="constrained", dpi=130)
-    # Shown once as a cell's value, without pyplot and the figures that it keeps open.
+    # Shown as the value of a notebook cell, without pyplot and the figures that it keeps open.
     setattr(fig, "_repr_png_", lambda: _png(fig))
     axes = fig.subplots(rows, columns, squeeze=False, **options)
     for axis in axes.flat:
@@ -31,7 +31,7 @@ def figure(rows=1, columns=1, size=(4.6, 3.2), **options):
 
 
 def panel_axes(count, across, size):
-    """Make a figure of `count` axes of `size` inches, at most `across` beside each other; returns (figure, axes)."""
+    """Make a figure of `count` axes of `size` inches, at most `across` per row; returns (figure, axes)."""
     columns = min(across, count)
     fig, axes = figure(-(-count // columns), columns, size)
     for axis in axes.flat[count:]:
@@ -62,7 +62,7 @@ def style(i: int) -> dict:
 
 
 def time_series(t, panels: dict[str, dict[str, np.ndarray]]):
-    """Draw curves against time, one panel a key of `panels`, one curve a name in it.
+    """Draw curves against time, one panel per key of `panels`, one curve per name in it.
 
     **Arguments:** `t` (T,); `panels` by axis label, curves (T,) by name.
 
@@ -72,8 +72,8 @@ def time_series(t, panels: dict[str, dict[str, np.ndarray]]):
     for axis, (label, curves) in zip(axes[:, 0], panels.items()):
         for i, (name, values) in enumerate(curves.items()):
             axis.plot(t, values, label=name, **style(i))
-        only = next(iter(curves))
-        axis.set_ylabel(label if len(curves) > 1 or only == "q" else f"{label}: {only}")
+        first = next(iter(curves))
+        axis.set_ylabel(label if len(curves) > 1 or first == "q" else f"{label}: {first}")
         if len(curves) > 1:
             axis.legend(fontsize=8, frameon=False, loc="center left", bbox_to_anchor=(1.0, 0.5))
     axes[-1, 0].set_xlabel("t")
@@ -81,7 +81,7 @@ def time_series(t, panels: dict[str, dict[str, np.ndarray]]):
 
 
 def families(label: str, x, ts, panels: dict[str, np.ndarray]):
-    """Draw curves against time, one panel a coordinate, one curve a value of `x` (N,), in its shade.
+    """Draw curves against time, one panel per coordinate, one curve per value of `x` (N,), which sets its shade.
 
     **Arguments:** `ts` (N, T); `panels` by coordinate, curves (N, T).
 
@@ -93,13 +93,13 @@ def families(label: str, x, ts, panels: dict[str, np.ndarray]):
     from matplotlib.colors import ListedColormap, Normalize
 
     low, high = np.min(x), np.max(x)
-    # The lightest shades would not be seen on white.
+    # The lightest shades are left out: they are hard to see on white.
     shades = ListedColormap(colormaps["cividis"](np.linspace(0.0, 0.88, 256)))
     shade = ScalarMappable(Normalize(low, high if high > low else low + 1), shades)
     fig, axes = figure(len(panels), 1, size=(6.4, 2.4), sharex=True)
     for axis, (name, curves) in zip(axes[:, 0], panels.items()):
-        for of, t, curve in zip(x, ts, curves):
-            axis.plot(t, curve, linewidth=1.2, color=shade.to_rgba(of))
+        for value, t, curve in zip(x, ts, curves):
+            axis.plot(t, curve, linewidth=1.2, color=shade.to_rgba(value))
         axis.set_ylabel(name)
     axes[-1, 0].set_xlabel("t")
     fig.colorbar(shade, ax=list(axes[:, 0]), label=label)
@@ -107,10 +107,10 @@ def families(label: str, x, ts, panels: dict[str, np.ndarray]):
 
 
 def phase_portrait(panels: dict[str, tuple[list[tuple[np.ndarray, np.ndarray]], bool]]):
-    """Draw velocities against coordinates, one panel a coordinate, one curve a motion; a dot where each starts.
+    """Draw velocities against coordinates, one panel per coordinate, one curve per motion, with a dot at its start.
 
-    **Arguments:** `panels` by coordinate: [(q (T,), v (T,)) of each motion], and whether it is an angle. Angles that go
-    around are drawn between -π and π.
+    **Arguments:** `panels` by coordinate: [(q (T,), v (T,)) of each motion], and whether it is an angle. Angles with
+    whole turns are drawn between -π and π.
 
     **Returns:** a matplotlib `Figure`.
     """
@@ -129,16 +129,16 @@ def phase_portrait(panels: dict[str, tuple[list[tuple[np.ndarray, np.ndarray]], 
 
 
 def section(panels: dict[tuple[str, str], tuple[list[tuple[np.ndarray, np.ndarray]], bool]], note: str):
-    """Draw points, one panel a pair of names, one colour a motion.
+    """Draw points, one panel per pair of names, one colour per motion.
 
-    **Arguments:** `panels` by the names to the right and upward: [(x (C,), y (C,)) of each motion], and whether x is an
-    angle. `note`: what stands above, for instance that these are not all; may be empty.
+    **Arguments:** `panels` by the names of the x and y axes: [(x (C,), y (C,)) of each motion], and whether x is an
+    angle. `note`: a title, for instance that some points are missing; may be empty.
 
     **Returns:** a matplotlib `Figure`.
     """
     fig, axes = panel_axes(len(panels), 3, (4.2, 3.4))
     for axis, ((to_the_right, upward), (motions, is_angle)) in zip(axes, panels.items()):
-        # Small enough for curves of many points to be told from areas.
+        # Small enough to distinguish curves of many points from areas.
         size = np.clip(80 / np.sqrt(1 + sum(len(x) for x, _ in motions)), 1.2, 5.0)
         for i, (x, y) in enumerate(motions):
             axis.plot(x, y, "o", markersize=size, markeredgewidth=0, color=COLOURS[i % len(COLOURS)])
@@ -151,7 +151,7 @@ def section(panels: dict[tuple[str, str], tuple[list[tuple[np.ndarray, np.ndarra
 
 
 def _cut_at_half_turns(q, v):
-    """An angle brought between -π and π, the curve cut (by NaN) where it leaves on one side and enters on the other."""
+    """An angle wrapped to -π ... π, with the curve cut (by NaN) where it leaves on one side and enters on the other."""
     turn = np.floor((q + np.pi) / (2 * np.pi))
     i = np.flatnonzero(np.diff(turn))
     edge = 2 * np.pi * np.maximum(turn[i], turn[i + 1]) - np.pi
@@ -162,7 +162,7 @@ def _cut_at_half_turns(q, v):
 
 
 def _ticks_in_pi(axis):
-    """Mark fractions of a half turn where a quarter turn or more is shown."""
+    """Put ticks at fractions of π if the axis spans a quarter turn or more."""
     from matplotlib.ticker import FuncFormatter, MultipleLocator
 
     low, high = axis.get_xlim()
@@ -182,8 +182,8 @@ def _ticks_in_pi(axis):
 class Drawn(NamedTuple):
     """One panel of a work-precision diagram.
 
-    - `label`: of the axis of work. `floor`: what the reference may be off by; 0 where that is not known.
-    - `curves`: by name: work (N,), relative errors (N,), which of them are to be trusted (N,), and the measured order.
+    - `label`: the label of the work axis. `floor`: the error of the reference; 0 if unknown.
+    - `curves`: by name: work (N,), relative errors (N,), which of them can be trusted (N,), and the measured order.
     """
 
     title: str
@@ -193,9 +193,10 @@ class Drawn(NamedTuple):
 
 
 def work_precision(panels: Sequence[Drawn]):
-    """Draw error against work, a panel each; the number beside a curve is its order. Returns a matplotlib `Figure`.
+    """Draw error against work, one panel each; the number at a curve is its order. Returns a matplotlib `Figure`.
 
-    Errors of zero are drawn at half a unit of round-off; what is not to be trusted is hollow, on grey.
+    Errors of zero are drawn at half a unit of round-off; untrusted points are hollow, and errors below that of the
+    reference are on grey.
     """
     fig, axes = panel_axes(len(panels), 3, (4.9, 3.9))
     names = list(dict.fromkeys(name for panel in panels for name in panel.curves))
@@ -212,16 +213,16 @@ def _draw_work(axis, panel, names):
     lowest = 0.5 * float(np.finfo(float).eps)
     axis.set(xscale="log", yscale="log", xlabel=panel.label, ylabel="relative error", title=panel.title)
     for name, (work, errors, trusted, order) in panel.curves.items():
-        there = np.isfinite(work) & np.isfinite(errors)
-        if not there.any():
+        finite = np.isfinite(work) & np.isfinite(errors)
+        if not finite.any():
             continue
         i = names.index(name)
-        work, errors, trusted = work[there], np.maximum(errors[there], lowest), trusted[there]
+        work, errors, trusted = work[finite], np.maximum(errors[finite], lowest), trusted[finite]
         axis.plot(work, errors, marker=MARKERS[i % len(MARKERS)], markersize=4, label=name, **style(i))
         hollow = {"marker": MARKERS[i % len(MARKERS)], "color": COLOURS[i % len(COLOURS)], "markerfacecolor": "white"}
         axis.plot(work[~trusted], errors[~trusted], linestyle="", markersize=4, zorder=3, **hollow)
         if np.isfinite(order):
-            # Where curves are farthest apart: at their tight ends.
+            # At the point of smallest error, where curves are farthest apart.
             k = np.argmin(errors)
             axis.annotate(
                 f"{order:.1f}", (work[k], errors[k]), (4, 1), textcoords="offset points", fontsize=8,
@@ -239,7 +240,7 @@ def _draw_work(axis, panel, names):
 
 
 def _ticks_of_decades(axis):
-    """Powers of ten, every second one where there are many; within two decades also twice and five times them."""
+    """Ticks at powers of ten, fewer if there are many; within two decades also at two and five times them."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, NullLocator
 
     low, high = sorted(axis.get_view_interval())
@@ -253,7 +254,7 @@ def _ticks_of_decades(axis):
 
 
 def fits(panels: dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]]):
-    """Draw measurements and what a fit makes of them, and beside them the residuals, one row a channel.
+    """Draw measurements and the fit on the left, and the residuals on the right, one row per channel.
 
     **Arguments:** `panels` by name: times (T,), measurements and residuals (T,) or (T, n).
 
@@ -277,9 +278,9 @@ def fits(panels: dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]]):
 
 
 def training(curves: dict[str, tuple[np.ndarray, np.ndarray]], best: int):
-    """Draw mean squared residuals against the steps of a training, and mark the `best` one.
+    """Draw mean squared residuals against training steps, and mark the `best` step.
 
-    **Arguments:** `curves` by name: steps (S,) and values (S,), NaN where there is none.
+    **Arguments:** `curves` by name: steps (S,) and values (S,), NaN for missing values.
 
     **Returns:** a matplotlib `Figure`.
     """
@@ -294,7 +295,7 @@ def training(curves: dict[str, tuple[np.ndarray, np.ndarray]], best: int):
 
 
 def lines(label: str, x, panels: dict[str, np.ndarray], bad):
-    """Draw values against one axis of a sweep, one panel a value; points that are `bad` are marked at the bottom."""
+    """Draw values against one axis of a sweep, one panel per value; `bad` points are marked at the bottom."""
     fig, axes = figure(len(panels), 1, size=(6.0, 2.8), sharex=True)
     for axis, (name, values) in zip(axes[:, 0], panels.items()):
         axis.plot(x, values, marker="." if len(x) < 200 else "", **style(0))
@@ -308,7 +309,7 @@ def lines(label: str, x, panels: dict[str, np.ndarray], bad):
 
 
 def maps(axes: dict[str, np.ndarray], panels: dict[str, np.ndarray]):
-    """Draw values over two axes as a map, one row a value; of three axes the first has a column for each value."""
+    """Draw values over two axes as maps, one row per value; a third axis in front gets one column per axis value."""
     *first, (down, y), (across, x) = axes.items()
     columns = [("", ...)] if not first else [(f"{first[0][0]} = {value:.4g}", i) for i, value in enumerate(first[0][1])]
     fig, grid = figure(len(panels), len(columns), size=(4.2, 3.2), sharex=True, sharey=True)
@@ -330,7 +331,7 @@ def maps(axes: dict[str, np.ndarray], panels: dict[str, np.ndarray]):
 
 
 def stacked(t, parts: dict[str, np.ndarray], total: np.ndarray, label: str):
-    """Draw parts against time, stacked, what is above zero upward and what is below downward; and their total.
+    """Draw parts against time, stacked upwards if positive and downwards if negative, and their total.
 
     **Arguments:** `t` (T,); `parts` by name, (T,); `total` (T,), drawn as a line with its `label`.
 
@@ -352,9 +353,9 @@ def stacked(t, parts: dict[str, np.ndarray], total: np.ndarray, label: str):
 
 
 def graph(names: Sequence[str], arrows: Sequence[tuple[str, str, str]]):
-    """Draw names on a circle, and arrows between them, with their labels.
+    """Draw names on a circle, and labelled arrows between them.
 
-    **Arguments:** `names`; `arrows`: (from, to, label) each; one from a name to itself is a loop.
+    **Arguments:** `names`; `arrows`: (from, to, label) each; an arrow from a name to itself is a loop.
 
     **Returns:** a matplotlib `Figure`.
     """

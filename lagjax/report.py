@@ -1,8 +1,8 @@
-"""Error against run time, and what happens in the extremes: the tables that `python -m lagjax` prints.
+"""Error against run time, and results of extreme cases: the tables that `python -m lagjax` prints.
 
-A scene offers `Run`s (motions with a known answer) and `Case`s (stiff and extreme inputs, tried once). Runs are
-compared by `lj.work_precision`: times are medians of compiled solves without the call's own. What a person
-waits for the first answer is a run time too, and stands apart: tracing and compiling.
+A scene has `Run`s (motions with a known answer) and `Case`s (stiff and extreme inputs, tried once). Runs are compared
+by `lj.work_precision`: times are medians of compiled solves without the overhead of a call. The time until the first
+answer, which includes tracing and compiling, is reported separately.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -24,7 +24,7 @@ from lagjax.motion.trajectory import Trajectory
 # The tolerance at which a run must reach its `required` error, for the method named with it.
 JUDGED_AT = 1e-10
 JUDGED_METHOD = "Dopri8"
-# Seconds of a solve by another tool after which its tighter tolerances are not tried.
+# If a solve by another tool takes longer than this, in seconds, its tighter tolerances are not tried.
 PATIENCE = 0.4
 
 
@@ -32,12 +32,12 @@ PATIENCE = 0.4
 class Run:
     """A motion with a known answer.
 
-    - `error`: the relative error of a trajectory, as one number; `measured` says in words what it compares.
+    - `error`: the relative error of a trajectory, as one number; `measured` says what it compares.
     - `required`: the largest error allowed at rtol = atol = 1e-10 with Dopri8.
     - `invariant`: a quantity that must not change, (T,) from a trajectory; the Jacobi integral if None.
-    - `events`: by name, `Crossing`s that end the motion.
-    - `by_hand`: accelerations and multipliers derived by hand, of `(t, q, v, params)`, for other tools; None without.
-    - `drawn`: whether it is long enough for run times to say something.
+    - `events`: `Crossing`s by name that end the motion.
+    - `by_hand`: accelerations and multipliers derived by hand, as a function of `(t, q, v, params)`, for other tools.
+    - `drawn`: whether the run is long enough for meaningful run times.
     """
 
     name: str
@@ -57,10 +57,10 @@ class Run:
 
 @dataclass(frozen=True)
 class Case:
-    """One stiff or extreme input: what was tried, what happened, and whether that is right.
+    """One stiff or extreme input: what was tried, what happened, and whether that is correct.
 
-    `error` is relative, against the exact answer; a case passes if it is at most `allowed`. Where the right
-    outcome is a refusal, `happened` quotes it and `error` is 0 (refused, as it should be) or infinite.
+    `error` is relative to the exact answer; a case passes if it is at most `allowed`. If the correct outcome is an
+    error message, `happened` quotes it and `error` is 0 (refused, as expected) or infinite.
     """
 
     name: str
@@ -87,13 +87,13 @@ class Scene:
     runs: Callable[[], Sequence[Run]]
     cases: Callable[[], Sequence[Case]]
     picture: Callable[[], Any]
-    # Left out of `--quick`: what compiles for longer than all of that.
+    # Left out of `--quick`, since it compiles for longer than everything else there.
     long: bool = False
 
 
 @dataclass(frozen=True)
 class Row:
-    """One line of a work-precision table; None where something is not known of another tool."""
+    """One line of a work-precision table; None for values that are unknown for another tool."""
 
     run: str
     measured: str
@@ -115,7 +115,7 @@ class Row:
 
 
 def work_precision(run: Run, others: bool = True, **settings: Any) -> WorkPrecision:
-    """Compare methods on a run; `others` with what one would take instead. `settings` are `lj.work_precision`'s."""
+    """Compare methods on a run; with `others` also with other tools. `settings` are those of `lj.work_precision`."""
     instead, by_hand = None, run.by_hand
     if others and by_hand is not None:
         acceleration = lambda *state: by_hand(*state)[0]
@@ -164,11 +164,11 @@ def work_precision_table(rows: Sequence[Row]) -> str:
 
 
 def first_answer(rows: Sequence[Row]) -> str:
-    """How long the scene's first answer took in this process, and its next: a line below the first table."""
+    """The time of the scene's first answer in this process, and of the next: a line below the first table."""
     row = rows[0]
     return (
         f"first answer: {row.compile_seconds or 0.0:.1f} s of tracing and compiling for '{row.run}' by {row.method}; "
-        f"then {in_ms(row.seconds)} ms a solve"
+        f"then {in_ms(row.seconds)} ms per solve"
     )
 
 
@@ -179,7 +179,7 @@ def case_table(cases: Sequence[Case]) -> str:
         for case in cases
     ]
     header = ("stiff and extreme cases", "error", "allowed", "", "what happened")
-    # The last column is prose: keep it to the left.
+    # The last column is prose, aligned to the left.
     width = max(len(row[-1]) for row in [header, *cells])
     return table(header[:-1] + (header[-1].ljust(width),), [row[:-1] + (row[-1].ljust(width),) for row in cells])
 

@@ -1,4 +1,4 @@
-"""What JAX compiles, counted."""
+"""Count the programs that JAX compiles."""
 
 from contextlib import contextmanager
 
@@ -12,13 +12,13 @@ def _heard(event, seconds, **_):
         _COMPILED.append(seconds)
 
 
-# For good: a listener cannot be taken away again.
+# Registered permanently: JAX cannot remove a listener.
 jax.monitoring.register_event_duration_secs_listener(_heard)
 
 
 @contextmanager
 def compiles():
-    """A list that holds, when it is over, the seconds of each program compiled meanwhile."""
+    """A list to which the compile seconds of each program compiled in this context are added."""
     before, found = len(_COMPILED), []
     yield found
     found.extend(_COMPILED[before:])

@@ -12,13 +12,13 @@ def particles(t, q, v, params):
 
 
 def links(t, q, params):
-    """A chain hung at the origin, each link of length l."""
+    """The constraints of a chain hung at the origin, with links of length l."""
     between = jnp.diff(jnp.concatenate([jnp.zeros((1, 2)), q]), axis=0)
     return jnp.sum(between**2, axis=1) - params["l"] ** 2
 
 
 def chain(count, seed=0):
-    """An open chain of one metre, its links turning at random; (system, q, v, params)."""
+    """An open chain of one metre with randomly turning links; (system, q, v, params)."""
     rng = np.random.default_rng(seed)
     angle = np.linspace(0.3, 1.2, count)
     link = np.stack([np.sin(angle), -np.cos(angle)], 1) / count
@@ -29,7 +29,7 @@ def chain(count, seed=0):
 
 
 def loop(count):
-    """A closed chain, turning."""
+    """A turning closed chain."""
     angle = 2 * np.pi * np.arange(count) / count
     q = np.stack([np.cos(angle), np.sin(angle)], 1) / (2 * count * np.sin(np.pi / count))
     closed = lj.Holonomic(lambda t, q, params: jnp.sum((q - jnp.roll(q, 1, axis=0)) ** 2, axis=1) - params["l"] ** 2)
@@ -43,7 +43,7 @@ def loop(count):
 
 
 def net(width, height):
-    """A net in space, hung at its two upper corners, wavy, at rest."""
+    """A wavy net in space at rest, hung at its two upper corners."""
     place = np.arange(width * height).reshape(height, width)
     pairs = np.concatenate([
         np.stack([place[:, 1:].ravel(), place[:, :-1].ravel()], 1),

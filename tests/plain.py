@@ -1,4 +1,4 @@
-"""For tests of what is written out, taken for regular or forgotten: with `LAGJAX_PLAIN=1` none of it is done."""
+"""Skips tests of written-out programs, assumed regularity and freed programs if `LAGJAX_PLAIN=1` turns these off."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""Reference values to 22 digits and more (mpmath), by key; `reference.json` holds all of them."""
+"""Reference values to 22 or more digits (mpmath), by key, from `reference.json`."""
 
 import json
 from pathlib import Path

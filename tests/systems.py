@@ -7,7 +7,7 @@ from lagjax import Holonomic, System
 
 
 def pendulum_lagrangian(t, q, v, params):
-    """A plane pendulum by its angle from the vertical."""
+    """A plane pendulum in terms of its angle from the vertical."""
     return 0.5 * v**2 + params["g"] / params["l"] * jnp.cos(q)
 
 
@@ -45,12 +45,12 @@ def two_masses_lagrangian(t, q, v, params):
 
 
 def inner_rod(t, q, params):
-    """From the pivot to the first mass."""
+    """The constraint from the pivot to the first mass."""
     return q["first"] @ q["first"] - params["l1"] ** 2
 
 
 def outer_rod(t, q, params):
-    """From the first mass to the second."""
+    """The constraint from the first mass to the second."""
     rod = q["second"] - q["first"]
     return rod @ rod - params["l2"] ** 2
 

@@ -1,4 +1,4 @@
-"""A film is one piece of HTML that holds its numbers and needs nothing else."""
+"""A film is one piece of HTML that contains its numbers and needs nothing else."""
 
 import base64
 import re
@@ -22,7 +22,7 @@ def page():
 
 
 def numbers(page):
-    """What the script draws from, each part (F, k, 2)."""
+    """The data of the script, one array (F, k, 2) per part."""
     film = told(page)
     decoded = lambda part: np.frombuffer(base64.b64decode(part["xy"][1]), "<i2").reshape(
         film["frames"], part["points"], 2
@@ -31,26 +31,26 @@ def numbers(page):
 
 
 def picture(page):
-    """The SVG that stands there before any script runs."""
+    """The SVG shown before any script runs."""
     return ET.fromstring(re.search(r"<svg.*</svg>", page)[0])
 
 
 def test_needs_nothing_from_outside(page):
-    """No address but the name of SVG, no file; small."""
+    """The HTML is small, and has no URL except the SVG namespace."""
     assert re.findall(r"(?:src|href|url|import|fetch)\b", page) == []
     assert set(re.findall(r"https?://[^\"]*", page)) == {"http://www.w3.org/2000/svg"}
     assert len(page) < 15_000
 
 
 def test_numbers_are_the_points(page):
-    """Undoing the scale gives the points back to a twentieth of a pixel, with one scale for x and y, y upwards."""
+    """Undoing the scale recovers the points to a twentieth of a pixel, with one scale for x and y, and y upwards."""
     drawn = [part.astype(float) for part in numbers(page)]
     pixels, points = (np.concatenate([x.reshape(-1, 2) for x in all_]) for all_ in (drawn, POINTS.values()))
     scale = np.ptp(pixels[:, 0]) / np.ptp(points[:, 0])
     np.testing.assert_allclose(pixels[:, 0] - pixels[0, 0], scale * (points[:, 0] - points[0, 0]), atol=2)
     np.testing.assert_allclose(pixels[:, 1] - pixels[0, 1], -scale * (points[:, 1] - points[0, 1]), atol=2)
     assert np.ptp(pixels[:, 0]) <= FIELD[0] and np.ptp(pixels[:, 1]) <= FIELD[1]
-    # Twin: another scale is told apart.
+    # Twin: another scale is detected.
     assert np.max(np.abs(pixels[:, 0] - pixels[0, 0] - 1.02 * scale * (points[:, 0] - points[0, 0]))) > 2
 
 
@@ -77,14 +77,14 @@ def test_outlines_have_no_marks():
 
 
 def test_the_same_film_is_the_same_text(page):
-    """Run again, a notebook does not change; another film on the same page has another name."""
+    """The same film has the same name, so a notebook run again does not change; another film has another name."""
     assert Animation(T, POINTS, 25.0, 10)._repr_html_() == page
     other = Animation(T, {"tip": POINTS["tip"]}, 25.0, 10)._repr_html_()
     assert other[:50] != page[:50]
 
 
 def test_saves_a_page(tmp_path, page):
-    """The page holds the same film."""
+    """The saved page contains the same film."""
     Animation(T, POINTS, 25.0, 10).save(tmp_path / "motion.html")
     text = (tmp_path / "motion.html").read_text(encoding="utf-8")
     assert text.startswith("<!DOCTYPE html>") and page in text
@@ -92,7 +92,7 @@ def test_saves_a_page(tmp_path, page):
 
 @pytest.mark.parametrize("size", [0.0, 1e-9, 1e12])
 def test_any_size(size):
-    """A point at rest, a tiny and a huge motion have a picture and distinct ticks."""
+    """A point at rest, a tiny and a huge motion are drawn with distinct ticks."""
     page = Animation(T, {"": size * CIRCLE}, 25.0, 10)._repr_html_()
     labels = [e.text for e in picture(page).iter() if e.tag.endswith("text")]
     assert 6 <= len(labels) <= 16

@@ -1,4 +1,4 @@
-"""The house: layers, cycles, file sizes, docstrings, exports."""
+"""The architecture: layers, cycles, file sizes, docstrings, exports."""
 
 import ast
 import doctest
@@ -66,7 +66,7 @@ def internal_imports(source):
 
 
 def upward_imports(name, source):
-    """The imports of a module that point up the house."""
+    """The imports of a module from higher layers."""
     if layer(name) in TOP:
         return []
     rank = LAYERS.index(layer(name))
@@ -74,7 +74,7 @@ def upward_imports(name, source):
 
 
 def nested_imports(source):
-    """Imports inside functions, but for optional extras."""
+    """Imports inside functions, except of optional extras."""
     found = []
     for function in ast.walk(ast.parse(source)):
         if isinstance(function, (ast.FunctionDef, ast.AsyncFunctionDef)):
@@ -101,7 +101,7 @@ def test_the_import_checks_can_fail():
 
 
 def private_imports(source):
-    """The modules of JAX that a source imports and that promise no stability."""
+    """The modules of JAX without a stability guarantee that a source imports."""
     found = set()
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Import):
@@ -112,14 +112,14 @@ def private_imports(source):
 
 
 def test_private_modules_stay_in_one_package():
-    """What of JAX and XLA is not documented is imported by `lagjax.jax_internals` alone."""
+    """Only `lagjax.jax_internals` imports undocumented modules of JAX and XLA."""
     for path in FILES:
         if layer(module_name(path)) != "jax_internals":
             assert private_imports(path.read_text()) == [], path
 
 
 def test_the_check_of_private_modules_can_fail():
-    """Twin: each way of importing one is seen, in any place; a public one is not."""
+    """Twin: each way of importing one is found, anywhere in a file; a public module is not."""
     for source in (
         "import jax._src.core",
         "from jax import interpreters",
@@ -191,7 +191,7 @@ def written_examples(source):
 
 
 def test_every_example_is_executed():
-    """What doctest finds, and so runs, is all that is written: wrappers may hide a docstring from it."""
+    """Doctest finds, and so runs, all examples: wrappers may hide a docstring from it."""
     for path in FILES:
         if path.stem != "__main__":
             module = importlib.import_module(module_name(path))
@@ -201,13 +201,13 @@ def test_every_example_is_executed():
 
 
 def test_the_example_check_can_fail():
-    """Twin: an example that is written is listed, by class, function and method."""
+    """Twin: examples are listed by class, function and method."""
     source = 'class A:\n    def f(self):\n        """One.\n\n        >>> 1\n        1\n        """\n'
     assert written_examples(source) == {"f"} != written_examples(source.replace(">>>", ""))
 
 
 def test_types_are_shipped():
-    """The marker by which type checkers read the annotations lies beside the code."""
+    """The marker file for type checkers is in the package."""
     assert (ROOT / "py.typed").exists()
 
 
@@ -229,7 +229,7 @@ def test_import_computes_nothing():
 
 
 def test_import_waits_for_nothing_that_few_need():
-    """Scenes, and the packages that only fits and scenes use, are imported when asked for; twin: then they are."""
+    """Scenes, and packages used only by fits and scenes, are imported on first access; twin: then they are."""
     tell = "print(*sorted({'.'.join(m.split('.')[:2]) for m in set(sys.modules) - before}))"
     start = "import sys, jax, diffrax; before = set(sys.modules); import lagjax as lj; assert 'scenes' in dir(lj); "
     ask = f"{start}{tell}; lj.scenes; {tell}"

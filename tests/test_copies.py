@@ -22,7 +22,7 @@ WAYS = {
 
 
 def spring(t, q, v, params):
-    """Of a mass of 1, and a number in params that is no array."""
+    """The Lagrangian of a unit mass on a spring, with a number in params that is not an array."""
     return 0.5 * v["x"] ** 2 - 0.5 * params["k"] ** params["power"] * q["x"] ** 2
 
 
@@ -30,7 +30,7 @@ system = lj.System(spring)
 
 
 def swing(k):
-    """The spring let go at 1: x = cos k t."""
+    """The spring released at 1: x = cos k t."""
     return lj.integrate(system, {"x": 1.0}, {"x": 0.0}, {"k": k, "power": 2}, ts=TS)
 
 
@@ -40,22 +40,22 @@ def at(point):
 
 
 def rod(t, q, params):
-    """A constraint, as one that can be pickled."""
+    """A constraint function that can be pickled."""
     return q["x"] - params["k"]
 
 
 def in_float64():
-    """As `conftest.py` sets it for the tests' own process."""
+    """Settings as in `conftest.py`, for another process."""
     jax.config.update("jax_enable_x64", True)
 
 
 def shown(motion):
-    """What a trajectory says of itself, which takes its system."""
+    """Texts and values of a trajectory that need its system."""
     return repr(motion), float(motion.drift()), float(motion.residual())
 
 
 def same(found, motion):
-    """The closed form, in the same words and structure."""
+    """Compare with the closed form, and with the text and structure of the original."""
     assert shown(found) == shown(motion) and found.residual() == 0
     assert jax.tree.structure(found) == jax.tree.structure(motion)
     assert found.params["power"] == 2 and bool(found.result == lj.RESULTS.successful)
@@ -64,7 +64,7 @@ def same(found, motion):
 
 @pytest.mark.parametrize("way", WAYS)
 def test_trajectories(way):
-    """It knows its system, and passes for the same in JAX."""
+    """A copied trajectory knows its system, and JAX treats both as equal."""
     motion = swing(2.0)
     same(WAYS[way](motion), motion)
 
@@ -72,7 +72,7 @@ def test_trajectories(way):
 @pytest.mark.slow
 @pytest.mark.parametrize("way", WAYS)
 def test_methods(way):
-    """A method that takes its tolerances from the step-size controller still does: equal ones, the same motion."""
+    """A copied method still takes its tolerances from the step-size controller, and gives the same motion."""
     found = WAYS[way](lj.Radau5())
     motion = lambda method: lj.integrate(
         system, {"x": 1.0}, {"x": 0.0}, {"k": 2.0, "power": 2}, ts=TS, method=method, rtol=1e-6
@@ -85,7 +85,7 @@ def test_methods(way):
 @pytest.mark.slow
 @pytest.mark.parametrize("way", WAYS)
 def test_orbits(way):
-    """A periodic orbit knows its system: its motion is that of before."""
+    """A copied periodic orbit knows its system, and has the same motion."""
     orbit = lj.periodic_orbit(system, ({"x": 1.0}, {"x": 0.0}), np.pi, {"k": 2.0, "power": 2})
     found = WAYS[way](orbit)
     assert repr(found) == repr(orbit) and found.system == system
@@ -93,7 +93,7 @@ def test_orbits(way):
 
 
 def test_systems_are_static_arguments():
-    """A program of `jax.jit` takes a system as a static argument: one trace for equal ones, another for another one."""
+    """As static arguments of `jax.jit`, equal systems share one trace; a different system is traced again."""
     traces = []
 
     def force(system, x):
@@ -109,7 +109,7 @@ def test_systems_are_static_arguments():
 
 
 def test_equal_systems():
-    """Constraints by name, and arrays that functions carry, count by value; twins: another name, another number."""
+    """Systems compare by constraint names and values of arrays in functions; twins: another name, another number."""
     of = lambda name: lj.System(spring, {name: lj.Holonomic(rod)})
     assert of("rod") == of("rod") != of("bar") and hash(of("rod")) == hash(of("rod"))
     carried = lambda x: lj.System(jax.tree_util.Partial(lambda x, *state: x * spring(*state), jnp.asarray(x)))
@@ -120,7 +120,7 @@ def test_equal_systems():
 
 
 def test_functions_that_pickle_cannot_find():
-    """Pickle is told about by the function's role, place and the fix; copies keep any function. Twin: `spring` goes."""
+    """The error of pickle names role, place and fix; copies keep any function. Twin: `spring` can be pickled."""
 
     def nameless(t, q, params):
         return q["x"]
@@ -143,7 +143,7 @@ def test_functions_that_pickle_cannot_find():
 @pytest.mark.slow
 @pytest.mark.parametrize("stored", [False, True])
 def test_sweeps(stored, tmp_path):
-    """Values, statuses and words stay; what ran it goes along, too, or is told."""
+    """Values, statuses and texts stay the same; the function is included, or its absence is reported."""
     store = tmp_path / "store" if stored else None
     swept = lj.sweep(at, {"k": np.array([1.0, 2.0])}, store=store, progress=False)
     for way in ("copy", "deepcopy", "pickle"):
@@ -152,7 +152,7 @@ def test_sweeps(stored, tmp_path):
         lane = lambda swept: jax.tree.map(lambda x: jnp.asarray(x[1]), swept.values["motion"])
         same(lane(found), lane(swept))
     if stored:
-        with pytest.raises(ValueError, match="what is in a store belongs to the run"):
+        with pytest.raises(ValueError, match="the values in a store belong to the run"):
             found.resweep(where=True)
     else:
         assert found.resweep(where=[True, False]).ran == 1
@@ -175,7 +175,7 @@ def test_fits(way):
 
 @pytest.mark.slow
 def test_another_process():
-    """A trajectory goes there and comes back."""
+    """A trajectory can be sent to another process and back."""
     with multiprocessing.get_context("spawn").Pool(1, initializer=in_float64) as pool:
         motion = pool.apply(swing, (2.0,))
         same(motion, swing(2.0))

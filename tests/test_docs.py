@@ -1,4 +1,4 @@
-"""The site: every public name with an example and its errors, every message found, pages that anybody can read.
+"""The site: every public name has an example and its errors, every message is found, pages are accessible.
 
 The code on its pages is run by `test_readme.py`; `docs/check_pages.mjs` looks at them in a browser.
 """
@@ -30,14 +30,14 @@ GALLERY = (DOCS / "gallery.md").read_text()
 
 
 def lacks(name, thing, page):
-    """What the page of a public name does not have."""
+    """The parts missing from the page of a public name."""
     function = inspect.isfunction(inspect.unwrap(thing)) if callable(thing) else False
     parts = {"signature": "{py:" in page, "example": ">>> " in page, "errors": not function or "**Raises:**" in page}
     return [part for part, there in parts.items() if not there]
 
 
 def test_every_public_name_has_a_page():
-    """Signature, example and, for functions, errors."""
+    """Every page has a signature, an example and, for functions, errors."""
     found = {name: lacks(name, getattr(lj, name), api_pages.page(name)) for name in lj.__all__}
     assert {name: missing for name, missing in found.items() if missing} == {}
     pages = [api_pages.page_of(name).lower() for name in lj.__all__]
@@ -47,7 +47,7 @@ def test_every_public_name_has_a_page():
 
 
 def test_what_a_page_lacks_is_seen():
-    """Twin: a function without an example and without its errors."""
+    """Twin: a function without an example and errors is found."""
 
     def silent(t):
         """Say nothing."""
@@ -56,14 +56,14 @@ def test_what_a_page_lacks_is_seen():
 
 
 def test_sections_are_those_of_the_front_door():
-    """All names stand under the comments of `lagjax/__init__.py`, in the order of `__all__`."""
+    """All names are in sections named by the comments of `lagjax/__init__.py`."""
     sections = api_pages.sections()
     assert sorted(sum(sections.values(), [])) == sorted(lj.__all__)
     assert list(sections)[0].startswith("A system") and "momentum" in next(v for k, v in sections.items() if "One" in k)
 
 
 def test_added_examples_run():
-    """Examples that stand on pages and in no docstring."""
+    """Examples on pages that are not in a docstring."""
     parser, runner = doctest.DocTestParser(), doctest.DocTestRunner(verbose=False)
     for name in lj.__all__:
         if text := api_pages.added_example(getattr(lj, name), name):
@@ -85,7 +85,7 @@ def f(x):
 
 
 def test_messages_are_found():
-    """Raised, warned of, or made to be raised elsewhere; docstrings are none."""
+    """Messages that are raised, used in warnings, or built for other functions are found; docstrings are not."""
     assert error_pages.messages(MESSAGES) == [
         ("ValueError", "… is quite wrong, ….\nFix: …"),
         ("AccuracyWarning", "beware of this"),
@@ -94,7 +94,7 @@ def test_messages_are_found():
 
 
 def test_every_message_has_its_place():
-    """One that is given stands on the page, and each has an anchor of its own."""
+    """A message that occurs is on the page, and each has its own anchor."""
     page = error_pages.page()
     with pytest.raises(TypeError) as raised:
         lj.Holonomic(3)  # pyright: ignore[reportArgumentType]
@@ -105,7 +105,7 @@ def test_every_message_has_its_place():
 
 
 def test_results_keep_what_is_missed():
-    """Rows that missed their target stand in bold; twin: the same row with its target met does not."""
+    """Rows that missed their target are bold; twin: the same row with its target met is not."""
     row = {"what": "a_b", "value": 2.0, "target": 1.0, "met": False, "better": "less"}
     assert result_pages.line(row) == "| a\\_b | 2 | ≤ 1 | **missed** |"
     assert "missed" not in result_pages.line(row | {"met": True})
@@ -113,7 +113,7 @@ def test_results_keep_what_is_missed():
 
 @pytest.mark.parametrize("name", [*SCENES, "woodpecker", *MECHANISMS])
 def test_gallery_has_a_picture_and_a_formula(name):
-    """Of every scene and mechanism, with words for the picture."""
+    """There is a film of every scene and mechanism, with an alternative text."""
     section = next(part for part in GALLERY.split("\n### ") if f"gallery/{name}.png" in part)
     alt = re.search(r"!\[(.*)\]", section)
     assert alt and len(alt[1]) > 40
@@ -121,9 +121,9 @@ def test_gallery_has_a_picture_and_a_formula(name):
     assert 4_000 < (DOCS / "gallery" / f"{name}.png").stat().st_size < 100_000
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_picture_is_drawn():
-    """One mechanism's, as the script draws it; its closed form is on the computed dots."""
+    """The figure of one mechanism as drawn by the script; the closed form passes through the computed dots."""
     spec = importlib.util.spec_from_file_location("gallery", DOCS / "gallery.py")
     assert spec and spec.loader
     gallery = importlib.util.module_from_spec(spec)
@@ -133,7 +133,7 @@ def test_a_picture_is_drawn():
 
 
 def test_formulas():
-    """LaTeX as MathML; short fractions are two numbers, which docutils alone takes for one."""
+    """LaTeX becomes MathML; short fractions have two numbers, which docutils would read as one."""
     mathml = pytest.importorskip("mathml", reason="needs the extra docs")
     assert "<mn>1</mn>\n    <mn>2</mn>" in mathml.converted(r"\tfrac12 x", True)
     assert "mspace" in mathml.converted(r"\cos\theta", True) and "mspace" not in mathml.converted(r"\cosh x", True)
@@ -143,7 +143,7 @@ def test_formulas():
 
 
 def test_pictures_of_notebooks_have_words():
-    """Each has an alternative text that says what is drawn."""
+    """Each figure has an alternative text that describes it."""
     for path in notebook_pages.SOURCE.glob("*.ipynb"):
         notebook = notebook_pages.with_alt_texts(json.loads(path.read_text()), path.stem)
         for cell in notebook["cells"]:
@@ -152,7 +152,7 @@ def test_pictures_of_notebooks_have_words():
 
 
 def test_notebooks_need_nothing_from_the_network():
-    """A slider becomes its text, a meter nothing, and the scripts of both are left out; other outputs stay."""
+    """Sliders become text, progress bars are removed, without their scripts; other outputs stay."""
     view = "application/vnd.jupyter.widget-view+json"
     outputs = [{"data": {view: {}, "text/plain": [text]}} for text in ("compiling, 00:00", "Knobs: a = 1")]
     notebook = {"metadata": {"widgets": {}}, "cells": [{"outputs": [*outputs, {"data": {"image/png": "x"}}]}]}
@@ -162,7 +162,7 @@ def test_notebooks_need_nothing_from_the_network():
 
 
 class Page(HTMLParser):
-    """What a reader without eyes, or a link, needs of a page."""
+    """The elements of a page that screen readers and links need."""
 
     def __init__(self, text):
         super().__init__()
@@ -192,7 +192,7 @@ class Page(HTMLParser):
 
 
 def faults(pages):
-    """What is wrong with pages by their paths: each fault as a line."""
+    """The faults of pages by path, one line each."""
     found = []
     for path, page in pages.items():
         if page.wordless or page.outside or page.headings != 1 or not page.lang or not page.title:
@@ -210,7 +210,7 @@ def faults(pages):
 
 
 def test_faults_are_seen(tmp_path):
-    """Twin: a picture without words, a dead link, a dead place, a missing heading, something from outside."""
+    """Twin: a missing alternative text, a dead link or anchor, a missing heading, an external resource are found."""
     good = '<html lang="en"><title>T</title><h1 id="a">T</h1><a href="#a">a</a><img src="x" alt="words"></html>'
     path = tmp_path / "page.html"
     path.write_text(good)
@@ -224,7 +224,7 @@ def test_faults_are_seen(tmp_path):
 
 @pytest.mark.slow
 def test_the_site_builds(tmp_path):
-    """No warning, no dead link, no picture without words, nothing from the network; headings, titles, a language."""
+    """No warnings, dead links, missing alternative texts or external resources; headings, titles and a language."""
     for module in ("sphinx", "myst_nb", "pydata_sphinx_theme"):
         pytest.importorskip(module, reason="needs the extra docs")
     built = subprocess.run(

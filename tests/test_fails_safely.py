@@ -1,4 +1,4 @@
-"""The benchmark of honest failure judges honestly itself: it passes what is reported and catches what is not."""
+"""The benchmark of reported failures is correct: it passes reported failures and catches unreported ones."""
 
 import dataclasses
 
@@ -24,7 +24,7 @@ def test_names_are_different():
 
 @pytest.mark.slow
 def test_broken_systems_are_reported_and_healthy_ones_are_not():
-    """Too few steps: reported alone by name and in lanes, and the twins are right to 100 tolerances."""
+    """Too few steps are reported alone and in lanes; the twins are accurate to 100 tolerances."""
     broken, healthy = fails_safely.judge(few, np.random.default_rng(0), 3)
     row = fails_safely.rates(few, broken, healthy)
     assert (row["cases"], row["alone"], row["lanes"], row["named"], row["false"]) == (3, 1.0, 1.0, "3/3", 0)
@@ -33,7 +33,7 @@ def test_broken_systems_are_reported_and_healthy_ones_are_not():
 
 @pytest.mark.slow
 def test_silence_and_false_alarms_are_caught():
-    """With broken and healthy exchanged every verdict turns: silence on the one side, alarm on the other."""
+    """With broken and healthy systems exchanged every verdict is reversed."""
 
     def exchanged(rng, broken):
         case = few.draw(rng, not broken)
@@ -48,7 +48,7 @@ def test_silence_and_false_alarms_are_caught():
 
 
 def test_a_wrong_answer_is_no_good_one():
-    """An answer off by more than the line counts as unreported unless something was said of it; a crash always does."""
+    """An error above the limit counts as unreported unless there was a warning; a crash always does."""
     case = few.draw(np.random.default_rng(0), False)
     line = fails_safely.WRONG * case.tolerance
     verdict = fails_safely.Verdict(case, "alone", None, 2 * line, False, 0.0)

@@ -1,4 +1,4 @@
-"""What a newcomer gets wrong first: one paragraph with what happened, the usual cause, and the fix as code.
+"""Typical first mistakes: the error is one paragraph with what happened, the usual cause, and the fix as code.
 
 All of these but the film fail before anything is compiled.
 """
@@ -63,7 +63,7 @@ def by_math(t, q, v, params):
 
 
 def by_float(t, q, v, params):
-    """A Python number made of a coordinate."""
+    """A Python number made from a coordinate."""
     return 0.5 * v["theta"] ** 2 + float(q["theta"])
 
 
@@ -80,17 +80,17 @@ def without_return(t, q, v, params):
 
 
 def attributes(t, q, v, params):
-    """Names as attributes."""
+    """Coordinates as attributes."""
     return 0.5 * v.theta**2
 
 
 def without_time(q, v, params):
-    """An argument left out."""
+    """A missing argument."""
     return 0.5 * v["theta"] ** 2
 
 
 def of_a_vector(t, q, v, params):
-    """Energies left unsummed."""
+    """Energies that are not summed."""
     return 0.5 * v**2 + jnp.cos(q)
 
 
@@ -100,24 +100,24 @@ def needs_mass(t, q, v, params):
 
 
 def counts(t, q, v, params):
-    """A sum of so many terms."""
+    """A sum over a number of terms given in params."""
     return 0.5 * v["theta"] ** 2 - sum(q["theta"] ** i for i in range(params["n"]))
 
 
 def taken_apart(t, q, v, params):
-    """A dict unpacked into its names."""
+    """A dictionary unpacked into variables."""
     (rate,) = v
     return 0.5 * rate**2
 
 
 def unpacked(t, q, v, params):
-    """A vector of two by its entries."""
+    """A vector of two unpacked into its entries."""
     x, y = v
     return 0.5 * (x**2 + y**2)
 
 
 def changed(t, q, v, params):
-    """An array written into."""
+    """An array modified in place."""
     v[0] = 0.0
     return 0.5 * v @ v
 
@@ -265,7 +265,7 @@ MISTAKES = {
 
 @pytest.mark.parametrize("mistake", MISTAKES)
 def test_says_what_happened_and_what_to_do(mistake):
-    """One paragraph: the user's names, a usual cause, a fix, and nothing of JAX's insides."""
+    """One paragraph with the user's names, a usual cause and a fix, without JAX internals."""
     act, kind, *parts = MISTAKES[mistake]
     with pytest.raises(kind) as caught:
         act()
@@ -277,7 +277,7 @@ def test_says_what_happened_and_what_to_do(mistake):
 
 
 def test_the_check_can_fail():
-    """Twin: JAX's own message would not pass, and right functions raise nothing."""
+    """Twin: JAX's own message would fail the check, and correct functions raise nothing."""
     with pytest.raises(jax.errors.TracerArrayConversionError) as caught:
         jax.eval_shape(by_numpy, 0.0, *START, PARAMS)
     assert "Fix: " not in str(caught.value)
@@ -285,7 +285,7 @@ def test_the_check_can_fail():
 
 
 def test_the_users_error_is_kept():
-    """The error in words is raised from the user's own, whose traceback ends at the user's line."""
+    """The message is raised from the original error, whose traceback ends at the user's line."""
     for lagrangian, kind in ((by_numpy, jax.errors.TracerArrayConversionError), (needs_mass, KeyError)):
         with pytest.raises((TypeError, ValueError)) as caught:
             move(lagrangian)
@@ -293,14 +293,14 @@ def test_the_users_error_is_kept():
         assert isinstance(cause, kind)
         frames = [frame.name for frame in traceback.extract_tb(cause.__traceback__)]
         assert lagrangian.__name__ in frames
-    # Twin: what is not put in words has no cause.
+    # Twin: an error without a message of ours has no cause.
     with pytest.raises(NameError) as caught:
         move(lambda t, q, v, params: 0.5 * mass * v["theta"] ** 2)  # noqa: F821  # pyright: ignore[reportUndefinedVariable]
     assert caught.value.__cause__ is None
 
 
 def test_other_names_are_no_other_order():
-    """Twin: names are the user's choice; one of the usual ones in another place says nothing."""
+    """Twin: argument names are free; a usual name in another position is no error."""
     for lagrangian in (
         lambda s, x, u, p: 0.5 * u["theta"] ** 2,
         lambda t, v, w, p: 0.5 * w["theta"] ** 2,
@@ -310,7 +310,7 @@ def test_other_names_are_no_other_order():
 
 
 def test_an_unknown_error_is_the_users_own():
-    """What is not recognized comes as it was raised."""
+    """Unrecognised errors are raised unchanged."""
 
     def fails(t, q, v, params):
         raise RuntimeError("my own")
@@ -322,14 +322,14 @@ def test_an_unknown_error_is_the_users_own():
 
 
 def test_closed_over_parameters_work():
-    """Parameters that L closes over are no mistake."""
+    """Parameters that L closes over are not an error."""
     length = 2.0
     closed = lj.System(lambda t, q, v, params: 0.5 * (length * v["theta"]) ** 2)
     assert float(lj.momentum(closed, 0.0, {"theta": 0.0}, {"theta": 1.5}, None)["theta"]) == 6.0
 
 
 def test_callables_of_any_kind():
-    """Objects with __call__, partial functions and compiled ones are called as functions are."""
+    """Objects with __call__, partial and compiled functions work like functions."""
     import functools
 
     class Swing:

@@ -1,4 +1,4 @@
-"""What is offered for learned Lagrangians, and the traps that it saves from."""
+"""The tools for learned Lagrangians, and the pitfalls that they avoid."""
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +15,7 @@ curvatures = jax.jit(jax.hessian(lambda x: jnp.sum(positive_definite(x, SIZES, f
 
 @pytest.mark.parametrize("numbers", HARD, ids=range(len(HARD)))
 def test_no_direction_is_without_mass(numbers):
-    """In units of the sizes no eigenvalue is below the floor, whatever the numbers; slopes are finite."""
+    """Relative to the sizes no eigenvalue is below the floor, whatever the numbers; slopes are finite."""
     scaled = np.asarray(positive_definite(numbers, SIZES, floor=1e-3)) / np.sqrt(SIZES[:, None] * SIZES[None, :])
     size = np.max(np.abs(scaled))
     assert np.min(np.linalg.eigvalsh(scaled)) > 1e-3 - 1e-14 * size
@@ -23,7 +23,7 @@ def test_no_direction_is_without_mass(numbers):
 
 
 def test_the_diagonal_is_the_formula():
-    """(x + √(x² + 4))/2 and its second derivative 2/(x² + 4)^(3/2), also where the sum is what rounding leaves."""
+    """(x + √(x² + 4))/2 and its second derivative 2/(x² + 4)^(3/2), also where the sum is only round-off."""
     root = lambda x: jnp.sqrt(positive_definite(x, floor=0.0)[0, 0])
     x = np.array([-1e8, -3.0, 0.0, 2.0, 1e6])
     exact = np.where(x > 0, (x + np.hypot(x, 2)) / 2, 2 / (np.hypot(x, 2) - x))
@@ -53,14 +53,14 @@ def test_damping_never_pushes():
 
 
 def test_wrong_counts():
-    """Two numbers make no symmetric matrix; none neither."""
+    """Two numbers do not make a symmetric matrix; neither do zero numbers."""
     for count in (0, 2, 4):
         with pytest.raises(ValueError, match=r"n\(n\+1\)/2 numbers"):
             positive_definite(np.zeros(count))
 
 
 def test_an_angle_comes_back():
-    """After a turn the network is the same; twin: one of the angle itself is not. It begins as zero."""
+    """After a turn the network is the same; twin: one of the angle itself is not. It is zero at first."""
     sizes, at = {"angle": 1.0, "height": 50.0}, {"angle": 0.3, "height": 20.0}
     turned = at | {"angle": 0.3 + 2 * np.pi}
     made = lambda **options: Network(sizes, key=jax.random.key(0), **options)
@@ -72,7 +72,7 @@ def test_an_angle_comes_back():
     # Scaled heights: a tanh of a hundred would have no slope.
     slopes = jax.grad(net)(at)
     assert abs(slopes["height"]) > 1e-4
-    # Only weights are numbers that a fit finds.
+    # A fit changes only the weights.
     of_mlp = sum(x.size for x in jax.tree.leaves(net.mlp) if hasattr(x, "size"))
     assert sum(x.size for x in jax.tree.leaves(net) if hasattr(x, "size")) == of_mlp
 
@@ -92,13 +92,13 @@ def test_activations_need_curvature():
 
 
 def test_other_mistakes():
-    """Of sizes, names and calls."""
+    """Errors for sizes, names and calls."""
     key = jax.random.key(0)
     with pytest.raises(ValueError, match="must be positive"):
         Network({"x": 0.0}, key=key)
-    with pytest.raises(ValueError, match="angles names 'y', and the coordinates are 'x'"):
+    with pytest.raises(ValueError, match="angles names 'y', but the coordinates are 'x'"):
         Network({"x": 1.0}, angles="y", key=key)
-    with pytest.raises(ValueError, match="takes 2 numbers, and was given 3"):
+    with pytest.raises(ValueError, match="takes 2 numbers, but was given 3"):
         Network(np.ones(2), key=key)(np.ones(3))
     with pytest.raises(ValueError, match="nothing to disagree"):
         disagreement(swing, [None], np.zeros(2), np.zeros(2))
@@ -109,7 +109,7 @@ Q, V = np.linspace(-1.0, 1.0, 7), np.linspace(2.0, -1.0, 7)
 
 
 def test_same_motion():
-    """3 L + dF/dt is the same motion, twin: another potential is not, and it says where."""
+    """3 L + dF/dt has the same motion; twin: another potential has not, and the result says where."""
     other = lambda L: same_motion(swing, lj.System(L), Q, V)
     gauge = lambda t, q, v, params: (
         3 * (0.5 * v**2 + jnp.cos(q)) + v * jnp.exp(q) * jnp.cos(t) - jnp.exp(q) * jnp.sin(t)
@@ -123,7 +123,7 @@ def test_same_motion():
 
 
 def test_other_lagrangians_of_the_same_motion():
-    """Of free motion v⁴ is as good as v², and their mass matrices are not proportional."""
+    """For free motion v⁴ is as good as v², but their mass matrices are not proportional."""
     free = lj.System(lambda t, q, v, params: 0.5 * v**2)
     quartic = lj.System(lambda t, q, v, params: v**4)
     found = same_motion(free, quartic, Q, V + 3)

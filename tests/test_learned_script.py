@@ -1,4 +1,4 @@
-"""`benchmarks/learned.py` learns what it says that it learns: with more time less is wrong, and truths are true."""
+"""`benchmarks/learned.py` really learns: more time gives smaller errors, and its reference values are correct."""
 
 import json
 import subprocess
@@ -11,7 +11,7 @@ BENCHMARKS = Path(__file__).parent.parent / "benchmarks"
 
 
 def run(*words):
-    """What a process prints."""
+    """The output of a process."""
     found = subprocess.run([sys.executable, *words], capture_output=True, text=True, timeout=900, cwd=BENCHMARKS)
     assert found.returncode == 0, found.stderr
     return found.stdout

@@ -66,7 +66,7 @@ def test_tables_pictures_and_numbers(run, monkeypatch):
 
 
 def test_what_compiles_for_long_is_not_quick(run):
-    """A scene that is marked so is left out of `--quick`, but where it is named."""
+    """A scene marked `long` is left out of `--quick`, unless it is named."""
     long = replace(SCENE, long=True, runs=tuple)
     assert "went well" not in run(long, "--quick")[1] and "went well" in run(long, "tiny", "--quick")[1]
     assert "went well" in run(replace(long, long=False), "--quick")[1]
@@ -97,7 +97,7 @@ def test_unknown_scene(run, capsys):
 
 @pytest.mark.exhaustive
 def test_side_by_side_prints_the_same_in_order(tmp_path, capsys, monkeypatch):
-    """Two scenes in processes of their own: what is printed and kept is that of one after the other, but for times."""
+    """Two scenes in separate processes print and save the same as one after the other, except for times."""
     monkeypatch.setattr(job, "_machine", lambda: "here")
     names = ["bead_on_hoop", "sliding_wedge"]
 

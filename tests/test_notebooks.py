@@ -1,4 +1,4 @@
-"""The notebooks run, and the hosted copies are those that were run."""
+"""The notebooks run, and their .ipynb copies match the scripts."""
 
 import json
 from pathlib import Path
@@ -11,7 +11,7 @@ from tests.tiers import exhaustive_but
 matplotlib.use("agg")
 FOLDER = Path(__file__).parent.parent / "notebooks"
 SCRIPTS = sorted(FOLDER.glob("*.py"))
-# These compile for half a minute and more; what they say is tested by `motion/`, `scenes/`, `analysis/` and `fitting/`.
+# These compile for half a minute or more; their content is tested by `motion/`, `scenes/`, `analysis/` and `fitting/`.
 LONG = ("02", "05", "07", "09", "10", "12", "13")
 SHORT = [script for script in SCRIPTS if script.stem[:2] not in LONG]
 

@@ -1,4 +1,4 @@
-"""What `benchmarks/on_gpu.py` rests on: no part of a batch and its gradient needs the host, and the check can tell."""
+"""Assumptions of `benchmarks/on_gpu.py`: a batch and its gradient never need the host, and the check detects it."""
 
 import json
 import subprocess
@@ -17,7 +17,7 @@ TS, WEIGHTS = np.array([0.0, 1.0]), np.random.default_rng(0).normal(size=(3, 10)
 
 
 def learned(looked_at=False):
-    """A particle in a potential of 30 numbers, more than are pushed forward; with a callback in L."""
+    """A particle in a potential of 30 numbers, more than use forward mode; optionally with a callback in L."""
 
     def lagrangian(t, q, v, weights):
         if looked_at:
@@ -44,7 +44,7 @@ def test_a_gradient_that_replays_steps_stays_on_the_device():
 
 
 def test_operations_on_the_host_are_found():
-    """A callback of any kind in a compiled program, and transfers in the words of XLA."""
+    """Callbacks of any kind in a compiled program, and transfers as XLA names them, are found."""
     shape = jax.ShapeDtypeStruct((), jnp.float64)
     for function in (
         with_a_look(jnp.sin),
@@ -62,7 +62,7 @@ def test_operations_on_the_host_are_found():
 
 
 def test_names_are_no_operations():
-    """What is called a callback in the metadata of other operations does not count, nor a fusion named outfeed."""
+    """A callback named in the metadata of other operations does not count, nor a fusion named outfeed."""
     named = (
         '  %sine.1 = f64[] sine(%x.1), metadata={op_name="jit(callback)/sin"}\n'
         '  %solve.1 = f64[2,2] custom-call(%x.1), custom_call_target="lapack_dgetrf_ffi"\n'
@@ -73,13 +73,13 @@ def test_names_are_no_operations():
 
 @pytest.mark.slow
 def test_a_callback_in_the_lagrangian_is_found():
-    """The failing twin: in the gradient's program, too."""
+    """Twin: a callback is found in the program of the gradient as well."""
     assert host_operations(text_of_gradient(learned(looked_at=True)))
 
 
 @pytest.mark.exhaustive
 def test_the_script_runs_small(tmp_path):
-    """On any machine: motions of rods, and what float32 says. A shared machine may miss the target of speed alone."""
+    """On any machine: motions of rods, and float32 results. A shared machine may only miss the speed target."""
     file = tmp_path / "rows.json"
     run = [sys.executable, "benchmarks/on_gpu.py", "--small", "--processor-time", "--json", str(file), "--only"]
     for what in ("rods, float64, motions", "single precision, rods"):

@@ -1,4 +1,4 @@
-"""What is said of the package agrees: its version, its pages, the extras that its messages name."""
+"""Statements about the package agree: its version, its pages, the extras named in messages."""
 
 import re
 import tomllib
@@ -12,7 +12,7 @@ PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 
 
 def test_one_version():
-    """The package, its metadata and the citation have one version, and the change log a section for it."""
+    """The package, its metadata and the citation have the same version, and the change log has a section for it."""
     number = lagjax.__version__
     cited = re.search(r"^version: (.+)$", (ROOT / "docs" / "CITATION.cff").read_text(), re.M)
     assert cited is not None and cited[1] == number == version("lagjax")
@@ -21,7 +21,7 @@ def test_one_version():
 
 
 def test_extras_that_messages_name_exist():
-    """`pip install "lagjax[...]"` in a message or docstring names an extra that there is."""
+    """`pip install "lagjax[...]"` in a message or docstring names an existing extra."""
     extras = PROJECT["optional-dependencies"]
     named = {
         (path.name, extra)
@@ -34,5 +34,5 @@ def test_extras_that_messages_name_exist():
 
 
 def test_every_dependency_has_a_lowest_version():
-    """What a plain installation takes says from which version on it was tested."""
+    """Each dependency of a plain installation has a tested lower bound."""
     assert all(">=" in requirement for requirement in PROJECT["dependencies"])

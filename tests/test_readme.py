@@ -1,4 +1,4 @@
-"""The README's code runs and prints what it says; its two commands are two."""
+"""The README's code runs and prints what it claims; it has exactly two commands."""
 
 import importlib.util
 import re
@@ -15,7 +15,7 @@ WITHOUT_CODE = {"CHANGELOG", "CONTRIBUTING", "derivatives", "gallery", "how-to",
 
 
 def claimed_and_printed(block, capsys):
-    """What a block prints, and what its comments say it prints."""
+    """The claimed and actual output of a block."""
     exec(compile(block, "README.md", "exec"), {})
     printed = capsys.readouterr().out.split()
     claimed = " ".join(re.findall(r"print\(.*\)\s*# (.*)", block)).split()
@@ -25,7 +25,7 @@ def claimed_and_printed(block, capsys):
 @pytest.mark.slow
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
 def test_python_blocks(page, capsys, tmp_path, monkeypatch):
-    """A page's blocks, one after the other: every printed number stands in the comment beside its print."""
+    """All blocks of a page print the numbers in their comments."""
     assert jnp.asarray(0.0).dtype == np.float64
     monkeypatch.chdir(tmp_path)
     blocks = re.findall(r"```python\n(.*?)```", page.read_text(), re.DOTALL)
@@ -38,7 +38,7 @@ def test_python_blocks(page, capsys, tmp_path, monkeypatch):
 
 @pytest.mark.slow
 def test_mujoco_block(capsys):
-    """The same problem in MuJoCo, where it is installed."""
+    """The same problem in MuJoCo, if it is installed."""
     pytest.importorskip("mujoco", reason="needs the extra bench")
     page = (ROOT / "docs" / "coming-from.md").read_text()
     block = next(found for found in re.findall(r"```py\n(.*?)```", page, re.DOTALL) if "mujoco" in found)
@@ -46,9 +46,9 @@ def test_mujoco_block(capsys):
     assert claimed == printed == ["True"]
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_the_figure_is_drawn(tmp_path):
-    """The script that made the README's figure still makes one, and the README shows it."""
+    """The script of the README's figure still works, and the README shows the figure."""
     assert "(docs/overview.png)" in README and (ROOT / "docs" / "overview.png").exists()
     spec = importlib.util.spec_from_file_location("overview", ROOT / "docs" / "overview.py")
     overview = importlib.util.module_from_spec(spec)
@@ -74,12 +74,12 @@ def test_size_and_commands():
 
 
 def test_tables_are_those_of_the_results():
-    """The tables of errors and speeds are what `benchmarks/quote.py` makes of `benchmarks/results/`."""
+    """The tables of errors and speeds equal those that `benchmarks/quote.py` makes from `benchmarks/results/`."""
     spec = importlib.util.spec_from_file_location("quote", Path(__file__).parent.parent / "benchmarks" / "quote.py")
     quote = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(quote)
     assert quote.quoted(README) == README
-    # Twin: other numbers are found out.
+    # Twin: different numbers are detected.
     for name in ("| ratio |", "| ms to an error of |"):
         changed = README.replace(name, "| other |")
         assert quote.quoted(changed) == README != changed

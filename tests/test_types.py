@@ -1,4 +1,4 @@
-"""The annotations hold: the type checker finds nothing in the package and its tests."""
+"""The annotations are correct: the type checker finds no errors in the package and its tests."""
 
 import importlib.util
 import json
@@ -22,9 +22,9 @@ pytestmark = [
 
 
 def checked(root):
-    """What the checker says of a project: the number of files that it read, and its errors, one line each."""
+    """The result of the checker for a project: the number of files read, and its errors, one line each."""
     root = root.resolve()
-    # Without --pythonpath it takes the first interpreter on the path, and finds other versions of JAX there, or none.
+    # Without --pythonpath it uses the first interpreter on the path, which may have another version of JAX, or none.
     told = subprocess.run(
         [sys.executable, "-m", "basedpyright", "--level", "error", "--outputjson", "--pythonpath", sys.executable],
         cwd=root, capture_output=True, text=True,
@@ -34,7 +34,7 @@ def checked(root):
     errors = []
     for error in found["generalDiagnostics"]:
         path = Path(error["file"]).relative_to(root).as_posix()
-        # What is about a whole file, such as a cycle of imports, has no range.
+        # Errors about a whole file, such as import cycles, have no range.
         line = error["range"]["start"]["line"] + 1 if "range" in error else 1
         errors.append(f"{path}:{line}: {error['message']} ({error.get('rule', 'syntax')})")
     return found["summary"]["filesAnalyzed"], errors
@@ -48,7 +48,7 @@ def test_no_type_errors():
 
 
 def test_the_type_check_can_fail(tmp_path):
-    """Twin: under the same settings a wrong result is found in either folder, and a missing module."""
+    """Twin: with the same settings a wrong return type in either folder, and a missing module, are found."""
     shutil.copy(ROOT / "pyproject.toml", tmp_path)
     for folder in CHECKED:
         (tmp_path / folder).mkdir()

@@ -1,4 +1,4 @@
-"""Whole numbers as coordinates, velocities and times are floats, at every door: bit for bit, nothing compiled anew."""
+"""Integers as coordinates, velocities and times become floats in every function: bit for bit, without recompiling."""
 
 import jax
 import jax.numpy as jnp
@@ -72,7 +72,7 @@ LONG = {
 
 
 def agree(act, kinds):
-    """What is found of whole numbers is what is found of floats."""
+    """Compare results for integers with those for floats."""
     expected = jax.tree.map(np.asarray, act(Q, V))
     assert jax.tree.leaves(expected)
     for kind in kinds:
@@ -83,23 +83,23 @@ def agree(act, kinds):
 
 @pytest.mark.parametrize("door", QUICK)
 def test_at_one_state(door):
-    """Of Python, NumPy and JAX, all of them or one beside a float."""
+    """Integers of Python, NumPy and JAX, alone or together with a float."""
     agree(QUICK[door], AS)
 
 
-# One program each that starts, searches or moves otherwise; the others compile for long.
+# One program of each kind; the others compile for long.
 KEPT = ("constraint_force", "on a rod", "equilibria", "linearise", "normal_modes", "symmetries", "periodic_orbit")
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("door", exhaustive_but(KEPT, LONG))
 def test_at_every_door(door):
-    """Motions, lanes, derivatives, sweeps, fits, and what a system is like."""
+    """Motions, lanes, derivatives, sweeps, fits, and analyses of a system."""
     agree(LONG[door], ("Python's", "JAX's"))
 
 
 def test_the_comparison_can_fail():
-    """Twin: another number is seen, and a function that keeps them whole."""
+    """Twin: another number, and a function that keeps integers, are detected."""
     with pytest.raises(AssertionError):
         agree(lambda q, v: q["x"] + isinstance(q["x"], int), ("Python's",))
     with pytest.raises(AssertionError):
@@ -107,7 +107,7 @@ def test_the_comparison_can_fail():
 
 
 def test_nothing_is_compiled_anew():
-    """The program that was compiled for floats serves whole numbers."""
+    """The program compiled for floats is used for integers."""
     QUICK["integrate"](Q, V)
     with compiles() as found:
         QUICK["integrate"](AS["Python's"](Q), AS["NumPy's"](V))
@@ -115,7 +115,7 @@ def test_nothing_is_compiled_anew():
 
 
 def test_the_dtype_is_that_of_the_floats():
-    """Whole numbers beside float32 are float32; alone the default; those beyond int64 too. A condition is refused."""
+    """Integers become float32 next to float32, else the default, also beyond int64. Booleans are refused."""
     of = lambda q: coordinates.state(0, q, jax.tree.map(np.zeros_like, q), None).q
     assert {x.dtype for x in of({"x": np.float32(1.0), "y": np.int64(2)}).values()} == {np.dtype("float32")}
     assert of({"x": 1, "y": np.int8(2)})["y"].dtype == np.float64
@@ -126,14 +126,14 @@ def test_the_dtype_is_that_of_the_floats():
 
 
 def test_whole_parameters_stay():
-    """A count in params stays one: it may choose a shape."""
+    """An integer in params stays an integer: it may set a shape."""
     counted = lj.System(lambda t, q, v, params: 0.5 * v**2 - sum(q**i for i in range(1, params["n"])))
     assert float(lj.accelerations(counted, 0, 1, 0, {"n": 3})[0]) == -3.0
 
 
 @pytest.mark.slow
 def test_a_routhian_by_itself():
-    """Routh's function of Python's numbers, against R = L - p v of the cyclic velocity v = p."""
+    """The Routhian for Python numbers equals R = L - p v with the cyclic velocity v = p."""
     free = lj.System(lambda t, q, v, params: 0.5 * (v["x"] ** 2 + v["y"] ** 2) - q["x"] ** 2)
     reduced = lj.routhian(free, "y").lagrangian
     for q, v in (({"x": 1}, {"x": 2}), ({"x": 1.0}, {"x": 2.0})):

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from lagjax import plot
-from lagjax.comparison import exported
+from lagjax.comparison import data_tables
 from lagjax.comparison.methods import as_code
 from lagjax.comparison.points import Curve, Point
 from lagjax.comparison.references import Reference
@@ -103,14 +103,14 @@ class WorkPrecision:
 
         **Raises:** `ImportError` without pandas.
         """
-        return exported.frame(self)
+        return data_tables.frame(self)
 
     def to_xarray(self):
         """An `xarray.Dataset` over `solver` (the methods by name) and `tolerance`, loose to tight; NaN where not tried.
 
         **Raises:** `ImportError` without xarray.
         """
-        return exported.dataset(self)
+        return data_tables.dataset(self)
 
     def plot(self, title: str = ""):
         """Draw error against run time, and against evaluations of the accelerations; returns a matplotlib `Figure`.

@@ -1,1 +1,1 @@
-"""Ways in and out: models from SymPy, compiled programs for processes without lagjax."""
+"""Import and export: models from SymPy, compiled programs for processes without lagjax."""

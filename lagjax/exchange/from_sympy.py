@@ -1,11 +1,11 @@
-"""A `System` from a Lagrangian that SymPy has derived.
+"""A `System` from a Lagrangian that was derived with SymPy.
 
-A coordinate is a function of time, `dynamicsymbols("theta")` or `Function("theta")(t)`, its velocity what `.diff(t)`
-gives, and every other symbol a parameter. SymPy's equations are not used: the expressions become a function
-`L(t, q, v, params)`, and lagjax derives the motion as from any other.
+A coordinate is a function of time, `dynamicsymbols("theta")` or `Function("theta")(t)`; its velocity is its
+`.diff(t)`, and every other symbol is a parameter. SymPy's equations are not used: the expressions become a function
+`L(t, q, v, params)`, and lagjax derives the motion as from any other Lagrangian.
 
-Of multipliers SymPy has two signs. In the equations of its `LagrangesMethod` and from `solve_multipliers` they push
-along -∂g/∂q; the last unknowns of `mass_matrix_full` and `rhs()` push along +∂g/∂q, as all multipliers do here.
+SymPy uses two signs of multipliers. In the equations of its `LagrangesMethod` and from `solve_multipliers` they push
+along -∂g/∂q; the last unknowns of `mass_matrix_full` and `rhs()` push along +∂g/∂q, like all multipliers here.
 """
 
 from collections.abc import Mapping, Sequence
@@ -28,7 +28,7 @@ def from_sympy(
     force: Mapping[Any, Any] | None = None,
     dissipation: Any = None,
 ) -> System:
-    """Make a system of a Lagrangian that is a SymPy expression.
+    """Make a system from a Lagrangian that is a SymPy expression.
 
     >>> import lagjax as lj
     >>> from sympy import cos, symbols
@@ -43,30 +43,30 @@ def from_sympy(
 
     **Main arguments:**
 
-    - `lagrangian`: L, `[energy]`, as an expression in coordinates, their first derivatives by time, time and
+    - `lagrangian`: L, `[energy]`, as an expression in coordinates, their first time derivatives, time and
       parameters; `sympy.physics.mechanics.Lagrangian(frame, *bodies)` gives one. Or a
       `sympy.physics.mechanics.LagrangesMethod`, with its coordinates, forces and constraints.
-    - `coordinates`: functions of time, as `dynamicsymbols("x y")`. Their names are the keys of `q` and `v`: `q["x"]`.
+    - `coordinates`: functions of time, such as `dynamicsymbols("x y")`. Their names are keys of `q` and `v`: `q["x"]`.
     - `parameters`: symbols; their names are the keys of `params`.
 
     **Other arguments:**
 
-    - `constraints`: expressions that vanish, or equations `Eq(a, b)`, by name: holonomic where no velocity is in them,
+    - `constraints`: expressions that vanish, or equations `Eq(a, b)`, by name: holonomic if they contain no velocity,
       nonholonomic otherwise. A list or a matrix under one name is a constraint of several equations. Without names they
       are "constraint1", "constraint2", ...; so are those of a `LagrangesMethod`, holonomic ones first, and their
       multipliers are minus its "lam1", "lam2", ...
     - `force`: generalized forces Q that L does not contain, `[L]/[q]`, by coordinate: `{x: -c * x.diff()}`.
     - `dissipation`: Rayleigh's function R; its force is `-∂R/∂v`.
 
-    **Returns:** a `System`, whose functions hold their text: `print(system.lagrangian)`. It can be copied and pickled,
-    and needs no SymPy any more. With a `Piecewise` each branch has to be smooth where it is taken.
+    **Returns:** a `System`, whose functions contain their source: `print(system.lagrangian)`. It can be copied and
+    pickled, and no longer needs SymPy. Each branch of a `Piecewise` must be smooth where it is taken.
 
     **Raises:**
 
     - `ImportError` without SymPy.
-    - `TypeError` for what is no expression, or no single number.
-    - `ValueError` for a symbol or a function of time that is neither a coordinate nor a parameter, two of one name,
-      second derivatives, a coordinate whose velocity is nowhere in L, and functions that JAX does not have.
+    - `TypeError` for arguments that are not expressions, or not single numbers.
+    - `ValueError` for a symbol or a function of time that is neither a coordinate nor a parameter, duplicate names,
+      second derivatives, a coordinate whose velocity is not in L, and functions that JAX does not have.
 
     Source: Goldstein, *Classical Mechanics*, Eq. (1.53), (2.26); SymPy, `sympy.physics.mechanics.LagrangesMethod`.
     """
@@ -77,7 +77,7 @@ def from_sympy(
             if value is not None:
                 raise TypeError(
                     f"a LagrangesMethod has its own {word}.\n"
-                    "Fix: lj.from_sympy(method, parameters=[m, g]), or its Lagrangian with the rest beside it."
+                    "Fix: lj.from_sympy(method, parameters=[m, g]), or pass the parts of it separately."
                 )
         coordinates, constraints = list(method.q), _equations_of(method)
         force = _forces_of(method)
@@ -96,7 +96,7 @@ def from_sympy(
 
 
 class _Names:
-    """The coordinates and parameters, by what SymPy has for them."""
+    """The coordinates and parameters of a Lagrangian, and functions of them made from SymPy expressions."""
 
     def __init__(self, sympy, coordinates, parameters):
         self.sympy, self.coordinates, self.parameters = sympy, coordinates, parameters
@@ -105,40 +105,40 @@ class _Names:
         for x in parameters:
             if not isinstance(x, sympy.Symbol):
                 raise TypeError(
-                    f"a parameter is a symbol, and {x} is none.\n"
-                    "Usual cause: a coordinate, a name or a number among them.\n"
+                    f"a parameter must be a symbol, but {x} is not.\n"
+                    "Usual cause: a coordinate, a name or a number among the parameters.\n"
                     'Fix: m, g = symbols("m g"), and parameters=[m, g].'
                 )
         times = {x.args[0] for x in coordinates}
         if len(times) > 1:
             raise ValueError(
                 f"the coordinates are functions of different times: {_commas(coordinates)}.\n"
-                'Usual cause: dynamicsymbols(...) beside Function("x")(t) with symbols("t", real=True).\n'
+                'Usual cause: dynamicsymbols(...) together with Function("x")(t) for symbols("t", real=True).\n'
                 "Fix: t = dynamicsymbols._t for all of them."
             )
         (self.time,) = times or {sympy.physics.mechanics.dynamicsymbols._t}
         self.keys = {x: x.func.__name__ for x in coordinates} | {x: x.name for x in parameters}
         if self.time in parameters:
             raise ValueError(
-                f"'{self.time}' is among the parameters, and is the time.\n"
-                "Fix: leave it out: L may depend on it as it stands."
+                f"'{self.time}' is among the parameters, but is the time.\n"
+                "Fix: leave it out of the parameters: L may depend on the time without that."
             )
         for key in self.keys.values():
-            alike = [str(x) for x in (*coordinates, *parameters) if self.keys[x] == key]
-            if len(alike) > 1:
+            same_name = [str(x) for x in (*coordinates, *parameters) if self.keys[x] == key]
+            if len(same_name) > 1:
                 raise ValueError(
-                    f"two of the coordinates and parameters have the name '{key}': {_commas(alike)}.\n"
-                    "Usual cause: symbols(...) and dynamicsymbols(...) of one name, or symbols of one name with other "
-                    "assumptions.\n"
-                    "Fix: make each of them once, and name them differently."
+                    f"two of the coordinates and parameters have the name '{key}': {_commas(same_name)}.\n"
+                    "Usual cause: symbols(...) and dynamicsymbols(...) with the same name, or symbols of one name with "
+                    "different assumptions.\n"
+                    "Fix: create each of them once, with different names."
                 )
-        # A velocity comes first: the coordinate is in it.
+        # Velocities come first, since a velocity contains the coordinate.
         self.places = {x.diff(self.time): ("v", self.keys[x]) for x in coordinates}
         self.places |= {x: ("q", self.keys[x]) for x in coordinates} | {self.time: ("t", "")}
         self.places |= {x: ("params", self.keys[x]) for x in parameters}
 
     def expression(self, given, role) -> Any:
-        """What was given, checked to be a number made of what is known."""
+        """The given expression, checked to be a scalar of known symbols."""
         sympy = self.sympy
         found: Any = None
         with suppress(sympy.SympifyError):
@@ -147,8 +147,8 @@ class _Names:
             found = found.lhs - found.rhs
         if not isinstance(found, sympy.Expr) or getattr(found, "is_Matrix", False):
             raise TypeError(
-                f"{role} must be one number, a SymPy expression, and is a {type(given).__name__}.\n"
-                "Usual cause: a matrix of one entry, a vector, or x == y, which Python answers with False.\n"
+                f"{role} must be a scalar SymPy expression, and is a {type(given).__name__}.\n"
+                "Usual cause: a matrix with one entry, a vector, or x == y, which Python evaluates to False.\n"
                 "Fix: L[0] of a matrix, a.dot(b) of vectors, and x - y or Eq(x, y) for a constraint."
             )
         if found.has(sympy.Derivative, sympy.Sum, sympy.Product):
@@ -171,13 +171,13 @@ class _Names:
             return function_of(takes, found, _without_time(written, self.coordinates), self.places)
         except NotInJax as error:
             raise ValueError(
-                f"'{error}' is in {role}, and JAX has nothing like it.\n"
-                "Usual cause: a function without a formula yet, an integral that was not found, I, a unit.\n"
-                "Fix: L.subs(f(x), ...) with what it is; .doit(); .rewrite(...) in other functions."
+                f"'{error}' is in {role}, but has no counterpart in JAX.\n"
+                "Usual cause: a function without a formula, an unevaluated integral, the imaginary unit I, a unit.\n"
+                "Fix: L.subs(f(x), ...) with its formula; .doit(); .rewrite(...) in other functions."
             ) from None
 
     def constraint(self, name, given) -> Holonomic | Nonholonomic:
-        """Holonomic where no velocity is in it."""
+        """The constraint; holonomic if it contains no velocity."""
         several = isinstance(given, list | tuple) or getattr(given, "is_Matrix", False)
         given, role = [*given] if several else given, f"constraint '{name}'"
         equations = [self.expression(x, role) for x in (given if several else [given])]
@@ -187,67 +187,68 @@ class _Names:
             return Nonholonomic(self.function(role, found))
         if not has(self.coordinates):
             raise ValueError(
-                f"{role} holds no coordinate: {found}.\n"
-                "Usual cause: a condition between parameters, or an equation that was solved already.\n"
+                f"{role} contains no coordinate: {found}.\n"
+                "Usual cause: a condition between parameters, or an equation that is already solved.\n"
                 "Fix: leave it out."
             )
         return Holonomic(self.function(role, found, OF_POSITION))
 
     def force(self, given) -> SymPyFunction:
-        """One force a coordinate."""
+        """The force, one component per coordinate."""
         if not isinstance(given, Mapping):
             raise TypeError(
-                f"force is a dictionary by coordinate, not a {type(given).__name__}.\nFix: force={{x: -c * x.diff()}}."
+                f"force must be a dictionary by coordinate, not a {type(given).__name__}.\n"
+                "Fix: force={x: -c * x.diff()}."
             )
         for x in given:
             if x not in self.coordinates:
                 raise ValueError(
-                    f"force has a part on {x!r}, and the coordinates are {_commas(self.coordinates)}.\n"
+                    f"force has a component for {x!r}, but the coordinates are {_commas(self.coordinates)}.\n"
                     "Fix: the coordinates themselves as keys, force={x: -c * x.diff()}."
                 )
         return self.function("force", {self.keys[x]: given.get(x, 0) for x in self.coordinates})
 
     def _check(self, expression, role):
-        """Raise where something is neither a coordinate, a velocity, the time nor a parameter."""
+        """Raise if the expression contains anything but coordinates, velocities, the time and parameters."""
         sympy, velocities = self.sympy, [x.diff(self.time) for x in self.coordinates]
         for derivative in expression.atoms(sympy.Derivative):
             if derivative.expr in self.coordinates and derivative not in velocities:
                 raise ValueError(
-                    f"{role} has {derivative} in it: an acceleration, or another derivative than the velocity.\n"
+                    f"{role} contains {derivative}: an acceleration, or another derivative than the velocity.\n"
                     "Usual cause: equations of motion in place of L, or dynamicsymbols(..., 2).\n"
-                    "Fix: L of coordinates and velocities alone; a force has no accelerations in it either."
+                    "Fix: use only coordinates and velocities in L; a force must not contain accelerations either."
                 )
         for f in sorted(expression.atoms(sympy.core.function.AppliedUndef) - {*self.coordinates}, key=str):
             if f.args == (self.time,):
                 raise ValueError(
-                    f"{role} has {f} in it, a function of time that is no coordinate.\n"
-                    "Usual cause: a coordinate left out, a generalized speed u in place of q.diff(), or a motion that "
-                    "is given.\n"
+                    f"{role} contains {f}, a function of time that is not a coordinate.\n"
+                    "Usual cause: a missing coordinate, a generalized speed u in place of q.diff(), or a prescribed "
+                    "motion.\n"
                     f"Fix: coordinates=[{_commas(x.func for x in (*self.coordinates, f))}]; L.subs(u, q.diff()); "
-                    "L.subs(f, sin(Omega * t)).doit() for what is given."
+                    "L.subs(f, sin(Omega * t)).doit() for a prescribed motion."
                 )
         unknown = sorted(expression.free_symbols - {*self.parameters, self.time}, key=str)
         if unknown:
             raise ValueError(self._about(unknown, role))
 
     def _about(self, unknown, role):
-        """What symbols may be that nothing is known of."""
+        """The message about unknown symbols."""
         known = {self.time.name: "the time of the coordinates"}
         known |= {key: "a coordinate" if x in self.coordinates else "a parameter" for x, key in self.keys.items()}
-        alike = [x for x in unknown if x.name in known]
-        if alike:
-            x = alike[0]
+        same_name = [x for x in unknown if x.name in known]
+        if same_name:
+            x = same_name[0]
             return (
-                f"{role} has a symbol '{x}' in it that is not the same as {known[x.name]}, '{x}'.\n"
-                "Usual cause: it was made twice, by symbols(...) with other assumptions, or by symbols(...) and "
+                f"{role} contains a symbol '{x}' that is not the same as {known[x.name]}, '{x}'.\n"
+                "Usual cause: it was created twice, by symbols(...) with other assumptions, or by symbols(...) and "
                 "dynamicsymbols(...).\n"
-                "Fix: make it once, and use it everywhere; for the time t = dynamicsymbols._t."
+                "Fix: create it once, and use it everywhere; for the time t = dynamicsymbols._t."
             )
         all_parameters = _commas([*self.parameters, *unknown])
         return (
-            f"{role} has {listed(unknown)} in it, and nothing is known of {'it' if len(unknown) == 1 else 'them'}.\n"
-            "Usual cause: a parameter that was not listed, or a coordinate that is no function of time.\n"
-            f"Fix: parameters=[{all_parameters}]; a coordinate is made by dynamicsymbols({str(unknown[0])!r})."
+            f"{role} contains {listed(unknown)}, which {'is' if len(unknown) == 1 else 'are'} unknown.\n"
+            "Usual cause: a parameter that was not listed, or a coordinate that is not a function of time.\n"
+            f"Fix: parameters=[{all_parameters}]; or make a coordinate by dynamicsymbols({str(unknown[0])!r})."
         )
 
 
@@ -256,9 +257,9 @@ def _check_coordinate(sympy, x):
         return
     is_velocity = isinstance(x, sympy.Derivative)
     raise TypeError(
-        f"a coordinate is a function of time, and {x} is {'a velocity' if is_velocity else f'a {type(x).__name__}'}.\n"
+        f"a coordinate is a function of time, but {x} is {'a velocity' if is_velocity else f'a {type(x).__name__}'}.\n"
         "Usual cause: symbols(...) in place of dynamicsymbols(...), or velocities among the coordinates.\n"
-        'Fix: theta = dynamicsymbols("theta"); its velocity, theta.diff(), is known by it.'
+        'Fix: theta = dynamicsymbols("theta"); its velocity is theta.diff().'
     )
 
 
@@ -266,8 +267,8 @@ def _several(given, role):
     """A sequence as a list."""
     if isinstance(given, Mapping | str) or not hasattr(given, "__iter__"):
         raise TypeError(
-            f"{role} must be a list, and are given as {given!s:.60}.\n"
-            f"Fix: {role}=[...], of one too; numbers are given to lj.integrate, as a dictionary by their names."
+            f"{role} must be a list, not {given!s:.60}.\n"
+            f"Fix: {role}=[...], even for one; numbers are passed to lj.integrate, as a dictionary by their names."
         )
     return list(given)
 
@@ -281,7 +282,7 @@ def _by_name(constraints):
 
 
 def _equations_of(method):
-    """The constraints of a `LagrangesMethod`: positions, then velocities; it keeps the former differentiated, too."""
+    """The constraints of a `LagrangesMethod`: holonomic, then nonholonomic; `coneqs` has the former differentiated."""
     holonomic = list(method._hol_coneqs)
     return [*holonomic, *list(method.coneqs)[len(holonomic) :]] or None
 
@@ -293,14 +294,14 @@ def _forces_of(method):
     frame, found = method.inertial, {}
     for x, velocity in zip(method.q, method.u):
         found[x] = 0
-        for place, load in method.forcelist:
-            moves = place.vel(frame) if hasattr(place, "vel") else place.ang_vel_in(frame)
-            found[x] += moves.diff(velocity, frame).dot(load)
+        for body, load in method.forcelist:
+            motion = body.vel(frame) if hasattr(body, "vel") else body.ang_vel_in(frame)
+            found[x] += motion.diff(velocity, frame).dot(load)
     return found
 
 
 def _without_time(written, coordinates):
-    """An expression in short: theta for theta(t), and theta' for its derivative."""
+    """A short form of an expression: theta for theta(t), and theta' for its derivative."""
     for x in coordinates:
         time = x.args[0]
         written = written.replace(f"Derivative({x}, {time})", f"{x.func.__name__}'").replace(str(x), x.func.__name__)

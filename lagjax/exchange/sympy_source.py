@@ -1,12 +1,13 @@
 """SymPy expressions as the source text of JAX functions.
 
-The text is what a `System` from SymPy holds: it can be read, compared, copied and pickled, and Python compiles it when
-it is first called. Common subexpressions are computed once. Whole powers stay whole: JAX computes these, and their
+A `System` from SymPy contains this text: it can be read, compared, copied and pickled, and Python compiles it at its
+first call. Common subexpressions are computed once. Integer powers stay integers: JAX computes them, and their
 derivatives, by products.
 
-A `Piecewise` becomes `jnp.where`, which computes every branch. Of a branch that is not taken, JAX's reverse mode
-multiplies the slope by zero, and zero times an infinite slope is NaN: that of (-x)**1.5, say, beside 0 for x > 0. So
-what has a slope at some numbers alone (roots, fractions, logarithms, inverse functions) gets a harmless number there.
+A `Piecewise` becomes `jnp.where`, which computes every branch. JAX's reverse mode multiplies the slope of a branch that
+is not taken by zero, and zero times an infinite slope or NaN is NaN: for example (-x)**1.5 for x < 0, 0 for x > 0.
+So functions without a slope at some numbers (roots, fractions, logarithms, inverse functions) get a harmless argument
+in branches that are not taken.
 """
 
 import keyword
@@ -20,7 +21,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-# By SymPy's names; those of two arguments too.
+# JAX's functions by SymPy's names, including those of two arguments.
 FUNCTIONS = {
     **{name: f"jnp.{name}" for name in ("sin", "cos", "tan", "sinh", "cosh", "tanh", "exp", "log", "sign", "floor")},
     **{f"a{name}": f"jnp.arc{name}" for name in ("sin", "cos", "tan", "tan2", "sinh", "cosh", "tanh")},
@@ -29,15 +30,15 @@ FUNCTIONS = {
     **{"erf": "jax.scipy.special.erf", "erfc": "jax.scipy.special.erfc", "gamma": "jax.scipy.special.gamma"},
     **{"loggamma": "jax.scipy.special.gammaln", "digamma": "jax.scipy.special.digamma"},
 }  # fmt: skip
-# What has no value, or no slope, at some numbers, and one at a half.
+# Functions without a value or a slope at some numbers, but with both at one half.
 DELICATE = ("log", "asin", "acos", "atanh", "log2", "log10", "log1p", "gamma", "loggamma", "digamma")
-# Beyond this a whole number is written with a point: JAX's own may have 32 bits.
+# Larger integers are written as floats, since JAX's integers may have 32 bits.
 WHOLE = 2**31 - 1
 RESERVED = {"t", "q", "v", "params", "jax", "jnp", "multipliers"}
 
 
 def sympy_itself() -> Any:
-    """The package."""
+    """Import SymPy, or say how to get it."""
     try:
         import sympy
         import sympy.physics.mechanics
@@ -47,13 +48,13 @@ def sympy_itself() -> Any:
 
 
 class NotInJax(Exception):
-    """Something of SymPy has no counterpart in JAX."""
+    """A part of a SymPy expression has no counterpart in JAX."""
 
 
 class SymPyFunction(eqx.Module):
-    """A function that SymPy wrote. It is compared by its text, and can be copied and pickled.
+    """A function made from a SymPy expression. It is compared by its text, and can be copied and pickled.
 
-    - `source`: its text, which `print` shows; `written`: the expression as SymPy writes it.
+    - `source`: its text, which `print` shows; `written`: the expression as SymPy prints it.
     """
 
     source: str = eqx.field(static=True)
@@ -76,7 +77,7 @@ class SymPyFunction(eqx.Module):
 
 @lru_cache(maxsize=1024)
 def _compiled(source):
-    """The function of a text, of which Python shows lines in tracebacks too."""
+    """Compile the function of a source text, under the file name that tracebacks show."""
     found: dict[str, Any] = {"jax": jax, "jnp": jnp}
     exec(compile(source, "<from SymPy>", "exec"), found)
     return found["function"]
@@ -85,13 +86,13 @@ def _compiled(source):
 def function_of(takes: Sequence[str], result: Any, written: str, names: Mapping[Any, tuple[str, str]]) -> SymPyFunction:
     """The function that computes an expression, or a list or a dictionary of them.
 
-    `names`: where to find what occurs in the expressions: ("params", "m") is params["m"], ("t", "") the time.
+    `names`: the argument and key of each symbol in the expressions: ("params", "m") is params["m"], ("t", "") the time.
     """
     sympy = sympy_itself()
     taken, symbols = set(RESERVED), {}
     for part, (argument, key) in names.items():
         name = _identifier(key + "_dot" * (argument == "v"), taken) if key else argument
-        # Real, so that SymPy needs no conjugates.
+        # Real, so that SymPy adds no complex conjugates.
         symbols[part] = sympy.Symbol(name, real=True)
     given = list(result.values()) if isinstance(result, dict) else result if isinstance(result, list) else [result]
     given = [_guarded(_in_jax(expression.xreplace(symbols)), sympy.true) for expression in given]
@@ -122,9 +123,9 @@ def _identifier(key, taken):
 
 
 def _guarded(expression, where):
-    """The expression in which delicate operations of a branch get a half where the branch is not taken.
+    """The expression in which `DELICATE` functions of a branch get the argument 1/2 if the branch is not taken.
 
-    `where`: the condition under which this part of it is taken.
+    `where`: the condition under which this part of the expression is taken.
     """
     sympy = sympy_itself()
     if isinstance(expression, sympy.Piecewise):
@@ -139,13 +140,13 @@ def _guarded(expression, where):
     args = [_guarded(arg, where) for arg in expression.args]
     is_power = expression.is_Pow and not (expression.exp.is_Integer and expression.exp > 0)
     if where != sympy.true and (is_power or expression.func.__name__ in DELICATE) and args[0].free_symbols:
-        # No `Piecewise`, which SymPy would draw out of a power.
+        # Not a `Piecewise`, which SymPy would pull out of a power.
         args[0] = sympy.Function("harmless", real=True)(args[0], where)
     return expression.func(*args)
 
 
 def _in_jax(expression):
-    """The expression in functions that JAX has; raises `NotInJax` for those that it has not."""
+    """The expression in functions that JAX has; raises `NotInJax` for others."""
     sympy = sympy_itself()
     one = sympy.Integer(1)
     others = {
@@ -162,7 +163,7 @@ def _in_jax(expression):
     kinds += [sympy.Piecewise, sympy.functions.elementary.piecewise.ExprCondPair, sympy.ITE, sympy.Max, sympy.Min]
     kinds += [sympy.And, sympy.Or, sympy.Not, sympy.core.relational.Relational, sympy.logic.boolalg.BooleanAtom]
     for part in sympy.preorder_traversal(expression):
-        # `nan` and `zoo` are numbers to SymPy.
+        # SymPy counts `nan` and `zoo` as numbers.
         known = isinstance(part, tuple(kinds)) and part not in (sympy.nan, sympy.zoo)
         undefined = isinstance(part, sympy.core.function.AppliedUndef)
         if not known and (undefined or type(part).__name__ not in FUNCTIONS):
@@ -172,7 +173,7 @@ def _in_jax(expression):
 
 @lru_cache(maxsize=1)
 def _printer():
-    """Of SymPy's printer of Python the order of operations; what it writes is ours."""
+    """SymPy's Python printer, which sets parentheses, with JAX's names for functions and numbers."""
     from sympy.printing.pycode import PythonCodePrinter
 
     sympy, of_python = sympy_itself(), cast(Any, PythonCodePrinter)
@@ -197,7 +198,7 @@ def _printer():
             (value, condition), *others = expr.args
             if condition == sympy.true:
                 return self._print(value)
-            # Where no condition holds there is no value.
+            # If no condition holds, the value is undefined.
             other = self._print(expr.func(*others, evaluate=False)) if others else "jnp.nan"
             return f"jnp.where({self._print(condition)}, {self._print(value)}, {other})"
 
@@ -223,7 +224,7 @@ def _printer():
         _print_NegativeInfinity = lambda self, expr: "(-jnp.inf)"
         _print_sinc = lambda self, expr: f"jnp.sinc({self._print(expr.args[0] / sympy.pi)})"
 
-        # Nothing else is an undefined function any more: `harmless`.
+        # The only undefined function left is `harmless`.
         _print_AppliedUndef = lambda self, expr: "jnp.where({1}, {0}, 0.5)".format(*map(self._print, expr.args))
         _print_frac = lambda self, expr: f"jnp.mod({self._print(expr.args[0])}, 1)"
 

@@ -1,4 +1,4 @@
-"""Knobs in a notebook: a motion that follows its parameters."""
+"""Sliders in a notebook: a motion that follows its parameters."""
 
 from lagjax.interactive.interact import Knobs, interact
 

@@ -1,4 +1,4 @@
-"""What a user may turn: ranges, values and choices, and the widget for each. Needs ipywidgets."""
+"""The controls of a user: ranges, values and choices, and the widget for each. Needs ipywidgets."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-# A slider without a step of its own has so many.
+# The number of steps of a slider for which none is given.
 STEPS = 200
 MOST_VALUES = 5000
 EXAMPLE = 'Fix: {"omega": (0.0, 10.0), "start": (0.1, 3.0, 0.1), "count": [1, 2, 5], "method": ["a", "b"]}.'
@@ -22,13 +22,13 @@ class Range(NamedTuple):
 
 
 class Values(NamedTuple):
-    """Some numbers (n, ...), of which one is passed as an array."""
+    """Numbers (n, ...), one of which is passed to `run` as an array."""
 
     values: np.ndarray
 
 
 class Choices(NamedTuple):
-    """Things that are no numbers (names, methods, functions, None): each has a program of its own."""
+    """Values that are not numbers (names, methods, functions, None): each needs its own compiled program."""
 
     values: tuple
 
@@ -37,7 +37,7 @@ Control = Range | Values | Choices
 
 
 def controls_of(knobs: Any) -> dict[str, Control]:
-    """The controls that a user wrote, or an error."""
+    """The controls that a user described, validated."""
     if not isinstance(knobs, Mapping) or not knobs:
         raise TypeError(f"knobs must be a dictionary by name, not {knobs!r:.60}.\n{EXAMPLE}")
     return {str(name): _control(str(name), given) for name, given in knobs.items()}
@@ -45,7 +45,7 @@ def controls_of(knobs: Any) -> dict[str, Control]:
 
 def _control(name, given) -> Control:
     if isinstance(given, bool | np.bool_):
-        # The first of values is where a knob stands at first.
+        # A knob starts at the first of its values.
         return Values(np.array([given, not given]))
     if isinstance(given, tuple) and len(given) in (2, 3) and all(map(_is_number, given)):
         return _range(name, *map(float, given))
@@ -59,8 +59,8 @@ def _control(name, given) -> Control:
             return _few(name, np.asarray(given))
         return Choices(tuple(given))
     raise ValueError(
-        f"knob '{name}' is {given!r:.60}, which says no range: (low, high), (low, high, step), or a list of values.\n"
-        f"{EXAMPLE} What does not vary belongs into run."
+        f"knob '{name}' is {given!r:.60}, not a range (low, high), (low, high, step), or a list of values.\n"
+        f"{EXAMPLE} Quantities that do not vary belong in run."
     )
 
 
@@ -68,7 +68,7 @@ def _range(name, low, high, step=None):
     given = (low, high) if step is None else (low, high, step)
     if not all(map(math.isfinite, given)) or low >= high or (step is not None and not 0 < step <= high - low):
         raise ValueError(
-            f"knob '{name}' is {given}: from low to high, with a step between 0 and their distance.\n{EXAMPLE}"
+            f"knob '{name}' is {given}: low must be below high, and the step between 0 and their distance.\n{EXAMPLE}"
         )
     return Range(low, high, (high - low) / STEPS if step is None else step)
 
@@ -76,7 +76,7 @@ def _range(name, low, high, step=None):
 def _few(name, x):
     if len(x) > MOST_VALUES:
         raise ValueError(
-            f"knob '{name}' has {len(x):,} values, and a slider at most {MOST_VALUES:,}.\n"
+            f"knob '{name}' has {len(x):,} values, but a slider has at most {MOST_VALUES:,}.\n"
             f"Fix: a range, ({x.min():.6g}, {x.max():.6g})."
         )
     return Values(x)
@@ -87,7 +87,7 @@ def _is_number(x):
 
 
 def start_of(name: str, control: Control, start: Mapping[str, Any]) -> Any:
-    """Where a control stands at first: the middle of a range, the first of values; or what `start` says."""
+    """The initial value of a control: from `start`, else the middle of a range or the first value."""
     if name not in start:
         if not isinstance(control, Range):
             return control.values[0]
@@ -96,7 +96,7 @@ def start_of(name: str, control: Control, start: Mapping[str, Any]) -> Any:
 
 
 def checked(name: str, control: Control, value: Any) -> Any:
-    """A value of a control, or an error."""
+    """A value of a control, validated."""
     if isinstance(control, Range):
         x = float(value)
         if not control.low <= x <= control.high:
@@ -106,7 +106,7 @@ def checked(name: str, control: Control, value: Any) -> Any:
 
 
 def place(name: str, control: Values | Choices, value: Any) -> int:
-    """Which of the values it is."""
+    """The index of a value among those of a control."""
     for i, known in enumerate(control.values):
         if known is value or (np.shape(known) == np.shape(value) and np.all(known == value)):
             return i
@@ -114,7 +114,7 @@ def place(name: str, control: Values | Choices, value: Any) -> int:
 
 
 def words(control: Control) -> str:
-    """A control as a person says it."""
+    """The values of a control as text."""
     if isinstance(control, Range):
         return f"{control.low:.6g} to {control.high:.6g}"
     labels = _labels(control)
@@ -145,9 +145,9 @@ def import_widgets():
 
 
 def widget(name: str, control: Control, value: Any):
-    """The widget of a control; `read` tells what it says."""
+    """The widget of a control; `read` gives its value."""
     widgets = import_widgets()
-    look = {
+    layout_options = {
         "description": name,
         "layout": widgets.Layout(width="560px", max_width="100%"),
         "style": {"description_width": "120px"},
@@ -156,14 +156,14 @@ def widget(name: str, control: Control, value: Any):
         digits = max(0, math.ceil(-math.log10(control.step) - 1e-9))
         readout = f".{min(digits + 1 if digits else 0, 12)}f" if 1e-6 < control.step else ".6g"
         return widgets.FloatSlider(
-            value=value, min=control.low, max=control.high, step=control.step, readout_format=readout, **look
+            value=value, min=control.low, max=control.high, step=control.step, readout_format=readout, **layout_options
         )
-    options, at = [(label, i) for i, label in enumerate(_labels(control))], place(name, control, value)
+    options, index = [(label, i) for i, label in enumerate(_labels(control))], place(name, control, value)
     if isinstance(control, Values) and len(options) > 2:
-        return widgets.SelectionSlider(options=options, value=at, **look)
-    return widgets.Dropdown(options=options, value=at, **look)
+        return widgets.SelectionSlider(options=options, value=index, **layout_options)
+    return widgets.Dropdown(options=options, value=index, **layout_options)
 
 
 def read(control: Control, shown: Any) -> Any:
-    """The value of a control from what its widget shows."""
+    """The value of a control from the value of its widget."""
     return shown if isinstance(control, Range) else control.values[shown]

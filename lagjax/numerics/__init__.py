@@ -1,1 +1,1 @@
-"""Numerical tools that know no mechanics."""
+"""Numerical tools that do not depend on mechanics."""

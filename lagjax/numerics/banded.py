@@ -1,17 +1,17 @@
-"""Symmetric matrices with few entries near the diagonal: ordering, solving, independent rows; and coloured columns.
+"""Symmetric band matrices: ordering, solving, independent rows; and coloured columns.
 
-**Ordering.** Numbered outwards from one end of its graph (Cuthill & McKee), a sparse symmetric matrix has its entries
-within a half bandwidth b of the diagonal: 1 for an open chain, 2 for a closed one, about its width for a net.
+**Ordering.** Numbering rows outwards from one end of the graph (Cuthill & McKee) puts entries of a sparse symmetric
+matrix within a half bandwidth b of the diagonal: 1 for an open chain, 2 for a closed one, about its width for a net.
 
-**Solving.** With b = 1 by LAPACK's tridiagonal elimination, above row by row, the oldest of b + 1 rows at a time, in a
-loop whose body XLA fuses. Measured for 256 rows on one core, elimination and solution: 6 microseconds with b = 1, 16
-with b = 2, 40 with b = 5; 480 rows with b = 31 take 0.4 ms. Elimination by blocks of b rows with LAPACK took 140 and
-more. Rows are not exchanged, which suits definite matrices; for others what is found is to be checked, and refined.
+**Solving.** For b = 1 LAPACK's tridiagonal elimination is used; for larger b a loop, whose body XLA fuses, keeps b + 1
+rows and eliminates the oldest. Measured for 256 rows on one core, elimination and solution: 6 microseconds with b = 1,
+16 with b = 2, 40 with b = 5; 480 rows with b = 31 take 0.4 ms. Elimination by blocks of b rows with LAPACK took 140 and
+more. Rows are not exchanged, which suits definite matrices; for others the solution must be checked and refined.
 Derivatives never pass through the elimination: `dx = K^-1 (dr - dK x)`.
 
-**Colours.** Columns that share no row can be had from one product with the sum of their unit vectors; columns are
-coloured so that those of one colour share none (Curtis, Powell & Reid). A matrix that is only known as a function then
-costs as many products as it has colours, whatever its size: four for a chain's constraints.
+**Colours.** Columns that share no row can be found from one product with the sum of their unit vectors; columns are
+coloured so that no two of one colour share a row (Curtis, Powell & Reid). A matrix known only as a function then costs
+as many products as it has colours, whatever its size: four for a chain's constraints.
 
 Source: Cuthill & McKee, Proc. 24th ACM Nat. Conf. (1969) 157; Golub & Van Loan, *Matrix Computations*, §4.3 and §4.5;
 Curtis, Powell & Reid, J. Inst. Maths. Applics. 13 (1974) 117.
@@ -30,7 +30,7 @@ from lagjax.numerics import dense
 
 
 class Order(NamedTuple):
-    """An order of the rows, and how far from the diagonal it leaves the entries."""
+    """An order of the rows, and the half bandwidth that it gives."""
 
     rows: Int[np.ndarray, " m"]
     half_bandwidth: int
@@ -46,14 +46,14 @@ def order(pattern: Bool[np.ndarray, "m m"]) -> Order:
     """
     neighbours = [np.flatnonzero(row) for row in pattern]
     degree = np.array([len(found) for found in neighbours])
-    left, rows = set(range(len(pattern))), []
-    while left:
-        # The end of a longest path begins a part: walk to a farthest row, and from there once more.
-        part = _outwards(min(left, key=lambda i: (degree[i], i)), neighbours, degree)
+    remaining, rows = set(range(len(pattern))), []
+    while remaining:
+        # A component starts at the end of a longest path, found by walking to a farthest row twice.
+        part = _outwards(min(remaining, key=lambda i: (degree[i], i)), neighbours, degree)
         for _ in range(2):
             part = _outwards(part[-1], neighbours, degree)
         rows += part
-        left -= set(part)
+        remaining -= set(part)
     rows = np.array(rows, int)
     place = np.argsort(rows)
     i, j = np.nonzero(pattern)
@@ -61,7 +61,7 @@ def order(pattern: Bool[np.ndarray, "m m"]) -> Order:
 
 
 def _outwards(start, neighbours, degree):
-    """All rows connected to one, in order of their distance; those of few neighbours first."""
+    """All rows connected to `start`, by distance; rows with few neighbours first."""
     found, seen = [start], {start}
     for row in found:
         new = [j for j in neighbours[row] if j not in seen]
@@ -71,7 +71,7 @@ def _outwards(start, neighbours, degree):
 
 
 class Colours(NamedTuple):
-    """Which columns of a pattern are pushed together, and where the entries are found again."""
+    """The colour of each column of a pattern, and the number of colours."""
 
     of_column: Int[np.ndarray, " n"]
     count: int
@@ -110,20 +110,20 @@ def blocks(pattern: Bool[np.ndarray, "n n"]) -> list[list[int]]:
     >>> print(blocks(np.array([[1, 0, 1], [0, 1, 0], [0, 0, 1]], bool)))
     [[0, 2], [1]]
     """
-    # SciPy has this, but importing its graphs takes longer than importing lagjax.
+    # SciPy has this function, but importing its graph module takes longer than importing lagjax.
     touches = pattern | pattern.T
-    left, found = set(range(len(touches))), []
-    while left:
-        block = [min(left)]
+    remaining, found = set(range(len(touches))), []
+    while remaining:
+        block = [min(remaining)]
         for i in block:
             block += [j for j in np.flatnonzero(touches[i]).tolist() if j not in block]
         found.append(sorted(block))
-        left -= set(block)
+        remaining -= set(block)
     return found
 
 
 class Band(NamedTuple):
-    """How to have a symmetric matrix as a band: pattern, colours and order."""
+    """How to compute a symmetric matrix as a band: order, colours and positions of the entries."""
 
     order: Order
     colours: Colours
@@ -150,18 +150,18 @@ def entries(push: Callable, where: Band, dtype) -> Float[Array, "m b1"]:
 
 
 def keep(band: Float[Array, "m b1"], kept: Bool[Array, " m"]) -> Float[Array, "m b1"]:
-    """The band with the rows and columns that are not kept replaced by those of the unit matrix."""
+    """The band in which rows and columns that are not kept are replaced by those of the unit matrix."""
     m, width = band.shape
     before = jnp.concatenate([jnp.zeros(width - 1, bool), kept])
-    both = kept[:, None] & jnp.stack([before[width - 1 - d : width - 1 - d + m] for d in range(width)], axis=1)
+    both_kept = kept[:, None] & jnp.stack([before[width - 1 - d : width - 1 - d + m] for d in range(width)], axis=1)
     unit = (np.arange(width) == 0).astype(band.dtype)
-    return jnp.where(both, band, jnp.where(kept[:, None], 0.0, unit[None]))
+    return jnp.where(both_kept, band, jnp.where(kept[:, None], 0.0, unit[None]))
 
 
 def solver(band: Float[Array, "m b1"]) -> Callable[[Float[Array, " m"]], Float[Array, " m"]]:
     """Eliminate once, and return the function that solves with the symmetric matrix of this band.
 
-    It has no derivative by the band; see `lax.custom_linear_solve`. A singular matrix gives NaN or infinity.
+    Not differentiable with respect to the band; see `lax.custom_linear_solve`. A singular matrix gives NaN or infinity.
 
     >>> import jax.numpy as jnp
     >>> print(solver(jnp.array([[2.0, 0.0], [2.0, 1.0], [2.0, 1.0]]))(jnp.array([3.0, 4.0, 3.0])))
@@ -205,13 +205,13 @@ def _by_rows(band):
 
 
 def _eliminate(band, keeps):
-    """The pivot of each row, and what is below it when its turn comes, (m, b); nothing below rows not kept."""
+    """The pivot of each row, and the column below it at its elimination, (m, b); zeros below rows not kept."""
     m, width = band.shape
-    # As many unit rows behind, so that the last rows are eliminated too.
-    behind = jnp.zeros((width - 1, width), band.dtype).at[:, 0].set(1.0)
+    # Unit rows are appended, so that the last rows are eliminated too.
+    padding = jnp.zeros((width - 1, width), band.dtype).at[:, 0].set(1.0)
 
     def take(window, row):
-        # Of the rows still to be eliminated, with the new one as the last; the oldest is eliminated.
+        # Add the new row as the last of the window, then eliminate the oldest.
         window = jnp.concatenate([jnp.concatenate([window, row[None, :-1]]), row[:, None]], axis=1)
         pivot, kept = window[0, 0], keeps(window[0, 0])
         column = jnp.where(kept, window[1:, 0], 0.0)
@@ -219,12 +219,12 @@ def _eliminate(band, keeps):
         return rest, (pivot, column)
 
     start = jnp.eye(width - 1, dtype=band.dtype)
-    _, (pivot, column) = lax.scan(take, start, jnp.concatenate([band, behind])[:, ::-1])
+    _, (pivot, column) = lax.scan(take, start, jnp.concatenate([band, padding])[:, ::-1])
     return pivot[width - 1 :], column[width - 1 :]
 
 
 def independent(band: Float[Array, "m b1"], least: float) -> Bool[Array, " m"]:
-    """Which rows of a Gram matrix `A Aᵀ` are of independent rows of A, by the pivots of its elimination.
+    """Which rows of A are independent, from the pivots in the elimination of the Gram matrix `A Aᵀ`.
 
     A pivot, relative to its diagonal entry, is the squared sine of the angle between the row of A and the span of those
     kept before it; rows whose sine is at most `least` are left out. Rows that are zero or not finite are kept.
@@ -236,11 +236,11 @@ def independent(band: Float[Array, "m b1"], least: float) -> Bool[Array, " m"]:
     m, width = band.shape
     band, b = lax.stop_gradient(band), width - 1
     size = band[:, 0]
-    ordinary = jnp.isfinite(size) & (size > 0)
-    scale = jnp.where(ordinary, 1 / jnp.sqrt(jnp.where(ordinary, size, 1.0)), 0.0)
+    usable = jnp.isfinite(size) & (size > 0)
+    scale = jnp.where(usable, 1 / jnp.sqrt(jnp.where(usable, size, 1.0)), 0.0)
     before = jnp.concatenate([jnp.zeros(b, band.dtype), scale])
     scales = jnp.stack([before[b - d : b - d + m] for d in range(width)], axis=1)
     unit = jnp.where(jnp.isfinite(band), band, 0.0) * scale[:, None] * scales
     keeps = lambda pivot: pivot > least**2
     pivot, _ = _eliminate(unit.at[:, 0].set(1.0), keeps)
-    return keeps(pivot) | ~ordinary
+    return keeps(pivot) | ~usable

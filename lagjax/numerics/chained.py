@@ -1,12 +1,12 @@
-"""Linear least squares for a chain of windows: unknowns that all share, and some of each window's own.
+"""Linear least squares for a chain of windows, with unknowns shared by all windows and unknowns of each window.
 
     rows of window w        R_w s_w + P_w p                = r_w
     the seam to the next    O_w s_w + N_w s_{w+1} + S_w p  = d_w
-    on what is shared                           Q p        = h
+    on the shared unknowns                      Q p        = h
 
-A QR factorisation of one window at a time eliminates s_w and hands what it says of s_{w+1} and p to the next, so the
-cost grows with the number of windows, not with its cube, and nothing is squared. The same factors, read backwards, give
-the covariance. This is the square-root information filter and its smoother.
+A QR factorisation of one window at a time eliminates s_w and passes the remaining equations in s_{w+1} and p to the
+next window, so the cost grows linearly with the number of windows, not with its cube, and no matrix is squared. A
+backward pass through the same factors gives the covariance. This is the square-root information filter and smoother.
 
 Source: Bierman, *Factorization Methods for Discrete Sequential Estimation*, §§V-VII and X.
 """
@@ -22,14 +22,14 @@ from jaxtyping import Array, Float
 
 
 class Unknowns(NamedTuple):
-    """What all windows share, and what each has of its own."""
+    """The unknowns shared by all windows, and those of each window."""
 
     shared: Float[Array, " p"]
     local: Float[Array, "windows k"]
 
 
 class Equations(NamedTuple):
-    """Residuals of the samples and the seam of each window, and of what is known about the shared unknowns."""
+    """Residuals of the samples and the seam of each window, and of prior knowledge about the shared unknowns."""
 
     rows: Float[Array, "windows m"]
     seams: Float[Array, "windows j"]
@@ -58,11 +58,11 @@ class Slopes(NamedTuple):
         )
 
     def sizes(self) -> Unknowns:
-        """The norm of the slopes by each unknown."""
+        """The norm of the slopes with respect to each unknown."""
         squares = lambda blocks: jnp.sum(blocks**2, axis=1)
         shared = jnp.sum(squares(self.rows_by_shared) + squares(self.seams_by_shared), axis=0)
         shared = shared + jnp.sum(self.shared**2, axis=0)
-        # A window's start is also where the seam before it ends.
+        # The unknowns of a window also enter the seam before it.
         local = (
             squares(self.rows_by_local)
             + squares(self.seams_by_local)
@@ -71,7 +71,7 @@ class Slopes(NamedTuple):
         return Unknowns(jnp.sqrt(shared), jnp.sqrt(local))
 
     def scaled(self, by_shared: Float[Array, " p"]) -> "Slopes":
-        """The slopes by shared unknowns that are measured in other units."""
+        """The slopes after a change of units of the shared unknowns."""
         return self._replace(
             rows_by_shared=self.rows_by_shared * by_shared[None, None],
             seams_by_shared=self.seams_by_shared * by_shared[None, None],
@@ -80,7 +80,7 @@ class Slopes(NamedTuple):
 
 
 def filled(sizes: Unknowns) -> Unknowns:
-    """Sizes with the largest of them where there is none: what is not seen shall stay where it is."""
+    """Sizes in which zeros are replaced by the largest size, so that undetermined unknowns are damped and stay put."""
     fill = lambda size: jnp.where(size > 0, size, jnp.maximum(jnp.max(size, initial=0.0), 1.0))
     return jax.tree.map(fill, sizes)
 
@@ -90,7 +90,7 @@ def _each(blocks, vectors):
 
 
 def _directions(u: Unknowns) -> Unknowns:
-    """Directions whose derivatives hold all slopes: every other window at a time, since seams see two."""
+    """Directions whose derivatives contain all slopes: every other window at a time, since a seam involves two."""
     (p,), (windows, k) = u.shared.shape, u.local.shape
     parities = min(windows, 2)
     alternating = (jnp.arange(windows)[None, :] % 2 == jnp.arange(parities)[:, None]).astype(u.local.dtype)
@@ -120,7 +120,7 @@ def _slopes(along: Equations, u: Unknowns) -> Slopes:
 
 
 class Factors(NamedTuple):
-    """What is left of the equations, triangular: `R s_w + next s_{w+1} + P p = rhs`, and `S p = rhs`."""
+    """The triangular equations after elimination: `R s_w + next s_{w+1} + P p = rhs`, and `S p = rhs`."""
 
     local: Float[Array, "windows k k"]
     following: Float[Array, "windows k k"]
@@ -167,7 +167,7 @@ def eliminate(a: Slopes, rhs: Equations, damping: Unknowns) -> Factors:
 
 
 def _triangle(matrix):
-    """The square triangular factor, rows of zeros added where there are fewer rows than columns."""
+    """The square triangular factor; rows of zeros are added if there are fewer rows than columns."""
     rows, columns = matrix.shape
     short = max(columns - rows, 0)
     return jnp.linalg.qr(jnp.concatenate([matrix, jnp.zeros((short, columns), matrix.dtype)]), mode="r")
@@ -188,7 +188,7 @@ def solution(f: Factors) -> Unknowns:
 
 
 class Covariance(NamedTuple):
-    """Of what is shared, of each window's own, and between the two."""
+    """The covariance of the shared unknowns, of each window's unknowns, and between the two."""
 
     shared: Float[Array, "p p"]
     local: Float[Array, "windows k k"]
@@ -196,9 +196,9 @@ class Covariance(NamedTuple):
 
 
 def covariance(f: Factors, inverse: Float[Array, "p p"]) -> Covariance:
-    """The covariance of the unknowns where the equations' errors are independent and of size one.
+    """The covariance of the unknowns if the errors of the equations are independent with unit variance.
 
-    `inverse` of the shared factor: a generalised one leaves out what is not determined.
+    `inverse` of the shared factor: a generalised inverse leaves out undetermined directions.
     """
     k, of_shared = f.local.shape[-1], inverse @ inverse.T
 
@@ -224,25 +224,25 @@ def _upper(triangle, rhs):
 
 
 def slopes_of(product: Callable[[Unknowns], Equations], u: Unknowns) -> Slopes:
-    """The slopes of equations from their products with few directions; `u` gives the shapes."""
+    """The slopes of equations from their products with a few directions; `u` gives the shapes."""
     return _slopes(jax.vmap(product)(_directions(u)), u)
 
 
 class ByWindows(lx.AbstractLinearSolver):
     """Solve the damped equations of Levenberg-Marquardt's step window by window, as a lineax solver.
 
-    Damping is in units of each unknown's slopes (Marquardt's), so that units of the unknowns do not matter; `tau` of
-    them to begin with.
+    Damping is relative to the slopes of each unknown (Marquardt's choice), so that units of the unknowns do not matter;
+    it starts at `tau` of them.
     """
 
     tau: float = 1e-3
 
     def init(self, operator: lx.AbstractLinearOperator, options: dict[str, Any]):
-        """The slopes and the damping, seen by applying the operator along few directions."""
+        """The slopes and the damping, found by applying the operator along a few directions."""
         u = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), operator.in_structure())
         found = slopes_of(lambda d: operator.mv(d)[0], u)
         _, damped = operator.mv(jax.tree.map(jnp.ones_like, u))
-        # One number on the diagonal.
+        # The damping is one number on the diagonal.
         damping = jnp.max(jnp.concatenate([jnp.ravel(x) for x in jax.tree.leaves(damped)]))
         return found, jax.tree.map(lambda size: jnp.sqrt(self.tau) * damping * size, filled(found.sizes()))
 
@@ -252,13 +252,13 @@ class ByWindows(lx.AbstractLinearSolver):
         return solution(eliminate(found, vector[0], damping)), lx.RESULTS.successful, {}
 
     def transpose(self, state, options: dict[str, Any]):
-        """Not offered: nothing is differentiated through a step."""
+        """Not implemented: steps are not differentiated."""
         raise NotImplementedError
 
     def conj(self, state, options: dict[str, Any]):
-        """The numbers are real."""
+        """The unchanged state: all numbers are real."""
         return state, options
 
     def assume_full_rank(self) -> bool:
-        """Damping makes it so."""
+        """True: damping makes the matrix full rank."""
         return True

@@ -3,12 +3,12 @@
 `solve(matrix, rhs)` inverts by Gauss-Jordan elimination with scaled partial pivoting and follows with one
 step of iterative refinement in the same precision. Refinement is what makes the answer accurate *component
 by component*: after it the computed x solves `(K + dK) x = b + db` with `|dK| <= c eps |K|` and
-`|db| <= c eps |b|` entrywise (Skeel, Math. Comp. 35 (1980) 817), so an acceleration of 1e-17 beside one
-of 10 keeps its digits where the entries of K and b carry them.
+`|db| <= c eps |b|` entrywise (Skeel, Math. Comp. 35 (1980) 817), so an acceleration of 1e-17 next to
+one of 10 keeps its digits if the entries of K and b carry them.
 
-The elimination acts on whole rows, one column a time, in a loop: written out it ran a fifth faster, and made up
-half of what there is to compile in a constrained system, where it is the way out of the fast one (`Saddle`). Against
-LAPACK, whose call costs 1-1.6 microseconds, it is faster up to n = 6.
+The elimination acts on whole rows, one column at a time, in a loop. Unrolled it ran a fifth faster, but made up half of
+the code to compile in a constrained system, where it is only the fallback of the fast solve (`Saddle`). It is faster
+than LAPACK, whose call costs 1-1.6 microseconds, up to n = 6.
 
 Differentiation never passes through the pivoting: `dx = K^-1 (db - dK x)`, transposed by JAX.
 """
@@ -24,9 +24,9 @@ from jaxtyping import Array, Float
 from lagjax.jax_internals.primitives import primitive
 
 ELIMINATE_UP_TO = 6
-# Where a library cannot be called; beyond, a program is better off with it.
+# The largest matrix inverted inside a program without LAPACK; larger ones are better off with it.
 ELIMINATE_INSIDE_UP_TO = 16
-# The square of the sine of a row to the span of those before it.
+# Rows count as independent if the squared sine of their angle to the span of those before exceeds this.
 INDEPENDENT_ABOVE = 1e-10
 
 
@@ -38,7 +38,7 @@ def solve(matrix: Float[Array, "n n"], rhs: Float[Array, " n"]) -> Float[Array, 
     >>> print(solve(jnp.array([[2.0, 1.0], [1.0, 3.0]]), jnp.array([3.0, 4.0])))
     [1. 1.]
 
-    **Arguments:** `matrix` (n, n) and `rhs` (n,), of one floating dtype.
+    **Arguments:** `matrix` (n, n) and `rhs` (n,), of the same floating dtype.
 
     **Returns:** x, shape (n,), `[rhs]/[matrix]`.
     """
@@ -53,8 +53,8 @@ def _solution(matrix, rhs):
     return refined(inverted, matrix, rhs), lambda b: inverted @ b
 
 
-# x comes from the same code with and without a derivative: JAX's batching of custom rules under `jit` relies on the
-# batch axis of both being in one place.
+# x comes from the same code with and without a derivative: JAX's batching of custom rules under `jit` requires that
+# both have their batch axis in the same position.
 @solve.defjvp
 def _solve_jvp(primals, tangents):
     (matrix, rhs), (d_matrix, d_rhs) = primals, tangents
@@ -69,15 +69,15 @@ def refined(inverted, matrix, rhs):
 
 
 def solved(matrix: Float[Array, "n n"], rhs: Array) -> Array:
-    """`matrix^-1 @ rhs` of one or several right-hand sides, by the inverse, refined once; derivatives of any order.
+    """`matrix^-1 @ rhs` for one or several right-hand sides, by the inverse, refined once; derivatives of any order.
 
-    Where lanes are many, XLA's own batches of LAPACK's solve can wait for each other without end.
+    With many lanes, XLA's own batches of LAPACK's solve can deadlock.
     """
     return refined(inverse(matrix), matrix, rhs)
 
 
 def inverse(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
-    """Invert a matrix: by elimination that XLA fuses where it is small, by LAPACK above."""
+    """Invert a matrix: small ones by elimination that XLA fuses, larger ones by LAPACK."""
     n = matrix.shape[0]
     if n < 2:
         return 1 / matrix
@@ -117,7 +117,7 @@ def _inverse_batched(operands, axes, **params):
     return jax.vmap(partial(_inverse, **params))(jnp.moveaxis(operands[0], axes[0], 0)), 0
 
 
-# A primitive, so that a program that is compiled as one function can have it without the library.
+# A primitive, so that a program compiled as one function can use it without calling LAPACK.
 _inverse_p = primitive(
     "inverse",
     lambda matrix, eliminate: jax.jit(_inverse, static_argnums=1)(matrix, eliminate),
@@ -129,7 +129,7 @@ _inverse_p = primitive(
 
 
 def reciprocal_condition(matrix: Float[Array, "n n"]) -> Float[Array, ""]:
-    """`1/(|K| |K^-1|)` in the maximum norm, of a symmetric matrix scaled by rows and columns alike; 0 if singular.
+    """`1/(|K| |K^-1|)` in the maximum norm, of a symmetric matrix after symmetric scaling; 0 if singular.
 
     The scaling brings every row's largest entry near one (Ruiz), so that units do not count as ill-conditioning.
     """
@@ -148,11 +148,12 @@ def reciprocal_condition(matrix: Float[Array, "n n"]) -> Float[Array, ""]:
 
 
 class Saddle:
-    """`[[M, Aᵀ], [A, 0]]` eliminated in the order in which it is written, one number at a time.
+    """`[[M, Aᵀ], [A, 0]]` eliminated without pivoting, one number at a time.
 
-    For programs that are written out (`scalars.py`), where the zeros of M and A cost nothing. `valid` says whether
-    the answers are as accurate as with pivoting: M is definite (or every pivot the largest of its column), and no row
-    of A depends on those before it. A `diagonal` M without A is divided by: what is singular gives NaN or infinity.
+    For programs of single numbers (`scalars.py`), in which the zeros of M and A cost nothing. `valid` says whether the
+    solution is as accurate as with pivoting: M is definite (or every pivot the largest of its column), and no row of A
+    depends on those before it. For a `diagonal` M without A the pivots are divided by unchecked: a singular one gives
+    NaN or infinity.
 
     Source: Golub & Van Loan, *Matrix Computations*, §4.1.2.
     """
@@ -169,7 +170,7 @@ class Saddle:
             if k == n:
                 schur = [work[i][i] for i in range(n, n + m)]
             pivot = work[k][k]
-            # What is not valid is computed too, and must not put NaN into the derivatives of what is taken instead.
+            # Invalid results are computed too, and must not put NaN into the derivatives of the results used instead.
             nonzero = nonzero & (pivot != 0)
             pivot = pivot if diagonal else jnp.where(pivot != 0, pivot, 1.0)
             self.pivots.append(pivot)
@@ -190,12 +191,12 @@ class Saddle:
         self.valid = diagonal or nonzero & ((definite & independent) if m else (definite | largest))
 
     def solve(self, forcing: Float[Array, " n"], gamma: Float[Array, " m"], refine: bool = True):
-        """a and λ of `M a - Aᵀ λ = F`, `A a = gamma`; with constraints, refined once."""
+        """Solve `M a - Aᵀ λ = F`, `A a = gamma` for a and λ; with constraints, refined once."""
         known = [forcing[i] for i in range(self.n)] + [gamma[i] for i in range(self.m)]
         x = self._substituted(known)
         if self.m and refine:
-            left = [b - sum(k * y for k, y in zip(row, x)) for b, row in zip(known, self.matrix)]
-            x = [a + b for a, b in zip(x, self._substituted(left))]
+            residual = [b - sum(k * y for k, y in zip(row, x)) for b, row in zip(known, self.matrix)]
+            x = [a + b for a, b in zip(x, self._substituted(residual))]
         stack = lambda entries: jnp.stack(entries) if entries else jnp.zeros(0, forcing.dtype)
         return stack(x[: self.n]), stack([-y for y in x[self.n :]])
 

@@ -1,16 +1,16 @@
 """Sine and cosine that vectorise on a CPU.
 
-XLA calls the C library once for every sine of a float64 array. Here sine and cosine are arithmetic alone, in three
-steps without a branch, so that XLA fuses them into loops over vector registers:
+XLA calls the C library once for every sine of a float64 array. Here sine and cosine use only arithmetic, in three steps
+without a branch, so that XLA fuses them into loops over vector registers:
 
     n = round(2 x/π),    x - n π/2 = r + d,    ±sin(r + d) or ±cos(r + d) by n modulo 4
 
-π/2 is split into parts (Cody & Waite) of which n times all but the last is exact, and so is the first subtraction. The
-later ones leave their rounding errors in d (Fast2Sum), which is needed where x lies next to a multiple of π/2: the
-distance is then small, and known to all its digits. Products being exact, it does not matter whether XLA contracts them
-with sums into fused operations. |n| < 2^16 in float64 and 2^10 in float32 is what this holds for; beyond `limit`
-the C library takes over, behind a `lax.cond` that stays a branch under `vmap`. The polynomials in r are fdlibm's, whose
-first-order terms in d keep the error below 0.85 units in the last place (C library: 0.55).
+π/2 is split into parts (Cody & Waite). The product of n and each part but the last is exact, and so is the first
+subtraction. The rounding errors of later subtractions are collected in d (Fast2Sum). It is needed if x is close to a
+multiple of π/2, so that the small difference has all its digits. Since the products are exact, it does not matter
+whether XLA fuses them with sums. This holds for |n| < 2^16 in float64 and 2^10 in float32; beyond `limit` the C library
+is used, behind a `lax.cond` that stays a branch under `vmap`. The polynomials in r are fdlibm's; first-order terms in d
+keep the error below 0.85 units in the last place (C library: 0.55).
 
 Source: Cody & Waite, *Software Manual for the Elementary Functions* (1980), ch. 8; fdlibm `k_sin.c`, `k_cos.c` (Sun
 Microsystems, 1993) and FreeBSD msun `k_sinf.c`, `k_cosf.c` for the coefficients; Dekker, Numer. Math. 18 (1971) 224.
@@ -30,13 +30,13 @@ from lagjax.jax_internals.primitives import primitive
 
 
 class Arithmetic(NamedTuple):
-    """What sine and cosine need in one floating format.
+    """The constants of sine and cosine in one floating-point format.
 
-    - `limit`: the largest argument that `parts` reduce.
-    - `parts`: π/2 as a sum, from the largest.
+    - `limit`: the largest argument that `parts` can reduce.
+    - `parts`: π/2 as a sum, largest part first.
     - `sine`, `cosine`: coefficients of r³, r⁵, ... and of r⁴, r⁶, ...
-    - `tiny`: below it the sine is its argument. Most processors take subnormal numbers for zero here.
-    - `integers`: adding this to a small integer leaves that in the lowest bits.
+    - `tiny`: below it the sine equals its argument. Most processors treat subnormal numbers as zero here.
+    - `integers`: adding this to a small integer puts the integer into the lowest bits.
     - `word`: the integer type of the same width.
     """
 
@@ -86,7 +86,7 @@ ARITHMETIC = {
 
 
 def _with_derivatives(pair):
-    """A function that computes sine and cosine, and its derivatives by itself."""
+    """Give a function (sine, cosine) derivatives in terms of itself."""
     pair = jax.custom_jvp(pair)
 
     @pair.defjvp
@@ -106,8 +106,8 @@ def sincos(x: Float[Array, "..."]) -> tuple[Float[Array, "..."], Float[Array, ".
     >>> print(sine.round(8), (cosine**2).round(8))
     [ 0.          0.5        -0.81788191] [1.         0.75       0.33106918]
 
-    **Arguments:** `x`, any shape. Where any element, in any lane, is beyond `ARITHMETIC[dtype].limit` (1e5 in float64,
-    1600 in float32), all of them take `jnp.sin` and `jnp.cos`; formats other than these two always do.
+    **Arguments:** `x`, any shape. If any element, in any lane, is beyond `ARITHMETIC[dtype].limit` (1e5 in float64,
+    1600 in float32), all elements use `jnp.sin` and `jnp.cos`; formats other than these two always do.
 
     **Returns:** sine and cosine, like `x`; NaN where `x` is not finite. Differentiable in both modes, to any order.
     """
@@ -118,9 +118,9 @@ def sincos(x: Float[Array, "..."]) -> tuple[Float[Array, "..."], Float[Array, ".
 
 
 def sincos_in_lanes(x):
-    """Sine and cosine: by the C library alone, by arithmetic in a batch on a CPU, where that is several times faster.
+    """Sine and cosine: by the C library, or in a batch on a CPU by arithmetic, which is several times faster there.
 
-    For one number the two cost the same, 23 ns the pair.
+    For a single number both cost the same, 23 ns per pair.
     """
     return tuple(_sincos_p.bind(x))
 
@@ -132,8 +132,8 @@ def _sincos_jvp(primals, tangents):
 
 
 def _sincos_batched(operands, axes):
-    together = sincos if jax.default_backend() == "cpu" else _by_library
-    return together(*operands), axes * 2
+    batched_version = sincos if jax.default_backend() == "cpu" else _by_library
+    return batched_version(*operands), axes * 2
 
 
 def _is_outside(x):
@@ -146,7 +146,7 @@ def _by_library(x):
 
 @_with_derivatives
 def _by_arithmetic(x):
-    """Sine and cosine of arguments within the limit; of others, something wrong."""
+    """Sine and cosine of arguments within the limit; wrong for others."""
     a = ARITHMETIC[np.dtype(x.dtype)]
     n = lax.round(x * (2 / np.pi), lax.RoundingMethod.TO_NEAREST_EVEN)
     r, d = x - n * a.parts[0], 0.0
@@ -157,19 +157,19 @@ def _by_arithmetic(x):
     z = r * r
     cube = z * r
     sine = r + ((d - z * (0.5 * d - cube * _polynomial(z, a.sine[1:]))) + cube * a.sine[0])
-    # 1 - z/2 is rounded; what that loses is added back.
-    most = 1 - 0.5 * z
-    cosine = most + (((1 - most) - 0.5 * z) + (z * z * _polynomial(z, a.cosine) - r * d))
-    # Cheaper than a conversion, for which many processors have no vector instruction.
-    quarter = lax.bitcast_convert_type(n + a.integers, a.word)
-    odd = (quarter & 1) != 0
+    # 1 - z/2 is rounded; the rounding error is added back.
+    leading = 1 - 0.5 * z
+    cosine = leading + (((1 - leading) - 0.5 * z) + (z * z * _polynomial(z, a.cosine) - r * d))
+    # Cheaper than a conversion to integers, for which many processors have no vector instruction.
+    quadrant = lax.bitcast_convert_type(n + a.integers, a.word)
+    odd = (quadrant & 1) != 0
     sine, cosine = jnp.where(odd, cosine, sine), jnp.where(odd, sine, cosine)
-    sine = jnp.where((quarter & 2) != 0, -sine, sine)
-    return jnp.where(jnp.abs(x) < a.tiny, x, sine), jnp.where(((quarter + 1) & 2) != 0, -cosine, cosine)
+    sine = jnp.where((quadrant & 2) != 0, -sine, sine)
+    return jnp.where(jnp.abs(x) < a.tiny, x, sine), jnp.where(((quadrant + 1) & 2) != 0, -cosine, cosine)
 
 
 def _polynomial(z, coefficients):
-    """By Estrin's scheme in pairs: half the chain of Horner's."""
+    """Evaluate in pairs (Estrin's scheme): half the dependency chain of Horner's."""
     pairs = [c + z * after for c, after in zip(coefficients[::2], coefficients[1::2])]
     pairs += coefficients[len(pairs) * 2 :]
     return functools.reduce(lambda rest, pair: pair + z * z * rest, reversed(pairs))

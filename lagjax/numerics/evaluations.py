@@ -1,4 +1,4 @@
-"""What a step of a method costs."""
+"""The cost of a step of a method."""
 
 import diffrax
 
@@ -7,7 +7,7 @@ from lagjax.numerics.runge_kutta import ExplicitRungeKutta
 
 
 def evaluations_a_step(method: diffrax.AbstractSolver) -> int | None:
-    """How often a step evaluates the accelerations, the last one being the first of the next; None of implicit ones.
+    """How often a step evaluates the accelerations, counting a shared last stage once; None for implicit methods.
 
     >>> import lagjax as lj
     >>> [evaluations_a_step(method) for method in (lj.Dopri8(), lj.Tsit5(), lj.Radau5())]

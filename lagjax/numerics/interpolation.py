@@ -1,4 +1,4 @@
-"""The state inside a step of diffrax, point by point."""
+"""Dense output of diffrax steps, given by the state at a time."""
 
 import abc
 
@@ -7,7 +7,7 @@ import jax.tree_util as jtu
 
 
 class Interpolation(diffrax.AbstractLocalInterpolation):
-    """A dense output given by the state `at` a time; a change over an interval is the difference of two."""
+    """A dense output given by the state `at` a time; the change over an interval is the difference of two states."""
 
     @abc.abstractmethod
     def at(self, t):

@@ -3,9 +3,9 @@
     k_i = a(t + c_i h, q + c_i h v + h² sum_j a_ij k_j)
     q1 = q + h v + h² sum_i b_i k_i,    v1 = v + h sum_i b'_i k_i
 
-A stage needs no velocity, so that fewer of them reach an order than for a general system: nine for order 8, of which
-the last is the first of the next step, where Prince and Dormand's method takes thirteen. On a bead and on a pendulum,
-at equal error, these methods take half to a third of its evaluations.
+A stage needs no velocity, so fewer stages are needed for an order than for a general system: nine for order 8, of which
+the last is the first of the next step, compared with thirteen in Prince and Dormand's method. On a bead and on a
+pendulum, at equal error, these methods take a half to a third of its evaluations.
 
 Source: Dormand, El-Mikkawy & Prince, *High-order embedded Runge-Kutta-Nyström formulae*, IMA J. Numer. Anal. 7 (1987)
 423: RKN8(6)9FM and RKN12(10)17M.
@@ -30,7 +30,7 @@ from lagjax.numerics.runge_kutta import weighted_sum
 class NystromTableau(NamedTuple):
     """The coefficients of a method, for s stages: nodes, rows of `a` from the second stage on, and weights.
 
-    `embedded_...` are the weights of the method of lower order, whose distance is the error.
+    `embedded_...` are the weights of the method of lower order; the difference of both results is the error estimate.
     """
 
     c: tuple[float, ...]
@@ -44,9 +44,9 @@ class NystromTableau(NamedTuple):
 class Nystrom(diffrax.AbstractAdaptiveSolver):
     """An embedded method for `diffrax.diffeqsolve`, with the tableau of its subclass.
 
-    The state is a pair (q, v) of pytrees alike and the vector field returns (v, a), where a must not depend on v: that
-    is not checked here, and `lj.integrate` checks it. `in_a_loop` compiles the vector field once for all stages, which
-    suits large ones; otherwise it is copied to each.
+    The state is a pair (q, v) of pytrees of the same structure. The vector field returns (v, a), where a must not
+    depend on v: `lj.integrate` checks this, it is not checked here. `in_a_loop` compiles the vector field once for all
+    stages, which suits large ones; otherwise it is copied into each stage.
     """
 
     tableau: AbstractClassVar[NystromTableau]
@@ -62,11 +62,11 @@ class Nystrom(diffrax.AbstractAdaptiveSolver):
         return Quintic
 
     def order(self, terms):
-        """The order of what is kept."""
+        """The order of the accepted solution."""
         return self.highest
 
     def error_order(self, terms):
-        """The error is that of the embedded method."""
+        """One more than the order of the embedded method."""
         return self.embedded + 1
 
     def func(self, terms, t0, y0, args):
@@ -74,11 +74,11 @@ class Nystrom(diffrax.AbstractAdaptiveSolver):
         return terms.vf(t0, y0, args)
 
     def init(self, terms, t0, t1, y0, args):
-        """The acceleration at the start: the last one of a step is the first of the next."""
+        """The acceleration at the start: the last stage of a step is the first of the next."""
         return terms.vf(t0, y0, args)[1]
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
-        """One step, its error and all that the dense output needs."""
+        """One step, its error and the data for the dense output."""
         tableau, h = self.tableau, terms.contr(t0, t1)
         acceleration = lambda t, q: terms.vf(t, (q, y0[1]), args)[1]
         first = solver_state if made_jump is False else None
@@ -106,19 +106,19 @@ def _position(y0, h, c, combined):
 
 
 def _one_by_one(tableau, acceleration, t0, t1, h, y0, first):
-    """The first and the last stage, and the sums of all of them by their weights; zero weights leave no trace."""
+    """The first and last stage, and a function for weighted sums of all stages; zero weights cost nothing."""
     found = [acceleration(t0, y0[0]) if first is None else first]
 
     combined = lambda weights: weighted_sum(None, weights, found)
     for c, row in zip(tableau.c[1:], tableau.a):
-        # Rounded differently, the last stage would not be at the time of the next step's first.
+        # Exactly t1, since the last stage must be at the same time as the first stage of the next step.
         t = t1 if c == 1 else t0 + c * (t1 - t0)
         found.append(acceleration(t, _position(y0, h, c, combined(row))))
     return found[0], found[-1], combined
 
 
 def _in_a_loop(tableau, acceleration, t0, t1, h, y0, first):
-    """The same with the acceleration compiled once."""
+    """Like `_one_by_one`, with the acceleration compiled once."""
     count = len(tableau.c)
     rows = np.zeros((count, count))
     for i, row in enumerate(tableau.a, start=1):
@@ -201,7 +201,7 @@ RKN86 = NystromTableau(
     ),
 )
 
-# Rational numbers in the source, some of sixty digits; here the nearest in double precision.
+# The source gives rational numbers, some with sixty digits; these are the nearest double-precision numbers.
 RKN1210 = NystromTableau(
     c=(
         0, 1 / 50, 1 / 25, 1 / 10, 2 / 15, 4 / 25, 1 / 20, 1 / 5, 1 / 4, 1 / 3, 1 / 2, 5 / 9, 3 / 4, 6 / 7,
@@ -290,9 +290,9 @@ RKN1210 = NystromTableau(
 
 
 class Nystrom8(Nystrom):
-    """Order 8 with an embedded method of order 6: eight accelerations a step.
+    """Order 8 with an embedded method of order 6: eight accelerations per step.
 
-    For costly accelerations with many outputs: each of these is the end of a step.
+    For costly accelerations with many outputs, since each output is the end of a step.
 
     >>> import diffrax
     >>> import jax.numpy as jnp
@@ -310,16 +310,16 @@ class Nystrom8(Nystrom):
 
 
 class Nystrom12(Nystrom):
-    """Order 12 with an embedded method of order 10: seventeen accelerations a step.
+    """Order 12 with an embedded method of order 10: seventeen accelerations per step.
 
-    The default of `lj.integrate` where accelerations do not depend on velocities and there are no constraints: of all
-    methods here the fastest to any error below 1e-4 on a bead and a pendulum. Used like `Nystrom8`.
+    The default of `lj.integrate` if accelerations do not depend on velocities and there are no constraints: the fastest
+    of all methods here for any error below 1e-4 on a bead and a pendulum. Used like `Nystrom8`.
 
     >>> print(Nystrom12().order(None))
     12
 
-    Where a stiff spring limits its steps (`print(traj)` says "stability"), derivatives of the motion can lose all
-    digits while the motion itself does not, since only that chooses the steps: `lj.Dopri8()` keeps both.
+    If a stiff spring limits its steps (`print(traj)` says "stability"), derivatives of the motion can lose all digits
+    while the motion itself does not, since only the motion controls the steps: `lj.Dopri8()` keeps both accurate.
     """
 
     tableau: ClassVar = RKN1210

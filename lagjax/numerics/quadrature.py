@@ -1,4 +1,4 @@
-"""Gauss and Kronrod's quadrature of many smooth functions at once, with an estimate of its error.
+"""Gauss-Kronrod quadrature of many smooth functions at once, with an error estimate.
 
 Source: Piessens, de Doncker-Kapenga, Überhuber & Kahaner, *QUADPACK* (1983), §2.2 (rules) and QK15 (the estimate).
 """
@@ -35,8 +35,8 @@ GAUSS[1::2] = _both_sides(_GAUSS)
 
 
 class Integrals(NamedTuple):
-    """Of m intervals and k functions the integrals (m, k), estimates of their errors (m,), all functions together, and
-    the errors (m,) that round-off leaves."""
+    """The integrals (m, k) of k functions over m intervals, error estimates (m,) summed over the functions, and the
+    errors (m,) due to round-off."""
 
     values: np.ndarray
     errors: np.ndarray
@@ -44,7 +44,7 @@ class Integrals(NamedTuple):
 
 
 def nodes(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """The places (m, 15) at which functions are needed, of the intervals from a to b, (m,)."""
+    """The nodes (m, 15) of the intervals from a to b, (m,)."""
     return 0.5 * (a + b)[:, None] + 0.5 * (b - a)[:, None] * NODES.astype(a.dtype)
 
 

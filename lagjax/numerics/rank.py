@@ -1,9 +1,9 @@
-"""Which rows of a matrix are independent, decided in a program that XLA can compile and batch.
+"""Which rows of a matrix are independent, decided by a program that XLA can compile and batch.
 
 `independent_rows` is Gram-Schmidt with row pivoting: each round takes the row that is farthest from the span of those
-taken before and removes its direction from the rest. What is left of a row, relative to the row, is the sine of its
-angle to that span; rows whose sine is at most `DEPENDENT_BELOW` depend on the others. Working on the rows themselves
-and not on their Gram matrix keeps small sines apart from round-off.
+taken before and removes its direction from the rest. The relative length of the remainder of a row is the sine of its
+angle to that span; rows whose sine is at most `DEPENDENT_BELOW` depend on the others. Working on the rows instead of
+their Gram matrix distinguishes small sines from round-off.
 
 Source: Golub & Van Loan, *Matrix Computations*, §5.4.2 (pivoting) and §5.2.8 (modified Gram-Schmidt).
 """
@@ -13,33 +13,33 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-# On a state that satisfies its constraints to round-off, dependent rows agree to round-off times the condition of the
-# mechanism; a state typed with seven digits keeps them apart by 1e-7.
+# In a state that satisfies its constraints to round-off, dependent rows agree to round-off times the condition of the
+# mechanism; in a state typed with seven digits they differ by 1e-7.
 DEPENDENT_BELOW = {np.dtype("float64"): 1e-6, np.dtype("float32"): 1e-3}
 UNROLL_UP_TO = 8
 
 
 def independent_rows(rows: Float[Array, "m n"], dependent_below=None) -> Bool[Array, " m"]:
-    """Choose a largest set of independent rows, the best conditioned that pivoting finds.
+    """Choose a largest set of independent rows, as well conditioned as pivoting finds.
 
     >>> import jax.numpy as jnp
     >>> print(independent_rows(jnp.array([[1.0, 0.0], [2.0, 0.0], [1.0, 1.0]])))
     [ True False  True]
 
-    Rows that are zero or not finite are kept: what is solved with them is then singular or not finite, and says so.
+    Rows that are zero or not finite are kept: solving with them is then singular or not finite, which is detected.
 
     **Arguments:** `rows` (m, n), a floating dtype; `dependent_below`, the largest sine of a dependent row, by default
-    `DEPENDENT_BELOW` of the dtype. Scaling rows does not change the answer; columns are compared as they are, since
-    scaling one up that is all round-off would make any rows independent.
+    `DEPENDENT_BELOW` of the dtype. Scaling rows does not change the answer; columns are not scaled, since scaling up a
+    column of pure round-off would make any rows independent.
 
-    **Returns:** (m,) booleans. It has no derivative.
+    **Returns:** (m,) booleans. Not differentiable.
     """
     count, dtype = rows.shape[0], np.dtype(rows.dtype)
     if count < 2:
         return jnp.ones(count, bool)
     rest, size = unit_rows(lax.stop_gradient(rows))
-    ordinary = jnp.isfinite(size) & (size > 0)
-    rest = jnp.where(ordinary[:, None], rest, 0.0)
+    usable = jnp.isfinite(size) & (size > 0)
+    rest = jnp.where(usable[:, None], rest, 0.0)
     least = (DEPENDENT_BELOW[dtype] if dependent_below is None else dependent_below) ** 2
 
     def take_farthest(_, state):
@@ -57,12 +57,12 @@ def independent_rows(rows: Float[Array, "m n"], dependent_below=None) -> Bool[Ar
             state = take_farthest(i, state)
     else:
         state = lax.fori_loop(0, rounds, take_farthest, state)
-    return state[1] | ~ordinary
+    return state[1] | ~usable
 
 
 def unit_rows(rows: Float[Array, "m n"]) -> tuple[Float[Array, "m n"], Float[Array, " m"]]:
-    """Rows scaled to length one, zero rows left as they are; and their lengths."""
-    # Through the largest entry, so that squares neither overflow nor vanish.
+    """Rows scaled to length one (zero rows are unchanged), and their lengths."""
+    # Scaled by the largest entry first, so that squares neither overflow nor underflow.
     largest = jnp.max(jnp.abs(rows), axis=1)
     shape = rows / jnp.where(largest > 0, largest, 1.0)[:, None]
     length = largest * jnp.sqrt(jnp.sum(shape**2, axis=1))
@@ -70,13 +70,13 @@ def unit_rows(rows: Float[Array, "m n"]) -> tuple[Float[Array, "m n"], Float[Arr
 
 
 def null_space(rows: np.ndarray, smallest: float | None = None) -> np.ndarray:
-    """An orthonormal basis (n, k) of the vectors that the rows (m, n) take to zero, outside of compiled programs.
+    """An orthonormal basis (n, k) of the null space of the rows (m, n), outside of compiled programs.
 
     >>> print(abs(null_space(np.array([[1.0, 1.0, 0.0]]))).round(3).sum(axis=1))
     [0.707 0.707 1.   ]
 
-    Singular values up to `smallest` times the largest count as zero, by default round-off. (SciPy's function of the
-    same name takes longer to import than all of lagjax.)
+    Singular values up to `smallest` times the largest count as zero, by default those of round-off size. (SciPy's
+    function of the same name takes longer to import than all of lagjax.)
     """
     _, sizes, directions = np.linalg.svd(rows)
     least = max(rows.shape) * np.finfo(sizes.dtype).eps if smallest is None else smallest

@@ -1,10 +1,10 @@
-"""Explicit Runge-Kutta methods with their stages written out.
+"""Explicit Runge-Kutta methods with unrolled stages.
 
     k_i = f(t + c_i h, y + h sum_j a_ij k_j),    y1 = y + h sum_i b_i k_i,    error = h sum_i e_i k_i
 
-diffrax runs the stages in a loop over a buffer of k. Here they are straight code on the leaves of y, in which zero
-coefficients leave no trace: with a state made of numbers XLA keeps all of it in registers. What a step costs on one
-coordinate is measured in `benchmarks/work_precision.py` and `benchmarks/against_peers.py`.
+diffrax runs the stages in a loop over a buffer of k. Here they are unrolled on the leaves of y, without terms for zero
+coefficients: for a state of single numbers XLA keeps all of them in registers. The cost of a step on one coordinate is
+measured in `benchmarks/work_precision.py` and `benchmarks/against_peers.py`.
 
 The tableaus and the dense output are diffrax's.
 """
@@ -25,8 +25,8 @@ from jax import lax
 class ExplicitRungeKutta(diffrax.AbstractAdaptiveSolver):
     """An embedded explicit method for `diffrax.diffeqsolve`, with the tableau of its subclass.
 
-    `shipped` is diffrax's implementation of it, for vector fields that are too large to be written out for each stage.
-    `in_a_loop` compiles the vector field once for all stages, too, in a loop that both modes differentiate.
+    `shipped` is diffrax's implementation of it, for vector fields that are too large to be copied into each stage.
+    `in_a_loop` also compiles the vector field once for all stages, in a loop that can be differentiated in both modes.
     """
 
     tableau: AbstractClassVar[diffrax.ButcherTableau]
@@ -40,11 +40,11 @@ class ExplicitRungeKutta(diffrax.AbstractAdaptiveSolver):
         return terms.vf(t0, y0, args)
 
     def init(self, terms, t0, t1, y0, args):
-        """The first stage, where the last one of a step is the first of the next."""
+        """The first stage, if the last stage of a step is the first of the next."""
         return terms.vf(t0, y0, args) if self.tableau.fsal else None
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
-        """One step, its error and all that the dense output needs."""
+        """One step, its error and the data for the dense output."""
         tableau, control = self.tableau, terms.contr(t0, t1)
         first = solver_state
         if self.in_a_loop:
@@ -53,7 +53,7 @@ class ExplicitRungeKutta(diffrax.AbstractAdaptiveSolver):
             first = terms.vf(t0, y0, args)
         increments, rate = [terms.prod(first, control)], first
         for weights, c in zip(tableau.a_lower, tableau.c):
-            # Rounded differently, the last stage would not be at the time of the next step's first.
+            # Exactly t1, since the last stage must be at the same time as the first stage of the next step.
             t = t1 if c == 1 else t0 + float(c) * (t1 - t0)
             rate = terms.vf(t, weighted_sum(y0, weights, increments), args)
             increments.append(terms.prod(rate, control))
@@ -63,7 +63,7 @@ class ExplicitRungeKutta(diffrax.AbstractAdaptiveSolver):
         return y1, error, {"y0": y0, "y1": y1, "k": stages}, rate if tableau.fsal else None, diffrax.RESULTS.successful
 
     def _in_a_loop(self, terms, t0, t1, y0, args, first):
-        """The same with the vector field compiled once; without a `first` stage it is one of the loop's."""
+        """Like `step`, with the vector field compiled once; the loop includes the first stage unless it is given."""
         tableau, control, count = self.tableau, terms.contr(t0, t1), len(self.tableau.b_sol)
         rows = np.zeros((count, count))
         for i, row in enumerate(tableau.a_lower, start=1):
@@ -92,7 +92,7 @@ def weighted_sum(start, weights, increments):
     chosen = [(w, k) for w, k in zip(weights, increments) if w != 0]
 
     def of_leaves(*leaves):
-        # By lax and not by jnp, which takes three times as long to trace.
+        # lax instead of jnp, which takes three times as long to trace.
         terms = [lax.mul(k, lax.full_like(k, w)) for (w, _), k in zip(chosen, leaves)]
         return functools.reduce(lax.add, terms)
 
@@ -101,7 +101,7 @@ def weighted_sum(start, weights, increments):
 
 
 class Tsit5(ExplicitRungeKutta):
-    """Tsitouras' method of order 5, with an embedded one of order 4: six evaluations a step.
+    """Tsitouras' method of order 5, with an embedded one of order 4: six evaluations per step.
 
     >>> import diffrax
     >>> decay = diffrax.ODETerm(lambda t, y, args: -y)
@@ -123,7 +123,7 @@ class Tsit5(ExplicitRungeKutta):
 
 
 class Dopri8(ExplicitRungeKutta):
-    """Prince and Dormand's method of order 8, with an embedded one of order 7: thirteen evaluations a step.
+    """Prince and Dormand's method of order 8, with an embedded one of order 7: thirteen evaluations per step.
 
     The default of `lj.integrate`; in `diffrax.diffeqsolve` it is used like `Tsit5`.
 
@@ -144,7 +144,7 @@ class Dopri8(ExplicitRungeKutta):
 
 
 def in_our_form(method: diffrax.AbstractSolver) -> ExplicitRungeKutta | None:
-    """Ours of the same name as one of diffrax's methods, as it is shipped; None of any other, or of one with options.
+    """The class here for one of diffrax's methods with default options; None for all others.
 
     >>> import diffrax
     >>> type(in_our_form(diffrax.Tsit5())) is Tsit5, in_our_form(diffrax.Heun())

@@ -1,12 +1,12 @@
-"""Small arrays written out as numbers, with their zeros left out.
+"""Programs on small arrays rewritten as operations on single numbers, without known zeros.
 
-The mechanics is written with vectors and matrices. On a few coordinates these are mostly zeros and ones: the rows of a
-unit matrix along which a momentum is pushed, a mass matrix with its diagonal alone. `written_out` takes a program
-apart into operations on single numbers: what is multiplied by a known zero is gone, what is a known one is not
-multiplied, and what is never used is not computed. XLA keeps the rest in registers.
+The mechanics is written with vectors and matrices. For a few coordinates these are mostly zeros and ones: the rows of a
+unit matrix along which a momentum is differentiated, a diagonal mass matrix. `written_out` splits a program into
+operations on single numbers: products with a known zero are dropped, products with a known one are not computed, and
+neither are unused numbers. XLA keeps the rest in registers.
 
-A known zero counts as zero whatever it multiplies, also infinity or NaN. Primitives that are not known here, control
-flow, and arrays of more than `LARGE` entries are left as they are.
+A product with a known zero is zero, even if the other factor is infinity or NaN. Primitives that are not known here,
+control flow, and arrays of more than `LARGE` entries are left unchanged.
 """
 
 import math
@@ -26,11 +26,11 @@ LARGE = 512
 
 
 class TooLong(Exception):
-    """A program becomes more operations than it was to have."""
+    """A program becomes longer than the allowed number of operations."""
 
 
 def written_out(closed: ClosedJaxpr, *args, most: float = math.inf) -> list:
-    """Evaluate a program on its (flat) arguments, number by number; raise `TooLong` beyond about `most` of them.
+    """Evaluate a program on its (flat) arguments, number by number; raise `TooLong` beyond about `most` operations.
 
     >>> import jax, jax.numpy as jnp
     >>> program = jax.make_jaxpr(lambda x: jnp.diag(jnp.array([2.0, 0.0])) @ x)(jnp.ones(2))
@@ -38,28 +38,28 @@ def written_out(closed: ClosedJaxpr, *args, most: float = math.inf) -> list:
     >>> print([str(equation.primitive) for equation in numbers.jaxpr.eqns].count("mul"))
     1
     """
-    # What is known beforehand follows the same rules as in the compiled program: 1/0 is infinite, and nobody is warned.
+    # Known numbers follow the same rules as in the compiled program: 1/0 is infinite, without a warning.
     with np.errstate(all="ignore"):
         inputs = [_split(x) if _small(x.aval) else x for x in map(_Value, args)]
-        results = interpreted(closed, inputs, partial(_apply, closed.jaxpr, _Book(most)), _constant, _is_plain_call)
+        results = interpreted(closed, inputs, partial(_apply, closed.jaxpr, _Ledger(most)), _constant, _is_plain_call)
     return [_joined(x, aval) for x, aval in zip(results, closed.out_avals)]
 
 
-class _Book:
-    """What was written: sine and cosine by their argument; and how many numbers may be."""
+class _Ledger:
+    """The sines and cosines computed so far by their argument, and how many operations are still allowed."""
 
     def __init__(self, most):
         self.pairs, self.left = {}, most
 
-    def enter(self, entries):
-        """Count what is not known beforehand."""
+    def count(self, entries):
+        """Count the entries that are not known numbers."""
         self.left -= sum(not isinstance(x, np.generic) for x in entries)
         if self.left < 0:
             raise TooLong
 
 
 class _Value:
-    """A whole array, that looks like a variable of a program."""
+    """A whole array with the interface of a program's variable."""
 
     def __init__(self, array):
         self.array, self.aval = array, jax.typeof(array)
@@ -70,7 +70,7 @@ def _small(aval):
 
 
 def _split(value):
-    """The numbers of a whole array, in an array of objects."""
+    """The numbers of a whole array, as an array of objects."""
     array = value.array
     if isinstance(array, (np.ndarray, np.generic)) or not isinstance(array, Tracer):
         return _known(np.asarray(array))
@@ -92,7 +92,7 @@ def _filled(shape, entries):
 
 
 def _joined(value, aval):
-    """The whole array of what is whole already or an array of numbers."""
+    """A whole array, from a `_Value` or an array of numbers."""
     if not isinstance(value, np.ndarray):
         return value.array
     if value.shape == ():
@@ -111,12 +111,12 @@ def _is_plain_call(equation):
     return equation.primitive.name in CALLS
 
 
-def _apply(jaxpr, book, equation, operands):
+def _apply(jaxpr, ledger, equation, operands):
     name, params = equation.primitive.name, equation.params
-    apart = all(isinstance(x, np.ndarray) for x in operands) and all(_small(x.aval) for x in equation.outvars)
-    if apart and name in ELEMENTWISE:
-        return [_elementwise(equation, operands, book)]
-    if apart and name in MOVES:
+    splittable = all(isinstance(x, np.ndarray) for x in operands) and all(_small(x.aval) for x in equation.outvars)
+    if splittable and name in ELEMENTWISE:
+        return [_elementwise(equation, operands, ledger)]
+    if splittable and name in MOVES:
         found = MOVES[name](params, equation.outvars, *operands)
         if found is not None:
             return found
@@ -125,41 +125,41 @@ def _apply(jaxpr, book, equation, operands):
 
 
 def _pair(x, pairs):
-    """Sine and cosine of a number, found together once."""
+    """Sine and cosine of a number, computed together and only once."""
     if id(x) not in pairs:
         pairs[id(x)] = (x, *sincos_in_lanes(x))
     return pairs[id(x)][1:]
 
 
-def _elementwise(equation, operands, book):
+def _elementwise(equation, operands, ledger):
     (variable,) = equation.outvars
     shape, dtype = variable.aval.shape, variable.aval.dtype
     rows = [np.broadcast_to(x, shape).reshape(-1) for x in operands]
-    entries = [_simplified(equation, dtype, book.pairs, *x) for x in zip(*rows)]
-    book.enter(entries)
+    entries = [_simplified(equation, dtype, ledger.pairs, *x) for x in zip(*rows)]
+    ledger.count(entries)
     return _filled(shape, entries)
 
 
-def _is(x, number):
+def _is_known(x, number):
     return isinstance(x, np.generic) and x == number
 
 
 def _simplified(equation, dtype, pairs, *x):
-    """One number by a primitive, computed at once where that is trivial."""
+    """The result of a primitive for one number, simplified if operands are known."""
     name = equation.primitive.name
     if name in ("add", "add_any"):
         return _add(*x)
-    if name == "sub" and _is(x[1], 0):
+    if name == "sub" and _is_known(x[1], 0):
         return x[0]
-    if name == "sub" and _is(x[0], 0):
+    if name == "sub" and _is_known(x[0], 0):
         return _negative(x[1])
     if name == "mul":
         return _multiply(*x)
     if name == "neg":
         return _negative(x[0])
-    if name == "div" and _is(x[1], 1):
+    if name == "div" and _is_known(x[1], 1):
         return x[0]
-    if name == "div" and _is(x[0], 0):
+    if name == "div" and _is_known(x[0], 0):
         return x[0]
     if name == "select_n" and isinstance(x[0], np.generic):
         return x[1 + int(x[0])]
@@ -180,9 +180,9 @@ def _simplified(equation, dtype, pairs, *x):
 
 
 def _add(x, y):
-    if _is(x, 0):
+    if _is_known(x, 0):
         return y
-    if _is(y, 0):
+    if _is_known(y, 0):
         return x
     if isinstance(x, np.generic) and isinstance(y, np.generic):
         return np.add(x, y)
@@ -191,11 +191,11 @@ def _add(x, y):
 
 def _multiply(x, y):
     for a, b in ((x, y), (y, x)):
-        if _is(a, 0):
+        if _is_known(a, 0):
             return a
-        if _is(a, 1):
+        if _is_known(a, 1):
             return b
-        if _is(a, -1):
+        if _is_known(a, -1):
             return _negative(b)
     if isinstance(x, np.generic) and isinstance(y, np.generic):
         return np.multiply(x, y)
@@ -282,7 +282,7 @@ def _product(params, variables, x, y):
     free_x = [i for i in range(x.ndim) if i not in (*contract_x, *batch_x)]
     free_y = [i for i in range(y.ndim) if i not in (*contract_y, *batch_y)]
     sizes = lambda z, axes: int(np.prod([z.shape[i] for i in axes]))
-    # The operands may be of other kinds than the result: integers, or of lower precision.
+    # The operands may have other dtypes than the result: integers, or lower precision.
     x, y = (_converted(z, variables[0].aval.dtype) for z in (x, y))
     inner, batch = sizes(x, contract_x), sizes(x, batch_x)
     x = x.transpose([*batch_x, *free_x, *contract_x]).reshape(batch, -1, inner)

@@ -1,15 +1,15 @@
-"""Simplified Newton iteration: one Jacobian, inverted once, for the iterations of an implicit step.
+"""Simplified Newton iteration: one Jacobian, inverted once, for all iterations of an implicit step.
 
     J (y_{k+1} - y_k) = -f(y_k),        theta_k = |y_{k+1} - y_k| / |y_k - y_{k-1}|
 
-The iteration contracts by about theta a time, so that what is still missing after iteration k is estimated by
-theta/(1 - theta) |y_{k+1} - y_k|. It has converged once that is below a small part of the tolerance which the step's
-error has to meet: a test of the residual would ask for less than round-off in stiff equations, where a residual is
-multiplied by the stiffness.
+Each iteration contracts by about theta, so the remaining error after iteration k is estimated by
+theta/(1 - theta) |y_{k+1} - y_k|. The iteration has converged once that is below a small part of the step's tolerance.
+A test of the residual would demand less than round-off in stiff equations, where a residual is multiplied by the
+stiffness.
 
-Where theta is close to one or above, the Jacobian is computed anew. RADAU5 rejects the step there; but the direction of
-a stiff spring turns during a step, and theta then is of the size of (stiffness) x (angle), whatever the accuracy of the
-step: rejecting such steps ties h to (k omega)^(-1/3).
+If theta is close to one or above, the Jacobian is computed again. RADAU5 rejects such a step; but the direction of a
+stiff spring turns during a step, and theta is then of the order of (stiffness) x (angle), however accurate the step is:
+rejecting such steps would limit h to (k omega)^(-1/3).
 
 Source: Hairer & Wanner, *Solving ODEs II*, §IV.8, (8.9)-(8.11).
 """
@@ -32,12 +32,12 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
 from lagjax.numerics import dense
 
-# Two corrections in a row of this part of the tolerance: what remains is round-off.
+# If two corrections in a row are below this part of the tolerance, the rest is round-off.
 NOISE = 0.1
 
 
 class Inverse(eqx.Module):
-    """The inverse of a Jacobian, acting on residuals of the structure of the unknown."""
+    """The inverse of a Jacobian, acting on residuals with the structure of the unknown."""
 
     matrix: Float[Array, "n n"]
 
@@ -48,7 +48,7 @@ class Inverse(eqx.Module):
 
 
 class Iteration(eqx.Module):
-    """Where the iteration stands: the last two corrections by one Jacobian, in units of the tolerance."""
+    """The state of the iteration: the last two corrections by one Jacobian, in units of the tolerance."""
 
     inverse: Inverse
     here: bool = eqx.field(static=True)
@@ -56,12 +56,12 @@ class Iteration(eqx.Module):
     size: Float[Array, ""]
     previous: Float[Array, ""]
     count: Int[Array, ""]
-    stale: Bool[Array, ""]  # The next iteration computes the Jacobian anew,
-    renewed: Bool[Array, ""]  # and one has done so already.
+    stale: Bool[Array, ""]  # The next iteration recomputes the Jacobian,
+    renewed: Bool[Array, ""]  # and an earlier one has already done so.
 
     @classmethod
     def first(cls, inverse: Inverse, start: PyTree, here: bool = False) -> "Iteration":
-        """Before the first iteration, with a Jacobian that is inverted already: that at the start, where `here`."""
+        """The state before the first iteration, with an inverted Jacobian; `here`: whether it is that of the start."""
         unknown = jnp.asarray(jnp.inf, inverse.matrix.dtype)
         no = jnp.asarray(False)
         return cls(inverse, here, start, unknown, unknown, jnp.asarray(0), no, no)
@@ -80,18 +80,18 @@ class SimplifiedNewton(optx.AbstractRootFinder):
     >>> import diffrax
     >>> kvaerno = diffrax.Kvaerno5(root_finder=diffrax.with_stepsize_controller_tols(SimplifiedNewton)())
 
-    and with tolerances of its own where steps are constant: `SimplifiedNewton(rtol=1e-10, atol=1e-12)`.
+    and with its own tolerances for constant steps: `SimplifiedNewton(rtol=1e-10, atol=1e-12)`.
 
-    **Fields:** `rtol`, `atol`: the tolerances of the step (`atol` may be a vector); `norm`: how a correction in units
-    of them is measured; `kappa`: which part of the tolerance the iteration may leave, by default
-    `min(0.03, 0.3 rtol^(1/3))` as in RADAU5; `slow`: the rate above which the Jacobian is computed anew (infinite:
-    never, as in RADAU5).
+    **Fields:** `rtol`, `atol`: the tolerances of the step (`atol` may be a vector); `norm`: the norm of a correction
+    in units of them; `kappa`: the part of the tolerance that the iteration error may take, by default
+    `min(0.03, 0.3 rtol^(1/3))` as in RADAU5; `slow`: the rate above which the Jacobian is recomputed (infinite: never,
+    as in RADAU5).
 
-    **Options** of a single solve: `init_state`, a state of another solve, whose Jacobian is used first; `offset`, added
-    to the unknown where its size sets the tolerance; `inverse_at`, from an unknown to the `Inverse` there.
+    **Options** of a single solve: `init_state`, the state of another solve, whose Jacobian is used first; `offset`,
+    added to the unknown when its size sets the tolerance; `inverse_at`, a function from an unknown to the `Inverse`.
 
     Converges linearly, by a factor that is proportional to the change of the Jacobian;
-    `tests/numerics/test_radau.py` counts steps and compares with diffrax's own.
+    `tests/numerics/test_radau.py` counts steps and compares with diffrax's root finder.
 
     Source: Hairer & Wanner, *Solving ODEs II*, §IV.8, (8.9)-(8.11).
     """
@@ -108,7 +108,7 @@ class SimplifiedNewton(optx.AbstractRootFinder):
         return Iteration.first(_inverse_at(fn, y, args, options), y, here=True)
 
     def step(self, fn, y, args, options, state, tags) -> tuple[PyTree, Iteration, Any]:
-        # Not a select under `vmap`: as long as no lane asks for it, no Jacobian is computed.
+        # A branch also under `vmap`: no Jacobian is computed unless a lane needs it.
         renew = lambda: jtu.tree_map(
             lambda new, old: jnp.where(state.stale, new, old), _inverse_at(fn, y, args, options), state.inverse
         )
@@ -116,15 +116,15 @@ class SimplifiedNewton(optx.AbstractRootFinder):
         residual, aux = fn(y, args)
         correction = inverse(residual)
         new = jtu.tree_map(lambda y, d: y - d, y, correction)
-        whole = jtu.tree_map(jnp.add, new, options["offset"]) if "offset" in options else new
-        own = lambda y: jnp.broadcast_to(self.atol, y.shape) + self.rtol * jnp.abs(y)
-        units = jtu.tree_map(lambda d, y: d / own(y), correction, whole)
+        full = jtu.tree_map(jnp.add, new, options["offset"]) if "offset" in options else new
+        tolerance = lambda y: jnp.broadcast_to(self.atol, y.shape) + self.rtol * jnp.abs(y)
+        units = jtu.tree_map(lambda d, y: d / tolerance(y), correction, full)
         size = self.norm(units).astype(state.size.dtype)
         first = state.count == 0
         now = Iteration(
             inverse,
             state.here,
-            # The Jacobian at the start would be no new one there: go on from the first correction instead.
+            # The Jacobian at the start would not be a new one if `here`: restart from the first correction.
             start=jtu.tree_map(lambda y, old: jnp.where(first, y, old), new if state.here else y, state.start),
             size=size,
             previous=jnp.where(state.stale, jnp.inf, state.size),
@@ -133,18 +133,18 @@ class SimplifiedNewton(optx.AbstractRootFinder):
             renewed=state.renewed | state.stale,
         )
         stale = self._too_slow(now)
-        # A Jacobian from elsewhere may have led anywhere, and from there to another root: begin again.
-        back = stale & ~now.renewed & ~(now.rate() < 1)
-        new = jtu.tree_map(lambda x, start: jnp.where(back, start, x), new, now.start)
+        # A Jacobian from another point may have led far away, towards another root: restart.
+        restart = stale & ~now.renewed & ~(now.rate() < 1)
+        new = jtu.tree_map(lambda x, start: jnp.where(restart, start, x), new, now.start)
         return new, eqx.tree_at(lambda state: state.stale, now, stale), aux
 
     def _converged(self, state):
         rate, size, previous = state.rate(), state.size, state.previous
         round_off = 10 * jnp.finfo(size.dtype).eps / jnp.where(self.rtol > 0, self.rtol, 1.0)
         kappa = jnp.minimum(0.03, 0.3 * jnp.cbrt(self.rtol)) if self.kappa is None else self.kappa
-        left = rate / jnp.where(rate < 1, 1 - rate, 1.0) * size
-        contracts = (rate < 1) & (left <= jnp.maximum(kappa, round_off))
-        # Small corrections by a new Jacobian that do not shrink are the round-off of a stiff residual.
+        remaining = rate / jnp.where(rate < 1, 1 - rate, 1.0) * size
+        contracts = (rate < 1) & (remaining <= jnp.maximum(kappa, round_off))
+        # Small corrections that do not shrink with a new Jacobian are the round-off of a stiff residual.
         noise = jnp.where(state.renewed, jnp.maximum(NOISE, round_off), round_off)
         return contracts | ((previous <= noise) & (size <= noise)) | (size == 0)
 
@@ -154,7 +154,7 @@ class SimplifiedNewton(optx.AbstractRootFinder):
 
     def terminate(self, fn, y, args, options, state, tags) -> tuple[Array, optx.RESULTS]:
         converged = self._converged(state)
-        # A Jacobian that is only old is renewed first. Beyond that, growth leads to another root as often as back.
+        # An old Jacobian is recomputed first. Growth after that leads to another root as often as back.
         grows = (jnp.isfinite(state.previous) & ~(state.rate() < 1)) | ~jnp.isfinite(state.size)
         renewable = np.isfinite(self.slow)
         diverged = ~converged & (state.count > 0) & grows & (state.renewed if renewable else True)
@@ -162,7 +162,7 @@ class SimplifiedNewton(optx.AbstractRootFinder):
         return converged | diverged, failure
 
     def postprocess(self, fn, y, aux, args, options, state, tags, result):
-        # A failed step is thrown away, but its derivative is multiplied by zero: it has to be finite.
+        # A failed step is discarded by multiplying its derivative by zero, so it must be finite.
         return jtu.tree_map(lambda x: jnp.where(jnp.isfinite(x), x, 0), y), aux, {}
 
 
@@ -174,18 +174,18 @@ def _inverse_at(fn, y, args, options):
 
 
 def tolerance_of_the_controller():
-    """What diffrax puts in place of tolerances that are those of the step-size controller."""
+    """The placeholder of diffrax for tolerances taken from the step-size controller."""
     return diffrax.with_stepsize_controller_tols(SimplifiedNewton)().rtol
 
 
-# It is known by identity, which a copy of a method, or one that was pickled, would not have.
+# diffrax compares it by identity, which must survive copying and pickling a method.
 copyreg.pickle(type(tolerance_of_the_controller()), lambda _: (tolerance_of_the_controller, ()))
 
 
 def with_tolerances(solver: diffrax.AbstractSolver, rtol, atol, norm=optx.max_norm) -> diffrax.AbstractSolver:
-    """Give a solver's root finder tolerances, where it was to take them from an adaptive step-size controller.
+    """Give a solver's root finder tolerances, if it would take them from an adaptive step-size controller.
 
-    With constant steps there is no such controller, and diffrax refuses. Other solvers are returned as they are.
+    With constant steps there is no such controller, and diffrax raises an error. Other solvers are returned unchanged.
 
     >>> import diffrax
     >>> with_tolerances(diffrax.ImplicitEuler(), 1e-10, 1e-12).root_finder.rtol
@@ -194,9 +194,9 @@ def with_tolerances(solver: diffrax.AbstractSolver, rtol, atol, norm=optx.max_no
     if not isinstance(solver, diffrax.AbstractImplicitSolver):
         return solver
     from_controller = tolerance_of_the_controller()
-    wanted = {"rtol": rtol, "atol": atol, "norm": norm}
-    missing = [name for name in wanted if getattr(solver.root_finder, name, None) is from_controller]
+    tolerances = {"rtol": rtol, "atol": atol, "norm": norm}
+    missing = [name for name in tolerances if getattr(solver.root_finder, name, None) is from_controller]
     if not missing:
         return solver
     at = lambda solver: [getattr(solver.root_finder, name) for name in missing]
-    return eqx.tree_at(at, solver, [wanted[name] for name in missing])
+    return eqx.tree_at(at, solver, [tolerances[name] for name in missing])

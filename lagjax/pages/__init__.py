@@ -1,4 +1,4 @@
-"""Pages that need neither Python nor a network: their scripts and their look, which lie beside this file."""
+"""Pages that need neither Python nor a network; their scripts and style sheet are in this folder."""
 
 from lagjax.pages.page import Page, encoded, fragment, whole
 

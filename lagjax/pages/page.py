@@ -1,7 +1,7 @@
-"""A page that works by itself: HTML, the numbers that it shows, and the scripts that show them, in one file.
+"""A self-contained page: HTML, the numbers that it shows, and the scripts that show them, in one file.
 
-Numbers travel as base64 of little-endian arrays in a JSON text, which the scripts (`*.js` beside this file) decode:
-three bytes become four characters. No script asks for anything from outside.
+Numbers are stored as base64 of little-endian arrays in a JSON text, which the scripts (`*.js` in this folder) decode:
+three bytes become four characters. No script loads anything from outside.
 """
 
 import hashlib
@@ -35,7 +35,7 @@ h1 {{ font-size: 20px; margin: 0 0 12px; }}</style>
 
 
 class Page:
-    """What plays and answers in a notebook, and in a browser from the page that `save` writes.
+    """An interactive page, in a notebook or in a browser from the file that `save` writes.
 
     >>> import jax.numpy as jnp
     >>> import lagjax as lj
@@ -43,7 +43,7 @@ class Page:
     >>> swept.to_html().title
     'Sweep over angle'
 
-    - `title`: what stands above it in a page of its own; `html`: itself; `words`: what it is, for `print`.
+    - `title`: the heading of the saved page; `html`: the content; `words`: a description for `print`.
     """
 
     def __init__(self, title: str, body: str, words: str):
@@ -63,24 +63,24 @@ class Page:
 
 
 def whole(title: str, body: str) -> str:
-    """A document of its own around some HTML."""
+    """A complete HTML document around a fragment."""
     return WHOLE.format(title=html.escape(title), body=body)
 
 
 def fragment(body: str, spec: dict[str, Any], scripts: tuple[str, ...], last: str = "") -> str:
     """HTML with its numbers and scripts, for a page or a notebook's cell.
 
-    **Arguments:** `body`: what is there before a script runs; `spec`: what the scripts are told, as JSON; `scripts`:
-    files beside this one, in the order in which they build on each other; `last`: a line of script after them.
+    **Arguments:** `body`: the HTML before a script runs; `spec`: the data for the scripts, as JSON; `scripts`: files in
+    this folder, in the order in which they build on each other; `last`: a line of script after them.
     """
-    beside = files(__package__)
+    folder = files(__package__)
     data = json.dumps(spec, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
-    script = "".join(beside.joinpath(name).read_text(encoding="utf-8") for name in scripts) + last
-    # The same numbers have the same name: run again, a notebook does not change.
+    script = "".join(folder.joinpath(name).read_text(encoding="utf-8") for name in scripts) + last
+    # The same numbers give the same name, so a notebook that is run again does not change.
     name = "lagjax-" + hashlib.sha256((data + body).encode()).hexdigest()[:12]
-    # The page may hold it twice: the script takes the first that no script has taken.
+    # A page may contain the fragment twice: each script takes the first one that is not yet live.
     return (
-        f'<div class="lagjax" id="{name}"><style>{beside.joinpath("page.css").read_text(encoding="utf-8")}</style>\n'
+        f'<div class="lagjax" id="{name}"><style>{folder.joinpath("page.css").read_text(encoding="utf-8")}</style>\n'
         f'{body}\n<script type="application/json">{data}</script>\n<script>(() => {{\n"use strict";\n'
         f'const root = document.querySelector("#{name}:not([data-live])");\nroot.dataset.live = "";\n'
         "const unique = `${root.id}-${Math.random().toString(36).slice(2, 8)}`;\n"
@@ -90,10 +90,10 @@ def fragment(body: str, spec: dict[str, Any], scripts: tuple[str, ...], last: st
 
 
 def encoded(x, dtype: str) -> tuple[str, str]:
-    """An array as `decode` reads it: its type, `"f4"`, `"f8"`, `"i1"` or `"i2"`, and base64 of it, little-endian."""
+    """An array in the form read by `decode`: its type, `"f4"`, `"f8"`, `"i1"` or `"i2"`, and little-endian base64."""
     return dtype, b64encode(np.ascontiguousarray(x, dtype=f"<{dtype}").tobytes()).decode()
 
 
 def in_bytes(count: float) -> str:
-    """A size in words."""
+    """A size in kB or MB."""
     return f"{math.ceil(count / 1e3)} kB" if count < 1e6 else f"{count / 1e6:.1f} MB"

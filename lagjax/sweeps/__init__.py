@@ -1,4 +1,4 @@
-"""Sweeps: one function over a grid of points, on all cores and devices, labelled and resumable."""
+"""Sweeps: run one function over a grid of points on all cores and devices, labelled and resumable."""
 
 from lagjax.sweeps.engine import sweep
 from lagjax.sweeps.lanes import Status

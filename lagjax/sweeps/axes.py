@@ -1,4 +1,4 @@
-"""What varies in a sweep: named axes, as a grid or paired, and the point at each flat index."""
+"""The parameters that vary in a sweep: named axes, as a grid or paired, and the point at each flat index."""
 
 import math
 from collections.abc import Mapping
@@ -9,14 +9,14 @@ import jax
 import numpy as np
 from jax.core import Tracer
 
-# The one dimension of paired axes.
+# The single dimension of paired axes.
 POINT = "point"
 
 
 class Axes(eqx.Module):
-    """Named axes: values (n, ...) by name, one slice of which is what a point gets.
+    """Named axes: values (n, ...) by name; each point gets one slice of each.
 
-    The flat index runs over the last axis first; with `paired` axes all of them move together.
+    The last axis varies fastest in the flat index; `paired` axes all move together.
     """
 
     names: tuple[str, ...] = eqx.field(static=True)
@@ -25,7 +25,7 @@ class Axes(eqx.Module):
 
     @property
     def values(self) -> dict[str, Any]:
-        """The values by name. Not a field: JAX would sort the names, and their order is that of the indices."""
+        """The values by name. Not a field: JAX would sort the names, but their order must match the indices."""
         return dict(zip(self.names, self.arrays))
 
     @property
@@ -41,16 +41,16 @@ class Axes(eqx.Module):
 
     @property
     def size(self) -> int:
-        """How many points there are."""
+        """The number of points."""
         return math.prod(self.shape)
 
     def at(self, index) -> dict[str, Any]:
-        """The point at a flat index, or of several indices (n,) their values (n, ...) by name."""
-        places = [index] * len(self.names) if self.paired else np.unravel_index(index, self.shape)
-        return {name: x[i] for name, x, i in zip(self.names, self.arrays, places)}
+        """The point at a flat index as a dictionary; for indices (n,) the values are (n, ...)."""
+        positions = [index] * len(self.names) if self.paired else np.unravel_index(index, self.shape)
+        return {name: x[i] for name, x, i in zip(self.names, self.arrays, positions)}
 
     def words(self, index: int) -> str:
-        """The point at a flat index as a person writes it."""
+        """The point at a flat index as text."""
         point = {name: np.asarray(x) for name, x in self.at(int(index)).items()}
         return ", ".join(
             f"{name} = {x:.6g}" if x.ndim == 0 else f"{name} of shape {x.shape}" for name, x in point.items()
@@ -58,7 +58,7 @@ class Axes(eqx.Module):
 
 
 def axes_of(axes: Any, paired: bool) -> Axes:
-    """The axes that a user wrote, or an error."""
+    """The axes that a user passed, validated."""
     example = 'Fix: axes={"omega": jnp.linspace(0.0, 3.0, 100)}.'
     if not isinstance(axes, Mapping) or not axes:
         raise TypeError(f"axes must be a dictionary of arrays by name, not {axes!r:.60}.\n{example}")
@@ -66,26 +66,26 @@ def axes_of(axes: Any, paired: bool) -> Axes:
     for name, given in axes.items():
         if any(isinstance(x, Tracer) for x in jax.tree.leaves(given)):
             raise TypeError(
-                f"axis '{name}' is being traced: a sweep compiles and runs for itself, outside of jit, grad and vmap.\n"
+                f"axis '{name}' is being traced: a sweep compiles and runs on its own, outside of jit, grad and vmap.\n"
                 "Fix: call lj.sweep with concrete arrays; inside a program use jax.vmap."
             )
         x = np.asarray(given)
         if not np.issubdtype(x.dtype, np.number) and x.dtype != bool or x.ndim == 0 or len(x) == 0:
             raise ValueError(
                 f"axis '{name}' must be an array of at least one number, and is {given!r:.60}.\n{example} "
-                "What does not vary belongs into run."
+                "Quantities that do not vary belong in run."
             )
         if str(name) in values:
             raise ValueError(
-                f"two axes are named '{name}', by a text and by a number.\nFix: one of them by another text."
+                f"two axes are named '{name}': one name is a string, the other a number.\nFix: rename one of them."
             )
-        # In the dtype that JAX would give it: float64 where that is enabled.
+        # In the dtype that JAX would give it: float64 only if x64 is enabled.
         values[str(name)] = x.astype(jax.dtypes.canonicalize_dtype(x.dtype))
     lengths = {name: len(x) for name, x in values.items()}
     if paired and len(set(lengths.values())) > 1:
-        told = ", ".join(f"'{name}' has {n}" for name, n in lengths.items())
+        lengths_in_words = ", ".join(f"'{name}' has {n}" for name, n in lengths.items())
         raise ValueError(
-            f"paired axes must be of one length: {told}.\n"
-            "Usual cause: a grid was meant.\nFix: leave paired=True out, or cut the axes to one length."
+            f"paired axes must all have the same length: {lengths_in_words}.\n"
+            "Usual cause: a grid was intended.\nFix: leave paired=True out, or cut the axes to the same length."
         )
     return Axes(tuple(values), tuple(values.values()), paired)

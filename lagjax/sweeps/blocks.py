@@ -1,4 +1,4 @@
-"""How an engine fills a store: points to write together, and whether it is as other versions were."""
+"""How an engine fills a store: which points are written together, and whether versions give the same results."""
 
 import warnings
 from collections.abc import Iterator
@@ -15,18 +15,18 @@ from lagjax.sweeps.labels import labels_of
 from lagjax.sweeps.lanes import GOOD, Status, not_run
 from lagjax.sweeps.memory import bytes_of
 from lagjax.sweeps.store import Store
-from lagjax.sweeps.structures import written
+from lagjax.sweeps.structures import description_of
 
-# A block of a store is written about so often, and holds no more than this.
+# A block of a store is written about this often, and holds no more bytes than this.
 BLOCK_SECONDS, BLOCK_BYTES = 2.0, 256e6
-# The last call of the program for some blocks is filled up with points of which nobody asks: one of so many.
+# The last call of the program for a group of blocks is padded with unused points: at most one call in this many.
 FULL_CHUNKS = 16
-# Two versions may differ by so much, relative to the largest value, before it is told.
+# Two versions may differ by this much, relative to the largest value, before a warning is given.
 ALIKE_VERSIONS = 1e-6
 
 
-class Begun(NamedTuple):
-    """What a new store is made of: its blocks; times of trajectories that do not depend on the point, by leaf; the
+class NewStore(NamedTuple):
+    """What a new store needs: its blocks; by leaf, the times of trajectories that are the same at every point; and the
     description of what `run` returns.
     """
 
@@ -35,19 +35,19 @@ class Begun(NamedTuple):
     structure: dict[str, Any] | None
 
 
-def begun(engine: Any, axes: Axes, shares: int) -> Begun:
-    """The beginnings of a store, by some points that are computed for it."""
+def new_store(engine: Any, axes: Axes, shares: int) -> NewStore:
+    """What a new store needs, found by computing a first chunk of points."""
     first = np.arange(min(engine.program.chunk, axes.size))
     seconds, values, status = engine.timed(first)
     good = np.flatnonzero(np.isin(status.result, GOOD))
     lane = good[0] if len(good) else 0
     one = jax.tree.map(lambda x: jnp.asarray(x[lane]), values)
     blocks = divided(axes.shape, _block(engine, axes, shares, seconds))
-    return Begun(blocks, _times(engine, axes, one), written(engine.program.values, one))
+    return NewStore(blocks, _times(engine, axes, one), description_of(engine.program.values, one))
 
 
 def _block(engine, axes, shares, seconds):
-    """Points to write together: some seconds' worth, `shares` of them or more, no more than fits."""
+    """Points per block: a few seconds' worth, at least `shares` blocks, and no more bytes than allowed."""
     chunk = engine.program.chunk
     wanted = max(1, round(BLOCK_SECONDS * engine.workers / max(seconds, 1e-6))) * chunk
     fair = max(1, axes.size // (shares * chunk)) * chunk
@@ -63,7 +63,7 @@ def _times(engine, axes, one):
 
 
 def _is_fixed(engine, axes, key):
-    """Whether a leaf of what `run` returns is the same at all points, whatever they are: vmap knows."""
+    """Whether a leaf of what `run` returns does not depend on the point: `vmap` with `out_axes=None` decides."""
     leaf = lambda point: dict(named_leaves(engine.run(point)))[key]
     try:
         jax.eval_shape(jax.vmap(leaf, out_axes=None), axes.at(np.zeros(1, int)))
@@ -75,7 +75,7 @@ def _is_fixed(engine, axes, key):
 
 
 class Filling:
-    """Blocks that are being computed together: each is written as soon as all of its points are there."""
+    """Blocks that are computed together: each is written as soon as all of its points have arrived."""
 
     def __init__(self, engine: Any, store: Store, numbers: list[int]):
         self.store, self.numbers = store, numbers
@@ -83,54 +83,54 @@ class Filling:
         self.indices = np.concatenate([np.arange(x.start, x.stop) for x in points])
         lengths = np.array([x.stop - x.start for x in points])
         self._ends, self._left = np.cumsum(lengths), lengths
-        self._found = not_run(engine.program, len(self.indices))
+        self._results = not_run(engine.program, len(self.indices))
 
-    def take(self, places: np.ndarray, values: Any, status: Status):
-        """What was computed at some places among the indices."""
-        for whole, some in zip(jax.tree.leaves(self._found), jax.tree.leaves((values, status))):
-            whole[places] = some
-        touched = np.searchsorted(self._ends, places, side="right")
-        self._left = self._left - np.bincount(touched, minlength=len(self._left))
-        for i in np.unique(touched)[self._left[np.unique(touched)] == 0].tolist():
+    def take(self, positions: np.ndarray, values: Any, status: Status):
+        """Accept the results at some positions among the indices."""
+        for whole, new in zip(jax.tree.leaves(self._results), jax.tree.leaves((values, status))):
+            whole[positions] = new
+        block_of_point = np.searchsorted(self._ends, positions, side="right")
+        self._left = self._left - np.bincount(block_of_point, minlength=len(self._left))
+        for i in np.unique(block_of_point)[self._left[np.unique(block_of_point)] == 0].tolist():
             start = 0 if i == 0 else self._ends[i - 1]
-            self.store.write(self.numbers[i], *jax.tree.map(lambda x: x[start : self._ends[i]], self._found))
+            self.store.write(self.numbers[i], *jax.tree.map(lambda x: x[start : self._ends[i]], self._results))
 
 
-def together(engine: Any, store: Store, numbers: list[int]) -> Iterator[list[int]]:
-    """Blocks to compute together: so that their points fill the chunks of the program, and fit into memory."""
+def groups_of_blocks(engine: Any, store: Store, numbers: list[int]) -> Iterator[list[int]]:
+    """Groups of blocks to compute together: their points fill the chunks of the program and fit into memory."""
     points = min(FULL_CHUNKS * engine.program.chunk, int(BLOCK_BYTES / bytes_of(engine.program)))
-    some, count = [], 0
+    group, count = [], 0
     for number in numbers:
         here = store.blocks.points(number)
-        if some and count + here.stop - here.start > points:
-            yield some
-            some, count = [], 0
-        some.append(number)
+        if group and count + here.stop - here.start > points:
+            yield group
+            group, count = [], 0
+        group.append(number)
         count += here.stop - here.start
-    if some:
-        yield some
+    if group:
+        yield group
 
 
 def compare_versions(engine: Any, store: Store) -> None:
-    """Where other versions have begun a store, compute some of its points again and tell how they differ."""
-    there, number = store.about["fingerprint"], store.first()
-    if there["program"] == engine.program.digest or number is None:
+    """If other versions began the store, recompute some of its points and warn if they differ."""
+    stored, number = store.about["fingerprint"], store.first()
+    if stored["program"] == engine.program.digest or number is None:
         return
     indices = np.r_[store.blocks.points(number)][: engine.program.chunk]
     found, status = engine.first(indices)
     worst, name = 0.0, None
-    for (leaf, x), before in zip(named_leaves(found), (x[: len(indices)] for x in store.read(number))):
+    for (leaf, x), stored_values in zip(named_leaves(found), (x[: len(indices)] for x in store.read(number))):
         good = np.isin(status.result, GOOD)
-        x, before = x[good].astype(complex), before[good].astype(complex)
-        largest = np.max(np.abs(before), initial=0.0)
-        off = np.max(np.abs(x - before), initial=0.0) / (largest if largest > 0 else 1.0)
-        if not off <= worst:
-            worst, name = off, leaf
+        x, stored_values = x[good].astype(complex), stored_values[good].astype(complex)
+        largest = np.max(np.abs(stored_values), initial=0.0)
+        difference = np.max(np.abs(x - stored_values), initial=0.0) / (largest if largest > 0 else 1.0)
+        if not difference <= worst:
+            worst, name = difference, leaf
     if not worst <= ALIKE_VERSIONS:
         warnings.warn(
-            f"{store.path} was begun with {in_words(there['versions'])}, and is continued with {in_words(versions())}: "
-            f"computed again, '{name}' of {len(indices):,} of its points differs by {worst:.1e} of its largest value.\n"
-            "Usual cause: run is another function than it was; or a motion that amplifies round-off.\n"
-            "Fix: another path, to compute all of it anew.",
+            f"{store.path} was begun with {in_words(stored['versions'])} and is continued with {in_words(versions())}: "
+            f"of {len(indices):,} points computed again, '{name}' differs by {worst:.1e} of its largest value.\n"
+            "Usual cause: run is not the same function as before; or a motion that amplifies round-off.\n"
+            "Fix: another path, to compute the whole sweep again.",
             stacklevel=4,
         )

@@ -1,4 +1,4 @@
-"""Digests: of data, and of programs, the same in every process."""
+"""Digests of data and of programs, the same in every process."""
 
 import hashlib
 import re
@@ -12,7 +12,7 @@ from lagjax.jax_internals.programs import ClosedJaxpr, bodies
 
 
 def digest(data: bytes) -> str:
-    """64 bits of a hash, as text."""
+    """The first 64 bits of a SHA-256 hash, as text."""
     return hashlib.sha256(data).hexdigest()[:16]
 
 
@@ -22,7 +22,7 @@ def program_digest(closed: ClosedJaxpr) -> str:
 
 
 def _text(closed):
-    # Without addresses, with the constants of its parts.
+    # Memory addresses are removed; the constants of nested programs are added.
     constants = "".join(digest(_data(x)) for x in closed.consts if not isinstance(x, Tracer))
     return re.sub(r"0x[0-9a-f]+", "", str(closed.jaxpr)) + constants + "".join(_constants(closed.jaxpr))
 

@@ -1,4 +1,4 @@
-"""What is drawn of the values of several lanes: numbers, and curves against time or against their index."""
+"""What can be drawn of the values of several lanes: numbers, and curves against time or against their index."""
 
 from typing import NamedTuple
 
@@ -9,7 +9,7 @@ from jaxtyping import PyTree
 from lagjax.mechanics import coordinates
 from lagjax.motion.trajectory import Trajectory
 
-# More curves than this in one panel could not be told apart.
+# More curves than this in one panel cannot be told apart.
 MOST_CURVES = 14
 INDEX = "index"
 
@@ -24,7 +24,7 @@ class Panel(NamedTuple):
 
 
 class Drawn(NamedTuple):
-    """`numbers` by name, (N,); `panels`; and what is `left_out`, in words."""
+    """`numbers` by name, (N,); `panels`; and, in words, the values `left_out`."""
 
     numbers: dict[str, np.ndarray]
     panels: list[Panel]
@@ -32,10 +32,10 @@ class Drawn(NamedTuple):
 
 
 def drawn(values: PyTree, of_motion: tuple[str, ...] = ("q", "v", "multipliers")) -> Drawn:
-    """What can be drawn of values whose leaves have the lanes in front, (N, ...).
+    """What can be drawn of values whose leaves have the lanes as first axis, (N, ...).
 
-    Of a `Trajectory` the curves in `of_motion` against its times. A number a lane is a number. An array is a curve, or
-    one for each of its columns, against the array `t` beside it in a dictionary, or else against its index.
+    A `Trajectory` gives the curves named in `of_motion` against its times. One number per lane stays a number. An array
+    gives one curve per column, against the array `t` in the same dictionary if there is one, else against its index.
     """
     found = Drawn({}, [], [])
     leaves = jax.tree_util.tree_leaves_with_path(values, is_leaf=lambda x: isinstance(x, Trajectory))
@@ -47,8 +47,8 @@ def drawn(values: PyTree, of_motion: tuple[str, ...] = ("q", "v", "multipliers")
         if isinstance(x, Trajectory):
             found.panels.extend(_of_motion(name, x, of_motion))
             continue
-        beside, _, last = name.rpartition(".")
-        times = named.get(f"{beside}.t" if beside else "t")
+        parent, _, last = name.rpartition(".")
+        times = named.get(f"{parent}.t" if parent else "t")
         times = None if isinstance(times, Trajectory) else times
         if last == "t" and np.ndim(x) == 2 and len(named) > 1:
             continue
@@ -58,7 +58,7 @@ def drawn(values: PyTree, of_motion: tuple[str, ...] = ("q", "v", "multipliers")
 
 
 def _of_motion(name, motion, of_motion):
-    t, under = np.asarray(motion.t), f"{name}: " if name else ""
+    t, prefix = np.asarray(motion.t), f"{name}: " if name else ""
     parts = {"q": motion.q, "v": motion.v, "multipliers": motion.multipliers}
     for part in of_motion:
         leaves = [np.asarray(x).reshape(*t.shape, -1) for x in jax.tree.leaves(parts[part])]
@@ -67,9 +67,9 @@ def _of_motion(name, motion, of_motion):
         one = jax.tree.map(lambda x: np.asarray(x)[0, 0], parts[part])
         columns = np.moveaxis(np.concatenate(leaves, axis=-1), -1, 0)
         curves = dict(zip(coordinates.names(one), columns))
-        only = next(iter(curves))
-        label = part if len(curves) > 1 or only == "q" else f"{part}: {only}"
-        yield Panel(under + label, "t", t, curves)
+        first = next(iter(curves))
+        label = part if len(curves) > 1 or first == "q" else f"{part}: {first}"
+        yield Panel(prefix + label, "t", t, curves)
 
 
 def _real_parts(name, x):
@@ -87,8 +87,8 @@ def _add(found, name, x, times):
         found.left_out.append(f"{name} of shape {x.shape[1:]}")
         return
     inner = list(np.ndindex(*x.shape[2:]))
-    ends = ["" if not i else str(list(i)) for i in inner]
+    suffixes = ["" if not i else str(list(i)) for i in inner]
     against_times = times is not None and np.shape(times) == x.shape[:2]
     at = np.asarray(times, float) if against_times else np.broadcast_to(np.arange(x.shape[1], dtype=float), x.shape[:2])
-    curves = {name + end: column for end, column in zip(ends, columns)}
+    curves = {name + end: column for end, column in zip(suffixes, columns)}
     found.panels.append(Panel(name, "t" if against_times else INDEX, at, curves))

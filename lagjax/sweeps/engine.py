@@ -1,4 +1,4 @@
-"""The front door of sweeps: compile once, run everywhere, lose nothing."""
+"""The entry point of sweeps: compile once, run on all devices, keep what was done."""
 
 import os
 import time
@@ -13,17 +13,18 @@ from jaxtyping import ArrayLike
 
 from lagjax.meter import meter
 from lagjax.sweeps.axes import axes_of
-from lagjax.sweeps.blocks import Filling, begun, compare_versions, together
+from lagjax.sweeps.blocks import Filling, compare_versions, groups_of_blocks, new_store
 from lagjax.sweeps.fingerprint import check_file_names
 from lagjax.sweeps.labels import labels_of
 from lagjax.sweeps.lanes import LAYOUTS, not_run
 from lagjax.sweeps.memory import check_memory
 from lagjax.sweeps.result import Stored, Sweep, of_store
 from lagjax.sweeps.running import CHUNKS_EACH, Engine, chunk_length, usable_cores
-from lagjax.sweeps.store import chunk_of, open_store, tell
+from lagjax.sweeps.store import chunk_of, open_store, warn_of_damage
 from lagjax.sweeps.travelling import pickled, shapes_of, unpickled
 
-# Points for one call of the compiled program. On a CPU a call costs 0.2 ms, and more gains nothing; a GPU is filled.
+# Points per call of the compiled program. On a CPU a call costs 0.2 ms, and larger chunks gain nothing; a GPU needs
+# more to be fully used.
 CHUNK = {"cpu": 1024, "gpu": 65536}
 
 
@@ -56,39 +57,39 @@ def sweep(
 
     **Main arguments:**
 
-    - `run(point)`: any JAX function; `point` is a dictionary with one scalar (or slice) an axis, and what it returns is
-      any pytree of numbers and arrays: a final state, a period, a gradient, a whole `Trajectory`. `integrate` needs
-      nothing special in it: it does not raise, and how it went is in `status`.
-    - `axes`: what varies, arrays (n, ...) by name. A grid of all combinations, the last axis fastest; with `paired` all
-      move together.
+    - `run(point)`: any JAX function; `point` is a dictionary with one scalar (or slice) per axis. It may return any
+      pytree of numbers and arrays: a final state, a period, a gradient, a whole `Trajectory`. `integrate` needs no
+      special options in it: it does not raise, and `status` records how it ended.
+    - `axes`: the parameters that vary, arrays (n, ...) by name. They form a grid of all combinations, the last axis
+      fastest; with `paired` they all move together.
 
     **Long sweeps:**
 
-    - `store`: a directory, to which blocks of points are written as they are finished (zarr). Called again with the
-      same sweep, only what is missing is computed; a store of another sweep is refused. What is there is read once and
-      checked against its checksums; what is not whole is told, and computed again.
-    - `accept_versions`: go on with a store that other versions of lagjax, jax or diffrax have begun. Whether `run` is
-      still the same function cannot be told then: a few points are computed again, and told if they differ.
-    - `part`: (k, n): this process computes every n-th block from the k-th on; by default as `jax.distributed` says.
-    - `progress`: show points done, rate and time left (tqdm); by default where somebody may look.
+    - `store`: a directory to which blocks of points are written as they are finished (zarr). When the same sweep is
+      called again, only missing points are computed; a store of another sweep is refused. Stored files are read once
+      and checked against their checksums; damaged blocks cause a warning and are computed again.
+    - `accept_versions`: continue a store that other versions of lagjax, jax or diffrax began. Whether `run` is still
+      the same function is then unknown: a few points are computed again, with a warning if they differ.
+    - `part`: (k, n): this process computes every n-th block from the k-th on; by default taken from `jax.distributed`.
+    - `progress`: show points done, rate and time left (tqdm); by default in a terminal or a notebook.
 
-    **How it runs,** which `print(swept)` says:
+    **How it runs** (`print(swept)` shows it):
 
-    - `chunk`: points for one call of the compiled program.
-    - `layout`: lanes `"vmap"` (`vmap`; those that take more than 32,768 steps are run again alone), or one after
-      the other, `"map"`.
-    - `sort`: first run a few points and then all in the order of their steps, so that a few long lanes do not hold the
-      rest; by default for lanes together, from 16,000 points on.
-    - `devices`: JAX devices to split each chunk between; by default all.
-    - `workers`: chunks at a time; by default the cores of the CPU, or two.
+    - `chunk`: points per call of the compiled program.
+    - `layout`: `"vmap"` runs lanes together (those that take more than 32,768 steps are run again alone); `"map"` runs
+      them one after the other.
+    - `sort`: first run a few points, then all points in the order of the steps they are expected to take, so that a few
+      long lanes do not hold up the rest; by default with `"vmap"`, from 16,000 points on.
+    - `devices`: JAX devices between which each chunk is split; by default all.
+    - `workers`: chunks computed at the same time; by default one per CPU core, or two.
 
-    Called again for the same function, or one that is written anew and reads the same from outside, over axes of the
-    same names, shapes and dtypes, it compiles nothing, whatever their values and lengths.
+    A second call compiles nothing if the axes have the same names, shapes and dtypes, whatever their values and
+    lengths, and `run` is the same function, or one with the same code that reads the same values from outside.
 
-    **Returns:** a `Sweep`. Interrupted (Ctrl-C) it has what was done, and `swept.resweep()` does the rest.
+    **Returns:** a `Sweep`. After an interruption (Ctrl-C) it has the finished points; `swept.resweep()` runs the rest.
 
-    **Raises:** `TypeError`, `ValueError` for axes and settings that make no sense, or another sweep's store;
-    `MemoryError` where the values would not fit, before anything runs.
+    **Raises:** `TypeError`, `ValueError` for invalid axes and settings, or another sweep's store; `MemoryError`
+    if the values would not fit, before anything runs.
     """
     if not callable(run):
         raise TypeError(
@@ -103,7 +104,7 @@ def sweep(
     cores = usable_cores() if platform == "cpu" else 2
     workers = (cores if len(devices) == 1 else 2) if workers is None else workers
     if chunk is None and store is not None and Path(store).exists():
-        # What was begun on other cores goes on as it was begun.
+        # A store keeps its chunk length, even when it is continued on another number of cores.
         chunk = chunk_of(store)
     elif chunk is None:
         chunk = chunk_length(grid.size, workers, CHUNK.get(platform, CHUNK["gpu"]))
@@ -124,25 +125,25 @@ def _in_memory(engine, indices, before):
     done = 0
     with _meter(len(indices), engine.progress) as shown:
         try:
-            for places, found, how in engine.over(indices):
-                at = indices[places]
-                # Neighbours are written as a slice, five times as fast.
+            for positions, found, how in engine.over(indices):
+                at = indices[positions]
+                # Consecutive points are written as a slice, which is five times as fast.
                 at = slice(at[0], at[0] + len(at)) if np.all(np.diff(at) == 1) else at
-                for whole, some in zip(jax.tree.leaves((values, status)), jax.tree.leaves((found, how))):
-                    whole[at] = some
-                done += len(places)
-                shown.update(len(places))
+                for whole, new in zip(jax.tree.leaves((values, status)), jax.tree.leaves((found, how))):
+                    whole[at] = new
+                done += len(positions)
+                shown.update(len(positions))
         except KeyboardInterrupt:
-            _tell_interrupted(done, len(indices), "swept.resweep() does the rest.")
+            _tell_interrupted(done, len(indices), "swept.resweep() runs the rest.")
     compiling, seconds = engine.seconds_since(started)
 
     return Sweep(axes, values, status, engine.words, done, compiling, seconds, _Again(engine))
 
 
 class _Again:
-    """Runs points of a sweep in memory again: by the engine that ran it, or by one like it in another process.
+    """Runs points of a sweep in memory again: with the engine that ran it, or in another process with a similar one.
 
-    What is compiled stays where it is. `run` goes along where pickle takes it, and is not looked at before it is used.
+    The compiled program is not pickled. `run` is, if pickle can do so, and is unpickled only when it is used.
     """
 
     def __init__(self, engine: Engine):
@@ -162,7 +163,7 @@ class _Again:
 
 
 class Elsewhere(NamedTuple):
-    """What runs points of a sweep again that was pickled."""
+    """Runs points of an unpickled sweep again."""
 
     run: bytes | None
     name: str
@@ -181,16 +182,16 @@ def _again(swept, engine, which):
     there, here = shapes_of(swept.values, lead), shapes_of(engine.program.values, 0)
     if there != here:
         raise ValueError(
-            f"this run returns another structure than the sweep has: {here}, not {there}.\n"
-            "Fix: return the same, computed with other settings."
+            f"this run returns another structure than the sweep: {here}, not {there}.\n"
+            "Fix: return the same structure, computed with other settings."
         )
     return _in_memory(engine, which, flat)
 
 
 def _in_store(engine, axes, path, part, accept_versions):
     started = time.perf_counter()
-    of_new = lambda: begun(engine, axes, CHUNKS_EACH * part[1])
-    store = open_store(path, axes, engine.program, engine.layout, part, accept_versions, of_new)
+    new = lambda: new_store(engine, axes, CHUNKS_EACH * part[1])
+    store = open_store(path, axes, engine.program, engine.layout, part, accept_versions, new)
     compare_versions(engine, store)
     k, n = part
     missing = [number for number in store.missing().tolist() if number % n == k]
@@ -198,21 +199,22 @@ def _in_store(engine, axes, path, part, accept_versions):
     done = 0
     with _meter(sum(map(length, missing)), engine.progress) as shown:
         try:
-            for numbers in together(engine, store, missing):
+            for numbers in groups_of_blocks(engine, store, missing):
                 filling = Filling(engine, store, numbers)
-                for places, values, status in engine.over(filling.indices):
-                    filling.take(places, values, status)
-                    shown.update(len(places))
+                for positions, values, status in engine.over(filling.indices):
+                    filling.take(positions, values, status)
+                    shown.update(len(positions))
                 done += len(filling.indices)
         except KeyboardInterrupt:
-            # A block that was written in this moment is there, too.
+            # A block that was written just before the interruption counts as well.
             done = sum(map(length, set(missing) - set(store.missing().tolist())))
-            _tell_interrupted(done, sum(map(length, missing)), "the same call goes on from there.")
+            _tell_interrupted(done, sum(map(length, missing)), "the same call continues from there.")
 
     here = f"{engine.words}, in {path}"
     status, _, lost = store.status()
     if lost:
-        tell(path, lost.values(), "Fix: this call without part, or with the part that they belong to.", stacklevel=3)
+        fix = "Fix: this call without part, or with the part to which these blocks belong."
+        warn_of_damage(path, lost.values(), fix, stacklevel=3)
     compiling, seconds = engine.seconds_since(started)
     return Sweep(axes, Stored(store, engine.program.values), status, here, done, compiling, seconds, of_store)
 
@@ -225,8 +227,8 @@ def _check(layout, part, store):
         raise ValueError(f"part must be (k, n) with 0 <= k < n, not {part}.\nFix: part=(0, 2) and part=(1, 2).")
     if n > 1 and store is None:
         raise ValueError(
-            f"this is process {k} of {n}, and without a store nobody gets its points.\n"
-            'Fix: store="a directory that all processes see".'
+            f"this is process {k} of {n}, and without a store its points would be lost.\n"
+            'Fix: store="a directory that all processes can reach".'
         )
 
 

@@ -1,4 +1,4 @@
-"""What a store belongs to: the axes, the values' names and kinds, the program, the versions that wrote it."""
+"""The fingerprint of the sweep in a store: axes, names and dtypes of values, program, and versions that wrote it."""
 
 from collections.abc import Iterable
 from importlib.metadata import version
@@ -11,15 +11,15 @@ from lagjax.sweeps.axes import Axes
 from lagjax.sweeps.digests import digest
 from lagjax.sweeps.lanes import Program
 
-# The earlier ones are read, and continued as they are: `earlier`.
+# Earlier formats are read, and continued without conversion (`earlier`).
 FORMAT = 3
 ANOTHER_FUNCTION = "run is another function"
-# Names that zarr, or a store, keeps for itself.
+# Names reserved by zarr or by a store.
 RESERVED = ("", ".", "..", "zarr.json", "lagjax")
 
 
 def fingerprint(axes: Axes, program: Program, layout: str) -> dict[str, Any]:
-    """What must be the same for two runs to belong to one store, in words where that is possible."""
+    """The properties that two runs must share to use one store, readable where possible."""
     return {
         "format": FORMAT,
         "points": ", ".join(f"{name}: {n}" for name, n in axes.dims.items()),
@@ -33,51 +33,51 @@ def fingerprint(axes: Axes, program: Program, layout: str) -> dict[str, Any]:
 
 
 def versions() -> dict[str, str]:
-    """What writes a store, here."""
+    """The versions of the packages that write a store."""
     return {name: version(name) for name in ("lagjax", "jax", "diffrax")}
 
 
 def in_words(of_versions: dict[str, str]) -> str:
-    """Versions, as a person says them."""
+    """Versions as text."""
     return ", ".join(f"{name} {number}" for name, number in of_versions.items())
 
 
 def of_axis(x: np.ndarray) -> str:
-    """The kind of an axis and a digest of its values."""
+    """The dtype and shape of an axis and a digest of its values."""
     return f"{x.dtype}{list(x.shape)} {digest(x.tobytes())}"
 
 
 def named_leaves(tree) -> list[tuple[str, Any]]:
-    """The leaves of what `run` returns, each with a name: its path, or "value" where it is alone.
+    """The leaves of what `run` returns, each with a name: its path, or "value" for a single leaf.
 
-    **Raises:** `ValueError` where two have the same.
+    **Raises:** `ValueError` if two have the same name.
     """
     key = lambda path: jax.tree_util.keystr(path, simple=True, separator=".").lstrip(".") or "value"
     found = [(key(path), path, leaf) for path, leaf in jax.tree_util.tree_leaves_with_path(tree)]
-    places = {}
+    paths = {}
     for name, path, _ in found:
-        places.setdefault(name, []).append(jax.tree_util.keystr(path) or "the value itself")
-    for name, alike in places.items():
-        if len(alike) > 1:
+        paths.setdefault(name, []).append(jax.tree_util.keystr(path) or "the value itself")
+    for name, same_name in paths.items():
+        if len(same_name) > 1:
             raise ValueError(
-                f"run returns {len(alike)} values of the name '{name}': {', '.join(alike)}.\n"
-                f"Usual cause: a key with a dot in it. Fix: another key, as '{name.replace('.', '_')}'."
+                f"run returns {len(same_name)} values named '{name}': {', '.join(same_name)}.\n"
+                f"Usual cause: a key with a dot in it. Fix: another key, such as '{name.replace('.', '_')}'."
             )
     return [(name, leaf) for name, _, leaf in found]
 
 
 def check_file_names(kind: str, names: Iterable[str]) -> None:
-    """Raise `ValueError` for names that cannot be those of folders."""
+    """Raise `ValueError` for names that cannot be folder names in a store."""
     for name in names:
         if name in RESERVED or name.startswith("__") or "/" in name or "\\" in name:
             raise ValueError(
-                f"{kind} '{name}' cannot be kept in a store: there is no place in it for such a name.\n"
+                f"{kind} '{name}' cannot be kept in a store: it is reserved or not a valid folder name.\n"
                 "Fix: another key, of letters, digits and underscores."
             )
 
 
 def differences(there: dict, here: dict, under: str = "") -> list[str]:
-    """What differs between two fingerprints, a line each."""
+    """The differences between two fingerprints, one line each."""
     found = []
     for key in dict.fromkeys((*there, *here)):
         a, b, name = there.get(key), here.get(key), f"{under}{key}"

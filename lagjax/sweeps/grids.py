@@ -1,7 +1,7 @@
-"""Blocks of a grid: boxes of it whose points are neighbours in the flat order as well, the last axis fastest.
+"""Blocks of a grid: boxes whose points are consecutive in the flat order as well, the last axis fastest.
 
-Such a box has one point along the first axes, some along one, and all along the rest. So a store keeps arrays in the
-shape of its axes, and yet each of its files has a run of flat indices.
+Such a box has one point along the first axes, some along one axis, and all along the rest. So a store keeps arrays in
+the shape of its axes, and yet each of its files holds consecutive flat indices.
 """
 
 import math
@@ -11,25 +11,25 @@ import numpy as np
 
 
 class Blocks(NamedTuple):
-    """How a grid is divided: its shape, and that of a block; those at the end of an axis may be shorter."""
+    """How a grid is divided: its shape and the shape of a block; blocks at the end of an axis may be shorter."""
 
     shape: tuple[int, ...]
     block: tuple[int, ...]
 
     @property
     def counts(self) -> tuple[int, ...]:
-        """How many blocks there are along each axis."""
+        """The number of blocks along each axis."""
         return tuple(-(-n // k) for n, k in zip(self.shape, self.block))
 
     def __len__(self):
         return math.prod(self.counts)
 
     def place(self, number: int) -> tuple[int, ...]:
-        """Where a block stands among the blocks, by axis: its file's name in zarr."""
+        """The position of a block along each axis, which names its file in zarr."""
         return tuple(int(i) for i in np.unravel_index(number, self.counts))
 
     def region(self, number: int) -> tuple[slice, ...]:
-        """What of the grid belongs to a block."""
+        """The part of the grid that belongs to a block, as slices."""
         found = zip(self.place(number), self.shape, self.block)
         return tuple(slice(i * k, min((i + 1) * k, n)) for i, n, k in found)
 
@@ -41,13 +41,13 @@ class Blocks(NamedTuple):
 
 
 def divided(shape: tuple[int, ...], points: int) -> Blocks:
-    """A grid in blocks of about so many points, and no more."""
+    """Divide a grid into blocks of about `points` points, and no more."""
     inner = 1
     for axis in reversed(range(len(shape))):
         if inner * shape[axis] > points:
-            # Even ones: 100 in blocks of no more than 40 are 34, 34 and 32.
+            # Blocks of similar size: 100 points in blocks of at most 40 give 34, 34 and 32.
             pieces = math.ceil(shape[axis] / max(1, points // inner))
-            some = math.ceil(shape[axis] / pieces)
-            return Blocks(shape, (*(1,) * axis, some, *shape[axis + 1 :]))
+            length = math.ceil(shape[axis] / pieces)
+            return Blocks(shape, (*(1,) * axis, length, *shape[axis + 1 :]))
         inner *= shape[axis]
     return Blocks(shape, shape)

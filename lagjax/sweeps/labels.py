@@ -1,9 +1,9 @@
-"""Names for what a sweep has, the same in xarray, in pandas and in a store: variables, dimensions, flags.
+"""Names for the arrays of a sweep, the same in xarray, in pandas and in a store: variables, dimensions, flags.
 
-An array that `run` returns is named by its path, `end.q`; "value" where it is alone. Its dimensions are those of the
-sweep, and behind them its own, `end.q_0`. Of a trajectory the outputs are shown, over the times `t`, their errors, its
-end, events and parameters, named as by `Trajectory.to_xarray`; what else it consists of has no name here. A name that
-is taken gets `value_` or `status_` in front.
+An array that `run` returns is named by its path, `end.q`; a single array is named "value". Its dimensions are those of
+the sweep, followed by its own, `end.q_0`. A trajectory shows its outputs over the times `t`, their errors, its end,
+events and parameters, named as by `Trajectory.to_xarray`; its other parts have no name here. A name that is already
+taken gets the prefix `value_` or `status_`.
 """
 
 from collections.abc import Iterable
@@ -18,20 +18,20 @@ from lagjax.motion.trajectory import Trajectory
 from lagjax.sweeps.axes import POINT, Axes
 from lagjax.sweeps.lanes import LOST, NOT_RUN, Status
 
-# What a store keeps beside them.
-KEPT_FREE = "lagjax"
-# The times of a trajectory, and where among its arrays its parameters are.
+# The name of a store's own group, not available to arrays.
+STORE_GROUP = "lagjax"
+# The name of a trajectory's times, and the index of the parameters among its `arrays`.
 TIMES, PARAMS = "t", 1
-OF_STATUS = Status(
-    "how each point went",
-    "steps of all integrations of a point",
-    "worst error of a point, in units of what is allowed",
-    "worst constraint residual of a point, relative",
+STATUS_LONG_NAMES = Status(
+    "how each point ended",
+    "total steps of all integrations of a point",
+    "worst error of a point, relative to the allowed error",
+    "worst relative constraint residual of a point",
 )
 
 
 class Label(NamedTuple):
-    """An array's name, and its dimensions behind those of the sweep; `times` where it has a trajectory's times."""
+    """An array's name and its dimensions after those of the sweep; `times` if it holds the times of a trajectory."""
 
     name: str
     dims: tuple[str, ...]
@@ -39,7 +39,7 @@ class Label(NamedTuple):
 
 
 class Labels(NamedTuple):
-    """The names of a sweep: of its axes (with all their dimensions), values by leaf, status by field."""
+    """The labels of a sweep: its axes (with all their dimensions), values by leaf, status by field."""
 
     axes: dict[str, Label]
     values: dict[str, Label]
@@ -47,60 +47,61 @@ class Labels(NamedTuple):
 
 
 def labels_of(axes: Axes, like: PyTree) -> Labels:
-    """The names of a sweep whose `run` returns what is like this, of shapes.
+    """The labels of a sweep whose `run` returns values of the shapes in `like`.
 
-    **Raises:** `ValueError` for two of one name.
+    **Raises:** `ValueError` if two values have the same name.
     """
     of_axes, names, values = _of_axes(axes), {}, {}
     dims_of_axes = {dim for label in of_axes.values() for dim in label.dims}
-    taken = {KEPT_FREE, *dims_of_axes, *(label.name for label in of_axes.values())}
-    shown = list(_shown(like))
+    taken = {STORE_GROUP, *dims_of_axes, *(label.name for label in of_axes.values())}
+    shown = list(_shown_arrays(like))
     for part in shown:
-        names[part.key] = _free(part.name, "value", taken)
+        names[part.key] = _unused_name(part.name, "value", taken)
         taken.add(names[part.key])
     status = {}
     for field in Status._fields:
-        status[field] = Label(_free(field, "status", taken), ())
+        status[field] = Label(_unused_name(field, "status", taken), ())
         taken.add(status[field].name)
     for part in shown:
         dims = *part.dims, *inner_dims(part.of or names[part.key], part.inner)
-        values[part.key] = Label(names[part.key], tuple(_apart(dim, taken) for dim in dims), part.times)
+        values[part.key] = Label(names[part.key], tuple(_unused_dimension(dim, taken) for dim in dims), part.times)
     return Labels(of_axes, values, status)
 
 
 def _of_axes(axes):
     found, taken = {}, set(axes.names) | {POINT}
     for name, x in axes.values.items():
-        inner = tuple(_apart(dim, taken) for dim in inner_dims(name, x.ndim - 1))
+        inner = tuple(_unused_dimension(dim, taken) for dim in inner_dims(name, x.ndim - 1))
         dims = (POINT if axes.paired else name, *inner)
-        # A coordinate of a dimension's name has one number for each of its places.
-        shown = _apart(f"{name}_values", taken) if inner and name == dims[0] else name
+        # xarray requires that a coordinate named like a dimension is one-dimensional.
+        shown = _unused_dimension(f"{name}_values", taken) if inner and name == dims[0] else name
         taken |= {shown, *inner}
         found[name] = Label(shown, dims)
     return found
 
 
 def inner_dims(name: str, count: int) -> tuple[str, ...]:
-    """The dimensions of an array of a point."""
+    """The names of an array's own dimensions."""
     return tuple(f"{name}_{i}" for i in range(count))
 
 
-def _free(name, kind, taken):
-    for free in (name, f"{kind}_{name}"):
-        if free not in taken:
-            return free
-    raise ValueError(f"two of the values are named '{name}'.\nFix: another key in what run returns.")
+def _unused_name(name, kind, taken):
+    for candidate in (name, f"{kind}_{name}"):
+        if candidate not in taken:
+            return candidate
+    raise ValueError(f"two of the values are named '{name}'.\nFix: another key in the dictionary that run returns.")
 
 
-def _apart(dim, taken):
+def _unused_dimension(dim, taken):
     while dim in taken:
         dim = f"value_{dim}"
     return dim
 
 
-class _Part(NamedTuple):
-    """An array among values: its leaf; its name before others are looked at; its dimensions, the last `inner` of them
-    named after `of`, or after itself.
+class _ShownArray(NamedTuple):
+    """An array among the values: its leaf, preferred name and named dimensions.
+
+    Its other `inner` dimensions are named after `of`, or after the array.
     """
 
     key: str
@@ -111,29 +112,29 @@ class _Part(NamedTuple):
     times: bool = False
 
 
-def _shown(like) -> Iterable[_Part]:
+def _shown_arrays(like) -> Iterable[_ShownArray]:
     for path, part in _with_path(like):
-        key = keyed(path) or "value"
+        key = key_of(path) or "value"
         if isinstance(part, Trajectory):
-            yield from _of_motion(part, f"{key}." if keyed(path) else "")
+            yield from _of_motion(part, f"{key}." if key_of(path) else "")
         else:
-            yield _Part(key, _flat(key), (), len(part.shape))
+            yield _ShownArray(key, _flat(key), (), len(part.shape))
 
 
-def _of_motion(motion, under):
-    """What a trajectory shows, as its own `to_xarray` names it."""
-    batch = inner_dims(f"{under}lane", len(motion.t.shape) - 1)
-    dims = *batch, f"{under}{TIMES}"
+def _of_motion(motion, prefix):
+    """The arrays that a trajectory shows, named as by its own `to_xarray`."""
+    batch = inner_dims(f"{prefix}lane", len(motion.t.shape) - 1)
+    dims = *batch, f"{prefix}{TIMES}"
 
     def part(key, name, dims, x, of="", times=False):
         inner, flat = len(x.shape) - len(dims), tuple(map(_flat, dims))
-        return _Part(under + key, _flat(under + name), flat, inner, _flat(under + of) if of else "", times)
+        return _ShownArray(prefix + key, _flat(prefix + name), flat, inner, _flat(prefix + of) if of else "", times)
 
     yield part("t", "times", dims, motion.t, times=True)
     errors = {} if motion.error is None else {f"error.{name}": getattr(motion.error, name) for name in ("q", "v")}
     for which, tree in {"q": motion.q, "v": motion.v, **errors}.items():
         for path, x in _with_path(tree):
-            inner = keyed(path)
+            inner = key_of(path)
             yield part(_joined(which, inner), _joined(which, inner), dims, x, inner or "q")
     for name, x in motion.multipliers.items():
         yield part(f"multipliers.{name}", name, dims, x, name)
@@ -141,9 +142,9 @@ def _of_motion(motion, under):
         yield part("phase", "phase", dims, motion.phase)
     yield part("end.t", "end", batch, motion.end.t)
     for name, found in motion.events.items():
-        yield part(f"events.{name}.t", f"events.{name}", (*batch, f"{under}crossing_of_{name}"), found.t)
+        yield part(f"events.{name}.t", f"events.{name}", (*batch, f"{prefix}crossing_of_{name}"), found.t)
     for path, x in _with_path(motion.arrays[PARAMS]):
-        inner = keyed(path)
+        inner = key_of(path)
         yield part(_joined(f"arrays.{PARAMS}", inner), _joined("params", inner), batch, x)
 
 
@@ -152,7 +153,7 @@ def _joined(which, inner):
 
 
 def _flat(name):
-    # Zarr and netCDF take what stands before a slash for a folder.
+    # Zarr and netCDF interpret a slash as a folder separator.
     return name.replace("/", "_")
 
 
@@ -160,13 +161,13 @@ def _with_path(tree):
     return jax.tree_util.tree_leaves_with_path(tree, is_leaf=lambda x: isinstance(x, Trajectory))
 
 
-def keyed(path) -> str:
+def key_of(path) -> str:
     """A path as `named_leaves` writes it."""
     return jax.tree_util.keystr(path, simple=True, separator=".").lstrip(".")
 
 
 def flags() -> dict[str, Any]:
-    """What the numbers of a result mean, as the CF conventions write it."""
+    """The meanings of the result codes, in the form of the CF conventions."""
     codes = {LOST: "lost_from_the_store", NOT_RUN: "not_run"}
     codes |= {int(item._value): name for name, item in RESULTS._name_to_item.items()}
     codes = dict(sorted(codes.items()))
@@ -174,16 +175,16 @@ def flags() -> dict[str, Any]:
 
 
 def status_attributes(field: str) -> dict[str, Any]:
-    """What xarray shows of a status."""
-    return {"long_name": getattr(OF_STATUS, field)} | (flags() if field == "result" else {})
+    """The attributes of a status array in xarray."""
+    return {"long_name": getattr(STATUS_LONG_NAMES, field)} | (flags() if field == "result" else {})
 
 
 def words_of(code) -> str:
-    """A result's number in words."""
+    """A result code in words."""
     return {NOT_RUN: "not run", LOST: "lost from the store"}.get(int(code)) or in_words(code)
 
 
-def shared_times(x: np.ndarray, there: np.ndarray):
-    """The times that all points have of which there are values; None where they differ, or there is none."""
-    times = x[there]
+def shared_times(x: np.ndarray, has_values: np.ndarray):
+    """The times shared by all points that have values; None if they differ, or no point has values."""
+    times = x[has_values]
     return times[0] if len(times) and np.all(times == times[0]) else None

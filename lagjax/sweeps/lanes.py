@@ -1,7 +1,7 @@
-"""The compiled program of a sweep: the values that its axes have at some points, to values and statuses.
+"""The compiled program of a sweep: maps the axis values at some points to values and statuses.
 
-Lanes run together, under `vmap`, each with its own steps; on a CPU `integrate` takes 256 of them at a time. `"map"`
-takes one after the other, which measures slower nearly everywhere (`benchmarks/sweep.py`), and needs the least memory.
+Lanes run together under `vmap`, each with its own steps; on a CPU `integrate` takes 256 of them at a time. `"map"` runs
+one after the other, which is slower in nearly all measurements (`benchmarks/sweep.py`) and needs the least memory.
 """
 
 import threading
@@ -27,11 +27,11 @@ LAYOUTS = ("vmap", "map")
 
 
 class Status(NamedTuple):
-    """How each point went, arrays in the shape of the sweep.
+    """How each point ended, as arrays in the shape of the sweep.
 
-    `result` is the code of a `RESULTS` item, -1 where the point was not run, -2 where it is lost from its store;
-    `steps` those of all its integrations; `scaled_error` and `residual` the worst (`Trajectory`), 0 where nothing was
-    integrated.
+    `result` is the code of a `RESULTS` item, -1 if the point was not run, -2 if it is lost from its store; `steps`
+    counts the steps of all its integrations; `scaled_error` and `residual` are the worst values of its integrations
+    (`Trajectory`), 0 if nothing was integrated.
     """
 
     result: Any
@@ -41,17 +41,17 @@ class Status(NamedTuple):
 
 
 STATUS_TYPES = Status(np.dtype(np.int8), np.dtype(np.int32), np.dtype(np.float32), np.dtype(np.float32))
-# What is to be trusted, and what there is a value of.
+# Result codes whose values can be trusted, and result codes that have a value at all.
 TRUSTED = tuple(int(item._value) for item in ENDED_WELL)
 GOOD = (*TRUSTED, *(int(item._value) for item in (RESULTS.drifted, RESULTS.not_converged, RESULTS.misfit)))
 
 
 class Program(NamedTuple):
-    """A compiled program for `chunk` points: one point's shapes, the bytes that it works with, a digest of its text.
+    """A compiled program for `chunk` points: shapes of one point's `values`, `working` memory in bytes, a digest.
 
-    `call(point, count)`: (values, status, settled) of no more than `chunk` points, as NumPy arrays; `point` has the
-    values of so many by axis. Points that are not settled belong to the robust program; None where this one is that.
-    `irregular` is set when most points turn out to belong there.
+    `call(point, count)`: (values, status, settled) of the first `count` points, as NumPy arrays; `point` has the values
+    of `chunk` points by axis. Points that are not settled need the robust program; settled is None for the robust
+    program itself. `irregular` is set when many points turn out to need the robust program.
     """
 
     call: Callable
@@ -63,14 +63,14 @@ class Program(NamedTuple):
 
 
 def point_of(run: Callable) -> Callable:
-    """A function of one point that returns (values, `Status`, whether these are settled: `reporting`).
+    """A function of one point that returns (values, `Status`, settled); `reporting` explains `settled`.
 
-    The numbers of a point that failed are NaN.
+    The values of a point that failed are NaN.
     """
-    told = reporting(run)
+    reporting_run = reporting(run)
 
     def point(at):
-        values, report, settled = told(at)
+        values, report, settled = reporting_run(at)
         if report is None:
             floats = [x for x in jax.tree.leaves(values) if jnp.issubdtype(x.dtype, jnp.inexact)]
             finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in floats])) if floats else jnp.asarray(True)
@@ -80,7 +80,7 @@ def point_of(run: Callable) -> Callable:
         well = jnp.any(jnp.stack([status.result == code for code in GOOD]))
 
         def masked(x):
-            # A trajectory says itself how far it got, and is NaN from there on.
+            # A trajectory records itself how far it got, and is NaN from there on.
             if isinstance(x, Trajectory) or not jnp.issubdtype(x.dtype, jnp.inexact):
                 return x
             return jnp.where(well, x, jnp.nan)
@@ -95,8 +95,8 @@ def compiled(
 ) -> Program:
     """Compile a sweep's program for chunks of some length, split between the devices.
 
-    Of the axes only names, shapes and dtypes matter. With `patience`, motions in it are given up after so many steps.
-    Where not `robust`, they are taken for regular.
+    Only the names, shapes and dtypes of the axes matter. Motions are given up after `patience` steps, if given. Unless
+    `robust`, motions are assumed to be regular.
     """
     point = point_of(run)
 
@@ -104,12 +104,12 @@ def compiled(
         at = lambda values: point(dict(zip(axes.names, values)))
         return jax.lax.map(at, values) if layout == "map" else jax.vmap(at)(values)
 
-    function, placed = lanes, SingleDeviceSharding(devices[0])
+    function, sharding = lanes, SingleDeviceSharding(devices[0])
     if len(devices) > 1:
         mesh, split = Mesh(np.asarray(devices), ("lanes",)), PartitionSpec("lanes")
         function = jax.shard_map(lanes, mesh=mesh, in_specs=split, out_specs=split, check_vma=False)
-        placed = NamedSharding(mesh, split)
-    shaped = tuple(jax.ShapeDtypeStruct((chunk, *x.shape[1:]), x.dtype, sharding=placed) for x in axes.arrays)
+        sharding = NamedSharding(mesh, split)
+    shaped = tuple(jax.ShapeDtypeStruct((chunk, *x.shape[1:]), x.dtype, sharding=sharding) for x in axes.arrays)
     of_user = Call("run", run, (POINT,))
     check_arguments(of_user, "the axes taken one by one; a point is one dictionary")
     with PATIENCE(patience), REGULAR_FIRST(not robust), in_words(of_user, {POINT: axes.values}):
@@ -127,8 +127,8 @@ def compiled(
 
 
 def not_run(program: Program, count: int) -> tuple[PyTree, Status]:
-    """Room for the values and statuses of some points: NaN, or 0 in numbers that have none."""
-    nothing = lambda x: np.nan if np.issubdtype(x.dtype, np.inexact) else 0
-    values = jax.tree.map(lambda x: np.full((count, *x.shape), nothing(x), x.dtype), program.values)
+    """Arrays for the values and statuses of some points, filled with NaN, or 0 for dtypes without NaN."""
+    empty = lambda x: np.nan if np.issubdtype(x.dtype, np.inexact) else 0
+    values = jax.tree.map(lambda x: np.full((count, *x.shape), empty(x), x.dtype), program.values)
     fills = (NOT_RUN, 0, np.nan, np.nan)
     return values, Status(*(np.full(count, fill, dtype) for fill, dtype in zip(fills, STATUS_TYPES)))

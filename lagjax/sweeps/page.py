@@ -1,4 +1,4 @@
-"""A sweep as a page with a slider for each axis: values, curves and motions of every point, and how each went."""
+"""A sweep as a page with a slider for each axis: values, curves and motions of every point, and how each ended."""
 
 from collections.abc import Callable
 from typing import Any
@@ -20,9 +20,9 @@ from lagjax.sweeps.drawn import Drawn, drawn
 from lagjax.sweeps.labels import words_of
 from lagjax.sweeps.lanes import NOT_RUN, TRUSTED
 
-# A number in base64: of one byte.
-LONGER = 4 / 3
-# What a browser opens without delay, and what a person sends by mail.
+# Characters of base64 per byte.
+BASE64_FACTOR = 4 / 3
+# A page of this size opens in a browser without delay, and can be sent by mail.
 MOST_MEGABYTES = 25.0
 # `positions` is called in Python for every frame of every point.
 MOST_FRAMES = 100_000
@@ -35,19 +35,19 @@ def page_of(
     codes: np.ndarray,
     positions: Callable | None,
     megabytes: float,
-    of_film: dict[str, Any],
+    film_settings: dict[str, Any],
 ) -> Page:
-    """The page of a sweep; `values` have the lanes in front, (N, ...), and so has `codes`, how each went."""
+    """The page of a sweep; `values` (N, ...) and `codes` (N,), the results, have the lanes as first axis."""
     found = drawn(values)
     _check_size(axes, found, megabytes)
-    moving, body = None, ""
+    film_spec, body = None, ""
     if positions is not None:
-        body, moving = _film(axes, values, codes, positions, megabytes, **of_film)
-    if not found.numbers and not found.panels and moving is None:
-        there = "; ".join(found.left_out) or "nothing"
+        body, film_spec = _film(axes, values, codes, positions, megabytes, **film_settings)
+    if not found.numbers and not found.panels and film_spec is None:
+        contents = "; ".join(found.left_out) or "nothing"
         raise ValueError(
-            f"there is nothing to draw: a point has {there}.\n"
-            "Fix: return numbers, a lj.Trajectory, or arrays along time of few columns from run."
+            f"there is nothing to draw: each point has {contents}.\n"
+            "Fix: return numbers, a lj.Trajectory, or arrays over time with few columns from run."
         )
     spec = {
         "axes": _axes(axes),
@@ -58,12 +58,12 @@ def page_of(
         "numbers": [{"name": name, "values": encoded(x, "f8")} for name, x in found.numbers.items()],
         "panels": [_panel(panel, codes) for panel in found.panels],
         "colours": list(COLOURS),
-        "film": moving,
+        "film": film_spec,
     }
     note = f'<p class="note">Not drawn: {"; ".join(found.left_out)}.</p>' if found.left_out else ""
-    waiting = "The sliders need scripts: allow them, or trust this notebook."
+    notice = "The sliders need scripts: allow them, or trust this notebook."
     body = (
-        f'<div data-controls=""></div><p data-status="" role="status">{waiting}</p>\n{body}'
+        f'<div data-controls=""></div><p data-status="" role="status">{notice}</p>\n{body}'
         f'<div data-views=""></div>{note}'
     )
     html = fragment(body, spec, ("decode.js", "film.js", "chart.js", "sliders.js"))
@@ -72,15 +72,15 @@ def page_of(
 
 
 def _axes(axes):
-    """A slider each: its name, its places in words, and where they stand in a picture."""
+    """One slider per axis: its name, the labels of its positions, and their coordinates in a picture."""
     if axes.paired:
         labels = [axes.words(i) for i in range(axes.size)]
         return [{"name": POINT, "labels": labels, "at": list(range(axes.size))}]
     sliders = []
     for name, x in axes.values.items():
-        plain = x.ndim == 1 and np.all(np.isfinite(x)) and x.dtype != bool and not np.iscomplexobj(x)
-        at = x.astype(float).tolist() if plain else list(range(len(x)))
-        labels = [f"{value:.6g}" for value in at] if plain else [_label(value, i) for i, value in enumerate(x)]
+        is_numeric = x.ndim == 1 and np.all(np.isfinite(x)) and x.dtype != bool and not np.iscomplexobj(x)
+        at = x.astype(float).tolist() if is_numeric else list(range(len(x)))
+        labels = [f"{value:.6g}" for value in at] if is_numeric else [_label(value, i) for i, value in enumerate(x)]
         sliders.append({"name": name, "labels": labels, "at": at})
     return sliders
 
@@ -94,28 +94,28 @@ def _panel(panel, codes):
     shared = len(ran) > 0 and np.array_equal(ran, np.broadcast_to(ran[0], ran.shape), equal_nan=True)
     x = ran[0] if shared else panel.x
     curves = [{"name": name, "y": encoded(y, _precision(y))} for name, y in panel.curves.items()]
-    told = {"label": panel.label, "across": panel.across, "length": panel.x.shape[1]}
-    return told | {"x": encoded(x, _precision(x)), "curves": curves}
+    spec = {"label": panel.label, "across": panel.across, "length": panel.x.shape[1]}
+    return spec | {"x": encoded(x, _precision(x)), "curves": curves}
 
 
 def _precision(x):
-    """Single precision, where that shows what there is to see."""
-    there = x[np.isfinite(x)]
-    if there.size == 0:
+    """Single precision, if it resolves the variation of the data."""
+    finite = x[np.isfinite(x)]
+    if finite.size == 0:
         return "f4"
-    largest, distance = np.max(np.abs(there)), np.max(there) - np.min(there)
+    largest, distance = np.max(np.abs(finite)), np.max(finite) - np.min(finite)
     return "f4" if (largest == 0 or 1e-30 < largest < 1e30) and not 0 < distance < 1e-3 * largest else "f8"
 
 
 def _check_size(axes, found: Drawn, megabytes):
     curves = [y for panel in found.panels for y in panel.curves.values()]
     numbers = len(found.numbers) + sum(y.size for y in curves) // axes.size
-    size = LONGER * (8 * axes.size * len(found.numbers) + sum(int(_precision(y)[1]) * y.size for y in curves))
+    size = BASE64_FACTOR * (8 * axes.size * len(found.numbers) + sum(int(_precision(y)[1]) * y.size for y in curves))
     if size > 1e6 * megabytes:
         raise ValueError(
-            f"the page would be larger than {in_bytes(size)}, and may have {megabytes:g} MB: {axes.size:,} points of "
+            f"the page would be larger than {in_bytes(size)}, but may have {megabytes:g} MB: {axes.size:,} points of "
             f"{numbers:,} numbers each.\n"
-            "Fix: fewer points, or fewer times ts in run; or megabytes=..., for browsers with patience."
+            "Fix: fewer points, or fewer times ts in run; or a larger megabytes=..."
         )
 
 
@@ -133,15 +133,15 @@ def _film(axes, values, codes, positions, megabytes, seconds, rate, trail):
     frames = axes.size * rate * (seconds or 2.0)
     if frames > MOST_FRAMES:
         raise ValueError(
-            f"{axes.size:,} points are more than {MOST_FRAMES:,} frames, and positions is called for each.\n"
-            "Fix: fewer points, a lower rate, as rate=10.0, or fewer seconds."
+            f"{axes.size:,} points are more than {MOST_FRAMES:,} frames, and positions is called for each frame.\n"
+            "Fix: fewer points, a lower rate such as rate=10.0, or fewer seconds."
         )
     at, points, kept = film_of_lanes(trajs, positions, seconds, rate, trail, [code == EVENT for code in codes])
-    size = LONGER * 2 * sum(x.size for x in points.values())
+    size = BASE64_FACTOR * 2 * sum(x.size for x in points.values())
     if size > 1e6 * megabytes:
         raise ValueError(
-            f"the film would take {in_bytes(size)}, and the page may have {megabytes:g} MB.\n"
-            "Fix: fewer points, a lower rate, as rate=10.0, or fewer seconds; or megabytes=..."
+            f"the film would take {in_bytes(size)}, but the page may have {megabytes:g} MB.\n"
+            "Fix: fewer points, a lower rate such as rate=10.0, or fewer seconds; or a larger megabytes=..."
         )
     return film(at, points, rate, kept)
 

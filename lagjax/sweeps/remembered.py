@@ -1,8 +1,8 @@
-"""The programs of the sweeps before, for another sweep of the same function over axes of the same kinds.
+"""A cache of the programs of earlier sweeps, for another sweep of the same function over axes of the same kinds.
 
-Two functions are the same where their code and all that they read from outside is (`meaning_of`): a lambda that is
-written anew is, and one that reads another number is not. So a program is never a stale one. A function whose meaning
-cannot be told is compiled for each sweep.
+Two functions are the same if their code and everything they read from outside are the same (`meaning_of`): a lambda
+that is written again counts as the same, one that reads another number does not. So no stale program is ever used. A
+function that cannot be compared in this way is compiled for each sweep.
 """
 
 import inspect
@@ -21,9 +21,9 @@ from lagjax.meter import waiting
 from lagjax.sweeps.axes import Axes
 from lagjax.sweeps.lanes import Program, compiled
 
-# Programs that are kept, those used last.
-KEPT = 32
-# (the code of the function, weakly; the program), by what they were compiled for.
+# The number of programs kept, the most recently used ones.
+MOST_PROGRAMS = 32
+# (weak reference to the code of the function, program), by the key they were compiled for.
 _PROGRAMS: OrderedDict = OrderedDict()
 _LOCK = threading.Lock()
 
@@ -38,7 +38,7 @@ def program_for(
     robust: bool = True,
     progress: bool | None = False,
 ) -> tuple[Program, float]:
-    """The program, and the seconds that compiling it took; 0 where there was one."""
+    """The program, and the seconds it took to compile; 0 if it was in the cache."""
     key, code = _key(run, axes, chunk, devices, layout, patience, robust), _code(run)
     with _LOCK:
         _, program = _PROGRAMS.get(key, (None, None))
@@ -50,22 +50,22 @@ def program_for(
         seconds = time.perf_counter() - started
     if key is not None and code is not None:
         with _LOCK:
-            # Of two codes that are the same the one that came last stays longer.
-            _PROGRAMS[key] = weakref.ref(code, lambda gone: _drop(key, gone)), program
+            # If two functions have the same code, the entry refers to the later one, which may live longer.
+            _PROGRAMS[key] = weakref.ref(code, lambda reference: _drop(key, reference)), program
             _PROGRAMS.move_to_end(key)
-            while len(_PROGRAMS) > KEPT:
+            while len(_PROGRAMS) > MOST_PROGRAMS:
                 _PROGRAMS.popitem(last=False)
     return program, seconds
 
 
-def _drop(key, gone):
-    # Without the lock: a collection may come while this thread holds it.
-    if _PROGRAMS.get(key, (None,))[0] is gone:
+def _drop(key, reference):
+    # No lock here: garbage collection may run this while the same thread holds the lock.
+    if _PROGRAMS.get(key, (None,))[0] is reference:
         _PROGRAMS.pop(key, None)
 
 
 def _key(run, axes, chunk, devices, layout, patience, robust):
-    """What a program is compiled for; None where that cannot be told."""
+    """The key of a program: everything it is compiled for; None if the function cannot be compared."""
     meaning = meaning_of(run)
     if meaning is None:
         return None
@@ -75,7 +75,7 @@ def _key(run, axes, chunk, devices, layout, patience, robust):
 
 
 def _code(run):
-    """The code of a function, which is gone when nothing is left that could make the function again."""
+    """The code object of a function: it is freed once nothing is left that could create the function again."""
     while not isinstance(run, types.FunctionType):
         if isinstance(run, partial):
             run = run.func

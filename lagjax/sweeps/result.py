@@ -1,4 +1,4 @@
-"""The answer of a sweep: values and statuses by axis, printed, plotted, exported, and what failed run again."""
+"""The result of a sweep: values and statuses by axis; printing, plotting, exporting, running failed points again."""
 
 import os
 from collections.abc import Callable
@@ -14,7 +14,7 @@ from lagjax import plot
 from lagjax.mechanics import coordinates
 from lagjax.motion.trajectory import Trajectory
 from lagjax.pages import Page
-from lagjax.sweeps import exported, structures
+from lagjax.sweeps import structures, tables
 from lagjax.sweeps.axes import POINT, Axes
 from lagjax.sweeps.fingerprint import in_words as versions_in_words
 from lagjax.sweeps.fingerprint import named_leaves, versions
@@ -22,23 +22,23 @@ from lagjax.sweeps.labels import words_of
 from lagjax.sweeps.lanes import LOST, TRUSTED, Status
 from lagjax.sweeps.metadata import restore
 from lagjax.sweeps.page import MOST_MEGABYTES, page_of
-from lagjax.sweeps.store import Store, nothing, tell
+from lagjax.sweeps.store import Store, nothing, warn_of_damage
 
 COMPUTED_AGAIN = (
-    "These points are lost in status, and NaN or 0 in values.\n"
+    "These points are marked as lost in status, and are NaN or 0 in values.\n"
     "Fix: lj.sweep(run, axes, store=path), which computes them again."
 )
 
 
 class Sweep:
-    """What a sweep found, by axis. It prints how its points went, plots itself and exports to xarray.
+    """The result of a sweep, by axis. It prints how its points ended, plots itself and exports to xarray.
 
-    - `axes`: the names and values of what varied; `dims` the dimensions and their lengths.
-    - `values`: what `run` returned, each leaf with the axes in front (NumPy). NaN where a point failed. Of a sweep with
-      a store they are read from it when asked for; what cannot be read is told, and lost in `status`.
-    - `status`: a `Status` of arrays in the shape of the axes; `ok` where the values are to be trusted.
-    - `how`: what ran it, in words; `ran` how many points this call computed, in how many `seconds`, after so many of
-      `compiling`: 0 where a sweep before it had done that.
+    - `axes`: the names and values of the parameters that varied; `dims`: the dimensions and their lengths.
+    - `values`: what `run` returned, each leaf with the axes in front (NumPy), NaN where a point failed. With a store
+      they are read from it on access; blocks that cannot be read cause a warning and are lost in `status`.
+    - `status`: a `Status` of arrays in the shape of the axes; `ok` is True where the values can be trusted.
+    - `how`: a description of what ran it; `ran`: how many points this call computed, in how many `seconds`, after
+      `compiling` seconds of compilation: 0 if an earlier sweep had compiled the program.
     """
 
     def __init__(
@@ -63,7 +63,7 @@ class Sweep:
         return same
 
     def __deepcopy__(self, memo):
-        # Of what is no array nothing changes: structures, systems, what ran it.
+        # Only arrays are copied: structures, systems and the engine never change.
         same, values = copy(self), self._values
         same.axes, same.status = (jax.tree.map(np.copy, x) for x in (self.axes, self.status))
         same._values = values if isinstance(values, Stored) else jax.tree.map(np.copy, values)
@@ -93,11 +93,11 @@ class Sweep:
 
     @property
     def ok(self) -> np.ndarray:
-        """Which points were computed to their end, drifting no more than the tolerance lets expect, or fitted well."""
+        """Which points were computed to their end, with no more drift than the tolerance allows, or fitted well."""
         return np.isin(self.status.result, TRUSTED)
 
     def counts(self) -> dict[str, int]:
-        """How many points went which way, in words, the most frequent first."""
+        """How many points ended with each result, in words, the most frequent first."""
         codes, counts = np.unique(self.status.result, return_counts=True)
         return {words_of(codes[i]): int(counts[i]) for i in np.argsort(-counts)}
 
@@ -116,16 +116,16 @@ class Sweep:
     def to_xarray(self):
         """Values, statuses and axes as an `xarray.Dataset`, with dimensions and coordinates by name.
 
-        The outputs of a `Trajectory` have the dimension `t`, where all points share their times. `result` says in its
-        attributes what its numbers mean (`flag_values`, `flag_meanings`). A value that is named like an axis has
-        `value_` in front. A store has the same names: `xarray.open_zarr(path)`.
+        The outputs of a `Trajectory` have the dimension `t` if all points share their times. The attributes of `result`
+        say what its numbers mean (`flag_values`, `flag_meanings`). A value that is named like an axis gets the prefix
+        `value_`. A store has the same names: `xarray.open_zarr(path)`.
 
-        **Raises:** `ImportError` without xarray; `ValueError` for two values of one name.
+        **Raises:** `ImportError` without xarray; `ValueError` if two values have the same name.
         """
-        return exported.dataset(self)
+        return tables.dataset(self)
 
     def to_pandas(self, values: Callable | None = None):
-        """A `pandas.DataFrame` with a row a point: the axes, what `run` returned, how the point went.
+        """A `pandas.DataFrame` with one row per point: the axes, what `run` returned, how the point ended.
 
         >>> import numpy as np
         >>> import lagjax as lj
@@ -136,26 +136,26 @@ class Sweep:
         0  1.0  0.5      1.0     10.0  1.5  successful
         1  2.0  0.5      2.0     20.0  2.5  successful
 
-        Rows are in the order of the points, the last axis fastest. An array of a point has a column a number, up to
-        100; `result` is categorical, in words.
+        Rows are in the order of the points, the last axis fastest. An array of a point has one column per number, up
+        to 100; `result` is categorical, in words.
 
-        **Arguments:** `values`: a function of `swept.values` that returns what to show in their place, each with the
-        axes in front: `lambda values: {"end": values.q[..., -1]}`. Of trajectories that is asked for.
+        **Arguments:** `values`: a function of `swept.values` that returns the values to show instead, each with the
+        axes in front: `lambda values: {"end": values.q[..., -1]}`. Trajectories require it.
 
-        **Raises:** `ImportError` without pandas; `ValueError` where a point has more than a row has room for.
+        **Raises:** `ImportError` without pandas; `ValueError` if a point has more numbers than fit into a row.
         """
-        return exported.frame(self, values)
+        return tables.frame(self, values)
 
     def plot(self, value: str | Callable | None = None):
         """Draw values over the axes: lines over one, a map over two, a map for each value of the first over three.
 
         **Arguments:** `value`: the name of a leaf, or a function of `values` that returns an array in the shape of the
-        axes; by default every leaf with one number a point. Lines mark what is not `ok`; NaN is grey in maps. A
-        `Trajectory` over one axis is drawn against time, a curve a point.
+        axes; by default every leaf with one number per point. Line plots mark points that are not `ok`; NaN is grey in
+        maps. A `Trajectory` over one axis is drawn against time, one curve per point.
 
         **Returns:** a matplotlib `Figure`.
 
-        **Raises:** `ValueError` where there is no such value, or more than three axes.
+        **Raises:** `ValueError` if there is no such value, or there are more than three axes.
         """
         values = self.values
         if value is None and isinstance(values, Trajectory) and len(self.axes.shape) == 1:
@@ -170,7 +170,7 @@ class Sweep:
             return plot.lines(name, x, panels, ~self.ok)
         if len(axes) > 3:
             raise ValueError(
-                f"a picture has room for three axes, and this sweep has {len(axes)}: {', '.join(axes)}.\n"
+                f"a figure can show three axes, and this sweep has {len(axes)}: {', '.join(axes)}.\n"
                 "Fix: choose a part with swept.to_xarray().isel(...) and plot that."
             )
         return plot.maps(axes, panels)
@@ -193,24 +193,24 @@ class Sweep:
         >>> swept.to_html()  # doctest: +ELLIPSIS
         Page of 3 points, v (3), ... kB: works in a notebook, and with .save("page.html") in a browser
 
-        It shows how the chosen point went, in words; of values with one number a point the number, and a curve over the
-        axis that was moved last; of a `Trajectory` its curves against time; of arrays their columns, against the array
-        `t` beside them in a dictionary, or else their index.
+        It shows how the chosen point ended, in words. A value with one number per point is shown as a number, and as a
+        curve over the axis that was moved last; a `Trajectory` as curves against time; an array as curves, one per
+        column, against the array `t` in the same dictionary, or else against the index.
 
         **Arguments:**
 
-        - `path`: where to write the page; it can be written later, too: `page.save(path)`.
-        - `positions`, `seconds`, `rate`, `trail`: of a sweep of trajectories, a film as `Trajectory.animate` makes it.
-        - `megabytes`: how large the page may be.
+        - `path`: where to write the page; it can also be written later: `page.save(path)`.
+        - `positions`, `seconds`, `rate`, `trail`: for a sweep of trajectories, a film as made by `Trajectory.animate`.
+        - `megabytes`: the largest allowed size of the page.
 
         **Returns:** a `Page`, which shows itself in a notebook.
 
-        **Raises:** `ValueError` where there is nothing to draw, or more than the page may hold.
+        **Raises:** `ValueError` if there is nothing to draw, or the page would be too large.
         """
         in_front = lambda x: np.asarray(x).reshape(self.axes.size, *np.shape(x)[len(self.axes.shape) :])
         flat = jax.tree.map(in_front, self.values)
-        codes, of_film = self.status.result.reshape(-1), {"seconds": seconds, "rate": rate, "trail": trail}
-        page = page_of(self.axes, flat, codes, positions, megabytes, of_film)
+        codes, film_settings = self.status.result.reshape(-1), {"seconds": seconds, "rate": rate, "trail": trail}
+        page = page_of(self.axes, flat, codes, positions, megabytes, film_settings)
         if path is not None:
             page.save(path)
         return page
@@ -228,16 +228,16 @@ class Sweep:
         if callable(value):
             chosen = {"value": np.asarray(value(values))}
         else:
-            of_motions = jax.tree.map(_without_motion, values, is_leaf=lambda x: isinstance(x, Trajectory))
-            drawn = named_leaves(of_motions if value is None else values)
-            chosen = {name: x for name, x in drawn if value is None or name == value}
+            without_motions = jax.tree.map(_without_motion, values, is_leaf=lambda x: isinstance(x, Trajectory))
+            candidates = named_leaves(without_motions if value is None else values)
+            chosen = {name: x for name, x in candidates if value is None or name == value}
         numbers = {name: x for name, x in chosen.items() if x.shape == self.axes.shape}
         if not numbers:
-            there = ", ".join(f"'{name}' {x.shape[len(self.axes.shape) :]}" for name, x in named_leaves(values))
+            contents = ", ".join(f"'{name}' {x.shape[len(self.axes.shape) :]}" for name, x in named_leaves(values))
             named = f" named {value!r}" if isinstance(value, str) else ""
             raise ValueError(
-                f"there is no value{named} with one number a point; a point has {there}.\n"
-                "Fix: choose one, as swept.plot(lambda values: values.q[..., -1])."
+                f"there is no value{named} with one number per point; each point has {contents}.\n"
+                "Fix: choose one, such as swept.plot(lambda values: values.q[..., -1])."
             )
         return numbers
 
@@ -284,10 +284,10 @@ def _without_motion(part):
 def open_sweep(path: str | os.PathLike, *, run: Callable | None = None, system: Any = None) -> Sweep:
     """Open the sweep in a store: its values have the structure of what `run` returned, trajectories included.
 
-    Any version of lagjax, jax and diffrax may have written it. Statuses are read now, values when they are asked for.
-    A file that is missing, cut off or of another block is seen now, without reading the values; one that has changed
-    inside, when they are read. Either is told by name, and from then on its points are "lost from the store" in
-    `status`, and not `ok`; `lj.sweep(run, axes, store=path)` computes them again.
+    Any version of lagjax, jax and diffrax may have written it. Statuses are read now, values on first access. A file
+    that is missing, cut off or of another block is detected now, without reading the values; a file whose contents have
+    changed is detected when the values are read. Either causes a warning that names the file; its points are then "lost
+    from the store" in `status` and not `ok`. `lj.sweep(run, axes, store=path)` computes them again.
 
     >>> import tempfile
     >>> import lagjax as lj
@@ -296,24 +296,24 @@ def open_sweep(path: str | os.PathLike, *, run: Callable | None = None, system: 
     ...     print(open_sweep(folder + "/squares").counts())
     {'successful': 2}
 
-    **Arguments:** `path`: the folder that `lj.sweep` was given as `store`. Functions are not stored, so that a
-    trajectory does not know its system. It plots and plays all the same; what else it needs one for (`print`,
-    `drift()`) it has with `system`, the one that was integrated, or with `run`, the function that was swept, which is
-    traced for it and not run.
+    **Arguments:** `path`: the folder that was passed to `lj.sweep` as `store`. Functions are not stored, so a
+    trajectory does not know its system. It can be plotted and animated all the same. For methods that need the system
+    (`print`, `drift()`), pass `system`, the one that was integrated, or `run`, the function that was swept; `run` is
+    only traced, not run.
 
     **Returns:** a `Sweep`.
 
-    **Raises:** `ValueError` where there is no store, nothing can be told of it, or `run` returns something else than
-    it has. Of a store in an earlier format `values` is a dictionary by name; and of values with functions among
-    them, or of classes that are not found, which a warning names.
+    **Raises:** `ValueError` if there is no store, its description is damaged, or `run` returns another structure.
+    `values` is a dictionary by name for a store in an earlier format, and for values that contain functions, or classes
+    that are not found (which a warning names).
     """
     path = Path(path)
     if wrong := restore(path):
-        tell(path, wrong, "It is put back; nothing needs to be done.", stacklevel=2)
+        warn_of_damage(path, wrong, "It has been restored; nothing needs to be done.", stacklevel=2)
     store = Store(path, "r")
     axes, (status, missing, lost) = store.axes(), store.status()
     if lost:
-        tell(path, lost.values(), COMPUTED_AGAIN, stacklevel=2)
+        warn_of_damage(path, lost.values(), COMPUTED_AGAIN, stacklevel=2)
     how = f"from {path}" + (f", of which {len(missing)} blocks are missing" if missing else "")
     if (by := store.about["fingerprint"]["versions"]) != versions():
         how += f", written by {versions_in_words(by)}"
@@ -322,23 +322,23 @@ def open_sweep(path: str | os.PathLike, *, run: Callable | None = None, system: 
 
 
 def opened(swept, run, indices):
-    """What runs points of an opened sweep again: nothing."""
+    """Refuse to run points of an opened sweep again."""
     raise ValueError(
-        "a sweep that was opened from its store does not know what ran it.\n"
+        "a sweep that was opened from its store does not know the function that ran it.\n"
         "Fix: lj.sweep(run, axes, store=path), which computes what is missing; without a store lj.sweep(run, axes)."
     )
 
 
 def of_store(swept, run, indices):
-    """What runs points of a sweep in a store again: nothing."""
+    """Refuse to run points of a sweep in a store with another function."""
     raise ValueError(
-        "what is in a store belongs to the run that it was begun with.\n"
-        "Fix: lj.sweep(other, axes of what failed, paired=True), or a sweep without a store."
+        "the values in a store belong to the run that it was begun with.\n"
+        "Fix: lj.sweep(other, axes of the failed points, paired=True), or a sweep without a store."
     )
 
 
 class Stored:
-    """The values of a store, read when asked for; `like` has the shapes of one point. In a pickle it is a path."""
+    """The values of a store, read on access; `like` has the shapes of one point. A pickle holds only the path."""
 
     def __init__(self, store: Store | Path, like: PyTree):
         self._store, self._like = store, like
@@ -349,7 +349,7 @@ class Stored:
 
     @property
     def store(self) -> Store:
-        """The store, opened when it is first needed."""
+        """The store, opened on first access."""
         if isinstance(self._store, Path):
             self._store = Store(self._store, "r")
         return self._store
@@ -360,7 +360,7 @@ class Stored:
         return self.store.one() if self._like is None else self._like
 
     def read(self, known: np.ndarray) -> tuple[PyTree, np.ndarray]:
-        """(the values, which points are lost); those that are not `known` to be are told."""
+        """(the values, which points are lost); warns of lost points that are not yet `known`."""
         values, lost = self.store.values(self._like)
         where, new = known.copy(), []
         for number, wrong in lost.items():
@@ -368,7 +368,7 @@ class Stored:
             new += [] if known[here].all() else [wrong]
             where[here] = True
         if new:
-            tell(self.store.path, new, COMPUTED_AGAIN, stacklevel=3)
+            warn_of_damage(self.store.path, new, COMPUTED_AGAIN, stacklevel=3)
         for x in jax.tree.leaves(values):
             x[where] = nothing(x.dtype)
         return values, where

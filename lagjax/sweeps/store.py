@@ -1,23 +1,23 @@
-"""A sweep on disk: a zarr group that xarray reads as it lies, written block by block, each marked when it is all there.
+"""A sweep on disk: a zarr group that xarray reads directly, written block by block; complete blocks are marked.
 
-    NAME                (*axes,) + what a point has: values by `labels`, result, steps, scaled_error, residual; the axes
-    lagjax              what the store says about itself, and
-    lagjax/values/NAME  what of trajectories has no label: their ends, statistics, parameters
-    lagjax/marks        (blocks, arrays, 2): of each block the length and checksum of its files; written last
+    NAME                (*axes,) + a point's shape: values by `labels`, result, steps, scaled_error, residual; the axes
+    lagjax              the description of the store, and
+    lagjax/values/NAME  the arrays of trajectories without a label: their ends, statistics, parameters
+    lagjax/marks        (blocks, arrays, 2): the length and checksum of each file of a block; written last
 
-A block is a box of the grid, and a run of flat indices (`grids`). One that is not marked is computed again, whatever of
-it was written. To zarr a file that is not there is a block of fill values, so that the marks must tell what belongs
-there. They are looked at in two ways:
+A block is a box of the grid with consecutive flat indices (`grids`). A block that is not marked is computed again, even
+if parts of it were written. Zarr reads a missing file as a block of fill values, so the marks must record which files
+belong there. Files are compared with their marks in two ways:
 
-- a glance, whenever a store is opened: each file is there, is as long as it was and ends as it did. It reads 4 bytes a
-  file, and sees what is missing, cut off, or of another block;
-- a full check, of its own part, when a sweep goes on: each file is read and has its checksum (crc32c).
+- a quick check, whenever a store is opened: each file exists, has its length and ends with its checksum. It reads 4
+  bytes per file, and detects files that are missing, cut off, or of another block;
+- a full check when a sweep continues, of this process's part: each file is read and its checksum (crc32c) computed.
 
-What neither has seen yet, zarr sees when values are read. In format 1, without checksums, a file that is not there is
-lost if there should be numbers in it, and one of fill values looks alike (`earlier`).
+Zarr detects any other damage when values are read. In format 1, without checksums, a missing file counts as lost if
+there should be numbers in it; the loss of a file that held only fill values is not noticed (`earlier`).
 
 Needs zarr (`pip install "lagjax[data]"`). A transactional store made for object stores (icechunk 1.1) was tried: of 64
-blocks that 8 processes had committed on a file system 16 were gone, as it warns.
+blocks that 8 processes had committed on a file system, 16 were lost, as its documentation warns.
 """
 
 import math
@@ -36,27 +36,27 @@ from lagjax.sweeps.grids import Blocks
 from lagjax.sweeps.lanes import GOOD, LOST, NOT_RUN, Program, Status
 from lagjax.sweeps.metadata import about, create, import_zarr, remove_leftovers, restore
 
-# What zarr and its codecs raise for files that are not what they were.
+# The exceptions that zarr and its codecs raise for damaged files.
 UNREADABLE = (ValueError, RuntimeError, TypeError, OSError)
-# The bytes of a checksum.
+# The length of a checksum in bytes.
 CHECKSUM = 4
-# Files that a message names, of many.
+# The largest number of files that a message names.
 SHOWN = 5
 
 
 class Store:
-    """A sweep's store, open. Its metadata are whole: `metadata.restore` comes first."""
+    """An open store of a sweep. Call `metadata.restore` first, so that its metadata are intact."""
 
     def __init__(self, path: str | os.PathLike, mode: str = "r+"):
         self.path = Path(path)
         self.about: dict[str, Any] = about(self.path)
         self.format: int = self.about["fingerprint"]["format"]
         places = self.about["places"]
-        # By the name of a leaf, or of a field.
+        # The array of each leaf of the values, and of each field of the status.
         self._values: dict[str, str] = {name: places["values"][name] for name in self.about["fingerprint"]["values"]}
         self._status: dict[str, str] = {name: places["status"][name] for name in Status._fields}
         zarr = import_zarr()
-        # A block of nothing but fill values has a file like any other.
+        # Blocks that contain only fill values are written to files as well.
         with zarr.config.set({"array.write_empty_chunks": True}):
             group: Any = zarr.open_group(str(path), mode=mode, use_consolidated=False)
             self.group = group
@@ -65,12 +65,12 @@ class Store:
             self._marks_name: str = places["marks"]
             self._marks_array = group[self._marks_name]
         shape = self.arrays[self._status["result"]].shape
-        # In earlier formats the grid is a row of all points.
+        # In earlier formats the grid is one-dimensional.
         self.blocks = Blocks(shape, tuple(self.about["block"]))
 
     @property
     def size(self) -> int:
-        """How many points there are."""
+        """The number of points."""
         return math.prod(self.blocks.shape)
 
     def missing(self) -> np.ndarray:
@@ -78,7 +78,7 @@ class Store:
         return self._missing(self._marks()[0])
 
     def _marks(self):
-        """(the marks of all blocks, 0 where there is none; the numbers of the blocks whose mark is damaged)."""
+        """(the marks of all blocks, 0 for unmarked ones; the numbers of the blocks whose mark is damaged)."""
         return _read(self._marks_array, lambda number: slice(number, number + 1), len(self.blocks))
 
     def _missing(self, marks):
@@ -95,14 +95,14 @@ class Store:
         self._marks_array[number] = marks
 
     def unmark(self, numbers: Iterable[int]):
-        """Forget that some blocks were written."""
+        """Mark some blocks as not written."""
         for number in numbers:
             self._marks_array[number] = 0
 
     def damage(self, numbers: Iterable[int], read: bool, marks=None) -> dict[int, str]:
-        """What of some blocks is not whole: by the block's number the file, and what is wrong with it.
+        """The damage of some blocks: by the block's number, the file and what is wrong with it.
 
-        A glance, or with `read` a full check. Blocks that are not marked are not looked at.
+        A quick check, or a full check if `read`. Blocks that are not marked are skipped.
         """
         marks, unreadable = self._marks() if marks is None else marks
         found = {}
@@ -117,7 +117,7 @@ class Store:
         return found
 
     def first(self) -> int | None:
-        """The number of the first block that is there."""
+        """The number of the first marked block."""
         missing = set(self.missing().tolist())
         return next((number for number in range(len(self.blocks)) if number not in missing), None)
 
@@ -134,9 +134,9 @@ class Store:
             file = self._file(name, number)
             try:
                 with open(file, "rb") as content:
-                    there = os.fstat(content.fileno()).st_size
-                    if there != length:
-                        yield f"{file} has {there:,} bytes of {length:,}"
+                    stored = os.fstat(content.fileno()).st_size
+                    if stored != length:
+                        yield f"{file} has {stored:,} bytes of {length:,}"
                         continue
                     if not read:
                         content.seek(-CHECKSUM, os.SEEK_END)
@@ -154,7 +154,7 @@ class Store:
         for name, array in self.arrays.items():
             file = self._file(name, number)
             if file is not None and not file.exists():
-                # Steps and the like that are all 0 had no file; results never were like what fills them.
+                # Arrays such as steps had no file if all their values were 0; results never equal their fill value.
                 if array is result or name in self._values.values() and np.isin(result[here], GOOD).any():
                     yield f"{file} is missing"
             elif read:
@@ -164,7 +164,7 @@ class Store:
                     yield f"{file} is damaged"
 
     def _file(self, name, number):
-        """The file of a block; None where an array has no numbers."""
+        """The file of a block; None for an empty array."""
         if name == self._marks_name:
             return self.path.joinpath(name, "c", str(number), *"0" * (len(self._marks_array.shape) - 1))
         shape, place = self.arrays[name].shape, self.blocks.place(number)
@@ -172,9 +172,9 @@ class Store:
         return None if math.prod(shape) == 0 else self.path.joinpath(name, "c", *map(str, place), *inner)
 
     def axes(self) -> Axes:
-        """The axes as they were written.
+        """The axes.
 
-        **Raises:** `ValueError` where their values are not.
+        **Raises:** `ValueError` if their values are damaged.
         """
         names = tuple(self.about["names"])
         return Axes(names, tuple(map(self._axis, names)), self.about["paired"])
@@ -195,7 +195,7 @@ class Store:
         return x
 
     def write_axes(self, axes: Axes) -> list[str]:
-        """Write the axes again where they are damaged, which are told, by the folder."""
+        """Write damaged axes again; returns a line about each."""
         damaged = []
         for name, x in axes.values.items():
             try:
@@ -207,11 +207,11 @@ class Store:
         return damaged
 
     def values(self, like=None) -> tuple[Any, dict[int, str]]:
-        """(the values of all points, what is lost: by the block's number, what is wrong with it).
+        """(the values of all points; the lost blocks: by number, what is wrong).
 
-        Each is (points, ...), in the structure of `like` or in a dictionary by name; NaN or 0 where there is no block.
+        Values are (points, ...), in the structure of `like` or in a dictionary by name; NaN or 0 in missing blocks.
         """
-        named, (missing, lost) = {}, self._glance()
+        named, (missing, lost) = {}, self._quick_check()
         for name, place in self._values.items():
             named[name], unreadable = self._read(place)
             lost.update({number: f"{self._file(place, number)} is damaged" for number in unreadable})
@@ -224,18 +224,18 @@ class Store:
         return named, lost
 
     def _read(self, name):
-        """(all of an array, each point in a row; the numbers of the blocks that cannot be read)."""
+        """(an array as (points, ...), the numbers of the blocks that cannot be read)."""
         found, unreadable = _read(self.arrays[name], self.blocks.region, len(self.blocks))
         return found.reshape(self.size, *found.shape[len(self.blocks.shape) :]), unreadable
 
     def one(self) -> dict[str, jax.ShapeDtypeStruct]:
-        """The shapes of one point's values by name, without reading any."""
+        """The shapes of one point's values by name, without reading any values."""
         arrays, lead = {name: self.arrays[place] for name, place in self._values.items()}, len(self.blocks.shape)
         return {name: jax.ShapeDtypeStruct(x.shape[lead:], x.dtype) for name, x in arrays.items()}
 
     def status(self) -> tuple[Status, set[int], dict[int, str]]:
-        """(the statuses of all points, the blocks that are not marked, what is lost of the others)."""
-        status, (missing, lost) = [], self._glance()
+        """(the statuses of all points, the unmarked blocks, the lost blocks with what is wrong)."""
+        status, (missing, lost) = [], self._quick_check()
         for place in self._status.values():
             x, unreadable = self._read(place)
             status.append(x)
@@ -247,27 +247,27 @@ class Store:
                     x[self.blocks.points(number)] = fill
         return Status(*status), missing, lost
 
-    def _glance(self):
-        """(the blocks that are not marked, what is lost of the others)."""
+    def _quick_check(self):
+        """(the unmarked blocks, the lost blocks with what is wrong), by a quick check."""
         marks, unreadable = self._marks()
         lost = self.damage(range(len(self.blocks)), False, (marks, unreadable))
         return set(self._missing(marks).tolist()) - set(unreadable), lost
 
 
-def tell(path: Path, wrong: Iterable[str], then: str, stacklevel: int):
-    """Warn of what is not whole in a store."""
+def warn_of_damage(path: Path, wrong: Iterable[str], then: str, stacklevel: int):
+    """Warn of damage in a store."""
     wrong = list(wrong)
     more = [f"and {len(wrong) - SHOWN:,} more"] if len(wrong) > SHOWN else []
     lines = "\n".join(f"    {line}" for line in [*wrong[:SHOWN], *more])
     warnings.warn(
-        f"the store {path} is not whole:\n{lines}\n"
+        f"the store {path} is damaged or incomplete:\n{lines}\n"
         "Usual cause: a copy that was cut short, files removed, a disk or its network that failed.\n" + then,
         stacklevel=stacklevel + 1,
     )
 
 
 def _read(array, region, blocks):
-    """(all of an array, the numbers of the blocks that cannot be read)."""
+    """(the whole array, the numbers of the blocks that cannot be read)."""
     try:
         return np.asarray(array[...]), []
     except UNREADABLE:
@@ -281,7 +281,7 @@ def _read(array, region, blocks):
 
 
 def nothing(dtype):
-    """What stands where there is no value."""
+    """The fill value of a dtype."""
     return np.nan if np.issubdtype(dtype, np.inexact) else 0
 
 
@@ -300,14 +300,14 @@ def _number(data):
 
 
 def _crc32c():
-    # Zarr has it, for the same use.
+    # A dependency of zarr, which uses it for the same checksums.
     from google_crc32c import value
 
     return value
 
 
 def chunk_of(path: str | os.PathLike) -> int:
-    """The points of a call of the program that a store was begun with."""
+    """The chunk length that a store was begun with."""
     return about(Path(path))["fingerprint"]["chunk"]
 
 
@@ -318,16 +318,16 @@ def open_store(
     layout: str,
     part: tuple[int, int],
     accept: bool,
-    begun: Callable[[], tuple[Blocks, dict, dict | None]],
+    new_store: Callable[[], tuple[Blocks, dict, dict | None]],
 ) -> Store:
-    """Open the store of a sweep, made where there is none; refuse one that belongs to another sweep.
+    """Open the store of a sweep, or make it if there is none; refuse one that belongs to another sweep.
 
-    `begun()`: the blocks of a new one, the times of its trajectories that all points share, the structure of values.
-    What of a store is not whole is told, put back or, of this part, marked as missing.
+    `new_store()`: the blocks of a new store, the times of trajectories that all points share, the structure of values.
+    Damage causes a warning; metadata and axes are restored, and damaged blocks of this part are marked as missing.
     """
     wanted = fingerprint(axes, program, layout)
     if not path.exists():
-        create(path, axes, program, wanted, *begun())
+        create(path, axes, program, wanted, *new_store())
     _check_belongs(path, about(path)["fingerprint"], wanted, accept)
     remove_leftovers(path)
     wrong = restore(path)
@@ -335,28 +335,29 @@ def open_store(
     wrong += store.write_axes(axes)
     lost = store.damage(range(part[0], len(store.blocks), part[1]), read=True)
     if wrong or lost:
-        again = f"Blocks that are computed again: {len(lost):,} of {len(store.blocks):,}" if lost else "It is put back"
-        tell(path, [*wrong, *lost.values()], f"{again}; nothing needs to be done.", stacklevel=4)
+        recomputed = f"Blocks that are computed again: {len(lost):,} of {len(store.blocks):,}"
+        outcome = recomputed if lost else "It has been restored"
+        warn_of_damage(path, [*wrong, *lost.values()], f"{outcome}; nothing needs to be done.", stacklevel=4)
     store.unmark(lost)
     return store
 
 
-def _check_belongs(path, there, here, accept):
-    found = differences(there, here)
+def _check_belongs(path, stored, here, accept):
+    found = differences(stored, here)
     older = [line for line in found if line.startswith(("versions", "format"))]
-    # Another version traces another program of the same function.
-    rest = [line for line in found if line not in older and not (older and line == ANOTHER_FUNCTION)]
+    # Other versions may trace another program from the same function.
+    other = [line for line in found if line not in older and not (older and line == ANOTHER_FUNCTION)]
     shown = lambda lines: "".join(f"    {line}\n" for line in lines)
-    if rest:
+    if other:
         raise ValueError(
-            f"{path} belongs to another sweep, and is left as it is:\n{shown(found)}"
+            f"{path} belongs to another sweep, and is left unchanged:\n{shown(found)}"
             "Usual cause: run, the axes or a setting has changed since it was begun.\n"
-            "Fix: another path; or change back what differs, to go on with this one."
+            "Fix: another path; or undo the differences, to continue this one."
         )
     if older and not accept:
         raise ValueError(
-            f"{path} was written by other versions, and is left as it is:\n{shown(older)}"
-            "What it has can be read: lj.open_sweep(path).\n"
-            "Fix: lj.sweep(..., accept_versions=True) goes on with it where run is still the same function, which "
-            "cannot be told across versions; or another path."
+            f"{path} was written by other versions, and is left unchanged:\n{shown(older)}"
+            "Its contents can be read: lj.open_sweep(path).\n"
+            "Fix: lj.sweep(..., accept_versions=True) continues it if run is still the same function, which "
+            "cannot be checked across versions; or another path."
         )

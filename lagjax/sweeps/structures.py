@@ -1,8 +1,8 @@
-"""The structure of what `run` returned, for values that are read from a store or a pickle: written down as JSON.
+"""The structure of what `run` returned, described in JSON for values that are read from a store or a pickle.
 
-Leaves are named, and trajectories written down as in their own files, without the functions of their systems. What
-cannot be written down (a function among the values, an object of a class that JSON has no word for) has no such
-description: its values are a dictionary by name.
+Leaves are named, and trajectories are described as in their own files, without the functions of their systems. Values
+that contain a function, or an object of a class that cannot be described in JSON, have no such description: they are
+read as a dictionary by name.
 """
 
 import base64
@@ -29,88 +29,87 @@ from lagjax.sweeps.travelling import pickled, shapes_of
 LEAF, MOTION = "leaf", "trajectory"
 
 
-class _Given:
-    """In a tree that is written down what is not: the role of a leaf, or of a trajectory."""
+class _Marker:
+    """A marker in a described tree, in place of a leaf or a trajectory, which are stored separately."""
 
     def __init__(self, role: str):
         self.role = role
 
 
-def written(like: PyTree, one: PyTree | None) -> dict[str, Any] | None:
-    """The description of values like these; None where there is none. `one` has numbers, of which systems are asked."""
+def description_of(like: PyTree, one: PyTree | None) -> dict[str, Any] | None:
+    """The description of values like these, or None. Systems are described from `one`, a point with numbers."""
     names = iter([name for name, _ in named_leaves(like)])
-    named = jax.tree.map(lambda x: _Given(f"{LEAF} {next(names)}"), like)
+    named = jax.tree.map(lambda x: _Marker(f"{LEAF} {next(names)}"), like)
     motions, found = jax.tree.leaves(named, is_leaf=_is_motion), []
     motions = [x for x in motions if _is_motion(x)]
-    asked = [x for x in jax.tree.leaves(one, is_leaf=_is_motion) if _is_motion(x)] if one is not None else motions
-    writer = Writer(lambda value: value.role if isinstance(value, _Given) else None)
+    examples = [x for x in jax.tree.leaves(one, is_leaf=_is_motion) if _is_motion(x)] if one is not None else motions
+    writer = Writer(lambda value: value.role if isinstance(value, _Marker) else None)
     count = iter(range(len(motions)))
-    tree = jax.tree.map(lambda x: _Given(f"{MOTION} {next(count)}") if _is_motion(x) else x, named, is_leaf=_is_motion)
+    tree = jax.tree.map(lambda x: _Marker(f"{MOTION} {next(count)}") if _is_motion(x) else x, named, is_leaf=_is_motion)
     try:
-        for motion, numbers in zip(motions, asked):
-            system = described(numbers) if one is not None else UnknownSystem(repr(motion.any_system), (), {}, None)
-            # In NumPy: a process that works in float32 can read these, too.
-            of = jax.tree.map(_in_numpy, {name: getattr(system, name) for name in system.__dataclass_fields__})
-            nodes = parts(motion, lambda result: {"codes": result._value, "names": {}}) | {"system": of}
+        for motion, numbered in zip(motions, examples):
+            system = described(numbered) if one is not None else UnknownSystem(repr(motion.any_system), (), {}, None)
+            # NumPy arrays, so that a process that works in float32 can read them, too.
+            fields = jax.tree.map(_in_numpy, {name: getattr(system, name) for name in system.__dataclass_fields__})
+            nodes = parts(motion, lambda result: {"codes": result._value, "names": {}}) | {"system": fields}
             found.append({name: writer.down(x, name) for name, x in nodes.items()})
-        said = {"tree": writer.down(tree, "values"), "trajectories": found}
+        description = {"tree": writer.down(tree, "values"), "trajectories": found}
     except NotWritable:
         return None
-    return said | {"arrays": {name: _in_json(x) for name, x in writer.arrays.items()}}
+    return description | {"arrays": {name: _in_json(x) for name, x in writer.arrays.items()}}
 
 
-def read(said: dict[str, Any], system: Any, path: Any) -> PyTree:
-    """The tree, with small arrays for leaves, whose values are of no use. Systems other than `system` stay unknown.
+def tree_of(description: dict[str, Any], system: Any, path: Any) -> PyTree:
+    """The described tree, with meaningless small arrays for leaves. Systems other than `system` stay unknown.
 
-    **Raises:** `ValueError` where none of its trajectories was integrated with `system`, and for classes that are not
-    found.
+    **Raises:** `ValueError` if none of its trajectories was integrated with `system`, or a class is not found.
     """
-    arrays = {name: _from_json(x) for name, x in said["arrays"].items()}
-    refused, known = [], []
+    arrays = {name: _from_json(x) for name, x in description["arrays"].items()}
+    mismatches, matching = [], []
 
-    def given(role):
-        kind, _, which = role.partition(" ")
+    def marked_value(role):
+        kind, _, number = role.partition(" ")
         if kind == LEAF:
             return jnp.zeros(())
-        found = {name: reader.up(node) for name, node in said["trajectories"][int(which)].items()}
+        found = {name: reader.up(node) for name, node in description["trajectories"][int(number)].items()}
         about = UnknownSystem(**found["system"])
         kept = UnknownSystem(about.words, about.angles, {}, None)
         if system is not None:
             try:
                 kept = same_system(system, about, path)
-                known.append(kept)
+                matching.append(kept)
             except ValueError as error:
-                refused.append(error)
+                mismatches.append(error)
         return trajectory_of(found, kept)
 
-    reader = Reader(arrays, given)
-    tree = reader.up(said["tree"])
-    if refused and not known:
-        raise refused[0]
+    reader = Reader(arrays, marked_value)
+    tree = reader.up(description["tree"])
+    if mismatches and not matching:
+        raise mismatches[0]
     return tree
 
 
 def as_stored(store: Store, system: Any = None) -> PyTree | None:
-    """One point's values, as shapes, as the store describes them; None where it does not, or a class is not found.
+    """The shapes of one point's values, as the store describes them; None without description or if a class is missing.
 
-    **Raises:** `ValueError` where `system` is not the one of any trajectory, or there is none.
+    **Raises:** `ValueError` if no trajectory has this `system`, or there are no trajectories.
     """
-    said = store.about.get("structure")
-    if system is not None and (said is None or not said["trajectories"]):
+    description = store.about.get("structure")
+    if system is not None and (description is None or not description["trajectories"]):
         raise ValueError(
-            f"{store.path} has no trajectories that ask for a system.\n"
-            "Usual cause: run returned numbers; or a store in an earlier format.\nFix: leave system out, or give run=."
+            f"{store.path} has no trajectories that need a system.\n"
+            "Usual cause: run returned numbers; or a store in an earlier format.\nFix: leave system out, or pass run=."
         )
-    if said is None:
+    if description is None:
         return None
     try:
-        tree = read(said, system, store.path)
+        tree = tree_of(description, system, store.path)
     except ValueError as error:
         if system is not None:
             raise
         warnings.warn(
             f"the values of {store.path} are a dictionary by name: {error}\n"
-            "Fix, where that does not help: lj.open_sweep(path, run=run), with the function that was swept.",
+            "Fix, if that does not help: lj.open_sweep(path, run=run), with the function that was swept.",
             stacklevel=3,
         )
         return None
@@ -120,56 +119,56 @@ def as_stored(store: Store, system: Any = None) -> PyTree | None:
 
 
 def as_run_returns(run: Callable, axes: Axes, store: Store) -> PyTree:
-    """The same: what `run` would return.
+    """The shapes of one point's values, as `run` would return them.
 
-    **Raises:** `ValueError` where the store has others.
+    **Raises:** `ValueError` if the store has other values.
     """
     like = jax.eval_shape(run, {name: jax.ShapeDtypeStruct(x.shape[1:], x.dtype) for name, x in axes.values.items()})
-    there, here = shapes_of(store.one(), 0), shapes_of(like, 0)
-    if there != here:
+    stored, here = shapes_of(store.one(), 0), shapes_of(like, 0)
+    if stored != here:
         raise ValueError(
-            f"run returns {here}, and {store.path} has {there}.\nFix: the function that was swept; or leave run out."
+            f"run returns {here}, but {store.path} has {stored}.\nFix: the function that was swept; or leave run out."
         )
     return like
 
 
 class Travelling(NamedTuple):
-    """Values in a pickle: their leaves, and their structure, as pickle has it and as JSON has it.
+    """Values in a pickle: their leaves, and their structure, both pickled and described in JSON.
 
-    Functions that pickle does not find, here or where it is read, are left out: then trajectories do not know their
-    system.
+    Functions that pickle does not find, on either side, are left out; trajectories then do not know their system.
     """
 
     leaves: list
     structure: bytes | None
     described: dict[str, Any] | None
-    # Of the leaves. A system that is not known has none of those that it had.
+    # The names of the leaves. An unknown system has lost its own leaves, so they are matched by name.
     names: list[str]
 
     @classmethod
     def of(cls, values: PyTree) -> "Travelling":
-        """Values, to be pickled."""
+        """Prepare values for a pickle."""
         leaves, structure = jax.tree.flatten(values)
-        said = written(values, None) if any(map(_is_motion, jax.tree.leaves(values, is_leaf=_is_motion))) else None
-        names = [] if said is None else [name for name, _ in named_leaves(values)]
-        numbers = jax.tree.unflatten(structure, range(len(leaves)))
-        # Where there is no other way, pickle says itself what it does not take.
-        return cls(leaves, pickle.dumps(numbers) if said is None else pickled(numbers), said, names)
+        has_motions = any(map(_is_motion, jax.tree.leaves(values, is_leaf=_is_motion)))
+        description = description_of(values, None) if has_motions else None
+        names = [] if description is None else [name for name, _ in named_leaves(values)]
+        numbered = jax.tree.unflatten(structure, range(len(leaves)))
+        # Without a description, pickle raises its own error for what it cannot pickle.
+        return cls(leaves, pickle.dumps(numbered) if description is None else pickled(numbered), description, names)
 
     def unpacked(self) -> PyTree:
-        """The values again."""
+        """The values, restored."""
         try:
             if self.structure is not None:
                 return jax.tree.unflatten(jax.tree.structure(pickle.loads(self.structure)), self.leaves)
         except (AttributeError, ImportError):
-            # Where it was written its functions had names.
+            # A function or class was importable only in the process that wrote the pickle.
             pass
         if self.described is not None:
-            tree, leaves = read(self.described, None, None), dict(zip(self.names, self.leaves))
+            tree, leaves = tree_of(self.described, None, None), dict(zip(self.names, self.leaves))
             return jax.tree.unflatten(jax.tree.structure(tree), [leaves[name] for name, _ in named_leaves(tree)])
         raise pickle.UnpicklingError(
-            "the values of this sweep have functions among them, or objects of a class, that are not found here.\n"
-            "Fix: import where they are defined before this; or lj.open_sweep, of a sweep in a store."
+            "the values of this sweep contain functions, or objects of a class, that are not found here.\n"
+            "Fix: first import the module that defines them; or lj.open_sweep, for a sweep in a store."
         )
 
 
@@ -185,6 +184,6 @@ def _in_json(x):
     return {"dtype": x.dtype.str, "shape": list(x.shape), "base64": base64.b64encode(x.tobytes()).decode()}
 
 
-def _from_json(said):
-    data = base64.b64decode(said["base64"])
-    return np.frombuffer(data, said["dtype"]).reshape(said["shape"]).copy()
+def _from_json(stored):
+    data = base64.b64decode(stored["base64"])
+    return np.frombuffer(data, stored["dtype"]).reshape(stored["shape"]).copy()

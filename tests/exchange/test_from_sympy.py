@@ -1,4 +1,4 @@
-"""Systems from SymPy: against SymPy's own equations, SciPy's integrator, closed forms, and what is written by hand."""
+"""Systems from SymPy: compared with SymPy's own equations, SciPy's integrator, closed forms, and systems by hand."""
 
 import copy
 import dataclasses
@@ -25,7 +25,7 @@ KINETIC, POTENTIAL = m * (x.diff() ** 2 + y.diff() ** 2) / 2, m * g * y
 
 
 def double_pendulum_of_particles():
-    """Two particles on rods, their energies found by SymPy from the places where they are."""
+    """Two particles on rods, their energies found by SymPy from their positions."""
     m1, m2, l1, l2 = sp.symbols("m1 m2 l1 l2", positive=True)
     N, pivot = me.ReferenceFrame("N"), me.Point("O")
     pivot.set_vel(N, 0)
@@ -58,7 +58,7 @@ def by_sympy_and_scipy(L, coordinates, parameters, params, q0, v0, ts):
 
 @pytest.mark.slow
 def test_double_pendulum():
-    """The same motion as from the Lagrangian by hand and from SymPy's own equations; twin: without a term another."""
+    """The same motion as from a Lagrangian by hand and SymPy's equations; twin: without a term it differs."""
     L, coordinates, parameters = double_pendulum_of_particles()
     ts, (q0, v0) = np.linspace(0.0, 3.0, 7), DOUBLE_SWING
     expected = by_sympy_and_scipy(L, coordinates, parameters, DOUBLE_PARAMS, q0, v0, ts)
@@ -75,7 +75,7 @@ def test_double_pendulum():
 
 
 def method_of_a_rod():
-    """A mass on a rod, in x and y, with air that drags it, as SymPy has it."""
+    """A mass on a rod, in x and y, with air drag, as a `LagrangesMethod`."""
     N, P = me.ReferenceFrame("N"), me.Point("P")
     P.set_vel(N, x.diff() * N.x + y.diff() * N.y)
     drag = [(P, -c * P.vel(N))]
@@ -84,7 +84,7 @@ def method_of_a_rod():
 
 
 def test_constraints_of_lagranges_method():
-    """Accelerations and the multiplier are SymPy's, whose `lam1` has the other sign; so is the force of air."""
+    """Accelerations with drag and the multiplier equal SymPy's, whose `lam1` has the opposite sign."""
     method, params = method_of_a_rod(), {"m": 1.5, "g": 9.75, "l": 1.25, "c": 0.5}
     state = {x: 0.75, y: -1.0, x.diff(): 2.0, y.diff(): 1.5}
     system = lj.from_sympy(method, parameters=[m, g, l, c])
@@ -98,7 +98,7 @@ def test_constraints_of_lagranges_method():
     np.testing.assert_allclose([a["x"], a["y"], multipliers["constraint1"]], [ax, ay, multiplier], rtol=1e-13)
     solved = method.solve_multipliers(op_point=numbers)
     np.testing.assert_allclose(multipliers["constraint1"], -float(solved[method.lam_vec[0]]), rtol=1e-13)
-    # By hand, and so the sign: the rod pulls with m v²/l + m g cos(angle), towards the pivot, and ∂g/∂q points away.
+    # By hand, including the sign: the rod pulls with m v²/l + m g cos(angle), towards the pivot, and ∂g/∂q points away.
     pull = 1.5 * 6.25 / 1.25 + 1.5 * 9.75 * 1.0 / 1.25
     np.testing.assert_allclose(multipliers["constraint1"], -pull / (2 * 1.25), rtol=1e-13)
 
@@ -122,7 +122,7 @@ def test_knife_edge():
 
 
 def test_time_forces_and_dissipation():
-    """Time by itself, Q and R, a rigid body: m a = m Ω² x + F cos 3t - c v - k v, I α = -torque."""
+    """Explicit time, Q and R, a rigid body: m a = m Ω² x + F cos 3t - c v - k v, I α = -torque."""
     N, B, P = me.ReferenceFrame("N"), me.ReferenceFrame("B"), me.Point("P")
     B.orient_axis(N, theta, N.z)
     P.set_vel(N, 0)
@@ -155,7 +155,7 @@ STATES = [(0.75, 1.625), (1.875, -0.625), (-0.6875, 0.5)]
 
 
 def test_functions():
-    """Values and slopes of what may be in a Lagrangian are SymPy's, at numbers on all sides of its branches."""
+    """Values and slopes of all supported functions equal SymPy's, on all sides of their branches."""
     params = {"k": 1.25, "l": 0.75}
     system = lj.from_sympy(KINETIC, [x, y], [m, k, l], constraints={"all": EXPRESSIONS})
     of_all: Any = system.constraints["all"]
@@ -171,7 +171,7 @@ def test_functions():
             step = mpmath.mpf(10) ** -12
             for i, expected in enumerate(of(mpmath.mpf(p), mpmath.mpf(q))):
                 if mpmath.im(expected):
-                    # SymPy's roots and logarithms of negative numbers are complex, ours are none.
+                    # SymPy's roots and logarithms of negative numbers are complex, ours are NaN.
                     assert np.isnan(values[place, i]), EXPRESSIONS[i]
                     continue
                 close = {"rtol": 1e-12, "atol": 1e-12, "err_msg": str(EXPRESSIONS[i])}
@@ -182,7 +182,7 @@ def test_functions():
 
 
 def test_a_branch_that_is_not_taken_harms_nobody():
-    """Beside a root the slope is zero; twin: without the harmless number it is NaN."""
+    """Where a root is not taken the slope is zero; twin: without the harmless argument it is NaN."""
     ours: Any = lj.from_sympy(HERTZ, [x], [k]).lagrangian
     slope = lambda function, value: jax.grad(lambda x: function(0.0, {"x": x}, {"x": 0.0}, {"k": 1.0}))(value)
     assert slope(ours, -0.5) == 0.0 and slope(ours, 4.0) == 2.5 * 4.0**1.5
@@ -192,7 +192,7 @@ def test_a_branch_that_is_not_taken_harms_nobody():
 
 
 def test_copies_and_words():
-    """It prints its expression and its text, is equal to another one of the same text, and needs no SymPy any more."""
+    """A system prints its expression and source, and equals its copies and another one of the same source."""
     make = lambda: lj.from_sympy(KINETIC - POTENTIAL, [x, y], [m, g, l], constraints={"rod": sp.Eq(x**2 + y**2, l**2)})
     system = make()
     assert repr(system) == "System(-g*m*y + m*(x'**2 + y'**2)/2; constraints: rod (holonomic))"
@@ -204,7 +204,7 @@ def test_copies_and_words():
 
 
 def test_without_sympy(monkeypatch):
-    """What was pickled runs without SymPy; what asks for SymPy says how to get it."""
+    """A pickled system runs without SymPy; `from_sympy` says how to install it."""
     pickled = pickle.dumps(lj.from_sympy(KINETIC - POTENTIAL, [x, y], [m, g]))
     for name in [name for name in sys.modules if name.split(".")[0] == "sympy"]:
         monkeypatch.setitem(sys.modules, name, None)
@@ -216,8 +216,8 @@ def test_without_sympy(monkeypatch):
 
 L = KINETIC - POTENTIAL
 REFUSED = {
-    "an unknown symbol": (lambda: lj.from_sympy(L, [x, y], [m]), "(?s)'g' in it, and nothing.*parameters=.m, g."),
-    "another of its name": (lambda: lj.from_sympy(L, [x, y], [m, sp.Symbol("g")]), "'g' in it that is not the same"),
+    "an unknown symbol": (lambda: lj.from_sympy(L, [x, y], [m]), "(?s)'g', which is unknown.*parameters=.m, g."),
+    "another of its name": (lambda: lj.from_sympy(L, [x, y], [m, sp.Symbol("g")]), "a symbol 'g' that is not the same"),
     "a symbol named as a coordinate": (lambda: lj.from_sympy(L + sp.Symbol("y"), [x, y], [m, g]), "a coordinate, 'y'"),
     "another time": (lambda: lj.from_sympy(L + sp.Symbol("t", real=True), [x, y], [m, g]), "as the time of"),
     "an acceleration": (lambda: lj.from_sympy(L + x.diff(t, 2), [x, y], [m, g]), "an acceleration"),
@@ -227,25 +227,25 @@ REFUSED = {
     "the time": (lambda: lj.from_sympy(L, [x, y], [m, g, t]), "is the time"),
     "a matrix": (lambda: lj.from_sympy(sp.Matrix([L]), [x, y], [m, g]), "L.0. of a matrix"),
     "text": (lambda: lj.from_sympy("m", [x, y], [m, g]), "is a str"),
-    "no formula": (lambda: lj.from_sympy(L + sp.Function("V")(x), [x, y], [m, g]), "'V' is in L, and JAX"),
+    "no formula": (lambda: lj.from_sympy(L + sp.Function("V")(x), [x, y], [m, g]), "'V' is in L, but has no"),
     "nor this, of a known name": (lambda: lj.from_sympy(L + sp.Function("gamma")(x), [x, y], [m, g]), "'gamma' is in"),
     "a function of SymPy alone": (lambda: lj.from_sympy(L + sp.besselj(0, x), [x, y], [m, g]), "'besselj' is in L"),
     "a complex number": (lambda: lj.from_sympy(L + sp.I * x, [x, y], [m, g]), "'I' is in L"),
     "symbols as coordinates": (lambda: lj.from_sympy(L, sp.symbols("x y"), [m, g]), "a coordinate is a function"),
     "velocities as coordinates": (lambda: lj.from_sympy(L, [x, x.diff()], [m, g]), "is a velocity"),
     "no list": (lambda: lj.from_sympy(L, x, [m, g]), "coordinates must be a list"),
-    "numbers": (lambda: lj.from_sympy(L, [x, y], {m: 1.0}), "numbers are given to lj.integrate"),
+    "numbers": (lambda: lj.from_sympy(L, [x, y], {m: 1.0}), "numbers are passed to lj.integrate"),
     "no coordinates": (lambda: lj.from_sympy(L), "coordinates of the Lagrangian are missing"),
     "coordinates of a method": (lambda: lj.from_sympy(me.LagrangesMethod(L, [x, y]), [x]), "has its own coordinates"),
     "a truth": (lambda: lj.from_sympy(L, [x, y], [m, g], constraints={"rod": x == y}), "constraint 'rod' must be"),
-    "no condition": (lambda: lj.from_sympy(L, [x, y], [m, g], constraints={"rod": m - g}), "holds no coordinate"),
-    "a force on nothing": (lambda: lj.from_sympy(L, [x, y], [m, g], force={"x": 1}), "a part on 'x', and the"),
+    "no condition": (lambda: lj.from_sympy(L, [x, y], [m, g], constraints={"rod": m - g}), "contains no coordinate"),
+    "a force on nothing": (lambda: lj.from_sympy(L, [x, y], [m, g], force={"x": 1}), "a component for 'x', but the"),
 }  # fmt: skip
 
 
 @pytest.mark.parametrize("case", REFUSED)
 def test_what_is_refused(case):
-    """Named in the words of the one who wrote it, with the fix."""
+    """The error names the user's symbols and gives a fix."""
     ask, words = REFUSED[case]
     with pytest.raises((TypeError, ValueError), match=words):
         ask()

@@ -1,4 +1,4 @@
-"""Sliders without a browser: values arrive, nothing is compiled anew, and what fails says so and does no harm.
+"""Sliders without a browser: values arrive, nothing is recompiled, and failures are shown without breaking the widget.
 
 `benchmarks/slider_response.py` measures the same in JupyterLab, in a browser.
 """
@@ -31,12 +31,12 @@ def swing(point):
 
 
 def wave(point):
-    """What compiles at once, and is not there below omega = 1."""
+    """A function that compiles fast, and is NaN below omega = 1."""
     return {"t": TS, "x": jnp.sqrt(point["omega"] - 1.0) * jnp.sin(point["omega"] * TS), "double": 2 * point["omega"]}
 
 
 def knobs_of(run, knobs, **settings):
-    """Knobs, in silence."""
+    """Knobs without progress messages."""
     return lj.interact(run, knobs, progress=False, **settings)
 
 
@@ -48,7 +48,7 @@ def waves():
 
 @pytest.mark.slow
 def test_a_slider_moves_the_motion():
-    """A trajectory at the slider's values, as SciPy has it; another value compiles nothing."""
+    """A trajectory at the slider's values agrees with SciPy; another value compiles nothing."""
     knobs = knobs_of(swing, {"angle": (0.0, 3.0), "g": (1, 9)}, start={"angle": 1.0})
     before = knobs.picture
     with compiles() as compiled:
@@ -58,12 +58,12 @@ def test_a_slider_moves_the_motion():
     fall = lambda t, y: [y[1], -4.0 * np.sin(y[0])]
     angle = lambda start: solve_ivp(fall, (0.0, 3.0), [start, 0.0], t_eval=TS, rtol=1e-9, atol=1e-9).y[0]
     np.testing.assert_allclose(knobs.result.q, angle(2.0), atol=1e-3)
-    # Twin: the motion of the value before is another one.
+    # Twin: the motion of the previous value differs.
     assert np.max(np.abs(knobs.result.q - angle(1.0))) > 0.1
 
 
 def test_values_arrive(waves):
-    """What `run` returns, in NumPy; the picture of the same value is the same."""
+    """`result` is what `run` returns, as NumPy arrays; the same value gives the same picture."""
     pictures = [waves.set(omega=x).picture for x in (3.0, 5.0, 3.0)]
     assert waves.result["double"] == 6.0 and isinstance(waves.result["x"], np.ndarray)
     np.testing.assert_allclose(waves.result["x"], np.sqrt(2.0) * np.sin(3.0 * TS), rtol=1e-12, atol=1e-14)
@@ -72,7 +72,7 @@ def test_values_arrive(waves):
 
 
 def test_a_point_that_fails_says_why(waves):
-    """The reason is in the picture, the message and the print; the next point is as good as ever."""
+    """The reason is shown in picture, message and print; the next point works as usual."""
     well = waves.set(omega=4.0).picture
     failed = waves.set(omega=0.5)
     assert not failed.ok and "NaN" in failed.status and "NaN" in failed._message.value
@@ -81,7 +81,7 @@ def test_a_point_that_fails_says_why(waves):
 
 
 def test_a_draw_that_fails_says_why():
-    """An error in the user's drawing after the first one is shown, and the widget lives on."""
+    """An error in the user's later drawings is shown, and the widget keeps working."""
 
     def draw(result, axes):
         if result["double"] > 10.0:
@@ -97,7 +97,7 @@ def test_a_draw_that_fails_says_why():
 
 
 def test_choices_are_programs_of_their_own():
-    """What is no number reaches `run` as it is; it is compiled when it is first chosen, and kept."""
+    """Values that are not numbers reach `run` unchanged; their program is compiled at the first choice, and kept."""
 
     def run(point):
         return point["shape"](point["omega"] * TS) if point["shape"] is not None else 1 / 0
@@ -139,7 +139,7 @@ def test_slices_of_arrays():
 
 
 def test_dragging_leaves_no_queue(waves, monkeypatch):
-    """While one picture is made, positions that come meanwhile are passed over: the last is drawn next, and stays."""
+    """Positions that arrive while a picture is made are skipped, except the last, which is drawn next."""
     waves.set(omega=2.0)
     slider, drawn, shown = waves._sliders["omega"], [], waves._show
     busy, go_on = threading.Event(), threading.Event()
@@ -175,7 +175,7 @@ def test_several_at_once_are_one_picture(monkeypatch):
 
 
 def test_shows_itself(waves, tmp_path):
-    """In a notebook the sliders, where there are none the picture, in a terminal what to do."""
+    """A notebook shows the sliders, a viewer without widgets the picture, a terminal a hint."""
     shown = waves.set(omega=3.0)._repr_mimebundle_()
     assert "application/vnd.jupyter.widget-view+json" in shown and b64decode(shown["image/png"]) == waves.picture
     assert shown["text/plain"] == repr(waves)
@@ -186,7 +186,7 @@ def test_shows_itself(waves, tmp_path):
 
 
 def test_where_knobs_stand_at_first():
-    """In the middle of a range, on its steps; at the first of values; where `start` says."""
+    """Knobs start in the middle of a range, on a step; at the first value; or where `start` says."""
     controls = controls_of({"a": (0.1, 3.0, 0.1), "b": [3, 1, 2], "c": (0, 1, 0.6), "d": False, "e": ["x", "y"]})
     found = {name: start_of(name, control, {"e": "y"}) for name, control in controls.items()}
     assert found == {"a": pytest.approx(1.5), "b": 3, "c": 0.6, "d": False, "e": "y"}
@@ -201,13 +201,13 @@ def test_where_knobs_stand_at_first():
     ids=str,
 )  # fmt: skip
 def test_what_is_no_knob(given):
-    """It is named, with an example."""
+    """The error names the knob and gives an example."""
     with pytest.raises((TypeError, ValueError), match=r"(?s)'omega'.*Fix:"):
         controls_of({"omega": given})
 
 
 def test_what_else_is_refused(waves, monkeypatch):
-    """Not callable, no knobs, unknown names and values beyond; without ipywidgets the pip line."""
+    """Errors for a wrong run, no knobs, unknown names and values out of range, and without ipywidgets."""
     with pytest.raises(TypeError, match="(?s)function of a point.*Fix:"):
         knobs_of(3.0, {"omega": (0.0, 1.0)})
     for none in ({}, [("omega", (0.0, 1.0))]):

@@ -1,4 +1,4 @@
-"""The picture that follows: what is drawn over kept axes is what a whole drawing gives, and limits stay."""
+"""Live pictures: curves drawn over kept axes equal a complete drawing, and limits are stable."""
 
 import io
 import re
@@ -15,7 +15,7 @@ T = np.linspace(0.0, 1.0, 200)
 
 
 def of(amplitude, words="", picture=None, **more):
-    """The picture of a wave and its double, and the pixels."""
+    """The picture of a wave and of twice the wave, and the pixels."""
     picture = picture or Picture()
     amplitude = np.full((1, 1, 1), amplitude)
     with np.errstate(invalid="ignore"):
@@ -55,12 +55,12 @@ def test_lines_over_the_axes():
     assert (
         look["stroke"] != other_look["stroke"] and look["stroke-dasharray"] == "none" != other_look["stroke-dasharray"]
     )
-    # Another value changes the lines, and not what is below.
+    # Another value changes the lines, but not the picture below them.
     assert picture.of_curves(drawn({"t": T[None], "x": 0.9 * x[None]}), "").over != over and picture.drawn_whole == 1
 
 
 def test_many_points_are_thinned():
-    """Of 2e5 points each column of pixels keeps its highest and lowest, and the message stays small."""
+    """From 2e5 points each pixel column keeps its highest and lowest, and the message stays small."""
     t = np.linspace(0.0, 1.0, 200_001)
     picture = Picture()
     _, over = picture.of_curves(drawn({"t": t[None], "x": np.sin(30_000 * t)[None]}), "")
@@ -72,7 +72,7 @@ def test_many_points_are_thinned():
 
 
 def test_over_kept_pixels_as_drawn_as_a_whole():
-    """Another curve over the pixels of the axes is the whole figure drawn at once, to the rounding of colours."""
+    """Another curve drawn over the kept axes equals the complete figure, up to rounding of colours."""
     picture, _ = of(1.0)
     _, quick = of(0.6, picture=picture)
     assert picture.drawn_whole == 1
@@ -81,14 +81,14 @@ def test_over_kept_pixels_as_drawn_as_a_whole():
     picture._canvas.draw()
     whole = np.asarray(picture._canvas.buffer_rgba(), int)[..., :3]
     assert np.mean(np.abs(quick - whole).max(axis=-1) > 40) < 2e-3
-    # Twin: the curve before it is told apart.
+    # Twin: the previous curve gives a different picture.
     _, other = of(1.0, picture=Picture())
     assert np.mean(np.abs(quick - other).max(axis=-1) > 40) > 1e-2
     assert len(np.unique(quick.reshape(-1, 3), axis=0)) <= COLOURS
 
 
 def test_limits_stay_until_they_are_left():
-    """They grow when a curve leaves them, with room for the next; they shrink when it fills less than an eighth."""
+    """Limits grow with some room when a curve leaves them, and shrink when it fills less than an eighth."""
     picture, _ = of(1.0)
     limits = lambda: picture.axes[0].get_ylim()
     first = limits()
@@ -105,13 +105,13 @@ def test_limits_stay_until_they_are_left():
 
 @pytest.mark.parametrize("amplitude", [0.0, 1e-300, 1e300, np.nan, -np.inf])
 def test_any_number(amplitude):
-    """Curves that are flat, tiny, huge or not there have a picture."""
+    """Curves that are flat, tiny, huge or missing can be drawn."""
     _, pixels = of(amplitude)
     assert pixels.std() > 1
 
 
 def test_words_above():
-    """A reason is red, its dollars no formulas; numbers are black; what is not drawn is named."""
+    """A reason is red, without interpreting dollar signs; numbers are black; values not drawn are named."""
     red = lambda pixels: np.sum((pixels[..., 0] > 120) & (pixels[..., 1] < 60) & (pixels[:, :, 2] < 60))
     picture, failed = of(1.0, "it cost 5 $ and 3 $, and the state became NaN, " + "again and " * 40)
     assert red(failed[:45]) > 100
@@ -120,13 +120,13 @@ def test_words_above():
     assert picture._above.get_text() == "period = 2.5,  not drawn: matrix of shape (3, 40)"
     below, over = picture.of_words("wrong")
     assert red(pixels_of(below)[:45]) > 20 and not over and picture.png() == below
-    # What is over the axes says it in the same words, as text.
+    # The text over the axes uses the same words.
     said = picture.of_curves(drawn({"t": T[None], "x": T[None]}), "a < b & 5 $").over
     assert ElementTree.fromstring(said)[-1][0].text == "a < b & 5 $"
 
 
 def test_panels():
-    """A panel for each value of its own; more than a few are named and not drawn; other values have another figure."""
+    """One panel per value; beyond a few they are only named; other values get another figure."""
     many = {f"value {i}": T[None] for i in range(MOST_PANELS + 1)}
     picture = Picture()
     picture.of_curves(drawn(many), "")
@@ -138,7 +138,7 @@ def test_panels():
 
 
 def test_what_the_user_draws():
-    """It is called with the result and empty axes each time."""
+    """A user's drawing function is called with the result and empty axes each time."""
     picture, lines = Picture(), []
 
     def draw(result, axes):

@@ -27,7 +27,7 @@ def shuffled(m, half_bandwidth, seed=0):
     ids=str,
 )
 def test_solves_as_lapack(size):
-    """Found in its random order, coloured, and solved to round-off, some rows left out."""
+    """A band in random row order is ordered, coloured and solved to round-off, with some rows left out."""
     m, half_bandwidth = size
     a = shuffled(m, half_bandwidth)
     where = banded.band(a != 0)
@@ -63,7 +63,7 @@ def test_ill_conditioned():
 @pytest.mark.slow
 @pytest.mark.parametrize("half_bandwidth", exhaustive_but((2,), (1, 2)))
 def test_derivatives_pass_by_the_elimination(half_bandwidth):
-    """Both modes, through the solution of a linear system that is known as a function."""
+    """Derivatives in both modes of the solution of a linear system known as a function."""
     a = jnp.asarray(shuffled(9, half_bandwidth))
     where = banded.band(np.asarray(a) != 0)
     rows = where.order.rows
@@ -81,7 +81,7 @@ def test_derivatives_pass_by_the_elimination(half_bandwidth):
 
 
 def test_singular_is_never_plausible():
-    """A singular band gives NaN, infinity or something enormous."""
+    """A singular band gives NaN, infinity or an enormous number."""
     for wider in (0, 1):
         band = jnp.concatenate([jnp.array([[1.0, 0.0], [1.0, 1.0], [3.0, 0.0]]), jnp.zeros((3, wider))], axis=1)
         assert not np.all(np.abs(banded.solver(band)(jnp.array([1.0, 2.0, 3.0]))) < 1e12)
@@ -90,7 +90,7 @@ def test_singular_is_never_plausible():
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", exhaustive_but((2,), range(3)))
 def test_independent_rows_by_pivots(seed):
-    """As many rows as the rank, themselves independent; with none dependent all are kept."""
+    """As many independent rows as the rank are kept; without dependent rows all are kept."""
     rng = np.random.default_rng(seed)
     rows = np.zeros((24, 20))
     for k in range(24):

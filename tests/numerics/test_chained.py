@@ -1,4 +1,4 @@
-"""Least squares window by window against the same equations solved at once."""
+"""Least squares window by window, compared with solving the same equations at once."""
 
 import jax
 import jax.flatten_util
@@ -56,13 +56,13 @@ def test_solution_and_covariance(windows):
         np.testing.assert_allclose(of.local[w], whole[part, part], rtol=1e-9)
         np.testing.assert_allclose(of.local_shared[w], whole[part, :P], rtol=1e-8)
     if windows > 1:
-        # Twin: without its seams a chain has another solution.
+        # Twin: without seams the solution differs.
         loose = eliminated(slopes._replace(seams_by_next=jnp.zeros((windows, J, K))))
         assert np.max(np.abs(solution(loose).shared - expected.shared)) > 1e-3
 
 
 def test_damped_step_as_a_linear_solver():
-    """As a lineax solver it damps every unknown in units of its slopes."""
+    """The lineax solver damps every unknown relative to its slopes."""
     product, rhs, u, matrix, back = chain(3)
     factor = 0.7
 

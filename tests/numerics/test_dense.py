@@ -1,4 +1,4 @@
-"""Small linear solves: right, accurate entry by entry, differentiable, honest about singular matrices."""
+"""Small linear solves: correct, accurate entry by entry, differentiable, and not finite for singular matrices."""
 
 import jax
 import jax.numpy as jnp
@@ -27,7 +27,7 @@ def test_pivots_where_the_diagonal_vanishes():
 
 
 def test_refinement_keeps_small_components():
-    """An acceleration of 1e-17 beside one of 10 keeps its digits; without refinement it is lost entirely."""
+    """An acceleration of 1e-17 next to one of 10 keeps its digits; without refinement it is lost entirely."""
     alpha, m, M, g = 2.0**-30, 1.5, 4.0, 9.8125
     s, c = np.sin(alpha), np.cos(alpha)
     row = np.array([-s, s, -c])

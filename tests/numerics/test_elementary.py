@@ -1,4 +1,4 @@
-"""Sine and cosine by arithmetic: a unit in the last place, everywhere; and functions rewritten to use them."""
+"""Sine and cosine by arithmetic: errors below a unit in the last place; and programs that use them."""
 
 import jax
 import jax.numpy as jnp
@@ -22,7 +22,7 @@ def neighbours(x):
 
 
 def multiples(of, up_to, count, dtype):
-    """The floating numbers next to multiples of an angle: the first few hundred, and some up to the limit."""
+    """The floating-point numbers next to multiples of an angle: the first few hundred, and some up to the limit."""
     with mpmath.workprec(200):
         angle = of(mpmath.pi)
         ks = np.unique(np.concatenate([np.arange(1, 200), rng.integers(1, int(up_to / float(angle)), count)]))
@@ -40,7 +40,7 @@ ARGUMENTS = {
 
 
 def ulps(found, exact, x):
-    """The largest error in units in the last place of the exact value, which mpmath knows to 100 bits more."""
+    """The largest error in units in the last place of the exact value, which mpmath computes with 100 extra bits."""
     with mpmath.workprec(160):
         values = [exact(mpmath.mpf(float(a))) for a in x]
         units = np.spacing(np.abs(np.array([float(v) for v in values])))
@@ -49,19 +49,19 @@ def ulps(found, exact, x):
 
 
 def fused(x):
-    """Sine and cosine compiled as one program, in which XLA may contract products and sums."""
+    """Sine and cosine compiled as one program, in which XLA may fuse products and sums."""
     return jax.jit(lambda x: elementary._by_arithmetic(x))(x)
 
 
 def apart(x):
-    """Sine and cosine with every operation rounded by itself."""
+    """Sine and cosine with every operation rounded separately."""
     return elementary._by_arithmetic(jnp.asarray(x))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("arguments", ARGUMENTS)
 def test_error_is_below_a_unit_in_the_last_place(arguments):
-    """Against mpmath, contracted by the compiler or not; and the public function takes this path."""
+    """Errors against mpmath, fused by the compiler or not; the public function gives the same values."""
     x = ARGUMENTS[arguments]()
     x = x[np.abs(x) <= LIMIT]
     for pair in (fused, apart, sincos):
@@ -81,14 +81,14 @@ def test_fewer_parts_are_found_out(parts, monkeypatch):
 
 
 def test_beyond_the_limit_the_library_takes_over():
-    """One large argument sends all of them to jnp.sin, to the last bit; whatever its size."""
+    """With one large argument all values are those of jnp.sin, bit for bit."""
     large = np.concatenate([10 ** rng.uniform(5.001, 308, 500), [1e300, 5.319372648326541e255]])
     mixed = np.append(rng.uniform(-3, 3, 20), 2 * LIMIT)
     for x in (large, -large, mixed):
         for found, library in zip(jax.jit(sincos)(x), (jnp.sin, jnp.cos)):
             assert np.array_equal(found, library(x))
     assert ulps(np.asarray(sincos(large)[0]), mpmath.sin, large) < WORST
-    # Twin: the arithmetic is of no use there.
+    # Twin: the arithmetic is wrong there.
     assert not np.allclose(fused(large)[0], np.sin(large))
 
 
@@ -103,7 +103,7 @@ def test_what_is_not_an_ordinary_number():
 
 
 def test_float32():
-    """A unit in the last place in single precision too, next to every multiple of pi/2 and within the range."""
+    """Below a unit in the last place in single precision too, next to multiples of pi/2 and within the range."""
     limit = ARITHMETIC[np.dtype("float32")].limit
     every = multiples(lambda pi: pi / 4, limit, 20000, np.float32)
     drawn = [rng.uniform(-limit, limit, 100000), 10 ** rng.uniform(-37, 3, 100000)]
@@ -119,7 +119,7 @@ def test_float32():
 
 @pytest.mark.slow
 def test_derivatives():
-    """Both modes, twice, alone and in lanes, within the limit and beyond, are what jnp.sin and jnp.cos give."""
+    """First and second derivatives, both modes, alone and in lanes, within and beyond the limit, equal those of jnp."""
     near = rng.uniform(-3, 3, 5)
     for derive in (jax.grad, jax.jacfwd, lambda f: jax.jacfwd(jax.grad(f)), lambda f: jax.grad(jax.grad(f))):
         for i, library in enumerate((jnp.sin, jnp.cos)):
@@ -131,29 +131,29 @@ def test_derivatives():
 
 
 def equations(jaxpr, name):
-    """How many equations of a name a jaxpr has, in the calls it makes too but not in its branches."""
+    """The number of equations of a name in a jaxpr, including its calls but not its branches."""
     inner = [p.jaxpr for eqn in jaxpr.eqns if eqn.primitive.name != "cond" for p in eqn.params.values()
              if hasattr(p, "jaxpr")]  # fmt: skip
     return sum(eqn.primitive.name == name for eqn in jaxpr.eqns) + sum(equations(j, name) for j in inner)
 
 
 def count(function, name, *args):
-    """How many equations of a name a function has."""
+    """The number of equations of a name in a function."""
     return equations(jax.make_jaxpr(function)(*args).jaxpr, name)
 
 
 def test_in_lanes_the_branch_stays_a_branch():
-    """Under vmap the library is called in a branch only, which lanes decide on together."""
+    """Under vmap the library is called only in a branch, chosen for all lanes together."""
     x = rng.uniform(-3, 3, 6)
     assert count(jax.vmap(lambda x: sincos(x)[0]), "sin", x) == 0
-    # Twin: a branch by the lane's own argument becomes a selection between both.
+    # Twin: a branch on a lane's own argument becomes a select that computes both.
     alone = lambda x: lax.cond(x > LIMIT, jnp.sin, lambda x: sincos(x)[0], x)
     assert count(jax.vmap(alone), "sin", x) == 1
 
 
 @pytest.mark.slow
 def test_by_the_library_alone_by_arithmetic_in_lanes():
-    """One number takes libm's own values; lanes agree to round-off, with derivatives in both modes and orders."""
+    """A single number has libm's values; lanes agree to round-off, with first and second derivatives in both modes."""
     x = rng.uniform(-9, 9, 50)
     assert tuple(jax.jit(sincos_in_lanes)(x[0])) == tuple(jax.jit(lambda x: (jnp.sin(x), jnp.cos(x)))(x[0]))
     for change in (lambda f: f, jax.grad, jax.jacfwd, lambda f: jax.jacfwd(jax.grad(f))):

@@ -1,4 +1,4 @@
-"""Nyström methods: orders, dense output, and where `integrate` takes them."""
+"""Nyström methods: orders, dense output, and where `integrate` uses them."""
 
 from typing import ClassVar
 
@@ -16,7 +16,7 @@ name_of = lambda x: type(x).__name__ + " in a loop" * x.in_a_loop if isinstance(
 
 
 def swing(t, y, args):
-    """A pendulum that is pushed."""
+    """A driven pendulum."""
     q, v = y
     return v, {"angle": -jnp.sin(q["angle"]) + 0.1 * jnp.cos(2 * t)}
 
@@ -32,7 +32,7 @@ def solve(method, controller, ts=None, dt0=None):
 
 @pytest.fixture(scope="module")
 def exact():
-    """By another method at a far smaller error: angle and rate at 1.3 and at the end."""
+    """Angle and rate at 1.3 and at the end, by another method with a far smaller error."""
     integrate = pytest.importorskip("scipy.integrate")
     field = lambda t, y: [y[1], -np.sin(y[0]) + 0.1 * np.cos(2 * t)]
     ends = [
@@ -42,7 +42,7 @@ def exact():
 
 
 class Misprinted(Nystrom8):
-    """One node's row changed, with its sum kept: c²/2."""
+    """A method with one row of `a` changed, which keeps its sum c²/2."""
 
     tableau: ClassVar = RKN86._replace(
         a=(*RKN86.a[:3], tuple(np.add(RKN86.a[3], (0.01, -0.01, 0.0, 0.0))), *RKN86.a[4:])
@@ -61,7 +61,7 @@ class Misprinted(Nystrom8):
     ids=name_of,
 )
 def test_order(exact, method, steps, order):
-    """Of angle and rate, on a nonlinear problem with explicit time; a misprint in the tableau loses it."""
+    """The order of angle and rate on a nonlinear problem with explicit time; a misprint in the tableau loses it."""
     end = lambda y: jnp.stack([y[0]["angle"][-1], y[1]["angle"][-1]])
     run = jax.jit(lambda dt: end(solve(method, diffrax.ConstantStepSize(), dt0=dt).ys))
     errors = [np.abs(run(jnp.asarray(ENDS[1] / n)) - exact[1]).max() for n in steps]
@@ -82,7 +82,7 @@ def test_weights_are_quadratures(tableau):
 
 @pytest.mark.exhaustive
 def test_stages_in_a_loop_are_the_same():
-    """Step by step."""
+    """Each step agrees with that of unrolled stages."""
     fixed = diffrax.ConstantStepSize()
     for method in (Nystrom8, Nystrom12):
         one_by_one, looped = (solve(method(in_a_loop=loop), fixed, dt0=0.25).ys for loop in (False, True))
@@ -90,7 +90,7 @@ def test_stages_in_a_loop_are_the_same():
 
 
 def test_dense_output(exact):
-    """Of order 5 or more between the steps, angle and rate."""
+    """Dense output of angle and rate has order 5 or more between the steps."""
     run = jax.jit(lambda dt: solve(Nystrom8(), diffrax.ConstantStepSize(), jnp.array([1.3]), dt).ys)
     errors = []
     for n in (25, 75):  # 1.3 is the middle of a step.
@@ -121,7 +121,7 @@ CASES = [
 
 @pytest.mark.parametrize(("system", "q0", "expected"), CASES)
 def test_default(system, q0, expected):
-    """Taken where accelerations do not depend on velocities, of lower order for a network, and nowhere else."""
+    """Used only if accelerations do not depend on velocities, with lower order for a network."""
     v0 = jax.tree.map(lambda x: 0.0, q0)
     params = {"g": 1.0} | ({"weights": np.ones((8, 8))} if system is NETWORK else {})
     run = lambda q0, v0: lj.integrate(system, q0, v0, params, ts=jnp.array([0.0, 0.1]), throw=False)
@@ -129,7 +129,7 @@ def test_default(system, q0, expected):
 
 
 def test_refused_where_velocities_count():
-    """With the reason and the fix."""
+    """The error gives the reason and a fix."""
     for system, cause in ((RELATIVISTIC, "these do"), (CASES[4][0], "there are constraints")):
         with pytest.raises(ValueError, match=rf"Nystrom8 is for accelerations .* {cause}[\s\S]*method=lj.Dopri8"):
             lj.integrate(system, 1.0, 0.0, {"g": 1.0}, ts=jnp.array([0.0, 0.1]), method=lj.Nystrom8())
@@ -137,7 +137,7 @@ def test_refused_where_velocities_count():
 
 @pytest.mark.exhaustive
 def test_many_coordinates_and_derivatives():
-    """A lattice of forty masses, in arrays and stages in a loop: against Dopri8, with its derivatives in both modes."""
+    """A lattice of forty masses, with arrays and stages in a loop, agrees with Dopri8; derivatives in both modes."""
     springs = lambda q, params: jnp.sum(0.5 * jnp.diff(q) ** 2 + params["β"] / 4 * jnp.diff(q) ** 4)
     lattice = lj.System(lambda t, q, v, params: 0.5 * jnp.sum(v**2) - springs(q, params))
     q0 = jnp.sin(jnp.linspace(0.0, jnp.pi, 40))

@@ -1,4 +1,4 @@
-"""Radau IIA and its Newton iteration: order, stability, published stiff end states, derivatives, honest failure."""
+"""Radau IIA and its Newton iteration: order, stability, published stiff end states, derivatives, failures."""
 
 import diffrax
 import jax
@@ -29,7 +29,7 @@ def solve(field, y0, args=None, *, tol=1e-8, atol=None, t1=1.0, ts=None, method=
 
 
 def constant(field, y0, args, steps, *, ts=None, t1=1.0, method=None):
-    """Steps of one length by plain diffrax; the number of steps may be traced."""
+    """Constant steps by plain diffrax; the number of steps may be traced."""
     saveat = diffrax.SaveAt(t1=True) if ts is None else diffrax.SaveAt(ts=ts)
     return diffrax.diffeqsolve(
         diffrax.ODETerm(field), Radau5(root_finder=EXACT) if method is None else method, 0.0, t1, t1 / steps, y0, args,
@@ -65,14 +65,14 @@ def test_stability():
 
 
 def predator(t, y, args):
-    """Volterra's equations, with a season: nonlinear and not autonomous."""
+    """Volterra's equations with a seasonal term: nonlinear and not autonomous."""
     rabbits, foxes = y["rabbits"], y["foxes"]
     return {"rabbits": rabbits * (1.5 - foxes), "foxes": foxes * (rabbits - 1 + 0.5 * jnp.sin(3 * t))}
 
 
 @pytest.mark.slow
 def test_order():
-    """Order 5 at the steps' ends; the twin is the order 4 that the same measurement finds of diffrax's interpolant."""
+    """Order 5 at the ends of steps; twin: the same measurement finds order 4 for diffrax's interpolant."""
     integrate = pytest.importorskip("scipy.integrate")
     ts = np.linspace(0.0, 2.0, 151)[1:]
     start = {"rabbits": jnp.array(1.25), "foxes": jnp.array(0.5)}
@@ -163,7 +163,7 @@ def rod_like(k):
 
 @pytest.mark.slow
 def test_stiff_springs_cost_no_steps():
-    """Velocities weighed by h: at k = 1e6 as at 1e10 under 300 steps, the rigid pendulum's motion to 1e-7 + 100/k."""
+    """With velocity errors weighted by h, k = 1e6 and 1e10 take under 300 steps; error below 1e-7 + 100/k."""
     integrate = pytest.importorskip("scipy.integrate")
     swing = lambda t, y: [y[1], -9.8125 * np.sin(y[0])]
     angle = integrate.solve_ivp(swing, (0, 2), [0.9, 2.0], "DOP853", rtol=2.5e-14, atol=1e-15).y[0, -1]
@@ -198,25 +198,25 @@ def decay(t, y, args):
 
 
 def end_of_decay(p, adjoint):
-    """y(1) by p = (k, y0), at a tolerance of 1e-10."""
+    """y(1) as a function of p = (k, y0), at a tolerance of 1e-10."""
     return solve(decay, p[1], p[0], tol=1e-10, adjoint=adjoint, dt0=0.01).ys[0]
 
 
 def gradient_of_decay(k, y0):
-    """Of y(1) by k and y0."""
+    """The derivatives of y(1) with respect to k and y0."""
     return np.array([-(y0**2), 1.0]) / (1 + k * y0) ** 2
 
 
 @pytest.mark.slow
 def test_forward_derivative():
-    """The derivative of an end state by parameter and start is that of the closed form."""
+    """The derivative of an end state with respect to parameter and start equals the closed form."""
     forward = jax.jit(jax.jacfwd(lambda p: end_of_decay(p, diffrax.ForwardMode())))
     np.testing.assert_allclose(forward(jnp.array([3.0, 1.5])), gradient_of_decay(3.0, 1.5), rtol=1e-7)
 
 
 @pytest.mark.exhaustive
 def test_reverse_derivative():
-    """So is the gradient through the checkpointed solve, and lane by lane."""
+    """The gradient through the checkpointed solve equals the closed form as well, also in lanes."""
     reverse = jax.jit(jax.vmap(jax.grad(lambda p: end_of_decay(p, diffrax.RecursiveCheckpointAdjoint()))))
     points = np.array([[3.0, 1.5], [0.5, 2.0], [40.0, 1.0]])
     np.testing.assert_allclose(reverse(points), [gradient_of_decay(*p) for p in points], rtol=1e-7)
@@ -244,7 +244,7 @@ def towards(t, y, k):
 
 
 def test_lanes_in_float32():
-    """Lanes of stiffness 1 to 1e7 in single precision, one of them NaN: that one fails, the others are right."""
+    """Lanes of stiffness 1 to 1e7 in single precision: the NaN lane fails, the others are correct."""
     k = np.array([1.0, 1e3, 1e5, 1e7, np.nan], np.float32)
     end = lambda k: solve(towards, jnp.zeros((), k.dtype), k, tol=1e-4, dt0=np.float32(0.01))
     found = jax.jit(jax.vmap(end))(k)
@@ -275,7 +275,7 @@ def test_unsolvable_step():
 
 
 def test_jacobian_is_renewed_where_it_fails():
-    """From a start with the wrong slope the kept Jacobian diverges, and says so; renewed, it finds the root."""
+    """From a start with the wrong slope the kept Jacobian diverges with that result; recomputed, it finds the root."""
     cubic = lambda y, a: y**3 + y - a
     far, near = jnp.array([0.0]), jnp.array([1.2])
     found = {}
@@ -289,7 +289,7 @@ def test_jacobian_is_renewed_where_it_fails():
 
 
 def test_tolerances_for_constant_steps():
-    """A root finder that waits for a controller's tolerances gets ours; an implicit Euler step is then y/(1 + h k)."""
+    """A root finder without a controller gets the given tolerances; an implicit Euler step is then y/(1 + h k)."""
     method = with_tolerances(diffrax.ImplicitEuler(root_finder=OF_CONTROLLER()), 1e-10, 1e-12)
     found = constant(lambda t, y, k: -k * y, jnp.array(1.0), 1e3, 4, method=method)
     assert abs(found.ys[0] / (1 + 250.0) ** -4 - 1) < 1e-9

@@ -1,4 +1,4 @@
-"""Independent rows: chosen whatever the scale, and by their angle to the others."""
+"""Independent rows are chosen by their angle to the others, whatever their scale."""
 
 import jax
 import jax.numpy as jnp
@@ -30,6 +30,6 @@ def test_threshold_is_an_angle():
 
 
 def test_rows_that_are_zero_or_not_finite_are_kept():
-    """A constraint without a derivative must not pass for a redundant one."""
+    """A constraint without a derivative must not count as redundant."""
     assert independent_rows(jnp.array([[1.0, 2.0], [0.0, 0.0]])).tolist() == [True, True]
     assert independent_rows(jnp.array([[1.0, 2.0], [2.0, jnp.nan]])).tolist() == [True, True]

@@ -19,7 +19,7 @@ name_of = lambda value: type(value).__name__
 
 
 def swing(t, y, args):
-    """A pendulum that is pushed, with its state as a pytree."""
+    """A driven pendulum, with its state as a pytree."""
     return {"angle": y["rate"], "rate": -jnp.sin(y["angle"]) + 0.1 * jnp.cos(2 * t)}
 
 
@@ -34,7 +34,7 @@ def solve(method, controller, ts=None, dt0=None):
 @pytest.mark.parametrize("kind", [Tsit5, Dopri8])
 @pytest.mark.parametrize("known", [False, True])
 def test_stages_in_a_loop(kind, known):
-    """The same step, and the same derivative in reverse, with the vector field compiled once; its first stage known."""
+    """With the vector field in a loop, steps and reverse derivatives are the same, also with a known first stage."""
     terms, y0 = diffrax.ODETerm(swing), {"angle": jnp.asarray(1.0), "rate": jnp.asarray(0.5)}
 
     def step(method, y0):
@@ -51,7 +51,7 @@ def test_stages_in_a_loop(kind, known):
 @pytest.mark.parametrize(("ours", "shipped"), PAIRS)
 def test_the_steps_of_diffrax(ours, shipped):
     """The same steps, states and dense output as diffrax's implementation."""
-    # At constant steps: an error of the size of round-off, as in a first step, chooses them differently.
+    # At constant steps: adaptive steps would differ where the error is only round-off, as in a first step.
     ts = jnp.linspace(*ENDS, 7)
     a, b = (solve(method, diffrax.ConstantStepSize(), ts, dt0=0.3) for method in (ours, shipped))
     assert a.stats["num_steps"] == b.stats["num_steps"]
@@ -75,7 +75,7 @@ class Misprinted(Tsit5):
 
 @pytest.fixture(scope="module")
 def exact():
-    """By another method at a far smaller error."""
+    """The solution by another method with a far smaller error."""
     integrate = pytest.importorskip("scipy.integrate")
     field = lambda t, y: [y[1], -np.sin(y[0]) + 0.1 * np.cos(2 * t)]
     return integrate.solve_ivp(field, ENDS, [1.0, 0.0], "DOP853", rtol=1e-13, atol=1e-15).y[0, -1]

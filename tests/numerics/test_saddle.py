@@ -1,4 +1,4 @@
-"""Elimination in the order in which the equations are written: as accurate as LAPACK, or not believed."""
+"""Elimination without pivoting: as accurate as LAPACK, or marked as invalid."""
 
 import jax
 import numpy as np
@@ -9,7 +9,7 @@ from lagjax.numerics.dense import Saddle
 
 @jax.jit
 def eliminated(mass, jacobian, forcing, gamma):
-    """a, multipliers, and whether they are believed."""
+    """a, multipliers, and whether they are valid."""
     saddle = Saddle(mass, jacobian)
     return *saddle.solve(forcing, gamma), saddle.valid
 
@@ -42,9 +42,9 @@ def test_as_accurate_as_lapack(name):
     """Backward error entry by entry: within a few units of round-off, as LAPACK's is, over the extremes."""
     mass, jacobian = CASES[name]
     forcing, gamma = RNG.normal(size=3), RNG.normal(size=len(jacobian))
-    a, multipliers, believed = eliminated(mass, jacobian, forcing, gamma)
+    a, multipliers, valid = eliminated(mass, jacobian, forcing, gamma)
     matrix, known = whole(mass, jacobian), np.concatenate([forcing, gamma])
-    assert believed
+    assert valid
     ours = error_of(np.concatenate([a, -multipliers]), matrix, known)
     assert ours < 20 * np.finfo(float).eps + 2 * error_of(np.linalg.solve(matrix, known), matrix, known)
 
@@ -60,6 +60,6 @@ def test_as_accurate_as_lapack(name):
     ids=["massless", "indefinite", "dependent", "vanishing"],
 )
 def test_not_believed(mass, jacobian):
-    """Where pivots would have to be chosen it says so, and nothing of it is NaN, which would spoil derivatives."""
-    a, multipliers, believed = eliminated(mass, jacobian, np.ones(3), np.ones(len(jacobian)))
-    assert not believed and np.all(np.isfinite(a)) and np.all(np.isfinite(multipliers))
+    """If pivoting is needed the result is invalid but never NaN, which would spoil derivatives."""
+    a, multipliers, valid = eliminated(mass, jacobian, np.ones(3), np.ones(len(jacobian)))
+    assert not valid and np.all(np.isfinite(a)) and np.all(np.isfinite(multipliers))

@@ -1,4 +1,4 @@
-"""Programs written out number by number: the same results with fewer operations."""
+"""Programs rewritten number by number: the same results with fewer operations."""
 
 from collections import Counter
 
@@ -24,13 +24,13 @@ def numbers(function, *args):
 
 
 def operations(program):
-    """How often each primitive stands in what the results depend on."""
+    """The count of each primitive on which the results depend."""
     return Counter(equation.primitive.name for equation in needed(program.jaxpr))
 
 
 @jax.custom_jvp
 def doubled(x):
-    """A function with a derivative rule of its own, which is not its derivative."""
+    """A function with a custom derivative rule, which differs from its derivative."""
     return 2 * x
 
 
@@ -58,7 +58,7 @@ FUNCTIONS = {
 
 @pytest.mark.parametrize("name", FUNCTIONS)
 def test_same_values_and_derivatives(name):
-    """The written-out program is the program, and so is its derivative."""
+    """The written-out program and its derivative give the same values."""
     function = FUNCTIONS[name]
     program = numbers(function, X)
     out = lambda x: jaxpr_as_fun(program)(x)[0]
@@ -67,7 +67,7 @@ def test_same_values_and_derivatives(name):
 
 
 def test_zeros_and_ones_leave_no_trace():
-    """A diagonal product has one multiplication an entry that is neither; a full one all of them."""
+    """A diagonal product has one multiplication per entry that is neither 0 nor 1; a full one has all of them."""
     diagonal = operations(numbers(lambda x: jnp.diag(jnp.array([2.0, 0.0, 1.0, 3.0])) @ x, X))
     assert diagonal["mul"] == 2 and diagonal["add"] == 0
     full = operations(numbers(lambda x: (MATRIX + 2) @ x, X))
@@ -75,7 +75,7 @@ def test_zeros_and_ones_leave_no_trace():
 
 
 def test_two_stages():
-    """What does not depend on the second argument is computed first, and its inverse where it is divided by."""
+    """Operations independent of the second argument are computed first, including inverses of divisors."""
 
     def function(p, x):
         return jnp.sin(p) * x / (p**2 + 1)
@@ -90,7 +90,7 @@ def test_two_stages():
 
 
 def test_integers_are_divided_as_integers():
-    """By a number that is known before: 29 by 10 is 2, and an index made so is one."""
+    """Integer division of known numbers is exact: 29 by 10 is 2, and can be used as an index."""
 
     def function(n, x):
         count = (jnp.floor(x) + 29).astype(int)
@@ -102,7 +102,7 @@ def test_integers_are_divided_as_integers():
 
 
 def test_what_becomes_too_long_is_left_early():
-    """A sum over 200 nodes is 600 operations; what is known beforehand is none."""
+    """A sum over 200 nodes is 600 operations; known numbers count as none."""
     nodes = jnp.linspace(0.0, 1.0, 200)
     program = jax.make_jaxpr(lambda x: jnp.exp(nodes * x[0]) + jnp.square(nodes))(X)
     written = lambda most: jax.make_jaxpr(lambda x: written_out(program, x, most=most))(X)

@@ -22,7 +22,7 @@ pytestmark = [
 
 AXES = {"a": np.array([0.5, 1.0, 2.0]), "b <i>": np.array([-1.0, 0.0, 4.0, 9.0])}
 T = np.linspace(0.0, 1.0, 6)
-# The words of a slider; the value that is shown; the ends of a curve in units of its picture.
+# The text of a slider; the value shown; the ends of a curve in units of its picture.
 SLIDER = ".lagjax .row input[type=range]"
 SHOWN = """(() => {
   const root = document.querySelector(".lagjax");
@@ -31,7 +31,7 @@ SHOWN = """(() => {
     number: root.querySelector("dd").textContent,
     curve: root.querySelector('[data-curve="wave"]').getAttribute("d")};
 })()"""
-# What people who cannot see well, or use no mouse, need; an empty list where all of it is there.
+# Checks for accessibility without good sight or a mouse; an empty list if all requirements are met.
 AUDIT = """(() => {
   const found = [], brightness = text => {
     const linear = x => x <= 0.03928 ? x / 12.92 : ((x + 0.055) / 1.055) ** 2.4;
@@ -96,7 +96,7 @@ def opened(browser, tmp_path, text, **size):
 
 
 def wrong_lanes(page):
-    """Walk through all places with the arrow keys; those at which another lane is shown than the closed form."""
+    """Walk through all points with the arrow keys; returns those whose values differ from the closed form."""
     found = []
     for i, a in enumerate(AXES["a"]):
         for j, b in enumerate(AXES["b <i>"]):
@@ -118,17 +118,17 @@ def wrong_lanes(page):
 
 
 def test_sliders_choose_the_lane(browser, tmp_path, text):
-    """At all places number, curve and status are those of the closed form; no script complains or asks for anything."""
+    """At all points number, curve and status match the closed form; no script logs errors or loads anything."""
     page = opened(browser, tmp_path, text)
     assert wrong_lanes(page) == [] and page.complaints() == []
-    # Twin: where the stride is wrong, other lanes are shown.
+    # Twin: with a wrong stride, wrong lanes are shown.
     stride = "lane * lengths[k] + i"
     assert text.count(stride) == 1
     assert len(wrong_lanes(opened(browser, tmp_path, text.replace(stride, "lane + i * lengths[k]")))) > 4
 
 
 def test_what_failed_is_said(browser, tmp_path, text):
-    """In words and not by colour alone, for those who see it and those who have it read to them."""
+    """Failures are reported in words, not by colour alone, also to screen readers."""
     page = opened(browser, tmp_path, text)
     page.run(f"document.querySelectorAll('{SLIDER}')[1].focus()")
     page.press("Home")
@@ -141,7 +141,7 @@ def test_what_failed_is_said(browser, tmp_path, text):
 
 
 def test_scales(browser, tmp_path, text):
-    """One scale for all points, or each its own: then the curve fills its picture."""
+    """One scale for all points, or one per point, in which the curve fills its picture."""
     page = opened(browser, tmp_path, text)
     height = "(box => box.height)(document.querySelector('[data-curve=\"wave\"]').getBoundingClientRect())"
     low = page.run(height)
@@ -153,7 +153,7 @@ def test_scales(browser, tmp_path, text):
 
 
 def circle(lanes):
-    """A point that goes around once, in each lane farther out; the last lane has no motion."""
+    """A point on a circle, with a larger radius in each lane; the last lane has no motion."""
     t = np.linspace(0.0, 2.0, 51)
     turn = np.stack([np.cos(np.pi * t), np.sin(np.pi * t)], axis=-1)[:, None]
     radii = np.arange(1.0, lanes + 1.0)
@@ -171,7 +171,7 @@ FRAME = """(() => {
 
 
 def test_a_film_plays(browser, tmp_path):
-    """By keyboard: the arrow keys show the frames, the space bar plays and stops; points and clock belong together."""
+    """By keyboard: arrow keys change the frame, the space bar plays and stops; points match the clock."""
     t, points = circle(1)
     Animation(t, {name: x[0] for name, x in points.items()}, 25.0, 10).save(tmp_path / "film.html")
     page = browser.open(tmp_path / "film.html")
@@ -182,7 +182,7 @@ def test_a_film_plays(browser, tmp_path):
         page.press("ArrowRight")
     half = page.run(FRAME)
     assert half["clock"] == "t = 1.00" and half["trail"] == 11
-    # Half a turn later the point is across its pivot.
+    # Half a turn later the point is opposite.
     np.testing.assert_allclose(np.add(first["line"][2:], half["line"][2:]) / 2, first["line"][:2], atol=1)
     page.press(" ")
     page.wait(f"({FRAME}).clock !== 't = 1.00'")
@@ -192,14 +192,14 @@ def test_a_film_plays(browser, tmp_path):
     stopped = page.run(FRAME)
     page.run("new Promise(done => setTimeout(done, 150))")
     assert page.run(FRAME) == stopped and stopped["button"] == "play" and page.complaints() == []
-    # Where it is on the circle is where its clock says, to the half of a frame.
+    # Its position on the circle matches the clock to half a frame.
     turned = np.subtract(stopped["line"][2:], stopped["line"][:2]) * [1, -1]
     expected = np.pi * float(stopped["clock"].removeprefix("t = "))
     assert abs(np.angle(complex(*turned) / np.exp(1j * expected))) < 0.02
 
 
 def test_films_of_several_lanes(browser, tmp_path):
-    """A lane's own frames; a lane without a motion says so."""
+    """Each lane has its own frames; a lane without a motion says so."""
     body, spec = film(*circle(3), 25.0, 10)
     html = fragment(body, {"film": spec}, ("decode.js", "film.js"), "window.show = film(root, spec.film);")
     page = opened(browser, tmp_path, whole("Lanes", html))
@@ -215,21 +215,21 @@ def test_films_of_several_lanes(browser, tmp_path):
 
 @pytest.mark.parametrize("width", [360, 1200])
 def test_for_everybody(browser, tmp_path, text, width):
-    """At two widths: labels, words for pictures, contrast, sizes, nothing beyond the edge."""
+    """At two widths: labels, alternative texts, contrast, sizes, and nothing beyond the edge."""
     t, points = circle(1)
     Animation(t, {name: x[0] for name, x in points.items()} | {"tip": points["rod"][0, :, 1:]}, 25.0, 10).save(
         tmp_path / "film.html"
     )
     for file in ("sweep.html", "film.html"):
         assert browser.open(tmp_path / file, width=width).run(AUDIT) == []
-    # Twin: a label less, and pale words, are found.
+    # Twin: a missing label and pale text are found.
     changed = text.replace('element(row, "label", {for: id}, axis.name);', "").replace("color: #222", "color: #aaa")
     audit = opened(browser, tmp_path, changed, width=width).run(AUDIT)
     assert any("no label" in x for x in audit) and any("too pale" in x for x in audit)
 
 
 def test_twice_in_one_notebook(browser, tmp_path, swept):
-    """The same output twice has two sets of sliders, each with its own labels and its own place."""
+    """The same output twice gives two independent sets of sliders with their own labels."""
     page = opened(browser, tmp_path, whole("Twice", 2 * swept.to_html().html))
     page.run(f"document.querySelectorAll('{SLIDER}')[0].focus()")
     page.press("Home")
@@ -240,7 +240,7 @@ def test_twice_in_one_notebook(browser, tmp_path, swept):
 
 
 def test_the_browser_can_complain(browser, tmp_path):
-    """Twin of what must not happen: a script that fails, and a page that asks for something, are told."""
+    """Twin: a failing script and a page that loads something are detected."""
     html = '<script>throw Error("twin")</script><img src="http://127.0.0.1:9/picture.png">'
     told = json.dumps(opened(browser, tmp_path, html).complaints())
     assert "twin" in told and "picture.png" in told

@@ -1,4 +1,4 @@
-"""What varies: order, zipping, slices, and what is no axis."""
+"""Axes of a sweep: order, pairing, slices, and invalid axes."""
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +11,7 @@ GRID = {"a": np.array([1.0, 2.0]), "b": np.array([10.0, 20.0, 30.0]), "c": np.ar
 
 
 def test_the_last_axis_is_the_fastest():
-    """As the loops run, one point and several; the slices of an axis of vectors."""
+    """Indices follow nested loops, for one point and several; an axis of vectors gives slices."""
     axes = axes_of(GRID, paired=False)
     assert axes.shape == (2, 3, 4) and axes.size == 24
     points = [(a, b, c) for a in GRID["a"] for b in GRID["b"] for c in GRID["c"]]
@@ -23,7 +23,7 @@ def test_the_last_axis_is_the_fastest():
 
 
 def test_paired_axes_move_together():
-    """One dimension, the point."""
+    """Paired axes have a single dimension, the point."""
     axes = axes_of({"a": jnp.arange(3.0), "b": 2 * jnp.arange(3.0)}, paired=True)
     assert axes.dims == {"point": 3}
     assert axes.at(2) == {"a": 2.0, "b": 4.0}
@@ -31,7 +31,7 @@ def test_paired_axes_move_together():
 
 
 def test_numbers_become_those_of_jax():
-    """A list of integers stays one of integers, floats are in JAX's dtype."""
+    """Integers stay integers; floats get JAX's dtype."""
     axes = axes_of({"n": [1, 2], "x": [0.5, 1.0]}, paired=False)
     assert axes.values["n"].dtype == np.int64 and axes.values["x"].dtype == np.float64
 
@@ -49,13 +49,13 @@ def test_numbers_become_those_of_jax():
     ],
 )
 def test_what_is_no_axis(axes, paired, error, words):
-    """By name, with the fix."""
+    """The error names the axis and gives a fix."""
     with pytest.raises(error, match=words) as refusal:
         axes_of(axes, paired)
     assert "Fix:" in str(refusal.value)
 
 
 def test_inside_a_program():
-    """A sweep compiles for itself."""
+    """A sweep cannot run inside jit."""
     with pytest.raises(TypeError, match="axis 'x' is being traced"):
         jax.jit(lambda x: axes_of({"x": x}, False).size)(jnp.arange(3.0))

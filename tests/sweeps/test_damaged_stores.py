@@ -1,4 +1,4 @@
-"""Stores that were damaged: nothing of them is returned as good, all of it is told, and the same call mends it."""
+"""Damaged stores: damaged points are never returned as good, all damage is reported, and the same call repairs it."""
 
 import json
 import shutil
@@ -23,18 +23,18 @@ EXACT = {
 
 
 def run(point):
-    """A whole number and two others, in closed form."""
+    """An integer and two floats, in closed form."""
     return {"n": 10 + point["k"], "y": jnp.stack([point["x"] * point["k"]] * 2)}
 
 
 def swept(path, of=run, axes=AXES, **settings):
-    """The sweep into a store, of five blocks of eight points."""
+    """The sweep in a store of five blocks with eight points each."""
     return lj.sweep(of, axes, store=path, chunk=8, workers=1, progress=False, **settings)
 
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
-    """A store that is whole."""
+    """An intact store."""
     path = tmp_path_factory.mktemp("whole") / "store"
     assert swept(path).ran == 40 and Store(path).blocks.block == (1, 8)
     return path
@@ -42,25 +42,25 @@ def whole(tmp_path_factory):
 
 @pytest.fixture
 def store(whole, tmp_path):
-    """A copy of it, to be damaged."""
+    """A copy of the intact store, to be damaged."""
     return shutil.copytree(whole, tmp_path / "store")
 
 
-def told(call):
-    """(what a call returns, what it warned of)."""
+def with_warnings(call):
+    """(what a call returns, its warnings)."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         return call(), "\n".join(str(x.message) for x in caught)
 
 
 def same(values, where=...):
-    """The closed form."""
+    """Check values against the closed form."""
     for name, exact in EXACT.items():
         np.testing.assert_allclose(values[name][where], exact[where], rtol=1e-15)
 
 
-def removed(file):
-    """A file or a folder."""
+def remove(file):
+    """Remove a file or a folder."""
     if file.is_dir():
         shutil.rmtree(file)
     else:
@@ -68,17 +68,17 @@ def removed(file):
 
 
 def cut(file):
-    """To its first half."""
+    """Cut a file to its first half."""
     file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
 
 
-def emptied(file):
-    """As after a power cut."""
+def empty(file):
+    """Empty a file, as after a power cut."""
     file.write_bytes(b"")
 
 
-def flipped(at):
-    """One bit."""
+def flip_bit(at):
+    """A function that flips one bit."""
 
     def flip(file):
         data = bytearray(file.read_bytes())
@@ -88,54 +88,54 @@ def flipped(at):
     return flip
 
 
-def exchanged(file):
-    """For that of another block."""
+def exchange(file):
+    """Replace the file by that of another block."""
     shutil.copy(str(file).replace("/c/1/", "/c/3/"), file)
 
 
 BLOCKS = {
-    "values gone": ("y/c/1/0/0", removed),
-    "whole numbers gone": ("n/c/1/0", removed),
-    "result gone": ("result/c/1/0", removed),
+    "values gone": ("y/c/1/0/0", remove),
+    "whole numbers gone": ("n/c/1/0", remove),
+    "result gone": ("result/c/1/0", remove),
     "values cut": ("y/c/1/0/0", cut),
-    "values empty": ("n/c/1/0", emptied),
-    "a bit of values": ("y/c/1/0/0", flipped(8)),
-    "a bit of whole numbers": ("n/c/1/0", flipped(20)),
-    "a bit of the checksum": ("y/c/1/0/0", flipped(-1)),
-    "a bit of the result": ("result/c/1/0", flipped(8)),
-    "a bit of the steps": ("steps/c/1/0", flipped(8)),
-    "another block's": ("y/c/1/0/0", exchanged),
-    "a bit of the mark": ("lagjax/marks/c/1/0/0", flipped(8)),
+    "values empty": ("n/c/1/0", empty),
+    "a bit of values": ("y/c/1/0/0", flip_bit(8)),
+    "a bit of whole numbers": ("n/c/1/0", flip_bit(20)),
+    "a bit of the checksum": ("y/c/1/0/0", flip_bit(-1)),
+    "a bit of the result": ("result/c/1/0", flip_bit(8)),
+    "a bit of the steps": ("steps/c/1/0", flip_bit(8)),
+    "another block's": ("y/c/1/0/0", exchange),
+    "a bit of the mark": ("lagjax/marks/c/1/0/0", flip_bit(8)),
     "the mark cut": ("lagjax/marks/c/1/0/0", cut),
 }
 
 
 @pytest.mark.parametrize("case", BLOCKS)
 def test_a_damaged_block(store, case):
-    """Its points are lost when they are read, never good; the same call names the file and computes them again."""
+    """Its points are read as lost, never as good; the same call names the file and computes them again."""
     name, damage = BLOCKS[case]
     damage(store / name)
-    (opened, values), words = told(lambda: (opened := lj.open_sweep(store), opened.values))
+    (opened, values), words = with_warnings(lambda: (opened := lj.open_sweep(store), opened.values))
     lost = np.arange(40).reshape(5, 8) // 8 == 1
     np.testing.assert_array_equal(opened.status.result == LOST, lost)
     np.testing.assert_array_equal(opened.ok, ~lost)
     same(values, ~lost)
     assert np.isnan(values["y"][lost]).all() and opened.counts() == {"successful": 32, "lost from the store": 8}
     assert str(store / name) in words and "lj.sweep(run, axes, store=path)" in words
-    mended, words = told(lambda: swept(store))
+    mended, words = with_warnings(lambda: swept(store))
     assert mended.ran == 8 and mended.ok.all() and str(store / name) in words and "computed again: 1 of 5" in words
     same(mended.values)
 
 
 def test_nothing_is_told_of_a_whole_store(whole):
-    """The twin: no warning (which would be an error here), nothing computed."""
+    """Twin: an intact store gives no warning (an error here), and nothing is computed."""
     assert swept(whole).ran == 0 and lj.open_sweep(whole).ok.all()
     same(lj.open_sweep(whole).values)
 
 
 def test_a_block_without_mark_was_not_run(store):
-    """Whatever values it has."""
-    removed(store / "lagjax/marks/c/1/0/0")
+    """An unmarked block counts as not run, whatever values it has."""
+    remove(store / "lagjax/marks/c/1/0/0")
     opened = lj.open_sweep(store)
     assert opened.counts() == {"successful": 32, "not run": 8} and np.isnan(opened.values["y"]).sum() == 16
     assert swept(store).ran == 8
@@ -143,16 +143,16 @@ def test_a_block_without_mark_was_not_run(store):
 
 METADATA = {
     "the group's": ("zarr.json", lambda file: file.write_text("{")),
-    "the group's gone": ("zarr.json", removed),
+    "the group's gone": ("zarr.json", remove),
     "what it says changed": (
         "lagjax/zarr.json",
         lambda file: file.write_text(file.read_text().replace('"paired": false', '"paired": true')),
     ),
-    "what it says gone": ("lagjax/zarr.json", removed),
+    "what it says gone": ("lagjax/zarr.json", remove),
     "what xarray reads": ("zarr.json", lambda file: file.write_text(file.read_text().replace("5,", "6,", 1))),
     "an array's": ("y/zarr.json", lambda file: file.write_text('{"zarr_format": 3')),
-    "an array's gone": ("n/zarr.json", removed),
-    "an array's empty": ("result/zarr.json", emptied),
+    "an array's gone": ("n/zarr.json", remove),
+    "an array's empty": ("result/zarr.json", empty),
     "a shape": ("n/zarr.json", lambda file: file.write_text(file.read_text().replace("5,", "6,", 1))),
     "of marks": ("lagjax/marks/zarr.json", cut),
 }
@@ -160,39 +160,39 @@ METADATA = {
 
 @pytest.mark.parametrize("case", METADATA)
 def test_damaged_metadata_are_put_back(store, case):
-    """By whoever opens the store first, and no value is lost."""
+    """Whoever opens the store next restores them, and no value is lost."""
     name, damage = METADATA[case]
     damage(store / name)
-    opened, words = told(lambda: lj.open_sweep(store))
-    assert opened.ok.all() and str(store / name) in words and "put back" in words
+    opened, words = with_warnings(lambda: lj.open_sweep(store))
+    assert opened.ok.all() and str(store / name) in words and "restored" in words
     same(opened.values)
     assert swept(store).ran == 0
 
 
 @pytest.mark.parametrize("name", ["y", "n", "steps", "result", "lagjax/marks"])
 def test_missing_arrays(store, name):
-    """All of them are computed again."""
-    removed(store / name)
-    opened, words = told(lambda: lj.open_sweep(store))
+    """A missing array causes all its points to be computed again."""
+    remove(store / name)
+    opened, words = with_warnings(lambda: lj.open_sweep(store))
     assert not opened.ok.any() and str(store / name) in words
-    mended, _ = told(lambda: swept(store))
+    mended, _ = with_warnings(lambda: swept(store))
     assert mended.ran == 40 and mended.ok.all() and swept(store).ran == 0
     same(mended.values)
 
 
-@pytest.mark.parametrize("damage", [removed, cut, flipped(20)])
+@pytest.mark.parametrize("damage", [remove, cut, flip_bit(20)])
 def test_damaged_axes(store, damage):
-    """Alone such a store does not know its points; the same call does."""
+    """Such a store cannot be opened alone; the same sweep writes its axes again."""
     damage(store / "x/c/0")
     with pytest.raises(ValueError, match="values of the axis 'x' in .*/x are damaged"):
         lj.open_sweep(store)
-    mended, words = told(lambda: swept(store))
+    mended, words = with_warnings(lambda: swept(store))
     assert mended.ran == 0 and "/x was damaged" in words
     np.testing.assert_array_equal(lj.open_sweep(store).axes.values["x"], AXES["x"])
 
 
 def test_nothing_known(store, tmp_path):
-    """Both copies of what a store belongs to damaged, or no store at all: in words."""
+    """Errors if both copies of the description are damaged, or there is no store."""
     cut(store / "lagjax/zarr.json")
     cut(store / "lagjax/marks/zarr.json")
     for call in (swept, lj.open_sweep):
@@ -201,21 +201,21 @@ def test_nothing_known(store, tmp_path):
     with pytest.raises(ValueError, match="there is no .*nowhere"):
         lj.open_sweep(tmp_path / "nowhere")
     (tmp_path / "other" / "lagjax").mkdir(parents=True)
-    with pytest.raises(ValueError, match="exists, and is no store of a sweep"):
+    with pytest.raises(ValueError, match="exists, but is not the store of a sweep"):
         lj.open_sweep(tmp_path / "other")
 
 
 def test_parts_look_after_their_own(store):
-    """What is lost of another part is told, and lost in what a part returns."""
-    removed(store / "y/c/1/0/0")
-    part, words = told(lambda: swept(store, part=(0, 2)))
+    """Lost blocks of another part are reported, and are lost in what a part returns."""
+    remove(store / "y/c/1/0/0")
+    part, words = with_warnings(lambda: swept(store, part=(0, 2)))
     assert part.ran == 0 and np.sum(part.status.result == LOST) == 8 and "this call without part" in words
-    assert told(lambda: swept(store, part=(1, 2)))[0].ran == 8
+    assert with_warnings(lambda: swept(store, part=(1, 2)))[0].ran == 8
     assert swept(store).ok.all()
 
 
 NAMES = [
-    (lambda x: {"a": {"b": x}, "a.b": x}, r"2 values of the name 'a.b': \['a'\]\['b'\], \['a.b'\]"),
+    (lambda x: {"a": {"b": x}, "a.b": x}, r"2 values named 'a.b': \['a'\]\['b'\], \['a.b'\]"),
     (lambda x: {"a/b/c": x, "a/b_c": x, "a_b/c": x}, "two of the values are named 'a_b_c'"),
     (lambda x: {"zarr.json": x}, "value 'zarr.json' cannot be kept in a store"),
     (lambda x: {"__x": x}, "cannot be kept in a store"),
@@ -225,77 +225,77 @@ NAMES = [
 
 @pytest.mark.parametrize("values, words", NAMES)
 def test_a_failed_creation_leaves_nothing(tmp_path, values, words):
-    """Names that collide, and numbers for which there is no place."""
+    """Colliding names, and dtypes that zarr cannot store."""
     with pytest.raises((ValueError, TypeError), match=words):
         swept(tmp_path / "new" / "store", lambda point: values(point["x"]))
     assert not list(tmp_path.iterdir())
 
 
 def test_names_that_look_like_folders(tmp_path):
-    """Beside each other they are kept; in xarray an axis and a value of one name, too."""
+    """Names with a common prefix before a slash are kept apart; so are an axis and a value of one name in xarray."""
     both = swept(tmp_path / "store", lambda point: {"a/b": point["x"], "a/c": point["k"], "x": 2 * point["x"]})
     opened = lj.open_sweep(tmp_path / "store")
     np.testing.assert_array_equal(opened.values["a/c"], both.values["a/c"])
     np.testing.assert_allclose(opened.to_xarray()["value_x"][0], 2 * AXES["x"])
-    with pytest.raises(ValueError, match="2 values of the name 'a.b'"):
+    with pytest.raises(ValueError, match="2 values named 'a.b'"):
         lj.sweep(lambda point: {"a": {"b": point["x"]}, "a.b": 1.0}, AXES, progress=False).to_xarray()
     with pytest.raises(ValueError, match="two axes are named '1'"):
         lj.sweep(run, {1: AXES["x"], "1": AXES["x"]}, progress=False)
 
 
 def test_what_killed_processes_left(store):
-    """Folders of a creation that was killed are removed; files of others beside them are not."""
-    left, other = store.with_name(".store.0123abcd"), store.with_name(".store.notes")
-    for folder in (left, other):
+    """Temporary folders of a killed process are removed; other files next to them are not."""
+    leftover, other = store.with_name(".store.0123abcd"), store.with_name(".store.notes")
+    for folder in (leftover, other):
         folder.mkdir()
     (store / "n/c/1/0.0123.partial").write_bytes(b"half")
-    assert swept(store).ran == 0 and not left.exists() and other.exists()
+    assert swept(store).ran == 0 and not leftover.exists() and other.exists()
 
 
-def rewritten(path, change):
-    """What a store says about itself, changed in both copies."""
-    said = json.loads((path / "lagjax/zarr.json").read_text())["attributes"]["lagjax"]
-    change(said)
-    said["digest"] = metadata.digest_of(said)
+def rewrite(path, change):
+    """Change the description of a store in both copies."""
+    description = json.loads((path / "lagjax/zarr.json").read_text())["attributes"]["lagjax"]
+    change(description)
+    description["digest"] = metadata.digest_of(description)
     for file in (path / "lagjax/zarr.json", path / "lagjax/marks/zarr.json"):
-        there = json.loads(file.read_text())
-        file.write_text(json.dumps(there | {"attributes": {"lagjax": said}}))
+        stored = json.loads(file.read_text())
+        file.write_text(json.dumps(stored | {"attributes": {"lagjax": description}}))
 
 
-def by_another_version(said):
-    """Another version traces another program."""
-    said["fingerprint"] |= {"versions": fingerprint.versions() | {"jax": "0.9.0"}, "program": "0" * 16}
+def by_another_version(description):
+    """Pretend that another version, which traced another program, wrote the store."""
+    description["fingerprint"] |= {"versions": fingerprint.versions() | {"jax": "0.9.0"}, "program": "0" * 16}
 
 
 def test_other_versions(store):
-    """Are read always, and continued when that is asked for; a run that is another is told by its values."""
-    rewritten(store, by_another_version)
-    removed(store / "lagjax/marks/c/4/0/0")
+    """Their stores can always be read, and continued on request; a different run is detected by its values."""
+    rewrite(store, by_another_version)
+    remove(store / "lagjax/marks/c/4/0/0")
     opened = lj.open_sweep(store)
     assert opened.counts() == {"successful": 32, "not run": 8} and "written by lagjax" in opened.how
     with pytest.raises(ValueError, match="written by other versions(.|\n)*jax: 0.9.0 there(.|\n)*accept_versions=True"):
         swept(store)
-    with pytest.warns(UserWarning, match="'y' of 8 of its points differs by 1.0e"):
+    with pytest.warns(UserWarning, match="of 8 points computed again, 'y' differs by 1.0e"):
         swept(store, lambda point: {"n": run(point)["n"], "y": 2 * run(point)["y"]}, accept_versions=True, part=(0, 9))
     continued = swept(store, accept_versions=True)
     assert continued.ran == 8
     same(continued.values)
     with pytest.raises(ValueError, match="axis 'x' has other values"):
         swept(store, axes=AXES | {"x": AXES["x"] + 1}, accept_versions=True)
-    rewritten(store, lambda said: said["fingerprint"].update(format=99))
+    rewrite(store, lambda description: description["fingerprint"].update(format=99))
     with pytest.raises(ValueError, match="which is newer"):
         lj.open_sweep(store)
 
 
 @pytest.fixture
 def format_2(tmp_path):
-    """The same sweep, as lagjax wrote it before arrays had the shape of the axes, with the words of then."""
+    """The same sweep, written by lagjax before arrays had the shape of the axes, with the names of that time."""
     shutil.unpack_archive(Path(__file__).with_name("format_2.zip"), tmp_path / "second")
     return tmp_path / "second"
 
 
 def test_a_store_of_format_2(format_2):
-    """It is read, told by its damages, and continued as it is when that is asked for."""
+    """It can be read, its damage is reported, and it is continued in its format on request."""
     opened = lj.open_sweep(format_2)
     same(opened.values)
     assert opened.ok.all() and opened.dims == {"k": 5, "x": 8} and (opened.status.scaled_error == 0).all()
@@ -303,8 +303,8 @@ def test_a_store_of_format_2(format_2):
         swept(format_2)
     assert "accept_versions=True" in str(refusal.value) and "layout" not in str(refusal.value)
     (format_2 / "values/n/zarr.json").write_text("{")
-    removed(format_2 / "values/y/c/1/0")
-    mended, words = told(lambda: swept(format_2, accept_versions=True))
+    remove(format_2 / "values/y/c/1/0")
+    mended, words = with_warnings(lambda: swept(format_2, accept_versions=True))
     assert mended.ran == 8 and mended.ok.all() and "values/y/c/1/0 is missing" in words and "n/zarr.json" in words
     same(mended.values)
     same(lj.open_sweep(format_2).values)
@@ -313,47 +313,47 @@ def test_a_store_of_format_2(format_2):
 
 
 def as_format_1(path, to):
-    """A store as it once was: one byte a block for a mark, no checksums, no copies, no files of fill values."""
-    there = Store(path)
-    said = {key: there.about["itself"][key] for key in ("fingerprint", "block", "names", "zipped")}
-    said["fingerprint"] |= {"format": 1}
+    """A store in format 1: one byte per block for a mark, no checksums, no copies, no files of fill values."""
+    stored = Store(path)
+    description = {key: stored.about["as_written"][key] for key in ("fingerprint", "block", "names", "zipped")}
+    description["fingerprint"] |= {"format": 1}
     group = zarr.create_group(str(to))
-    for name in said["names"]:
-        group.create_array(f"axes/{name}", data=there.group[f"axes/{name}"][...])
-    for name, x in there.arrays.items():
+    for name in description["names"]:
+        group.create_array(f"axes/{name}", data=stored.group[f"axes/{name}"][...])
+    for name, x in stored.arrays.items():
         array = group.create_array(name, shape=x.shape, chunks=x.chunks, dtype=x.dtype, fill_value=x.fill_value)
         array[...] = x[...]
     done = group.create_array("done", shape=(5,), chunks=(1,), dtype="uint8", fill_value=0, compressors=None)
     done[:] = 1
-    group.attrs["lagjax"] = json.loads(json.dumps(said))
+    group.attrs["lagjax"] = json.loads(json.dumps(description))
     return to
 
 
 def test_a_store_without_checksums(format_2, tmp_path):
-    """It is read, continued when that is asked for, and what is seen to be missing or cut is mended."""
+    """It can be read, and continued on request; files detected as missing or cut are repaired."""
     first = as_format_1(format_2, tmp_path / "first")
     assert not (first / "status/steps/c/0").exists(), "all of them are 0"
     same(lj.open_sweep(first).values)
     with pytest.raises(ValueError, match="format: 1 there, 3 here"):
         swept(first)
     assert swept(first, accept_versions=True).ran == 0
-    for name, damage in [("values/n/c/1", removed), ("values/y/c/1/0", cut), ("status/result/c/1", removed)]:
+    for name, damage in [("values/n/c/1", remove), ("values/y/c/1/0", cut), ("status/result/c/1", remove)]:
         damage(first / name)
-        (opened, _), words = told(lambda: (opened := lj.open_sweep(first), opened.values))
+        (opened, _), words = with_warnings(lambda: (opened := lj.open_sweep(first), opened.values))
         assert np.sum(opened.status.result == LOST) == 8 and str(first / name) in words
-        mended, words = told(lambda: swept(first, accept_versions=True))
+        mended, words = with_warnings(lambda: swept(first, accept_versions=True))
         assert mended.ran == 8 and mended.ok.all() and str(first / name) in words
         same(mended.values)
-    removed(first / "done/c/2")
+    remove(first / "done/c/2")
     assert swept(first, accept_versions=True).ran == 8
     assert np.sum(lj.open_sweep(first).status.result == NOT_RUN) == 0
-    emptied(first / "values/n/zarr.json")
+    empty(first / "values/n/zarr.json")
     with pytest.raises(ValueError, match="values/n/zarr.json is damaged"):
         lj.open_sweep(first)
 
 
 def test_checksums_stand_in_every_array(whole):
-    """So that whoever reads a store with zarr sees what is not whole."""
+    """Anyone who reads a store with zarr can detect damage."""
     files = list(whole.rglob("zarr.json"))
     arrays = [x for x in (json.loads(file.read_text()) for file in files) if x["node_type"] == "array"]
     assert len(arrays) == 2 + 2 + 4 + 1

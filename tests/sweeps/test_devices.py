@@ -24,7 +24,7 @@ np.savez(sys.argv[1], values=swept.values, steps=swept.status.steps, how=swept.h
 """
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_two_devices(tmp_path):
     """Through `jax.shard_map`, with a number of points that does not divide by two."""
     environment = os.environ | {"PYTHONPATH": str(Path(lj.__file__).parents[1])}
@@ -32,8 +32,8 @@ def test_two_devices(tmp_path):
     two = np.load(tmp_path / "two.npz")
     one = lj.sweep(worker.run, worker.axes(170), progress=False)
     assert str(two["how"]).startswith("2 cpus")
-    # Split, the program is compiled otherwise, and where an error is no more than round-off the next step differs.
+    # The split program is compiled differently; where an error estimate is only round-off, the next step differs.
     np.testing.assert_allclose(two["steps"], one.status.steps, rtol=0.2)
     np.testing.assert_allclose(two["values"], one.values, atol=1e-7)
-    # Half of the lanes belong to the robust program.
+    # Some of the lanes need the robust program.
     np.testing.assert_allclose(two["irregular"], exact(BOTH["k"]), rtol=1e-7)

@@ -1,4 +1,4 @@
-"""Sweeps take motions for regular first: what is not settled is computed with the robust program, all of it."""
+"""Sweeps first assume regular motions: lanes that are not settled are computed entirely with the robust program."""
 
 import contextlib
 from collections import Counter
@@ -32,7 +32,7 @@ def saddle_motion(k):
 
 
 def first_coordinate(point):
-    """At t = 1."""
+    """The first coordinate at t = 1."""
     return saddle_motion(point["k"]).q[-1, 0]
 
 
@@ -44,12 +44,12 @@ def exact(k):
 
 
 def quiet(run, axes=BOTH, **settings):
-    """A sweep in silence."""
+    """A sweep without a progress bar."""
     return lj.sweep(run, axes, progress=False, **settings)
 
 
 def regular_alone(run, axes=BOTH):
-    """(values, status, settled) of the program that takes motions for regular, and of nothing else."""
+    """(values, status, settled) of only the program that assumes regular motions."""
     grid = axes_of(axes, False)
     program, _ = remembered.program_for(run, grid, grid.size, jax.local_devices()[:1], "vmap", robust=False)
     return program.call(grid.at(np.arange(grid.size)), grid.size)
@@ -57,7 +57,7 @@ def regular_alone(run, axes=BOTH):
 
 @pytest.fixture(autouse=True)
 def compiled(monkeypatch):
-    """How many programs of each kind are compiled, beginning with none."""
+    """Count the compiled programs of each kind, starting with an empty cache."""
     count, compiled = Counter(), remembered.compiled
 
     def counted(*args):
@@ -71,7 +71,7 @@ def compiled(monkeypatch):
 
 @contextlib.contextmanager
 def all_robust(monkeypatch):
-    """Sweeps as they would be without."""
+    """Run sweeps with the robust program from the start."""
     with monkeypatch.context() as changed:
         changed.setattr(lanes, "REGULAR_FIRST", lambda _: REGULAR_FIRST(False))
         remembered._PROGRAMS.clear()
@@ -82,7 +82,7 @@ def all_robust(monkeypatch):
 @pytest.mark.slow
 @not_plain
 def test_lanes_that_are_not_regular(compiled):
-    """They have their exact values, and the others those that they had. Twin: without the second program they fail."""
+    """All lanes have their exact values. Twin: without the robust program the irregular ones fail."""
     swept = quiet(first_coordinate)
     assert swept.ok.all() and compiled == {"regular": 1, "robust": 1}
     np.testing.assert_allclose(swept.values, exact(BOTH["k"]), rtol=1e-7)
@@ -93,16 +93,16 @@ def test_lanes_that_are_not_regular(compiled):
 
 
 def test_where_all_are_regular(compiled):
-    """Nothing robust is compiled."""
+    """No robust program is compiled if all motions are regular."""
     swept = quiet(first_coordinate, DEFINITE)
     np.testing.assert_allclose(swept.values, exact(DEFINITE["k"]), rtol=1e-7)
     assert swept.ok.all() and compiled == {"regular": 1}
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @not_plain
 def test_what_run_makes_of_a_failure():
-    """A run that catches NaN, and looks at `result`: the whole lane is computed anew. Twin: the first program alone."""
+    """A run that replaces NaN and reads `result`: the whole lane is computed again. Twin: the first program alone."""
 
     def run(point):
         traj = saddle_motion(point["k"])
@@ -112,11 +112,11 @@ def test_what_run_makes_of_a_failure():
     swept, (values, *_) = quiet(run), regular_alone(run)
     np.testing.assert_allclose(swept.values["q"], exact(BOTH["k"]), rtol=1e-7)
     assert swept.values["went well"].all()
-    # Not even NaN: its report says that it failed.
+    # The values are not even NaN: only the report says that the lane failed.
     assert not values["went well"][:2].any() and not np.allclose(values["q"][:2], swept.values["q"][:2])
 
 
-# Each integrates at k.
+# Functions that hide an integration at k.
 HIDDEN = {
     "a map": lambda k: lax.map(lambda k: saddle_motion(k).q[-1, 0], jnp.stack([k]))[0],
     "a branch": lambda k: lax.cond(k < 9.0, lambda k: saddle_motion(k).q[-1, 0], lambda k: k, k),
@@ -125,10 +125,10 @@ HIDDEN = {
 }
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("what", exhaustive_but(("a map",), HIDDEN))
 def test_motions_that_nobody_is_told_of(what, compiled, monkeypatch):
-    """In a loop or a branch nothing is taken for regular. Twin: it would go unnoticed."""
+    """In a loop or a branch no motion is assumed regular. Twin: failures there would go unnoticed."""
     run = lambda point: HIDDEN[what](point["k"])
     np.testing.assert_allclose(quiet(run).values, exact(BOTH["k"]), rtol=1e-7)
     assert regular_alone(run)[2] is None and compiled["robust"] == 0
@@ -137,12 +137,12 @@ def test_motions_that_nobody_is_told_of(what, compiled, monkeypatch):
     np.testing.assert_array_equal(np.isnan(quiet(run).values), BOTH["k"] < 1)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.parametrize(
     "derivative", exhaustive_but((jax.grad,), (jax.grad, jax.jacfwd, lambda f: jax.vmap(jax.grad(f))))
 )
 def test_derivatives(derivative, compiled):
-    """In both modes, and in lanes inside: those of the exact motion. Twin: the first program alone has NaN."""
+    """Both modes, and `vmap` inside, give the exact derivatives. Twin: the first program alone gives NaN."""
     motion = lambda k: saddle_motion(k).q[-1, 0]
 
     def run(point):
@@ -158,7 +158,7 @@ def test_derivatives(derivative, compiled):
 
 @pytest.mark.exhaustive
 def test_many_chunks_and_workers(compiled):
-    """One robust program for all of them; after a chunk that is mostly irregular the other is not called again."""
+    """All chunks share one robust program; after a mostly irregular chunk the first program is not called again."""
     many = {"k": np.tile(BOTH["k"][:2], 40)}
     swept = quiet(first_coordinate, many, chunk=4, workers=4)
     np.testing.assert_allclose(swept.values, exact(many["k"]), rtol=1e-7)
@@ -172,7 +172,7 @@ def test_many_chunks_and_workers(compiled):
     again = quiet(first_coordinate, many, chunk=4, workers=4)
     np.testing.assert_array_equal(again.values, swept.values)
     assert again.compiling == 0 and not calls
-    # Twin: of the others it is called.
+    # Twin: with the flag cleared it is called.
     program.irregular.clear()
     quiet(first_coordinate, many, chunk=4, workers=1)
     assert calls["regular"] == 1
@@ -180,16 +180,16 @@ def test_many_chunks_and_workers(compiled):
 
 @pytest.mark.exhaustive
 def test_in_turn_and_resweep(compiled):
-    """One lane after the other, and run again."""
+    """Lanes one after the other, and points run again."""
     swept = quiet(first_coordinate, layout="map")
     np.testing.assert_allclose(swept.values, exact(BOTH["k"]), rtol=1e-7)
     again = swept.resweep(lambda point: 2 * first_coordinate(point), where=BOTH["k"] < 3)
     np.testing.assert_allclose(again.values, exact(BOTH["k"]) * np.where(BOTH["k"] < 3, 2, 1), rtol=1e-7)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_in_a_store(tmp_path, compiled):
-    """The same values, and the store is known again, also where the first program is not called any more."""
+    """Same values; the store is recognised even when the first program is no longer called."""
     pytest.importorskip("zarr")
     path, whole = tmp_path / "sweep", quiet(first_coordinate, chunk=3)
     half = quiet(first_coordinate, chunk=3, store=path, part=(0, 2))
@@ -211,7 +211,7 @@ doubled = lj.System(
 
 @pytest.mark.exhaustive
 def test_a_constraint_written_twice(monkeypatch):
-    """Dependent constraints, and starts that are none: values and statuses are those without all this."""
+    """Dependent constraints and invalid starts: values and statuses match those of the robust program alone."""
 
     def values(point):
         still = {"x": 0.0, "y": 0.0, "z": 0.0}
@@ -230,7 +230,7 @@ def test_a_constraint_written_twice(monkeypatch):
 
 
 def test_a_fit_takes_nothing_for_regular():
-    """A sweep of fits does not hear of the motions that a search tries."""
+    """Motions that a search tries are not assumed regular and not reported to a sweep of fits."""
     with WATCHED(True), REGULAR_FIRST(True):
         assert takes_for_regular()
         inside = []

@@ -1,4 +1,4 @@
-"""A sweep called again compiles nothing, and never gives an answer of before."""
+"""A sweep called again compiles nothing, and never gives a stale answer."""
 
 import gc
 import threading
@@ -18,22 +18,22 @@ K, TABLE = 2.0, np.array([2.0, 7.0])
 
 
 def quiet(run, axes, **settings):
-    """A sweep in silence."""
+    """A sweep without a progress bar."""
     return lj.sweep(run, axes, progress=False, **settings)
 
 
 def times_k(point):
-    """A number read from the module."""
+    """A run that reads a global of the module."""
     return K * point["x"]
 
 
 def xs(count):
-    """So many different points."""
+    """An axis of `count` different points."""
     return {"x": np.linspace(1.0, 3.0, count)}
 
 
 def test_called_again_it_compiles_nothing():
-    """Nor with other values, or some points more; it says so. Twins: another dtype, shape, name, length of chunks."""
+    """Other values or more points compile nothing, and repr says so. Twins: another dtype, shape, name, chunk."""
     run = lambda point: jnp.sin(point["x"])
     first = quiet(run, xs(1000))
     assert first.compiling > 0 and "; computed in" in repr(first) and "nothing had" not in repr(first)
@@ -59,12 +59,12 @@ def test_called_again_it_compiles_nothing():
 
 
 def closing_over(value):
-    """A run written anew at each call."""
+    """A new function at each call."""
     return lambda point: value * point["x"]
 
 
 def test_a_function_written_anew():
-    """The same in all that it reads is the same; another number is another function."""
+    """Functions that read the same values count as the same; another number makes another function."""
     assert closing_over(2.0) is not closing_over(2.0)
     quiet(closing_over(2.0), xs(40))
     with compiles() as found:
@@ -75,7 +75,7 @@ def test_a_function_written_anew():
 
 
 class Law:
-    """What a run reads of an object, and of its class."""
+    """An object whose attributes and class a run reads."""
 
     exponent = 1.0
 
@@ -83,12 +83,12 @@ class Law:
         self.k = {"of": [2.0]}
 
     def force(self, x):
-        """By a method, which reads the module."""
+        """A method that reads a global of the module."""
         return K * self.k["of"][0] * x**self.exponent
 
 
 def set_global(name, value):
-    """As in a notebook."""
+    """Set a global, as a notebook cell does."""
     globals()[name] = value
 
 
@@ -126,7 +126,7 @@ CHANGES = {
 
 @pytest.mark.parametrize("what", CHANGES)
 def test_what_has_changed_is_seen(what):
-    """The function itself says what is right; before the change nothing is compiled the second time."""
+    """After each change the values match the function; before it, a second sweep compiles nothing."""
     run, change = CHANGES[what]
     axes = xs(3)
     exact = lambda: [run({"x": x}) for x in axes["x"]]
@@ -141,7 +141,7 @@ def test_what_has_changed_is_seen(what):
 
 
 def test_settings_of_jax_are_part_of_it():
-    """In float32 the same function is another program."""
+    """In float32 the same function gives another program."""
     run = lambda point: jnp.asarray(0.1) * point["n"]
     in_double = quiet(run, {"n": np.arange(4, dtype=np.int32)})
     with jax.enable_x64(False):
@@ -150,7 +150,7 @@ def test_settings_of_jax_are_part_of_it():
 
 
 def test_a_run_without_a_meaning():
-    """What cannot be compared is compiled for each sweep, as a random number is drawn anew."""
+    """A function that cannot be compared is compiled for each sweep, so a new random number is drawn."""
     random = np.random.default_rng(0)
     run = lambda point: random.normal() * point["x"]
     assert meaning_of(run) is None and meaning_of(closing_over(random)) is None and meaning_of(times_k) is not None
@@ -158,7 +158,7 @@ def test_a_run_without_a_meaning():
 
 
 def test_equal_parts_and_the_same_part():
-    """Meanings tell one thing twice from two things, and what hashes alike."""
+    """Meanings distinguish one object used twice from two equal objects, and values with equal hashes."""
     one, two = [1.0], [1.0]
     of = lambda *values: meaning_of(closing_over(values))
     assert of(one, one) == of(one, one) and of(one, two) == of(two, one)
@@ -170,7 +170,7 @@ def test_equal_parts_and_the_same_part():
 
 
 def test_programs_of_functions_that_are_gone(monkeypatch):
-    """They are dropped with them; of all no more than so many are kept."""
+    """Programs are dropped with their functions, and only a limited number is kept."""
     names = {}
     exec("def run(point):\n    return 3.0 * point['x']", names)
     programs = remembered._PROGRAMS
@@ -180,7 +180,7 @@ def test_programs_of_functions_that_are_gone(monkeypatch):
     del swept, names["run"]
     gc.collect()
     assert len(programs) == 0
-    monkeypatch.setattr(remembered, "KEPT", 3)
+    monkeypatch.setattr(remembered, "MOST_PROGRAMS", 3)
     for k in range(5):
         quiet(closing_over(float(k)), xs(3))
     assert len(programs) == 3
@@ -190,7 +190,7 @@ def test_programs_of_functions_that_are_gone(monkeypatch):
 
 
 def test_a_long_compile_is_announced(monkeypatch, capsys):
-    """While it lasts, where somebody looks; a program that is there needs no word."""
+    """A message is shown while it lasts, if progress is shown; a program from the cache shows none."""
     monkeypatch.setattr(meter, "LONG", 0.05)
     monkeypatch.setattr(meter, "TICK", 0.05)
 
@@ -199,6 +199,6 @@ def test_a_long_compile_is_announced(monkeypatch, capsys):
         return point["x"]
 
     for progress, words in ((False, False), (True, True), (True, False)):
-        # The first time for other points than the second.
+        # The first sweep uses another dtype than the second, so both compile.
         lj.sweep(slow, {"x": xs(3)["x"].astype(np.float64 if progress else np.float32)}, progress=progress)
         assert ("compiling" in capsys.readouterr().err) == words

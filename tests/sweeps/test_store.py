@@ -26,13 +26,13 @@ def swept(run, store=None, **settings):
 
 
 def same(found, whole):
-    """Bit for bit: a resumed sweep runs the same program."""
+    """Check equality bit for bit: a resumed sweep runs the same program."""
     np.testing.assert_array_equal(found.values, whole.values)
     np.testing.assert_array_equal(found.status.result, whole.status.result)
 
 
 def started(store, k=0, n=1, *port):
-    """The worker's process."""
+    """Start a worker process."""
     root = Path(lj.__file__).parents[1]
     environment = os.environ | {"PYTHONPATH": str(root)}
     command = [sys.executable, worker.__file__, str(store), str(k), str(n), str(POINTS), *map(str, port)]
@@ -40,7 +40,7 @@ def started(store, k=0, n=1, *port):
 
 
 def test_written_resumed_and_read(tmp_path):
-    """A second call computes nothing; the store opens without what ran it."""
+    """A second call computes nothing; the store opens without the function that ran it."""
     path, whole = tmp_path / "sweep", swept(worker.quick)
     first = swept(worker.quick, path)
     assert first.ran == POINTS
@@ -52,12 +52,12 @@ def test_written_resumed_and_read(tmp_path):
     assert alone.dims == whole.dims and alone.counts() == whole.counts()
     np.testing.assert_array_equal(alone.values, whole.values)
     assert alone.to_xarray()["value"].dims == ("g", "angle")
-    with pytest.raises(ValueError, match="does not know what ran it"):
+    with pytest.raises(ValueError, match="does not know the function that ran it"):
         alone.resweep(where=True)
 
 
 def test_only_what_is_missing(tmp_path):
-    """Blocks that are not marked are computed again, whatever stands in them."""
+    """Unmarked blocks are computed again, whatever values they contain."""
     path, whole = tmp_path / "sweep", swept(worker.quick)
     swept(worker.quick, path)
     store = Store(path)
@@ -69,7 +69,7 @@ def test_only_what_is_missing(tmp_path):
 
 
 def test_another_sweep_is_refused(tmp_path):
-    """Other values, another function, other settings: each in words, and the store stays as it is."""
+    """Other values, another function, other settings: each is named, and the store stays unchanged."""
     path, axes = tmp_path / "sweep", {"x": jnp.arange(6.0)}
     run = lambda scale: lambda point: scale * point["x"]
     lj.sweep(run(2.0), axes, store=path, chunk=2, progress=False)
@@ -86,24 +86,24 @@ def test_another_sweep_is_refused(tmp_path):
         assert words in str(refusal.value)
     assert lj.sweep(run(2.0), axes, store=path, progress=False).ran == 0
     (tmp_path / "other").mkdir()
-    with pytest.raises(ValueError, match="is no store of a sweep"):
+    with pytest.raises(ValueError, match="is not the store of a sweep"):
         lj.sweep(run(2.0), axes, store=tmp_path / "other", progress=False)
 
 
 def blocks_there(path):
-    """How many blocks are marked, 0 before there is a store."""
+    """The number of marked blocks, 0 before the store exists."""
     return 0 if not path.exists() else len(Store(path).blocks) - len(Store(path).missing())
 
 
 def points_there(path):
-    """How many points these blocks have."""
+    """The number of points in the marked blocks."""
     store = Store(path)
     there = set(range(len(store.blocks))) - set(store.missing().tolist())
     return sum(len(np.r_[store.blocks.points(number)]) for number in there)
 
 
 def wait_for(process, path, count):
-    """Until some blocks are there."""
+    """Wait until `count` blocks are marked."""
     deadline = time.monotonic() + 120
     while blocks_there(path) < count:
         assert process.poll() is None and time.monotonic() < deadline
@@ -111,7 +111,7 @@ def wait_for(process, path, count):
 
 
 def kill_when(process, path, count):
-    """`kill -9` once some blocks are there."""
+    """`kill -9` once `count` blocks are marked."""
     wait_for(process, path, count)
     process.send_signal(signal.SIGKILL)
     process.wait()
@@ -120,7 +120,7 @@ def kill_when(process, path, count):
 
 @pytest.mark.slow
 def test_killed_and_resumed(tmp_path):
-    """At any moment: nothing is lost but the block that was being computed, nothing is corrupted."""
+    """At any moment only the block in progress is lost, and nothing is corrupted."""
     path = tmp_path / "sweep"
     kill_when(started(path), path, 1)
     kill_when(started(path), path, 2)
@@ -133,10 +133,10 @@ def test_killed_and_resumed(tmp_path):
 
 @pytest.mark.slow
 def test_interrupted_from_the_keyboard(tmp_path):
-    """The process ends well, with what it had, and says so."""
+    """The process exits normally and keeps the finished points."""
     path, computed = tmp_path / "sweep", POINTS
     while computed == POINTS:
-        # On a busy machine a sweep may be over before it is interrupted, and is tried again.
+        # On a busy machine a sweep may finish before it is interrupted; then it is tried again.
         shutil.rmtree(path, ignore_errors=True)
         process = started(path)
         wait_for(process, path, 1)
@@ -149,7 +149,7 @@ def test_interrupted_from_the_keyboard(tmp_path):
 
 @pytest.mark.slow
 def test_two_processes_by_jax_distributed(tmp_path):
-    """On loopback: each finds its part, and together they have it all."""
+    """On loopback: each process finds its part, and together they compute all points."""
     path = tmp_path / "sweep"
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
@@ -162,7 +162,7 @@ def test_two_processes_by_jax_distributed(tmp_path):
 
 @pytest.mark.slow
 def test_two_processes_one_killed(tmp_path):
-    """Each takes its blocks of one store; the one that died is started again and does only what it had not."""
+    """Two processes share a store; the killed one is restarted and computes only its missing blocks."""
     path = tmp_path / "sweep"
     first, second = started(path, 0, 2), started(path, 1, 2)
     kill_when(second, path, 1)

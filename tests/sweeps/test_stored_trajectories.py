@@ -1,4 +1,4 @@
-"""Trajectories that a sweep stored or pickled come back as trajectories; their systems when they are given again."""
+"""Trajectories that a sweep stored or pickled come back as trajectories, with their system if it is passed again."""
 
 import copy
 import pickle
@@ -16,20 +16,20 @@ import lagjax as lj
 
 TS = np.linspace(0.0, 2.0, 5)
 AXES = {"k": np.array([1.0, 2.0, 3.0]), "x": np.array([0.5, 1.0])}
-# x cos k t, with a number and a text in params that are no arrays.
+# x cos k t; params contain a number and a string, which are not arrays.
 spring = lj.System(lambda t, q, v, params: 0.5 * v["x"] ** 2 - 0.5 * params["k"] ** params["power"] * q["x"] ** 2)
 EXACT = AXES["x"][:, None] * np.cos(AXES["k"][:, None, None] * TS)
 
 
 class Pair(NamedTuple):
-    """Named."""
+    """A named tuple among the values."""
 
     square: jax.Array
     rest: tuple
 
 
 def swing(point, ts=TS):
-    """The spring let go."""
+    """The spring released from rest."""
     params = {"k": point["k"], "power": 2, "name": "spring"}
     return lj.integrate(spring, {"x": point["x"]}, {"x": 0.0}, params, ts=ts)
 
@@ -40,7 +40,7 @@ def run(point):
 
 
 def quiet(of, axes=AXES, **settings):
-    """In silence."""
+    """A sweep without a progress bar."""
     return lj.sweep(of, axes, progress=False, **settings)
 
 
@@ -58,20 +58,20 @@ def lane(motions, *at):
 
 
 def test_structures_without_trajectories(tmp_path):
-    """Tuples, named tuples, lists and None come back as they were; there is nothing to give a system to."""
+    """Tuples, named tuples, lists and None come back unchanged; passing a system is an error."""
     of = lambda point: {"pair": Pair(point["k"] ** 2, (point["x"], [point["k"] * jnp.ones(2), None])), "a.b": 1.0}
     swept = quiet(of, store=tmp_path / "store")
     opened = lj.open_sweep(tmp_path / "store")
     assert jax.tree.structure(opened.values) == jax.tree.structure(swept.values)
     assert isinstance(opened.values["pair"], Pair) and repr(opened.values) == repr(swept.values)
-    with pytest.raises(ValueError, match="has no trajectories that ask for a system"):
+    with pytest.raises(ValueError, match="has no trajectories that need a system"):
         lj.open_sweep(tmp_path / "store", system=spring)
-    with pytest.raises(ValueError, match="run returns value float64, and .* has a.b float64, pair.rest.0 float64"):
+    with pytest.raises(ValueError, match="run returns value float64, but .* has a.b float64, pair.rest.0 float64"):
         lj.open_sweep(tmp_path / "store", run=lambda point: point["x"])
 
 
 def test_what_cannot_be_written_down(tmp_path):
-    """A function among the values: a dictionary by name, or what it was with `run` given again."""
+    """Values that contain a function are read as a dictionary by name, or restored if `run` is passed again."""
     of = lambda point: jax.tree_util.Partial(lambda k, x: k * x, point["k"])
     quiet(of, {"k": AXES["k"]}, store=tmp_path / "store")
     values = lj.open_sweep(tmp_path / "store").values
@@ -81,13 +81,13 @@ def test_what_cannot_be_written_down(tmp_path):
 
 
 class Law(eqx.Module):
-    """Of the user's."""
+    """A class of the user."""
 
     k: jax.Array
 
 
 def test_a_class_that_is_not_found(tmp_path, monkeypatch):
-    """As in a process that has not imported it: by name, and told. Twin: before, it came back."""
+    """As in a process that has not imported it: a dictionary and a warning. Twin: with the class it is restored."""
     quiet(lambda point: Law(point["k"]), {"k": AXES["k"]}, store=tmp_path / "store")
     assert isinstance(lj.open_sweep(tmp_path / "store").values, Law)
     monkeypatch.delattr(sys.modules[__name__], "Law")
@@ -98,7 +98,7 @@ def test_a_class_that_is_not_found(tmp_path, monkeypatch):
 
 @pytest.mark.slow
 def test_a_store_opened(store):
-    """Trajectories in closed form, bit for bit those of the sweep; they print, plot and play without their system."""
+    """Trajectories equal those of the sweep bit for bit; they print, plot and animate without their system."""
     swept, opened = quiet(run, store=store), lj.open_sweep(store)
     motions = opened.values["motion"]
     assert swept.ran == 0 and isinstance(motions, lj.Trajectory) and isinstance(opened.values["pair"], Pair)
@@ -118,7 +118,7 @@ def test_a_store_opened(store):
 
 @pytest.mark.slow
 def test_the_system_given_again(store):
-    """By itself or by `run` it makes trajectories whole; twins: another one, and another run."""
+    """Passing the system or `run` completes trajectories; twins: another system, and another run."""
     known = lane(quiet(run, store=store).values["motion"], 1, 1)
     for given in ({"system": spring}, {"run": run}):
         one = lane(lj.open_sweep(store, **given).values["motion"], 1, 1)
@@ -135,7 +135,7 @@ def test_the_system_given_again(store):
 
 @pytest.mark.slow
 def test_labelled_with_the_axes_in_front(store):
-    """As xarray reads the store, and as each trajectory labels itself."""
+    """Labels equal those xarray reads from the store, and those of each trajectory."""
     data, opened = xarray.open_zarr(store).load(), lj.open_sweep(store)
     assert data["motion.q.x"].dims == ("k", "x", "motion.t") and np.array_equal(data["motion.t"], TS)
     np.testing.assert_allclose(data["motion.q.x"], EXACT, atol=1e-8)
@@ -150,9 +150,9 @@ def test_labelled_with_the_axes_in_front(store):
 
 @pytest.mark.slow
 def test_times_of_their_own(tmp_path):
-    """Where each point has other times they are a variable; where all have the same, the coordinate. Alone: no prefix.
+    """Times that differ between points are a variable; shared times are the coordinate. A single value has no prefix.
 
-    An axis named as the times keeps its name.
+    An axis named like the times keeps its name.
     """
     of = lambda point: swing({"k": point["t"], "x": 1.0}, ts=TS * point["t"])
     axes = {"t": AXES["k"]}
@@ -167,7 +167,7 @@ def test_times_of_their_own(tmp_path):
 
 @pytest.mark.slow
 def test_part_of_it(store, tmp_path):
-    """What was not run is NaN, with its times; the rest is there."""
+    """Points not run are NaN but have times; the others have values."""
     half = quiet(run, store=tmp_path / "store", chunk=1, part=(0, 2))
     data = xarray.open_zarr(tmp_path / "store").load()
     not_run = data["result"].values == -1
@@ -181,7 +181,7 @@ def test_part_of_it(store, tmp_path):
 
 @pytest.mark.slow
 def test_pickled_with_a_lambda():
-    """The functions stay where they are, all else goes along; a copy in this process has them."""
+    """Functions are left out of the pickle, everything else is in it; a copy in this process keeps them."""
     swept = quiet(run)
     found = pickle.loads(pickle.dumps(swept))
     assert repr(found) == repr(swept) and found.to_xarray().identical(swept.to_xarray())
@@ -205,7 +205,7 @@ class Stiff(eqx.Module):
 
 @pytest.mark.slow
 def test_a_system_with_arrays(tmp_path):
-    """They are stored, and come back with the system; without it there is no place for them, and all else is there."""
+    """Its arrays are stored and restored with the system; without the system they are dropped, all else remains."""
     stiff = lj.System(Stiff(jnp.array(4.0)), dissipation=lambda t, q, v, params: 0.0 * v**2)
     of = lambda point: lj.integrate(stiff, point["x"], 0.0, None, ts=TS)
     swept = quiet(of, {"x": AXES["x"]}, store=tmp_path / "store")

@@ -1,4 +1,4 @@
-"""Sweeps against loops: values, gradients, steps, statuses; what they print, draw and export."""
+"""Sweeps compared with loops: values, gradients, steps, statuses; printing, plotting and exporting."""
 
 import diffrax
 import equinox as eqx
@@ -28,23 +28,23 @@ def swing(point, **settings):
 
 
 def quiet(run, axes=AXES, **settings):
-    """A sweep in silence."""
+    """A sweep without a progress bar."""
     return lj.sweep(run, axes, progress=False, **settings)
 
 
 def slope(point):
-    """The derivative of the last angle by g, through a program of its own."""
+    """The derivative of the last angle with respect to g, in a nested jit."""
     return jax.jit(jax.grad(lambda g: swing({"g": g, "angle": point["angle"]}).q[-1]))(point["g"])
 
 
 def final_angle_and_slope(point):
-    """Two values by name."""
+    """Three values by name."""
     traj = swing(point)
     return {"angle": traj.q[-1], "slope": slope(point), "steps": traj.stats["num_steps"]}
 
 
 def by_loop(run, axes):
-    """Point by point, each alone."""
+    """Run point by point."""
     program = jax.jit(run)
     points = [program({"g": g, "angle": angle}) for g in axes["g"] for angle in axes["angle"]]
     return jax.tree.map(lambda *x: np.stack(x).reshape(len(axes["g"]), len(axes["angle"])), *points)
@@ -57,27 +57,27 @@ def looped():
 
 
 def assert_same(found, expected, rtol, atol):
-    """Values and gradients."""
+    """Compare values and gradients."""
     for name in ("angle", "slope"):
         np.testing.assert_allclose(found[name], expected[name], rtol=rtol, atol=atol)
 
 
 @pytest.mark.slow
 def test_same_as_a_loop(looped):
-    """One lane after the other: the same steps. Together: sines are rounded otherwise, and first steps see that."""
+    """One lane after the other takes the same steps; together, sines round differently, which changes first steps."""
     in_turn, together = quiet(final_angle_and_slope, layout="map", workers=1), quiet(final_angle_and_slope)
     assert in_turn.dims == {"g": 3, "angle": 7} and in_turn.ok.all() and together.ok.all()
     np.testing.assert_array_equal(in_turn.values["steps"], looped["steps"])
     assert_same(in_turn.values, looped, 1e-10, 1e-12)
     np.testing.assert_allclose(together.values["steps"], looped["steps"], rtol=0.2)
     assert_same(together.values, looped, 1e-7, 1e-7)
-    # The gradient integrates too.
+    # The gradient integrates as well.
     assert np.all(in_turn.status.steps > looped["steps"])
 
 
 @pytest.mark.slow
 def test_same_as_vmap_and_whoever_is_beside():
-    """The same steps as under `jax.vmap`, in other chunks, sorted, and among other lanes."""
+    """Steps are the same as under `jax.vmap`, in other chunks, sorted, and in another order of lanes."""
     swept = quiet(final_angle_and_slope)
     of_g = lambda g: jax.vmap(lambda angle: final_angle_and_slope({"g": g, "angle": angle}))(AXES["angle"])
     others = [
@@ -92,7 +92,7 @@ def test_same_as_vmap_and_whoever_is_beside():
 
 @pytest.mark.slow
 def test_a_lane_that_fails_keeps_its_reason():
-    """It is NaN, the others are what they are without it; run again with other settings it is filled in."""
+    """A failed lane is NaN and does not affect the others; running it again with other settings fills it in."""
     few = quiet(lambda point: swing(point, max_steps=22).q[-1])
     failed = few.status.result == MAX_STEPS
     assert 0 < failed.sum() < failed.size and set(np.unique(few.status.result)) == {OK, MAX_STEPS}
@@ -107,15 +107,15 @@ def test_a_lane_that_fails_keeps_its_reason():
         few.resweep(lambda point: (point["g"], point["g"]))
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_long_lanes_are_run_alone(monkeypatch):
-    """The others do not wait for them; steps that run out by the user's own word are not taken again."""
+    """Other lanes do not wait for them; lanes that hit the user's own step limit are not run again."""
     monkeypatch.setattr(running, "PATIENCE", 30)
     run = lambda limit: jax.jit(lambda point: swing(point, max_steps=limit).q[-1])
     alone = run(2**16)
     swept = quiet(alone)
     assert swept.ok.all() and 0 < np.sum(swept.status.steps > 30) < 10
-    # Jitted by the user, and traced in the sweep: outside of it, it is as patient as ever.
+    # A function jitted by the user and traced in the sweep has no step limit outside the sweep.
     for i, j in np.argwhere(swept.status.steps > 30):
         np.testing.assert_allclose(
             swept.values[i, j], alone({"g": AXES["g"][i], "angle": AXES["angle"][j]}), rtol=1e-14
@@ -124,9 +124,9 @@ def test_long_lanes_are_run_alone(monkeypatch):
     assert few.status.steps.max() == 28 and np.any(few.status.result == MAX_STEPS)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_starts_that_cannot_be_integrated():
-    """Off the constraint, NaN: each lane with its own word, none raises."""
+    """Starts off the constraint, or NaN: each lane has its own result, none raises."""
     start = lambda point: ({"x": point["x"], "y": 0.0}, {"x": 0.0, "y": 0.0})
     run = lambda point: lj.integrate(rod, *start(point), {"g": point["g"]}, ts=TS).end.q["x"]
     swept = quiet(run, {"x": jnp.array([1.0, 1.5]), "g": jnp.array([1.0, jnp.nan])})
@@ -138,7 +138,7 @@ def test_starts_that_cannot_be_integrated():
 
 
 def test_a_check_that_fails_ends_its_lane_alone():
-    """`error_if` in a force, and in `run` itself: NaN and a status there; twin: without it the lanes go on."""
+    """`error_if` in a force and in `run` gives NaN and a status; twin: without the check the lanes continue."""
     deep = {"wall": jnp.array([0.5, 0.9, 1.1, 2.0])}
 
     def swing(point, checked):
@@ -157,16 +157,16 @@ def test_a_check_that_fails_ends_its_lane_alone():
 
 
 def test_a_drifting_motion_is_marked():
-    """Fixed steps that are too long: the values stay, `ok` says not to trust them."""
+    """With fixed steps that are too long the values stay, but `ok` is False."""
     settings = {"stepsize_controller": diffrax.ConstantStepSize(), "dt0": jnp.asarray(0.5), "method": diffrax.Heun()}
     swept = quiet(lambda point: swing(point, **settings).q[-1], {"g": jnp.array([1.0]), "angle": jnp.array([2.0])})
     assert not swept.ok.any() and np.isfinite(swept.values).all()
     assert swept.status.scaled_error > 1 and "the change of what must stay constant" in repr(swept)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_reports_are_found_in_every_kind_of_program():
-    """Plain, under jit, grad, vmap and in a branch of a check; the worst of several counts."""
+    """Reports are found in plain, jitted, differentiated and batched programs; the worst of several counts."""
     program = lambda wrap: jax.jit(reporting(lambda point: wrap(lambda g: swing({"g": g, "angle": 1.0}).q[-1])(point)))
     _, alone, _ = program(lambda f: f)(4.0)
     assert int(alone.steps) > 0
@@ -180,7 +180,7 @@ def test_reports_are_found_in_every_kind_of_program():
 
 
 def test_without_an_integration():
-    """Any function of a point; what is not finite has failed."""
+    """Any function of a point can be swept; values that are not finite count as failed."""
     swept = quiet(lambda point: {"root": jnp.sqrt(point["x"]), "n": 3}, {"x": jnp.array([4.0, -1.0])})
     assert swept.values["n"].tolist() == [3, 3] and swept.counts() == {
         "successful": 1,
@@ -189,7 +189,7 @@ def test_without_an_integration():
 
 
 def test_whole_trajectories():
-    """One leaf of `values`, with its times as a dimension."""
+    """A trajectory is one leaf of `values`, with its times as a dimension."""
     swept = quiet(lambda point: swing(point))
     assert swept.values.q.shape == (3, 7, 4)
     data = swept.to_xarray()
@@ -201,7 +201,7 @@ def test_whole_trajectories():
 
 
 def test_paired_and_labelled():
-    """The dimension is the point, the axes its coordinates."""
+    """The dimension is the point, and the axes are its coordinates."""
     pairs = {"g": jnp.array([1.0, 4.0, 9.0]), "angle": jnp.array([0.1, 0.2, 0.3])}
     swept = quiet(lambda point: swing(point).q[-1], pairs, paired=True)
     data = swept.to_xarray()
@@ -210,7 +210,7 @@ def test_paired_and_labelled():
 
 
 def test_repr_and_pictures():
-    """Counts by status, where it was hardest; a line, a map, small multiples; what has no picture says so."""
+    """repr shows counts by status and the hardest point; plots are a line, a map or small multiples, or an error."""
     swept = quiet(lambda point: {"end": jnp.sqrt(point["g"] - 2 * point["angle"])})
     shown = repr(swept)
     for part in ("21: g (3) x angle (7)", "successful", "The state became NaN", "first not ok", "points/s"):
@@ -219,18 +219,18 @@ def test_repr_and_pictures():
     assert len(quiet(lambda point: point["g"] ** 2, {"g": jnp.arange(5.0)}).plot().axes) == 1
     three = quiet(lambda p: p["a"] * p["b"] * p["c"], {k: jnp.arange(1.0, 4.0) for k in "abc"})
     assert len(three.plot().axes) == 4
-    with pytest.raises(ValueError, match=r"no value with one number a point; a point has 'q' \(4,\)"):
+    with pytest.raises(ValueError, match=r"no value with one number per point; each point has 'q' \(4,\)"):
         quiet(lambda point: {"q": point["g"] * TS}).plot()
     motions = quiet(swing, {"g": jnp.array([1.0, 4.0, 9.0]), "angle": jnp.array([0.1, 0.2, 0.3])}, paired=True)
     panel, shades = motions.plot().axes
     assert shades.get_ylabel() == "point" and panel.get_xlabel() == "t" and len(panel.lines) == 3
     np.testing.assert_array_equal(panel.lines[2].get_ydata(), motions.values.q[2])
-    with pytest.raises(ValueError, match="(?s)a point has.*'q' .*Fix: choose one"):
+    with pytest.raises(ValueError, match="(?s)each point has.*'q' .*Fix: choose one"):
         quiet(swing).plot()
 
 
 class Spring(eqx.Module):
-    """A result that is a function as well, as a trained network is."""
+    """A result that is also a function, such as a trained network."""
 
     k: jax.Array
 
@@ -239,14 +239,14 @@ class Spring(eqx.Module):
 
 
 def test_what_run_returns_may_be_a_function():
-    """A module that can be called is a pytree as any other."""
+    """A callable module is a pytree like any other."""
     swept = quiet(lambda point: Spring(point["g"]), {"g": AXES["g"]})
     np.testing.assert_array_equal(swept.values(1.0), -AXES["g"])
     assert "k float64" in repr(swept)
 
 
 def test_interrupted(monkeypatch):
-    """Ctrl-C keeps what is done, and `resweep` does the rest."""
+    """Ctrl-C keeps finished points, and `resweep` runs the rest."""
 
     class Impatient(Silent):
         def update(self, count):
@@ -262,22 +262,22 @@ def test_interrupted(monkeypatch):
 
 
 def test_what_would_not_fit_is_refused():
-    """Before anything runs, with the number."""
+    """A sweep too large for memory is refused before anything runs, with its size."""
     with pytest.raises(MemoryError, match=r"this sweep needs [\d.e+]+ GB: 1,000,000,000,000 points of \d+ bytes"):
         quiet(lambda point: point["x"] + point["y"] + jnp.zeros(10), {"x": jnp.zeros(10**6), "y": jnp.zeros(10**6)})
 
 
 def test_what_run_must_not_return():
-    """Words."""
+    """The error names the value of a wrong type."""
     with pytest.raises(TypeError, match="run must return numbers and arrays, and returned 'fast', a str"):
         quiet(lambda point: (point["g"], "fast"))
 
 
 def test_bad_settings():
-    """Layout and part."""
+    """Errors for a wrong layout or part."""
     with pytest.raises(ValueError, match="layout must be one of 'vmap', 'map'"):
         quiet(lambda point: point["g"], layout="sideways")
     with pytest.raises(ValueError, match=r"part must be \(k, n\)"):
         quiet(lambda point: point["g"], part=(2, 2))
-    with pytest.raises(ValueError, match="without a store nobody gets its points"):
+    with pytest.raises(ValueError, match="without a store its points would be lost"):
         quiet(lambda point: point["g"], part=(0, 2))

@@ -1,4 +1,4 @@
-"""The page of a sweep holds its values, lane by lane, and says in words what failed and what it leaves out."""
+"""The page of a sweep contains the values of every lane, and says what failed and what is left out."""
 
 import base64
 import re
@@ -17,7 +17,7 @@ T = np.linspace(0.0, 1.0, 6)
 
 
 def run(point):
-    """A number, curves over time and over their index, and what has too many columns."""
+    """A number, curves over time and over their index, and an array with too many columns."""
     wave = jnp.sin(point["a"] * T + point["b"])
     return {
         "root": point["a"] * jnp.sqrt(point["b"] * 1.0),
@@ -34,7 +34,7 @@ def swept():
 
 
 def array(encoded, dtype, *shape):
-    """An array of the page, which has this type."""
+    """Decode an array of the page, and check its dtype."""
     assert encoded[0] == dtype
     return np.frombuffer(base64.b64decode(encoded[1]), f"<{dtype}").reshape(shape)
 
@@ -55,13 +55,13 @@ def test_the_values_of_every_lane(swept):
     np.testing.assert_array_equal(array(wave["curves"][0]["y"], "f4", 3, 4, 6), expected["wave"].astype("f4"))
     assert [curve["name"] for curve in pair["curves"]] == ["of.pair[0]", "of.pair[1]"]
     np.testing.assert_array_equal(array(pair["curves"][1]["y"], "f4", 3, 4, 6), expected["pair"][..., 1].astype("f4"))
-    # What all lanes share is there once.
+    # Values shared by all lanes are stored once.
     np.testing.assert_array_equal(array(turn["x"], "f4", 6), np.arange(6))
     np.testing.assert_allclose(array(turn["curves"][0]["y"], "f4", 3, 4, 6)[:, 1:], swept.values["turn"].imag[:, 1:])
 
 
 def test_what_failed_and_what_is_left_out_in_words(swept):
-    """A status for every lane, its words, and which are good; matrices are named."""
+    """The page has a status for every lane, its meaning, and which are good; matrices left out are named."""
     page = swept.to_html()
     spec = told(page.html)
     codes = array(spec["status"], "i1", 3, 4)
@@ -73,7 +73,7 @@ def test_what_failed_and_what_is_left_out_in_words(swept):
 
 
 def test_paired_axes_and_slices_have_one_slider():
-    """Axes that move together are one slider, whose places say all; slices are counted; booleans are words."""
+    """Paired axes share one slider, whose labels name all axes; slices are numbered; booleans are words."""
     axes = {"a": np.array([1.0, 2.5]), "w": np.eye(2)}
     together = lj.sweep(lambda p: p["a"] * p["w"][0], axes, paired=True, progress=False).to_html()
     (slider,) = told(together.html)["axes"]
@@ -86,7 +86,7 @@ def test_paired_axes_and_slices_have_one_slider():
 
 
 def test_writes_a_file_and_reads_a_store(tmp_path):
-    """`path` is written; a sweep that was opened from its store has the same page."""
+    """`path` is written; a sweep opened from its store has the same page."""
     axes = {"a": np.array([1.0, 4.0])}
     swept = lj.sweep(lambda p: {"root": jnp.sqrt(p["a"])}, axes, store=tmp_path / "store", progress=False)
     swept.to_html(tmp_path / "page.html")
@@ -96,7 +96,7 @@ def test_writes_a_file_and_reads_a_store(tmp_path):
 
 
 def test_what_single_precision_would_hide():
-    """Small changes of large numbers, huge and tiny ones keep all their digits; infinity is a number, too."""
+    """Small changes of large numbers, and huge and tiny numbers, keep double precision."""
     t = np.linspace(0.0, 1.0, 11)
     run = lambda p: {
         "near": 1e6 + p["a"] * t, "huge": 1e300 * p["a"] * t, "tiny": 1e-60 * p["a"] * t, "plain": p["a"] * t,
@@ -110,7 +110,7 @@ def test_what_single_precision_would_hide():
 
 @pytest.mark.slow
 def test_batches_in_a_point_are_named():
-    """A run that returns many motions at once is not drawn, and said so."""
+    """A batch of trajectories per point is not drawn, and the page says so."""
     free = lj.System(lambda t, q, v, params: 0.5 * v**2)
     several = jax.vmap(lambda v: lj.integrate(free, 0.0, v, ts=np.array([0.0, 1.0])))
     swept = lj.sweep(lambda p: {"all": several(p["v"] * np.ones(2)), "v": p["v"]}, {"v": np.ones(1)}, progress=False)
@@ -123,7 +123,7 @@ def refused(*parts):
 
 
 def test_what_makes_no_page(swept):
-    """Too large, nothing to draw, and a film of what is no motion."""
+    """Errors for a page too large, nothing to draw, and a film without a trajectory."""
     with refused("larger than", "12 points", "megabytes"):
         swept.to_html(megabytes=0.001)
     with refused("nothing to draw", "value of shape (4, 40)"):
@@ -134,7 +134,7 @@ def test_what_makes_no_page(swept):
 
 @pytest.mark.slow
 def test_films_of_all_lanes():
-    """Each lane's points at the same times; one that ends early stays where it was; one that never began is nowhere."""
+    """All lanes share their times; a lane that ends early stays in place; a lane that never started is not shown."""
     fall = lj.System(lambda t, q, v, params: 0.5 * v**2 / jnp.where(params["g"] > 0, 1.0, 0.0) - params["g"] * q)
     ground = {"ground": lj.Crossing(lambda t, q, v, params: q)}
     ts = np.linspace(0.0, 2.0, 41)
@@ -146,11 +146,11 @@ def test_films_of_all_lanes():
     assert (film["frames"], film["start"], film["parts"][0]["points"]) == (21, 0.0, 1)
     points = np.frombuffer(base64.b64decode(film["parts"][0]["xy"][1]), "<i2").reshape(3, 21, 2)
     assert np.all(points[0] == NOWHERE) and np.all(points[1:] != NOWHERE)
-    # Pixels downward for height: linear, from both ends of the slow one, which falls by g t²/2 to 1.
+    # Pixels count downwards; the scale is calibrated from both ends of the slow lane, which falls by g t²/2 to 1.
     top, bottom = points[1, [0, -1], 1].astype(float)
     height = 2.0 - (points[..., 1] - top) / (bottom - top)
     t = np.linspace(0.0, 2.0, 21)
     np.testing.assert_allclose(height[1], 2.0 - 0.25 * t**2, atol=1e-2)
     np.testing.assert_allclose(height[2], np.maximum(2.0 - 2.0 * t**2, 0.0), atol=1e-2)
-    # Twin: lanes in another order are another film.
+    # Twin: lanes in another order would differ.
     assert np.max(np.abs(height[2] - (2.0 - 0.25 * t**2))) > 0.5

@@ -1,4 +1,4 @@
-"""Sweeps that are pickled and copied: what goes along, and what is said of the rest."""
+"""Pickled and copied sweeps: what is included, and what errors say about the rest."""
 
 import copy
 import pickle
@@ -22,12 +22,12 @@ WAYS = {
 
 
 def product(point):
-    """Found by its name."""
+    """A function that pickle finds by name."""
     return {"y": point["x"] * point["k"], "n": point["k"]}
 
 
 def swept(run, store=None):
-    """In silence."""
+    """A sweep without a progress bar."""
     return lj.sweep(run, AXES, store=store, chunk=4, progress=False)
 
 
@@ -38,7 +38,7 @@ def named():
 
 
 def same(found, whole):
-    """All that a sweep has."""
+    """Compare everything that a sweep has."""
     assert repr(found) == repr(whole) and found.counts() == whole.counts() == {"successful": 12}
     assert found.dims == whole.dims and found.ok.all()
     for name, x in found.axes.values.items():
@@ -50,7 +50,7 @@ def same(found, whole):
 
 @pytest.mark.parametrize("way", WAYS)
 def test_all_goes_along_where_pickle_finds_the_function(named, way):
-    """Values, axes, statuses, words, exports, and running points again; the first sweep stays as it was."""
+    """Values, axes, statuses, exports and resweep work in the copy; the original stays unchanged."""
     found = WAYS[way](named)
     same(found, named)
     some = np.eye(4, 3, dtype=bool)
@@ -62,44 +62,48 @@ def test_all_goes_along_where_pickle_finds_the_function(named, way):
     if way != "copy":
         found.values["y"][:] = 0.0
         np.testing.assert_array_equal(named.values["y"], EXACT)
-    with pytest.raises(ValueError, match="returns another structure than the sweep has: y float64, not n int64, y"):
+    with pytest.raises(ValueError, match="returns another structure than the sweep: y float64, not n int64, y"):
         found.resweep(lambda point: {"y": point["x"]}, where=some)
 
 
 def test_a_function_without_a_name():
-    """Stays where it is: copies in this process have it, a pickle says so and takes it."""
+    """A lambda is not pickled: copies in this process keep it; a pickle says so and accepts another function."""
     lambdas = swept(lambda point: product(point))
     assert copy.deepcopy(lambdas).resweep(where=True).ran == 12
     found = WAYS["pickle"](lambdas)
     same(found, lambdas)
-    with pytest.raises(ValueError, match="what ran this sweep, <lambda>, could not be pickled(.|\n)*swept.resweep"):
+    with pytest.raises(
+        ValueError, match="the function that ran this sweep, <lambda>, could not be pickled(.|\n)*swept.resweep"
+    ):
         found.resweep(where=True)
     assert found.resweep(product, where=True).ran == 12
     assert found.resweep() is found, "there is nothing to run"
 
 
 def test_a_function_that_is_gone(named, monkeypatch):
-    """As one of a notebook is in another process: the rest is read."""
+    """If the function is missing, as one from a notebook in another process, the rest can still be read."""
     data = pickle.dumps(named)
     monkeypatch.delattr(sys.modules[__name__], "product")
     found = pickle.loads(data)
     same(found, named)
-    with pytest.raises(ValueError, match="what ran this sweep, product, is not found here(.|\n)*swept.resweep"):
+    with pytest.raises(
+        ValueError, match="the function that ran this sweep, product, is not found here(.|\n)*swept.resweep"
+    ):
         found.resweep(where=True)
 
 
 @pytest.mark.parametrize("way", WAYS)
 def test_a_sweep_in_a_store(way, tmp_path):
-    """Its values stay there."""
+    """The values stay in the store, not in the pickle."""
     whole = swept(product, tmp_path / "store")
     data = pickle.dumps(whole)
     assert len(data) < len(pickle.dumps(swept(product))) + 5000
     same(WAYS[way](whole), whole)
-    with pytest.raises(ValueError, match="what is in a store belongs to the run that it was begun with"):
+    with pytest.raises(ValueError, match="the values in a store belong to the run that it was begun with"):
         WAYS[way](whole).resweep(where=True)
     opened = WAYS[way](lj.open_sweep(tmp_path / "store"))
     same(opened, lj.open_sweep(tmp_path / "store"))
-    with pytest.raises(ValueError, match="opened from its store does not know what ran it"):
+    with pytest.raises(ValueError, match="opened from its store does not know the function that ran it"):
         opened.resweep(where=True)
 
 
@@ -114,7 +118,7 @@ print(found, found.values["y"].sum())
 
 @pytest.mark.slow
 def test_in_another_process(named, tmp_path):
-    """Where nothing is compiled yet."""
+    """A sweep unpickled in another process compiles its program there."""
     (tmp_path / "swept").write_bytes(pickle.dumps(named))
     root = Path(lj.__file__).parents[1]
     found = subprocess.run(

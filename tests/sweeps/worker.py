@@ -1,7 +1,7 @@
-"""A sweep as its own process, for tests that kill it: `worker.py STORE K N POINTS [PORT]` prints what it computed.
+"""A sweep in its own process, for tests that kill it: `worker.py STORE K N POINTS [PORT]` prints the points it ran.
 
-It rests after each chunk, so that there is a while in which it can be killed.
-With a port the processes know of each other by `jax.distributed`, which then says which part is whose.
+It sleeps after each chunk, so that there is time to kill it.
+With a port the processes are connected by `jax.distributed`, which assigns their parts.
 """
 
 import signal
@@ -22,32 +22,32 @@ pendulum = lj.System(lambda t, q, v, params: 0.5 * v**2 + params["g"] * jnp.cos(
 
 
 def run(point):
-    """The angle after a while; where it starts too far out, the steps are used up."""
+    """The angle at t = 60; from large initial angles the steps run out."""
     steps = {"max_steps": 400}
     return lj.integrate(pendulum, point["angle"], 0.0, {"g": point["g"]}, ts=jnp.array([0.0, 60.0]), **steps).q[-1]
 
 
 def quick(point):
-    """A closed form."""
+    """A function in closed form, without an integration."""
     return jnp.sqrt(point["g"]) * jnp.cos(point["angle"])
 
 
 def axes(points):
-    """Ten values of g, and as many angles as it takes."""
-    # By NumPy: what XLA rounds may differ between processes, and a store knows its axes bit for bit.
+    """Ten values of g, and as many angles as needed."""
+    # NumPy arrays: XLA may round differently between processes, and a store compares its axes bit for bit.
     return {"g": np.linspace(0.5, 20.0, 10), "angle": np.linspace(0.1, 3.0, points // 10)}
 
 
 class Resting(Silent):
-    """A meter that takes its time."""
+    """A meter that sleeps at each update."""
 
     def update(self, count):
-        """After a chunk."""
+        """Sleep after a chunk."""
         time.sleep(0.05)
 
 
 if __name__ == "__main__":
-    # A shell has what it starts in the background ignore Ctrl-C, and Python keeps to that.
+    # A shell makes background processes ignore Ctrl-C, and Python inherits that.
     signal.signal(signal.SIGINT, signal.default_int_handler)
     engine._meter = lambda total, progress: Resting()
     store, k, n, points, *port = sys.argv[1], *map(int, sys.argv[2:])

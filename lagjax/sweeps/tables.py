@@ -1,4 +1,4 @@
-"""Sweeps for others to read: as an `xarray.Dataset`, as a `pandas.DataFrame`."""
+"""Sweeps as an `xarray.Dataset` or a `pandas.DataFrame`."""
 
 from typing import Any
 
@@ -10,7 +10,7 @@ from lagjax.sweeps.fingerprint import named_leaves
 from lagjax.sweeps.labels import Labels, labels_of, shared_times, status_attributes, words_of
 from lagjax.sweeps.lanes import Status
 
-# Columns of one array of a point.
+# The largest number of columns for one array of a point.
 MOST_COLUMNS = 100
 
 
@@ -23,12 +23,12 @@ def dataset(swept: Any):
     values = swept.values
     labels, lead = _labels(swept, values), tuple(swept.dims)
     coords = {label.name: (label.dims, swept.axes.values[name]) for name, label in labels.axes.items()}
-    variables, there = {}, swept.status.result >= 0
+    variables, has_values = {}, swept.status.result >= 0
     for key, x in named_leaves(values):
         label = labels.values.get(key)
         if label is None:
             continue
-        shared = shared_times(x, there) if label.times and len(label.dims) == 1 else None
+        shared = shared_times(x, has_values) if label.times and len(label.dims) == 1 else None
         if shared is None:
             variables[label.name] = ((*lead, *label.dims), x)
         else:
@@ -39,7 +39,7 @@ def dataset(swept: Any):
 
 
 def frame(swept: Any, of_values):
-    """A row a point: `Sweep.to_pandas`."""
+    """A sweep with one row per point: `Sweep.to_pandas`."""
     try:
         import pandas
     except ImportError as error:
@@ -58,8 +58,8 @@ def frame(swept: Any, of_values):
     for field, x in zip(Status._fields, swept.status):
         columns[labels.status[field].name] = x.reshape(-1)
     result = labels.status["result"].name
-    codes, places = np.unique(columns[result], return_inverse=True)
-    columns[result] = pandas.Categorical.from_codes(places, [words_of(code) for code in codes])
+    codes, indices = np.unique(columns[result], return_inverse=True)
+    columns[result] = pandas.Categorical.from_codes(indices, [words_of(code) for code in codes])
     return pandas.DataFrame(columns)
 
 
@@ -69,32 +69,32 @@ def _labels(swept, values) -> Labels:
 
 
 def _columns(name, x):
-    """An array (points, ...) as columns."""
+    """The columns of an array (points, ...), by name."""
     if x.ndim == 1:
         return {name: x}
-    places = np.ndindex(*x.shape[1:])
-    return {f"{name}[{', '.join(map(str, place))}]": x[(slice(None), *place)] for place in places}
+    indices = np.ndindex(*x.shape[1:])
+    return {f"{name}[{', '.join(map(str, place))}]": x[(slice(None), *place)] for place in indices}
 
 
 def _check_rows(swept, values):
-    """Whether each value fits into a row, and is one of the sweep's points."""
+    """Raise `ValueError` unless each value has the sweep's axes in front and fits into a row."""
     lead, advice = swept.axes.shape, 'swept.to_pandas(lambda values: {"end": values.q[..., -1]})'
     motions = [x for x in jax.tree.leaves(values, is_leaf=_is_motion) if _is_motion(x)]
     if motions:
         raise ValueError(
-            f"a point has a whole trajectory, at {motions[0].t.shape[-1]} times, for which a row has no room.\n"
-            f"Fix: choose what to show, as {advice}; or swept.to_xarray().to_dataframe(), with a row an output."
+            f"each point has a whole trajectory, at {motions[0].t.shape[-1]} times, which does not fit into a row.\n"
+            f"Fix: choose what to show: {advice}; or swept.to_xarray().to_dataframe(), with one row per output."
         )
     for name, x in named_leaves(values):
         if np.shape(x)[: len(lead)] != lead:
             raise ValueError(
-                f"'{name}' has the shape {np.shape(x)}, and does not begin with that of the axes, {lead}.\n"
-                f"Usual cause: an axis that was summed over or left out. Fix: as in {advice}."
+                f"'{name}' has the shape {np.shape(x)}, which does not begin with the shape of the axes, {lead}.\n"
+                f"Usual cause: an axis that was summed over or left out. Fix: keep the axes: {advice}."
             )
         if np.prod(np.shape(x)[len(lead) :]) > MOST_COLUMNS:
             raise ValueError(
-                f"a point has '{name}' {np.shape(x)[len(lead) :]}, for which a row has no room.\n"
-                f"Fix: choose what to show, as {advice}; or swept.to_xarray().to_dataframe()."
+                f"each point has '{name}' {np.shape(x)[len(lead) :]}, which does not fit into a row.\n"
+                f"Fix: choose what to show: {advice}; or swept.to_xarray().to_dataframe()."
             )
 
 

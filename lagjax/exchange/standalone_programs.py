@@ -1,9 +1,9 @@
-"""A function that integrates, as a program that runs without lagjax.
+"""Export a function that integrates as a program that runs without lagjax.
 
-What JAX compiles of it is a program in StableHLO, which needs nothing of the Python that made it; `jax.export` writes
-such programs down. Three things of a motion stand in the way, and are taken out here:
+JAX compiles the function to a StableHLO program, which does not need the Python code that made it; `jax.export` writes
+such programs to bytes. Three parts of a motion prevent this, and are removed here:
 
-- checks that raise an error at run time, for which the program calls Python: failures are told by codes and NaN;
+- checks that raise an error at run time, for which the program calls Python: failures become codes and NaN instead;
 - a `Trajectory`, whose class the other process does not have: it becomes a dictionary of its arrays;
 - prints, callbacks and progress meters: these are refused.
 """
@@ -25,14 +25,14 @@ from lagjax.motion.results import RESULTS
 from lagjax.motion.results import in_words as result_in_words
 from lagjax.motion.trajectory import Trajectory
 
-# What a process without lagjax can take and give.
+# The containers that a process without lagjax can pass and receive.
 PLAIN = (dict, list, tuple)
-# An item of one of equinox's enumerations.
+# The type of items of equinox's enumerations.
 ITEM = type(RESULTS.successful)
 
 
 def export(run: Callable, *examples: PyTree, platforms: Sequence[str] | None = None) -> jax_export.Exported:
-    """Make of a function that integrates a program that runs without lagjax, by JAX alone.
+    """Export a function that integrates as a program that needs only JAX, not lagjax.
 
     >>> import jax.numpy as jnp
     >>> import lagjax as lj
@@ -45,21 +45,21 @@ def export(run: Callable, *examples: PyTree, platforms: Sequence[str] | None = N
 
     **Arguments:**
 
-    - `run`: any function that `jax.jit` takes, with motions in it or derivatives of them.
-    - `examples`: its arguments, for their structures, shapes and dtypes: numbers, arrays, `jax.ShapeDtypeStruct`, in
-      dictionaries, lists and tuples. All of them are arguments of the program; whole Python numbers are taken as
-      floats. Shapes may be symbolic (`jax.export.symbolic_shape`), for a batch of any size under `jax.vmap`; the number
-      of output times may not.
-    - `platforms`: such as `("cpu", "cuda")`; by default the one that JAX uses here.
+    - `run`: any function that `jax.jit` accepts; it may contain motions and their derivatives.
+    - `examples`: example arguments, which give structures, shapes and dtypes: numbers, arrays, `jax.ShapeDtypeStruct`,
+      in dictionaries, lists and tuples. All of them become arguments of the program; Python integers become floats.
+      Shapes may be symbolic (`jax.export.symbolic_shape`), for a batch of any size under `jax.vmap`; the number of
+      output times may not.
+    - `platforms`: such as `("cpu", "cuda")`; by default the platform that JAX uses here.
 
     **Returns:** a `jax.export.Exported`: `.serialize()` gives its bytes, and in another process
-    `jax.export.deserialize(bytes).call(*arguments)` runs it. It takes arguments as `run` does and returns what `run`
-    does, with dictionaries of arrays in place of trajectories and of whatever else has names. Nothing in it raises: a
-    motion that fails is NaN from there on, and tells why by its "result", a number that `lj.result_codes()` explains. A
-    check (`equinox.error_if`) gives NaN.
+    `jax.export.deserialize(bytes).call(*arguments)` runs it. It takes the same arguments as `run` and returns the
+    same results, with dictionaries of arrays in place of trajectories and other classes with named fields. It never
+    raises: a motion that fails is NaN from there on, and its "result" gives the reason, a number that
+    `lj.result_codes()` explains. A failing check (`equinox.error_if`) gives NaN.
 
-    **Raises:** `TypeError` for arguments or results that are no numbers, arrays, dictionaries, lists and tuples;
-    `ValueError` for what calls Python while it runs.
+    **Raises:** `TypeError` for arguments or results that are not numbers, arrays, dictionaries, lists and tuples;
+    `ValueError` for functions that call Python while they run.
 
     Source: https://docs.jax.dev/en/latest/export/export.html; `docs/taking-a-solve-elsewhere.md`.
     """
@@ -72,36 +72,36 @@ def export(run: Callable, *examples: PyTree, platforms: Sequence[str] | None = N
 
     def program(*args):
         leaves, structure = jtu.tree_flatten(args)
-        shape = []
+        structures = []
 
         def of_leaves(*leaves):
-            found, tree = jtu.tree_flatten(plain(run(*jtu.tree_unflatten(structure, leaves))))
-            shape.append(tree)
-            return [_as_result(x) for x in found]
+            results, tree = jtu.tree_flatten(plain(run(*jtu.tree_unflatten(structure, leaves))))
+            structures.append(tree)
+            return [_as_result(x) for x in results]
 
         with SILENT(True):
             silent = poisoned(jax.make_jaxpr(of_leaves)(*leaves))
         if calls_host(silent.jaxpr) or silent.effects:
             raise ValueError(
-                "the function calls Python while it runs, and a process without it could not.\n"
+                "the function calls Python while it runs, which is impossible in a process without that Python code.\n"
                 "Usual cause: jax.debug.print, jax.debug.callback, jax.pure_callback, or progress=True.\n"
-                "Fix: leave it out of what is exported."
+                "Fix: leave it out of the exported function."
             )
-        return jtu.tree_unflatten(shape[0], jaxpr_as_fun(silent)(*leaves))
+        return jtu.tree_unflatten(structures[0], jaxpr_as_fun(silent)(*leaves))
 
-    # The name that the other process shows.
+    # The name that is shown in the other process.
     program.__name__ = getattr(run, "__name__", "run")
     return jax_export.export(jax.jit(program), platforms=platforms)(*examples)
 
 
 def result_codes() -> dict[int, str]:
-    """What the numbers mean that an exported program gives as the "result" of a motion.
+    """The meanings of the numbers that an exported program returns as the "result" of a motion.
 
     >>> import lagjax as lj
     >>> lj.result_codes()[0]
     'successful'
 
-    **Returns:** sentences by their numbers, those of this version of lagjax: write them down beside the program.
+    **Returns:** sentences by code, for this version of lagjax: store them together with the program.
 
     **Raises:** nothing.
     """
@@ -109,7 +109,7 @@ def result_codes() -> dict[int, str]:
 
 
 def plain(tree: PyTree) -> PyTree:
-    """Dictionaries, lists and tuples: what has named parts becomes a dictionary, a `RESULTS` item its code."""
+    """Convert to dictionaries, lists and tuples: classes become dictionaries, a `RESULTS` item its code."""
     if isinstance(tree, ITEM):
         return tree._value
     if isinstance(tree, Mapping):
@@ -119,7 +119,7 @@ def plain(tree: PyTree) -> PyTree:
     if isinstance(tree, list | tuple):
         return type(tree)(map(plain, tree))
     if is_dataclass(tree) and not isinstance(tree, type):
-        # The system and the parameters of a trajectory are not among what is known of the motion.
+        # The system and the parameters of a trajectory (`arrays`) are inputs, not results.
         names = [f.name for f in fields(tree) if not f.metadata.get("static", False)]
         names = [name for name in names if not (isinstance(tree, Trajectory) and name == "arrays")]
         return {name: plain(getattr(tree, name)) for name in names}
@@ -127,16 +127,16 @@ def plain(tree: PyTree) -> PyTree:
 
 
 def _as_argument(x):
-    """An example as the program takes it."""
+    """An example converted to the type that the program takes."""
     if isinstance(x, int) and not isinstance(x, bool):
         return float(x)
     if isinstance(x, bool | float | complex | np.ndarray | np.generic | jax.Array | jax.ShapeDtypeStruct):
         return x
     raise TypeError(
-        f"an argument of an exported program is a number or an array, in dictionaries, lists and tuples, and not "
-        f"{type(x).__name__}: the other process does not know what that is.\n"
+        f"an argument of an exported program must be a number or an array, in dictionaries, lists and tuples, and not "
+        f"{type(x).__name__}, which the other process does not know.\n"
         "Usual cause: a named tuple, a class, a system or a function among the examples.\n"
-        'Fix: {"x": 1.0, "y": 0.0} in place of a class; close over what is no number: lj.export(lambda q0: ..., q0).'
+        'Fix: {"x": 1.0, "y": 0.0} in place of a class; close over everything else: lj.export(lambda q0: ..., q0).'
     )
 
 
@@ -144,6 +144,6 @@ def _as_result(x):
     if isinstance(x, bool | int | float | complex | np.ndarray | np.generic | jax.Array):
         return jnp.asarray(x)
     raise TypeError(
-        f"an exported program gives numbers and arrays, and the function returned {x!r:.60}, a {type(x).__name__}.\n"
-        "Fix: return what is wanted of it, as traj.q and traj.result."
+        f"an exported program returns numbers and arrays, but the function returned {x!r:.60}, a {type(x).__name__}.\n"
+        "Fix: return the parts that are needed, such as traj.q and traj.result."
     )

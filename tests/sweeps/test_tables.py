@@ -1,4 +1,4 @@
-"""Sweeps for others to read: stores that xarray opens as they lie, half filled and paired ones; pandas."""
+"""Sweeps in xarray and pandas: stores that xarray opens directly, including half-filled and paired ones."""
 
 import json
 import shutil
@@ -21,7 +21,7 @@ WAYS = ({}, {"consolidated": True}, {"consolidated": False})
 
 
 def run(point):
-    """Numbers, an array, a nested name, names that are taken, a complex one."""
+    """Numbers, an array, a nested name, names that are already taken, a complex number."""
     y = point["k"] * point["x"]
     return {"y": y, "x": -y, "steps": 2, "both": {"a/b": y * point["w"], "z": 1j * y}, "lagjax": y > 1.0}
 
@@ -32,27 +32,27 @@ def paired(point):
 
 
 def swept(path, of=run, axes=AXES, **settings):
-    """Into a store, in small blocks."""
+    """A sweep in a store, in small blocks."""
     return lj.sweep(of, axes, store=path, chunk=4, workers=1, progress=False, **settings)
 
 
 @pytest.fixture(scope="module")
 def store(tmp_path_factory):
-    """A whole one."""
+    """A complete store."""
     path = tmp_path_factory.mktemp("whole") / "store"
     swept(path)
     return path
 
 
 def grid(*names):
-    """Axes by name, as they are in the grid."""
+    """Axes by name, shaped to broadcast over the grid."""
     shapes = {name: [-1 if other == name else 1 for other in AXES] for name in AXES}
     return [np.asarray(AXES[name]).reshape(shapes[name]) for name in names]
 
 
 @pytest.mark.parametrize("way", WAYS)
 def test_xarray_opens_a_store_as_it_lies(store, way):
-    """By the names of the axes, in closed form, without a warning (an error here); the same as `to_xarray`."""
+    """Names of the axes, values in closed form, no warning (an error here); equal to `to_xarray`."""
     data = xarray.open_zarr(store, **way).load()
     k, x = grid("k", "x")
     y = k * x * np.ones((1, 1, 2))
@@ -71,14 +71,14 @@ def test_xarray_opens_a_store_as_it_lies(store, way):
 
 
 def test_twin_a_store_of_before(tmp_path):
-    """What xarray said of stores in a flat order, which have no dimensions."""
+    """xarray cannot open a store of format 2, which is flat and has no dimensions."""
     shutil.unpack_archive(Path(__file__).with_name("format_2.zip"), tmp_path)
     with pytest.raises(KeyError, match="dimension_names"):
         xarray.open_zarr(tmp_path / "status", consolidated=False)
 
 
 def test_half_filled(tmp_path):
-    """What was not run is NaN and says so; twin: the rest has its values, and the whole has no such."""
+    """Points not run are NaN and marked; twin: the others have values, and a complete store has no such points."""
     part = swept(tmp_path / "store", part=(1, 3))
     data = xarray.open_zarr(tmp_path / "store").load()
     meanings = dict(zip(data["result"].attrs["flag_values"], data["result"].attrs["flag_meanings"].split()))
@@ -104,7 +104,7 @@ def test_paired_axes(tmp_path):
 
 
 def test_blocks_end_with_the_axes(store):
-    """Runs of flat indices that have it all once, each a box of the grid; the last of a row may be shorter."""
+    """Blocks are boxes with consecutive flat indices that cover the grid once; the last of a row may be shorter."""
     blocks = Store(store).blocks
     lengths = {x.stop - x.start for x in map(blocks.points, range(len(blocks)))}
     assert blocks.block == (1, 4, 2) and lengths == {6, 8}
@@ -116,7 +116,7 @@ def test_blocks_end_with_the_axes(store):
 
 
 def test_a_short_block_is_mended(store, tmp_path):
-    """The last of a row, cut off: only its points are computed again."""
+    """Only the points of a short block at the end of a row are computed again."""
     copied = shutil.copytree(store, tmp_path / "store")
     file = copied / "y/c/1/1/0"
     file.write_bytes(file.read_bytes()[:9])
@@ -128,13 +128,13 @@ def test_a_short_block_is_mended(store, tmp_path):
 
 
 def test_other_attributes_are_nobodys_harm(store, tmp_path):
-    """What a user adds to the metadata stays, and is no damage; nor is to consolidate them again."""
+    """Attributes added by a user stay and do not count as damage; nor does consolidating the metadata again."""
     copied = shutil.copytree(store, tmp_path / "store")
     file = copied / "y/zarr.json"
     said = json.loads(file.read_text())
     file.write_text(json.dumps(said | {"attributes": {"units": "m"}}))
     with warnings.catch_warnings():
-        # That consolidation is no part of zarr's third format yet.
+        # Zarr warns that consolidated metadata are not yet part of its third format.
         warnings.simplefilter("ignore")
         __import__("zarr").consolidate_metadata(copied)
     assert lj.open_sweep(copied).ok.all() and swept(copied).ran == 0
@@ -142,7 +142,7 @@ def test_other_attributes_are_nobodys_harm(store, tmp_path):
 
 
 def test_pandas():
-    """A row a point, bit for bit; arrays a column a number; how it went as a category."""
+    """One row per point, bit for bit; one column per number of an array; the result as a category."""
     found = lj.sweep(run, AXES, progress=False)
     table = found.to_pandas()
     assert len(table) == 42 and list(table)[:6] == ["k", "x", "w[0]", "w[1]", "w[2]", "both.a_b[0]"]
@@ -157,20 +157,22 @@ def test_pandas():
 
 
 def test_pandas_of_pairs_and_of_a_choice():
-    """Axes that move together; what is chosen of the values; what fits into no row."""
+    """Paired axes, a choice of the values, and values that do not fit into a row."""
     pairs = lj.sweep(paired, PAIRS, paired=True, progress=False)
     np.testing.assert_array_equal(pairs.to_pandas()[["x", "n", "w[0]"]].to_numpy()[:, 1], PAIRS["n"])
     many = lj.sweep(lambda point: point["x"] * jnp.arange(101.0), {"x": PAIRS["x"]}, progress=False)
-    with pytest.raises(ValueError, match=r"a point has 'value' \(101,\), for which a row has no room(.|\n)*Fix:"):
+    with pytest.raises(ValueError, match=r"each point has 'value' \(101,\), which does not fit into a row(.|\n)*Fix:"):
         many.to_pandas()
     np.testing.assert_array_equal(many.to_pandas(lambda x: {"last": x[..., -1]})["last"], 100 * PAIRS["x"])
-    with pytest.raises(ValueError, match=r"'value' has the shape \(\), and does not begin with that of the axes"):
+    with pytest.raises(
+        ValueError, match=r"'value' has the shape \(\), which does not begin with the shape of the axes"
+    ):
         many.to_pandas(lambda x: np.sum(x))
 
 
 @pytest.mark.parametrize("name, export", [("pandas", "to_pandas"), ("xarray", "to_xarray")])
 def test_without_the_extra(monkeypatch, name, export):
-    """It says how to get it."""
+    """The error says how to install it."""
     found = lj.sweep(paired, PAIRS, paired=True, progress=False)
     monkeypatch.setitem(sys.modules, name, None)
     with pytest.raises(ImportError, match=rf'needs {name}(.|\n)*pip install "lagjax\[data\]"'):
@@ -178,7 +180,7 @@ def test_without_the_extra(monkeypatch, name, export):
 
 
 def test_axes_with_names_that_are_taken(tmp_path):
-    """A value named like a dimension, axes named like a status, and one for which there is no place."""
+    """A value named like a dimension, axes named like a status, and axis names that a store cannot keep."""
     axes = {"steps": np.arange(3.0), "y_0": np.arange(2.0)}
     of = lambda point: {"y": point["y_0"] * jnp.ones(4), "result": point["steps"]}
     data = swept(tmp_path / "store", of, axes).to_xarray()

@@ -1,4 +1,4 @@
-"""Programs that integrate, written to files and run by a process that has JAX and NumPy alone."""
+"""Exported programs that integrate, run by a process that has only JAX and NumPy."""
 
 import json
 import subprocess
@@ -13,11 +13,11 @@ import pytest
 from jax import export
 
 import lagjax as lj
-from lagjax.exchange.exported import plain
+from lagjax.exchange.standalone_programs import plain
 from tests.systems import HORIZONTAL, PARAMS, pendulum, rod_pendulum
 
 TS = np.linspace(0.0, 1.0, 5)
-# Reads each program and its arguments, runs it twice, and writes what came.
+# Reads each program and the arguments of its calls, runs them, and writes the results.
 ELSEWHERE = textwrap.dedent("""
     import json, pathlib, sys
     import jax, numpy as np
@@ -41,12 +41,12 @@ def swing(angle, speed, params, **options):
 
 
 def slope(angle, params):
-    """The last angle and its derivatives by all there is."""
+    """The last angle and its derivatives with respect to all arguments."""
     return jax.value_and_grad(lambda angle, params: swing(angle, 0.5, params).q[-1], (0, 1))(angle, params)
 
 
 def by_jax_alone(angle, params):
-    """Without help: failures are to be told by codes, and only arrays are returned."""
+    """Exportable by `jax.export` itself: no exceptions, and only arrays are returned."""
     motion = swing(angle, 0.0, params, throw=False)
     return motion.q, motion.v
 
@@ -67,7 +67,7 @@ CASES = {
 
 
 def written(folder, name, exported, *calls):
-    """The size of its file."""
+    """Write a program and the arguments of its calls; returns the size of its file."""
     (folder / name).write_bytes(exported.serialize())
     listed = jax.tree.map(lambda x: np.asarray(x).tolist(), calls)
     known = json.loads((folder / "calls.json").read_text()) if (folder / "calls.json").exists() else {}
@@ -76,19 +76,19 @@ def written(folder, name, exported, *calls):
 
 
 def read(folder, name, call):
-    """What the other process computed."""
+    """The results of the other process."""
     with np.load(folder / f"{name}-{call}.npz") as file:
         return [file[f"arr_{i}"] for i in range(len(file.files))]
 
 
 @pytest.mark.slow
 def test_another_process_without_lagjax(tmp_path):
-    """Bit for bit what is computed here, of motions, forces, events and derivatives; twin: other arguments, others."""
+    """Motions, forces, events and derivatives equal those here bit for bit; twin: other arguments change them."""
     for name, (run, *calls) in CASES.items():
         assert written(tmp_path, name, lj.export(run, *calls[0]), *calls) < 150_000
     jitted = jax.jit(by_jax_alone)
     assert written(tmp_path, "jax", export.export(jitted)(1.0, PARAMS), (1.0, PARAMS)) < 100_000
-    # A batch of any size, in arrays: other kernels than for one, and another round-off.
+    # A batch of any size uses other kernels than a single motion, with another round-off.
     (size,) = export.symbolic_shape("size")
     many, batch = jax.ShapeDtypeStruct((size,), np.float64), jax.vmap(swing, (0, None, None))
     angles = np.linspace(0.5, 1.5, 300)
@@ -113,7 +113,7 @@ def test_another_process_without_lagjax(tmp_path):
 
 @pytest.mark.slow
 def test_derivatives_of_what_was_written():
-    """`vjp_order=1` takes the derivative along; it is that of the motion here."""
+    """With `vjp_order=1` the derivative is exported as well, and equals that of the motion here."""
     exported = lj.export(lambda angle, params: swing(angle, 0.5, params).q[-1], 1.0, PARAMS)
     read_again = export.deserialize(exported.serialize(vjp_order=1))
     found = jax.grad(lambda *x: read_again.call(*x), (0, 1))(1.0, PARAMS)
@@ -123,7 +123,7 @@ def test_derivatives_of_what_was_written():
 
 
 def test_failures_are_codes():
-    """A motion that would raise tells why by its code, and keeps what it reached; a check gives NaN where it fails."""
+    """A motion that would raise gives a code instead and keeps its first outputs; a failing check gives NaN."""
 
     def run(angle, params):
         return swing(angle, 0.0, params, max_steps=5), eqx.error_if(angle, angle > 2, "too far")
@@ -136,14 +136,14 @@ def test_failures_are_codes():
 
 
 def test_result_codes():
-    """Each item of `lj.RESULTS` has its words."""
+    """Each item of `lj.RESULTS` has a description."""
     codes = lj.result_codes()
     assert codes[int(lj.RESULTS.start_off_constraints._value)] == "The initial state does not satisfy the constraints."
     assert codes[int(lj.RESULTS.event_occurred._value)] == "ended by its event" and len(codes) == len(lj.RESULTS)
 
 
 def prints(x):
-    """Calls Python."""
+    """A function that calls Python."""
     jax.debug.print("{}", x)
     return x
 
@@ -171,14 +171,14 @@ REFUSED = {
 
 @pytest.mark.parametrize("case", REFUSED)
 def test_what_is_refused(case):
-    """With the fix."""
+    """The error says what is refused."""
     ask, words = REFUSED[case]
     with pytest.raises((TypeError, ValueError), match=words):
         ask()
 
 
 def test_whole_numbers_and_structures():
-    """Whole numbers are floats in the program; lists, tuples and None stay; integers in arrays stay what they are."""
+    """Python integers become floats in the program; lists, tuples, None and integer arrays stay the same."""
     exported = lj.export(lambda a, b: (a["x"] + b[0], [b[1], None]), {"x": 1}, (2, np.arange(3)))
     found, (whole, nothing) = exported.call({"x": 0.5}, (0.25, np.array([4, 5, 6])))
     assert found == 0.75 and whole.dtype == jnp.int64 and nothing is None
