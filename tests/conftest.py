@@ -7,12 +7,12 @@ Tiers of tests; `.ci/run` runs the first three:
                         `test_main.py` and `test_stability.py` check.
     pytest              every module on programs that compile in seconds; messages; docstring examples; architecture.
     pytest -m "slow and not exhaustive"
-                        tests with long compilation or their own processes: derivatives in both modes, orders, events,
-                        degenerate and large systems, every mechanism to its end, fits and their uncertainties, random
-                        systems; the code of README and docs, the notebooks, the types.
+                        tests that compile for 3 to 20 s, or have processes of their own: derivatives in both modes,
+                        orders, events, degenerate and large systems, mechanisms to their end, fits and their
+                        uncertainties, random systems; code of README and docs, short notebooks, the types.
     pytest -m exhaustive
-                        before a release, by hand, for an hour or more: further sizes, seeds, methods and modes of
-                        the tests above.
+                        before a release and after a change of what they test (`.ci/release`), for two hours: tests
+                        that compile or train for longer; further sizes, seeds, methods and modes of those above.
 """
 
 import gc
@@ -40,12 +40,12 @@ allowed = [MOST_PAGES]
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup(item):
-    """In the first tier XLA optimises little, which compiles in two thirds of the time.
+    """In the first two tiers XLA optimises little, which compiles in two thirds of the time.
 
-    Order, stability, speed and compiled programs are measured as users get them: in the slow tiers, in all processes
-    that tests start, in `python -m lagjax`, and in tests of the first tier that are marked `optimised`.
+    Order, stability, speed and compiled programs are measured as users get them: in tests marked `optimised`, in all
+    processes that tests start, in `python -m lagjax`, and in the last tier.
     """
-    as_users_get_it = any(item.get_closest_marker(name) for name in ("slow", "exhaustive", "optimised"))
+    as_users_get_it = any(item.get_closest_marker(name) for name in ("exhaustive", "optimised"))
     jax.config.update("jax_disable_most_optimizations", not as_users_get_it)
 
 

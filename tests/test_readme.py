@@ -8,10 +8,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from tests.tiers import exhaustive_but
+
 ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text()
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 WITHOUT_CODE = {"CHANGELOG", "CONTRIBUTING", "derivatives", "gallery", "how-to", "index", "known-gaps", "look-up"}
+# Their code trains, fits or compiles for half a minute.
+LONG = ("fitting", "learned", "switch-phases", "what-a-system-is-like")
+SHORT = [page for page in PAGES if page.stem not in LONG]
 
 
 def claimed_and_printed(block, capsys):
@@ -23,7 +28,7 @@ def claimed_and_printed(block, capsys):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+@pytest.mark.parametrize("page", exhaustive_but(SHORT, PAGES), ids=lambda page: page.stem)
 def test_python_blocks(page, capsys, tmp_path, monkeypatch):
     """All blocks of a page print the numbers in their comments."""
     assert jnp.asarray(0.0).dtype == np.float64

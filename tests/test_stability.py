@@ -116,6 +116,7 @@ def test_tiers(monkeypatch, tmp_path):
     assert asked == [stability.FULL, stability.QUICK, stability.REDUCED]
 
 
+@pytest.mark.optimised
 @pytest.mark.slow
 def test_a_wrong_derivative_is_found():
     """The derivative by the frequency is checked; twin: a reference that ignores ω is silently wrong."""

@@ -103,6 +103,7 @@ def compiled(system, q0, v0, params):
     return jax.jit(run).lower(params).compile().as_text()
 
 
+@pytest.mark.optimised
 @pytest.mark.slow
 def test_the_compiled_program():
     """No LAPACK call with one coordinate or a rod; seven coupled coordinates need one."""
@@ -120,6 +121,7 @@ def test_the_compiled_program():
     assert is_small(seven, *coordinates.state(0.0, np.ones(7), np.ones(7), np.ones(64)))
 
 
+@pytest.mark.optimised
 @pytest.mark.slow
 def test_changed_numbers_do_not_compile_again():
     """Other tolerances, parameters, times and initial states compile nothing; twin: many more times do."""

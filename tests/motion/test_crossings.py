@@ -337,6 +337,7 @@ def test_derivative_by_many_numbers():
         np.testing.assert_allclose(jax.grad(second)(weights, dt0), np.full(40, jax.grad(by_sum)(1.0)), rtol=1e-6)
 
 
+@pytest.mark.optimised
 @pytest.mark.slow
 def test_what_jumps():
     """A sign and a boolean condition cross where they jump, to the resolution of time."""

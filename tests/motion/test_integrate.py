@@ -106,6 +106,7 @@ def test_diffrax_adjoints_are_accepted(adjoint):
     np.testing.assert_allclose(mode(final)(4.0), -np.sin(2.0) / 4.0, rtol=1e-7)
 
 
+@pytest.mark.optimised
 @pytest.mark.slow
 def test_lanes_agree_with_single_runs_and_keep_their_own_failure():
     """vmap gives each lane its own result; a lane with NaN parameters fails alone, with its reason."""

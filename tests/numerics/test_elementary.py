@@ -58,6 +58,7 @@ def apart(x):
     return elementary._by_arithmetic(jnp.asarray(x))
 
 
+@pytest.mark.optimised
 @pytest.mark.slow
 @pytest.mark.parametrize("arguments", ARGUMENTS)
 def test_error_is_below_a_unit_in_the_last_place(arguments):

@@ -51,6 +51,7 @@ def test_tableau():
     assert abs(radau.GAMMA - (3 + np.cbrt(9.0) - np.cbrt(3.0))) < 1e-13
 
 
+@pytest.mark.optimised
 @pytest.mark.slow
 def test_stability():
     """One step is R(z) of Hairer & Wanner II, table IV.3.3 in all of the left half-plane; R(-1e6) = 3e-6 (L-stable)."""
@@ -70,6 +71,7 @@ def predator(t, y, args):
     return {"rabbits": rabbits * (1.5 - foxes), "foxes": foxes * (rabbits - 1 + 0.5 * jnp.sin(3 * t))}
 
 
+@pytest.mark.optimised
 @pytest.mark.slow
 def test_order():
     """Order 5 at the ends of steps; twin: the same measurement finds order 4 for diffrax's interpolant."""
@@ -88,6 +90,7 @@ def test_order():
     assert not abs(between - 5) < 0.35
 
 
+@pytest.mark.optimised
 @pytest.mark.slow
 @pytest.mark.parametrize("name", exhaustive_but(("rod_pendulum",), ("pendulum", "rod_pendulum")))
 def test_order_of_a_motion(name):
@@ -137,6 +140,7 @@ def van_der_pol(t, y, epsilon):
     return jnp.stack([y[1], ((1 - y[0] ** 2) * y[1] - y[0]) / epsilon])
 
 
+@pytest.mark.optimised
 @pytest.mark.slow
 def test_van_der_pol():
     """Van der Pol's oscillator at epsilon = 1e-6, to 10 rtol of the published values (IVP test set, problem VDPOL)."""
