@@ -25,6 +25,8 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import jax  # noqa: E402
 import pytest  # noqa: E402
 
+from lagjax.sweeps import remembered  # noqa: E402
+
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
 # Tracing creates so many objects that garbage collection runs constantly: 1.3 of 17 s of a test, now 0.3.
@@ -38,6 +40,16 @@ SIZE, MOST_PAGES = Path("/proc/self/statm"), 4 * 2**30 // os.sysconf("SC_PAGE_SI
 allowed = [MOST_PAGES]
 
 
+def as_users_get_it(item):
+    """Whether a test's programs are optimised."""
+    return any(item.get_closest_marker(name) for name in ("exhaustive", "optimised"))
+
+
+def pytest_collection_modifyitems(items):
+    """Run the optimised tests last, so that few programs are compiled in both ways."""
+    items.sort(key=as_users_get_it)
+
+
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup(item):
     """In the first two tiers XLA optimises little, which compiles in two thirds of the time.
@@ -45,8 +57,12 @@ def pytest_runtest_setup(item):
     Order, stability, speed and compiled programs are measured as users get them: in tests marked `optimised`, in all
     processes that tests start, in `python -m lagjax`, and in the last tier.
     """
-    as_users_get_it = any(item.get_closest_marker(name) for name in ("exhaustive", "optimised"))
-    jax.config.update("jax_disable_most_optimizations", not as_users_get_it)
+    optimised = as_users_get_it(item)
+    if optimised and jax.config.read("jax_disable_most_optimizations"):
+        # JAX would use the programs that earlier tests compiled for the same functions.
+        jax.clear_caches()
+        remembered._PROGRAMS.clear()
+    jax.config.update("jax_disable_most_optimizations", not optimised)
 
 
 def pytest_collection_finish():

@@ -173,6 +173,7 @@ def test_fits(way):
     np.testing.assert_array_equal(found.sd, fitted.sd)
 
 
+@pytest.mark.optimised
 @pytest.mark.slow
 def test_another_process():
     """A trajectory can be sent to another process and back."""

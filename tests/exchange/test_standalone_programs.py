@@ -81,6 +81,7 @@ def read(folder, name, call):
         return [file[f"arr_{i}"] for i in range(len(file.files))]
 
 
+@pytest.mark.optimised
 @pytest.mark.slow
 def test_another_process_without_lagjax(tmp_path):
     """Motions, forces, events and derivatives equal those here bit for bit; twin: other arguments change them."""

@@ -118,6 +118,7 @@ def kill_when(process, path, count):
     process.stdout.close()
 
 
+@pytest.mark.optimised
 @pytest.mark.slow
 def test_killed_and_resumed(tmp_path):
     """At any moment only the block in progress is lost, and nothing is corrupted."""
@@ -131,6 +132,7 @@ def test_killed_and_resumed(tmp_path):
     same(swept(worker.run, path), swept(worker.run))
 
 
+@pytest.mark.optimised
 @pytest.mark.slow
 def test_interrupted_from_the_keyboard(tmp_path):
     """The process exits normally and keeps the finished points."""
@@ -147,6 +149,7 @@ def test_interrupted_from_the_keyboard(tmp_path):
     same(swept(worker.run, path), swept(worker.run))
 
 
+@pytest.mark.optimised
 @pytest.mark.slow
 def test_two_processes_by_jax_distributed(tmp_path):
     """On loopback: each process finds its part, and together they compute all points."""
@@ -160,6 +163,7 @@ def test_two_processes_by_jax_distributed(tmp_path):
     same(swept(worker.run, path), swept(worker.run))
 
 
+@pytest.mark.optimised
 @pytest.mark.slow
 def test_two_processes_one_killed(tmp_path):
     """Two processes share a store; the killed one is restarted and computes only its missing blocks."""
