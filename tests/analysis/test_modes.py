@@ -362,5 +362,5 @@ def test_it_draws_itself():
     film = modes[0].animate(lambda t, q, params: (q["R"], q["r"]), amplitude=0.1)
     moved = film.points[""][:, 0] - [float(cross_rails.equilibrium_length(cross_rails.PARAMS)), 0.0]
     assert 0.09 < np.max(np.abs(moved)) <= 0.1 + 1e-12
-    with pytest.raises(ValueError, match="no film"):
+    with pytest.raises(ValueError, match="not a film"):
         modes[0].animate(lambda t, q, params: (q["R"], q["r"]), seconds=0.0)

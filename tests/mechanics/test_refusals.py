@@ -81,7 +81,7 @@ def test_no_door_is_left_out():
 def test_other_refusals_of_what_is_no_system():
     """`energy_ledger` needs a motion, `sweep` a function and `Hybrid` systems as phases."""
     for act, words in (
-        (lambda: lj.energy_ledger(pendulum), "made of a motion"),
+        (lambda: lj.energy_ledger(pendulum), "needs a motion that was computed"),
         (lambda: lj.sweep(pendulum, {"g": [1.0, 2.0]}), "a function of a point"),
         (lambda: lj.Hybrid({"swinging": pendulum.lagrangian}), "phase 'swinging' is function"),
     ):
