@@ -35,12 +35,12 @@ THEMES = {
     "motion": "Motion",
     "numerics": "Motion",
     "jax_internals": "Motion",
-    "analysis": "What a system is like",
+    "analysis": "Analysis of a system",
     "sweeps": "Sweeps",
     "fitting": "Fits",
     "learned": "Learned models",
     "comparison": "Error against run time",
-    "exchange": "Input and output",
+    "exchange": "Import and export",
     "interactive": "Sliders",
     "plot": "Pictures",
     "animation": "Pictures",
@@ -97,6 +97,7 @@ def messages(source: str) -> list[tuple[str, str]]:
 
     def add(kind, text):
         text = text and re.sub(r"…(?:\s?…)+", "…", text).strip()
+        text = text and text.replace("Usual cause: ….", "Usual cause: one of several, which the message names.")
         if text and telling(text) and text not in known:
             known.add(text)
             found.append((kind, text))
