@@ -27,6 +27,7 @@ import jax
 import jax.numpy as jnp
 import matplotlib
 import numpy as np
+import xarray
 
 import lagjax as lj
 from lagjax import plot
@@ -143,6 +144,14 @@ again = lj.sweep(run, axes, store=store, progress=False)
 print(f"computed by the first process {first.ran}, by the second {rest.ran}, by the last call {again.ran}")
 
 # %% [markdown]
+# The store is a Zarr group that xarray reads directly, with the axes as dimensions, also where lagjax is not installed.
+
+# %%
+in_xarray = xarray.open_zarr(store)
+print(dict(in_xarray.sizes), list(in_xarray.data_vars))
+agrees = np.array_equal(in_xarray["value"], again.values)
+
+# %% [markdown]
 # A store records which sweep it belongs to, and refuses another one.
 
 # %%
@@ -162,6 +171,7 @@ assert np.array_equal(over, h > 1) and not over[:, degrees < 45].any()
 lowest = np.array([np.min(degrees[of_one]) for of_one in over])
 assert np.all(np.diff(lowest) >= 0) and lowest[-1] > 140
 assert one.sizes == {"start": 64} and set(data.sizes) == {"omega", "start"}
+assert agrees
 assert 0 < first.ran < over.size and np.sum(on_disk.ok) == first.ran
 assert first.ran + rest.ran == over.size and again.ran == 0
 assert np.allclose(together, swept.values, rtol=0, atol=1e-6) and "another sweep" in refused
