@@ -82,7 +82,7 @@ def test_methods(way):
     assert motion(found).asked.method == lj.Radau5()
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("way", WAYS)
 def test_orbits(way):
     """A copied periodic orbit knows its system, and has the same motion."""
@@ -140,7 +140,7 @@ def test_functions_that_pickle_cannot_find():
     assert pickle.loads(pickle.dumps(lj.System(spring, {"rod": lj.Holonomic(rod)}))).constraints["rod"].g is rod
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("stored", [False, True])
 def test_sweeps(stored, tmp_path):
     """Values, statuses and texts stay the same; the function is included, or its absence is reported."""
@@ -158,7 +158,7 @@ def test_sweeps(stored, tmp_path):
         assert found.resweep(where=[True, False]).ran == 1
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("way", WAYS)
 def test_fits(way):
     """The table, the starts and the standard deviations."""
@@ -173,8 +173,7 @@ def test_fits(way):
     np.testing.assert_array_equal(found.sd, fitted.sd)
 
 
-@pytest.mark.optimised
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_another_process():
     """A trajectory can be sent to another process and back."""
     with multiprocessing.get_context("spawn").Pool(1, initializer=in_float64) as pool:

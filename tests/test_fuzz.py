@@ -14,7 +14,7 @@ def fuzzed(*options):
     return subprocess.run(list(map(str, run)), capture_output=True, text=True, timeout=900)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("seeds", exhaustive_but(((4, 257),), ((4, 257), (2, 70, 97, 147, 187), (196, 210, 219, 288))))
 def test_what_once_failed(seeds):
     """Systems with tables over 10 kB, a known 1/0, mixed dtypes, and 4,096 multiplications (257)."""

@@ -37,7 +37,7 @@ def text_of_gradient(system):
     return jax.jit(jax.grad(loss)).lower(WEIGHTS, np.linspace(0.0, 1.0, 4)).compile().as_text()
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_gradient_that_replays_steps_stays_on_the_device():
     """The compiled gradient has no operation on the host."""
     assert host_operations(text_of_gradient(learned())) == []

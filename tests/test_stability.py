@@ -116,8 +116,7 @@ def test_tiers(monkeypatch, tmp_path):
     assert asked == [stability.FULL, stability.QUICK, stability.REDUCED]
 
 
-@pytest.mark.optimised
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_wrong_derivative_is_found():
     """The derivative by the frequency is checked; twin: a reference that ignores ω is silently wrong."""
     by_frequency = replace(fixed(0.25), along=(0.0, 0.0, {"omega": 1.0}))

@@ -154,7 +154,7 @@ class Picture:
         """The lines, each panel cut off at its axes, and the words above them."""
         width, height = self._canvas.get_width_height()
         panels = [_panel(axis, lines, height) for axis, lines in zip(self.axes, self._lines) if lines]
-        size = self._above.get_fontsize() * DPI / 72
+        size = float(self._above.get_fontsize()) * DPI / 72
         x, y = self._above.get_position()
         rows = "".join(
             f'<tspan x="{x * width:g}" dy="{1.2 * size if i else size:g}">{html.escape(row)}</tspan>'

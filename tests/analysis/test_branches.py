@@ -160,7 +160,7 @@ def test_sleeping_top():
     np.testing.assert_array_equal(branch.stable[off], branch.parameter[off] > float(critical.parameter))
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_flutter_of_a_column():
     """Ziegler's: P l/c = 7/2 - √2 without damping, 41/28 + b²/(2 m l² c) with it (Ziegler, Ing.-Arch. 20 (1952) 49)."""
     for system, exact in ((ziegler, flutter_load), (damped_ziegler, damped_flutter_load)):

@@ -38,7 +38,7 @@ def shot(rate, period, z):
 # Families of a conservative system.
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_pendulum_by_its_amplitude():
     """The period is 4 K(k) √(l/g) at every point; twin: that of small swings is different."""
     orbit = lj.periodic_orbit(pendulum, (1.0, 0.0), 6.7, UNIT)
@@ -62,7 +62,7 @@ def test_pendulum_by_its_amplitude():
     np.testing.assert_allclose(by_period.period, swinging(by_period.q), rtol=1e-11)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("along, to", [("energy", 0.9), ("l", 3.0)])
 def test_pendulum_on_a_rod(along, to):
     """With a constraint: along the energy, and along the rod's length at constant energy; the rod keeps its length."""

@@ -239,7 +239,7 @@ def duffing_free(t, q, v, p):
     return 0.5 * v**2 - 0.5 * q**2
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_derivatives():
     """Of the period by g and the amplitude, both modes, as of the elliptic integral; twin: of small swings one is 0."""
 
@@ -291,7 +291,7 @@ def test_stiff_cycle():
     assert "not known" not in repr(lj.floquet(van_der_pol_orbit(1.0)))
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_lanes_and_sweeps():
     """A batch over μ agrees with a loop, and a sweep reports which points did not converge."""
     mu = jnp.array([0.5, 1.0, 2.0])

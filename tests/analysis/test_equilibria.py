@@ -76,7 +76,7 @@ def test_multiplier_and_redundant_rods(times):
     assert found.multipliers["rod"][0] < 0 < found.multipliers["rod"][1]
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_bead_and_its_derivatives():
     """cos α = g/(a ω²) with first and second derivatives by a, in programs and lanes; twin: the bottom's."""
     at = lambda a: lj.equilibria(bead_on_hoop.system, BEAD | {"a": a}, starts=[1.0]).q[0]
@@ -181,7 +181,7 @@ def test_sleeping_top():
     np.testing.assert_allclose(found.momenta[:, 0], TOP["I3"] * rates, rtol=1e-14)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_governor():
     """The balls' moment about a hinge vanishes, from the equilibrium of one rod and the slider, written by hand."""
     parts, p, rate = governor.Parts, governor.PARAMS, governor.RATE
@@ -210,7 +210,7 @@ def test_governor():
     np.testing.assert_allclose([hanging.q.C[0, 0], hanging.q.C[0, 2]], [p["b"], 0.0], atol=1e-9)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_roots_have_derivatives():
     """Derivatives of a damped pendulum's s = -c/2 ± i√(±g - c²/4), both modes, also on a rod; twin: with another c."""
     damped = lj.System(
@@ -234,7 +234,7 @@ def test_roots_have_derivatives():
     np.testing.assert_allclose(jax.grad(on_a_rod)(1.25), -0.5 * np.sqrt(g / 1.25**3), rtol=1e-9)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_roots_are_those_of_the_linearisation():
     """Two derivations agree: gyroscopic, holonomic and velocity constraints, all kinds of forces."""
     rng = np.random.default_rng(3)

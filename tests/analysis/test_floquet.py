@@ -306,7 +306,7 @@ def test_refused_in_words():
         lj.floquet(PARAMS)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_equations_that_fail():
     """A degenerate L and a NaN parameter are named in the message, also in the search for an orbit."""
     massless = lj.System(lambda t, q, v, p: 0.5 * v["x"] ** 2 - q["x"] ** 2 - (q["y"] - q["x"]) ** 2)

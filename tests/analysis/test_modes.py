@@ -79,7 +79,7 @@ def test_the_force_of_a_constraint_is_in_the_stiffness():
     assert len(modes) == 1 and np.abs(modes.shapes["y"][0]) < 1e-12
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_the_double_pendulum_by_angles_and_by_rods():
     """The roots of det(K - ω² M), in angles, with two constraints, and with one constraint given twice."""
     m1, m2, l1, l2, g = (DOUBLE_PARAMS[name] for name in ("m1", "m2", "l1", "l2", "g"))
@@ -312,7 +312,7 @@ def test_damping_and_circulation():
 # Double roots, and compiled programs.
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_double_root_is_reported():
     """An isotropic oscillator has finite derivatives, those of the mean, and is reported as double."""
     at = lambda k1: lj.normal_modes(small.circulating, 0.0, STILL, STILL, {"k1": k1, "k2": 4.0, "n": 0.0, "c": 0.0})

@@ -140,7 +140,7 @@ def test_the_top_without_its_cyclic_angles():
     np.testing.assert_allclose(found, -jax.grad(potential)(0.5) / OF_TOP["I1"], rtol=1e-12)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_routhian_moves_as_the_whole():
     """A nutation; and, in an array with one entry less and a non-quadratic L, a relativistic central motion."""
     reduced, state, params = reduced_top()

@@ -161,7 +161,7 @@ def test_a_moving_constraint_does_work():
         assert lj.is_symmetry(hoop, wrong, *state, params).broken_by() == ["constraint 'plane'"]
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_under_vmap_and_in_a_sweep():
     """A rotation is a symmetry of two springs only at the ratio one, to round-off; else the rate is (k_x - k_y) x y."""
     springs = lambda t, q, v, p: 0.5 * v @ v - 0.5 * (q[0] ** 2 + p["ratio"] * q[1] ** 2)

@@ -138,7 +138,7 @@ def test_a_motion_that_amplifies_is_said_to():
     assert "WARNING" in repr(found)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_errors_of_an_event_are_those_of_its_time_and_state():
     """The quarter period is K(1/2)/ω; a loose tolerance misses it by the stated error, relative to the span."""
     down = {"down": lj.Crossing(lambda t, q, v, params: q, direction=-1)}

@@ -59,7 +59,7 @@ def test_finds_parameters_and_start(swinging, capsys):
     assert stuck.rms()["q"] > 1e-2 and not capsys.readouterr().err
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_against_scipy(swinging):
     """Estimates and covariance agree with SciPy's least squares with numerical slopes."""
     data = noisy(swinging[0])
@@ -104,7 +104,7 @@ def test_gaps_and_several_runs(swinging):
     assert wrong.rms()["q"] > 1e-3
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_identifiability_before_and_after(swinging):
     """A swing determines g/l and c/(m l²); what is not determined gets no uncertainty."""
     record = lj.Record(TS, q=noisy(swinging[0]))
@@ -129,7 +129,7 @@ def test_identifiability_before_and_after(swinging):
     assert lj.identifiability(pendulum, record, more, free=["g", "colour"]).unseen() == ["colour"]
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_measured_force_shows_the_mass():
     """A motion does not determine the scale of L, but a multiplier does."""
     case = CASES["pendulum on a rod"]
@@ -207,7 +207,7 @@ def test_elements_of_any_pytree():
     np.testing.assert_array_equal(found.params.m, SPRINGS.m)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_what_the_residuals_tell():
     """As many unknowns as measurements leave no uncertainty; residuals on a curve are not measurement errors."""
     spring = lj.System(lambda t, q, v, p: 0.5 * v**2 - 0.5 * p["k"] * q**2)
@@ -278,7 +278,7 @@ def test_a_long_record_wants_a_growing_horizon():
     assert int(np.sum(best.costs > 2 * best.cost)) > 5
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_outliers_priors_and_bounds(swinging):
     """A robust loss tolerates outliers; a prior counts as a measurement; a reached bound is named."""
     data = noisy(swinging[0])
@@ -411,7 +411,7 @@ def test_other_optimisers(swinging):
     np.testing.assert_allclose(slow.values[1], ours.values[1], rtol=1e-2)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_log_likelihood(swinging):
     """The likelihood is largest at the estimates, and falls by a half at one standard deviation."""
     record = lj.Record(TS, q=swinging[0], sigma=0.01, q0=1.0, v0=0.0, hold_q=True, hold_v=True)

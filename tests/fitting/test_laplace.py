@@ -57,7 +57,7 @@ def test_a_linear_motion_has_this_posterior():
     assert abs(other.log_evidence - evidence) > 0.3
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_draws():
     """Draws have the covariance of the fall, and the standardised density is a standard normal one."""
     y = measured()
@@ -119,7 +119,7 @@ def test_large_residuals_against_scipy(rough):
     np.testing.assert_allclose(standard, -np.eye(3), atol=1e-6)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_evidence_against_quadrature():
     """The evidence is nearly the integral of the density over one unknown, the more so the smaller the errors."""
     off = []
@@ -138,7 +138,7 @@ def test_evidence_against_quadrature():
     assert abs(told.log_evidence - (best - 15 * np.log(sigma) - 7.5 * np.log(2 * np.pi))) > 1.0
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_no_peak(rough):
     """A direction without a peak is named, and nothing is drawn; an estimate off the peak gets a caveat."""
     data, found = rough

@@ -51,7 +51,7 @@ def train(width, depth, **options):
         return net, lj.fit(learned, list(records()), {"potential": net}, **options)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_learned_potential():
     """From four noisy motions by Levenberg-Marquardt: the potential, and a motion that was not trained on."""
     net, found = train(10, 1)

@@ -253,7 +253,7 @@ def test_constraints_forces_and_observations():
         np.testing.assert_allclose(angle[name].alone, further[name].alone, rtol=1e-5)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_windows_runs_without_sigma_and_several():
     """Without sigma results are multiples of an error; records are distinguished; each window has its own start."""
     plain = lj.identifiability(fall, lj.Record(T, q=5.0 * T**2), {"g": 9.81}, shrink="g").next

@@ -35,7 +35,7 @@ def test_what_a_bounce_leaves():
 KEPT = 0.8
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_what_a_switch_reads_may_change(monkeypatch):
     """A fit uses the current value of a global restitution: with another one the measurements no longer fit."""
     reset = lambda t, q, v, params: -KEPT * v

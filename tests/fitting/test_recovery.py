@@ -22,7 +22,7 @@ def inside(values, sd, truth):
     return np.mean(np.abs(values - truth) < 1.96 * sd, axis=0)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("name", exhaustive_but(("pendulum",), CASES))
 def test_recovers_the_truth_and_its_uncertainty(name):
     """Without errors the truth to 1e-8; with errors, 95 % of 200 repeats have the truth in their 95 % interval."""

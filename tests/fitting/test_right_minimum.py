@@ -38,7 +38,7 @@ def measured(clean, seed):
     return clean + SIGMA * jax.random.normal(jax.random.key(seed), clean.shape)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_stage_does_not_move_what_it_cannot_see(clean, monkeypatch):
     """A growing part of this record once led to a negative driving frequency; now the first search succeeds."""
     record = lj.Record(TS, q=measured(clean, 11), sigma=SIGMA)

@@ -34,7 +34,7 @@ def check(found, path, *given):
     return again
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_saved_and_loaded(tmp_path):
     """With its functions a loaded fit is complete; without, it has its results, and says what is missing."""
     path, guess = tmp_path / "fit.npz", {"k": 3.5}

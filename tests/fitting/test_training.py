@@ -112,7 +112,7 @@ def test_starts_of_their_own():
         np.testing.assert_allclose(at.sums[i], 2 * exact.cost, rtol=1e-6)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_step_is_the_formula():
     """One step of gradient descent from known starts: k minus the rate times the slope of the mean square."""
     r, prior, rate = record(), (5.0, 0.5), 1e-3

@@ -46,7 +46,7 @@ def waves():
     return knobs_of(wave, {"omega": (0.0, 8.0)})
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_slider_moves_the_motion():
     """A trajectory at the slider's values agrees with SciPy; another value compiles nothing."""
     knobs = knobs_of(swing, {"angle": (0.0, 3.0), "g": (1, 9)}, start={"angle": 1.0})

@@ -125,7 +125,7 @@ def test_coordinates_of_any_structure_agree():
     np.testing.assert_allclose([got["upper"], got["lower"][0]], expected, rtol=1e-13)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_network_inside_the_lagrangian():
     """params may be an equinox network; its weights have a gradient through the accelerations."""
     network = eqx.nn.MLP(2, "scalar", 8, 1, activation=jax.nn.softplus, key=jax.random.key(0), dtype=jnp.float64)

@@ -106,7 +106,7 @@ def test_residuals_by_level():
     assert float(constraint_residual(system, *state, level="velocity")["rod"]) == 22.0
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_gradient_of_a_multiplier():
     """∂λ/∂(params) of the pendulum, forward and reverse, against the closed form."""
     angle, rate = 0.75, 1.25

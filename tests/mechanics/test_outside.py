@@ -98,7 +98,7 @@ def test_the_next_call_has_the_new_value():
         np.testing.assert_allclose(lj.momentum(fall, 0.0, 1.0, 3.0, None), 3.0, rtol=1e-15)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.filterwarnings("error")
 def test_the_next_motion_has_the_new_value():
     """The same for a motion, by its closed form, and for a sweep."""

@@ -94,7 +94,7 @@ def test_door_on_three_hinges():
     np.testing.assert_allclose(np.concatenate([multipliers["hinges"], multipliers["rigid"]]), shortest, atol=1e-11)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_report_names_dependent_constraints_and_counts_freedoms():
     """`explain`: a pendulum on two rods has one degree of freedom, and both rods are named."""
     pair = lj.explain(twice(2.0), *STATE)

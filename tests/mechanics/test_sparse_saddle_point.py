@@ -145,7 +145,7 @@ def acceleration(system, q, v):
     return sparse, dense
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_derivatives_in_both_modes():
     """Derivatives by every mass, forward and reverse, are those of the dense equations."""
     system, q, v, params = chain(8)

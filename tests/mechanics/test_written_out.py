@@ -121,8 +121,7 @@ def test_the_compiled_program():
     assert is_small(seven, *coordinates.state(0.0, np.ones(7), np.ones(7), np.ones(64)))
 
 
-@pytest.mark.optimised
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_changed_numbers_do_not_compile_again():
     """Other tolerances, parameters, times and initial states compile nothing; twin: many more times do."""
     system = lj.System(lambda t, q, v, params: 0.5 * v**2 + params["k"] * jnp.cos(q))

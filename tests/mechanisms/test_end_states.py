@@ -54,7 +54,7 @@ def reference_of(mechanism):
 
 
 # The others take longer to compile.
-IN_SECONDS = ("car_axis", "double_pendulum", "fekete", "slider_crank")
+IN_SECONDS = ("double_pendulum", "slider_crank")
 
 
 @pytest.mark.parametrize("name", exhaustive_but(IN_SECONDS, sorted(MECHANISMS)))
@@ -74,6 +74,7 @@ def test_end_state(name):
     assert missed.keys() == {key for key in MISSED if key[0] == name}, missed
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize(
     ("name", "parameter"),
     [
@@ -126,6 +127,7 @@ def test_ladder_before_it_lies_down(rtol):
     assert np.all(errors <= WITHIN), errors
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("rtol", exhaustive_but((1e-8,), (*TOLERANCES, 1e-12)))
 def test_singular_position_is_passed_or_reported(rtol):
     """After the first singular position the end is right, or the integration reports that it failed."""

@@ -123,7 +123,7 @@ def test_start_off_the_constraint():
         lj.integrate(rod_pendulum, q0, v0, PARAMS, ts=TS)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_the_remedy_for_a_start_off_the_constraint():
     """The advised remedy works; twin: without it the same start is refused, above."""
     q0, v0 = {"x": 1.3, "y": 0.1}, {"x": 0.2, "y": -1.0}

@@ -97,7 +97,7 @@ def test_another_function_is_looked_at():
         lj.integrate(pendulum, np.array([0.5, 0.5]), np.zeros(2), PARAMS, ts=TS)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_equations_are_taken_for_regular_first():
     """A rod is regular; a rod given twice is not, and the robust solve finds the same motion."""
     once = lj.integrate(rod_pendulum, *HORIZONTAL, PARAMS, ts=TS)
@@ -139,7 +139,7 @@ def test_programs_of_many_systems_are_dropped():
     assert grown("2") < 40 and grown("100") > 60
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_regular_and_robust_agree():
     """On regular equations both solves agree to round-off; a program that JAX traces uses the robust one."""
     at_once = lj.integrate(rod_pendulum, *HORIZONTAL, PARAMS, ts=TS, rtol=1e-12)
@@ -162,7 +162,7 @@ def test_where_nothing_is_traced():
     assert seen[0] and seen[-1] and not any(seen[1:-1])
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_lanes_of_what_functions_close_over():
     """Batched numbers that L and a guard close over, without `jit`: each lane uses its own. Twin: its neighbour's."""
 

@@ -121,7 +121,7 @@ def test_compositions(motion, composition):
     np.testing.assert_allclose(found, expected, rtol=1e-7, atol=1e-8)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_third_derivatives_are_refused():
     """A third derivative is refused with a clear message; twin: second derivatives work, above."""
     twice = lambda p: jax.jvp(jax.grad(of_free), (p,), (W,))[1] @ U

@@ -50,7 +50,7 @@ def flat(state):
     return jnp.stack([q["x"], q["y"], v["x"], v["y"]])
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_nearest_in_the_metric_of_the_masses():
     """From far away the nearest point of a moving ellipse is found, 1e-12 from its one-angle solution.
 
@@ -62,7 +62,7 @@ def test_nearest_in_the_metric_of_the_masses():
     assert np.max(np.abs(found - euclidean)) > 0.05
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("mode", exhaustive_but((jax.jacrev,), (jax.jacfwd, jax.jacrev)))
 def test_derivatives_by_everything(mode):
     """Derivatives by time, state and parameters are those of the one-angle solution, even from far off."""

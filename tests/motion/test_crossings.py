@@ -220,7 +220,7 @@ def test_twin_ends_of_steps(monkeypatch):
     assert len(times(run(lambda t, q, v, p: q - 0.991))) == 0
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_lanes():
     """Lanes with two crossings, with none, started on the guard, refused, and ended give the same as single runs."""
     q0, v0 = jnp.array([0.0, 0.0, 0.5, jnp.nan, 0.0]), jnp.array([1.0, 0.1, 0.75**0.5, 1.0, 1.0])
@@ -281,7 +281,7 @@ def test_multipliers_in_a_guard():
     assert int(found.count) == 1
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_derivatives():
     """Times and states at recorded and terminal crossings, forward and reverse, with respect to all their inputs."""
 

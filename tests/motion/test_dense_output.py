@@ -115,7 +115,7 @@ def test_where_there_is_no_motion():
     assert list(np.isnan(inside)) == [True, False, True] and abs(inside[1] - exact(1.0)[0]) < 1e-9
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_batches():
     """The lane axis comes first, each lane as in a single run; NaN where a lane has ended."""
     lanes = jax.vmap(lambda q0: swing(q0, events={"up": lj.Crossing(lambda t, q, v, params: q)}))(np.array([2.0, 3.1]))
@@ -134,7 +134,7 @@ def ball(t, q, v, params):
     return 0.5 * v**2 - params["g"] * q
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_motions_in_phases():
     """A ball that bounces with half of its speed: parabolas between the impacts at t = 1, 2 and 2.5."""
     floor = [
@@ -163,7 +163,7 @@ def test_what_cannot_be_continued():
         swing(**planned, throw=False).at(0.3)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("of", [swing, rotate])
 def test_derivatives(of):
     """The derivative by t is the velocity, also at outputs and ends; that by a parameter is the central difference."""
@@ -179,7 +179,7 @@ def test_derivatives(of):
         np.testing.assert_allclose(by_t, np.cos(exact(t)[0]) * v, atol=1e-8)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_second_derivative_at_an_output():
     """The second derivative by t at an output, where no step is taken, is the acceleration -g sin q, not zero."""
     traj = swing()

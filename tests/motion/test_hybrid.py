@@ -53,7 +53,7 @@ def heights(t, h=1.0, e=0.5):
     )
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_ball_that_bounces():
     """Times, states before and after, impulses; outputs on a switch have the state before it; derivatives both ways."""
     traj = bounced()
@@ -77,7 +77,7 @@ def test_a_ball_that_bounces():
 RESTITUTION, LEVEL = 0.5, 0.0
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("ready_made", exhaustive_but((True,), (True, False)))
 def test_what_functions_read_may_change(monkeypatch, ready_made):
     """A reset, a restitution and a gap that read globals, as in notebooks: each call uses their current values."""
@@ -103,7 +103,7 @@ def made_again(e):
     return lj.Hybrid({"flying": system}, [flying], most_switches=4)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_made_again_it_compiles_nothing():
     """The same functions made again use the same program; twin: with another number in them they do not."""
     end = lambda e: float(in_phases(made_again(e), 1.0, 0.0, {"g": G}, ts=np.array([0.0, 1.0])).q[-1])
@@ -116,7 +116,7 @@ def test_made_again_it_compiles_nothing():
     assert found
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_lanes_are_single_runs():
     """Lanes that switch at different times, and different numbers of times, agree with single runs."""
     hs = np.array([0.4, 1.0, 3.0, 6.0])
@@ -154,7 +154,7 @@ def test_said_by_name():
         lj.integrate(lj.Hybrid({"flying": ball}, [odd]), 1.0, 0.0, PARAMS, ts=np.array([0.0, 1.0]))
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_it_comes_to_rest():
     """Infinitely many bounces end in the phase of rest, at the time in closed form, √(2h/g)(1+e)/(1-e)."""
     fall = lj.Switch("flying", to="flying", when=lj.touches(height, restitution=0.5), rest="lying", slower_than=1e-8)
@@ -307,7 +307,7 @@ def test_two_balls_collide():
     np.testing.assert_allclose(ends(v0), v0[0] * when + after * (1.0 - when), rtol=1e-12)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_stick_and_slip():
     """A block on a belt, held by a spring: it sticks, slips and sticks again; the period against its quadrature."""
     params = {"k": 4.0, "belt": 0.5, "mu_s": 0.4, "mu_k": 0.2, "g": G}

@@ -188,7 +188,7 @@ def test_what_holds_goes_by_any_name(name):
     np.testing.assert_allclose(found, [4.0, 2.0], rtol=1e-13)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_contact_that_jams_is_said():
     """A jammed contact is reported by name and cause; the motion up to it is kept."""
     start, ts = (jnp.array([2.0, 1.0]), jnp.zeros(2), {"mu": 5.0}), np.array([0.0, 1.0, 1.2])
@@ -287,7 +287,7 @@ landing = lj.Hybrid(
 )
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_it_lands_sliding_or_rolling():
     """A ball that sticks at the impact rolls at once, one that slides rolls later."""
     fall, ts = np.sqrt(2 * HEIGHT / G), np.array([0.0, UNTIL, 3.0])

@@ -188,7 +188,7 @@ def test_lanes_with_and_without_an_event():
     assert float(batch.end.t[3]) == pytest.approx(1.5, abs=1e-12)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_event_time_gradient():
     """d(quarter period)/dl = T/(2 l), forward and reverse, through the event."""
     event = diffrax.Event(lambda t, y, params, **kwargs: y[0])
@@ -286,7 +286,7 @@ def test_feedback_and_values_closed_over_where_equations_are_not_written_out():
     np.testing.assert_allclose(closed_over(1.25), there.q["x"], atol=1e-12)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_an_empty_batch():
     """A batch without lanes gives no motions: with every kind of method, constraints, events, derivatives, printed."""
     nobody = jnp.zeros(0)

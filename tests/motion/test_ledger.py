@@ -142,7 +142,7 @@ def test_backward():
     assert ledgers[0].closes and ledgers[1].closes and "gave" not in repr(ledgers[1])
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_impacts():
     """A ball loses 1 - e² of its energy at each impact, and drag takes the rest; an output may be at an impact."""
     ball = DRAGGED

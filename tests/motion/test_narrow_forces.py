@@ -77,7 +77,7 @@ def test_outputs_at_and_beside_jumps(method):
     assert traj.stats["num_steps"] < 30
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_jumps_backward_with_constraints_and_lanes():
     """A rod driven by a switched torque: few steps are rejected, and integrating backward retraces the motion."""
     rod = lj.Holonomic(lambda t, q, params: q["x"] ** 2 + q["y"] ** 2 - 1.0)

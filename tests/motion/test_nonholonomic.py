@@ -304,7 +304,7 @@ def cruise_run(params, ts, tol, **options):
     return traj.q, traj.v, traj.multipliers["cruise"]
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_cruise():
     """Kept at its speed, the particle turns downwards as a gudermannian; values, forward derivatives, residual."""
     ts = np.array([0.0, 0.5, 1.0, 2.0])
@@ -472,7 +472,7 @@ def coin_state(params, heading, tilt, u, p, w, x=0.0, y=0.0):
 COIN_TS = np.linspace(0.0, 3.0, 16)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_tilted_disk_rolls_steadily():
     """At the spin required by its tilt, a disk rolls on a circle; the contact carries m g, and m R ω₃ Ω inwards."""
     tilt, turn = 1.125, 2.5

@@ -15,7 +15,7 @@ TOLERANCE = 1e-10
 START = ({"x": 1.0, "y": 0.75}, {"x": -1.5, "y": 2.0})
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_pendulum_on_two_rods():
     """A rod given twice moves the pendulum as one does, and the two share its force in the ratio of their scales."""
     ts = np.linspace(0.0, 5.0, 6)

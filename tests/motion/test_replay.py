@@ -85,7 +85,7 @@ def test_more_steps_than_there_is_room_for(monkeypatch, room):
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-12), of(system), expected)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_lanes_that_fail_have_no_part():
     """A lane without mass does not start: it adds nothing to derivatives by shared parameters, and its own are zero."""
     heavy = lj.System(lambda t, q, v, p: 0.5 * p["m"] * v**2 - 0.5 * p["k"] * q**2)
@@ -124,7 +124,7 @@ def test_networks_as_matrices(kind):
     np.testing.assert_allclose(back, along, rtol=1e-10)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_differences_on_the_same_steps():
     """If each step goes from one output to the next, a difference quotient of whole motions uses the same steps."""
     system, ts = pendulum(), np.linspace(0.0, 2.0, 41)
@@ -152,7 +152,7 @@ def test_at_rest():
     np.testing.assert_allclose(by_q, np.cos(np.sqrt(9.81 / 2.0) * TS[-1]), rtol=1e-8)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("method", exhaustive_but((None,), (None, diffrax.Kvaerno5())))
 def test_implicit_methods(method):
     """A stiff spring: derivatives by the implicit function theorem at each step."""
@@ -176,7 +176,7 @@ def falling():
     return lj.System(lambda t, q, v, p: 0.5 * v**2 - p["g"] * q)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_an_event():
     """Derivatives of the end time, the end velocity and the outputs of a fall to the floor."""
     stone, floor = falling(), lj.Crossing(lambda t, q, v, p: q, direction=-1)
@@ -208,7 +208,7 @@ def long_swing():
     return lambda adjoint: jax.jit(jax.grad(lambda p: end(p, adjoint)))
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_budget_of_memory(monkeypatch):
     """A record has the requested size, and pieces that are run again meet whatever the round-off."""
     at, swing = jnp.full(30, 1 / 30), long_swing()

@@ -62,7 +62,7 @@ def test_scenes(name):
     modes_agree(run.system, run.q0, run.v0, run.params, ts, events=run.events)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("name", exhaustive_but(("double_pendulum",), tuple(MECHANISMS)))
 def test_mechanisms(name):
     """The modes agree over a short time; redundant mechanisms use the robust solve."""

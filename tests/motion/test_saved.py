@@ -148,7 +148,7 @@ def test_how_it_ended(tmp_path):
         assert bool(again.result == result) and np.isnan(again.q["x"][-1]) and again.end.t == traj.end.t
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_methods_and_controllers(tmp_path):
     """The method and the steps asked for come back, so that `at` continues the motion as before."""
     pid = dict(method=diffrax.Dopri5(), stepsize_controller=diffrax.PIDController(rtol=1e-6, atol=1e-6))

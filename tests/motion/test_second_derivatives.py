@@ -38,7 +38,7 @@ def of_thirty_by_hand(p):
     return rest + (0.3 - rest) * jnp.cos(0.9 * jnp.sqrt(stiffness))
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("inner", exhaustive_but((jax.jacrev,), (jax.jacfwd, jax.jacrev)))
 @pytest.mark.parametrize("outer", exhaustive_but((jax.jacrev,), (jax.jacfwd, jax.jacrev)))
 def test_modes_in_any_order(inner, outer):
@@ -47,7 +47,7 @@ def test_modes_in_any_order(inner, outer):
     np.testing.assert_allclose(outer(inner(end))(x), jax.hessian(exact)(x), atol=1e-8)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_gradients_of_gradients():
     """`grad(grad)` by one parameter, jitted and batched, is that of the formula."""
     second = lambda f: jax.grad(jax.grad(lambda k: f(jnp.stack([0.75, k]))))

@@ -63,7 +63,7 @@ def test_turning_points_of_the_pendulum():
     np.testing.assert_allclose(lj.periods(found), of_pendulum(2.0, PARAMS["l"])[0] / 2, rtol=1e-9)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_derivatives_of_the_period():
     """Derivatives of one period and of the mean period, by amplitude and length, forward and reverse."""
 

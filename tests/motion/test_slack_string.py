@@ -44,7 +44,7 @@ def thrown(speed, until=1.2):
     return traj
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_slack_and_taut():
     """Times, places and the remaining velocity against closed forms. Twin: those of another speed differ."""
     speed = np.sqrt(3.0 * G * L)

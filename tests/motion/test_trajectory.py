@@ -115,7 +115,7 @@ def test_phase_portrait_of_a_rotation_stays_in_a_turn():
     np.testing.assert_array_equal(drawn, [swing.q, swing.v])
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_phase_portrait_has_a_panel_a_coordinate(traj):
     """Panels have the user's names; lengths keep their ticks and are never cut; a batch has one curve per lane."""
     axes = [axis for axis in traj.phase_portrait().axes if axis.get_visible()]

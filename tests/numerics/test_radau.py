@@ -179,7 +179,7 @@ def test_stiff_springs_cost_no_steps():
         np.testing.assert_allclose(found.ys[0][0], [np.sin(angle), -np.cos(angle)], atol=1e-7 + 100 / k)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_kvaerno_with_this_root_finder():
     """Kvaerno5 on a stiff spring: at most half of the steps that it takes with diffrax's root finder, same accuracy."""
     k = 1e4

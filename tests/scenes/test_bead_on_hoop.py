@@ -331,7 +331,7 @@ def test_reverse_gradient_of_state():
     _check_gradient(jax.jacrev, _final)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("derivative", exhaustive_but((jax.jacrev,), (jax.jacfwd, jax.jacrev)))
 def test_gradient_of_torque(derivative):
     """So do the driven bead's state and the motor's torque, in both modes, including the torque's explicit ω."""

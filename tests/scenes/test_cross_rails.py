@@ -139,7 +139,7 @@ def test_exact_motion_is_the_matrix_exponential():
             assert np.max(np.abs(got - expected)) < 1e-12 * np.max(np.abs(expected)), (omega, K)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_frames_agree_after_a_hundred_turns():
     """x, y and R, r, integrated separately for 100 turns at 5e-13, agree to 1e-9; with the factor 1 they do not."""
     ts = np.linspace(0.0, 100 * 2 * np.pi / PARAMS["omega"], 11)
@@ -296,7 +296,7 @@ def test_forward_gradient():
     _check_gradient(jax.jacfwd)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_reverse_gradient():
     """The same holds in reverse mode."""
     _check_gradient(jax.jacrev)

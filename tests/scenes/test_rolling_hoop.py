@@ -106,7 +106,7 @@ def test_multipliers_from_the_lagrangian():
             assert float(a["theta"]) != pytest.approx(float(hoop.rate(params)) ** 2 * np.cos(theta), rel=1e-3)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_motion_and_departure_when_integrated():
     """θ(0.5), θ̇(0.5) and the time and angle of the departure are right to 1e-9, and outputs after it are NaN."""
     down, *_ = hoop.runs()
@@ -184,7 +184,7 @@ def test_flight_is_the_same_lagrangian_without_constraints():
     assert not np.allclose(hoop.flight(PARAMS, left._replace(vy=-left.vy), t).y[1:], gap.y[1:], rtol=1e-2)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_swings_about_the_bottom():
     """Twenty swings follow Jacobi's functions, with residuals below 1e-12; a disk would not."""
     *_, run = hoop.runs()
@@ -196,7 +196,7 @@ def test_swings_about_the_bottom():
     assert np.max(np.abs(other - got.q["theta"])) > 0.1
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_thousand_swings_stay_on_the_constraints():
     """1,000 natural periods: residuals stay below 1e-12; errors of phase and energy only accumulate."""
     theta0 = hoop.BOTTOM + 1.0

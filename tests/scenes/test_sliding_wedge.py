@@ -90,7 +90,7 @@ def motions():
     return {"rest": run(*rest, jnp.asarray(T)), "init": run(*moving, jnp.asarray(T)), "drop": run(*rest, drop)}
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_motion(motions):
     """Positions, energies, power, work and momentum after 0.75 s, and the drop to y = 1, to 1e-9."""
     m, M, g = PARAMS["m"], PARAMS["M"], PARAMS["g"]

@@ -79,7 +79,7 @@ def all_robust(monkeypatch):
     remembered._PROGRAMS.clear()
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @not_plain
 def test_lanes_that_are_not_regular(compiled):
     """All lanes have their exact values. Twin: without the robust program the irregular ones fail."""

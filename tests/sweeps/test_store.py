@@ -132,8 +132,7 @@ def test_killed_and_resumed(tmp_path):
     same(swept(worker.run, path), swept(worker.run))
 
 
-@pytest.mark.optimised
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_interrupted_from_the_keyboard(tmp_path):
     """The process exits normally and keeps the finished points."""
     path, computed = tmp_path / "sweep", POINTS
@@ -149,8 +148,7 @@ def test_interrupted_from_the_keyboard(tmp_path):
     same(swept(worker.run, path), swept(worker.run))
 
 
-@pytest.mark.optimised
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_two_processes_by_jax_distributed(tmp_path):
     """On loopback: each process finds its part, and together they compute all points."""
     path = tmp_path / "sweep"
@@ -163,8 +161,7 @@ def test_two_processes_by_jax_distributed(tmp_path):
     same(swept(worker.run, path), swept(worker.run))
 
 
-@pytest.mark.optimised
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_two_processes_one_killed(tmp_path):
     """Two processes share a store; the killed one is restarted and computes only its missing blocks."""
     path = tmp_path / "sweep"

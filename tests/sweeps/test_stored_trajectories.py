@@ -96,7 +96,7 @@ def test_a_class_that_is_not_found(tmp_path, monkeypatch):
     assert list(values) == ["k"] and values["k"].tolist() == [1.0, 2.0, 3.0]
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_store_opened(store):
     """Trajectories equal those of the sweep bit for bit; they print, plot and animate without their system."""
     swept, opened = quiet(run, store=store), lj.open_sweep(store)

@@ -62,7 +62,7 @@ def assert_same(found, expected, rtol, atol):
         np.testing.assert_allclose(found[name], expected[name], rtol=rtol, atol=atol)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_same_as_a_loop(looped):
     """One lane after the other takes the same steps; together, sines round differently, which changes first steps."""
     in_turn, together = quiet(final_angle_and_slope, layout="map", workers=1), quiet(final_angle_and_slope)
@@ -75,7 +75,7 @@ def test_same_as_a_loop(looped):
     assert np.all(in_turn.status.steps > looped["steps"])
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_same_as_vmap_and_whoever_is_beside():
     """Steps are the same as under `jax.vmap`, in other chunks, sorted, and in another order of lanes."""
     swept = quiet(final_angle_and_slope)
@@ -90,7 +90,7 @@ def test_same_as_vmap_and_whoever_is_beside():
         assert_same(swept.values, other, 1e-10, 1e-12)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_lane_that_fails_keeps_its_reason():
     """A failed lane is NaN and does not affect the others; running it again with other settings fills it in."""
     few = quiet(lambda point: swing(point, max_steps=22).q[-1])

@@ -132,7 +132,7 @@ def test_what_makes_no_page(swept):
         swept.to_html(positions=lambda t, q, params: (q, q))
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_films_of_all_lanes():
     """All lanes share their times; a lane that ends early stays in place; a lane that never started is not shown."""
     fall = lj.System(lambda t, q, v, params: 0.5 * v**2 / jnp.where(params["g"] > 0, 1.0, 0.0) - params["g"] * q)
