@@ -61,7 +61,7 @@ def pytest_runtest_setup(item):
     if optimised and jax.config.read("jax_disable_most_optimizations"):
         # JAX would use the programs that earlier tests compiled for the same functions.
         jax.clear_caches()
-        remembered._PROGRAMS.clear()
+        remembered.PROGRAMS.clear()
     jax.config.update("jax_disable_most_optimizations", not optimised)
 
 

@@ -34,7 +34,6 @@ from lagjax.analysis.found_equilibria import (
 from lagjax.analysis.starts import checked, stacked, stacked_one, symmetries_of
 from lagjax.jax_internals.tracing import is_eager
 from lagjax.mechanics import constraints, coordinates
-from lagjax.mechanics.closures import lift
 from lagjax.mechanics.compiled import compiled
 from lagjax.mechanics.refusals import by_name, check_system
 from lagjax.mechanics.structure import angles, is_autonomous
@@ -123,7 +122,7 @@ def equilibria(
         )
     symmetries = symmetries_of(system, s, cyclic, hold, moving)
     # A function may close over traced values although no argument is traced.
-    steady = Steady(lift(system, s), s.t, s.params, np.zeros(symmetries.count, s.t.dtype), s.q, symmetries)
+    steady = Steady(system, s.t, s.params, np.zeros(symmetries.count, s.t.dtype), s.q, symmetries)
     q, v = jax.tree.map(lambda x: x.astype(s.t.dtype), (q, v))
     lasting = not symmetries.count and is_autonomous(system, *s)
     concrete = is_eager() and not coordinates.is_traced((steady, q, v))

@@ -18,7 +18,7 @@ from lagjax.analysis.legendre import velocity_of
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.compiled import compiled
 from lagjax.mechanics.diagnosis import describe
-from lagjax.mechanics.first_call import looked_at
+from lagjax.mechanics.first_call import traced_system
 from lagjax.mechanics.noether import applied_force
 from lagjax.mechanics.reactions import reacts
 from lagjax.mechanics.refusals import check_system
@@ -58,7 +58,7 @@ class Hamiltonian(eqx.Module):
                 "Fix: p = lj.momentum(system, t, q, v, params)."
             )
         s = coordinates.state(t, q, p, params)
-        system = looked_at(self.system, s)
+        system = traced_system(self.system, s)
         value, v, momentum_rate, mass, regular, reached = _hamiltonian(system, *s)
         if coordinates.is_traced((value, regular)):
             known = regular & reached

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from lagjax.mechanics import coordinates
-from lagjax.mechanics.first_call import looked_at
+from lagjax.mechanics.first_call import traced_system
 from lagjax.mechanics.refusals import check_system
 from lagjax.motion.trajectory import Trajectory
 
@@ -63,7 +63,7 @@ def action(
     edges = t0 + (t1 - t0) * jnp.arange(pieces + 1) / pieces
     q, v = _position_and_velocity(path, t0)
     s = coordinates.state(t0, q, v, params)
-    system = looked_at(system, s)
+    system = traced_system(system, s)
     at = lambda t: system.lagrangian(t, *_position_and_velocity(path, t), s.params)
     return _integral(at, edges[:-1], edges[1:])
 
@@ -78,7 +78,7 @@ def _action_of_trajectory(system, path, params, t0, t1):
     t, q, v = path.t, path.q, path.v
     _, unflatten = coordinates.flatten(jax.tree.map(lambda x: x[0], q))
     s = coordinates.state(t[0], *jax.tree.map(lambda x: x[0], (q, v)), params)
-    system = looked_at(system, s)
+    system = traced_system(system, s)
     flat = lambda tree: jax.vmap(lambda y: coordinates.flatten(y)[0])(tree)
     x, u = flat(q), flat(v)
     t0, t1 = (t[0] if t0 is None else t0), (t[-1] if t1 is None else t1)

@@ -15,10 +15,9 @@ from lagjax.analysis.linear_parts import Kind, Parts, parts_of
 from lagjax.analysis.steadiness import Steadiness, check_steady, steadiness_of
 from lagjax.jax_internals.tracing import is_eager
 from lagjax.mechanics import constraints, coordinates
-from lagjax.mechanics.closures import lift
 from lagjax.mechanics.compiled import compiled
 from lagjax.mechanics.coordinates import State
-from lagjax.mechanics.first_call import looked_at
+from lagjax.mechanics.first_call import traced_system
 from lagjax.mechanics.memory import kinds, remembered
 from lagjax.mechanics.refusals import check_system
 from lagjax.mechanics.structure import structure, unseen_coordinates
@@ -135,10 +134,8 @@ def linearise(system, t, q, v, params) -> Linearisation:
     """
     check_system(system, t, q, v, params)
     s = coordinates.state(t, q, v, params)
-    system = looked_at(system, s)
+    system = traced_system(system, s)
     traced = not is_eager() or coordinates.is_traced((s, eqx.filter(system, eqx.is_array)))
-    if traced:
-        system = lift(system, s)
     kind = _kind(system, s)
     n, m = len(kind.unseen), len(kind.holonomic)
     if m >= n:
@@ -163,7 +160,7 @@ def linearise(system, t, q, v, params) -> Linearisation:
 def _kind(system, s: State) -> Kind:
     """The static part of the linearisation."""
     holonomic = tuple(bool(x) for x in constraints.holonomic_equations(system, *s))
-    key = (_kind, system.read, kinds(s))
+    key = (_kind, kinds(s))
     unseen, linear_terms, timeless = remembered(system, key, lambda: _structure_facts(system, s))
     at_rest = not coordinates.is_traced(s.v) and not any(np.any(x) for x in jax.tree.leaves(s.v))
     conservative = system.force is None and system.dissipation is None and all(holonomic)

@@ -21,11 +21,10 @@ from lagjax.analysis.flow import TOLERANCE, all_rows, flow_of, independent_rows_
 from lagjax.analysis.trivial import Reasons, directions, orthonormal, reasons_of
 from lagjax.jax_internals.tracing import WATCHED, is_eager
 from lagjax.mechanics import coordinates
-from lagjax.mechanics.closures import lift
 from lagjax.mechanics.compiled import compiled
 from lagjax.mechanics.coordinates import State
 from lagjax.mechanics.diagnosis import explain_failure
-from lagjax.mechanics.first_call import looked_at
+from lagjax.mechanics.first_call import traced_system
 from lagjax.mechanics.refusals import check_system
 from lagjax.mechanics.structure import angles
 
@@ -65,7 +64,7 @@ def problem_of(system, t, q, v, params) -> Problem:
     """Check a system at a state; unless JAX is tracing, dependent constraints are found and left out."""
     check_system(system, q, v, params)
     s = coordinates.prepared(t, q, v, params)
-    system = lift(looked_at(system, s), s)
+    system = traced_system(system, s)
     state = coordinates.state(*s)
     rows = independent_rows_of(system, *state)
     _check_freedom(system, state, rows)

@@ -22,7 +22,6 @@ from jaxtyping import Array, Float
 
 from lagjax.analysis.states import States, around
 from lagjax.mechanics import constraints, coordinates
-from lagjax.mechanics.closures import lift
 from lagjax.mechanics.compiled import compiled
 from lagjax.mechanics.equations import equations_of
 from lagjax.mechanics.generators import Generator
@@ -120,7 +119,7 @@ def rates(system, affine: Affine, generators: tuple[Generator, ...], s, places) 
 @compiled
 def _rates(system, affine, generators, s, states, scales) -> _StateRates:
     _, unflatten = coordinates.flatten(s.q)
-    equations = equations_of(lift(system, s), *s) if reacts(system) else None
+    equations = equations_of(system, *s) if reacts(system) else None
 
     def at(t, x, u):
         lagrangian = lambda t, x, u: system.lagrangian(t, unflatten(x), unflatten(u), s.params)

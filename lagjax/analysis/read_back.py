@@ -21,7 +21,7 @@ from lagjax.jax_internals.programs import Literal
 from lagjax.mechanics import constraints, coordinates
 from lagjax.mechanics.constraints import evaluate
 from lagjax.mechanics.diagnosis import equation_names
-from lagjax.mechanics.first_call import looked_at
+from lagjax.mechanics.first_call import traced_system
 from lagjax.mechanics.in_numbers import Numbers, in_numbers
 from lagjax.mechanics.lagrangian import mass_and_forcing
 from lagjax.mechanics.refusals import check_system
@@ -81,11 +81,11 @@ def latex(system, q, v, params=None, *, t=0.0) -> EquationsOfMotion:
     check_system(system, q, v, params)
     s = coordinates.state(t, q, v, jax.tree.map(lambda x: float(x) if type(x) is int else x, params))
     try:
-        system = looked_at(system, s)
+        system = traced_system(system, s)
     except (TypeError, IndexError):
         # An integer that is used as a count or an index must stay an integer.
         s = coordinates.state(t, q, v, params)
-        system = looked_at(system, s)
+        system = traced_system(system, s)
     n = len(coordinates.names(s.q))
     if n > COORDINATES:
         raise ValueError(f"the system has {n} coordinates, but equations are written only for up to {COORDINATES}.")

@@ -75,7 +75,7 @@ class Routhian(eqx.Module):
         shaped = coordinates.flatten(v)[0]
         zeros = [jnp.zeros_like(shaped[0])] * len(self.cyclic)
         q = _together(q, self.cyclic, zeros)
-        key = (Routhian, self.cyclic, self.system.read, kinds((t, q, params)))
+        key = (Routhian, self.cyclic, kinds((t, q, params)))
         remembered(self.system, key, lambda: self._check(t, q, _together(v, self.cyclic, zeros), params))
         of = lambda u: self.system.lagrangian(t, q, _together(v, self.cyclic, list(u)), params)
         p = jnp.stack([jnp.asarray(momenta[name], shaped.dtype) for name in self.cyclic])

@@ -12,7 +12,7 @@ from lagjax.analysis.balance import MOMENTUM, VELOCITY, Symmetries
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.coordinates import State
 from lagjax.mechanics.diagnosis import listed
-from lagjax.mechanics.first_call import looked_at
+from lagjax.mechanics.first_call import traced_system
 from lagjax.mechanics.structure import structure
 
 AS_STARTS = 'starts=[{"theta": 0.1}, {"theta": 3.0}], or starts={"theta": jnp.linspace(-3.0, 3.0, 20)}'
@@ -62,11 +62,11 @@ def checked(system, t, q, v, params):
     s = coordinates.state(t, q, v, floats)
     if any(type(x) is int for x in jtu.tree_leaves(params)):
         try:
-            return looked_at(system, s), s
+            return traced_system(system, s), s
         except (TypeError, ValueError):
             # A count or an index must stay an integer.
             s = coordinates.state(t, q, v, params)
-    return looked_at(system, s), s
+    return traced_system(system, s), s
 
 
 def symmetries_of(system, s: State, cyclic, hold, moving: np.ndarray | None) -> Symmetries:

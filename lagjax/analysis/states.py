@@ -95,7 +95,7 @@ def sizes(system, s: coordinates.State, x, u) -> Scales:
     of_x = together(x)
     of_x = xp.where(of_x > 0, of_x, xp.ones_like(x))
     # Angles are at least 1: with small angles only, a pendulum would look like a harmonic oscillator.
-    known = remembered(system, (angles, system.read, kinds(s)), lambda: angles(system, *s))
+    known = remembered(system, (angles, kinds(s)), lambda: angles(system, *s))
     leaves = zip(jax.tree.leaves(known), jax.tree.leaves(s.q))
     is_angle = np.concatenate([np.full(int(np.prod(np.shape(leaf))), angle) for angle, leaf in leaves])
     of_x = xp.where(is_angle, xp.maximum(of_x, 1.0).astype(of_x.dtype), of_x)

@@ -27,7 +27,7 @@ from lagjax.analysis.states import draws
 from lagjax.analysis.symmetry import AT_LEAST, STATES, too_few
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.diagnosis import describe
-from lagjax.mechanics.first_call import looked_at
+from lagjax.mechanics.first_call import traced_system
 from lagjax.mechanics.generators import Generator, as_generator
 from lagjax.mechanics.memory import filled_up, kinds, remembered
 from lagjax.mechanics.noether import NoetherCharge
@@ -71,7 +71,7 @@ def symmetries(system, q, v, params=None, *, basis: Iterable | Mapping | None = 
             "symmetries are found from values, but JAX is tracing here.\n"
             "Fix: call it outside of jax.jit, jax.vmap and sweeps; lj.is_symmetry(...).holds tests one symmetry inside."
         )
-    system = looked_at(system, s)
+    system = traced_system(system, s)
     own = _given(basis, s)
     tried = motions(s.q)
     gauge = gauges(s.q)
@@ -143,7 +143,7 @@ def _found(system, s, tried: Basis, own, gauge: Gauge, sampled: Rates) -> Symmet
     columns = _columns(tried, own, gauge, sampled)
     spaces = _spaces(columns, gauge, precision)
     parameters = named_parameters(s.params)
-    shown = remembered(system, (conserved_momenta, system.read, kinds(s)), lambda: conserved_momenta(system, *s))
+    shown = remembered(system, (conserved_momenta, kinds(s)), lambda: conserved_momenta(system, *s))
     cyclic = {f"p_{name}" for name in shown}
     # Motions in time come last, as energies do in a list of constants.
     clocks = [kind == "time" for kind in columns.kinds]

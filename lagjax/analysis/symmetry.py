@@ -17,7 +17,7 @@ from lagjax.analysis.states import draws
 from lagjax.mechanics import constraints, coordinates
 from lagjax.mechanics.constraints import Holonomic
 from lagjax.mechanics.diagnosis import describe
-from lagjax.mechanics.first_call import looked_at
+from lagjax.mechanics.first_call import traced_system
 from lagjax.mechanics.generators import as_generator
 from lagjax.mechanics.multipliers import accelerations
 from lagjax.mechanics.refusals import check_system
@@ -126,7 +126,7 @@ def is_symmetry(system, generator, q, v, params=None, *, t=0.0) -> SymmetryTest:
     check_system(system, generator, q, v, params)
     generator = as_generator(generator)
     s = coordinates.state(t, q, v, params)
-    system = looked_at(system, s)
+    system = traced_system(system, s)
     generator.check(s)
     n = len(coordinates.names(s.q))
     empty = np.zeros((0, n))

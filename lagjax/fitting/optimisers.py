@@ -6,7 +6,7 @@ some entries of an array are fitted, these are passed as a vector.
 """
 
 import inspect
-from collections.abc import Hashable
+from functools import partial
 from typing import Any
 
 import jax
@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 
 from lagjax.fitting.parameters import Found
-from lagjax.mechanics.outside import meaning_of
+from lagjax.jax_internals.meaning import Meaning, content_of, meaning_of
 
 
 def is_of_optax(optimiser: Any) -> bool:
@@ -25,13 +25,17 @@ def is_of_optax(optimiser: Any) -> bool:
 class Optimiser:
     """A gradient transformation, equal to all that do the same: `optax.adam(1e-2)` is a new object in each call."""
 
-    def __init__(self, given: Any):
+    def __init__(self, given: Any, found: Found):
         self.given = given
-        meanings = meaning_of(given.init), meaning_of(given.update)
-        self.meaning: Hashable = id(given) if None in meanings else meanings
         # Some take the value, too, such as `optax.contrib.reduce_on_plateau`.
         kinds = [p.kind for p in inspect.signature(given.update).parameters.values()]
         self.takes_value = inspect.Parameter.VAR_KEYWORD in kinds
+        programs = jax.make_jaxpr(partial(self._first_step, found))(found.free(found.start))
+        self.meaning = Meaning((meaning_of(programs.jaxpr), tuple(map(content_of, programs.consts))))
+
+    def _first_step(self, found, y):
+        value = jnp.sum(y)
+        return self.step(found, y, y, self.init(found, y), value, lambda y: value)
 
     def __hash__(self):
         return hash(self.meaning)

@@ -14,11 +14,15 @@ from lagjax.fitting.records import KINDS, Record, channels, cut, spread
 from lagjax.fitting.result import FitWarning
 from lagjax.fitting.starts import starts
 from lagjax.mechanics import coordinates
+from lagjax.mechanics.arguments import OF_STATE
+from lagjax.mechanics.constraints import zero_multipliers
 from lagjax.mechanics.diagnosis import listed
+from lagjax.mechanics.first_call import traced_call, traced_system
 from lagjax.mechanics.hybrid import Hybrid, first_phase
-from lagjax.mechanics.outside import up_to_date
+from lagjax.mechanics.in_words import Call
 from lagjax.mechanics.refusals import check_system
-from lagjax.motion.switching import each_phase, starting
+from lagjax.motion.crossings import Crossing, traced_guard
+from lagjax.motion.switching import starting, traced_phases
 
 # Arguments of `integrate` that a fit sets itself.
 SET_BY_FIT = {"ts", "throw", "adjoint"}
@@ -44,7 +48,9 @@ def problem_of(system, records, params, free, observe, bounds, priors, loss, win
     windows = cut(records, window, dtype)
     overrides = _overrides(records, windows, found)
     params_of = lambda r: replace(found.params, {name: values[r] for name, values in overrides.items()})
-    guessed, unflatten = starts(first, records, windows, params_of, options)
+    guessed, unflatten, guess = starts(first, records, windows, params_of, options)
+    system = traced_phases(system, guess)
+    first, observe, options = first_phase(system), _traced(observe, guess), _with_traced_events(options, first, guess)
     measured = {kind: _gathered(windows, [record.measured[kind] for record in records], kind)
                 for kind in records[0].measured}  # fmt: skip
     _check_anything_measured(measured)
@@ -59,9 +65,24 @@ def problem_of(system, records, params, free, observe, bounds, priors, loss, win
     )  # fmt: skip
 
 
+def _traced(observe, guess):
+    if observe is None:
+        return None
+    return traced_call(Call("observe", observe, OF_STATE), guess._asdict(), lambda call, value: None)
+
+
+def _with_traced_events(options, system, guess):
+    events = options.get("events")
+    if not isinstance(events, Mapping) or not all(isinstance(event, Crossing) for event in events.values()):
+        return options
+    given = guess._asdict() | {"multipliers": zero_multipliers(traced_system(system, guess), guess)}
+    traced = {name: event.with_guard(traced_guard(name, event.guard, given)) for name, event in events.items()}
+    return options | {"events": traced}
+
+
 def _system_at_start(system, window, options):
-    """The up-to-date system; a motion in phases starts in that of `start=`, which is removed from the options."""
-    system = starting(each_phase(system, up_to_date), options.pop("start", None))
+    """The system; a motion in phases starts in that of `start=`, which is removed from the options."""
+    system = starting(system, options.pop("start", None))
     if isinstance(system, Hybrid) and window is not None:
         raise ValueError(
             "window= cuts records into windows, but for a lj.Hybrid the phase in which each window would start is not "

@@ -28,8 +28,8 @@ from lagjax.mechanics.compiled import compiled
 from lagjax.mechanics.coordinates import State
 from lagjax.mechanics.diagnosis import listed
 from lagjax.mechanics.equations import equations_of
-from lagjax.mechanics.first_call import check_functions
-from lagjax.mechanics.memory import kinds, remembered
+from lagjax.mechanics.first_call import traced_system
+from lagjax.mechanics.memory import kinds
 from lagjax.motion.consistency import departures, stopped, within
 from lagjax.motion.consistent_state import free_coordinates
 from lagjax.motion.integrate import integrate
@@ -113,8 +113,8 @@ class Starts(NamedTuple):
 
 def starts(
     system, records: Sequence[Record], windows: Windows, params_of: Callable, options
-) -> tuple[Starts, Callable]:
-    """The guessed starts of all windows, and the function that turns a vector of coordinates into a pytree."""
+) -> tuple[Starts, Callable, State]:
+    """The guessed starts of all windows, the function that turns a vector of coordinates into a pytree, and one start."""
     guesses = []
     for r, record in enumerate(records):
         here = np.flatnonzero(windows.record == r)
@@ -127,13 +127,13 @@ def starts(
             later = _states_along_motion(system, first, windows.ts[here, 0], options)
         for w, (q, v) in zip(here[1:], later):
             guesses.append(_state(windows.ts[w, 0], q, v, first.params))
-    charts = []
+    system, charts = traced_system(system, guesses[0]), []
     for w, (r, guess) in enumerate(zip(windows.record, guesses)):
         held = (records[r].hold_q, records[r].hold_v) if w in windows.first else (False, False)
         charts.append(_charts(system, guess, *(_free(guess.q, hold) for hold in held), r))
     q, v = zip(*charts)
     k = max(chart.along.shape[1] for chart in q), max(chart.along.shape[1] for chart in v)
-    return Starts(_stacked(q, 0, sum(k)), _stacked(v, k[0], sum(k))), unflatten_of(kinds(guesses[0].q))
+    return Starts(_stacked(q, 0, sum(k)), _stacked(v, k[0], sum(k))), unflatten_of(kinds(guesses[0].q)), guesses[0]
 
 
 def _stacked(charts: Sequence[Chart], before: int, k: int) -> Chart:
@@ -192,7 +192,7 @@ def _guess(system, record, r, params) -> State:
     guess = _state(record.t[0], q, v, params)
     if record.q0 is None and isinstance(q, dict):
         try:
-            remembered(system, (check_functions, kinds(guess)), lambda: check_functions(system, *guess))
+            traced_system(system, guess)
         except ValueError as error:
             raise ValueError(
                 f"{error}\nThe start of record {r} was read off what it measures, {listed(list(q))}; give "

@@ -184,7 +184,7 @@ def train(
     rounds = int(np.ceil(steps / max(ROUND, np.ceil(PASSES * windows / batch))))
     each = int(np.ceil(steps / rounds))
     numbers = (np.asarray(x) for x in (seed, steps, patience))
-    task = Task(problem, held, Optimiser(optimiser), batch, each, *numbers)
+    task = Task(problem, held, Optimiser(optimiser, problem.found), batch, each, *numbers)
     if coordinates.is_traced((problem, held)):
         first, state, (losses, scores) = all_rounds(task, rounds)
         scores = jnp.concatenate([first.best.score[None], scores])

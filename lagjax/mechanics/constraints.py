@@ -93,7 +93,7 @@ def shapes(system, t, q, v, params) -> dict[str, tuple[int, ...]]:
         name: jnp.shape(shape_of(evaluate, constraint, t, q, v, params))
         for name, constraint in system.constraints.items()
     }
-    return remembered(system, (shapes, system.read, kinds((t, q, v, params))), find)
+    return remembered(system, (shapes, kinds((t, q, v, params))), find)
 
 
 def count(system, t, q, v, params) -> int:

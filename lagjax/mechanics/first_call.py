@@ -1,7 +1,11 @@
 """The first call of the user's functions: on shapes alone, before anything is computed or compiled.
 
-`in_words.py` explains the errors that occur inside them.
+Each is checked, and becomes its jaxpr (`traced.py`). `in_words.py` explains the errors that occur inside them.
 """
+
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -10,25 +14,60 @@ import jax.tree_util as jtu
 import numpy as np
 
 from lagjax.jax_internals.programs import depends
-from lagjax.jax_internals.tracing import is_eager
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.arguments import OF_POSITION, OF_STATE, takes_of
-from lagjax.mechanics.constraints import Holonomic, count, zero_multipliers
+from lagjax.mechanics.constraints import Holonomic, Nonholonomic, count, zero_multipliers
 from lagjax.mechanics.coordinates import State
 from lagjax.mechanics.in_words import Call, check_arguments, in_words
-from lagjax.mechanics.memory import kinds, remembered, shape_of
-from lagjax.mechanics.outside import first_alike, up_to_date
+from lagjax.mechanics.memory import kinds, remembered
 from lagjax.mechanics.reactions import force_at, reacts
 from lagjax.mechanics.refusals import check_system
 from lagjax.mechanics.system import System
+from lagjax.mechanics.traced import Program, Traced, traced
+
+CAUSE = "an argument left out as the function does not need it, or one too many: a constraint of positions takes no v"
 
 
-def looked_at(system: System, s: State) -> System:
-    """Check a system's functions; return it with what they read from outside now, or an earlier system like it."""
+def traced_system(system: System, s: State) -> System:
+    """The system with each of its functions checked and traced for such states: what it computes, and no more.
+
+    Raises if L, R, Q or a constraint cannot be called, or returns something of the wrong kind or shape.
+    """
     check_system(system)
-    now = up_to_date(system)
-    remembered(system, (check_functions, now.read, kinds(s)), lambda: check_functions(now, *s))
-    return first_alike(system, now) if is_eager() else now
+    given = dict(zip(OF_STATE, s))
+    energy = lambda role, f: None if f is None else traced_call(Call(role, f, OF_STATE), given, _check_energy)
+    lagrangian, dissipation = energy("L", system.lagrangian), energy("dissipation", system.dissipation)
+    constraints = {}
+    for name, constraint in system.constraints.items():
+        kind, takes = (Holonomic, OF_POSITION) if isinstance(constraint, Holonomic) else (Nonholonomic, OF_STATE)
+        role, function = ("g", constraint.g) if kind is Holonomic else ("phi", constraint.phi)
+        call = Call(role, function, takes, f" of constraint '{name}'")
+        constraints[name] = kind(traced_call(call, given, _check_constraint))
+    found = System(lagrangian, constraints, None, dissipation)
+    if system.force is None:
+        return found
+    # After the constraints, which determine the multipliers.
+    given["multipliers"] = zero_multipliers(found, s)
+    call = Call("force", system.force, takes_of(system.force))
+    force = traced_call(call, given, partial(_check_force, q=s.q))
+    found = System(lagrangian, constraints, force, dissipation)
+    if reacts(found):
+        remembered(found, (_check_linear, kinds(s)), lambda: _check_linear(found, *s))
+    return found
+
+
+def traced_call(call: Call, given: Mapping[str, Any], check: Callable, usual_cause: str = CAUSE) -> Traced:
+    """A function traced on the `given` arguments; raises in the user's words, also if `check` refuses what it returns."""
+    args = tuple(given[name] for name in call.takes)
+
+    def make():
+        check_arguments(call, usual_cause)
+        with in_words(call, given):
+            program = Program(call.function, call.takes, args)
+        check(call, program.value)
+        return program
+
+    return traced(call.function, args, make)
 
 
 def with_known_kinds(system: System, s: State) -> State:
@@ -37,8 +76,7 @@ def with_known_kinds(system: System, s: State) -> State:
     `g=10` after `g=9.81` must not compile another program. A function that needs a whole number (an index, a count) has
     already refused the float.
     """
-    known_kinds: dict = remembered(system, with_known_kinds, dict)
-    kind = kinds(s.params)
+    known_kinds, kind = _known_kinds(system), kinds(s.params)
     if kind not in known_kinds and (places := _whole_numbers(s.params)):
         leaves, structure = jtu.tree_flatten(s.params)
         for known in known_kinds:
@@ -48,8 +86,16 @@ def with_known_kinds(system: System, s: State) -> State:
             changed = [np.asarray(x, s.t.dtype) if i in differing else x for i, x in enumerate(leaves)]
             if kinds(changed)[1:] == known[1:]:
                 return s._replace(params=jtu.tree_unflatten(structure, changed))
-    known_kinds[kind] = True
     return s
+
+
+def know_kinds(system: System, s: State):
+    """Note what the system's functions have taken."""
+    _known_kinds(system)[kinds(s.params)] = True
+
+
+def _known_kinds(system) -> dict:
+    return remembered(system, _known_kinds, dict)
 
 
 def _whole_numbers(params):
@@ -58,27 +104,7 @@ def _whole_numbers(params):
     return {i for i, x in enumerate(jtu.tree_leaves(params)) if is_whole(x)}
 
 
-def check_functions(system, t, q, v, params):
-    """Raise where L, R, Q or a constraint cannot be called, or returns something of the wrong kind or shape."""
-    given = {"t": t, "q": q, "v": v, "params": params}
-    for role, function in (("L", system.lagrangian), ("dissipation", system.dissipation)):
-        if function is not None:
-            _check_energy(Call(role, function, OF_STATE), given)
-    for name, constraint in system.constraints.items():
-        if isinstance(constraint, Holonomic):
-            _check_constraint(Call("g", constraint.g, OF_POSITION, f" of constraint '{name}'"), given)
-        else:
-            _check_constraint(Call("phi", constraint.phi, OF_STATE, f" of constraint '{name}'"), given)
-    if system.force is not None:
-        # After the constraints, which determine the multipliers.
-        given |= {"multipliers": zero_multipliers(system, State(t, q, v, params))}
-        _check_force(Call("force", system.force, takes_of(system.force)), given)
-        if reacts(system):
-            _check_linear(system, t, q, v, params)
-
-
-def _check_energy(call, given):
-    value = _shapes(call, given)
+def _check_energy(call, value):
     shape, dtype = getattr(value, "shape", None), getattr(value, "dtype", None)
     if isinstance(value, float) or shape == () and jnp.issubdtype(dtype, jnp.floating):
         return
@@ -101,8 +127,8 @@ def _is_complex(dtype):
     return jnp.issubdtype(dtype, jnp.complexfloating)
 
 
-def _check_force(call, given):
-    force, expected = _shapes(call, given), jax.tree.map(jnp.shape, given["q"])
+def _check_force(call, force, q):
+    expected = jax.tree.map(jnp.shape, q)
     if force is None:
         raise ValueError(
             f"{call} must return one force per coordinate, like q, and returned None.\n"
@@ -138,8 +164,7 @@ def _check_linear(system, t, q, v, params):
         )
 
 
-def _check_constraint(call, given):
-    value = _shapes(call, given)
+def _check_constraint(call, value):
     shape, dtype = getattr(value, "shape", None), getattr(value, "dtype", None)
     if shape is None or len(shape) > 1:
         got = f"an array of shape {shape}" if shape is not None else f"a {type(value).__name__}"
@@ -160,11 +185,3 @@ def _check_constraint(call, given):
             "Usual cause: an equation in place of its residual, x**2 + y**2 == l**2.\n"
             "Fix: return x**2 + y**2 - l**2."
         )
-
-
-def _shapes(call, given):
-    """The shapes and dtypes that the function returns, or an error in the user's words."""
-    check_arguments(call, "an argument left out as the function does not need it, or one too many: a constraint of "
-                    "positions takes no v")  # fmt: skip
-    with in_words(call, given):
-        return shape_of(call.function, *(given[name] for name in call.takes))

@@ -8,7 +8,7 @@ Source: Brogliato, *Nonsmooth Mechanics*, §1.3; Acary & Brogliato, *Numerical M
 §2.8 (event-driven schemes).
 """
 
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import equinox as eqx
 import jax
@@ -99,6 +99,15 @@ class Switch(eqx.Module):
         check_functions({f"{role} of the switch {self.in_words()}": f for role, f in functions.items()})
         return super().__reduce_ex__(protocol)
 
+    def with_functions(self, when: Callable, reset: Callable | None) -> "Switch":
+        """The same switch with other functions, unchecked."""
+        same = object.__new__(Switch)
+        for name in ("phase", "to", "rest", "slower_than"):
+            object.__setattr__(same, name, getattr(self, name))
+        object.__setattr__(same, "when", when)
+        object.__setattr__(same, "reset", reset)
+        return same
+
     def value(self, t, q, v, multipliers, params):
         """The value of the guard at one state."""
         given = {"t": t, "q": q, "v": v, "multipliers": multipliers, "params": params}
@@ -142,8 +151,6 @@ class Hybrid(eqx.Module):
     first: Int[Array, ""] | np.ndarray
     names: tuple[str, ...] = eqx.field(static=True)
     most_switches: int = eqx.field(static=True)
-    # What the switches' functions read from outside; a compiled program contains these values.
-    read: Hashable = eqx.field(static=True)
 
     def __init__(
         self,
@@ -183,7 +190,7 @@ class Hybrid(eqx.Module):
                     )
         self.systems, self.names = tuple(phases.values()), tuple(phases)
         self.switches, self.most_switches = tuple(listed), most_switches
-        self.first, self.read = np.zeros((), np.int32), ()
+        self.first = np.zeros((), np.int32)
 
     def starting(self, start: str | None) -> "Hybrid":
         """The same hybrid with motions that start in the named phase; None keeps the present one."""
@@ -231,7 +238,7 @@ def _count(n, word, plural):
 def replace_fields(hybrid: Hybrid, **fields) -> Hybrid:
     """Replace some fields of a hybrid without checking them again."""
     same = object.__new__(Hybrid)
-    for name in ("systems", "switches", "first", "names", "most_switches", "read"):
+    for name in ("systems", "switches", "first", "names", "most_switches"):
         object.__setattr__(same, name, fields.get(name, getattr(hybrid, name)))
     return same
 

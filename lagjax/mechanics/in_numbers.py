@@ -57,7 +57,7 @@ def in_numbers(system: System, unflatten: Callable) -> System:
         },
         force=None if system.force is None else wrap(system.force, returns_coordinates=True),
         dissipation=None if system.dissipation is None else wrap(system.dissipation),
-    ).reading(system.read)
+    )
 
 
 class Numbers:

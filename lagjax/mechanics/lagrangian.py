@@ -19,7 +19,7 @@ from jaxtyping import Array, Float, PyTree
 
 from lagjax.mechanics import constraints, coordinates
 from lagjax.mechanics.compiled import compiled
-from lagjax.mechanics.first_call import looked_at
+from lagjax.mechanics.first_call import traced_system
 from lagjax.mechanics.reactions import force_at, response
 from lagjax.mechanics.refusals import check_system
 
@@ -134,7 +134,7 @@ def jacobi_integral(system, t, q, v, params) -> Float[Array, ""]:
 def _checked(system, t, q, v, params):
     check_system(system, t, q, v, params)
     s = coordinates.state(t, q, v, params)
-    return looked_at(system, s), s
+    return traced_system(system, s), s
 
 
 @compiled

@@ -1,7 +1,8 @@
-"""Results about an object, remembered for as long as the object lives."""
+"""Facts about systems, remembered; and pytrees in a form to compare."""
 
 import math
-import weakref
+import threading
+from collections import OrderedDict
 from collections.abc import Callable, Hashable
 from typing import Any, NamedTuple, TypeVar
 
@@ -13,27 +14,41 @@ from jax.core import Tracer
 from jaxtyping import PyTree
 
 T = TypeVar("T")
-# The most results of one object. Only a user's loop over new shapes has more, and does not need the first ones again.
-AT_MOST = 256
-_results: dict[int, tuple[weakref.ref, dict]] = {}
+
+
+class Recent:
+    """Results by key, as many as were used last."""
+
+    def __init__(self, most: int):
+        self.most, self._found, self._one_thread = most, OrderedDict(), threading.Lock()
+
+    def made(self, key: Hashable, make: Callable[[], T]) -> T:
+        """The result of this key, made if there is none yet; made each time if the key cannot be compared."""
+        try:
+            with self._one_thread:
+                if key in self._found:
+                    self._found.move_to_end(key)
+                    return self._found[key]
+        except TypeError:
+            return make()
+        found = make()
+        with self._one_thread:
+            self._found[key] = found
+            while len(self._found) > self.most:
+                self._found.popitem(last=False)
+        return found
+
+    def clear(self):
+        """Forget all results."""
+        self._found.clear()
+
+
+_facts = Recent(1024)
 
 
 def remembered(thing: Any, key: Hashable, find: Callable[[], T]) -> T:
-    """`find()`, or its earlier result for this very object and this key."""
-    try:
-        hash(key)
-    except TypeError:
-        return find()
-    reference, found = _results.get(id(thing), (None, {}))
-    if reference is None or reference() is not thing:
-        number, found = id(thing), {}
-        _results[number] = weakref.ref(thing, lambda _: _results.pop(number, None)), found
-    if key not in found:
-        value = find()
-        if len(found) >= AT_MOST:
-            found.clear()
-        found[key] = value
-    return found[key]
+    """`find()`, or its earlier result for this key and anything that means the same as `thing`."""
+    return _facts.made((kinds(thing), key), find)
 
 
 def kinds(tree: PyTree):

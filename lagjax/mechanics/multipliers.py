@@ -11,12 +11,10 @@ from jaxtyping import Array, PyTree
 
 from lagjax.jax_internals.tracing import is_eager
 from lagjax.mechanics import constraints, coordinates
-from lagjax.mechanics.closures import lift
 from lagjax.mechanics.compiled import compiled
 from lagjax.mechanics.diagnosis import explain_failure, explain_singular, where
 from lagjax.mechanics.equations import equations_of
-from lagjax.mechanics.first_call import looked_at
-from lagjax.mechanics.outside import up_to_date
+from lagjax.mechanics.first_call import traced_system
 from lagjax.mechanics.refusals import check_system
 from lagjax.mechanics.saddle_point import examined
 from lagjax.mechanics.sparse_saddle_point import Banded
@@ -51,10 +49,10 @@ def accelerations(system, t, q, v, params) -> tuple[PyTree[Array], dict[str, Arr
     """
     check_system(system, t, q, v, params)
     s = coordinates.prepared(t, q, v, params)
-    system = looked_at(system, s)
+    system = traced_system(system, s)
     # A value that a function closes over may be traced where no argument is.
     if not is_eager() or coordinates.is_traced((s, eqx.filter(system, eqx.is_array))):
-        equations = equations_of(lift(system, s), *s, fast=True)
+        equations = equations_of(system, *s, fast=True)
         a, multipliers = equations.solution_or_nan(s.t, equations.inside(s.q), equations.inside(s.v))
         return equations.outside(a), multipliers
     equations = equations_of(system, *s)
@@ -92,8 +90,8 @@ def constraint_force(system, t, q, v, params) -> dict[str, PyTree[Array]]:
     """
     check_system(system, t, q, v, params)
     s = coordinates.state(t, q, v, params)
+    system = traced_system(system, s)
     _, multipliers = accelerations(system, *s)
-    system = up_to_date(system)
     return _constraint_force(system, *s, multipliers)
 
 
@@ -119,7 +117,7 @@ def constraint_residual(system, t, q, v, params, level: str = "constraint") -> d
         )
     check_system(system, t, q, v, params)
     s = coordinates.state(t, q, v, params)
-    system = looked_at(system, s)
+    system = traced_system(system, s)
     return _constraint_residual(system, *s, level)
 
 

@@ -26,7 +26,7 @@ from jaxtyping import Array, Float, PyTree
 
 from lagjax.mechanics import constraints, coordinates
 from lagjax.mechanics.compiled import compiled
-from lagjax.mechanics.first_call import looked_at
+from lagjax.mechanics.first_call import traced_system
 from lagjax.mechanics.generators import Generator, as_generator
 from lagjax.mechanics.multipliers import accelerations
 from lagjax.mechanics.reactions import force_at
@@ -62,7 +62,7 @@ class NoetherCharge(eqx.Module):
     def _checked(self, *state):
         s = coordinates.state(*state)
         self.generator.check(s)
-        return looked_at(self.system, s), s
+        return traced_system(self.system, s), s
 
     def __repr__(self):
         return f"NoetherCharge({self.generator.name} of {self.system})"

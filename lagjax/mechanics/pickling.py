@@ -10,6 +10,8 @@ import sys
 from collections.abc import Callable, Mapping
 from types import FrameType, FunctionType
 
+from lagjax.mechanics.traced import Traced
+
 # Packages that pickle any function, whatever its name: they write down what it does.
 TAKES_ANY_FUNCTION = ("cloudpickle", "dill")
 
@@ -17,6 +19,7 @@ TAKES_ANY_FUNCTION = ("cloudpickle", "dill")
 def check_functions(functions: Mapping[str, Callable | None]) -> None:
     """Raise `pickle.PicklingError` if one of these functions, given by role, cannot be found by its name."""
     for role, function in functions.items():
+        function = function.function if isinstance(function, Traced) else function
         if isinstance(function, FunctionType) and not _is_found(function) and not _any_function_is_taken():
             code, name = function.__code__, function.__name__
             raise pickle.PicklingError(

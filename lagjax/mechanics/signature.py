@@ -19,7 +19,6 @@ from lagjax.mechanics.compiled import compiled
 from lagjax.mechanics.constraints import Holonomic, zero_multipliers
 from lagjax.mechanics.coordinates import State
 from lagjax.mechanics.hybrid import Hybrid
-from lagjax.mechanics.outside import up_to_date
 from lagjax.mechanics.system import System
 
 # Values that differ by more than this, relative to the largest of their row, come from another function. Round-off is
@@ -57,10 +56,10 @@ class UnknownSystem(eqx.Module):
 def signature(system: System | Hybrid, state: State) -> dict[str, np.ndarray]:
     """What each function of a system returns at a state, by role."""
     if isinstance(system, System):
-        return _signature(up_to_date(system), *state)
+        return _signature(system, *state)
     found = {}
     for name, phase in zip(system.names, system.systems):
-        found |= {f"{role} of phase '{name}'": x for role, x in _signature(up_to_date(phase), *state).items()}
+        found |= {f"{role} of phase '{name}'": x for role, x in _signature(phase, *state).items()}
     names = [f"{i}: {switch.phase} -> {switch.to}, {switch.rest}" for i, switch in enumerate(system.switches)]
     return found | {f"switch {name}": np.zeros(0) for name in names}
 

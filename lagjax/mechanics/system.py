@@ -1,6 +1,6 @@
 """A mechanical system: a Lagrangian, its constraints, and the forces that do not come from a potential."""
 
-from collections.abc import Callable, Hashable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import fields
 
 import equinox as eqx
@@ -43,8 +43,6 @@ class System(eqx.Module):
     constraints: dict[str, Holonomic | Nonholonomic]
     force: Callable | None
     dissipation: Callable | None
-    # What these functions read from outside, as found by `outside.py`.
-    read: Hashable = eqx.field(static=True)
 
     def __init__(
         self,
@@ -91,14 +89,6 @@ class System(eqx.Module):
         self.constraints = dict(sorted((constraints or {}).items()))
         self.force = force
         self.dissipation = dissipation
-        self.read = ()
-
-    def reading(self, values: Hashable) -> "System":
-        """The same system, equal only to one whose functions read the same values from outside."""
-        same = object.__new__(System)
-        for field in fields(self):
-            object.__setattr__(same, field.name, values if field.name == "read" else getattr(self, field.name))
-        return same
 
     def functions(self) -> dict[str, Callable | None]:
         """The user's functions by role."""

@@ -26,7 +26,7 @@ from lagjax.mechanics import constraints, coordinates
 from lagjax.mechanics.compiled import compiled
 from lagjax.mechanics.diagnosis import describe, listed
 from lagjax.mechanics.equations import equations_of
-from lagjax.mechanics.first_call import looked_at
+from lagjax.mechanics.first_call import traced_system
 from lagjax.mechanics.lagrangian import mass_and_forcing
 from lagjax.mechanics.refusals import check_system
 from lagjax.mechanics.saddle_point import displacement_map
@@ -74,7 +74,7 @@ def consistent_state(system, t, q, v, params, hold: str | Iterable[str] = ()):
     """
     check_system(system, t, q, v, params)
     s = coordinates.state(t, q, v, params)
-    system = looked_at(system, s)
+    system = traced_system(system, s)
     free = free_coordinates(s.q, hold)
     if not system.constraints:
         return s.q, s.v

@@ -5,8 +5,7 @@ space, a contact that lets go (its multiplier). `watching.py` follows its sign a
 """
 
 import inspect
-from collections.abc import Callable, Hashable, Mapping
-from functools import partial
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import diffrax
@@ -19,16 +18,14 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from lagjax.jax_internals.programs import length
-from lagjax.jax_internals.tracing import is_eager
 from lagjax.mechanics.arguments import OF_STATE, WITH_MULTIPLIERS, takes_of
-from lagjax.mechanics.closures import lift_function
 from lagjax.mechanics.constraints import zero_multipliers
 from lagjax.mechanics.coordinates import State
-from lagjax.mechanics.in_words import Call, check_arguments, in_words
-from lagjax.mechanics.memory import is_array, kinds, remembered, shape_of
-from lagjax.mechanics.outside import first_guard_alike, read_by
+from lagjax.mechanics.first_call import traced_call
+from lagjax.mechanics.in_words import Call
 from lagjax.mechanics.pickling import check_functions
 from lagjax.mechanics.system import System
+from lagjax.mechanics.traced import Traced
 from lagjax.mechanics.warned import warn
 
 # A guard of more operations is compiled once for all places where it is evaluated.
@@ -86,6 +83,13 @@ class Crossing(eqx.Module):
         self.terminal = bool(terminal)
         self.most = 1 if terminal else most
 
+    def with_guard(self, guard: Callable) -> "Crossing":
+        """Return the same crossing with another guard, unchecked."""
+        same = object.__new__(Crossing)
+        for name, x in (vars(self) | {"guard": guard}).items():
+            object.__setattr__(same, name, x)
+        return same
+
     def __reduce_ex__(self, protocol):
         check_functions({"the guard of a crossing": self.guard})
         return super().__reduce_ex__(protocol)
@@ -141,8 +145,7 @@ class Crossings(eqx.Module):
 class Kind(NamedTuple):
     """The static properties of a guard: see `Crossing`. `long`: it takes long to compile.
 
-    `read`: the values that it reads from outside. `holds`: it is assumed to be above zero at the start; if it is not,
-    it counts as crossed there.
+    `holds`: it is assumed to be above zero at the start; if it is not, it counts as crossed there.
     """
 
     name: str
@@ -151,7 +154,6 @@ class Kind(NamedTuple):
     most: int
     takes_multipliers: bool
     long: bool
-    read: Hashable
     holds: bool
 
 
@@ -271,36 +273,25 @@ def guards_of(crossings: Mapping[str, Crossing], system: System, start: State, h
     if not crossings:
         return None
     functions, of_guards = [], []
+    given = dict(zip(OF_STATE, start)) | {"multipliers": zero_multipliers(system, start)}
     for name, crossing in crossings.items():
-        guard, read = first_guard_alike(crossing.guard) if is_eager() else (crossing.guard, read_by(crossing.guard))
-        examine = partial(_examined, name, guard, system, start)
-        takes, multipliers, long = remembered(system, (guards_of, guard, read, kinds(start)), examine)
-        given = dict(zip(OF_STATE, start)) | {"multipliers": multipliers}
-        functions.append(lift_function(guard, tuple(given[name] for name in takes)))
+        guard = traced_guard(name, crossing.guard, given)
+        takes_multipliers = guard.takes == WITH_MULTIPLIERS
+        # Multipliers require the equations, which take long to compile.
+        long = takes_multipliers or length(guard.program.jaxpr) > LONG
+        functions.append(guard)
         of_crossing = crossing.direction, crossing.terminal, crossing.most
-        of_guards.append(Kind(name, *of_crossing, takes == WITH_MULTIPLIERS, long, read, holds))
+        of_guards.append(Kind(name, *of_crossing, takes_multipliers, long, holds))
     return Guards(tuple(functions), tuple(of_guards))
 
 
-def _examined(name, guard, system, start):
-    """Return a guard's arguments, zero multipliers, and whether it takes long to compile; raise if it is no guard."""
-    takes, multipliers = takes_of(guard), zero_multipliers(system, start)
-    given = dict(zip(OF_STATE, start)) | {"multipliers": multipliers}
-    call = Call("guard", guard, takes, f" of event '{name}'")
-    _check(call, given)
-    # Multipliers require the equations, which take long to compile.
-    return takes, multipliers, takes == WITH_MULTIPLIERS or _length(call, given) > LONG
+def traced_guard(name: str, guard: Callable, given: Mapping[str, Any]) -> Traced:
+    """A guard checked and traced at a given state; raises if it is no guard."""
+    call = Call("guard", guard, takes_of(guard), f" of event '{name}'")
+    return traced_call(call, given, _check, "the arguments of a condition of diffrax, (t, y, args)")
 
 
-def _length(call, given):
-    arrays, static = eqx.partition([given[name] for name in call.takes], is_array)
-    return length(jax.make_jaxpr(lambda arrays: call.function(*eqx.combine(arrays, static)))(arrays).jaxpr)
-
-
-def _check(call, given):
-    check_arguments(call, "the arguments of a condition of diffrax, (t, y, args)")
-    with in_words(call, given):
-        value = shape_of(call.function, *(given[name] for name in call.takes))
+def _check(call, value):
     shape, dtype = getattr(value, "shape", ()), getattr(value, "dtype", np.dtype(type(value)))
     if shape != () or not (jnp.issubdtype(dtype, jnp.floating) or jnp.issubdtype(dtype, jnp.bool_)):
         raise ValueError(

@@ -11,7 +11,7 @@ from lagjax.mechanics import constraints, coordinates
 from lagjax.mechanics.constraints import Holonomic
 from lagjax.mechanics.diagnosis import dependencies, describe, equation_names, explain_failure, listed
 from lagjax.mechanics.equations import equations_of
-from lagjax.mechanics.first_call import looked_at
+from lagjax.mechanics.first_call import traced_system
 from lagjax.mechanics.hybrid import Hybrid
 from lagjax.mechanics.refusals import check_system
 from lagjax.mechanics.saddle_point import examined
@@ -101,7 +101,7 @@ def explain(system, t, q, v, params=None):
 
 
 def _explain(system: System, s: coordinates.State) -> Explanation:
-    system = looked_at(system, s)
+    system = traced_system(system, s)
     place = _on_the_constraints(system, s) if system.constraints else _Place(s)
     s = place.state
     found = examined(system, *s)

@@ -42,7 +42,7 @@ from jaxtyping import ArrayLike
 
 from lagjax.jax_internals.programs import depends
 from lagjax.mechanics import constraints, coordinates
-from lagjax.mechanics.arguments import OF_STATE
+from lagjax.mechanics.arguments import OF_POSITION, OF_STATE
 from lagjax.mechanics.constraints import Holonomic, Nonholonomic
 from lagjax.mechanics.memory import shape_of
 from lagjax.mechanics.system import System
@@ -64,6 +64,16 @@ class Impact(OfPhases):
     restitution: Callable | ArrayLike
     friction: Callable | ArrayLike | None = None
     sliding: Callable | None = None
+
+    def mapped(self, on: Callable) -> "Impact":
+        """Return the same with `on(role, function, takes)` in place of each function."""
+        part = lambda role, f, *takes: on(role, f, takes) if callable(f) else f
+        return Impact(
+            part("gap", self.gap, *OF_POSITION),
+            part("restitution", self.restitution, "speed"),
+            part("friction", self.friction, "params"),
+            part("sliding", self.sliding, *OF_STATE),
+        )
 
     def between(self, before: System, after: System) -> Callable:
         """Return the reset: constraints of the phase before keep holding, and only the contact's velocities jump."""

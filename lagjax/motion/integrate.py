@@ -15,8 +15,7 @@ from jaxtyping import Array, ArrayLike, PyTree
 
 from lagjax.jax_internals.tracing import SILENT, WATCHED, is_eager
 from lagjax.mechanics import coordinates
-from lagjax.mechanics.closures import lift
-from lagjax.mechanics.first_call import looked_at, with_known_kinds
+from lagjax.mechanics.first_call import know_kinds, with_known_kinds
 from lagjax.mechanics.hybrid import Hybrid, phases_of
 from lagjax.mechanics.refusals import by_name, check_system
 from lagjax.mechanics.system import System
@@ -33,7 +32,7 @@ from lagjax.motion.reported import patient, report
 from lagjax.motion.results import ENDED_WELL, is_among
 from lagjax.motion.slips import warn_of_odd_dissipation
 from lagjax.motion.solve import Settings
-from lagjax.motion.switching import each_phase, phases_in, refuse_beside_switches, starting
+from lagjax.motion.switching import phases_in, refuse_beside_switches, starting, traced_phases
 from lagjax.motion.trajectory import BY_INTEGRATION, Trajectory
 
 BY_INTEGRATION["at"] = at
@@ -151,9 +150,12 @@ def integrate(
     ts = problem.vector_of_times(ts)
     state = coordinates.prepared(ts[0], q0, v0, params)
     dtype = state.t.dtype
-    system = each_phase(starting(system, start), lambda phase: looked_at(phase, state))
+    system = starting(system, start)
+    given = phases_of(system)[0]
     if is_eager():
-        state = with_known_kinds(phases_of(system)[0], state)
+        state = with_known_kinds(given, state)
+    system = traced_phases(system, state)
+    know_kinds(given, state)
     for phase in phases_of(system):
         warn_of_odd_dissipation(phase.dissipation, state)
     if isinstance(system, Hybrid):
@@ -161,7 +163,6 @@ def integrate(
         guards = phases_in(system, state, crossings_of(events, event))
     else:
         guards = guards_of(crossings_of(events, event), system, state)
-    system = each_phase(system, lambda phase: lift(phase, state))
     drift, left = problem.check_drift(drift, system), left_to_diffrax(event)
     problem.check_adjoint(adjoint, drift, jump_ts, stepsize_controller is None and left is None and not progress)
     settings = Settings(

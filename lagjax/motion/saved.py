@@ -10,7 +10,6 @@ import numpy as np
 from lagjax.mechanics import files
 from lagjax.mechanics.coordinates import State
 from lagjax.mechanics.hybrid import Hybrid
-from lagjax.mechanics.outside import first_alike, up_to_date
 from lagjax.mechanics.signature import UnknownSystem, differences, signature
 from lagjax.mechanics.system import System
 from lagjax.mechanics.written_trees import Reader
@@ -19,7 +18,7 @@ from lagjax.motion.crossings import Crossings
 from lagjax.motion.hybrid_trajectory import HybridTrajectory, Switches
 from lagjax.motion.results import RESULTS, item
 from lagjax.motion.saving import PLAIN
-from lagjax.motion.switching import each_phase
+from lagjax.motion.switching import traced_phases
 from lagjax.motion.trajectory import Asked, How, Snapshot, Trajectory, pack
 
 
@@ -83,7 +82,7 @@ def trajectory_of(found: dict, kept: System | Hybrid | UnknownSystem) -> Traject
 def same_system(system, known: UnknownSystem, path) -> System | Hybrid:
     """Return the integrated system, which the user passes again; raise if it is another one."""
     check_same(system, known, path)
-    return each_phase(system, lambda phase: first_alike(phase, up_to_date(phase)))
+    return system
 
 
 def check_same(system, known: UnknownSystem, path) -> None:
@@ -95,7 +94,8 @@ def check_same(system, known: UnknownSystem, path) -> None:
     if known.state is None:
         return
     try:
-        here = signature(system, State(*known.state))
+        state = State(*known.state)
+        here = signature(traced_phases(system, state), state)
     except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
         raise ValueError(
             f"this system is not the one of {path} ({known.words.splitlines()[0]}): it cannot be evaluated at a state "

@@ -1,6 +1,7 @@
 """The parts of a solve that a hybrid system defines: phases, their guards, and the resets of the state by switches."""
 
-from collections.abc import Callable, Hashable, Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
 import diffrax
@@ -11,20 +12,17 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array
 
-from lagjax.jax_internals.tracing import is_eager
 from lagjax.mechanics import constraints, coordinates
 from lagjax.mechanics.arguments import OF_STATE, takes_of
-from lagjax.mechanics.closures import lift_function
 from lagjax.mechanics.constraints import zero_multipliers
 from lagjax.mechanics.coordinates import State
+from lagjax.mechanics.first_call import traced_call, traced_system
 from lagjax.mechanics.hybrid import Hybrid, Switch, replace_fields
-from lagjax.mechanics.in_words import Call, check_arguments, in_words
-from lagjax.mechanics.memory import shape_of
-from lagjax.mechanics.outside import first_guard_alike, read_by
+from lagjax.mechanics.in_words import Call
 from lagjax.mechanics.system import System
 from lagjax.motion.backward import runs_backward
 from lagjax.motion.consistency import velocity_change
-from lagjax.motion.crossings import Crossing, Guards, guards_of, left_to_diffrax
+from lagjax.motion.crossings import Crossing, Guards, guards_of, left_to_diffrax, traced_guard
 from lagjax.motion.hybrid_trajectory import SWITCHES
 from lagjax.motion.legs import Phase
 
@@ -34,12 +32,11 @@ class Reset(eqx.Module):
 
     `function` gives velocities, or the whole state; without one the state is kept. If `settle` is given and the guard
     `when` opens at no more than `slower_than` after the reset, the motion comes to rest, with the velocities of
-    `settle`. `read`: the values that the function reads from outside, which tell it from another of the same code.
+    `settle`.
     """
 
     function: Callable | None
     takes: tuple[str, ...] = eqx.field(static=True)
-    read: Hashable = eqx.field(static=True, default=())
     settle: Callable | None = None
     when: Callable | None = None
     slower_than: Array | np.ndarray | None = None
@@ -64,11 +61,9 @@ class Reset(eqx.Module):
         return jtu.tree_map(lambda new, old: new + 0 * old, found, (q, v))
 
 
-def each_phase(system: System | Hybrid, function: Callable[[System], System]) -> Any:
-    """Apply `function` to the system, or to the system of each phase."""
-    if isinstance(system, Hybrid):
-        return replace_fields(system, systems=tuple(map(function, system.systems)))
-    return function(system)
+def traced_phases(system: System | Hybrid, start: State) -> Any:
+    """The system, or hybrid, with all its functions checked and traced for such states."""
+    return traced_hybrid(system, start) if isinstance(system, Hybrid) else traced_system(system, start)
 
 
 def check_phases(hybrid: Hybrid, start: State):
@@ -120,42 +115,62 @@ def phases_in(hybrid: Hybrid, start: State, events: Mapping[str, Crossing]) -> t
 
 def _phase(hybrid, i, start, events):
     numbers, system = hybrid.leaving(i), hybrid.systems[i]
-    listed = [hybrid.switches[k] for k in numbers]
-    names = {f"{switch.in_words()}, number {k}": switch for k, switch in zip(numbers, listed)}
+    names = {_name(hybrid, k): hybrid.switches[k] for k in numbers}
     crossings = {name: Crossing(switch.when, direction=-1) for name, switch in names.items()}
     both = [guards_of(crossings, system, start, holds=True), guards_of(events, system, start)]
     given = [guards for guards in both if guards is not None]
     guards = Guards(*(sum((getattr(g, name) for g in given), ()) for name in ("functions", "kinds"))) if given else None
-    read = hybrid.read or ((),) * len(hybrid.switches)
-    resets = tuple(_reset(hybrid.switches[k], read[k], hybrid, system, start) for k in numbers)
+    resets = tuple(_reset(hybrid.switches[k], hybrid, system) for k in numbers)
     return Phase(guards, tuple(numbers), hybrid.targets[numbers], resets, tuple(events))
 
 
-def _reset(switch: Switch, read: Hashable, hybrid, system, start) -> Reset:
-    reset = _reset_alone(switch, read, hybrid, system, start)
+def _name(hybrid, k):
+    return f"{hybrid.switches[k].in_words()}, number {k}"
+
+
+def _reset(switch: Switch, hybrid, system) -> Reset:
+    function = switch.reset
+    if isinstance(function, OfPhases):
+        function = function.between(system, hybrid.systems[hybrid.names.index(switch.to)])
+    takes = OF_STATE if function is None else takes_of(function)
     if switch.rest is None:
-        return reset
+        return Reset(function, takes)
     if takes_of(switch.when) != OF_STATE:
         raise ValueError(
             f"the switch {switch.in_words()} has rest=, and its guard takes multipliers: velocities do not tell how "
             "fast it opens.\nFix: rest= only with lj.touches(gap)."
         )
     settle = Plastic().between(system, hybrid.systems[hybrid.names.index(switch.rest)])
-    return Reset(reset.function, reset.takes, read, settle, switch.when, switch.slower_than)
+    return Reset(function, takes, settle, switch.when, switch.slower_than)
 
 
-def _reset_alone(switch: Switch, read: Hashable, hybrid, system, start) -> Reset:
-    function = switch.reset
-    if function is None:
-        return Reset(None, OF_STATE, read)
-    if isinstance(function, OfPhases):
-        function = function.between(system, hybrid.systems[hybrid.names.index(switch.to)])
-    takes = takes_of(function)
-    given: Mapping[str, Any] = start._asdict() | {"multipliers": zero_multipliers(system, start)}
-    call = Call("reset", function, takes, f" of the switch {switch.in_words()}")
-    check_arguments(call, "the arguments of a guard without the parameters")
-    with in_words(call, given):
-        found = shape_of(function, *(given[name] for name in takes))
+def traced_hybrid(hybrid: Hybrid, start: State) -> Hybrid:
+    """The hybrid with all functions of its phases and switches checked, and traced for such states."""
+    hybrid = replace_fields(hybrid, systems=tuple(traced_system(system, start) for system in hybrid.systems))
+    return replace_fields(hybrid, switches=tuple(_traced_switch(hybrid, k, start) for k in range(len(hybrid.switches))))
+
+
+def _traced_switch(hybrid, k, start):
+    switch = hybrid.switches[k]
+    system = hybrid.systems[hybrid.names.index(switch.phase)]
+    given: dict[str, Any] = start._asdict() | {"multipliers": zero_multipliers(system, start), "speed": start.t}
+    when, reset = traced_guard(_name(hybrid, k), switch.when, given), switch.reset
+    of_switch = f" of the switch {switch.in_words()}"
+    if isinstance(reset, OfPhases):
+        reset = reset.mapped(lambda role, f, takes: traced_call(Call(role, f, takes, of_switch), given, _is_anything))
+    elif reset is not None:
+        call = Call("reset", reset, takes_of(reset), of_switch)
+        reset = traced_call(
+            call, given, partial(_check_reset, start=start), "the arguments of a guard without the parameters"
+        )
+    return switch.with_functions(when, reset)
+
+
+def _is_anything(call, value):
+    """The parts of a contact are checked where they are used."""
+
+
+def _check_reset(call, found, start):
     if not (_alike(found, start.v) or _alike(found, (start.q, start.v))):
         raise ValueError(
             f"{call} must return velocities like v, or a pair (q, v).\n"
@@ -164,11 +179,14 @@ def _reset_alone(switch: Switch, read: Hashable, hybrid, system, start) -> Reset
             "Usual cause: only the velocity that jumps was returned.\n"
             'Fix: return v | {"y": -v["y"]}.'
         )
-    return Reset(lift_function(function, tuple(given[name] for name in takes)), takes, read)
 
 
 class OfPhases(eqx.Module):
     """A reset that depends on the systems before and after a switch."""
+
+    def mapped(self, on: Callable) -> "OfPhases":
+        """The same with `on(role, function, takes)` in place of each function of the user's in it."""
+        return self
 
     def between(self, before: System, after: System) -> Callable:
         """Return `reset(t, q, v, params)` for a switch between these systems."""
@@ -204,23 +222,10 @@ def _alike(found, wanted):
     return same and shapes(found) == shapes(wanted)
 
 
-def _with_first_alike(switch: Switch):
-    """The switch with the first functions seen that mean the same as its own, and the values that these read."""
-    functions = switch.when, switch.reset
-    if not is_eager():
-        return switch, tuple(map(read_by, functions))
-    found, read = zip(*((None, ()) if function is None else first_guard_alike(function) for function in functions))
-    if any(one is not other for one, other in zip(found, functions)):
-        is_function = lambda x: any(x is function for function in functions)
-        switch = eqx.tree_at(lambda s: (s.when, s.reset), switch, found, is_leaf=is_function)
-    return switch, read
-
-
 def starting(system, start: str | None):
-    """The system; a hybrid one starts in phase `start`, with the values that its switches read now."""
+    """The system; a hybrid one starts in phase `start`."""
     if isinstance(system, Hybrid):
-        switches, read = zip(*map(_with_first_alike, system.switches)) if system.switches else ((), ())
-        return replace_fields(system.starting(start), switches=switches, read=read)
+        return system.starting(start)
     if start is not None:
         raise ValueError("start= names the first phase of a lj.Hybrid, and this is one lj.System.\nFix: leave it out.")
     return system

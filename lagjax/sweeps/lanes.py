@@ -6,6 +6,7 @@ one after the other, which is slower in nearly all measurements (`benchmarks/swe
 
 import threading
 from collections.abc import Callable, Sequence
+from contextlib import contextmanager
 from typing import Any, NamedTuple
 
 import jax
@@ -14,6 +15,7 @@ import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec, SingleDeviceSharding
 from jaxtyping import PyTree
 
+from lagjax.jax_internals.programs import ClosedJaxpr
 from lagjax.jax_internals.tracing import REGULAR_FIRST
 from lagjax.mechanics.in_words import Call, check_arguments, in_words
 from lagjax.motion.reported import PATIENCE, reporting
@@ -90,6 +92,21 @@ def point_of(run: Callable) -> Callable:
     return point
 
 
+@contextmanager
+def _explained(run, axes, patience, robust):
+    of_user = Call("run", run, (POINT,))
+    check_arguments(of_user, "the axes taken one by one; a point is one dictionary")
+    with PATIENCE(patience), REGULAR_FIRST(not robust), in_words(of_user, {POINT: axes.values}):
+        yield
+
+
+def traced_point(run: Callable, axes: Axes, patience=None, robust=True) -> ClosedJaxpr:
+    """What a sweep computes at one point."""
+    shaped = [jax.ShapeDtypeStruct(x.shape[1:], x.dtype) for x in axes.arrays]
+    with _explained(run, axes, patience, robust):
+        return jax.make_jaxpr(lambda *values: point_of(run)(dict(zip(axes.names, values))))(*shaped)
+
+
 def compiled(
     run: Callable, axes: Axes, chunk: int, devices: Sequence, layout: str, patience=None, robust=True
 ) -> Program:
@@ -110,9 +127,7 @@ def compiled(
         function = jax.shard_map(lanes, mesh=mesh, in_specs=split, out_specs=split, check_vma=False)
         sharding = NamedSharding(mesh, split)
     shaped = tuple(jax.ShapeDtypeStruct((chunk, *x.shape[1:]), x.dtype, sharding=sharding) for x in axes.arrays)
-    of_user = Call("run", run, (POINT,))
-    check_arguments(of_user, "the axes taken one by one; a point is one dictionary")
-    with PATIENCE(patience), REGULAR_FIRST(not robust), in_words(of_user, {POINT: axes.values}):
+    with _explained(run, axes, patience, robust):
         traced = jax.jit(function).trace(shaped)
     shapes, *_ = traced.out_info
     program = traced.lower().compile()

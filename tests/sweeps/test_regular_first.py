@@ -65,7 +65,7 @@ def compiled(monkeypatch):
         return compiled(*args)
 
     monkeypatch.setattr(remembered, "compiled", counted)
-    remembered._PROGRAMS.clear()
+    remembered.PROGRAMS.clear()
     return count
 
 
@@ -74,9 +74,9 @@ def all_robust(monkeypatch):
     """Run sweeps with the robust program from the start."""
     with monkeypatch.context() as changed:
         changed.setattr(lanes, "REGULAR_FIRST", lambda _: REGULAR_FIRST(False))
-        remembered._PROGRAMS.clear()
+        remembered.PROGRAMS.clear()
         yield
-    remembered._PROGRAMS.clear()
+    remembered.PROGRAMS.clear()
 
 
 @pytest.mark.exhaustive
@@ -133,7 +133,7 @@ def test_motions_that_nobody_is_told_of(what, compiled, monkeypatch):
     np.testing.assert_allclose(quiet(run).values, exact(BOTH["k"]), rtol=1e-7)
     assert regular_alone(run)[2] is None and compiled["robust"] == 0
     monkeypatch.setattr(reported, "_hides", lambda jaxpr: False)
-    remembered._PROGRAMS.clear()
+    remembered.PROGRAMS.clear()
     np.testing.assert_array_equal(np.isnan(quiet(run).values), BOTH["k"] < 1)
 
 
@@ -198,7 +198,7 @@ def test_in_a_store(tmp_path, compiled):
     done = quiet(first_coordinate, chunk=3, store=path, part=(1, 2))
     assert done.ran == 3 and done.ok.all()
     np.testing.assert_allclose(done.values, whole.values, rtol=1e-13)
-    remembered._PROGRAMS.clear()
+    remembered.PROGRAMS.clear()
     assert quiet(first_coordinate, chunk=3, store=path).ran == 0
 
 
