@@ -16,31 +16,28 @@ from jaxtyping import PyTree
 T = TypeVar("T")
 
 
-class Recent:
+class Recent(OrderedDict):
     """Results by key, as many as were used last."""
 
     def __init__(self, most: int):
-        self.most, self._found, self._one_thread = most, OrderedDict(), threading.Lock()
+        super().__init__()
+        self.most, self._one_thread = most, threading.Lock()
 
     def made(self, key: Hashable, make: Callable[[], T]) -> T:
         """The result of this key, made if there is none yet; made each time if the key cannot be compared."""
         try:
             with self._one_thread:
-                if key in self._found:
-                    self._found.move_to_end(key)
-                    return self._found[key]
+                if key in self:
+                    self.move_to_end(key)
+                    return self[key]
         except TypeError:
             return make()
         found = make()
         with self._one_thread:
-            self._found[key] = found
-            while len(self._found) > self.most:
-                self._found.popitem(last=False)
+            self[key] = found
+            while len(self) > self.most:
+                self.popitem(last=False)
         return found
-
-    def clear(self):
-        """Forget all results."""
-        self._found.clear()
 
 
 _facts = Recent(1024)

@@ -163,12 +163,12 @@ def test_many_chunks_and_workers(compiled):
     swept = quiet(first_coordinate, many, chunk=4, workers=4)
     np.testing.assert_allclose(swept.values, exact(many["k"]), rtol=1e-7)
     assert compiled == {"regular": 1, "robust": 1} and swept.compiling > 0
-    (program,) = [program for _, program in remembered._PROGRAMS.values() if program.irregular.is_set()]
+    (program,) = [program for program in remembered.PROGRAMS.values() if program.irregular.is_set()]
     calls = Counter()
     remembered_program = program._replace(call=lambda *args: calls.update(["regular"]) or program.call(*args))
-    for key, (code, kept) in list(remembered._PROGRAMS.items()):
+    for key, kept in list(remembered.PROGRAMS.items()):
         if kept is program:
-            remembered._PROGRAMS[key] = code, remembered_program
+            remembered.PROGRAMS[key] = remembered_program
     again = quiet(first_coordinate, many, chunk=4, workers=4)
     np.testing.assert_array_equal(again.values, swept.values)
     assert again.compiling == 0 and not calls
@@ -194,7 +194,7 @@ def test_in_a_store(tmp_path, compiled):
     path, whole = tmp_path / "sweep", quiet(first_coordinate, chunk=3)
     half = quiet(first_coordinate, chunk=3, store=path, part=(0, 2))
     assert half.ran == 3 and half.ok.sum() == 3
-    assert any(program.irregular.is_set() for _, program in remembered._PROGRAMS.values())
+    assert any(program.irregular.is_set() for program in remembered.PROGRAMS.values())
     done = quiet(first_coordinate, chunk=3, store=path, part=(1, 2))
     assert done.ran == 3 and done.ok.all()
     np.testing.assert_allclose(done.values, whole.values, rtol=1e-13)
