@@ -28,7 +28,7 @@ from lagjax.mechanics.memory import Recent, is_array
 
 # Arrays of up to so many numbers, or of so many whole numbers (indices), that are read from outside are part of the
 # jaxpr: the equations can then leave out what is multiplied by their zeros.
-SMALL, SMALL_INDICES = 64, 4096
+SMALL, SMALL_INDICES = 1024, 4096
 # What a function may name and still be traced once: these libraries, but nothing in them that reads the outside.
 LIBRARIES = {"jax", "numpy", "math", "cmath", "operator", "functools", "itertools", "equinox"}
 CHANGING = {
