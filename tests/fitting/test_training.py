@@ -40,7 +40,8 @@ def quietly(*args, **options):
 
 def test_optimisers_by_what_they_mean():
     """Two equal optimisers compare equal, so nothing is compiled again; twin: another rate differs."""
-    made = lambda rate: Optimiser(optax.chain(optax.clip_by_global_norm(1.0), optax.adam(rate)))
+    found = find({"a": 1.0, "b": np.ones(3)}, None, {}, {}, np.dtype(float))
+    made = lambda rate: Optimiser(optax.chain(optax.clip_by_global_norm(1.0), optax.adam(rate)), found)
     assert made(1e-2) == made(1e-2) and hash(made(1e-2)) == hash(made(1e-2))
     assert made(1e-2) != made(1e-3)
     assert is_of_optax(optax.sgd(0.1)) and not is_of_optax(optax.sgd) and not is_of_optax((1, 2))
@@ -130,7 +131,7 @@ def test_only_what_is_in_a_batch_moves():
     """A round of one step moves the start of one window, and leaves the others unchanged bit for bit."""
     problem = problem_with([record(i, known=False) for i in range(4)])
     numbers = (np.asarray(x) for x in (0, 10, 10))
-    task = Task(problem, None, Optimiser(optax.adam(0.1)), 1, 1, *numbers)
+    task = Task(problem, None, Optimiser(optax.adam(0.1), problem.found), 1, 1, *numbers)
     # Inaccurate starts, so that they can move.
     state = initial_state(task)
     state = state._replace(local=np.asarray(state.local) + 0.01)
