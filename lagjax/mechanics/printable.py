@@ -1,0 +1,6 @@
+"""Text of the user's or of a file, as it may be printed: no character of it commands a terminal, or hides another."""
+
+
+def printable(text: object) -> str:
+    """Text with control characters, line ends among them, and characters without a width written as escapes."""
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in str(text))
