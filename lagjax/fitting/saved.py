@@ -11,6 +11,7 @@ import numpy as np
 from lagjax.fitting.result import Fit
 from lagjax.fitting.starts import unflatten_of
 from lagjax.mechanics import files
+from lagjax.mechanics.file_table import Table
 from lagjax.mechanics.hybrid import Hybrid, first_phase, replace_fields
 from lagjax.mechanics.memory import kinds
 from lagjax.mechanics.printable import printable
@@ -65,9 +66,9 @@ def load_fit(
     """
     known = {"system": system, "observe": observe} | {f"options.{name}": x for name, x in options.items()}
     known = {role: x for role, x in known.items() if x is not None}
-    classes = tuple(classes)
+    table = Table(classes)
     with files.opened(path, "fit") as (contents, array):
-        reader, asked = Reader(array, classes=classes), contents["functions"]
+        reader, asked = Reader(array, table=table), contents["functions"]
         if not isinstance(asked, list) or not all(isinstance(role, str) for role in asked):
             raise ValueError("its list of functions is not one that lagjax writes.")
         said, unflatten = reader.up(contents["known"]), unflatten_of(kinds(reader.up(contents["q"])))

@@ -8,7 +8,7 @@ them) as the name of their class and the values of their fields. Classes and fun
 import dataclasses
 import math
 import types
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -166,16 +166,16 @@ class Writer:
 class Reader:
     """Reads trees; each array is read once, by `array(name)`.
 
-    `given(role)` returns the user's value for one that was not written; `classes`: those of the user.
+    `given(role)` returns the user's value for one that was not written; `table`: what the tree may name.
     """
 
     def __init__(
         self,
         array: Callable[[str], np.ndarray],
         given: Callable[[str], Any] | None = None,
-        classes: Iterable[type] = (),
+        table: Table | None = None,
     ):
-        self.array, self.given, self._table = array, given, Table(classes)
+        self.array, self.given, self._table = array, given, table or Table()
 
     def up(self, node, depth: int = 0) -> Any:
         """The value that a node stands for.

@@ -11,7 +11,7 @@ import numpy as np
 
 from lagjax.mechanics import files
 from lagjax.mechanics.coordinates import State
-from lagjax.mechanics.file_table import check_field, fields_of
+from lagjax.mechanics.file_table import Table, check_field, fields_of
 from lagjax.mechanics.hybrid import Hybrid
 from lagjax.mechanics.outside import first_alike, up_to_date
 from lagjax.mechanics.signature import UnknownSystem, differences, signature
@@ -62,9 +62,9 @@ def load_trajectory(
       other than the integrated one, as told by the values of its functions at a state in the middle of the motion; for
       a file in float64 if JAX works in float32; and for objects of a class that was not passed.
     """
-    classes = tuple(classes)
+    table = Table(classes)
     with files.opened(path, "trajectory") as (said, array):
-        reader = Reader(array, classes=classes)
+        reader = Reader(array, table=table)
         found = {name: reader.up(node) for name, node in said["trajectory"].items()}
         known = described_system(found["system"])
         check_shapes(found)

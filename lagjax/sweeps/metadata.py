@@ -238,7 +238,7 @@ def _check_length(description):
     # Metadata contain the description once, and copies of all arrays with line ends and spaces.
     if 4 * len(json.dumps(description)) > MOST_METADATA:
         raise ValueError(
-            f"run returns {len(description['arrays']):,} arrays, and their description is longer than a store's may be.\n"
+            f"run returns {len(description['arrays']):,} arrays, whose description is longer than a store's may be.\n"
             "Fix: return fewer and larger arrays."
         )
 

@@ -12,6 +12,7 @@ from jaxtyping import PyTree
 
 from lagjax import plot
 from lagjax.mechanics import coordinates
+from lagjax.mechanics.file_table import Table
 from lagjax.motion.trajectory import Trajectory
 from lagjax.pages import Page
 from lagjax.sweeps import structures, tables
@@ -288,10 +289,12 @@ def open_sweep(
     """Open the sweep in a store: its values have the structure of what `run` returned, trajectories included.
 
     A store is data: opening it imports nothing, runs nothing of it and writes nothing, whoever has written it; nothing
-    outside of it is read. Other versions of lagjax, jax and diffrax may have written it. Statuses are read now, values on first access. A file
-    that is missing, cut off or of another block is detected now, without reading the values; a file whose contents have
-    changed is detected when the values are read. Either causes a warning that names the file; its points are then "lost
-    from the store" in `status` and not `ok`. `lj.sweep(run, axes, store=path)` computes them again.
+    outside of it is read. Other versions of lagjax, jax and diffrax may have written it.
+
+    Statuses are read now, values on first access. A file that is missing, cut off or of another block is detected now,
+    without reading the values; a file whose contents have changed is detected when the values are read. Either causes a
+    warning that names the file; its points are then "lost from the store" in `status` and not `ok`.
+    `lj.sweep(run, axes, store=path)` computes them again.
 
     >>> import tempfile
     >>> import lagjax as lj
@@ -311,7 +314,7 @@ def open_sweep(
     earlier format, or `run` returns another structure. `values` is a dictionary by name for values that contain
     functions, or objects of classes that were not passed (which a warning names).
     """
-    path = Path(path)
+    path, table = Path(path), Table(classes)
     store = Store(path)
     if wrong := damaged(path, store.about):
         warn_of_damage(path, wrong.values(), "It is read all the same. " + RESTORED, stacklevel=2)
@@ -322,7 +325,7 @@ def open_sweep(
     if (by := store.about["fingerprint"]["versions"]) != versions():
         how += f", written by {versions_in_words(by)}"
     if run is None:
-        like = structures.as_stored(store, system, classes)
+        like = structures.as_stored(store, system, table)
     else:
         like = structures.as_run_returns(run, axes, store)
     return Sweep(axes, Stored(store, like), status, how, 0, 0.0, 0.0, opened)

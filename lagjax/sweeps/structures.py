@@ -9,7 +9,7 @@ import base64
 import math
 import pickle
 import warnings
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
+from lagjax.mechanics.file_table import Table
 from lagjax.mechanics.files import MALFORMED
 from lagjax.mechanics.printable import printable
 from lagjax.mechanics.signature import UnknownSystem
@@ -67,7 +68,7 @@ def description_of(like: PyTree, one: PyTree | None, classes: list[type] | None 
     return description | {"arrays": {name: _in_json(x) for name, x in writer.arrays.items()}}
 
 
-def tree_of(description: dict[str, Any], system: Any, path: Any, classes: Iterable[type] = ()) -> PyTree:
+def tree_of(description: dict[str, Any], system: Any, path: Any, table: Table) -> PyTree:
     """The described tree, with meaningless small arrays for leaves. Systems other than `system` stay unknown.
 
     **Raises:** `ValueError` if none of its trajectories was integrated with `system`, a class was not passed, or the
@@ -94,7 +95,7 @@ def tree_of(description: dict[str, Any], system: Any, path: Any, classes: Iterab
                 mismatches.append(error)
         return trajectory_of(found, kept)
 
-    reader = Reader(lambda name: _from_json(arrays.pop(name)), marked_value, classes)
+    reader = Reader(lambda name: _from_json(arrays.pop(name)), marked_value, table)
     try:
         tree = reader.up(description["tree"])
     except MALFORMED as error:
@@ -104,12 +105,12 @@ def tree_of(description: dict[str, Any], system: Any, path: Any, classes: Iterab
     return tree
 
 
-def as_stored(store: Store, system: Any = None, classes: Iterable[type] = ()) -> PyTree | None:
+def as_stored(store: Store, system: Any, table: Table) -> PyTree | None:
     """The shapes of one point's values, as the store describes them; None without description or if a class is missing.
 
     **Raises:** `ValueError` if no trajectory has this `system`, or there are no trajectories.
     """
-    description, classes = store.about.get("structure"), tuple(classes)
+    description = store.about.get("structure")
     if system is not None and (not isinstance(description, dict) or not description.get("trajectories")):
         raise ValueError(
             f"{store.path} has no trajectories that need a system.\n"
@@ -119,7 +120,7 @@ def as_stored(store: Store, system: Any = None, classes: Iterable[type] = ()) ->
         return None
     one = store.one()
     try:
-        tree = tree_of(description, system, store.path, classes)
+        tree = tree_of(description, system, store.path, table)
         if sorted(name for name, _ in named_leaves(tree)) != sorted(one):
             raise ValueError("its structure has other values than its arrays.")
     except ValueError as error:
@@ -185,7 +186,8 @@ class Travelling(NamedTuple):
             # A function or class was importable only in the process that wrote the pickle.
             pass
         if self.described is not None:
-            tree = tree_of(self.described, None, None, [x for x in map(_unpickled, self.classes) if x is not None])
+            table = Table(x for x in map(_unpickled, self.classes) if x is not None)
+            tree = tree_of(self.described, None, None, table)
             leaves = dict(zip(self.names, self.leaves))
             return jax.tree.unflatten(jax.tree.structure(tree), [leaves[name] for name, _ in named_leaves(tree)])
         raise pickle.UnpicklingError(
@@ -215,6 +217,7 @@ def _in_json(x):
 
 def _from_json(stored):
     dtype, data = np.dtype(stored["dtype"]), base64.b64decode(stored["base64"], validate=True)
-    if dtype.kind not in KINDS_OF_ARRAY or math.prod(stored["shape"]) * dtype.itemsize != len(data) or not dtype.itemsize:
+    expected = math.prod(stored["shape"]) * dtype.itemsize
+    if dtype.kind not in KINDS_OF_ARRAY or dtype.itemsize == 0 or expected != len(data):
         raise ValueError(f"an array of its structure is said to be {dtype}, and has {len(data):,} bytes.")
     return np.frombuffer(data, dtype).reshape(stored["shape"]).copy()
