@@ -1,5 +1,6 @@
 """Read fits from files, with the functions that the user passes again."""
 
+import math
 import os
 from collections.abc import Callable, Iterable
 from dataclasses import replace
@@ -109,32 +110,45 @@ def check_shapes(found: Fit, described: UnknownSystem) -> None:
     p, (count, times), n = len(numbers.names), windows.ts.shape, np.size(problem.unit) // 2
     k, searched = starts.unknowns, found.unknowns
 
-    def check(name, *expected):
+    def check(name, kinds, *expected, lead=False):
         for x, shape in expected:
-            if np.shape(x)[: len(shape)] != shape or not isinstance(x, (np.ndarray, np.generic, jax.Array)):
+            here = np.shape(x)[: len(shape)] if lead else np.shape(x)
+            if not isinstance(x, (np.ndarray, np.generic, jax.Array)) or here != shape or x.dtype.kind not in kinds:
                 raise ValueError(f"{name} of shape {np.shape(x)} does not belong to {p} numbers in {count} windows.")
 
     of_numbers = (numbers.start, numbers.low, numbers.high, numbers.mean, numbers.sd, searched.shared)
-    check("found", *((x, (p,)) for x in of_numbers), (searched.local, (count, k)))
-    check("windows", *((x, (count, times)) for x in (windows.real, windows.sample)))
-    check("windows", *((x, (count,)) for x in (windows.last, windows.seam, windows.record)))
-    check("starts", *((x, (count, n)) for chart in starts for x in chart), (problem.unit, (2 * n,)))
-    check("starts", *((chart.along, (count, n, k)) for chart in starts))
+    check("found", "f", *((x, (p,)) for x in of_numbers), (searched.local, (count, k)))
+    check("windows", "f", (windows.ts, (count, times)))
+    check("windows", "b", (windows.real, (count, times)), (windows.seam, (count,)))
+    check("windows", "iu", (windows.sample, (count, times)), (windows.last, (count,)), (windows.record, (count,)))
+    check("starts", "f", *((chart.guess, (count, n)) for chart in starts), (problem.unit, (2 * n,)))
+    check("starts", "f", *((chart.along, (count, n, k)) for chart in starts))
+    check("starts", "f", *((chart.across, (count, n, chart.across.shape[-1])) for chart in starts))
+    check("the search", "f", (found.cost, ()), (found.costs, (found.costs.size,)), (problem.spread_in_sigmas, ()))
+    check("the search", "b", (found.rested, ()), (found.misfit.doubtful, ()))
+    check("the search", "iu", (found.steps, ()))
+    channels, columns = jax.tree.leaves(problem.measured), 0
+    check("misfit", "f", (found.misfit.times, (len(channels),)))
+    check("misfit", "b", *((x, (len(channels),)) for x in (found.misfit.large, found.misfit.curved)))
     for kind, tree in problem.measured.items():
-        lead = (count,) if kind == "end" else (count, times)
+        rows = (count,) if kind == "end" else (count, times)
         for x, sigma in zip(jax.tree.leaves(tree), jax.tree.leaves(problem.sigma[kind]), strict=True):
-            check(kind, (x, lead), (sigma, lead))
+            check(kind, "f", (x, rows), (sigma, rows), lead=True)
+            check(kind, "f", (sigma, x.shape))
+            columns += math.prod(x.shape[1:])
     records, order = len(windows.first), np.diff(windows.record, prepend=-1)
-    known_starts = jax.tree.leaves(described.starts)
-    check("starts", *((x, (records,)) for x in known_starts))
+    if described.starts is not None:
+        for state, slopes in zip(*(jax.tree.leaves(tree) for tree in described.starts), strict=True):
+            check("starts", "f", (state, (records,)), (slopes, (*state.shape, p + k)), lead=True)
     if windows.record[0] != 0 or order.min() < 0 or order.max() > 1 or not 0 <= windows.last.min() <= times:
         raise ValueError("its windows are not in the order of its records.")
-    if found.evaluation is not None:
-        at = found.evaluation
+    if (at := found.evaluation) is not None:
         of, determined = at.covariance, at.determined
-        check("covariance", (of.shared, (p, p)), (of.local, (count, k, k)), (of.local_shared, (count, k, p)))
-        check("determined", (determined.shared, (p,)), (determined.local, (count, k)), (at.rows, (count,)))
-        check("combinations", (at.combinations, (p, p)), (at.singular_values, (p,)))
+        check("covariance", "f", (of.shared, (p, p)), (of.local, (count, k, k)), (of.local_shared, (count, k, p)))
+        check("determined", "b", (determined.shared, (p,)), (determined.local, (count, k)))
+        check("rows", "f", (at.rows, (count, columns)))
+        check("combinations", "f", (at.combinations, (p, p)), (at.singular_values, (p,)))
+        check("chi2", "f", (at.chi2, ()), (at.freedom, ()))
     leaves = jax.tree.leaves(numbers.params)
     sizes = [np.size(leaves[number]) if places is None else len(places) for number, places in numbers.leaves]
     inside = all(0 <= i < np.size(leaves[number]) for number, places in numbers.leaves for i in places or ())

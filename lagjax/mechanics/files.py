@@ -17,10 +17,12 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from importlib.metadata import version
 from pathlib import Path
+from tokenize import TokenError
 from typing import Any, NoReturn
 
 import numpy as np
 
+from lagjax.mechanics.printable import by_line
 from lagjax.mechanics.written_trees import KINDS_OF_ARRAY
 
 FORMAT = 1
@@ -30,7 +32,7 @@ KINDS = {"trajectory": "lj.load_trajectory", "fit": "lj.load_fit"}
 # A description has at most this many bytes: numbers in bulk belong in arrays. Arrays are read in pieces.
 MOST_DESCRIPTION, PIECE = 4_000_000, 1 << 20
 # What zip, zlib, NumPy and the operating system raise for damaged files, and Python for a malformed description.
-DAMAGED = (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, OSError, SyntaxError, MemoryError)
+DAMAGED = (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, OSError, SyntaxError, MemoryError, TokenError)
 MALFORMED = (LookupError, TypeError, AttributeError, ArithmeticError, RuntimeError, StopIteration, AssertionError)
 
 
@@ -93,14 +95,14 @@ def opened(path: str | os.PathLike, kind: str) -> Iterator[tuple[dict[str, Any],
 
             yield header, array
     except Explained as error:
-        raise ValueError(str(error)) from None
+        raise ValueError(by_line(error)) from None
     except ValueError as error:
-        raise ValueError(f"{path} cannot be read: {error}") from error
+        raise ValueError(by_line(f"{path} cannot be read: {error}")) from error
     except DAMAGED as error:
-        raise ValueError(str(_damaged(path, str(error)[:200] or type(error).__name__))) from error
+        raise ValueError(by_line(_damaged(path, str(error)[:200] or type(error).__name__))) from error
     except MALFORMED as error:
         why = f"its description is incomplete, or not lagjax's ({type(error).__name__}: {str(error)[:200]})"
-        raise ValueError(str(_damaged(path, why))) from error
+        raise ValueError(by_line(_damaged(path, why))) from error
 
 
 class Explained(ValueError):

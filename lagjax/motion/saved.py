@@ -72,6 +72,10 @@ def load_trajectory(
     return trajectory if system is None else trajectory_of(found, same_system(system, known, path))
 
 
+# What is counted of every motion.
+COUNTS = "num_steps", "num_accepted_steps", "num_rejected_steps"
+
+
 def described_system(said: dict[str, Any]) -> UnknownSystem:
     """What a file knows about a system.
 
@@ -94,19 +98,18 @@ def check_shapes(found: dict[str, Any]) -> None:
     t, outputs = found["t"], found["t"].shape
     batch = outputs[:-1]
 
-    def check(name, tree, lead, kinds="fiub", exactly=False):
-        for x in jax.tree.leaves(tree):
+    def check(name, leaves, lead, kinds="f", exactly=False):
+        for x in leaves if isinstance(leaves, list) else jax.tree.leaves(leaves):
             shape = np.shape(x) if exactly else np.shape(x)[: len(lead)]
             if not isinstance(x, (jax.Array, np.ndarray, np.generic)) or shape != lead or x.dtype.kind not in kinds:
                 raise ValueError(f"{name} does not belong to times of shape {outputs}.")
 
     def check_states(name, said, lead):
-        check(f"{name} t", said["t"], lead, "f", exactly=True)
-        check(f"{name} q", said["q"], lead, "f")
-        check(f"{name} v", said["v"], lead, "f")
-        check(f"{name} multipliers", said["multipliers"], lead, "f")
-        if not isinstance(said["multipliers"], dict) or not jax.tree.leaves(said["q"]):
-            raise ValueError(f"{name} has no coordinates, or multipliers without names.")
+        check(name, [said["t"]], lead, exactly=True)
+        check(name, (said["q"], said["v"]), lead)
+        check(name, list(said["multipliers"].values()), lead)
+        if jax.tree.structure(said["q"]) != jax.tree.structure(said["v"]) or not jax.tree.leaves(said["q"]):
+            raise ValueError(f"{name} has no coordinates, or velocities in another structure.")
 
     def of_rows(said):
         # The crossings or switches of each lane: their number is free.
@@ -114,26 +117,33 @@ def check_shapes(found: dict[str, Any]) -> None:
 
     if t.ndim == 0:
         raise ValueError("its times are one number.")
-    check_states("the motion:", found, outputs)
-    check_states("the end:", found["end"], batch)
-    check("stats", found["stats"], batch, "iu", exactly=True)
-    check("scaled_error", found["scaled_error"], batch, "f", exactly=True)
+    check_states("the motion", found, outputs)
+    check_states("the end", found["end"], batch)
+    check("stats", [found["stats"][name] for name in COUNTS], batch, "iu", exactly=True)
+    check("scaled_error", [found["scaled_error"]], batch, exactly=True)
     rtol, atol = found["tolerance"]
-    check("tolerance", (rtol, atol), batch, "f")
-    check("result", found["result"]["codes"], batch, "iu", exactly=True)
+    check("tolerance", [rtol, atol], (*batch, 2))
+    if max(rtol.ndim, atol.ndim) > len(batch) + 2 or not isinstance(found["tolerance"], tuple):
+        raise ValueError("its tolerances are not two rows of numbers.")
+    check("result", [found["result"]["codes"]], batch, "iu", exactly=True)
     for name, crossings in found["events"].items():
-        check_states(f"event {name}:", crossings, of_rows(crossings))
-        check(f"event {name}:", (crossings["count"], crossings["uncertain"]), batch, exactly=True)
+        check_states(f"event {name}", crossings, of_rows(crossings))
+        check(f"event {name}", [crossings["count"]], batch, "iu", exactly=True)
+        check(f"event {name}", [crossings["uncertain"]], batch, "b", exactly=True)
     if (error := found["error"]) is not None:
-        check("error", (error["q"], error["v"], error["multipliers"]), outputs, "f")
-        check("error of events", error["events"], batch, "f")
-        check("error", (error["result"]["codes"], error["steps"]), batch, "iu", exactly=True)
+        check("error", (error["q"], error["v"]), outputs)
+        check("error", list(error["multipliers"].values()), outputs)
+        check("error of events", list(error["events"].values()), batch)
+        check("error", [error["result"]["codes"], error["steps"]], batch, "iu", exactly=True)
     if "phase" in found:
-        check("phase", found["phase"], outputs, "iu", exactly=True)
-        switches, rows = found["switches"], of_rows(found["switches"])
-        check("switches", [switches[name] for name in ("t", "way", "to")], rows, exactly=True)
-        check("switches", [switches[name] for name in ("q", "v", "q_after", "v_after", "impulse")], rows, "f")
-        check("switches", [switches["count"], switches["uncertain"]], batch, exactly=True)
+        switches = found["switches"]
+        rows = of_rows(switches)
+        check("phase", [found["phase"]], outputs, "iu", exactly=True)
+        check("switches", [switches["t"]], rows, exactly=True)
+        check("switches", [switches["way"], switches["to"]], rows, "iu", exactly=True)
+        check("switches", tuple(switches[name] for name in ("q", "v", "q_after", "v_after", "impulse")), rows)
+        check("switches", [switches["count"]], batch, "iu", exactly=True)
+        check("switches", [switches["uncertain"]], batch, "b", exactly=True)
         if not all(isinstance(x, str) for x in (*switches["names"], *switches["ways"])):
             raise ValueError("its phases have no names.")
 
