@@ -97,7 +97,7 @@ def opened(path: str | os.PathLike, kind: str) -> Iterator[tuple[dict[str, Any],
     except Explained as error:
         raise ValueError(by_line(error)) from None
     except ValueError as error:
-        raise ValueError(by_line(f"{path} cannot be read: {error}")) from error
+        raise ValueError(by_line(f"{path} cannot be read: {str(error)[:2000]}")) from error
     except DAMAGED as error:
         raise ValueError(by_line(_damaged(path, str(error)[:200] or type(error).__name__))) from error
     except MALFORMED as error:

@@ -3,9 +3,17 @@
 
 def printable(text: object) -> str:
     """Text with control characters, line ends among them, and characters without a width written as escapes."""
-    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in str(text))
+    text = str(text)
+    if text.isprintable():
+        return text
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 
 def by_line(text: object) -> str:
-    """Text of several lines, each as `printable` writes it, and not longer than a screen."""
-    return "\n".join(map(printable, str(text)[:2000].split("\n")))
+    """Text of several lines, each as `printable` writes it."""
+    return "\n".join(map(printable, str(text).split("\n")))
+
+
+def is_plain(text: str) -> bool:
+    """Whether a text has only characters that `printable` leaves as they are, line ends and tabs."""
+    return text.replace("\n", "").replace("\t", "").isprintable()

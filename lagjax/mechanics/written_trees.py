@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax.mechanics.file_table import Table, check_field, fields_of, listed, name_of_function
+from lagjax.mechanics.printable import is_plain, printable
 from lagjax.numerics.simplified_newton import tolerance_of_the_controller
 
 # Structures are nested no deeper than this.
@@ -86,6 +87,8 @@ class Writer:
         if depth > DEEPEST:
             raise NotWritable(f"{path[:80]}... is nested deeper than {DEEPEST} levels.\nFix: a flatter structure.")
         inside = lambda x, name: self.down(x, name, depth + 1)
+        if isinstance(value, str) and not is_plain(value):
+            raise NotWritable(f"{printable(path)} is text with control characters.\nFix: leave them out.")
         if value is None or isinstance(value, (bool, str)) or type(value) is int:
             return value
         if type(value) is float:
@@ -182,6 +185,8 @@ class Reader:
 
         **Raises:** `ValueError`, and what Python raises for a node that is not as `Writer` makes it.
         """
+        if isinstance(node, str) and not is_plain(node):
+            raise ValueError(f"it holds text with control characters, {printable(node)[:80]!r}.")
         if node is None or isinstance(node, (bool, int, str)):
             return node
         kind = next(iter(node))

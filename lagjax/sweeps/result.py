@@ -13,6 +13,7 @@ from jaxtyping import PyTree
 from lagjax import plot
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.file_table import Table
+from lagjax.mechanics.printable import printable
 from lagjax.motion.trajectory import Trajectory
 from lagjax.pages import Page
 from lagjax.sweeps import structures, tables
@@ -264,7 +265,7 @@ class Sweep:
             compiled = f"compiled in {self.compiling:.3g} s" if self.compiling else "nothing had to be compiled"
             rows.append(("", f"{compiled}; computed in {self.seconds:.3g} s, {self.ran / self.seconds:,.0f} points/s"))
         width = max(len(label) for label, _ in rows)
-        return "\n".join(["Sweep", *(f"  {label:<{width}}  {value}" for label, value in rows)])
+        return "\n".join(["Sweep", *(printable(f"  {label:<{width}}  {value}") for label, value in rows)])
 
     def _shapes(self):
         shown = []
