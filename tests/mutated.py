@@ -126,7 +126,7 @@ def mutate(tree, rng):
         elif how == 4 and isinstance(inside, dict):
             inside[NAMES[int(rng.integers(len(NAMES)))]] = inside.pop(key)
         elif how == 5:
-            for _ in range(int(rng.choice([1, 120, 300]))):
+            for _ in range(int(rng.choice([1, 60, 150]))):
                 inside[key] = {"tuple": [inside[key]]}
         elif how == 6:
             numbers = [x for x in everywhere if isinstance(part(tree, x), int)]

@@ -306,6 +306,7 @@ def bomb(path):
     mutated.mark(path, "y", 1)
 
 
+@pytest.mark.slow
 def test_stores_that_reach_out(good, tmp_path, monkeypatch):
     """A store writes nothing, reads nothing outside of it, and takes no more memory than its files have room for.
 

@@ -4,6 +4,7 @@ import math
 import os
 from collections.abc import Callable, Iterable
 from dataclasses import replace
+from inspect import signature
 from typing import Any
 
 import jax
@@ -12,6 +13,7 @@ import numpy as np
 from lagjax.fitting.result import Fit
 from lagjax.fitting.starts import unflatten_of
 from lagjax.mechanics import files
+from lagjax.mechanics.diagnosis import listed
 from lagjax.mechanics.file_table import Table
 from lagjax.mechanics.hybrid import Hybrid, first_phase, replace_fields
 from lagjax.mechanics.memory import kinds
@@ -19,6 +21,7 @@ from lagjax.mechanics.printable import printable
 from lagjax.mechanics.signature import UnknownSystem
 from lagjax.mechanics.system import System
 from lagjax.mechanics.written_trees import NotGiven, Reader
+from lagjax.motion.integrate import integrate
 from lagjax.motion.saved import described_system, same_system
 
 
@@ -94,6 +97,8 @@ def _with(found: Fit, known: dict[str, Any], described: UnknownSystem, path) -> 
     if "system" in known:
         system: Any = same_system(known["system"], described, path)
         if described.phase is not None:
+            if not isinstance(system, Hybrid) or not 0 <= described.phase < len(system.systems):
+                raise ValueError(f"{path} starts in phase {described.phase}, which this system does not have.")
             system = replace_fields(system, first=np.asarray(described.phase, np.int32))
         fields |= {"system": system, "first": first_phase(system)}
     options = {name: known.get(f"options.{name}", x) for name, x in problem.options.items()}
@@ -152,6 +157,8 @@ def check_shapes(found: Fit, described: UnknownSystem) -> None:
     leaves = jax.tree.leaves(numbers.params)
     sizes = [np.size(leaves[number]) if places is None else len(places) for number, places in numbers.leaves]
     inside = all(0 <= i < np.size(leaves[number]) for number, places in numbers.leaves for i in places or ())
+    if unknown := set(problem.options) - set(signature(integrate).parameters):
+        raise ValueError(f"its options are not those of lj.integrate: {listed(sorted(unknown))}.")
     if sum(sizes) != p or not inside:
         raise ValueError(f"its parameters do not hold {p} numbers.")
     if found.training is not None and found.training.held_back is not None:

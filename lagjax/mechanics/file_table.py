@@ -200,10 +200,10 @@ class Table:
 
         **Raises:** `UnknownClass`, a `ValueError`.
         """
-        for candidates in (self._given.get(f"{module}.{name}"), self._given.get(name)):
-            if candidates and all(cls is candidates[0] for cls in candidates):
-                return candidates[0], fields_of(candidates[0]) or (), False
         found = listed(module, name)
+        given = self._given.get(f"{module}.{name}") or ([] if found else self._given.get(name, []))
+        if given and all(cls is given[0] for cls in given):
+            return given[0], fields_of(given[0]) or (), False
         if found is None:
             raise UnknownClass(
                 f"it holds an object of class {f'{module}.{name}'[:200]}, which is neither lagjax's nor passed.\n"

@@ -85,6 +85,8 @@ def opened(path: str | os.PathLike, kind: str) -> Iterator[tuple[dict[str, Any],
             if HEADER not in entries.namelist():
                 _raise_foreign(path, kind)
             left = _entries(entries, path)
+            if left[HEADER].file_size > MOST_DESCRIPTION:
+                raise ValueError(f"its description has {left[HEADER].file_size:,} bytes.")
             header = parsed(entries.read(left.pop(HEADER)))
             _check_header(path, header, kind)
 

@@ -25,6 +25,8 @@ CODECS = {("bytes", "zstd", "crc32c"): True, ("bytes", "crc32c"): False}
 # Arrays that need more than this many bytes, and more than this many times those of all files, are not read.
 MOST_BYTES, MOST_EXPANSION = 16_000_000, 1000
 MARKS = "lagjax/marks"
+# A sweep that continues computes as many points at a time as its store says, but no more than this.
+LONGEST_CHUNK = 1 << 24
 
 
 class Spec(NamedTuple):
@@ -99,7 +101,6 @@ def checked(description: dict[str, Any]) -> Described:
     texts += [*fingerprint["versions"], *fingerprint["versions"].values(), *fingerprint["axes"].values()]
     _require(all(isinstance(x, str) and x.isprintable() for x in texts), "its names are not text")
     _require(isinstance(description["paired"], bool) and len(set(names)) == len(names) > 0, "its axes have no names")
-    _require(isinstance(fingerprint["chunk"], int) and fingerprint["chunk"] > 0, "its chunk length is not a number")
     _require(isinstance(description["attributes"], dict), "its attributes are not")
     axes = [arrays[places["axes"][name]] for name in names]
     lengths = tuple(axis.shape[0] for axis in axes)
@@ -109,6 +110,8 @@ def checked(description: dict[str, Any]) -> Described:
     _require(not description["paired"] or len(set(lengths)) == 1, "paired axes have different lengths")
     blocks = Blocks(lengths[:1] if description["paired"] else lengths, tuple(description["block"]))
     shape, block = blocks
+    _require(type(fingerprint["chunk"]) is int, "its chunk length is not a number")
+    _require(0 < fingerprint["chunk"] <= max(LONGEST_CHUNK, math.prod(shape)), "its chunks are empty or too long")
     _require(len(block) == len(shape), "its blocks have another number of axes")
     _require(all(type(k) is int and 0 < k <= n for n, k in zip(shape, block)), "its blocks are empty or too long")
     splits = (all(k == 1 for k in block[:i]) and block[i + 1 :] == shape[i + 1 :] for i in range(len(shape)))

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from lagjax.mechanics.files import MALFORMED, parsed
-from lagjax.mechanics.printable import printable
+from lagjax.mechanics.printable import by_line, printable
 from lagjax.sweeps.axes import Axes
 from lagjax.sweeps.described import MARKS, checked
 from lagjax.sweeps.fingerprint import FORMAT, digest, named_leaves
@@ -78,7 +78,7 @@ def about(path: Path) -> dict[str, Any]:
         return description | {"checked": checked(description)}
     except (ValueError, *MALFORMED) as error:
         why = str(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {printable(error)[:200]}"
-        raise ValueError(f"{path} cannot be read: {why}") from error
+        raise ValueError(by_line(f"{path} cannot be read: {why}")) from error
 
 
 def _raise_earlier(path, which):

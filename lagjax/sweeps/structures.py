@@ -19,7 +19,7 @@ from jaxtyping import PyTree
 
 from lagjax.mechanics.file_table import Table
 from lagjax.mechanics.files import MALFORMED
-from lagjax.mechanics.printable import printable
+from lagjax.mechanics.printable import by_line, printable
 from lagjax.mechanics.signature import UnknownSystem
 from lagjax.mechanics.written_trees import KINDS_OF_ARRAY, NotWritable, Reader, Writer
 from lagjax.motion.saved import described_system, same_system, trajectory_of
@@ -127,8 +127,8 @@ def as_stored(store: Store, system: Any, table: Table) -> PyTree | None:
         if system is not None:
             raise
         warnings.warn(
-            f"the values of {store.path} are a dictionary by name: {error}\n"
-            "In any case: lj.open_sweep(path, run=run), with the function that was swept.",
+            by_line(f"the values of {store.path} are a dictionary by name: {error}")
+            + "\nIn any case: lj.open_sweep(path, run=run), with the function that was swept.",
             stacklevel=3,
         )
         return None
