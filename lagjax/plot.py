@@ -59,7 +59,7 @@ def import_matplotlib():
 
 @contextmanager
 def names_as_they_are():
-    """A context, or a decorator, in which a dollar in a text is no formula: names are the user's, or those of a file."""
+    """A context or decorator in which a dollar in a text is no formula: names are the user's, or those of a file."""
     with import_matplotlib().rc_context({"text.parse_math": False}):
         yield
 
