@@ -80,6 +80,8 @@ def load_fit(
         given: dict[str, Any] = {"system": described, "first": described, "unflatten": unflatten}
         reader.given = lambda role: given[role] if role in given else NotGiven(_short(role))
         found = reader.up(contents["fit"])
+        if described.starts is None:
+            raise ValueError("it does not say where its motions start.")
         check_shapes(found, described)
     if unknown := sorted(set(known) - set(asked)):
         raise TypeError(
@@ -143,8 +145,14 @@ def check_shapes(found: Fit, described: UnknownSystem) -> None:
             columns += math.prod(x.shape[1:])
     records, order = len(windows.first), np.diff(windows.record, prepend=-1)
     if described.starts is not None:
-        for state, slopes in zip(*(jax.tree.leaves(tree) for tree in described.starts), strict=True):
-            check("starts", "f", (state, (records,)), (slopes, (*state.shape, p + k)), lead=True)
+        (q, v), (q_slopes, v_slopes) = described.starts
+        for tree, slopes in ((q, q_slopes), (v, v_slopes)):
+            leaves = jax.tree.leaves(tree)
+            for x, slope in zip(leaves, jax.tree.leaves(slopes), strict=True):
+                check("starts", "f", (x, (records,)), lead=True)
+                check("starts", "f", (slope, (*x.shape, p + k)))
+            if sum(x[0].size for x in leaves) != n or jax.tree.structure(tree) != jax.tree.structure(slopes):
+                raise ValueError(f"its starts do not have {n} coordinates.")
     if windows.record[0] != 0 or order.min() < 0 or order.max() > 1 or not 0 <= windows.last.min() <= times:
         raise ValueError("its windows are not in the order of its records.")
     if (at := found.evaluation) is not None:
