@@ -178,7 +178,7 @@ def check_same(system, known: UnknownSystem, path) -> None:
         return
     try:
         here = signature(system, State(*known.state))
-    except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
+    except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RuntimeError) as error:
         raise ValueError(
             f"this system is not the one of {path} ({known.words.splitlines()[0]}): it cannot be evaluated at a state "
             f"of that motion.\nIts error: {error}"

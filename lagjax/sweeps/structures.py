@@ -162,7 +162,7 @@ class Travelling(NamedTuple):
     # The names of the leaves. An unknown system has lost its own leaves, so they are matched by name.
     names: list[str]
     # The classes of objects in the description, each pickled: by name, as pickle writes any class.
-    classes: list[bytes]
+    classes: tuple[bytes, ...] = ()
 
     @classmethod
     def of(cls, values: PyTree) -> "Travelling":
@@ -175,7 +175,8 @@ class Travelling(NamedTuple):
         numbered = jax.tree.unflatten(structure, range(len(leaves)))
         # Without a description, pickle raises its own error for what it cannot pickle.
         structure = pickle.dumps(numbered) if description is None else pickled(numbered)
-        return cls(leaves, structure, description, names, [x for x in map(pickled, set(classes)) if x is not None])
+        found = tuple(x for x in map(pickled, set(classes)) if x is not None)
+        return cls(leaves, structure, description, names, found)
 
     def unpacked(self) -> PyTree:
         """The values, restored."""
