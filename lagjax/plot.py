@@ -2,6 +2,7 @@
 
 import io
 from collections.abc import Sequence
+from contextlib import contextmanager
 from fractions import Fraction
 from typing import NamedTuple
 
@@ -56,11 +57,19 @@ def import_matplotlib():
     return matplotlib
 
 
+@contextmanager
+def names_as_they_are():
+    """A context or decorator in which a dollar in a text is no formula: names are the user's, or those of a file."""
+    with import_matplotlib().rc_context({"text.parse_math": False}):
+        yield
+
+
 def style(i: int) -> dict:
     """Colour and dash of the i-th curve."""
     return {"color": COLOURS[i % len(COLOURS)], "linestyle": DASHES[i % len(DASHES)]}
 
 
+@names_as_they_are()
 def time_series(t, panels: dict[str, dict[str, np.ndarray]]):
     """Draw curves against time, one panel per key of `panels`, one curve per name in it.
 
@@ -80,6 +89,7 @@ def time_series(t, panels: dict[str, dict[str, np.ndarray]]):
     return fig
 
 
+@names_as_they_are()
 def families(label: str, x, ts, panels: dict[str, np.ndarray]):
     """Draw curves against time, one panel per coordinate, one curve per value of `x` (N,), which sets its shade.
 
@@ -106,6 +116,7 @@ def families(label: str, x, ts, panels: dict[str, np.ndarray]):
     return fig
 
 
+@names_as_they_are()
 def phase_portrait(panels: dict[str, tuple[list[tuple[np.ndarray, np.ndarray]], bool]]):
     """Draw velocities against coordinates, one panel per coordinate, one curve per motion, with a dot at its start.
 
@@ -128,6 +139,7 @@ def phase_portrait(panels: dict[str, tuple[list[tuple[np.ndarray, np.ndarray]], 
     return fig
 
 
+@names_as_they_are()
 def section(panels: dict[tuple[str, str], tuple[list[tuple[np.ndarray, np.ndarray]], bool]], note: str):
     """Draw points, one panel per pair of names, one colour per motion.
 
@@ -253,6 +265,7 @@ def _ticks_of_decades(axis):
         axis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:,.0f}" if x >= 1000 else f"{x:g}"))
 
 
+@names_as_they_are()
 def fits(panels: dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]]):
     """Draw measurements and the fit on the left, and the residuals on the right, one row per channel.
 
@@ -294,6 +307,7 @@ def training(curves: dict[str, tuple[np.ndarray, np.ndarray]], best: int):
     return fig
 
 
+@names_as_they_are()
 def lines(label: str, x, panels: dict[str, np.ndarray], bad):
     """Draw values against one axis of a sweep, one panel per value; `bad` points are marked at the bottom."""
     fig, axes = figure(len(panels), 1, size=(6.0, 2.8), sharex=True)
@@ -308,6 +322,7 @@ def lines(label: str, x, panels: dict[str, np.ndarray], bad):
     return fig
 
 
+@names_as_they_are()
 def maps(axes: dict[str, np.ndarray], panels: dict[str, np.ndarray]):
     """Draw values over two axes as maps, one row per value; a third axis in front gets one column per axis value."""
     *first, (down, y), (across, x) = axes.items()
@@ -330,6 +345,7 @@ def maps(axes: dict[str, np.ndarray], panels: dict[str, np.ndarray]):
     return fig
 
 
+@names_as_they_are()
 def stacked(t, parts: dict[str, np.ndarray], total: np.ndarray, label: str):
     """Draw parts against time, stacked upwards if positive and downwards if negative, and their total.
 
@@ -352,6 +368,7 @@ def stacked(t, parts: dict[str, np.ndarray], total: np.ndarray, label: str):
     return fig
 
 
+@names_as_they_are()
 def graph(names: Sequence[str], arrows: Sequence[tuple[str, str, str]]):
     """Draw names on a circle, and labelled arrows between them.
 

@@ -36,7 +36,8 @@ LAYERS = (
 TOP = {"__init__", "__main__", "job"}
 FINDER = doctest.DocTestFinder()
 PRIVATE = ("jax._src", "jax.experimental", "jax.extend", "jax.interpreters", "jaxlib")
-OPTIONAL = {"PIL", "google_crc32c", "ipywidgets", "matplotlib", "pandas", "sympy", "tqdm", "xarray", "zarr"}
+OPTIONAL = {"PIL", "google_crc32c", "ipywidgets", "matplotlib", "numcodecs", "pandas", "sympy", "tqdm", "xarray"}
+OPTIONAL |= {"zarr"}
 
 
 def layer(module):

@@ -124,6 +124,7 @@ class Branches(eqx.Module):
         # A value that is negligible compared with the range is round-off.
         return f"{0.0 if abs(x) < 1e-13 * abs(self.last - self.first) else float(x):.{digits}g}"
 
+    @plot.names_as_they_are()
     def plot(self, *names: str):
         """Draw coordinates against the parameter: stable branches solid, unstable dashed, critical points marked.
 

@@ -15,6 +15,7 @@ from lagjax.motion.frames import drawn
 PERIODS, GROWTHS = 3.0, 3.0
 
 
+@plot.names_as_they_are()
 def drawn_roots(roots: np.ndarray, growing: np.ndarray, zero: np.ndarray):
     """Draw numbered roots in the complex plane; returns a matplotlib `Figure`."""
     fig, axes = plot.figure(size=(5.6, 3.6))
@@ -42,6 +43,7 @@ def drawn_roots(roots: np.ndarray, growing: np.ndarray, zero: np.ndarray):
     return fig
 
 
+@plot.names_as_they_are()
 def drawn_mode(mode):
     """Draw the amplitude and the motion of each coordinate; returns a matplotlib `Figure`."""
     names = mode.linearisation.names

@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Complex, Float, Int, PyTree
 from lagjax.analysis.balance import Symmetries
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.diagnosis import describe
+from lagjax.mechanics.printable import by_line
 
 OK, NO_BALANCE, CONSTRAINED, NOT_FINITE, NOT_LASTING, UNFINISHED = range(6)
 WORDS = (
@@ -101,7 +102,7 @@ class Equilibria(eqx.Module):
             return (
                 f"Equilibria, {int(np.sum(self.found))} from a batch of {shape} with {self.found.shape[-1]} starts each"
             )
-        return "\n".join(_lines(self))
+        return by_line("\n".join(_lines(self)))
 
 
 def merged(rows: Equilibria, is_angle: PyTree[bool]) -> Equilibria:

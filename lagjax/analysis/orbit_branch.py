@@ -93,6 +93,7 @@ class OrbitBranch(eqx.Module):
         """The critical points of one kind, `"fold"`, `"period doubling"`, ..."""
         return [c for c in self.critical if c.kind == kind]
 
+    @plot.names_as_they_are()
     def plot(self, *names: str):
         """Draw the largest value of coordinates against the parameter: stable solid, unstable dashed, with markers.
 

@@ -19,9 +19,10 @@ def written(name: str) -> str:
     >>> written("theta"), written("m1"), written("r[0, 1]"), written("length")
     ('\\theta', 'm_{1}', 'r_{0,1}', '\\mathrm{length}')
     """
-    parts = re.findall(r"[A-Za-z]+|\d+", name.replace("_", " "))
+    # Letters of any alphabet, and digits: no other character of a name reaches the formula.
+    parts = re.findall(r"[^\W\d_]+|\d+", name)
     if not parts:
-        return rf"\mathrm{{{name}}}"
+        return r"\square"
     letters = lambda part: (
         rf"\{part}" if part in GREEK else part if len(part) == 1 or part.isdigit() else rf"\mathrm{{{part}}}"
     )

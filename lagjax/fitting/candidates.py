@@ -20,6 +20,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from lagjax.mechanics.printable import by_line
+
 # A number is determined if the undetermined directions hold no larger share than this of its squared slopes.
 NEGLIGIBLE_SHARE = 1e-8
 # The largest number of rounds of exchanges; few are needed.
@@ -90,7 +92,7 @@ class NextMeasurements(NamedTuple):
         raise KeyError(f"no candidate is called '{name}': {', '.join(c.name for c in self.candidates)}")
 
     def __repr__(self):
-        return "\n".join(_lines(self))
+        return by_line("\n".join(_lines(self)))
 
 
 def assess(name, t, rows, known, direction, values, sigma, least, one_time=False) -> Candidate:

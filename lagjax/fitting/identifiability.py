@@ -18,6 +18,7 @@ from jaxtyping import Array, Float
 
 from lagjax.fitting.candidates import NextMeasurements
 from lagjax.mechanics.diagnosis import listed
+from lagjax.mechanics.printable import by_line
 from lagjax.numerics.rank import null_space
 
 # A combination is written as a product of powers (m/M, k/m², but not m^0.37 M^-1.2) if its scaled exponents are
@@ -67,7 +68,7 @@ class Identifiability(eqx.Module):
 
     def __repr__(self):
         following = [] if self.next is None else [f"  {line}" for line in repr(self.next).splitlines()]
-        return "\n".join([self._own_lines(), *following])
+        return by_line("\n".join([self._own_lines(), *following]))
 
     def _own_lines(self):
         names, rank = listed(list(self.names)), self.rank

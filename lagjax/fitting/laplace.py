@@ -31,6 +31,7 @@ from lagjax.fitting.equations import WHOLE, Problem, over_windows, window_part
 from lagjax.fitting.search import UNSEEN
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.compiled import compiled
+from lagjax.mechanics.printable import by_line
 from lagjax.numerics.chained import Unknowns
 
 # Standard deviations that differ by more than this fraction from Gauss-Newton's get a caveat.
@@ -154,7 +155,7 @@ class Laplace:
         gauss_newton = np.sqrt(np.diag(self.gauss_newton))
         for name, mean, sd, other in list(zip(self.names, self.mean, self.sd, gauss_newton))[:40]:
             lines.append(f"  {name:<{width}}  {mean:.6g} ± {sd:.3g}, by Gauss and Newton ± {other:.3g}")
-        return "\n".join([*lines, *(f"  {words}" for words in self.caveats)])
+        return by_line("\n".join([*lines, *(f"  {words}" for words in self.caveats)]))
 
 
 def laplace(problem: Problem, u: Unknowns, variance: float) -> Laplace:

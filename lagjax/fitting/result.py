@@ -26,6 +26,7 @@ from lagjax.fitting.table import lines_of
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.compiled import compiled
 from lagjax.mechanics.diagnosis import listed
+from lagjax.mechanics.printable import by_line
 from lagjax.mechanics.signature import UnknownSystem
 from lagjax.motion.integrate import integrate
 from lagjax.motion.reported import Report
@@ -370,7 +371,7 @@ class Fit:
     def __repr__(self):
         if coordinates.is_traced(self.cost):
             return f"Fit of {listed(list(self.names))}, being traced"
-        return "\n".join(lines_of(self) + ([] if self.training is None else [repr(self.training)]))
+        return by_line("\n".join(lines_of(self) + ([] if self.training is None else [repr(self.training)])))
 
 
 @partial(compiled, in_numpy=True)

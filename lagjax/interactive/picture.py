@@ -45,6 +45,7 @@ class Picture:
         plot.import_matplotlib()
         self.kind, self.drawn_whole = None, 0
 
+    @plot.names_as_they_are()
     def of_curves(self, found: Drawn, words: str) -> Layers:
         """Numbers and curves, those of the first lane."""
         panels = found.panels[:MOST_PANELS]

@@ -19,6 +19,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PyTree
 
 from lagjax.jax_internals.tracing import is_eager
+from lagjax.mechanics.printable import printable
 from lagjax.mechanics.single_precision import warn_of_float32
 
 FLOAT64 = np.dtype("float64")
@@ -85,7 +86,7 @@ def _key_name(key, first):
     if isinstance(key, jtu.SequenceKey):
         return f"q[{key.idx}]" if first else f"[{key.idx}]"
     name = key.name if isinstance(key, jtu.GetAttrKey) else str(getattr(key, "key", key))
-    return name if first else f".{name}"
+    return printable(name) if first else f".{printable(name)}"
 
 
 def state(t, q, v, params) -> State:

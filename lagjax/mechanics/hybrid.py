@@ -18,6 +18,7 @@ from jaxtyping import Array, ArrayLike, Int
 from lagjax.mechanics.arguments import takes_of
 from lagjax.mechanics.memory import kinds, same
 from lagjax.mechanics.pickling import check_functions
+from lagjax.mechanics.printable import by_line
 from lagjax.mechanics.system import System
 
 MOST_SWITCHES = 16
@@ -228,7 +229,7 @@ class Hybrid(eqx.Module):
             + (f", or {switch.rest} where it comes to rest" if switch.rest is not None else "")
             for switch in self.switches
         ]
-        return "\n".join([f"Hybrid: {', '.join(counts)}, at most {self.most_switches} in a motion", *rows])
+        return by_line("\n".join([f"Hybrid: {', '.join(counts)}, at most {self.most_switches} in a motion", *rows]))
 
 
 def _count(n, word, plural):

@@ -82,7 +82,7 @@ def differences(there: dict[str, Any], here: dict[str, Any]) -> list[str]:
             what = (
                 "value" if a.size and not np.isclose(a[0], b[0], rtol=0.0, atol=tolerance, equal_nan=True) else "slope"
             )
-            i = 0 if what == "value" else int(np.nanargmax(np.abs(a - b)))
+            i = 0 if what == "value" else int(np.argmax(np.nan_to_num(np.abs(a - b), nan=np.inf)))
             found.append(f"{role}: its {what} was {a[i]:.9g}, and is {b[i]:.9g}")
     return found
 

@@ -8,6 +8,7 @@ import equinox as eqx
 from lagjax.mechanics.constraints import Holonomic, Nonholonomic
 from lagjax.mechanics.memory import kinds, same
 from lagjax.mechanics.pickling import check_functions
+from lagjax.mechanics.printable import by_line
 
 
 class System(eqx.Module):
@@ -118,7 +119,7 @@ class System(eqx.Module):
             parts.append(f"force: {_name(self.force)}")
         if self.dissipation is not None:
             parts.append(f"dissipation: {_name(self.dissipation)}")
-        return f"System({'; '.join(parts)})"
+        return by_line(f"System({'; '.join(parts)})")
 
 
 def _name(function):

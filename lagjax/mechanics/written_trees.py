@@ -1,17 +1,13 @@
 """Write pytrees as a structure that JSON can hold and arrays by name: no pickle, and no functions.
 
 Numbers, text, dicts, lists, tuples and named tuples are written as they are, dataclass objects (equinox modules among
-them) as the name of their class and the values of their fields. Functions are only named, and only those of lagjax and
-the packages that it depends on. Reading runs no code: a class of the user's must have been imported before; in place of
-a named tuple that has not, one with the same fields is made.
+them) as the name of their class and the values of their fields. Classes and functions are those of a closed table
+(`file_table`) and the user's classes that he passes again. Reading imports nothing and calls nothing that a file names.
 """
 
 import dataclasses
-import importlib
 import math
-import sys
 import types
-from collections import namedtuple
 from collections.abc import Callable
 from typing import Any
 
@@ -19,10 +15,33 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from lagjax.mechanics.file_table import Table, check_field, fields_of, listed, name_of_function
+from lagjax.mechanics.printable import is_plain, printable
 from lagjax.numerics.simplified_newton import tolerance_of_the_controller
 
-# Packages whose modules may be imported by name, and whose functions may be named.
-KNOWN = ("lagjax", "diffrax", "optimistix", "lineax", "equinox", "jax", "numpy")
+# Structures are nested no deeper than this.
+DEEPEST = 100
+# Arrays hold truth values, numbers and text.
+KINDS_OF_ARRAY = "biufcSU"
+# Types of numbers for which NumPy's files have no name, and the kinds of JAX's random keys.
+_SMALL = "bfloat16 float8_e4m3fn float8_e5m2 float8_e4m3b11fnuz float8_e4m3fnuz float8_e5m2fnuz int4 uint4"
+SMALL_NUMBERS = {name: jnp.dtype(getattr(jnp, name)) for name in _SMALL.split() if hasattr(jnp, name)}
+RANDOM_KEYS = ("threefry2x32", "rbg", "unsafe_rbg")
+# What the nodes of a written tree consist of, by their first entry.
+NODES = {
+    "float": {"float"},
+    "complex": {"complex"},
+    "tolerance": {"tolerance"},
+    "given": {"given"},
+    "array": {"array", "of", "dtype"},
+    "key": {"key", "impl"},
+    "dict": {"dict"},
+    "list": {"list"},
+    "tuple": {"tuple"},
+    "namedtuple": {"namedtuple", "fields"},
+    "object": {"object", "fields"},
+    "function": {"function"},
+}
 
 
 class NotWritable(TypeError):
@@ -52,23 +71,30 @@ class NotGiven:
 
 
 class Writer:
-    """Writes trees down; `arrays` are the arrays of everything written, by name.
+    """Writes trees down; `arrays` are the arrays of everything written, by name, `classes` those of the objects.
 
     `given(value)`: the role of a value that is not written but given again by the user, or None.
     """
 
     def __init__(self, given: Callable[[Any], str | None] = lambda value: None):
         self.arrays: dict[str, np.ndarray] = {}
+        self.classes: list[type] = []
         self._given = given
+        self._taken: set[str] = set()
 
-    def down(self, value, path: str):
+    def down(self, value, path: str, depth: int = 0):
         """A value in a form for JSON; `path` is how the user would write it."""
+        if depth > DEEPEST:
+            raise NotWritable(f"{path[:80]}... is nested deeper than {DEEPEST} levels.\nFix: a flatter structure.")
+        inside = lambda x, name: self.down(x, name, depth + 1)
+        if isinstance(value, str) and not is_plain(value):
+            raise NotWritable(f"{printable(path)} is text with control characters.\nFix: leave them out.")
         if value is None or isinstance(value, (bool, str)) or type(value) is int:
             return value
         if type(value) is float:
             return {"float": value.hex() if math.isfinite(value) else repr(value)}
         if type(value) is complex:
-            return {"complex": [self.down(value.real, path), self.down(value.imag, path)]}
+            return {"complex": [inside(value.real, path), inside(value.imag, path)]}
         if value is tolerance_of_the_controller():
             return {"tolerance": "of the controller"}
         if (role := self._given(value)) is not None:
@@ -76,22 +102,37 @@ class Writer:
         if isinstance(value, (jax.Array, np.ndarray, np.generic)):
             return self._array(value, path)
         if type(value) is dict:
-            return {"dict": [[self._key(k, path), self.down(x, _under(path, k))] for k, x in value.items()]}
+            return {"dict": [[self._key(k, path), inside(x, _under(path, k))] for k, x in value.items()]}
         if type(value) in (list, tuple):
-            return {type(value).__name__: [self.down(x, f"{path}[{i}]") for i, x in enumerate(value)]}
-        if isinstance(value, tuple) and (names := getattr(value, "_fields", None)) is not None:
-            parts = {name: self.down(getattr(value, name), _under(path, name)) for name in names}
-            return {"namedtuple": _name_of(type(value)), "fields": parts}
-        if isinstance(value, types.FunctionType) or callable(value) and not dataclasses.is_dataclass(value):
-            return self._function(value, path)
-        if dataclasses.is_dataclass(value):
-            names = [f.name for f in dataclasses.fields(value) if hasattr(value, f.name)]
-            parts = {name: self.down(getattr(value, name), _under(path, name)) for name in names}
-            return {"object": _name_of(type(value)), "fields": parts}
+            return {type(value).__name__: [inside(x, f"{path}[{i}]") for i, x in enumerate(value)]}
+        if (function := name_of_function(value)) is not None:
+            return {"function": function}
+        if not isinstance(value, type) and (fields := fields_of(type(value))) is not None:
+            return self._object(value, fields, path, inside)
+        if isinstance(value, types.FunctionType) or callable(value):
+            raise NotWritable(
+                f"{path} is a function ({getattr(value, '__name__', type(value).__name__)}), and functions are not "
+                "data.\nUsual cause: a function in params.\n"
+                "Fix: write it into the Lagrangian, and leave its numbers in params."
+            )
         raise NotWritable(
             f"{path} is a {type(value).__name__}, which cannot be written down.\n"
             "Fix: use numbers, arrays, text, dicts, lists, tuples, named tuples and dataclasses of these."
         )
+
+    def _object(self, value, fields, path, inside):
+        cls = type(value)
+        of_table = listed(cls.__module__, cls.__qualname__)
+        if of_table is not None:
+            # A field that another version of a package has added is left out, if it is as by default.
+            added = set(fields) - set(of_table[1])
+            if of_table[0] is not cls or any(getattr(value, name) is not getattr(cls, name, 0) for name in added):
+                raise NotWritable(f"{path} is a {cls.__module__}.{cls.__qualname__}, which files do not hold.")
+            fields = of_table[1]
+        parts = {name: inside(getattr(value, name), _under(path, name)) for name in fields if hasattr(value, name)}
+        self.classes.append(cls)
+        kind = "namedtuple" if issubclass(cls, tuple) else "object"
+        return {kind: {"module": cls.__module__, "name": cls.__qualname__}, "fields": parts}
 
     def _key(self, key, path):
         if not isinstance(key, (str, int, float, bool)) and key is not None:
@@ -104,14 +145,14 @@ class Writer:
             self.arrays[name] = np.asarray(jax.random.key_data(value))
             return {"key": name, "impl": str(jax.random.key_impl(value))}
         x = np.asarray(value)
-        if x.dtype == object:
-            raise NotWritable(f"{path} is an array of Python objects.\nFix: an array of numbers.")
         of = "jax" if isinstance(value, jax.Array) else "numpy" if isinstance(value, np.ndarray) else "number"
         node = {"array": name, "of": of}
-        if x.dtype.kind == "V":
-            # NumPy's files have no name for bfloat16 and its like.
+        if x.dtype.name in SMALL_NUMBERS:
             node["dtype"] = x.dtype.name
             x = x.view(f"u{x.dtype.itemsize}")
+        if x.dtype.kind not in KINDS_OF_ARRAY:
+            what = "Python objects" if x.dtype == object else str(x.dtype)
+            raise NotWritable(f"{path} is an array of {what}.\nFix: an array of numbers.")
         self.arrays[name] = x
         return node
 
@@ -119,67 +160,78 @@ class Writer:
         wanted = "".join(c if c.isalnum() or c in "._-[]" else "_" for c in path) or "value"
         name, number = wanted, 1
         # Names must differ by more than case: somebody may unpack the file on a file system that ignores it.
-        while name.lower() in {other.lower() for other in self.arrays}:
+        while name.lower() in self._taken:
             name, number = f"{wanted}.{number}", number + 1
+        self._taken.add(name.lower())
         return name
-
-    def _function(self, value, path):
-        module = getattr(value, "__module__", None) or ""
-        if _is_known(module):
-            # By its own name, or the name under which its module keeps it.
-            kept_as = [name for name, x in vars(sys.modules.get(module, sys)).items() if x is value]
-            for name in (getattr(value, "__qualname__", ""), *kept_as):
-                if name and _find(module, name) is value:
-                    return {"function": {"module": module, "name": name}}
-        raise NotWritable(
-            f"{path} is a function ({getattr(value, '__name__', type(value).__name__)}), and functions are not data.\n"
-            "Usual cause: a function in params.\n"
-            "Fix: write it into the Lagrangian, and leave its numbers in params."
-        )
 
 
 class Reader:
-    """Reads trees; `given(role)` returns the user's value for one that was not written."""
+    """Reads trees; each array is read once, by `array(name)`.
 
-    def __init__(self, arrays: dict[str, np.ndarray], given: Callable[[str], Any] | None = None):
-        self._arrays, self._given = arrays, given
+    `given(role)` returns the user's value for one that was not written; `table`: what the tree may name.
+    """
 
-    def up(self, node) -> Any:
-        """The value that a node stands for."""
-        if not isinstance(node, dict):
+    def __init__(
+        self,
+        array: Callable[[str], np.ndarray],
+        given: Callable[[str], Any] | None = None,
+        table: Table | None = None,
+    ):
+        self.array, self.given, self._table = array, given, table or Table()
+
+    def up(self, node, depth: int = 0) -> Any:
+        """The value that a node stands for.
+
+        **Raises:** `ValueError`, and what Python raises for a node that is not as `Writer` makes it.
+        """
+        if isinstance(node, str) and not is_plain(node):
+            raise ValueError(f"it holds text with control characters, {printable(node)[:80]!r}.")
+        if node is None or isinstance(node, (bool, int, str)):
             return node
         kind = next(iter(node))
+        if not node.keys() <= NODES[kind]:
+            raise ValueError(f"a node of kind '{kind}' has entries that are not known.")
+        if depth > DEEPEST:
+            raise ValueError(f"it is nested deeper than {DEEPEST} levels.")
+        inside = lambda x: self.up(x, depth + 1)
         if kind == "float":
             text = node["float"]
             return float.fromhex(text) if "x" in text else float(text)
         if kind == "complex":
-            return complex(*map(self.up, node["complex"]))
+            real, imaginary = map(inside, node["complex"])
+            return complex(real, imaginary)
         if kind == "tolerance":
             return tolerance_of_the_controller()
-        if kind == "given" and self._given is not None:
-            return self._given(node["given"])
+        if kind == "given" and self.given is not None:
+            return self.given(node["given"])
         if kind == "array":
             return self._array(node)
-        if kind == "key":
-            return jax.random.wrap_key_data(jnp.asarray(self._arrays[node["key"]]), impl=node["impl"])
+        if kind == "key" and node["impl"] in RANDOM_KEYS:
+            return jax.random.wrap_key_data(jnp.asarray(self.array(node["key"])), impl=node["impl"])
         if kind == "dict":
-            return {self.up(key): self.up(x) for key, x in node["dict"]}
-        if kind in ("list", "tuple"):
-            return (list if kind == "list" else tuple)(self.up(x) for x in node[kind])
-        if kind == "namedtuple":
-            return self._named_tuple(node)
+            found = {inside(key): inside(x) for key, x in node["dict"]}
+            if len(found) < len(node["dict"]):
+                raise ValueError("a dictionary has one key twice.")
+            return found
+        if kind in ("list", "tuple") and isinstance(node[kind], list):
+            return (list if kind == "list" else tuple)(map(inside, node[kind]))
         if kind == "function":
-            return self._function(node["function"])
-        if kind == "object":
-            return self._object(node)
-        raise ValueError(f"a node of kind '{kind}' is not known.")
+            return self._table.function_of(**node["function"])
+        if kind in ("namedtuple", "object"):
+            return self._object(kind, node, inside)
+        raise ValueError(f"a node of kind '{kind}' cannot be read here.")
 
     def _array(self, node):
-        x = self._arrays[node["array"]]
+        x = self.array(node["array"])
         if "dtype" in node:
-            x = x.view(jnp.dtype(node["dtype"]))
+            x = x.view(SMALL_NUMBERS[node["dtype"]])
+        if node["of"] == "number":
+            return x[()] if x.ndim == 0 else _raise_shape(node["array"])
+        if node["of"] == "numpy":
+            return x
         if node["of"] != "jax":
-            return x if node["of"] == "numpy" else x[()]
+            raise ValueError(f"an array is not of {node['of']!r:.20}.")
         if jax.dtypes.canonicalize_dtype(x.dtype) != x.dtype:
             raise ValueError(
                 f"it holds {x.dtype} arrays, and JAX works in 32 bits here, which would lose half of their digits.\n"
@@ -187,55 +239,39 @@ class Reader:
             )
         return jnp.asarray(x)
 
-    def _named_tuple(self, node):
-        cls, fields = _find(**node["namedtuple"]), node["fields"]
-        if not (isinstance(cls, type) and issubclass(cls, tuple) and getattr(cls, "_fields", None) == tuple(fields)):
-            cls: Any = namedtuple(node["namedtuple"]["name"].rsplit(".", 1)[-1], list(fields))
-        return cls(**{name: self.up(x) for name, x in fields.items()})
-
-    def _function(self, named):
-        found = _find(**named) if _is_known(named["module"]) else None
-        if not callable(found):
-            raise ValueError(f"there is no function {named['module']}.{named['name']} any more.")
-        return found
-
-    def _object(self, node):
-        module, name = node["object"]["module"], node["object"]["name"]
-        cls = _find(module, name)
-        if not (isinstance(cls, type) and dataclasses.is_dataclass(cls)):
-            fix = f"import {module} before this" if not _is_known(module) else "the version that wrote it"
-            raise ValueError(f"it holds an object of class {module}.{name}, which is not known here.\nFix: {fix}.")
+    def _object(self, kind, node, inside):
+        cls, allowed, of_table = self._table.class_of(**node[kind])
+        fields, is_tuple = node["fields"], issubclass(cls, tuple)
+        if is_tuple != (kind == "namedtuple"):
+            raise ValueError(f"class {cls.__name__} is{'' if is_tuple else ' not'} a named tuple.")
+        if unknown := sorted(set(fields) - set(allowed)):
+            raise ValueError(f"class {cls.__name__} has no field {', '.join(unknown)[:200]}.")
+        values = _defaults(cls) | {name: inside(x) for name, x in fields.items()}
+        if missing := [name for name in fields_of(cls) or () if name not in values]:
+            raise ValueError(f"class {cls.__name__} needs the field {', '.join(missing)}.")
+        if of_table:
+            for name in fields:
+                check_field(cls, name, values[name])
+        # Neither `__new__` nor `__init__` of a class is called: these may change what was written.
+        if is_tuple:
+            return tuple.__new__(cls, [values[name] for name in cls._fields])
         found = object.__new__(cls)
-        if unknown := set(node["fields"]) - {field.name for field in dataclasses.fields(cls)}:
-            raise ValueError(f"class {module}.{name} has no field {', '.join(sorted(unknown))} any more.")
-        for field, x in node["fields"].items():
-            object.__setattr__(found, field, self.up(x))
+        for name, x in values.items():
+            object.__setattr__(found, name, x)
         return found
+
+
+def _defaults(cls) -> dict[str, Any]:
+    if issubclass(cls, tuple):
+        return dict(cls._field_defaults)
+    fields, missing = dataclasses.fields(cls), dataclasses.MISSING
+    found = {x.name: x.default for x in fields if x.default is not missing}
+    return found | {x.name: x.default_factory() for x in fields if x.default_factory is not missing}
+
+
+def _raise_shape(name):
+    raise ValueError(f"{name[:80]} has to be one number, and is an array.")
 
 
 def _under(path, key):
     return f"{path}.{key}" if path else str(key)
-
-
-def _is_known(module):
-    return module.split(".")[0] in KNOWN
-
-
-def _name_of(cls):
-    # By its public name, which stays the same when its file moves.
-    public = getattr(sys.modules.get("lagjax"), cls.__name__, None) is cls
-    module, name = ("lagjax", cls.__name__) if public else (cls.__module__, cls.__qualname__)
-    return {"module": module, "name": name}
-
-
-def _find(module: str, name: str):
-    """Look up a name in a module; a module of the user's must have been imported already."""
-    if _is_known(module) and module not in sys.modules:
-        try:
-            importlib.import_module(module)
-        except ImportError:
-            return None
-    found = sys.modules.get(module)
-    for part in name.split("."):
-        found = getattr(found, part, None)
-    return found

@@ -13,6 +13,7 @@ from lagjax.mechanics.diagnosis import dependencies, describe, equation_names, e
 from lagjax.mechanics.equations import equations_of
 from lagjax.mechanics.first_call import traced_system
 from lagjax.mechanics.hybrid import Hybrid
+from lagjax.mechanics.printable import by_line
 from lagjax.mechanics.refusals import check_system
 from lagjax.mechanics.saddle_point import examined
 from lagjax.mechanics.structure import Structure, angles, is_free_of_velocities, structure
@@ -51,7 +52,7 @@ class Explanation:
 
     def __repr__(self):
         width = max(len(label) for label, _ in self.rows)
-        return "\n".join(["System", *(f"  {label:<{width}}  {text}" for label, text in self.rows)])
+        return "\n".join(["System", *(by_line(f"  {label:<{width}}  {text}") for label, text in self.rows)])
 
 
 @overload

@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 from lagjax import plot
 from lagjax.mechanics.compiled import compiled
 from lagjax.mechanics.hybrid import Hybrid
+from lagjax.mechanics.printable import by_line
 from lagjax.mechanics.signature import UnknownSystem, known_system
 from lagjax.mechanics.system import System
 from lagjax.motion.consistency import worst_residual
@@ -66,7 +67,7 @@ class Switches(eqx.Module):
         if np.ndim(self.count):
             low, high = int(np.min(self.count)), int(np.max(self.count))
             return f"Switches of {np.size(self.count)} lanes, {low} to {high} each"
-        return "\n".join(["Switches: " + self.in_words(), *self._rows()])
+        return by_line("\n".join(["Switches: " + self.in_words(), *self._rows()]))
 
     def in_words(self) -> str:
         """Return the number of switches, and whether some may be missing."""

@@ -6,6 +6,7 @@ from lagjax import plot
 from lagjax.mechanics.coordinates import State
 from lagjax.mechanics.hybrid import Hybrid
 from lagjax.mechanics.multipliers import accelerations
+from lagjax.mechanics.printable import by_line
 
 
 @dataclass(frozen=True, repr=False)
@@ -53,7 +54,7 @@ class HybridExplanation:
                 lines.append(f"  {'':<{width}}    -> {' or '.join(targets)}, when {guard} reaches zero{now}")
             if found.problem:
                 lines.append(f"  {'':<{width}}    problem: {found.problem.splitlines()[0]}")
-        return "\n".join(lines)
+        return by_line("\n".join(lines))
 
 
 def explained(hybrid: Hybrid, phases: dict, state: State) -> HybridExplanation:

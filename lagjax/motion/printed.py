@@ -3,6 +3,7 @@
 import jax
 import numpy as np
 
+from lagjax.mechanics.printable import printable
 from lagjax.motion import account
 from lagjax.motion.results import ENDED_WELL, is_among, item, message
 
@@ -70,4 +71,4 @@ def _shape_rows(traj):
 
 def _aligned(rows):
     width = max(len(label) for label, _ in rows)
-    return [f"  {label:<{width}}  {value}" for label, value in rows]
+    return [printable(f"  {label:<{width}}  {value}") for label, value in rows]

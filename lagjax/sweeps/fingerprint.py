@@ -2,16 +2,18 @@
 
 from collections.abc import Iterable
 from importlib.metadata import version
+from pathlib import PureWindowsPath
 from typing import Any
 
 import jax
 import numpy as np
 
+from lagjax.mechanics.printable import printable
 from lagjax.sweeps.axes import Axes
 from lagjax.sweeps.digests import digest
 from lagjax.sweeps.lanes import Program
 
-# Earlier formats are read, and continued without conversion (`earlier`).
+# Stores of other formats are not read.
 FORMAT = 3
 ANOTHER_FUNCTION = "run is another function"
 # Names reserved by zarr or by a store.
@@ -69,9 +71,10 @@ def named_leaves(tree) -> list[tuple[str, Any]]:
 def check_file_names(kind: str, names: Iterable[str]) -> None:
     """Raise `ValueError` for names that cannot be folder names in a store."""
     for name in names:
-        if name in RESERVED or name.startswith("__") or "/" in name or "\\" in name:
+        reserved = name in RESERVED or name.startswith("__") or "/" in name or "\\" in name
+        if reserved or not name.isprintable() or PureWindowsPath(name).anchor:
             raise ValueError(
-                f"{kind} '{name}' cannot be kept in a store: it is reserved or not a valid folder name.\n"
+                f"{kind} '{printable(name)}' cannot be kept in a store: it is reserved or not a valid folder name.\n"
                 "Fix: another key, of letters, digits and underscores."
             )
 

@@ -2,7 +2,8 @@
 
 Zarr describes each array in a `zarr.json` of its own. The description of a store contains copies of all of them and the
 fingerprint of its sweep. It is kept in the attributes of the group `lagjax` and of its array of marks. A store is made
-under a temporary name and then renamed, so that several processes may open it at the same time.
+under a temporary name and then renamed, so that several processes may open it at the same time. What a description says
+is checked before it is used (`described`), and only a sweep that continues restores metadata: opening never writes.
 """
 
 import json
@@ -15,15 +16,18 @@ from typing import Any
 
 import numpy as np
 
+from lagjax.mechanics.files import MALFORMED, parsed
+from lagjax.mechanics.printable import by_line, printable
 from lagjax.sweeps.axes import Axes
-from lagjax.sweeps.earlier import brought_up_to_date
+from lagjax.sweeps.described import MARKS, checked
 from lagjax.sweeps.fingerprint import FORMAT, digest, named_leaves
 from lagjax.sweeps.grids import Blocks
 from lagjax.sweeps.labels import STORE_GROUP, labels_of, status_attributes
 from lagjax.sweeps.lanes import NOT_RUN, STATUS_TYPES, Program, Status
 
 META = "zarr.json"
-MARKS = f"{STORE_GROUP}/marks"
+# Metadata have at most this many bytes.
+MOST_METADATA = 16_000_000
 GROUP = {"zarr_format": 3, "node_type": "group"}
 # The dimensions of an array without a label.
 HIDDEN_DIMENSION = "lagjax_{}"
@@ -41,45 +45,65 @@ def import_zarr():
 
 
 def about(path: Path) -> dict[str, Any]:
-    """The description of a store in today's terms, from the first of its two copies that is intact.
+    """The description of a store, from the first of its two copies that is intact.
 
-    **Raises:** `ValueError` if there is no such store or no intact copy.
+    **Raises:** `ValueError` if there is no such store, no intact copy, or one that is not as lagjax writes it.
     """
     if not path.exists():
         raise ValueError(f"there is no {path}.\nFix: the path that was passed to lj.sweep as store=.")
-    is_current = (path / STORE_GROUP / META).exists() or (path / MARKS).exists()
-    copies = [path / STORE_GROUP, path / MARKS] if is_current else [path, path / "done"]
-    for folder in copies:
-        description = _read_description(folder / META)
-        if description is not None:
-            break
-    else:
-        if not is_current and not (path / "status").exists():
-            raise ValueError(
-                f"{path} exists, but is not the store of a sweep.\nFix: another path, or remove it if it is not needed."
-            )
+    copies = [path / STORE_GROUP, path / MARKS]
+    if not any((folder / META).exists() for folder in copies) and not copies[1].exists():
+        if (path / "done").exists():
+            _raise_earlier(path, "an earlier format")
+        raise ValueError(
+            f"{path} exists, but is not the store of a sweep.\nFix: another path, or remove it if it is not needed."
+        )
+    description = next((found for found in map(_read_description, copies) if found is not None), None)
+    if description is None:
         one, other = (folder / META for folder in copies)
         raise ValueError(
             f"{one} and {other} are both damaged: the sweep of this store is unknown.\n"
             f"Usual cause: a copy that was cut short, or a disk that failed.\n"
             f"Fix: copy one of the two files again from the original; or remove {path} and compute it again."
         )
-    if description["fingerprint"]["format"] > FORMAT:
-        raise ValueError(
-            f"{path} was written by lagjax {description['fingerprint']['versions']['lagjax']}, which is newer.\n"
-            "Fix: pip install -U lagjax."
-        )
-    return brought_up_to_date(description)
-
-
-def _read_description(file):
     try:
-        description = json.loads(file.read_text())["attributes"]["lagjax"]
-        # Format 1 has one copy and no digest.
-        intact = description["fingerprint"]["format"] == 1 or description["digest"] == digest_of(description)
-    except (OSError, ValueError, KeyError, TypeError):
+        number = description["fingerprint"]["format"]
+        if type(number) is int and number > FORMAT:
+            raise ValueError(
+                f"it was written by lagjax {description['fingerprint']['versions']['lagjax']!r:.20}, which is newer.\n"
+                "Fix: pip install -U lagjax."
+            )
+        if number != FORMAT:
+            raise ValueError(f"its format is {number!r:.20}, not {FORMAT}.")
+        return description | {"checked": checked(description)}
+    except (ValueError, *MALFORMED) as error:
+        why = str(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {printable(error)[:200]}"
+        raise ValueError(by_line(f"{path} cannot be read: {why}")) from error
+
+
+def _raise_earlier(path, which):
+    raise ValueError(
+        f"{path} is a store in {which}, of lagjax 0.1, which this version does not read.\n"
+        'Fix: compute it again; or read it with that version, pip install "lagjax<0.3", and save what you need of it.'
+    )
+
+
+def _read_description(folder):
+    try:
+        description = read_metadata(folder / META)["attributes"]["lagjax"]
+        return description if description["digest"] == digest_of(description) else None
+    except (OSError, ValueError, *MALFORMED):
         return None
-    return description if intact else None
+
+
+def read_metadata(file: Path) -> Any:
+    """What a file of metadata says.
+
+    **Raises:** `OSError` or `ValueError` if it cannot be read.
+    """
+    if file.stat().st_size > MOST_METADATA:
+        raise ValueError(f"{file} is longer than {MOST_METADATA:,} bytes.")
+    return parsed(file.read_bytes(), MOST_METADATA)
 
 
 def digest_of(description: dict) -> str:
@@ -87,32 +111,34 @@ def digest_of(description: dict) -> str:
     return digest(json.dumps({key: x for key, x in description.items() if key != "digest"}, sort_keys=True).encode())
 
 
-def restore(path: Path) -> list[str]:
+def damaged(path: Path, description: dict[str, Any]) -> dict[str, str]:
+    """The groups and arrays of a store whose metadata are damaged or missing, each with a line about it."""
+    found = {}
+    for name, expected in _expected_metadata(description).items():
+        file = path / name / META
+        if not _is_as_expected(file, expected):
+            found[name] = f"{file} was {'damaged' if file.exists() else 'missing'}"
+    return found
+
+
+def restore(path: Path, description: dict[str, Any]) -> list[str]:
     """Restore damaged metadata; returns a line about each file that was damaged or missing.
 
     **Raises:** `ValueError` if they cannot be restored.
     """
-    description, restored = about(path), []
-    if "arrays" not in description:
-        _check_readable(path, description)
-        return []
-    for name, expected in _expected_metadata(description).items():
-        file = path / name / META
-        if not _is_as_expected(file, expected):
-            restored.append(f"{file} was {'damaged' if file.exists() else 'missing'}")
-            try:
-                _write(file, expected)
-            except OSError as error:
-                raise ValueError(f"{restored[-1]}, and cannot be restored: {error.strerror}.") from error
-    return restored
+    found, expected = damaged(path, description), _expected_metadata(description)
+    for name, line in found.items():
+        try:
+            _write(path / name / META, expected[name])
+        except OSError as error:
+            raise ValueError(f"{line}, and cannot be restored: {error.strerror}.") from error
+    return list(found.values())
 
 
 def _expected_metadata(description):
     """The expected metadata of every group and array of a store, by name."""
-    arrays, own_attribute = description["arrays"], {"attributes": {"lagjax": description["as_written"]}}
-    if description["fingerprint"]["format"] < FORMAT:
-        groups = {name: GROUP for name in ("", "axes", "values", "status")}
-        return groups | {"": GROUP | own_attribute} | arrays | {"done": arrays["done"] | own_attribute}
+    written = {key: x for key, x in description.items() if key != "checked"}
+    arrays, own_attribute = description["arrays"], {"attributes": {"lagjax": written}}
     inside = {name for array in arrays for name in _folders(array)}
     groups = {name: GROUP for name in sorted(inside)} | {STORE_GROUP: GROUP | own_attribute}
     # xarray reads these instead of the metadata of each array.
@@ -130,10 +156,10 @@ def _folders(name):
 def _is_as_expected(file, expected):
     """Whether metadata are unchanged; users may add attributes and consolidate more arrays."""
     try:
-        found = json.loads(file.read_text())
+        found = read_metadata(file)
         mutable = {"attributes", "consolidated_metadata"}
         same = all(found.get(key) == x for key, x in expected.items() if key not in mutable)
-        if not same or "lagjax" in expected.get("attributes", {}) and _read_description(file) is None:
+        if not same or "lagjax" in expected.get("attributes", {}) and _read_description(file.parent) is None:
             return False
         if "consolidated_metadata" in expected:
             metadata = found["consolidated_metadata"]["metadata"]
@@ -144,7 +170,7 @@ def _is_as_expected(file, expected):
                 if key != "attributes"
             )
         return True
-    except (OSError, ValueError, AttributeError, KeyError, TypeError):
+    except (OSError, ValueError, *MALFORMED):
         return False
 
 
@@ -153,21 +179,6 @@ def _write(file, metadata):
     partial = file.with_suffix(f".{uuid.uuid4().hex[:8]}.partial")
     partial.write_text(json.dumps({"attributes": {}} | metadata, indent=2))
     partial.replace(file)
-
-
-def _check_readable(path, description):
-    """Check the metadata of a store of format 1, which has no copies of them."""
-    places = description["places"]
-    names = [*places["axes"].values(), *places["values"].values(), *places["status"].values(), places["marks"]]
-    for name in names:
-        file = path / name / META
-        if not _is_as_expected(file, {"zarr_format": 3, "node_type": "array"}):
-            how = "damaged" if file.exists() else "missing"
-            raise ValueError(
-                f"{file} is {how}, and this store, of format 1, has no copy of it.\n"
-                "Fix: copy it from the original, or from a store of the same sweep with few points, then enter "
-                "this store's 'shape' and 'chunk_shape'."
-            )
 
 
 def create(
@@ -207,7 +218,9 @@ def create(
             description["attributes"]["coordinates"] = " ".join(coordinates)
         description = json.loads(json.dumps(description))
         description["digest"] = digest_of(description)
-        for name, metadata in _expected_metadata(description | {"as_written": description}).items():
+        checked(description)
+        _check_length(description)
+        for name, metadata in _expected_metadata(description).items():
             _write(temporary / name / META, metadata)
         os.rename(temporary, path)
     except BaseException as error:
@@ -219,6 +232,15 @@ def create(
             if folder.exists() and not any(folder.iterdir()):
                 folder.rmdir()
         raise
+
+
+def _check_length(description):
+    # Metadata contain the description once, and copies of all arrays with line ends and spaces.
+    if 4 * len(json.dumps(description)) > MOST_METADATA:
+        raise ValueError(
+            f"run returns {len(description['arrays']):,} arrays, whose description is longer than a store's may be.\n"
+            "Fix: return fewer and larger arrays."
+        )
 
 
 def _create_arrays(zarr, group, axes, program, blocks, times):

@@ -1,5 +1,6 @@
 """A sweep as a page with a slider for each axis: values, curves and motions of every point, and how each ended."""
 
+import html
 from collections.abc import Callable
 from typing import Any
 
@@ -60,15 +61,16 @@ def page_of(
         "colours": list(COLOURS),
         "film": film_spec,
     }
-    note = f'<p class="note">Not drawn: {"; ".join(found.left_out)}.</p>' if found.left_out else ""
+    left_out = html.escape("; ".join(found.left_out))
+    note = f'<p class="note">Not drawn: {left_out}.</p>' if left_out else ""
     notice = "The sliders need scripts: allow them, or trust this notebook."
     body = (
         f'<div data-controls=""></div><p data-status="" role="status">{notice}</p>\n{body}'
         f'<div data-views=""></div>{note}'
     )
-    html = fragment(body, spec, ("decode.js", "film.js", "chart.js", "sliders.js"))
+    page = fragment(body, spec, ("decode.js", "film.js", "chart.js", "sliders.js"))
     dims = " x ".join(f"{name} ({n})" for name, n in axes.dims.items())
-    return Page(f"Sweep over {', '.join(axes.names)}", html, f"Page of {axes.size:,} points, {dims}")
+    return Page(f"Sweep over {', '.join(axes.names)}", page, f"Page of {axes.size:,} points, {dims}")
 
 
 def _axes(axes):

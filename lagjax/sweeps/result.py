@@ -1,7 +1,7 @@
 """The result of a sweep: values and statuses by axis; printing, plotting, exporting, running failed points again."""
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from copy import copy
 from pathlib import Path
 from typing import Any
@@ -12,6 +12,8 @@ from jaxtyping import PyTree
 
 from lagjax import plot
 from lagjax.mechanics import coordinates
+from lagjax.mechanics.file_table import Table
+from lagjax.mechanics.printable import printable
 from lagjax.motion.trajectory import Trajectory
 from lagjax.pages import Page
 from lagjax.sweeps import structures, tables
@@ -20,10 +22,11 @@ from lagjax.sweeps.fingerprint import in_words as versions_in_words
 from lagjax.sweeps.fingerprint import named_leaves, versions
 from lagjax.sweeps.labels import words_of
 from lagjax.sweeps.lanes import LOST, TRUSTED, Status
-from lagjax.sweeps.metadata import restore
+from lagjax.sweeps.metadata import damaged
 from lagjax.sweeps.page import MOST_MEGABYTES, page_of
 from lagjax.sweeps.store import Store, nothing, warn_of_damage
 
+RESTORED = "Fix: lj.sweep(run, axes, store=path), which restores it."
 COMPUTED_AGAIN = (
     "These points are marked as lost in status, and are NaN or 0 in values.\n"
     "Fix: lj.sweep(run, axes, store=path), which computes them again."
@@ -262,7 +265,7 @@ class Sweep:
             compiled = f"compiled in {self.compiling:.3g} s" if self.compiling else "nothing had to be compiled"
             rows.append(("", f"{compiled}; computed in {self.seconds:.3g} s, {self.ran / self.seconds:,.0f} points/s"))
         width = max(len(label) for label, _ in rows)
-        return "\n".join(["Sweep", *(f"  {label:<{width}}  {value}" for label, value in rows)])
+        return "\n".join(["Sweep", *(printable(f"  {label:<{width}}  {value}") for label, value in rows)])
 
     def _shapes(self):
         shown = []
@@ -281,13 +284,18 @@ def _without_motion(part):
     return None if isinstance(part, Trajectory) else part
 
 
-def open_sweep(path: str | os.PathLike, *, run: Callable | None = None, system: Any = None) -> Sweep:
+def open_sweep(
+    path: str | os.PathLike, *, run: Callable | None = None, system: Any = None, classes: Iterable[type] = ()
+) -> Sweep:
     """Open the sweep in a store: its values have the structure of what `run` returned, trajectories included.
 
-    Any version of lagjax, jax and diffrax may have written it. Statuses are read now, values on first access. A file
-    that is missing, cut off or of another block is detected now, without reading the values; a file whose contents have
-    changed is detected when the values are read. Either causes a warning that names the file; its points are then "lost
-    from the store" in `status` and not `ok`. `lj.sweep(run, axes, store=path)` computes them again.
+    A store is data: opening it imports nothing, runs nothing of it and writes nothing, whoever has written it; nothing
+    outside of it is read. Other versions of lagjax, jax and diffrax may have written it.
+
+    Statuses are read now, values on first access. A file that is missing, cut off or of another block is detected now,
+    without reading the values; a file whose contents have changed is detected when the values are read. Either causes a
+    warning that names the file; its points are then "lost from the store" in `status` and not `ok`.
+    `lj.sweep(run, axes, store=path)` computes them again.
 
     >>> import tempfile
     >>> import lagjax as lj
@@ -299,25 +307,28 @@ def open_sweep(path: str | os.PathLike, *, run: Callable | None = None, system: 
     **Arguments:** `path`: the folder that was passed to `lj.sweep` as `store`. Functions are not stored, so a
     trajectory does not know its system. It can be plotted and animated all the same. For methods that need the system
     (`print`, `drift()`), pass `system`, the one that was integrated, or `run`, the function that was swept; `run` is
-    only traced, not run.
+    only traced, not run. `classes`: your own classes among the values, named tuples and dataclasses: `classes=[Pair]`.
 
     **Returns:** a `Sweep`.
 
-    **Raises:** `ValueError` if there is no store, its description is damaged, or `run` returns another structure.
-    `values` is a dictionary by name for a store in an earlier format, and for values that contain functions, or classes
-    that are not found (which a warning names).
+    **Raises:** `ValueError` if there is no store, it is not as lagjax writes it, its description is damaged or of an
+    earlier format, or `run` returns another structure. `values` is a dictionary by name for values that contain
+    functions, or objects of classes that were not passed (which a warning names).
     """
-    path = Path(path)
-    if wrong := restore(path):
-        warn_of_damage(path, wrong, "It has been restored; nothing needs to be done.", stacklevel=2)
-    store = Store(path, "r")
+    path, table = Path(path), Table(classes)
+    store = Store(path)
+    if wrong := damaged(path, store.about):
+        warn_of_damage(path, wrong.values(), "It is read all the same. " + RESTORED, stacklevel=2)
     axes, (status, missing, lost) = store.axes(), store.status()
     if lost:
         warn_of_damage(path, lost.values(), COMPUTED_AGAIN, stacklevel=2)
     how = f"from {path}" + (f", of which {len(missing)} blocks are missing" if missing else "")
     if (by := store.about["fingerprint"]["versions"]) != versions():
         how += f", written by {versions_in_words(by)}"
-    like = structures.as_run_returns(run, axes, store) if run is not None else structures.as_stored(store, system)
+    if run is None:
+        like = structures.as_stored(store, system, table)
+    else:
+        like = structures.as_run_returns(run, axes, store)
     return Sweep(axes, Stored(store, like), status, how, 0, 0.0, 0.0, opened)
 
 
@@ -351,7 +362,7 @@ class Stored:
     def store(self) -> Store:
         """The store, opened on first access."""
         if isinstance(self._store, Path):
-            self._store = Store(self._store, "r")
+            self._store = Store(self._store)
         return self._store
 
     @property

@@ -13,8 +13,8 @@ belong there. Files are compared with their marks in two ways:
   bytes per file, and detects files that are missing, cut off, or of another block;
 - a full check when a sweep continues, of this process's part: each file is read and its checksum (crc32c) computed.
 
-Zarr detects any other damage when values are read. In format 1, without checksums, a missing file counts as lost if
-there should be numbers in it; the loss of a file that held only fill values is not noticed (`earlier`).
+Any other damage is detected when values are read. They are read without zarr (`chunks`), and nothing is read or written
+outside of the store, whatever its description says (`described`); opening a store writes nothing.
 
 Needs zarr (`pip install "lagjax[data]"`). A transactional store made for object stores (icechunk 1.1) was tried: of 64
 blocks that 8 processes had committed on a file system, 16 were lost, as its documentation warns.
@@ -24,6 +24,7 @@ import math
 import os
 import warnings
 from collections.abc import Callable, Iterable
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -31,42 +32,49 @@ import jax
 import numpy as np
 
 from lagjax.sweeps.axes import Axes
+from lagjax.sweeps.chunks import CHECKSUM, UNREADABLE, as_number, checksum_of, read_array, read_chunk
+from lagjax.sweeps.described import MARKS, Described, Spec, check_files, check_room
 from lagjax.sweeps.fingerprint import ANOTHER_FUNCTION, differences, fingerprint, named_leaves, of_axis
 from lagjax.sweeps.grids import Blocks
-from lagjax.sweeps.lanes import GOOD, LOST, NOT_RUN, Program, Status
+from lagjax.sweeps.labels import flags
+from lagjax.sweeps.lanes import LOST, NOT_RUN, Program, Status
 from lagjax.sweeps.metadata import about, create, import_zarr, remove_leftovers, restore
 
-# The exceptions that zarr and its codecs raise for damaged files.
-UNREADABLE = (ValueError, RuntimeError, TypeError, OSError)
-# The length of a checksum in bytes.
-CHECKSUM = 4
 # The largest number of files that a message names.
 SHOWN = 5
 
 
 class Store:
-    """An open store of a sweep. Call `metadata.restore` first, so that its metadata are intact."""
+    """An open store of a sweep.
 
-    def __init__(self, path: str | os.PathLike, mode: str = "r+"):
+    `of_own_sweep`: the caller knows its axes, which decide how much memory it takes; otherwise arrays far larger than
+    its files are refused.
+    """
+
+    def __init__(self, path: str | os.PathLike, of_own_sweep: bool = False):
         self.path = Path(path)
+        size = check_files(self.path) if self.path.is_dir() else 0
         self.about: dict[str, Any] = about(self.path)
-        self.format: int = self.about["fingerprint"]["format"]
+        described: Described = self.about["checked"]
         places = self.about["places"]
+        if not of_own_sweep:
+            check_room(self.path, described, places, size)
+        self.blocks, self._specs = described.blocks, described.arrays
         # The array of each leaf of the values, and of each field of the status.
         self._values: dict[str, str] = {name: places["values"][name] for name in self.about["fingerprint"]["values"]}
         self._status: dict[str, str] = {name: places["status"][name] for name in Status._fields}
-        zarr = import_zarr()
+        names = *self._values.values(), *self._status.values()
+        self.arrays: dict[str, Spec] = {name: self._specs[name] for name in names}
+
+    @cached_property
+    def _in_zarr(self) -> Any:
+        """The group that writes. Call `metadata.restore` first, so that its metadata are intact."""
+        return import_zarr().open_group(str(self.path), mode="r+", use_consolidated=False)
+
+    def _write_to(self, name, where, x):
         # Blocks that contain only fill values are written to files as well.
-        with zarr.config.set({"array.write_empty_chunks": True}):
-            group: Any = zarr.open_group(str(path), mode=mode, use_consolidated=False)
-            self.group = group
-            names = (*self._values.values(), *self._status.values())
-            self.arrays: dict[str, Any] = {name: group[name] for name in names}
-            self._marks_name: str = places["marks"]
-            self._marks_array = group[self._marks_name]
-        shape = self.arrays[self._status["result"]].shape
-        # In earlier formats the grid is one-dimensional.
-        self.blocks = Blocks(shape, tuple(self.about["block"]))
+        with import_zarr().config.set({"array.write_empty_chunks": True}):
+            self._in_zarr[name][where] = x
 
     @property
     def size(self) -> int:
@@ -79,7 +87,16 @@ class Store:
 
     def _marks(self):
         """(the marks of all blocks, 0 for unmarked ones; the numbers of the blocks whose mark is damaged)."""
-        return _read(self._marks_array, lambda number: slice(number, number + 1), len(self.blocks))
+        spec, unreadable = self._specs[MARKS], []
+        found = np.zeros(spec.shape, spec.dtype)
+        for number in range(len(self.blocks)):
+            try:
+                found[number] = read_chunk(self._file(MARKS, number), spec)[0]
+            except FileNotFoundError:
+                pass
+            except UNREADABLE:
+                unreadable.append(number)
+        return found, unreadable
 
     def _missing(self, marks):
         return np.flatnonzero(marks.reshape(len(self.blocks), -1).max(axis=1) == 0)
@@ -89,15 +106,14 @@ class Store:
         here = self.blocks.region(number)
         shape = tuple(x.stop - x.start for x in here)
         flat = [x for _, x in named_leaves(values)] + list(status)
-        for array, x in zip(self.arrays.values(), flat):
-            array[here] = x.reshape(shape + x.shape[1:])
-        marks = 1 if self.format == 1 else [_mark(self._file(name, number)) for name in self.arrays]
-        self._marks_array[number] = marks
+        for name, x in zip(self.arrays, flat):
+            self._write_to(name, here, x.reshape(shape + x.shape[1:]))
+        self._write_to(MARKS, number, [_mark(self._file(name, number)) for name in self.arrays])
 
     def unmark(self, numbers: Iterable[int]):
         """Mark some blocks as not written."""
         for number in numbers:
-            self._marks_array[number] = 0
+            self._write_to(MARKS, number, 0)
 
     def damage(self, numbers: Iterable[int], read: bool, marks=None) -> dict[int, str]:
         """The damage of some blocks: by the block's number, the file and what is wrong with it.
@@ -108,10 +124,9 @@ class Store:
         found = {}
         for number in numbers:
             if number in unreadable:
-                found[number] = f"{self._file(self.about['places']['marks'], number)} is damaged"
+                found[number] = f"{self._file(MARKS, number)} is damaged"
             elif np.any(marks[number]):
-                find_damage = self._damage_unchecked if self.format == 1 else self._damage
-                wrong = next(find_damage(number, marks[number], read), None)
+                wrong = next(self._damage(number, marks[number], read), None)
                 if wrong is not None:
                     found[number] = wrong
         return found
@@ -123,9 +138,16 @@ class Store:
 
     def read(self, number: int) -> list[np.ndarray]:
         """The values of a block, each (points, ...)."""
-        here, lead = self.blocks.region(number), len(self.blocks.shape)
-        found = [np.asarray(self.arrays[name][here]) for name in self._values.values()]
+        lead = len(self.blocks.shape)
+        found = [self._block(name, number) for name in self._values.values()]
         return [x.reshape(math.prod(x.shape[:lead]), *x.shape[lead:]) for x in found]
+
+    def _block(self, name, number):
+        """The numbers of a block, in the shape of its region."""
+        spec, here, file = self.arrays[name], self.blocks.region(number), self._file(name, number)
+        shape = *(x.stop - x.start for x in here), *spec.shape[len(here) :]
+        # Zarr fills blocks at the end of an axis up to their whole shape.
+        return np.zeros(shape, spec.dtype) if file is None else read_chunk(file, spec)[tuple(map(slice, shape))]
 
     def _damage(self, number, mark, read):
         for name, (length, checksum) in zip(self.arrays, mark.tolist()):
@@ -146,27 +168,13 @@ class Store:
             except OSError as error:
                 yield f"{file} cannot be read ({error.strerror})"
             else:
-                if _number(data[-CHECKSUM:]) != checksum or read and _crc32c()(data[:-CHECKSUM]) != checksum:
+                if as_number(data[-CHECKSUM:]) != checksum or read and checksum_of(data[:-CHECKSUM]) != checksum:
                     yield f"{file} is not as it was written"
-
-    def _damage_unchecked(self, number, mark, read):
-        result, here = self.arrays[self._status["result"]], self.blocks.region(number)
-        for name, array in self.arrays.items():
-            file = self._file(name, number)
-            if file is not None and not file.exists():
-                # Arrays such as steps had no file if all their values were 0; results never equal their fill value.
-                if array is result or name in self._values.values() and np.isin(result[here], GOOD).any():
-                    yield f"{file} is missing"
-            elif read:
-                try:
-                    array[here]
-                except UNREADABLE:
-                    yield f"{file} is damaged"
 
     def _file(self, name, number):
         """The file of a block; None for an empty array."""
-        if name == self._marks_name:
-            return self.path.joinpath(name, "c", str(number), *"0" * (len(self._marks_array.shape) - 1))
+        if name == MARKS:
+            return self.path / MARKS / "c" / str(number) / "0" / "0"
         shape, place = self.arrays[name].shape, self.blocks.place(number)
         inner = "0" * (len(shape) - len(place))
         return None if math.prod(shape) == 0 else self.path.joinpath(name, "c", *map(str, place), *inner)
@@ -183,7 +191,7 @@ class Store:
         place = self.about["places"]["axes"][name]
         folder = self.path / place
         try:
-            x = np.asarray(self.group[place][...])
+            x = read_array(folder, self._specs[place])
         except UNREADABLE:
             x = None
         if x is None or of_axis(x) != self.about["fingerprint"]["axes"][name]:
@@ -202,7 +210,7 @@ class Store:
                 self._axis(name)
             except ValueError:
                 place = self.about["places"]["axes"][name]
-                self.group[place][...] = x
+                self._write_to(place, ..., x)
                 damaged.append(f"{self.path / place} was damaged")
         return damaged
 
@@ -212,21 +220,25 @@ class Store:
         Values are (points, ...), in the structure of `like` or in a dictionary by name; NaN or 0 in missing blocks.
         """
         named, (missing, lost) = {}, self._quick_check()
-        for name, place in self._values.items():
-            named[name], unreadable = self._read(place)
-            lost.update({number: f"{self._file(place, number)} is damaged" for number in unreadable})
         lost = {number: wrong for number, wrong in lost.items() if number not in missing}
-        for number in missing:
-            for x in named.values():
-                x[self.blocks.points(number)] = nothing(x.dtype)
+        for name, place in self._values.items():
+            named[name], unreadable = self._read(place, missing)
+            lost.update({number: f"{self._file(place, number)} is damaged" for number in unreadable})
         if like is not None:
             named = jax.tree.unflatten(jax.tree.structure(like), [named[name] for name, _ in named_leaves(like)])
         return named, lost
 
-    def _read(self, name):
-        """(an array as (points, ...), the numbers of the blocks that cannot be read)."""
-        found, unreadable = _read(self.arrays[name], self.blocks.region, len(self.blocks))
-        return found.reshape(self.size, *found.shape[len(self.blocks.shape) :]), unreadable
+    def _read(self, name, missing):
+        """(an array as (points, ...) with nothing in missing blocks, the numbers of the blocks that cannot be read)."""
+        spec, unreadable = self.arrays[name], []
+        found = np.full(spec.shape, nothing(spec.dtype), spec.dtype)
+        for number in range(len(self.blocks)):
+            if number not in missing:
+                try:
+                    found[self.blocks.region(number)] = self._block(name, number)
+                except UNREADABLE:
+                    unreadable.append(number)
+        return found.reshape(self.size, *spec.shape[len(self.blocks.shape) :]), unreadable
 
     def one(self) -> dict[str, jax.ShapeDtypeStruct]:
         """The shapes of one point's values by name, without reading any values."""
@@ -236,11 +248,16 @@ class Store:
     def status(self) -> tuple[Status, set[int], dict[int, str]]:
         """(the statuses of all points, the unmarked blocks, the lost blocks with what is wrong)."""
         status, (missing, lost) = [], self._quick_check()
+        lost = {number: wrong for number, wrong in lost.items() if number not in missing}
         for place in self._status.values():
-            x, unreadable = self._read(place)
+            x, unreadable = self._read(place, missing)
             status.append(x)
             lost.update({number: f"{self._file(place, number)} is damaged" for number in unreadable})
-        lost = {number: wrong for number, wrong in lost.items() if number not in missing}
+        if unknown := sorted({*np.unique(status[0]).tolist()} - {*flags()["flag_values"]}):
+            raise ValueError(
+                f"{self.path} has results with the number {unknown[0]}, which this version of lagjax does not know.\n"
+                "Fix: pip install -U lagjax."
+            )
         for numbers, code in ((missing, NOT_RUN), (lost, LOST)):
             for number in numbers:
                 for x, fill in zip(status, (code, 0, np.nan, np.nan)):
@@ -266,20 +283,6 @@ def warn_of_damage(path: Path, wrong: Iterable[str], then: str, stacklevel: int)
     )
 
 
-def _read(array, region, blocks):
-    """(the whole array, the numbers of the blocks that cannot be read)."""
-    try:
-        return np.asarray(array[...]), []
-    except UNREADABLE:
-        found, unreadable = np.full(array.shape, nothing(array.dtype), array.dtype), []
-        for number in range(blocks):
-            try:
-                found[region(number)] = array[region(number)]
-            except UNREADABLE:
-                unreadable.append(number)
-        return found, unreadable
-
-
 def nothing(dtype):
     """The fill value of a dtype."""
     return np.nan if np.issubdtype(dtype, np.inexact) else 0
@@ -292,18 +295,7 @@ def _mark(file):
     with open(file, "rb") as content:
         length = content.seek(0, os.SEEK_END)
         content.seek(-CHECKSUM, os.SEEK_END)
-        return length, _number(content.read())
-
-
-def _number(data):
-    return int.from_bytes(data, "little")
-
-
-def _crc32c():
-    # A dependency of zarr, which uses it for the same checksums.
-    from google_crc32c import value
-
-    return value
+        return length, as_number(content.read())
 
 
 def chunk_of(path: str | os.PathLike) -> int:
@@ -328,10 +320,10 @@ def open_store(
     wanted = fingerprint(axes, program, layout)
     if not path.exists():
         create(path, axes, program, wanted, *new_store())
-    _check_belongs(path, about(path)["fingerprint"], wanted, accept)
+    store = Store(path, of_own_sweep=True)
+    _check_belongs(path, store.about["fingerprint"], wanted, accept)
     remove_leftovers(path)
-    wrong = restore(path)
-    store = Store(path)
+    wrong = restore(path, store.about)
     wrong += store.write_axes(axes)
     lost = store.damage(range(part[0], len(store.blocks), part[1]), read=True)
     if wrong or lost:

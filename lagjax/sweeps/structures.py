@@ -6,6 +6,7 @@ read as a dictionary by name.
 """
 
 import base64
+import math
 import pickle
 import warnings
 from collections.abc import Callable
@@ -16,9 +17,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
+from lagjax.mechanics.file_table import Table
+from lagjax.mechanics.files import MALFORMED
+from lagjax.mechanics.printable import by_line, printable
 from lagjax.mechanics.signature import UnknownSystem
-from lagjax.mechanics.written_trees import NotWritable, Reader, Writer
-from lagjax.motion.saved import same_system, trajectory_of
+from lagjax.mechanics.written_trees import KINDS_OF_ARRAY, NotWritable, Reader, Writer
+from lagjax.motion.saved import described_system, same_system, trajectory_of
 from lagjax.motion.saving import described, parts
 from lagjax.motion.trajectory import Trajectory
 from lagjax.sweeps.axes import Axes
@@ -36,8 +40,11 @@ class _Marker:
         self.role = role
 
 
-def description_of(like: PyTree, one: PyTree | None) -> dict[str, Any] | None:
-    """The description of values like these, or None. Systems are described from `one`, a point with numbers."""
+def description_of(like: PyTree, one: PyTree | None, classes: list[type] | None = None) -> dict[str, Any] | None:
+    """The description of values like these, or None. Systems are described from `one`, a point with numbers.
+
+    The classes of the objects among them are appended to `classes`.
+    """
     names = iter([name for name, _ in named_leaves(like)])
     named = jax.tree.map(lambda x: _Marker(f"{LEAF} {next(names)}"), like)
     motions, found = jax.tree.leaves(named, is_leaf=_is_motion), []
@@ -56,23 +63,29 @@ def description_of(like: PyTree, one: PyTree | None) -> dict[str, Any] | None:
         description = {"tree": writer.down(tree, "values"), "trajectories": found}
     except NotWritable:
         return None
+    if classes is not None:
+        classes += writer.classes
     return description | {"arrays": {name: _in_json(x) for name, x in writer.arrays.items()}}
 
 
-def tree_of(description: dict[str, Any], system: Any, path: Any) -> PyTree:
+def tree_of(description: dict[str, Any], system: Any, path: Any, table: Table) -> PyTree:
     """The described tree, with meaningless small arrays for leaves. Systems other than `system` stay unknown.
 
-    **Raises:** `ValueError` if none of its trajectories was integrated with `system`, or a class is not found.
+    **Raises:** `ValueError` if none of its trajectories was integrated with `system`, a class was not passed, or the
+    description is malformed.
     """
-    arrays = {name: _from_json(x) for name, x in description["arrays"].items()}
+    arrays, motions = dict(description["arrays"]), dict(enumerate(description["trajectories"]))
     mismatches, matching = [], []
 
     def marked_value(role):
         kind, _, number = role.partition(" ")
         if kind == LEAF:
             return jnp.zeros(())
-        found = {name: reader.up(node) for name, node in description["trajectories"][int(number)].items()}
-        about = UnknownSystem(**found["system"])
+        if kind != MOTION:
+            raise ValueError(f"a value of kind '{printable(kind)[:80]}' is not known.")
+        # Each is described once, and used once.
+        found = {name: reader.up(node) for name, node in motions.pop(int(number)).items()}
+        about = described_system(found["system"])
         kept = UnknownSystem(about.words, about.angles, {}, None)
         if system is not None:
             try:
@@ -82,38 +95,43 @@ def tree_of(description: dict[str, Any], system: Any, path: Any) -> PyTree:
                 mismatches.append(error)
         return trajectory_of(found, kept)
 
-    reader = Reader(arrays, marked_value)
-    tree = reader.up(description["tree"])
+    reader = Reader(lambda name: _from_json(arrays.pop(name)), marked_value, table)
+    try:
+        tree = reader.up(description["tree"])
+    except MALFORMED as error:
+        raise ValueError(f"its structure is not one that lagjax writes ({type(error).__name__}).") from error
     if mismatches and not matching:
         raise mismatches[0]
     return tree
 
 
-def as_stored(store: Store, system: Any = None) -> PyTree | None:
+def as_stored(store: Store, system: Any, table: Table) -> PyTree | None:
     """The shapes of one point's values, as the store describes them; None without description or if a class is missing.
 
     **Raises:** `ValueError` if no trajectory has this `system`, or there are no trajectories.
     """
     description = store.about.get("structure")
-    if system is not None and (description is None or not description["trajectories"]):
+    if system is not None and (not isinstance(description, dict) or not description.get("trajectories")):
         raise ValueError(
             f"{store.path} has no trajectories that need a system.\n"
-            "Usual cause: run returned numbers; or a store in an earlier format.\nFix: leave system out, or pass run=."
+            "Usual cause: run returned numbers.\nFix: leave system out, or pass run=."
         )
     if description is None:
         return None
+    one = store.one()
     try:
-        tree = tree_of(description, system, store.path)
+        tree = tree_of(description, system, store.path, table)
+        if sorted(name for name, _ in named_leaves(tree)) != sorted(one):
+            raise ValueError("its structure has other values than its arrays.")
     except ValueError as error:
         if system is not None:
             raise
         warnings.warn(
-            f"the values of {store.path} are a dictionary by name: {error}\n"
-            "Fix, if that does not help: lj.open_sweep(path, run=run), with the function that was swept.",
+            by_line(f"the values of {store.path} are a dictionary by name: {error}")
+            + "\nIn any case: lj.open_sweep(path, run=run), with the function that was swept.",
             stacklevel=3,
         )
         return None
-    one = store.one()
     names = iter([name for name, _ in named_leaves(tree)])
     return jax.tree.map(lambda _: one[next(names)], tree)
 
@@ -143,17 +161,22 @@ class Travelling(NamedTuple):
     described: dict[str, Any] | None
     # The names of the leaves. An unknown system has lost its own leaves, so they are matched by name.
     names: list[str]
+    # The classes of objects in the description, each pickled: by name, as pickle writes any class.
+    classes: tuple[bytes, ...] = ()
 
     @classmethod
     def of(cls, values: PyTree) -> "Travelling":
         """Prepare values for a pickle."""
         leaves, structure = jax.tree.flatten(values)
         has_motions = any(map(_is_motion, jax.tree.leaves(values, is_leaf=_is_motion)))
-        description = description_of(values, None) if has_motions else None
+        classes: list[type] = []
+        description = description_of(values, None, classes) if has_motions else None
         names = [] if description is None else [name for name, _ in named_leaves(values)]
         numbered = jax.tree.unflatten(structure, range(len(leaves)))
         # Without a description, pickle raises its own error for what it cannot pickle.
-        return cls(leaves, pickle.dumps(numbered) if description is None else pickled(numbered), description, names)
+        structure = pickle.dumps(numbered) if description is None else pickled(numbered)
+        found = tuple(x for x in map(pickled, set(classes)) if x is not None)
+        return cls(leaves, structure, description, names, found)
 
     def unpacked(self) -> PyTree:
         """The values, restored."""
@@ -164,12 +187,21 @@ class Travelling(NamedTuple):
             # A function or class was importable only in the process that wrote the pickle.
             pass
         if self.described is not None:
-            tree, leaves = tree_of(self.described, None, None), dict(zip(self.names, self.leaves))
+            table = Table(x for x in map(_unpickled, self.classes) if x is not None)
+            tree = tree_of(self.described, None, None, table)
+            leaves = dict(zip(self.names, self.leaves))
             return jax.tree.unflatten(jax.tree.structure(tree), [leaves[name] for name, _ in named_leaves(tree)])
         raise pickle.UnpicklingError(
             "the values of this sweep contain functions, or objects of a class, that are not found here.\n"
             "Fix: first import the module that defines them; or lj.open_sweep, for a sweep in a store."
         )
+
+
+def _unpickled(cls):
+    try:
+        return pickle.loads(cls)
+    except (AttributeError, ImportError):
+        return None
 
 
 def _is_motion(x):
@@ -185,5 +217,8 @@ def _in_json(x):
 
 
 def _from_json(stored):
-    data = base64.b64decode(stored["base64"])
-    return np.frombuffer(data, stored["dtype"]).reshape(stored["shape"]).copy()
+    dtype, data = np.dtype(stored["dtype"]), base64.b64decode(stored["base64"], validate=True)
+    expected = math.prod(stored["shape"]) * dtype.itemsize
+    if dtype.kind not in KINDS_OF_ARRAY or dtype.itemsize == 0 or expected != len(data):
+        raise ValueError(f"an array of its structure is said to be {dtype}, and has {len(data):,} bytes.")
+    return np.frombuffer(data, dtype).reshape(stored["shape"]).copy()

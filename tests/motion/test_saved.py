@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 import zipfile
+from collections import namedtuple
 from typing import NamedTuple
 
 import diffrax
@@ -62,7 +63,7 @@ def swing(g=9.81, **settings):
 def check(traj, system, path):
     """Check that a trajectory comes back: arrays bit for bit and of the same kind, all else equal, and its print."""
     traj.save(path)
-    again = lj.load_trajectory(path, system)
+    again = lj.load_trajectory(path, system, classes=[Pair, Place])
     pairs = list(zip(jax.tree.leaves(traj), jax.tree.leaves(again), strict=True))
     for a, b in pairs:
         assert type(a) is type(b)
@@ -206,16 +207,21 @@ def test_parameters(tmp_path):
     assert not (tmp_path / "y.npz").exists()
 
 
-def test_named_tuples_of_a_class_that_is_gone(tmp_path, monkeypatch):
-    """They come back as another class of the same name and fields; the class of an object has to be imported."""
+def test_classes_of_the_user_are_passed(tmp_path):
+    """An object comes back if its class is passed; twins: without it, with another of other fields, with no class."""
     of = lambda q0, v0: lj.integrate(springs, q0, v0, ts=TS)
     of(Pair(1.0, 2.0), Pair(0.0, 0.0)).save(tmp_path / "pair.npz")
     of(Place(jnp.array(1.0), "here"), Place(jnp.array(0.0), "here")).save(tmp_path / "place.npz")
-    monkeypatch.delitem(sys.modules, __name__)
-    found = lj.load_trajectory(tmp_path / "pair.npz", springs).q
-    assert type(found) is not Pair and type(found).__name__ == "Pair" and found._fields == ("x", "y")
-    with pytest.raises(ValueError, match=rf"class {__name__}.Place, .*\nFix: import {__name__} before"):
-        lj.load_trajectory(tmp_path / "place.npz")
+    for name, cls in (("pair", Pair), ("place", Place)):
+        assert type(lj.load_trajectory(tmp_path / f"{name}.npz", springs, classes=[cls]).q) is cls
+        words = rf"of class {__name__}.{cls.__name__}(.|\n)*Fix: classes=\[{cls.__name__}\]"
+        with pytest.raises(ValueError, match=words):
+            lj.load_trajectory(tmp_path / f"{name}.npz")
+    another = namedtuple("Pair", ["x", "z"])
+    with pytest.raises(ValueError, match="class Pair has no field y"):
+        lj.load_trajectory(tmp_path / "pair.npz", classes=[another])
+    with pytest.raises(TypeError, match=r"classes holds \(1, 2\), which is not the class of a named tuple"):
+        lj.load_trajectory(tmp_path / "pair.npz", classes=[(1, 2)])
 
 
 def test_files_that_are_not_whole(tmp_path):

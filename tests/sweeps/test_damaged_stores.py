@@ -3,16 +3,14 @@
 import json
 import shutil
 import warnings
-from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import zarr
 
 import lagjax as lj
 from lagjax.sweeps import fingerprint, metadata
-from lagjax.sweeps.lanes import LOST, NOT_RUN
+from lagjax.sweeps.lanes import LOST
 from lagjax.sweeps.store import Store
 
 AXES = {"k": np.arange(1, 6), "x": np.linspace(0.1, 1.0, 8)}
@@ -160,13 +158,17 @@ METADATA = {
 
 @pytest.mark.parametrize("case", METADATA)
 def test_damaged_metadata_are_put_back(store, case):
-    """Whoever opens the store next restores them, and no value is lost."""
+    """The store is read all the same, unchanged; the same sweep restores them, and no value is lost."""
     name, damage = METADATA[case]
     damage(store / name)
+    before = {file: file.read_bytes() for file in store.rglob("*") if file.is_file()}
     opened, words = with_warnings(lambda: lj.open_sweep(store))
-    assert opened.ok.all() and str(store / name) in words and "restored" in words
+    assert opened.ok.all() and str(store / name) in words and "which restores it" in words
     same(opened.values)
-    assert swept(store).ran == 0
+    assert before == {file: file.read_bytes() for file in store.rglob("*") if file.is_file()}
+    mended, words = with_warnings(lambda: swept(store))
+    assert mended.ran == 0 and str(store / name) in words and "It has been restored" in words
+    assert swept(store).ran == 0 and lj.open_sweep(store).ok.all()
 
 
 @pytest.mark.parametrize("name", ["y", "n", "steps", "result", "lagjax/marks"])
@@ -287,69 +289,15 @@ def test_other_versions(store):
         lj.open_sweep(store)
 
 
-@pytest.fixture
-def format_2(tmp_path):
-    """The same sweep, written by lagjax before arrays had the shape of the axes, with the names of that time."""
-    shutil.unpack_archive(Path(__file__).with_name("format_2.zip"), tmp_path / "second")
-    return tmp_path / "second"
-
-
-def test_a_store_of_format_2(format_2):
-    """It can be read, its damage is reported, and it is continued in its format on request."""
-    opened = lj.open_sweep(format_2)
-    same(opened.values)
-    assert opened.ok.all() and opened.dims == {"k": 5, "x": 8} and (opened.status.scaled_error == 0).all()
-    with pytest.raises(ValueError, match="format: 2 there, 3 here") as refusal:
-        swept(format_2)
-    assert "accept_versions=True" in str(refusal.value) and "layout" not in str(refusal.value)
-    (format_2 / "values/n/zarr.json").write_text("{")
-    remove(format_2 / "values/y/c/1/0")
-    mended, words = with_warnings(lambda: swept(format_2, accept_versions=True))
-    assert mended.ran == 8 and mended.ok.all() and "values/y/c/1/0 is missing" in words and "n/zarr.json" in words
-    same(mended.values)
-    same(lj.open_sweep(format_2).values)
-    with pytest.raises(ValueError, match="axis 'x' has other values"):
-        swept(format_2, axes=AXES | {"x": AXES["x"] + 1}, accept_versions=True)
-
-
-def as_format_1(path, to):
-    """A store in format 1: one byte per block for a mark, no checksums, no copies, no files of fill values."""
-    stored = Store(path)
-    description = {key: stored.about["as_written"][key] for key in ("fingerprint", "block", "names", "zipped")}
-    description["fingerprint"] |= {"format": 1}
-    group = zarr.create_group(str(to))
-    for name in description["names"]:
-        group.create_array(f"axes/{name}", data=stored.group[f"axes/{name}"][...])
-    for name, x in stored.arrays.items():
-        array = group.create_array(name, shape=x.shape, chunks=x.chunks, dtype=x.dtype, fill_value=x.fill_value)
-        array[...] = x[...]
-    done = group.create_array("done", shape=(5,), chunks=(1,), dtype="uint8", fill_value=0, compressors=None)
-    done[:] = 1
-    group.attrs["lagjax"] = json.loads(json.dumps(description))
-    return to
-
-
-def test_a_store_without_checksums(format_2, tmp_path):
-    """It can be read, and continued on request; files detected as missing or cut are repaired."""
-    first = as_format_1(format_2, tmp_path / "first")
-    assert not (first / "status/steps/c/0").exists(), "all of them are 0"
-    same(lj.open_sweep(first).values)
-    with pytest.raises(ValueError, match="format: 1 there, 3 here"):
-        swept(first)
-    assert swept(first, accept_versions=True).ran == 0
-    for name, damage in [("values/n/c/1", remove), ("values/y/c/1/0", cut), ("status/result/c/1", remove)]:
-        damage(first / name)
-        (opened, _), words = with_warnings(lambda: (opened := lj.open_sweep(first), opened.values))
-        assert np.sum(opened.status.result == LOST) == 8 and str(first / name) in words
-        mended, words = with_warnings(lambda: swept(first, accept_versions=True))
-        assert mended.ran == 8 and mended.ok.all() and str(first / name) in words
-        same(mended.values)
-    remove(first / "done/c/2")
-    assert swept(first, accept_versions=True).ran == 8
-    assert np.sum(lj.open_sweep(first).status.result == NOT_RUN) == 0
-    empty(first / "values/n/zarr.json")
-    with pytest.raises(ValueError, match="values/n/zarr.json is damaged"):
-        lj.open_sweep(first)
+def test_stores_of_earlier_formats(store, tmp_path):
+    """They are refused in words, by their place of the description or by their number."""
+    (tmp_path / "flat" / "done").mkdir(parents=True)
+    with pytest.raises(ValueError, match="flat is a store in an earlier format(.|\n)*Fix: compute it again"):
+        lj.open_sweep(tmp_path / "flat")
+    rewrite(store, lambda description: description["fingerprint"].update(format=2))
+    for call in (lj.open_sweep, swept):
+        with pytest.raises(ValueError, match="its format is 2, not 3"):
+            call(store)
 
 
 def test_checksums_stand_in_every_array(whole):

@@ -4,7 +4,6 @@ import json
 import shutil
 import sys
 import warnings
-from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
@@ -68,13 +67,6 @@ def test_xarray_opens_a_store_as_it_lies(store, way):
     labelled = lj.open_sweep(store).to_xarray()
     xarray.testing.assert_equal(data, labelled)
     assert all(data[name].attrs == labelled[name].attrs for name in data.variables)
-
-
-def test_twin_a_store_of_before(tmp_path):
-    """xarray cannot open a store of format 2, which is flat and has no dimensions."""
-    shutil.unpack_archive(Path(__file__).with_name("format_2.zip"), tmp_path)
-    with pytest.raises(KeyError, match="dimension_names"):
-        xarray.open_zarr(tmp_path / "status", consolidated=False)
 
 
 def test_half_filled(tmp_path):
