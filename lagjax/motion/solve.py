@@ -176,7 +176,7 @@ def _trajectory_of(*problem):
 def _trajectory(system, q0, v0, params, ts, guards, settings):
     """The trajectory, and whether it is settled: the robust solve would give the same."""
     s, method = settings, method_of(settings, system, ts[0], q0, v0, params)
-    asked = Asked(s.method, s.controller, s.dt0, s.max_step, s.jump_ts, s.drift)
+    asked = Asked(s.method, s.controller, s.dt0, s.max_step, s.jump_ts, s.drift, s.jumps)
     how = _how(method, s.method, settings, isinstance(system, Hybrid))
     settings = eqx.tree_at(lambda s: s.method, settings, method, is_leaf=lambda x: x is None)
     # Derivatives flow to the floating-point arrays of these; the settings are constants.
