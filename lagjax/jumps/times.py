@@ -5,6 +5,7 @@ functions of t is evaluated on a fine grid, and each change is bisected; Newton'
 and the derivatives. The times become ends of steps.
 """
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
@@ -43,7 +44,7 @@ def _named(traced, ts, place, timed, function, arguments):
 
 def _sought(traced, ts, place, timed, function, arguments):
     outputs = [place, place + 1] + ([place + 2] if timed.rule == "place" else [])
-    fixed = lax.stop_gradient((function, arguments))
+    fixed = jax.tree.map(lambda x: lax.stop_gradient(x) if eqx.is_array(x) else x, (function, arguments))
 
     def modes_at(t):
         return _at(traced, outputs[:1], t, *fixed)[0]

@@ -142,7 +142,7 @@ class Kind(NamedTuple):
     """The static properties of a guard: see `Crossing`. `long`: it takes long to compile.
 
     `read`: the values that it reads from outside. `holds`: it is assumed to be above zero at the start; if it is not,
-    it counts as crossed there.
+    it counts as crossed there. `may_rest`: it may be zero for a while, which is not in doubt.
     """
 
     name: str
@@ -153,6 +153,7 @@ class Kind(NamedTuple):
     long: bool
     read: Hashable
     holds: bool
+    may_rest: bool = False
 
 
 class Guards(eqx.Module):

@@ -138,7 +138,7 @@ def _together(model: Model, guards: Guards | None) -> Guards:
     """The guards of the modes, and then those of the user's events."""
     long = any(len(f.guard.program.jaxpr.eqns) > LONG for f in model.guards) or model.sliding is not None
     kinds = tuple(
-        Kind(f"mode {i}", -1, True, 1, False, long, (), holds=True) for i in range(len(model.guards))
+        Kind(f"mode {i}", -1, True, 1, False, long, (), holds=True, may_rest=True) for i in range(len(model.guards))
     )  # fmt: skip
     if guards is None:
         return Guards(model.guards, kinds)

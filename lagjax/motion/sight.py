@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from lagjax.motion.crossings import Guards, Kind
-from lagjax.motion.pieces import INNER, Node, Pieces, Value, between, pieces_of
+from lagjax.motion.pieces import INNER, Node, Pieces, Value, between, pieces_of, without_rest
 from lagjax.motion.stepping import OnManifold
 
 # The error is taken to be this many times the distance of the two interpolants.
@@ -69,11 +69,12 @@ class Sight(eqx.Module):
     def judged(self, left: Node, right: Node, inner) -> list[Pieces]:
         """Each guard between two nodes, from its values at the inner ones by the quintic and by the cubics."""
         found, h, count = [], right.t - left.t, len(INNER)
-        for begin, end, by_both in zip(left.values, right.values, inner):
+        for kind, begin, end, by_both in zip(self.guards.kinds, left.values, right.values, inner):
             pairs = zip(by_both[:count], by_both[count:])
             off = [tuple(SAFETY * jnp.abs(x - z) for x, z in zip(*pair)) for pair in pairs]
             touches = TOUCHES * self.motion.tolerances.rtol[0] * h * jnp.maximum(jnp.abs(begin.rate), jnp.abs(end.rate))
-            found.append(pieces_of(begin, by_both[:count], off, end, h, touches))
+            pieces = pieces_of(begin, by_both[:count], off, end, h, touches)
+            found.append(without_rest(pieces, begin, end, by_both, h) if kind.may_rest else pieces)
         return found
 
     def first_sign(self, value: Value, kind: Kind):
