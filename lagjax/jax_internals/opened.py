@@ -19,7 +19,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
-from lagjax.jax_internals.programs import bodies, equations, evaluate, stands_for, written
+from lagjax.jax_internals.bounds import ALL, Bounds, of_number, of_result
+from lagjax.jax_internals.programs import bodies, equations, evaluate, needed, stands_for, written
 
 COMPARISONS = {"gt", "ge", "lt", "le"}
 KINKS = {"abs", "max", "min", "clamp"}
@@ -29,6 +30,11 @@ ELEMENTARY = COMPARISONS | KINKS | LEVELS | {"sign"}
 CHOOSING = {"reduce_max", "reduce_min", "argmax", "argmin", "sort", "cummax", "cummin", "top_k"}
 # Functions with a derivative of their own count as smooth, but for these.
 WITH_KINKS = {"relu", "relu6", "hard_tanh", "leaky_relu"}
+# Functions that are smooth, and are put together from several formulas.
+SMOOTH = {
+    "hypot", "i0", "i0e", "i1", "i1e", "expi", "exp1", "expn", "betainc", "spence", "zeta", "polygamma", "log_ndtr",
+    "ndtr", "ndtri", "erfcx", "sinc", "entr", "gammainc", "gammaincc", "bessel_jn", "fresnel", "hyp1f1", "lambertw",
+}  # fmt: skip
 # Operations on arrays of more numbers are not followed: those of a network, or of a picture.
 LARGEST = 16
 
@@ -78,11 +84,12 @@ class Table:
 
 
 class Known(NamedTuple):
-    """A value in a program, its number in the table, and on what of the state it depends."""
+    """A value in a program, its number in the table, on what of the state it depends, and its bounds."""
 
     value: Any
     number: int
     depends: frozenset
+    bounds: Bounds = ALL
 
 
 class Inside(NamedTuple):
@@ -119,6 +126,8 @@ class Opening:
     def run(self, closed: ClosedJaxpr, inputs: list[Known]) -> list[Known]:
         """The results of a program."""
         jaxpr, constants = closed.jaxpr, closed.consts
+        # What is not used, as the sign that `logsumexp` could return, does not jump.
+        jaxpr = jaxpr.replace(eqns=needed(jaxpr))
         values = {x: self._constant(c) for x, c in zip(jaxpr.constvars, constants)}
         values.update(zip(jaxpr.invars, inputs))
         read = lambda x: self._constant(written(x)) if isinstance(x, Literal) else values[x]
@@ -130,7 +139,8 @@ class Opening:
     def _constant(self, value):
         if isinstance(value, np.ndarray | np.generic | float | int) and np.size(value) == 1:
             # A weak type does not tell one zero from another.
-            return Known(value, self.table.number("number", float(np.ravel(value)[0])), frozenset())
+            number = self.table.number("number", float(np.ravel(value)[0]))
+            return Known(value, number, frozenset(), of_number(value))
         # Held by the table's key: another object cannot get its address.
         return Known(value, self.table.number("constant", _Held(value)), frozenset())
 
@@ -139,6 +149,9 @@ class Opening:
         if depends:
             inner = stands_for(equation)
             if name in ("jit", "closed_call") and inner is not None:
+                if str(equation.params.get("name")) in SMOOTH:
+                    at = {x: k.value for x, k in zip(equation.invars, operands) if not isinstance(x, Literal)}
+                    return self._known(equation, operands, depends, evaluate(jaxpr, equation, at))
                 if str(equation.params.get("name")) == "searchsorted":
                     found = self._searched(equation, operands, depends)
                     if found is not None:
@@ -149,11 +162,11 @@ class Opening:
             if name == "custom_jvp_call" and inner is not None and _called(equation) in WITH_KINKS:
                 return self.run(inner, operands)
             if bodies(equation) and name not in ("custom_jvp_call", "custom_vjp_call"):
-                for body in bodies(equation):
-                    if has_jumps(body):
-                        self.table.missed[f"a comparison inside {_in_words(name)}"] = None
-                        break
-            elif name in CHOOSING and any(_is_float(x.aval) for x in equation.invars):
+                # That a loop ends when something is small is no jump.
+                inside = [body for key, body in _named_bodies(equation) if key != "cond_jaxpr"]
+                if any(map(has_jumps, inside)):
+                    self.table.missed[f"a comparison inside {_in_words(name)}"] = None
+            elif name in CHOOSING and _is_float(equation.invars[0].aval) and not _is_only_a_scale(jaxpr):
                 self.table.missed[f"{_in_words(name)}, which chooses among several numbers"] = None
             elif name in ELEMENTARY:
                 taken = self._taken(equation, operands, depends)
@@ -166,12 +179,14 @@ class Opening:
         name = equation.primitive.name
         if name == "convert_element_type" and jnp.issubdtype(equation.params["new_dtype"], jnp.floating):
             # The same number in another dtype.
-            return [Known(results[0], operands[0].number, depends)]
+            return [operands[0]._replace(value=results[0])]
         if name == "stop_gradient":
-            return [Known(results[0], operands[0].number, depends)]
+            return [operands[0]._replace(value=results[0])]
         params = () if not equation.params else str({k: v for k, v in equation.params.items() if k != "sharding"})
         key = self.table.number(name, params, *(x.number for x in operands))
-        return [Known(y, self.table.number("result", i, key), depends) for i, y in enumerate(results)]
+        bounds = of_result(equation, [x.bounds for x in operands])
+        each = enumerate(results)
+        return [Known(y, self.table.number("result", i, key), depends, ALL if i else bounds) for i, y in each]
 
     # What each primitive does for given modes.
 
@@ -222,6 +237,9 @@ class Opening:
 
     def _above(self, a: Known, b: Known, depends, jumps, kind):
         """Whether a > b by the mode; both orders of a and b have one mode."""
+        if a.bounds[0] >= b.bounds[1] or a.bounds[1] <= b.bounds[0]:
+            # Decided once and for all: it guards against round-off.
+            return None
         turned = a.number > b.number
         one, other = (b, a) if turned else (a, b)
         key = ("above", one.number, other.number)
@@ -309,12 +327,23 @@ class _Held:
         return isinstance(other, _Held) and self.value is other.value
 
 
+def _named_bodies(equation):
+    for key, value in equation.params.items():
+        yield from ((key, getattr(x, "jaxpr", x)) for x in (value if isinstance(value, tuple) else (value,))
+                    if isinstance(x, ClosedJaxpr | Jaxpr))  # fmt: skip
+
+
 def _called(equation):
     inner = stands_for(equation)
     names = [str(equation.params.get("name", ""))]
     if inner is not None:
         names += [str(e.params.get("name", "")) for e in inner.jaxpr.eqns]
     return next((name for name in names if name in WITH_KINKS), "")
+
+
+def _is_only_a_scale(jaxpr):
+    # As in `logsumexp`, which subtracts the largest of its numbers and adds it again.
+    return any(e.primitive.name == "stop_gradient" for e in jaxpr.eqns)
 
 
 def _to_whole(equation):

@@ -4,6 +4,7 @@ In a given *mode* (the outcome of each comparison, see `opened.py`) all three ar
 shapes, and gives the smooth system, the guard of each mode, and the times of jumps that depend on t alone.
 """
 
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -15,7 +16,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
-from lagjax.jax_internals.opened import Known, Opening, Slot, Table, Timed, has_jumps
+from lagjax.jax_internals.opened import COMPARISONS, Known, Opening, Slot, Table, Timed, has_jumps
 from lagjax.jax_internals.programs import outputs_of, run
 from lagjax.mechanics.arguments import OF_STATE, takes_of
 from lagjax.mechanics.constraints import Holonomic, Nonholonomic, zero_multipliers
@@ -24,7 +25,8 @@ from lagjax.mechanics.system import System
 
 # More modes than this are not followed: each adds to the program that watches the motion.
 MOST = 24
-ROLES = ("lagrangian", "force", "dissipation")
+NAMES = {"lagrangian": "Lagrangian", "force": "force", "dissipation": "dissipation"}
+ROLES = tuple(NAMES)
 
 
 class Given(NamedTuple):
@@ -116,6 +118,17 @@ class Jumps:
     def in_time(self) -> bool:
         """Whether there are jumps that depend on t alone."""
         return any(traced.of_time for traced in self.traced.values())
+
+    def in_words(self) -> list[str]:
+        """What was found, in words, and in which function."""
+        of_state = [
+            f"{'a comparison' if slot.kind in COMPARISONS else slot.kind} of {', '.join(sorted(slot.depends))} "
+            f"in the {' and the '.join(NAMES[role] for role in ROLES if role in slot.roles)}"
+            for slot in self.slots
+        ]
+        of_time = [f"t in the {NAMES[role]}" for role, traced in self.traced.items() for _ in traced.of_time]
+        counts = Counter(of_state + of_time)
+        return [text if n == 1 else f"{text} ({n} times)" for text, n in counts.items()]
 
     def each(self) -> list[Slot]:
         """The slot of each mode."""

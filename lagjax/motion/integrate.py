@@ -29,6 +29,7 @@ from lagjax.motion.failure import raise_failure
 from lagjax.motion.global_error import steps_to_repeat
 from lagjax.motion.no_lanes import raise_at_run_time
 from lagjax.motion.replay import Replay
+from lagjax.motion.over_jumps import warn_of_lost
 from lagjax.motion.reported import patient, report
 from lagjax.motion.results import ENDED_WELL, is_among
 from lagjax.motion.slips import warn_of_odd_dissipation
@@ -208,4 +209,5 @@ def _raise_or_warn(trajectory, start, settings):
         raise_failure(trajectory, start, settings)
     problem.warn_of_inaccuracy(trajectory)
     warn_of_events(trajectory.events)
+    warn_of_lost(trajectory)
     return trajectory

@@ -31,6 +31,7 @@ from lagjax.jumps.found import Given, Jumps, OfParams, Smooth
 from lagjax.jumps.sliding import Mixed, Sliding, slidable
 from lagjax.mechanics import constraints
 from lagjax.mechanics.system import System
+from lagjax.mechanics.warned import warn
 from lagjax.motion.consistency import stopped
 from lagjax.motion.crossings import LONG, Crossings, Guards, Kind
 from lagjax.motion.legs import AT_ONCE, NOT_BELOW, ROWS, reached, sizes_of
@@ -43,6 +44,38 @@ from lagjax.motion.trajectory import Snapshot
 
 # The most jumps that are followed in a motion.
 MOST_JUMPS = 1000
+
+
+class JumpWarning(UserWarning):
+    """A force jumps or has a kink where the motion is not followed across it: derivatives may lack a part."""
+
+
+def warn_of_missed(jumps: Jumps):
+    """Say which jumps are not followed."""
+    warn(
+        f"not followed across its jumps or kinks: {'; '.join(jumps.missed)}.\n"
+        "The motion is right to its tolerance, but takes more steps, and where such a number changes its branch, "
+        "derivatives lack the part that is due to the change.\n"
+        "Usual cause: a network with relu, a table that is searched in a loop, a comparison inside lax.scan.\n"
+        "Fix: a smooth function in its place (jax.nn.softplus, jnp.tanh), the comparison outside of the loop, or "
+        'jumps="ignored" if it does not matter.',
+        JumpWarning,
+    )
+
+
+def warn_of_lost(trajectory):
+    """Say that a motion could not be followed across all its jumps."""
+    if "lost_jumps" in trajectory.stats and bool(trajectory.stats["lost_jumps"]):
+        count = int(trajectory.stats["num_jumps"])
+        why = f"after {count} jumps, the most that are" if count >= MOST_JUMPS else f"after {count} of its jumps"
+        warn(
+            f"the motion was not followed across the jumps of its forces {why}; from there on forces were taken as "
+            "they come: the motion is right to its tolerance, and derivatives lack the part that is due to later "
+            "jumps.\n"
+            "Usual cause: a comparison at the end of a function's domain (arccos, sqrt), or a control that chatters.\n"
+            'Fix: jumps="ignored" if the comparison only guards against NaN; a shorter time span.',
+            JumpWarning,
+        )
 
 
 class ModeGuard(eqx.Module):

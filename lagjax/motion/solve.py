@@ -31,7 +31,7 @@ from lagjax.motion.global_error import with_errors, with_errors_inside
 from lagjax.motion.hybrid_trajectory import HybridTrajectory
 from lagjax.motion.legs import solved_in_legs
 from lagjax.motion.one_solve import solved
-from lagjax.motion.over_jumps import solved_over_jumps
+from lagjax.motion.over_jumps import solved_over_jumps, warn_of_missed
 from lagjax.motion.reported import report_settled
 from lagjax.motion.trajectory import Asked, How, Trajectory, pack
 from lagjax.numerics.evaluations import evaluations_a_step
@@ -215,7 +215,10 @@ def followed(settings, system, t, q, v, params):
     ours = settings.controller is None and settings.event is None and not settings.progress
     if settings.jumps == "ignored" or not ours or isinstance(settings.adjoint, diffrax.BacksolveAdjoint):
         return None
-    return jumps_found(system, t, q, v, params)
+    found = jumps_found(system, t, q, v, params)
+    if found is not None and found.missed:
+        warn_of_missed(found)
+    return found
 
 
 def _how(method, asked, settings, in_legs):
