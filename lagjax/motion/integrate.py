@@ -28,8 +28,8 @@ from lagjax.motion.dense_output import at
 from lagjax.motion.failure import raise_failure
 from lagjax.motion.global_error import steps_to_repeat
 from lagjax.motion.no_lanes import raise_at_run_time
-from lagjax.motion.replay import Replay
 from lagjax.motion.over_jumps import warn_of_lost
+from lagjax.motion.replay import Replay
 from lagjax.motion.reported import patient, report
 from lagjax.motion.results import ENDED_WELL, is_among
 from lagjax.motion.slips import warn_of_odd_dissipation
@@ -104,10 +104,10 @@ def integrate(
     - `dt0`: the length of the first step, `[t]`; needed with `diffrax.ConstantStepSize()`.
     - `max_step`: the longest step, `[t]`. Adaptive steps may miss what is narrower than they are, such as a short push
       or a thin barrier, without a warning. No step is longer than this, nor than the time between two outputs.
-    - `jumps`: "found" reads jumps and kinks off the programs of L, the force and the dissipation (`jnp.where(q > 0, ...)`,
-      `jnp.sign(v)`, `jnp.maximum`, `jnp.interp`): each becomes an end of a step, derivatives are those of the motion
-      across it, and a motion that is pushed back from both sides stays on it, as under dry friction. "ignored" takes
-      forces as they come. See `docs/forces-that-jump.md`.
+    - `jumps`: "found" reads jumps and kinks off the programs of L, the force and the dissipation (`jnp.where(q > 0,
+      ...)`, `jnp.sign(v)`, `jnp.maximum`, `jnp.interp`): each becomes an end of a step, derivatives are those of the
+      motion across it, and a motion that is pushed back from both sides stays on it, as under dry friction. "ignored"
+      takes forces as they come. See `docs/forces-that-jump.md`.
     - `jump_ts` (J,): times at which a force jumps or has a kink, in any order, `[t]`, that cannot be read off its
       program. They become ends of steps, and each step stays on one side of them; derivatives with respect to these
       times are right.

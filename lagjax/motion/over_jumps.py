@@ -231,8 +231,8 @@ def _leg(model: Model, guards: Guards, recorded, way: Way, params, ts, settings,
 
 
 class Ending(NamedTuple):
-    """How a leg ends: `onward`: a mode changes, the one with the number `first`; `wrong`: the leg is to be repeated with
-    the comparisons as they are."""
+    """How a leg ends: `onward`: a mode changes, the one with the number `first`; `wrong`: the leg is to be repeated
+    with the comparisons as they are."""
 
     onward: Bool[Array, ""]
     wrong: Bool[Array, ""]

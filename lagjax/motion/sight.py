@@ -54,12 +54,22 @@ class Sight(eqx.Module):
 
     def _along(self, places, directions, args):
         """The guards at places (t, y), and their derivatives along one direction for each place: pairs of tuples."""
-        push = lambda place, direction: jax.jvp(lambda t, y: self.value(t, y, args), place, direction)
+        value = lambda t, y: self.value(t, y, args)
+        push = lambda place, direction: self._known(*jax.jvp(value, place, direction))
         if not self.guards.long:
             return [push(*x) for x in zip(places, directions)]
         together = jtu.tree_map(lambda *x: jnp.stack(x), *zip(places, directions))
         found = jax.vmap(push)(*together)
         return [jtu.tree_map(lambda x: x[i], found) for i in range(len(places))]
+
+    def _known(self, g, rate):
+        """The guards and their rates, without infinite slopes and NaN where a guard may not stop the motion."""
+        finite = lambda x, other: jnp.where(jnp.isfinite(x), x, other)
+        may_rest = [kind.may_rest for kind in self.guards.kinds]
+        return (
+            tuple(finite(x, 1.0) if rests else x for x, rests in zip(g, may_rest)),
+            tuple(finite(x, 0.0) if rests else x for x, rests in zip(rate, may_rest)),
+        )
 
     def unseen(self, t) -> Node:
         """A node at which nothing is known yet."""
