@@ -71,10 +71,11 @@ class Timed(NamedTuple):
 class Table:
     """The numbers of values, and the slots found so far, for several programs over the same state.
 
-    `slots` by key, in order; `missed`: what is not followed, in words.
+    `negative`: for the numbers of values -x, that of x. `slots` by key, in order; `missed`: what is not followed, in words.
     """
 
     numbers: dict = field(default_factory=dict)
+    negative: dict[int, int] = field(default_factory=dict)
     slots: dict[Any, Slot] = field(default_factory=dict)
     missed: dict[str, None] = field(default_factory=dict)
 
@@ -184,6 +185,8 @@ class Opening:
             return [operands[0]._replace(value=results[0])]
         params = () if not equation.params else str({k: v for k, v in equation.params.items() if k != "sharding"})
         key = self.table.number(name, params, *(x.number for x in operands))
+        if name == "neg":
+            self.table.negative[self.table.number("result", 0, key)] = operands[0].number
         bounds = of_result(equation, [x.bounds for x in operands])
         each = enumerate(results)
         return [Known(y, self.table.number("result", i, key), depends, ALL if i else bounds) for i, y in each]
@@ -240,10 +243,10 @@ class Opening:
         if a.bounds[0] >= b.bounds[1] or a.bounds[1] <= b.bounds[0]:
             # Decided once and for all: it guards against round-off.
             return None
-        turned = a.number > b.number
-        one, other = (b, a) if turned else (a, b)
-        key = ("above", one.number, other.number)
-        raw = one.value - other.value
+        first, second = self._without_sign(a.number, b.number)
+        turned = first > second
+        key = ("above", *sorted((first, second)))
+        raw = b.value - a.value if turned else a.value - b.value
         # At a tie as the user's comparison says: true for `a >= b`, and for its opposite `a < b`.
         at_tie = (kind in ("ge", "lt")) != turned
         actual = jnp.where(raw >= 0 if at_tie else raw > 0, 1.0, 0.0).astype(raw.dtype)
@@ -255,6 +258,13 @@ class Opening:
             return None
         self.inside.setdefault(key, Inside((2 * mode - 1) * raw, 1 - mode, actual, raw))
         return mode < 0.5 if turned else mode > 0.5
+
+    def _without_sign(self, first, second):
+        # -y > 0 is 0 > y, and 0 > -y is y > 0.
+        zero, negative = self.table.number("number", 0.0), self.table.negative
+        if second == zero and first in negative:
+            return zero, negative[first]
+        return (negative[second], zero) if first == zero and second in negative else (first, second)
 
     def _level(self, rule, x, operands, depends, kind):
         """The whole number that belongs to x, by the mode."""
