@@ -71,7 +71,8 @@ class Timed(NamedTuple):
 class Table:
     """The numbers of values, and the slots found so far, for several programs over the same state.
 
-    `negative`: for the numbers of values -x, that of x. `slots` by key, in order; `missed`: what is not followed, in words.
+    `negative`: for the numbers of values -x, that of x. `slots` by key, in order; `missed`: what is not followed, in
+    words.
     """
 
     numbers: dict = field(default_factory=dict)

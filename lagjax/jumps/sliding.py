@@ -40,7 +40,9 @@ def slidable(jumps: Jumps, system: System) -> tuple[int, ...]:
     found = tuple(
         i
         for i, slot in enumerate(jumps.each())
-        if "v" in slot.depends and not slot.levels and slot.roles <= of_forces
+        if "v" in slot.depends
+        and not slot.levels
+        and slot.roles <= of_forces
         # A kink of Rayleigh's function is a jump of its force.
         and (slot.jumps or "dissipation" in slot.roles)
     )

@@ -15,6 +15,7 @@ Jumps that depend on t alone are ends of steps inside a leg, like `jump_ts` (`ju
 Source: Hiskens & Pai, IEEE Trans. Circuits Syst. I 47 (2000) 204 (trajectory sensitivities through switches).
 """
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import diffrax
@@ -50,13 +51,13 @@ class JumpWarning(UserWarning):
     """A force jumps or has a kink where the motion is not followed across it: derivatives may lack a part."""
 
 
-def warn_of_missed(jumps: Jumps):
+def warn_of_missed(missed: Sequence[str]):
     """Say which jumps are not followed."""
     warn(
-        f"not followed across its jumps or kinks: {'; '.join(jumps.missed)}.\n"
+        f"not followed across its jumps or kinks: {'; '.join(dict.fromkeys(missed))}.\n"
         "The motion is right to its tolerance, but takes more steps, and where such a number changes its branch, "
         "derivatives lack the part that is due to the change.\n"
-        "Usual cause: a network with relu, a table that is searched in a loop, a comparison inside lax.scan.\n"
+        "Usual cause: a network with relu, a comparison inside lax.scan, a force with a comparison in a phase.\n"
         "Fix: a smooth function in its place (jax.nn.softplus, jnp.tanh), the comparison outside of the loop, or "
         'jumps="ignored" if it does not matter.',
         JumpWarning,

@@ -183,7 +183,7 @@ def _trajectory(system, q0, v0, params, ts, guards, settings):
     x, rest = eqx.partition((system, q0, v0, params, ts, guards, settings.jump_ts), eqx.is_inexact_array)
     fixed, static = eqx.partition((rest, settings), eqx.is_array)
 
-    jumps = None if isinstance(system, Hybrid) else followed(settings, system, ts[0], q0, v0, params)
+    jumps = followed(settings, system, ts[0], q0, v0, params)
     in_time = jumps if jumps is not None and jumps.in_time else None
     jumps = jumps if jumps is not None and jumps.count else None
     solve = solved_in_legs if isinstance(system, Hybrid) else partial(solved_over_jumps, jumps) if jumps else solved
@@ -211,14 +211,24 @@ def _trajectory(system, q0, v0, params, ts, guards, settings):
 
 
 def followed(settings, system, t, q, v, params):
-    """The jumps of a system that a motion follows; None if there are none, or steps are not chosen by lagjax."""
-    ours = settings.controller is None and settings.event is None and not settings.progress
-    if settings.jumps == "ignored" or not ours or isinstance(settings.adjoint, diffrax.BacksolveAdjoint):
+    """The jumps of a system that a motion follows; None if there are none. Says which are not followed."""
+    if settings.jumps == "ignored":
         return None
-    found = jumps_found(system, t, q, v, params)
-    if found is not None and found.missed:
-        warn_of_missed(found)
-    return found
+    found = [jumps for phase in phases_of(system) if (jumps := jumps_found(phase, t, q, v, params)) is not None]
+    if isinstance(system, Hybrid):
+        why = "in the phases of a lj.Hybrid"
+    elif settings.controller is not None or settings.event is not None:
+        why = "with a stepsize_controller, or a condition for diffrax, of your own"
+    elif isinstance(settings.adjoint, diffrax.BacksolveAdjoint):
+        why = "with diffrax.BacksolveAdjoint"
+    else:
+        why = ""
+    missed = [words for jumps in found for words in jumps.missed]
+    if why:
+        missed += [f"{words}, {why}" for jumps in found for words in jumps.in_words()]
+    if missed:
+        warn_of_missed(missed)
+    return found[0] if found and not why else None
 
 
 def _how(method, asked, settings, in_legs):

@@ -273,8 +273,7 @@ def _of_breaks(breaks, order, rejected):
         return (
             f"{where}, where its velocity is {first.velocity:.6g}{sticks} (dry friction, a sign of a velocity); "
             f"{rejected}",
-            'jumps="found", the default, and the jump where it can be read: jnp.sign(v) in the force itself, outside of '
-            "loops",
+            'jumps="found", the default, and the jump where it can be read: jnp.sign(v) in the force itself, not in a loop',
         )
     if first.by == "time":
         return (
