@@ -1,6 +1,6 @@
 """Forces that jump or have a kink: is the motion right, and at what cost, with jumps found and without, and in diffrax?
 
-Ten forces, each written the way one writes it first. The reference is a closed form, or else the motion by diffrax alone
+Ten forces, each written the way one writes it first. The reference is a closed form, or else the motion by diffrax
 at rtol 1e-13, which knows nothing of jumps. All runs at rtol 1e-9, atol as lagjax chooses it and 1e-12 in diffrax
 (`Dopri8`, the same accelerations). Printed: error of the last position relative to its largest size, steps (accepted
 and rejected), the time of a repeated call, and that of the first.

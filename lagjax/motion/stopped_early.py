@@ -273,7 +273,7 @@ def _of_breaks(breaks, order, rejected):
         return (
             f"{where}, where its velocity is {first.velocity:.6g}{sticks} (dry friction, a sign of a velocity); "
             f"{rejected}",
-            'jumps="found", the default, and the jump where it can be read: jnp.sign(v) in the force itself, not in a loop',
+            'jumps="found", the default, with the jump where it can be read: jnp.sign(v) in the force itself, no loop',
         )
     if first.by == "time":
         return (
