@@ -37,6 +37,7 @@ from lagjax.motion.crossings import Crossing, Crossings, EventWarning
 from lagjax.motion.hybrid_trajectory import HybridTrajectory, Switches
 from lagjax.motion.integrate import integrate
 from lagjax.motion.ledger import EnergyLedger, energy_ledger
+from lagjax.motion.over_jumps import JumpWarning
 from lagjax.motion.phase_graph import HybridExplanation
 from lagjax.motion.replay import Replay
 from lagjax.motion.results import RESULTS
@@ -169,6 +170,7 @@ __all__ = [
     "Crossing",
     "Crossings",
     "EventWarning",
+    "JumpWarning",
     "poincare",
     "PoincareSection",
     "periods",

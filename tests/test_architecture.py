@@ -19,6 +19,7 @@ LAYERS = (
         "jax_internals",
         "numerics",
         "mechanics",
+        "jumps",
         "learned",
         "plot",
         "pages",

@@ -217,6 +217,17 @@ def needed(jaxpr: Jaxpr) -> list:
     return kept[::-1]
 
 
+def outputs_of(closed: ClosedJaxpr, which: Iterable[int]) -> ClosedJaxpr:
+    """The program that gives some of the results of another one, and computes nothing else."""
+    jaxpr = closed.jaxpr.replace(outvars=[closed.jaxpr.outvars[i] for i in which])
+    return closed.replace(jaxpr=jaxpr.replace(eqns=needed(jaxpr)))
+
+
+def run(closed: ClosedJaxpr, operands: Sequence) -> list:
+    """The results of a program."""
+    return jaxpr_as_fun(closed)(*operands)
+
+
 def staged(program: ClosedJaxpr, first: Sequence[int], then: Sequence[int]):
     """Split a program into two functions: of the inputs `first`, and of the first one's results and the inputs `then`.
 

@@ -72,7 +72,9 @@ class Arriving(diffrax.AbstractStepSizeController):
 def together(ts: Float[Array, " T"], jump_ts: Float[Array, " J"]) -> Float[Array, " T+J"]:
     """Merge the increasing times `ts` and the jumps between the first and last, each once; pad with the last time."""
     # If a jump and one of `ts` are equal, the jump is kept, for the derivative with respect to it.
-    times = jnp.sort(jnp.concatenate([jnp.clip(jump_ts, ts[0], ts[-1]), ts]), stable=True)
+    # Not `clip`, whose derivative is one half for a jump at the first or the last time.
+    within = jnp.where(jump_ts < ts[0], ts[0], jnp.where(jump_ts > ts[-1], ts[-1], jump_ts))
+    times = jnp.sort(jnp.concatenate([within, ts]), stable=True)
     repeated = jnp.concatenate([jnp.zeros_like(times[:1], bool), times[1:] == times[:-1]])
     return jnp.sort(jnp.where(repeated, ts[-1], times), stable=True)
 
@@ -91,7 +93,8 @@ def apart_from_jumps(equations: Equations, ts, jump_ts, q, v):
 
     `late` is zero, but its derivative is that of the difference of the two times.
     """
-    same = ts[:, None] == jump_ts[None, :]
+    # The first and the last time are those of the motion itself, and never move with a jump.
+    same = (ts[:, None] == jump_ts[None, :]) & ((ts > ts[0]) & (ts < ts[-1]))[:, None]
     late = jnp.where(jnp.any(same, axis=1), ts - jump_ts[jnp.argmax(same, axis=1)], 0.0)
     before = ts - _round_off(jnp.abs(ts))
     a = jax.vmap(lambda t, q, v: equations.accelerations(t, q, v)[0])(before, q, v)

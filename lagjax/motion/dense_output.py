@@ -198,6 +198,7 @@ def _continued(system, params, asked, tolerance, node: Snapshot, t, backward):
         max_steps=patient(MAX_STEPS),
         drift=asked.drift if system.constraints else "none",
         progress=False,
+        jumps=asked.jumps,
     )
     ts = jnp.stack([node.t, t])
     found = in_either_direction(system, node.q, node.v, params, ts, None, settings, backward)

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from lagjax.jumps.found import found as jumps_found
 from lagjax.mechanics import constraints, coordinates
 from lagjax.mechanics.constraints import Holonomic
 from lagjax.mechanics.diagnosis import dependencies, describe, equation_names, explain_failure, listed
@@ -131,6 +132,9 @@ def _explain(system: System, s: coordinates.State) -> Explanation:
     if found_structure is not None:
         rows += _of_structure(found_structure)
     rows += [(name, "yes") for name in ("force", "dissipation") if getattr(system, name) is not None]
+    if (jumps := jumps_found(system, *s)) is not None:
+        rows += [("jumps and kinks", "; ".join(words))] if (words := jumps.in_words()) else []
+        rows += [("not followed", "; ".join(jumps.missed))] if jumps.missed else []
     rows.append(("solved", _how_solved(equations_of(system, *s, fast=True), found_structure)))
     if is_free_of_velocities(system, *s):
         by = type(nystrom_for(system, s.params)).__name__

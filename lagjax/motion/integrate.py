@@ -27,6 +27,7 @@ from lagjax.motion.dense_output import at
 from lagjax.motion.failure import raise_failure
 from lagjax.motion.global_error import steps_to_repeat
 from lagjax.motion.no_lanes import raise_at_run_time
+from lagjax.motion.over_jumps import warn_of_lost
 from lagjax.motion.replay import Replay
 from lagjax.motion.reported import patient, report
 from lagjax.motion.results import ENDED_WELL, is_among
@@ -53,6 +54,7 @@ def integrate(
     dt0: ArrayLike | None = None,
     max_step: ArrayLike | None = None,
     jump_ts: ArrayLike | Sequence[float] | None = None,
+    jumps: str = "found",
     events: Mapping[str, Crossing] | None = None,
     event: diffrax.Event | None = None,
     adjoint: diffrax.AbstractAdjoint | Replay | None = None,
@@ -101,8 +103,13 @@ def integrate(
     - `dt0`: the length of the first step, `[t]`; needed with `diffrax.ConstantStepSize()`.
     - `max_step`: the longest step, `[t]`. Adaptive steps may miss what is narrower than they are, such as a short push
       or a thin barrier, without a warning. No step is longer than this, nor than the time between two outputs.
-    - `jump_ts` (J,): times at which a force jumps or has a kink, in any order, `[t]`. They become ends of steps, and
-      each step stays on one side of them; derivatives with respect to these times are right.
+    - `jumps`: "found" reads jumps and kinks off the programs of L, the force and the dissipation (`jnp.where(q > 0,
+      ...)`, `jnp.sign(v)`, `jnp.maximum`, `jnp.interp`): each becomes an end of a step, derivatives are those of the
+      motion across it, and a motion that is pushed back from both sides stays on it, as under dry friction. "ignored"
+      takes forces as they come. See `docs/forces-that-jump.md`.
+    - `jump_ts` (J,): times at which a force jumps or has a kink, in any order, `[t]`, that cannot be read off its
+      program. They become ends of steps, and each step stays on one side of them; derivatives with respect to these
+      times are right.
     - `events`: by name, a `lj.Crossing` each: where a function of the state crosses zero, recorded in `traj.events` or
       ending the motion. Crossings are also found inside steps, several in one, and located to round-off: such a step
       is taken in parts that end there, but its controller sees it as one. A value that jumps over zero at a switch of
@@ -181,6 +188,7 @@ def integrate(
         max_steps=patient(max_steps),
         drift=drift,
         progress=progress,
+        jumps=problem.check_jumps(jumps),
         shares=np.array(WHOLE_STEPS, dtype),
         repeated_up_to=steps_to_repeat(estimate_error, stepsize_controller, progress),
     )
@@ -202,4 +210,5 @@ def _raise_or_warn(trajectory, start, settings):
         raise_failure(trajectory, start, settings)
     problem.warn_of_inaccuracy(trajectory)
     warn_of_events(trajectory.events)
+    warn_of_lost(trajectory)
     return trajectory

@@ -153,7 +153,7 @@ def _first_leg(hybrid, q0, v0, params, ts, phase, settings):
     return Way(
         t=ts[0], q=q0, v=v0, phase=jnp.asarray(hybrid.first, jnp.int32), continues=jnp.asarray(True), rows=rows,
         switches=switches, events=nothing(phase.guards, phase.events, q0, v0, start.multipliers), end=start,
-        stats=stats, sizes_so_far=_sizes(q0, v0), least=least, scaled_error=jnp.zeros((), dtype),
+        stats=stats, sizes_so_far=sizes_of(q0, v0), least=least, scaled_error=jnp.zeros((), dtype),
         settled=jnp.asarray(True), result=RESULTS.successful,
     )  # fmt: skip
 
@@ -181,7 +181,7 @@ def _leg(hybrid, i, in_phase, way: Way, params, ts, phase: Phase, settings, adjo
         broken = onward & ~all_finite((after.q, after.v))
         result, onward = RESULTS.where(broken, RESULTS.reset_not_finite, result), onward & ~broken
     rows = jax.tree.map(lambda x: x[jnp.maximum(place - past + 1, 0)], {name: found[name] for name in ROWS})
-    known = ((ts > way.t) & (ts <= end.t) | (way.switches.count == 0) & (ts <= way.t)) & _reached(rows["q"])
+    known = ((ts > way.t) & (ts <= end.t) | (way.switches.count == 0) & (ts <= way.t)) & reached(rows["q"])
     none = lambda name, x: end.multipliers.get(name, jnp.full_like(x, jnp.nan))
     end = end._replace(multipliers={name: none(name, x) for name, x in way.end.multipliers.items()})
     least = way.least if not settings.by_size else jnp.maximum(way.least, stopped(found["tolerance"][1]))
@@ -192,7 +192,7 @@ def _leg(hybrid, i, in_phase, way: Way, params, ts, phase: Phase, settings, adjo
         events=with_those_of(found["events"], way.events),
         end=_where(onward, end._replace(q=after.q, v=after.v), end),
         stats={name: n + found["stats"][name] for name, n in way.stats.items()},
-        sizes_so_far=jnp.maximum(way.sizes_so_far, _sizes(end.q, end.v)), least=least,
+        sizes_so_far=jnp.maximum(way.sizes_so_far, sizes_of(end.q, end.v)), least=least,
         scaled_error=jnp.maximum(way.scaled_error, found["scaled_error"]),
         settled=way.settled & found["settled"], result=result,
     )  # fmt: skip
@@ -240,7 +240,8 @@ def _is_below(end: Snapshot, params, guards: Guards, count: int, rtol):
     return jnp.any(g < -NOT_BELOW * rtol[0] * jnp.abs(terms))
 
 
-def _reached(q):
+def reached(q):
+    """The rows of q that are known."""
     return jnp.isfinite(jax.vmap(lambda q: jnp.sum(coordinates.flatten(q)[0]))(q))
 
 
@@ -278,7 +279,8 @@ def _switched(system, ending: Ending, params, phase: Phase, way: Way):
     return after, to, record
 
 
-def _sizes(q, v):
+def sizes_of(q, v):
+    """The sizes of coordinates and velocities, (2, n)."""
     return jnp.abs(jnp.stack([stopped(coordinates.flatten(y)[0]) for y in (q, v)]))
 
 

@@ -156,6 +156,15 @@ def pieces_of(begin: Value, inner, off, end: Value, h, touches) -> Pieces:
     return Pieces(g, rate, known, sign[1:], doubt)
 
 
+def without_rest(pieces: Pieces, begin: Value, end: Value, inner, h) -> Pieces:
+    """The same, without doubts where the guard is zero all along, to round-off."""
+    noise = jnp.maximum(begin.noise, end.noise)
+    rests = jnp.asarray(True)
+    for g, rate in [(begin.g, begin.rate), (end.g, end.rate), *inner]:
+        rests = rests & (jnp.abs(g) <= noise) & (jnp.abs(h * rate) <= noise)
+    return pieces._replace(doubt=[doubt & ~rests for doubt in pieces.doubt])
+
+
 def _bend(g, rate, h):
     """How far a guard and its rate at the inner nodes are from the cubic through both ends."""
     off = jnp.zeros_like(h)

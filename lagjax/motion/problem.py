@@ -51,6 +51,17 @@ def check_method(method: Any):
         )
 
 
+def check_jumps(jumps: Any) -> str:
+    """Return `jumps`; raise unless it is one of its two values."""
+    if jumps not in ("found", "ignored"):
+        raise ValueError(
+            f"jumps must be 'found' or 'ignored', not {jumps!r:.60}.\n"
+            "Usual cause: times of jumps, which are jump_ts=.\n"
+            'Fix: leave jumps out (they are found), or jumps="ignored".'
+        )
+    return jumps
+
+
 def check_adjoint(adjoint: Any, drift: str, jump_ts: Any, recorded: bool):
     """Raise if an adjoint cannot differentiate the motion; `recorded`: whether lagjax can record its steps."""
     if adjoint is not None and not isinstance(adjoint, diffrax.AbstractAdjoint | Replay):

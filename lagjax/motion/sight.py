@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from lagjax.motion.crossings import Guards, Kind
-from lagjax.motion.pieces import INNER, Node, Pieces, Value, between, pieces_of
+from lagjax.motion.pieces import INNER, Node, Pieces, Value, between, pieces_of, without_rest
 from lagjax.motion.stepping import OnManifold
 
 # The error is taken to be this many times the distance of the two interpolants.
@@ -54,12 +54,22 @@ class Sight(eqx.Module):
 
     def _along(self, places, directions, args):
         """The guards at places (t, y), and their derivatives along one direction for each place: pairs of tuples."""
-        push = lambda place, direction: jax.jvp(lambda t, y: self.value(t, y, args), place, direction)
+        value = lambda t, y: self.value(t, y, args)
+        push = lambda place, direction: self._known(*jax.jvp(value, place, direction))
         if not self.guards.long:
             return [push(*x) for x in zip(places, directions)]
         together = jtu.tree_map(lambda *x: jnp.stack(x), *zip(places, directions))
         found = jax.vmap(push)(*together)
         return [jtu.tree_map(lambda x: x[i], found) for i in range(len(places))]
+
+    def _known(self, g, rate):
+        """The guards and their rates, without infinite slopes and NaN where a guard may not stop the motion."""
+        finite = lambda x, other: jnp.where(jnp.isfinite(x), x, other)
+        may_rest = [kind.may_rest for kind in self.guards.kinds]
+        return (
+            tuple(finite(x, 1.0) if rests else x for x, rests in zip(g, may_rest)),
+            tuple(finite(x, 0.0) if rests else x for x, rests in zip(rate, may_rest)),
+        )
 
     def unseen(self, t) -> Node:
         """A node at which nothing is known yet."""
@@ -69,11 +79,12 @@ class Sight(eqx.Module):
     def judged(self, left: Node, right: Node, inner) -> list[Pieces]:
         """Each guard between two nodes, from its values at the inner ones by the quintic and by the cubics."""
         found, h, count = [], right.t - left.t, len(INNER)
-        for begin, end, by_both in zip(left.values, right.values, inner):
+        for kind, begin, end, by_both in zip(self.guards.kinds, left.values, right.values, inner):
             pairs = zip(by_both[:count], by_both[count:])
             off = [tuple(SAFETY * jnp.abs(x - z) for x, z in zip(*pair)) for pair in pairs]
             touches = TOUCHES * self.motion.tolerances.rtol[0] * h * jnp.maximum(jnp.abs(begin.rate), jnp.abs(end.rate))
-            found.append(pieces_of(begin, by_both[:count], off, end, h, touches))
+            pieces = pieces_of(begin, by_both[:count], off, end, h, touches)
+            found.append(without_rest(pieces, begin, end, by_both, h) if kind.may_rest else pieces)
         return found
 
     def first_sign(self, value: Value, kind: Kind):

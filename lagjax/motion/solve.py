@@ -16,6 +16,8 @@ from jaxtyping import Array, Float, Int
 
 from lagjax.jax_internals.compiling import compiler_options
 from lagjax.jax_internals.tracing import is_eager, takes_for_regular
+from lagjax.jumps.found import found as jumps_found
+from lagjax.jumps.times import with_jumps_in_time
 from lagjax.mechanics.hybrid import Hybrid, phases_of
 from lagjax.mechanics.kept import kept
 from lagjax.mechanics.memory import filled_up, parted
@@ -29,6 +31,7 @@ from lagjax.motion.global_error import with_errors, with_errors_inside
 from lagjax.motion.hybrid_trajectory import HybridTrajectory
 from lagjax.motion.legs import solved_in_legs
 from lagjax.motion.one_solve import solved
+from lagjax.motion.over_jumps import solved_over_jumps, warn_of_missed
 from lagjax.motion.reported import report_settled
 from lagjax.motion.trajectory import Asked, How, Trajectory, pack
 from lagjax.numerics.evaluations import evaluations_a_step
@@ -74,6 +77,8 @@ class Settings:
     memory: float | None = eqx.field(static=True, default=None)
     # False if the equations are assumed regular, until that turns out to be wrong.
     robust: bool = eqx.field(static=True, default=True)
+    # Whether jumps of forces are found and followed.
+    jumps: str = eqx.field(static=True, default="found")
     # A right-hand side of up to this many operations is copied to each of a method's stages.
     unroll_up_to: int = eqx.field(static=True, default=UNROLL_UP_TO)
 
@@ -171,18 +176,23 @@ def _trajectory_of(*problem):
 def _trajectory(system, q0, v0, params, ts, guards, settings):
     """The trajectory, and whether it is settled: the robust solve would give the same."""
     s, method = settings, method_of(settings, system, ts[0], q0, v0, params)
-    asked = Asked(s.method, s.controller, s.dt0, s.max_step, s.jump_ts, s.drift)
+    asked = Asked(s.method, s.controller, s.dt0, s.max_step, s.jump_ts, s.drift, s.jumps)
     how = _how(method, s.method, settings, isinstance(system, Hybrid))
     settings = eqx.tree_at(lambda s: s.method, settings, method, is_leaf=lambda x: x is None)
     # Derivatives flow to the floating-point arrays of these; the settings are constants.
     x, rest = eqx.partition((system, q0, v0, params, ts, guards, settings.jump_ts), eqx.is_inexact_array)
     fixed, static = eqx.partition((rest, settings), eqx.is_array)
 
-    solve = solved_in_legs if isinstance(system, Hybrid) else solved
+    jumps = followed(settings, system, ts[0], q0, v0, params)
+    in_time = jumps if jumps is not None and jumps.in_time else None
+    jumps = jumps if jumps is not None and jumps.count else None
+    solve = solved_in_legs if isinstance(system, Hybrid) else partial(solved_over_jumps, jumps) if jumps else solved
 
     def of_arrays(x, fixed, adjoint, differentiated):
         rest, settings = eqx.combine(fixed, static)
         *motion, jump_ts = eqx.combine(x, rest)
+        if in_time is not None:
+            jump_ts = with_jumps_in_time(in_time, jump_ts, *motion[:5])
         unroll_up_to = 0 if differentiated else settings.unroll_up_to
         robust = settings.robust or differentiated and settings.adjoint is None
         settings = replace(settings, jump_ts=jump_ts, unroll_up_to=unroll_up_to, robust=robust)
@@ -191,13 +201,34 @@ def _trajectory(system, q0, v0, params, ts, guards, settings):
 
     if settings.adjoint is None:
         # Each leg of a motion in phases is replayed separately.
-        fields = solve_in_both_modes(of_arrays, x, fixed, recorded=not isinstance(system, Hybrid))
+        fields = solve_in_both_modes(of_arrays, x, fixed, recorded=solve is solved)
     else:
         fields, _ = of_arrays(x, fixed, settings.adjoint, True)
     arrays, described = pack(system, params, asked, how)
     settled = fields.pop("settled")
     of = HybridTrajectory if isinstance(system, Hybrid) else Trajectory
     return of(t=ts, **fields, arrays=arrays, static=described), settled
+
+
+def followed(settings, system, t, q, v, params):
+    """The jumps of a system that a motion follows; None if there are none. Says which are not followed."""
+    if settings.jumps == "ignored":
+        return None
+    found = [jumps for phase in phases_of(system) if (jumps := jumps_found(phase, t, q, v, params)) is not None]
+    if isinstance(system, Hybrid):
+        why = "in the phases of a lj.Hybrid"
+    elif settings.controller is not None or settings.event is not None:
+        why = "with a stepsize_controller, or a condition for diffrax, of your own"
+    elif isinstance(settings.adjoint, diffrax.BacksolveAdjoint):
+        why = "with diffrax.BacksolveAdjoint"
+    else:
+        why = ""
+    missed = [words for jumps in found for words in jumps.missed]
+    if why:
+        missed += [f"{words}, {why}" for jumps in found for words in jumps.in_words()]
+    if missed:
+        warn_of_missed(missed)
+    return found[0] if found and not why else None
 
 
 def _how(method, asked, settings, in_legs):

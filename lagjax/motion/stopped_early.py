@@ -273,16 +273,16 @@ def _of_breaks(breaks, order, rejected):
         return (
             f"{where}, where its velocity is {first.velocity:.6g}{sticks} (dry friction, a sign of a velocity); "
             f"{rejected}",
-            "a steep slope in place of the jump, jnp.tanh(v / 1e-3) for jnp.sign(v), with method=lj.Radau5()",
+            'jumps="found", the default, with the jump where it can be read: jnp.sign(v) in the force itself, no loop',
         )
     if first.by == "time":
         return (
             f"{where} (a force that is switched); {rejected}",
-            "name the times at which it does, jump_ts=jnp.array([...])",
+            'jumps="found", the default, which reads such times off the force; or name them, jump_ts=jnp.array([...])',
         )
     return (
         f"{where} (a contact, an end stop, a table that is interpolated); {rejected}",
-        "a smooth function in its place, or an event there and a new start from where it ended",
+        'jumps="found", the default, which reads such places off the force; or a smooth function in its place',
     )
 
 

@@ -67,6 +67,7 @@ class Asked(NamedTuple):
     max_step: Array | None
     jump_ts: Array | None
     drift: str
+    jumps: str = "found"
 
 
 class Static(NamedTuple):

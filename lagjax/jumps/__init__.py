@@ -1,0 +1,1 @@
+"""Jumps and kinks of forces, read off their programs."""

@@ -1,0 +1,298 @@
+"""A motion over the jumps and kinks of its forces: one solve after another, each in one mode (`jumps/found.py`).
+
+In a mode the equations are smooth, and each leg ends where the guard of one of its comparisons is zero. There the mode
+changes and the state does not; the time and the state carry their derivatives (`crossing_times.py`) into the next leg,
+so that derivatives of all orders get the jump: with the flows φ₋ and φ₊ of both sides and the time τ at which a
+neighbouring motion crosses, the neighbour goes on from φ₊(-τ) φ₋(τ). If both sides push the motion back it goes along
+the jump (`jumps/sliding.py`), until a share of the mixture leaves [0, 1].
+
+After very many jumps, and where a mode turns out to be wrong, the rest of the motion is integrated with the comparisons
+as they are, which is right too, with more steps and without the jumps' part of the derivatives; `stats["lost_jumps"]`
+says so.
+
+Jumps that depend on t alone are ends of steps inside a leg, like `jump_ts` (`jumps/times.py`).
+
+Source: Hiskens & Pai, IEEE Trans. Circuits Syst. I 47 (2000) 204 (trajectory sensitivities through switches).
+"""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import diffrax
+import equinox as eqx
+import equinox.internal as eqxi
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int, PyTree
+
+from lagjax.jax_internals.one_function import apart
+from lagjax.jumps.found import Given, Jumps, OfParams, Smooth
+from lagjax.jumps.sliding import Mixed, Sliding, slidable
+from lagjax.mechanics import constraints
+from lagjax.mechanics.system import System
+from lagjax.mechanics.warned import warn
+from lagjax.motion.consistency import stopped
+from lagjax.motion.crossings import LONG, Crossings, Guards, Kind
+from lagjax.motion.legs import AT_ONCE, NOT_BELOW, ROWS, reached, sizes_of
+from lagjax.motion.loop import resolution
+from lagjax.motion.one_solve import solved
+from lagjax.motion.recorded import nothing, with_those_of
+from lagjax.motion.results import RESULTS, ended_well
+from lagjax.motion.sight import uneven
+from lagjax.motion.trajectory import Snapshot
+
+# The most jumps that are followed in a motion.
+MOST_JUMPS = 1000
+
+
+class JumpWarning(UserWarning):
+    """A force jumps or has a kink where the motion is not followed across it: derivatives may lack a part."""
+
+
+def warn_of_missed(missed: Sequence[str]):
+    """Say which jumps are not followed."""
+    warn(
+        f"not followed across its jumps or kinks: {'; '.join(dict.fromkeys(missed))}.\n"
+        "The motion is right to its tolerance, but takes more steps, and where such a number changes its branch, "
+        "derivatives lack the part that is due to the change.\n"
+        "Usual cause: a network with relu, a comparison inside lax.scan, a force with a comparison in a phase.\n"
+        "Fix: a smooth function in its place (jax.nn.softplus, jnp.tanh), the comparison outside of the loop, or "
+        'jumps="ignored" if it does not matter.',
+        JumpWarning,
+    )
+
+
+def warn_of_lost(trajectory):
+    """Say that a motion could not be followed across all its jumps."""
+    if "lost_jumps" in trajectory.stats and bool(trajectory.stats["lost_jumps"]):
+        count = int(trajectory.stats["num_jumps"])
+        why = f"after {count} jumps, the most that are" if count >= MOST_JUMPS else f"after {count} of its jumps"
+        warn(
+            f"the motion was not followed across the jumps of its forces {why}; from there on forces were taken as "
+            "they come: the motion is right to its tolerance, and derivatives lack the part that is due to later "
+            "jumps.\n"
+            "Usual cause: a comparison at the end of a function's domain (arccos, sqrt), or a control that chatters.\n"
+            'Fix: jumps="ignored" if the comparison only guards against NaN; a shorter time span.',
+            JumpWarning,
+        )
+
+
+class ModeGuard(eqx.Module):
+    """The guard of one mode, (t, q, v, given) -> a number above zero as long as the mode lasts.
+
+    A motion that slides along jump `number` has α (1 - α) in its place.
+    """
+
+    guard: Smooth
+    sliding: Sliding | None
+    number: int = eqx.field(static=True)
+
+    def __call__(self, t, q, v, given: Given):
+        value = self.guard(t, q, v, given)
+        if self.sliding is not None:
+            share = self.sliding.mixture(t, q, v, given).shares[self.sliding.which.index(self.number)]
+            value = jnp.where(given.slides[self.number], share * (1 - share), value)
+        return jnp.where(given.free, 1.0, value)
+
+
+class Model(eqx.Module):
+    """A system in a mode: its `smooth` equations, the mixtures, and for each mode its guard and the mode beyond."""
+
+    smooth: System
+    sliding: Sliding | None
+    guards: tuple[ModeGuard, ...]
+    beyond: tuple[Smooth, ...]
+
+
+def model_of(jumps: Jumps, system: System, small: bool) -> Model:
+    """The smooth system with its guards; motions slide in `small` systems."""
+    smooth, guards, sliding = jumps.smooth(system), jumps.numbers(system, 0), None
+    which = slidable(jumps, system) if small else ()
+    if which:
+        differences = jumps.numbers(system, 2)
+        sliding = Sliding(smooth, tuple(differences[i] for i in which), which)
+        smooth = System(smooth.lagrangian, smooth.constraints, Mixed(smooth.force, sliding), smooth.dissipation)
+    of = lambda i, guard: ModeGuard(guard, sliding if i in which else None, i)
+    return Model(smooth, sliding, tuple(of(i, g) for i, g in enumerate(guards)), tuple(jumps.numbers(system, 1)))
+
+
+class Way(NamedTuple):
+    """How far the legs have come, as in `legs.py`; `modes`, `slides`, `free`: as in `Given`; `count`: of all jumps."""
+
+    t: Float[Array, ""]
+    q: PyTree[Float[Array, "..."]]
+    v: PyTree[Float[Array, "..."]]
+    modes: Float[Array, " n"]
+    slides: Bool[Array, " n"]
+    free: Bool[Array, ""]
+    count: Int[Array, ""]
+    continues: Bool[Array, ""]
+    rows: dict[str, Any]
+    events: dict[str, Crossings]
+    end: Snapshot
+    stats: dict[str, Array]
+    sizes_so_far: Array
+    least: Array
+    scaled_error: Float[Array, ""]
+    settled: Bool[Array, ""]
+    result: Any
+
+
+def solved_over_jumps(jumps: Jumps, system: System, q0, v0, params, ts, guards, settings, adjoint):
+    """Return the fields of the trajectory, like `one_solve.solved`."""
+    small = sum(x.size for x in jtu.tree_leaves(q0)) + constraints.count(system, ts[0], q0, v0, params) <= 24
+    model = model_of(jumps, system, small)
+    modes = stopped(jumps.modes(system, ts[0], q0, v0, params))
+    both = _together(model, guards)
+    first = _first(system, q0, v0, params, ts, guards, modes, settings)
+
+    def next_leg(way: Way) -> Way:
+        return _leg(model, both, guards, way, params, ts, settings, adjoint)
+
+    if isinstance(adjoint, diffrax.ForwardMode):
+        way = lax.while_loop(lambda way: way.continues, next_leg, first)
+    else:
+        step = lambda way, _: (lax.cond(eqxi.unvmap_any(way.continues), next_leg, lambda way: way, way), None)
+        way, _ = lax.scan(step, first, None, length=MOST_JUMPS + 2)
+    return {
+        **way.rows,
+        "end": way.end,
+        "stats": way.stats | {"num_jumps": way.count, "lost_jumps": way.free},
+        "tolerance": (settings.rtol, way.least),
+        "scaled_error": way.scaled_error,
+        "result": way.result,
+        "settled": way.settled,
+        "events": way.events,
+    }
+
+
+def _together(model: Model, guards: Guards | None) -> Guards:
+    """The guards of the modes, and then those of the user's events."""
+    long = any(len(f.guard.program.jaxpr.eqns) > LONG for f in model.guards) or model.sliding is not None
+    kinds = tuple(
+        Kind(f"mode {i}", -1, True, 1, False, long, holds=True, may_rest=True) for i in range(len(model.guards))
+    )  # fmt: skip
+    if guards is None:
+        return Guards(model.guards, kinds)
+    return Guards((*model.guards, *map(OfParams, guards.functions)), (*kinds, *guards.kinds))
+
+
+def _first(system, q0, v0, params, ts, guards, modes, settings) -> Way:
+    dtype, many = ts.dtype, ts.shape[0]
+    nan = lambda shape: jnp.full(shape, jnp.nan, dtype)
+    of_rows = lambda tree: jax.tree.map(lambda x: nan((many, *x.shape)), tree)
+    multipliers = {name: nan(shape) for name, shape in constraints.shapes(system, ts[0], q0, v0, params).items()}
+    rows = {"q": of_rows(q0), "v": of_rows(v0), "multipliers": of_rows(multipliers)}
+    sizes, zero = sizes_of(q0, v0), jnp.asarray(0)
+    names = () if guards is None else [kind.name for kind in guards.kinds]
+    return Way(
+        t=ts[0], q=q0, v=v0, modes=modes, slides=jnp.zeros(modes.shape, bool), free=jnp.asarray(False), count=zero,
+        continues=jnp.asarray(True), rows=rows, events=nothing(guards, names, q0, v0, multipliers),
+        end=Snapshot(ts[0], q0, v0, multipliers),
+        stats={name: zero for name in ("num_steps", "num_accepted_steps", "num_rejected_steps")},
+        sizes_so_far=sizes, least=jnp.zeros_like(sizes) if settings.by_size else settings.atol,
+        scaled_error=jnp.zeros((), dtype), settled=jnp.asarray(True), result=RESULTS.successful,
+    )  # fmt: skip
+
+
+def _leg(model: Model, guards: Guards, recorded, way: Way, params, ts, settings, adjoint) -> Way:
+    """Return the way after one more leg."""
+    # Past outputs would cost a step each: those ahead come first, padded with the last.
+    place, past, here = jnp.arange(ts.shape[0]), jnp.sum(ts <= way.t), way.continues
+    ahead = jnp.where(place == 0, way.t, ts[jnp.minimum(place + past - 1, ts.shape[0] - 1)])
+    times = jnp.where(here, ahead, way.t)
+    given = Given(params, way.modes, way.slides, way.free)
+    found = apart(solved, model.smooth, way.q, way.v, given, times, guards, settings, adjoint, way.sizes_so_far)
+    crossings = [found["events"][kind.name] for kind in guards.kinds]
+    when = jnp.stack([jnp.where(jnp.isfinite(x.t[0]), x.t[0], jnp.inf) for x in crossings])
+    ending = apart(_ending, model, guards, found["result"], found["end"], when, way, given, resolution(ts), settings)
+    end, onward = ending.end, here & ending.onward
+    modes, slides = apart(_beyond, model, ending.first, end, given)
+    # What a leg found whose mode was wrong does not count.
+    counts = here & ~ending.wrong
+    rows = jax.tree.map(lambda x: x[jnp.maximum(place - past + 1, 0)], {name: found[name] for name in ROWS})
+    known = ((ts > way.t) & (ts <= end.t) | (way.t <= ts[0]) & (ts <= way.t)) & reached(rows["q"])
+    put = lambda all, new: jax.tree.map(lambda x, y: jnp.where(_like(counts & known, x), y, x), all, new)
+    least = way.least if not settings.by_size else jnp.maximum(way.least, stopped(found["tolerance"][1]))
+    again = here & ending.wrong
+    further = way._replace(
+        t=jnp.where(onward, end.t, way.t), q=_where(onward, end.q, way.q), v=_where(onward, end.v, way.v),
+        modes=jnp.where(onward, modes, way.modes), slides=jnp.where(onward, slides, way.slides),
+        free=way.free | again | (onward & (way.count + 1 >= MOST_JUMPS)), count=way.count + onward,
+        continues=again | (onward & (end.t < ts[-1])), rows=put(way.rows, rows),
+        events=_where(counts, with_those_of(found["events"], way.events), way.events), end=_where(counts, end, way.end),
+        stats={name: n + found["stats"][name] for name, n in way.stats.items()},
+        sizes_so_far=jnp.maximum(way.sizes_so_far, sizes_of(end.q, end.v)), least=least,
+        scaled_error=jnp.where(counts, jnp.maximum(way.scaled_error, found["scaled_error"]), way.scaled_error),
+        settled=way.settled & found["settled"], result=RESULTS.where(again, RESULTS.successful, ending.result),
+    )  # fmt: skip
+    return _where(here, further, way)
+
+
+class Ending(NamedTuple):
+    """How a leg ends: `onward`: a mode changes, the one with the number `first`; `wrong`: the leg is to be repeated
+    with the comparisons as they are."""
+
+    onward: Bool[Array, ""]
+    wrong: Bool[Array, ""]
+    first: Int[Array, ""]
+    end: Snapshot
+    result: Any
+
+
+def _ending(model, guards: Guards, result, end: Snapshot, when, way: Way, given, resolution, settings) -> Ending:
+    """Find out what ends a leg; `when`: the times at which its guards cross, infinite for those that do not."""
+    count, at_one_time = len(model.guards), AT_ONCE * resolution
+    # An event of the user's that ends the motion at the time of a jump comes first.
+    ends = jnp.where(guards.terminal, when, jnp.inf)[count:]
+    when = when[:count]
+    by_event = jnp.any(ends <= jnp.min(when) + at_one_time)
+    onward = (result == RESULTS.event_occurred) & ~by_event
+    at_once = onward & (end.t - way.t <= at_one_time)
+    # A jump at once happens where the leg begins, so that its time has the derivatives of that.
+    t, q, v = _where(at_once, (way.t, way.q, way.v), (end.t, end.q, end.v))
+    end = Snapshot(t, q, v, end.multipliers)
+    below = ended_well(result) & ~onward & _is_below(end, given, guards, count, settings.rtol)
+    wrong = ~way.free & (below | ~ended_well(result) & (result != RESULTS.max_steps_reached))
+    result = RESULTS.where(onward, RESULTS.successful, result)
+    first = jnp.argmax(when <= jnp.min(when) + at_one_time)
+    return Ending(onward, wrong, first, end, result)
+
+
+def _is_below(end: Snapshot, given, guards: Guards, count: int, rtol):
+    """Whether one of the first `count` guards is below zero by more than errors can cause."""
+    state = stopped(tuple(end))
+    value = lambda *state: jnp.stack(guards(*state, stopped(given))[:count])
+    g, terms = jax.jvp(value, state, uneven(state))
+    return jnp.any(g < -NOT_BELOW * rtol[0] * jnp.abs(terms))
+
+
+def _beyond(model: Model, first, end: Snapshot, given: Given):
+    """The modes after the guard `first` has crossed zero, and along which jumps the motion then slides."""
+    state, given = stopped((end.t, end.q, end.v)), stopped(given)
+    n = len(model.guards)
+    mine, slid = jnp.arange(n) == first, given.slides
+    beyond = jnp.stack([f(*state, given) for f in model.beyond]).astype(given.modes.dtype)
+    modes = jnp.where(mine, beyond, given.modes)
+    if model.sliding is None:
+        return modes, slid
+    which = model.sliding.which
+    shares = model.sliding.mixture(*state, given).shares
+    # A motion that slides leaves to the side of the share that it has.
+    stays = jnp.zeros(n, bool).at[jnp.asarray(which)].set(jnp.stack(shares) < 0.5) & slid
+    modes = jnp.where(mine & stays, given.modes, modes)
+    after = given._replace(modes=modes, slides=slid & ~mine)
+    rates = jnp.zeros(n, modes.dtype).at[jnp.asarray(which)].set(jnp.stack(model.sliding.mixture(*state, after).rates))
+    back = mine & ~slid & (rates * (2 * modes - 1) < 0)
+    return modes, (slid & ~mine) | back
+
+
+def _where(condition, a, b):
+    pick = lambda x, y: jnp.where(condition, x, y).astype(jnp.result_type(y)) if eqx.is_array(y) else y
+    return jax.tree.map(pick, a, b)
+
+
+def _like(mask, x):
+    return mask.reshape(mask.shape + (1,) * (x.ndim - 1))
