@@ -158,7 +158,7 @@ def warning_of(trajectory) -> str:
         f"over a time of {span:.6g} ({steps} steps) the error of '{account.names[column]}' grows to about {error:.1g}, "
         f"while {'a turn' if turn else 'the largest value'} is {size:.3g}: {_left(error, size)}. From t = {since:.6g} "
         f"on it is larger than {_expected(size, account.limit[column])} at rtol = {rtol:.1g}.\n"
-        f"Usual cause: {cause}.\nFix: {fix}."
+        f"Cause: {cause}.\nFix: {fix}."
     )
 
 

@@ -147,14 +147,19 @@ def _first_leg(hybrid, q0, v0, params, ts, phase, settings):
         impulse=record(v0), count=jnp.asarray(0), uncertain=jnp.asarray(False), names=hybrid.names,
         ways=tuple(s.phase for s in hybrid.switches),
     )  # fmt: skip
-    start = Snapshot(ts[0], q0, v0, {name: nan(shape) for name, shape in shapes.items()})
+    # A motion in no phase would never end.
+    first, phases = jnp.asarray(hybrid.first, jnp.int32), len(hybrid.systems)
+    exists = (first >= 0) & (first < phases)
+    known = lambda tree: jax.tree.map(lambda x: jnp.where(exists, x, jnp.nan), tree)
+    start = Snapshot(ts[0], known(q0), known(v0), {name: nan(shape) for name, shape in shapes.items()})
     zero, least = jnp.asarray(0), jnp.zeros((2, n), dtype) if settings.by_size else settings.atol
     stats = {name: zero for name in ("num_steps", "num_accepted_steps", "num_rejected_steps")}
     return Way(
-        t=ts[0], q=q0, v=v0, phase=jnp.asarray(hybrid.first, jnp.int32), continues=jnp.asarray(True), rows=rows,
+        t=ts[0], q=q0, v=v0, phase=jnp.clip(first, 0, phases - 1), continues=exists, rows=rows,
         switches=switches, events=nothing(phase.guards, phase.events, q0, v0, start.multipliers), end=start,
-        stats=stats, sizes_so_far=_sizes(q0, v0), least=least, scaled_error=jnp.zeros((), dtype),
-        settled=jnp.asarray(True), result=RESULTS.successful,
+        stats=stats, sizes_so_far=_sizes(q0, v0), least=least,
+        scaled_error=jnp.where(exists, jnp.zeros((), dtype), jnp.nan), settled=jnp.asarray(True),
+        result=RESULTS.where(exists, RESULTS.successful, RESULTS.no_such_phase),
     )  # fmt: skip
 
 

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, ArrayLike
 
 from lagjax.jax_internals.tracing import is_eager
 from lagjax.mechanics import constraints, coordinates
@@ -216,7 +216,7 @@ def _with_first_alike(switch: Switch):
     return switch, read
 
 
-def starting(system, start: str | None):
+def starting(system, start: str | ArrayLike | None):
     """The system; a hybrid one starts in phase `start`, with the values that its switches read now."""
     if isinstance(system, Hybrid):
         switches, read = zip(*map(_with_first_alike, system.switches)) if system.switches else ((), ())
