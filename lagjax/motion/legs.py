@@ -158,7 +158,7 @@ def _first_leg(hybrid, q0, v0, params, ts, phase, settings):
         t=ts[0], q=q0, v=v0, phase=jnp.clip(first, 0, phases - 1), continues=exists, rows=rows,
         switches=switches, events=nothing(phase.guards, phase.events, q0, v0, start.multipliers), end=start,
         stats=stats, sizes_so_far=_sizes(q0, v0), least=least,
-        scaled_error=jnp.where(exists, jnp.zeros((), dtype), jnp.nan), settled=jnp.asarray(True),
+        scaled_error=jnp.where(exists, jnp.zeros((), dtype), jnp.inf), settled=jnp.asarray(True),
         result=RESULTS.where(exists, RESULTS.successful, RESULTS.no_such_phase),
     )  # fmt: skip
 
@@ -204,7 +204,7 @@ def _leg(hybrid, i, in_phase, way: Way, params, ts, phase: Phase, settings, adjo
         end=_where(onward, end._replace(q=after.q, v=after.v), end),
         stats={name: n + found["stats"][name] for name, n in way.stats.items()},
         sizes_so_far=jnp.maximum(way.sizes_so_far, _sizes(end.q, end.v)), least=least,
-        scaled_error=jnp.where(ended_well(result), jnp.maximum(way.scaled_error, found["scaled_error"]), jnp.nan),
+        scaled_error=jnp.where(ended_well(result), jnp.maximum(way.scaled_error, found["scaled_error"]), jnp.inf),
         settled=way.settled & found["settled"], result=result,
     )  # fmt: skip
     return _where(in_phase, further, way)

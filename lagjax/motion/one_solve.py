@@ -177,7 +177,7 @@ def _result(equations, start, solution, outputs, guards, settings):
         "end": end,
         "stats": stats,
         "tolerance": (settings.rtol, _absolute(stopped((motion.q, motion.v)), start.scales, settings)),
-        "scaled_error": jnp.where(ended_well(result), change, jnp.nan),
+        "scaled_error": jnp.where(ended_well(result), change, jnp.inf),
         "result": result,
         "settled": ended_well(result) | _among(result, UNAFFECTED) if regular else jnp.asarray(True),
         "events": {} if located is None else by_name(guards, located, end.t[None], ~start.refused),
