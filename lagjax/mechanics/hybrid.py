@@ -13,6 +13,7 @@ from collections.abc import Callable, Mapping, Sequence
 import equinox as eqx
 import jax
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Int
 
 from lagjax.mechanics.arguments import takes_of
@@ -137,7 +138,8 @@ class Hybrid(eqx.Module):
     **Arguments:**
 
     - `phases`: by name, `System`s over the same coordinates. A constraint of the same name in several phases has the
-      same shape in all. Motions start in the first one, or with `lj.integrate(..., start=name)`.
+      same shape in all. Motions start in the first one, or with `lj.integrate(..., start=name)`; `start` may be the
+      phase's number, which can differ from lane to lane.
     - `switches`: `Switch`es, or lists of them. Where two guards cross at the same time, the one listed first takes
       effect; the other one does so at once in the next phase, if it belongs to that phase.
     - `most_switches`: the largest number of switches in a motion; memory is reserved for so many.
@@ -193,16 +195,39 @@ class Hybrid(eqx.Module):
         self.switches, self.most_switches = tuple(listed), most_switches
         self.first = np.zeros((), np.int32)
 
-    def starting(self, start: str | None) -> "Hybrid":
-        """The same hybrid with motions that start in the named phase; None keeps the present one."""
+    def starting(self, start: str | ArrayLike | None) -> "Hybrid":
+        """The same hybrid with motions that start in this phase, a name or a number; None keeps the present one.
+
+        A number may be traced: one that no phase has is then a failure of the motion.
+        """
         if start is None:
             return self
+        if not isinstance(start, str):
+            return replace_fields(self, first=self._number(start))
         if start not in self.names:
             raise ValueError(
                 f"start={start!r} is not a phase.\nThe phases are {', '.join(map(repr, self.names))}; motions start in "
                 "the first one by default."
             )
         return replace_fields(self, first=np.asarray(self.names.index(start), np.int32))
+
+    def _number(self, start):
+        whole = hasattr(start, "dtype") and np.issubdtype(start.dtype, np.integer) or isinstance(start, int)
+        if isinstance(start, bool) or not whole or np.ndim(start):
+            shape = f" of shape {np.shape(start)}" if np.ndim(start) else ""
+            raise ValueError(
+                f"start must be the name of a phase, or its number, a whole one, not {type(start).__name__}{shape}.\n"
+                'Fix: start="flying"; or lanes that start in different phases, '
+                "jax.vmap(lambda q, start: lj.integrate(..., start=start))(q, jnp.array([0, 1]))."
+            )
+        if isinstance(start, Tracer):
+            return start.astype(np.int32)
+        if not 0 <= int(start) < len(self.names):
+            raise ValueError(
+                f"start={int(start)} is not the number of a phase.\nThe phases are "
+                f"{', '.join(f'{i}: {name!r}' for i, name in enumerate(self.names))}."
+            )
+        return np.asarray(start, np.int32)
 
     def __hash__(self):
         return hash(kinds(self))

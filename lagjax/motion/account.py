@@ -6,7 +6,17 @@ import jax
 import numpy as np
 
 from lagjax.mechanics import coordinates
-from lagjax.motion.accuracy import AMPLIFIED, DIGITS_LEFT, EXPECTED, allowed, angle_mask, columns, of_a_step, sizes_of
+from lagjax.motion.accuracy import (
+    AMPLIFIED,
+    DIGITS_LEFT,
+    EXPECTED,
+    allowed,
+    angle_mask,
+    columns,
+    in_units_of,
+    of_a_step,
+    sizes_of,
+)
 from lagjax.motion.tolerances import TURN
 
 # A motion whose velocity grows to this many times its median has passed near a singularity.
@@ -27,7 +37,7 @@ class Account(NamedTuple):
 
     - `names`: as the user would write them; `t` (T,): the outputs that were reached.
     - `value`, `error` (T, 2n); `size` (2n,): the largest values; `limit` (2n,): the allowed errors.
-    - `amplified` (T, 2n): the errors in units of the sum of the tolerances of all steps so far.
+    - `amplified` (T, 2n): the errors in units of the sum of the tolerances of all steps so far; 0 without a tolerance.
     """
 
     names: list[str]
@@ -41,7 +51,7 @@ class Account(NamedTuple):
     @property
     def excess(self) -> np.ndarray:
         """The errors in units of the allowed ones."""
-        return self.error / np.where(self.limit > 0, self.limit, 1.0)
+        return in_units_of(np, self.error, self.limit)
 
 
 def account_of(trajectory) -> Account | None:
@@ -63,7 +73,8 @@ def account_of(trajectory) -> Account | None:
     )
     size = sizes_of(np, largest, angle_mask(trajectory), span, steps, len(trajectory.t))
     limit, step, size = allowed(np, size, span, tolerance).ravel(), of_a_step(size, tolerance).ravel(), size.ravel()
-    amplified = error / (step * np.maximum(1.0, steps * abs(t - t[0]) / span)[:, None])
+    steps_so_far = np.maximum(1.0, steps * abs(t - t[0]) / span)[:, None]
+    amplified = error / np.where(step > 0, step * steps_so_far, np.inf)
     return Account([*names, *(f"v of {name}" for name in names)], t, value, error, size, limit, amplified)
 
 
@@ -87,7 +98,8 @@ def _at_the_end(account):
     n, last = len(account.names) // 2, account.error[-1]
     parts = []
     for which, group in (("q", slice(0, n)), ("v", slice(n, None))):
-        relative = last[group] / np.where(account.size[group] > 0, account.size[group], 1.0)
+        known = account.size[group] > 0
+        relative = np.where(known, last[group] / np.where(known, account.size[group], 1.0), last[group] > 0)
         i = int(np.argmax(relative))
         parts.append(f"{last[group][i]:.0e} in {which}" + (f" ({account.names[i]})" if n > 1 else ""))
     return f"about {' and '.join(parts)} at the end"
@@ -146,7 +158,7 @@ def warning_of(trajectory) -> str:
         f"over a time of {span:.6g} ({steps} steps) the error of '{account.names[column]}' grows to about {error:.1g}, "
         f"while {'a turn' if turn else 'the largest value'} is {size:.3g}: {_left(error, size)}. From t = {since:.6g} "
         f"on it is larger than {_expected(size, account.limit[column])} at rtol = {rtol:.1g}.\n"
-        f"Usual cause: {cause}.\nFix: {fix}."
+        f"Cause: {cause}.\nFix: {fix}."
     )
 
 
@@ -160,15 +172,26 @@ def _expected(size, limit):
 
 
 def _cause(trajectory, account, row, column, rtol):
+    """The cause, with the number that shows it, and the fix."""
     how, dtype = trajectory.static.how, np.asarray(trajectory.t).dtype
+    single = dtype == np.dtype("float32")
     tighter = f"rtol={max(rtol / 1e3, 1e2 * float(np.finfo(dtype).eps)):.0e}, and atol smaller by as much"
+    if account.size[column] == 0:
+        return (
+            "a force that is narrower than the steps: the motion is zero throughout in this run, and not in a second "
+            "one with shorter steps",
+            "jump_ts= with the times at which the force sets in and ends, or max_step= shorter than it lasts",
+        )
     if how.steps == "fixed":
-        return "fixed steps that are too long", "a shorter dt0, or leave stepsize_controller out"
+        return (
+            f"fixed steps that are too long: half as long they change the result by {account.error[row, column]:.1g}",
+            "a shorter dt0, or leave stepsize_controller out",
+        )
     round_off = rtol < NEAR_ROUND_OFF * np.finfo(dtype).eps
     speeds = abs(account.value[:, len(account.names) // 2 :])
     typical = np.median(speeds, axis=0)
     peaks = speeds.max(axis=0) / np.where(typical > 0, typical, np.inf)
-    if peaks.max() > PEAK:
+    if peaks.max() > PEAK and not round_off:
         i = int(np.argmax(peaks))
         return (
             f"the motion passes near a singularity: {account.names[len(account.names) // 2 + i]} grows to "
@@ -176,13 +199,21 @@ def _cause(trajectory, account, row, column, rtol):
             f"{tighter}, or coordinates that are regular there",
         )
     times = account.amplified[row, column]
+    limit = f"rtol = {rtol:.1g} is {rtol / np.finfo(dtype).eps:.3g} round-offs of {dtype}"
+    beyond = "study what does not depend on a single motion: averages, sections, energies"
     if times > AMPLIFIED:
+        kept = "float64" if single and round_off else None if round_off else tighter
         return (
-            f"the motion itself amplifies errors, here {times:.0e} times (a chaotic or an unstable motion, or a phase "
-            "error that grows over many periods)",
-            f"{'float64 where this is float32' if round_off else tighter}, which keeps more digits for some time; "
-            "beyond that, study what does not depend on a single motion: averages, sections, energies",
+            f"the motion itself amplifies errors, here {times:.0e} times"
+            + (f", and {limit}: a tighter one keeps hardly more digits" if round_off and not single else ""),
+            f"a shorter span; beyond that, {beyond}"
+            if kept is None
+            else f"{kept}, which keeps more digits for some time; beyond that, {beyond}",
         )
     if round_off:
-        return "round-off: the tolerance is near its limit", "a shorter span, or float64 where this is float32"
-    return "the errors of many steps add up, at a loose tolerance", f"{tighter}, or a method of higher order"
+        return f"round-off: {limit}", f"a shorter span{', or float64' if single else ''}"
+    steps = int(trajectory.stats["num_accepted_steps"])
+    return (
+        f"the errors of {steps} steps add up, at a loose tolerance: to {times:.2g} times the sum of what each may have",
+        f"{tighter}, or a method of higher order",
+    )

@@ -77,14 +77,19 @@ def allowed(xp, size, span, tolerance):
     return xp.minimum(EXPECTED * tolerances, xp.where(nothing, np.inf, DIGITS_LEFT * size))
 
 
+def in_units_of(xp, error, limit):
+    """Return errors in units of the allowed ones; where a number is zero throughout, its size is the error itself."""
+    known = limit > 0
+    return xp.where(known, error / xp.where(known, limit, 1.0), xp.where(error > 0, 1 / DIGITS_LEFT, 0.0 * error))
+
+
 def scaled_error(xp, worst, largest, trajectory, ts, tolerance):
     """Return the largest of the errors `worst` (2, n) in units of the allowed ones; the former value if all are NaN."""
     span, steps = abs(ts[-1] - ts[0]), xp.asarray(trajectory.stats["num_accepted_steps"])
 
     def by(is_angle):
         limit = allowed(xp, sizes_of(xp, largest, is_angle, span, steps, len(ts)), span, tolerance)
-        # A number that is zero throughout has an error of zero.
-        share = worst / xp.where(limit > 0, limit, 1.0)
+        share = in_units_of(xp, worst, limit)
         unknown = xp.isnan(share)
         return xp.where(unknown.all(), trajectory.scaled_error, xp.where(unknown, 0.0, share).max()).astype(ts.dtype)
 

@@ -118,6 +118,12 @@ class Crossings(eqx.Module):
         """Return the same with q and v in another structure."""
         return Crossings(self.t, q, v, self.multipliers, self.count, self.uncertain)
 
+    def none_where(self, condition) -> "Crossings":
+        """Return the same without any crossing where `condition` holds."""
+        rows = self.t, self.q, self.v, self.multipliers
+        rows = jax.tree.map(lambda x: jnp.where(condition, jnp.nan, x), rows)
+        return Crossings(*rows, jnp.where(condition, 0, self.count), self.uncertain)
+
     def found(self) -> "Crossings":
         """Return the same without the unused places, in NumPy. Not while JAX is tracing."""
         kept = np.isfinite(np.asarray(self.t))

@@ -10,6 +10,7 @@ from lagjax.mechanics.coordinates import State
 from lagjax.mechanics.diagnosis import describe, explain_failure
 from lagjax.mechanics.multipliers import accelerations
 from lagjax.motion import problem
+from lagjax.motion.accuracy import columns
 from lagjax.motion.hybrid_trajectory import HybridTrajectory
 from lagjax.motion.one_solve import START_TOLERANCES
 from lagjax.motion.results import RESULTS, is_among, message
@@ -20,6 +21,10 @@ from lagjax.motion.trajectory import Trajectory, pack
 
 # Switches at times that differ by less than this part of the last time are simultaneous.
 AT_ONE_TIME = 1e-12
+# Of so many gaps between switches, the last ones that are not of zero length, most have one ratio.
+ENOUGH = 12
+# A switch that changes velocities by less than this part of the largest one changes nothing.
+STILL = 1e-12
 
 
 def raise_failure(trajectory: Trajectory, start: State, settings: Settings) -> NoReturn:
@@ -49,11 +54,11 @@ def _raise_in_phase(trajectory, start, settings) -> NoReturn:
         raise ValueError(_below_zero(hybrid, start))
     if is_among(result, [RESULTS.guard_not_seen]):
         raise RuntimeError(
-            f"a guard of phase '{hybrid.names[trajectory.last_phase()]}' is below zero at t = "
-            f"{float(trajectory.end.t):.9g}, but no crossing of zero was found.\n"
-            "Usual cause: its phase began with the guard at zero, and with a rate that is only round-off: a body that "
-            "rests on what its phase lets it fly above.\n"
-            "Fix: add a phase for that, with the constraint that holds it: lj.Switch(..., rest=name), or start=name."
+            f"a guard of phase '{hybrid.names[trajectory.last_phase()]}', which began at t = "
+            f"{float(trajectory.end.t):.9g}, is below zero at t = {float(trajectory.t[-1]):.9g}, but no crossing of "
+            "zero was found.\n"
+            "Fix: a guard that is continuous and above zero as long as its phase lasts; or max_step=, so that steps "
+            "see where it dips below."
         )
     if is_among(result, [RESULTS.reset_not_finite]):
         raise RuntimeError(_no_state_after(trajectory))
@@ -79,25 +84,35 @@ def _raise_in_phase(trajectory, start, settings) -> NoReturn:
 def _too_many(trajectory):
     switches = trajectory.switches
     t, count = np.asarray(switches.t)[: len(switches)], len(switches)
-    gaps, last = np.diff(t[-4:]), float(t[-1])
-    names = " -> ".join(trajectory.system.names[i] for i in _phases_along(trajectory)[-4:])
+    gaps, last = np.diff(t), float(t[-1])
+    apart = gaps[gaps > AT_ONE_TIME * max(abs(last), 1e-300)]
     said = f"there were {count} switches until t = {last:.9g}, and one more exceeds most_switches = {count}.\n"
-    if gaps.size and np.all(gaps <= AT_ONE_TIME * max(abs(last), 1e-300)):
-        return said + (
-            f"Usual cause: no phase lasts: the last switches, {names}, happen at one time, as each guard is below zero "
-            "in the phase that the other leads to.\n"
-            "Fix: add a phase for what happens there (a contact that stays, a joint that sticks); look at the guards "
-            "at the last state, in traj.switches with throw=False."
-        )
-    ratio = gaps[-1] / gaps[-2] if gaps.size > 1 and gaps[-2] > 0 else 1.0
-    if 0 < ratio < 1 and gaps.size > 2 and abs(gaps[-2] / gaps[-3] - ratio) < 0.1 * ratio:
+    ratios = apart[1:][-ENOUGH:] / apart[:-1][-ENOUGH:]
+    ratio = float(np.median(ratios)) if ratios.size > 1 else 1.0
+    if ratio < 1 and np.mean(abs(ratios - ratio) < 0.1 * ratio) > 0.5:
+        end = last + (gaps[-1] * ratio / (1 - ratio) if gaps[-1] in apart else 0.0)
         return said + (
             f"Usual cause: infinitely many switches in finite time: each takes {ratio:.3g} of the time of the "
-            f"one before, so that the motion comes to rest at about t = {last + gaps[-1] * ratio / (1 - ratio):.6g}.\n"
+            f"one before, so that the motion comes to rest at about t = {end:.6g}.\n"
             'Fix: add a phase of rest, with lj.Switch(..., rest="lying") to go there; or ts that end before.'
         )
+    at_once = 1 + int(np.argmax(gaps[::-1] > AT_ONE_TIME * max(abs(last), 1e-300))) if apart.size else count
+    if at_once < min(3, count):
+        return said + f"Fix: lj.Hybrid(..., most_switches={10 * count}), or ts that end before."
+    names = " -> ".join(trajectory.system.names[i] for i in _phases_along(trajectory)[-4:])
+    said += f"The last {at_once} of them, {names}, happen at one time"
+    before, after = (columns(np, x, rows=len(switches.t))[:count] for x in (switches.v, switches.v_after))
+    change, size = np.max(abs(after[-1] - before[-1])), np.max(abs(np.concatenate([before, after])))
+    if change > STILL * size:
+        return said + (
+            f", and still change velocities, the last one by {change:.2g}: impacts that follow each other.\n"
+            f"Fix: lj.Hybrid(..., most_switches={10 * count})."
+        )
     return said + (
-        f"Usual cause: a long motion.\nFix: lj.Hybrid(..., most_switches={10 * count}), or ts that end before."
+        f", and the last one changes velocities by {change:.1g} only: its guard is at zero, or below, and falls "
+        "although nothing moves toward it. No phase lasts.\n"
+        "Fix: add a phase for what happens there (a contact that stays, a joint that sticks), with the constraint "
+        'that holds it: lj.Switch(..., rest="lying"), or start="lying".'
     )
 
 

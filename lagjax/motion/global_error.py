@@ -72,7 +72,8 @@ def with_errors_inside(run: Callable, first: Trajectory, settings, ts) -> Trajec
     known, settings, ts = stopped((first, settings, ts))
     second = stopped(run(_closer(jnp, settings, known.stats["num_accepted_steps"], known.end.t, ts)))
     found = _compared(jnp, known, second, ts)
-    return replace(first, error=found.error, scaled_error=found.scaled_error)
+    excess = jnp.where(ended_well(known.result), found.scaled_error, first.scaled_error)
+    return replace(first, error=found.error, scaled_error=excess)
 
 
 def _fixed(controller):

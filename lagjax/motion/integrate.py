@@ -63,7 +63,7 @@ def integrate(
     progress: bool | None = None,
     drift: str | None = None,
     estimate_error: bool | None = None,
-    start: str | None = None,
+    start: str | ArrayLike | None = None,
 ) -> Trajectory:
     """Integrate Lagrange's equations from (q0, v0) at `ts[0]`, with outputs at `ts`.
 
@@ -127,7 +127,9 @@ def integrate(
       20,000. It then compiles nothing and costs 1.2 to 2 times the solve; inside `jit`, `vmap`, a sweep and derivatives
       it is one more solve in the program, which is not differentiated. It cannot see what a method damps in both runs
       alike, as `lj.Radau5(step_powers=(0, 1))` damps fast oscillations.
-    - `start`: the name of the phase of a `Hybrid` in which the motion starts; by default its first one.
+    - `start`: the phase of a `Hybrid` in which the motion starts, its name or its number in the order of the phases; by
+      default the first one. A number may be traced, so that each lane of a `vmap`, or each point of a sweep over
+      numbers, starts in its own phase.
     - `drift`: `"project"` (return to the constraints after every step; the default if there are any),
       `"baumgarte"` (feedback at 50 decays a time span), or `"none"`.
 

@@ -36,7 +36,7 @@ from lagjax.motion.hybrid_trajectory import NO_PHASE, SWITCHES, Switches
 from lagjax.motion.loop import resolution
 from lagjax.motion.one_solve import solved
 from lagjax.motion.recorded import nothing, with_those_of
-from lagjax.motion.results import RESULTS
+from lagjax.motion.results import RESULTS, ended_well
 from lagjax.motion.sight import uneven
 from lagjax.motion.trajectory import Snapshot
 
@@ -147,14 +147,19 @@ def _first_leg(hybrid, q0, v0, params, ts, phase, settings):
         impulse=record(v0), count=jnp.asarray(0), uncertain=jnp.asarray(False), names=hybrid.names,
         ways=tuple(s.phase for s in hybrid.switches),
     )  # fmt: skip
-    start = Snapshot(ts[0], q0, v0, {name: nan(shape) for name, shape in shapes.items()})
+    # A motion in no phase would never end.
+    first, phases = jnp.asarray(hybrid.first, jnp.int32), len(hybrid.systems)
+    exists = (first >= 0) & (first < phases)
+    known = lambda tree: jax.tree.map(lambda x: jnp.where(exists, x, jnp.nan), tree)
+    start = Snapshot(ts[0], known(q0), known(v0), {name: nan(shape) for name, shape in shapes.items()})
     zero, least = jnp.asarray(0), jnp.zeros((2, n), dtype) if settings.by_size else settings.atol
     stats = {name: zero for name in ("num_steps", "num_accepted_steps", "num_rejected_steps")}
     return Way(
-        t=ts[0], q=q0, v=v0, phase=jnp.asarray(hybrid.first, jnp.int32), continues=jnp.asarray(True), rows=rows,
+        t=ts[0], q=q0, v=v0, phase=jnp.clip(first, 0, phases - 1), continues=exists, rows=rows,
         switches=switches, events=nothing(phase.guards, phase.events, q0, v0, start.multipliers), end=start,
-        stats=stats, sizes_so_far=sizes_of(q0, v0), least=least, scaled_error=jnp.zeros((), dtype),
-        settled=jnp.asarray(True), result=RESULTS.successful,
+        stats=stats, sizes_so_far=sizes_of(q0, v0), least=least,
+        scaled_error=jnp.where(exists, jnp.zeros((), dtype), jnp.inf), settled=jnp.asarray(True),
+        result=RESULTS.where(exists, RESULTS.successful, RESULTS.no_such_phase),
     )  # fmt: skip
 
 
@@ -168,7 +173,7 @@ def _leg(hybrid, i, in_phase, way: Way, params, ts, phase: Phase, settings, adjo
     times = jnp.where(in_phase, ahead, way.t)
     settings = settings if system.constraints else replace(settings, drift="none")
     found = apart(solved, system, way.q, way.v, params, times, phase.guards, settings, adjoint, way.sizes_so_far)
-    result, end, onward = found["result"], found["end"], jnp.asarray(False)
+    result, end, onward, events = found["result"], found["end"], jnp.asarray(False), found["events"]
     after, target, switches = After(way.q, way.v, jnp.asarray(False)), way.phase, way.switches
     if phase.guards is not None and phase.switches:
         crossings = [found["events"][kind.name] for kind in phase.guards.kinds]
@@ -178,10 +183,16 @@ def _leg(hybrid, i, in_phase, way: Way, params, ts, phase: Phase, settings, adjo
         result, end, onward = ending.result, ending.end, ending.onward
         after, target, switches = apart(_switched, system, ending, params, phase, way)
         switches = eqx.tree_at(lambda s: s.uncertain, switches, switches.uncertain | uncertain)
+        # A motion in the wrong phase is wrong from that phase's start on, its first output included.
+        invalid = in_phase & ((result == RESULTS.guard_not_seen) | (result == RESULTS.guard_below_zero))
+        unknown = jax.tree.map(lambda x: jnp.full_like(x, jnp.nan), end.multipliers)
+        end = _where(invalid, Snapshot(way.t, way.q, way.v, unknown), end)
+        events = {name: x.none_where(invalid) for name, x in events.items()}
         broken = onward & ~all_finite((after.q, after.v))
         result, onward = RESULTS.where(broken, RESULTS.reset_not_finite, result), onward & ~broken
     rows = jax.tree.map(lambda x: x[jnp.maximum(place - past + 1, 0)], {name: found[name] for name in ROWS})
-    known = ((ts > way.t) & (ts <= end.t) | (way.switches.count == 0) & (ts <= way.t)) & reached(rows["q"])
+    known = (ts > way.t) & (ts <= end.t) | (way.switches.count == 0) & (ts <= way.t)
+    known = known & (result != RESULTS.guard_below_zero) & reached(rows["q"])
     none = lambda name, x: end.multipliers.get(name, jnp.full_like(x, jnp.nan))
     end = end._replace(multipliers={name: none(name, x) for name, x in way.end.multipliers.items()})
     least = way.least if not settings.by_size else jnp.maximum(way.least, stopped(found["tolerance"][1]))
@@ -189,11 +200,11 @@ def _leg(hybrid, i, in_phase, way: Way, params, ts, phase: Phase, settings, adjo
         t=jnp.where(onward, end.t, way.t), q=_where(onward, after.q, way.q), v=_where(onward, after.v, way.v),
         phase=jnp.where(onward, target, way.phase), continues=onward & (end.t < ts[-1]),
         rows=_filled(way.rows, in_phase & known, rows, i), switches=switches,
-        events=with_those_of(found["events"], way.events),
+        events=with_those_of(events, way.events),
         end=_where(onward, end._replace(q=after.q, v=after.v), end),
         stats={name: n + found["stats"][name] for name, n in way.stats.items()},
         sizes_so_far=jnp.maximum(way.sizes_so_far, sizes_of(end.q, end.v)), least=least,
-        scaled_error=jnp.maximum(way.scaled_error, found["scaled_error"]),
+        scaled_error=jnp.where(ended_well(result), jnp.maximum(way.scaled_error, found["scaled_error"]), jnp.inf),
         settled=way.settled & found["settled"], result=result,
     )  # fmt: skip
     return _where(in_phase, further, way)

@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, PyTree
 
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.coordinates import State
-from lagjax.mechanics.equations import Equations, equations_of
+from lagjax.mechanics.equations import Equations, all_finite, equations_of
 from lagjax.mechanics.structure import conserves_jacobi_integral
 from lagjax.motion.arriving import apart_from_jumps
 from lagjax.motion.consistency import returned, stopped, within, worst_residual
@@ -87,10 +87,14 @@ class Start(NamedTuple):
 
 
 class Outputs(NamedTuple):
-    """The motion at the outputs and, as the last row, at its end, without any NaN; and which outputs were `reached`."""
+    """The motion at the outputs and, as the last row, at its end; which outputs were `reached`; which are finite.
+
+    At outputs that were not reached it is the start's state.
+    """
 
     motion: Snapshot
     reached: Bool[Array, " T"]
+    sound: Bool[Array, " T"]
 
 
 def _start(equations: Equations, q, v, ts, settings, sizes_so_far) -> Start:
@@ -140,17 +144,18 @@ def _outputs(equations, start, solution, ts, settings) -> Outputs:
         states = apart_from_jumps(equations, ts, settings.jump_ts, *states)
     # One compiled evaluation for the outputs and the end together.
     t, (q, v) = jax.tree.map(lambda x, last: jnp.concatenate([x, last]), (ts, states), solution.end)
-    return Outputs(Snapshot(t, q, v, jax.vmap(equations.multipliers)(t, q, v)), reached)
+    sound = jax.vmap(all_finite)((q, v))[:-1]
+    return Outputs(Snapshot(t, q, v, jax.vmap(equations.multipliers)(t, q, v)), reached, sound)
 
 
 def _result(equations, start, solution, outputs, guards, settings):
     """The fields of the trajectory: NaN at outputs that it did not reach, and the reason."""
-    (motion, reached), located = outputs, solution.located
+    (motion, reached, sound), located = outputs, solution.located
     result = RESULTS.promote(solution.result)
     for reported, ours in TRANSLATED.items():
         result = RESULTS.where(result == getattr(RESULTS, reported), getattr(RESULTS, ours), result)
     # An output is a step of its own, and can fail although the steps of the solve did not.
-    known = jnp.all(jnp.isfinite(coordinates.flatten(jax.tree.map(lambda x: x[:-1], (motion.q, motion.v)))[0]))
+    known = jnp.all(sound)
     regular = equations.are_taken_for_regular
     if regular:
         known = known & jnp.all(jnp.isfinite(coordinates.flatten(motion.multipliers)[0]))
@@ -159,8 +164,12 @@ def _result(equations, start, solution, outputs, guards, settings):
     for name, holds in start.against.items():
         result = RESULTS.where(holds, getattr(RESULTS, name), result)
     stats = {name: jnp.asarray(count) for name, count in solution.stats.items() if name != "max_steps"}
-    masked = jax.tree.map(lambda x: jnp.where(_like(reached, x), x[:-1], jnp.nan), motion)
-    end = jax.tree.map(lambda x: jnp.where(start.refused, jnp.nan, x[-1]), motion)._replace(t=motion.t[-1])
+    change = _scaled_error(stopped(equations), *stopped((motion.t, motion.q, motion.v)), stats, settings)
+    # Nothing is known from the first failed output on; the motion then ends at the output before it.
+    up_to = jnp.cumsum(~sound) == 0
+    masked = jax.tree.map(lambda x: jnp.where(_like(reached & up_to, x), x[:-1], jnp.nan), motion)
+    last = jnp.where(jnp.all(up_to), sound.size, jnp.maximum(jnp.sum(up_to) - 1, 0))
+    end = jax.tree.map(lambda x: jnp.where(start.refused, jnp.nan, x[last]), motion)._replace(t=motion.t[last])
     return {
         "q": masked.q,
         "v": masked.v,
@@ -168,10 +177,10 @@ def _result(equations, start, solution, outputs, guards, settings):
         "end": end,
         "stats": stats,
         "tolerance": (settings.rtol, _absolute(stopped((motion.q, motion.v)), start.scales, settings)),
-        "scaled_error": _scaled_error(stopped(equations), *stopped((motion.t, motion.q, motion.v)), stats, settings),
+        "scaled_error": jnp.where(ended_well(result), change, jnp.inf),
         "result": result,
         "settled": ended_well(result) | _among(result, UNAFFECTED) if regular else jnp.asarray(True),
-        "events": {} if located is None else by_name(guards, located, motion.t[-1:], ~start.refused),
+        "events": {} if located is None else by_name(guards, located, end.t[None], ~start.refused),
     }
 
 

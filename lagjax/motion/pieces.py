@@ -115,10 +115,11 @@ class Pieces(NamedTuple):
     doubt: list
 
 
-def pieces_of(begin: Value, inner, off, end: Value, h, touches) -> Pieces:
+def pieces_of(begin: Value, inner, off, end: Value, h, touches, at_zero) -> Pieces:
     """The pieces of an interval of length h between exact ends; `off`: the errors of the inner nodes (value, rate).
 
-    A piece that comes nearer to zero than `touches` is not clear.
+    A piece that comes nearer to zero than `touches` is not clear. A guard that holds, and has not left zero since the
+    start, has no sign up to `at_zero` from it, and is clear as long as it does not fall below that (-inf: any other).
     """
     zero, yes, lengths = jnp.zeros_like(h), jnp.asarray(True), [h * float(x) for x in np.diff(SHARES)]
     g = [begin.g, *(x for x, _ in inner), end.g]
@@ -129,8 +130,9 @@ def pieces_of(begin: Value, inner, off, end: Value, h, touches) -> Pieces:
     known = [yes, *(jnp.abs(dx) > d for (_, dx), (_, d) in zip(inner, off)), yes]
     sign = [jnp.where(jnp.abs(x) > e, jnp.sign(x), 0.0) for x, e in zip(g, error)]
     sign[-1] = jnp.where(jnp.abs(end.g) > end.noise, sign[-1], 0.0)
+    sign = [jnp.where(jnp.abs(x) <= at_zero, 0.0, s) for x, s in zip(g, sign)]
     rate_sign = [jnp.sign(x) for x in rate]
-    monotone, direction, doubt = [], [], []
+    monotone, direction, doubt, stays = [], [], [], []
     bent = BENT * _bend(g, rate, h)
     for i in range(PIECES):
         third = lengths[i] / 3
@@ -138,7 +140,8 @@ def pieces_of(begin: Value, inner, off, end: Value, h, touches) -> Pieces:
         largest = jnp.maximum(error[i], error[i + 1]) + touches + bent
         lowest = jnp.minimum(jnp.minimum(one, two), jnp.minimum(three, four))
         highest = jnp.maximum(jnp.maximum(one, two), jnp.maximum(three, four))
-        clear = (lowest > largest) | (highest < -largest)
+        stays.append(lowest >= jnp.maximum(error[i], error[i + 1]) + bent - at_zero)
+        clear = (lowest > largest) | (highest < -largest) | stays[i]
         direction.append(jnp.sign(rate_sign[i] + rate_sign[i + 1]))
         same = known[i] & known[i + 1] & (direction[i] != 0) & (rate_sign[i] * rate_sign[i + 1] >= 0)
         rises = (three - two) * direction[i] >= bent
@@ -151,7 +154,7 @@ def pieces_of(begin: Value, inner, off, end: Value, h, touches) -> Pieces:
     for i in range(1, PIECES):
         # The sign must be known where one monotone run ends and another begins, but not inside a run.
         inside = monotone[i - 1] & monotone[i] & (direction[i - 1] == direction[i])
-        unknown = (sign[i] == 0) & ~inside
+        unknown = (sign[i] == 0) & ~inside & ~(stays[i - 1] & stays[i])
         doubt[i - 1], doubt[i] = doubt[i - 1] | unknown, doubt[i] | unknown
     return Pieces(g, rate, known, sign[1:], doubt)
 

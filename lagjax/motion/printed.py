@@ -17,7 +17,7 @@ def lines(traj) -> list[str]:
         *(account.of_error(traj) or _not_estimated(traj)),
     ]
     rows += traj._of_system()
-    if float(traj.scaled_error) > 1:
+    if 1 < float(traj.scaled_error) < np.inf:
         rows.append(("WARNING", f"the error is {float(traj.scaled_error):.2g} times what the tolerance lets expect"))
     rows += _shape_rows(traj)
     return ["Trajectory", *_aligned(rows)]
@@ -42,7 +42,8 @@ def batch_lines(traj, lanes) -> list[str]:
     """The printed lines of a batch; `lanes`: its shape."""
     values, counts = np.unique(np.asarray(traj.result._value), return_counts=True)
     words = [f"{n} {message(item(traj.result, v))}" for v, n in zip(values, counts)]
-    steps, drifted = np.asarray(traj.stats["num_steps"]), int(np.sum(np.asarray(traj.scaled_error) > 1))
+    steps, errors = np.asarray(traj.stats["num_steps"]), np.asarray(traj.scaled_error)
+    drifted = int(np.sum((errors > 1) & (errors < np.inf)))
     rows = [
         ("method", traj.static.method),
         ("lanes", " x ".join(map(str, lanes))),

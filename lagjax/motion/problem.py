@@ -24,6 +24,10 @@ from lagjax.motion.trajectory import AccuracyWarning
 DEFAULT_TOLERANCE = {np.dtype("float64"): 1e-9, np.dtype("float32"): 1e-5}
 # The prefix with which a user writes a method, by the package that defines it.
 PACKAGES = {"diffrax": "diffrax.", "lagjax": "lj."}
+# Steps are counted in 32 bits where x64 is off.
+MOST_STEPS = 2**31 - 1
+# The least span of a motion in round-offs of its times: a step ends at some of the times that can be told apart.
+RESOLVED = 1024
 # Results of starts that cannot be integrated for a reason in the equations.
 REFUSED = (RESULTS.start_not_finite, RESULTS.start_singular, RESULTS.contradictory)
 
@@ -90,8 +94,13 @@ def check_adjoint(adjoint: Any, drift: str, jump_ts: Any, recorded: bool):
 
 def check_max_steps(max_steps: Any):
     """Raise unless max_steps is None or a positive whole number."""
-    if max_steps is None or isinstance(max_steps, int | np.integer) and max_steps > 0:
+    if max_steps is None or isinstance(max_steps, int | np.integer) and 0 < max_steps <= MOST_STEPS:
         return
+    if isinstance(max_steps, int | np.integer) and max_steps > MOST_STEPS:
+        raise ValueError(
+            f"max_steps = {max_steps} is more than can be counted: the steps are counted up to {MOST_STEPS:,}.\n"
+            "Fix: max_steps=None, for no limit."
+        )
     raise ValueError(
         f"max_steps must be a whole number above zero, not {max_steps!r}.\n"
         "Usual cause: 1e6, which is a float.\n"
@@ -172,6 +181,14 @@ def times(ts: Any, dtype):
                 f"{dtype} can tell apart.\n"
                 "Fix: ts=jnp.unique(ts), and ts=jnp.unique(ts)[::-1] to run backward in time."
             )
+        resolved = RESOLVED * np.finfo(dtype).eps * float(np.max(np.abs(ts)))
+        if abs(float(ts[-1]) - float(ts[0])) <= resolved:
+            raise ValueError(
+                f"ts go from {float(ts[0]):.17g} to {float(ts[-1]):.17g}, and {dtype} tells apart only "
+                f"{max(1, round(abs(float(ts[-1]) - float(ts[0])) / float(np.spacing(np.max(np.abs(ts))))))} times "
+                "on the way: there is no room for steps.\n"
+                "Fix: count time from the start, ts - ts[0], with the start's time in params."
+            )
     return ts
 
 
@@ -234,10 +251,17 @@ def tolerance(value: Any, name: str, dtype):
 @lru_cache(maxsize=64)
 def _tolerance(value, name, dtype):
     _check_tolerance(np.min(value), name, dtype)
+    _check_tolerance(np.max(value), name, dtype)
     return np.full(2, value, dtype)
 
 
 def _check_tolerance(value, name, dtype):
+    if value == np.inf:
+        raise ValueError(
+            f"{name} is infinite, which allows any error in a step: nothing would choose the steps.\n"
+            "Fix: a finite tolerance; or, for steps of a fixed length, "
+            "stepsize_controller=diffrax.ConstantStepSize(), dt0=0.01."
+        )
     if not value >= 0:
         raise ValueError(f"{name} must be a number >= 0, not {value}.\nFix: {name}=1e-9, or leave it out.")
     floor = ROUND_OFFS * float(jnp.finfo(dtype).eps)
@@ -293,11 +317,15 @@ def warn_of_inaccuracy(trajectory):
 def _of_drift(trajectory):
     drift, rtol = float(trajectory.drift()), float(trajectory.tolerance[0][0])
     span, steps = abs(float(trajectory.end.t - trajectory.t[0])), int(trajectory.stats["num_accepted_steps"])
+    dtype, how = np.asarray(trajectory.t).dtype, trajectory.static.how.steps
+    fix = f"rtol={max(rtol / 1e3, 1e2 * float(np.finfo(dtype).eps)):.0e}"
+    if how in ("fixed", "controller"):
+        fix = "shorter steps" if how == "fixed" else "tighter tolerances of the stepsize_controller"
+    elif rtol < 1e3 * np.finfo(dtype).eps:
+        fix = "a shorter span" + (", or float64" if dtype == np.dtype("float32") else "")
     off = f", and a constraint is off by {float(trajectory.residual()):.1g}" if trajectory.system.constraints else ""
     return (
         f"over a time of {span:.6g} ({steps} steps) the Jacobi integral, which should stay constant, changed by "
         f"{drift:.1g} of its size{off}, at rtol = {rtol:.1g}.\n"
-        "Usual cause: a span of very many periods, over which small errors add up, an unstable motion, steps that are "
-        "too long, or round-off (float32, or a tolerance near its limit).\n"
-        "Fix: a tighter rtol and atol (in float64), a method of higher order, or a shorter span."
+        f"Fix: {fix}. What caused it, estimate_error=True says."
     )

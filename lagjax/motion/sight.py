@@ -76,14 +76,18 @@ class Sight(eqx.Module):
         zero = jnp.zeros_like(t)
         return Node(t, None, None, (Value(zero, zero, zero, jnp.asarray(False)),) * len(self.guards.kinds))
 
-    def judged(self, left: Node, right: Node, inner) -> list[Pieces]:
-        """Each guard between two nodes, from its values at the inner ones by the quintic and by the cubics."""
+    def judged(self, left: Node, right: Node, inner, touching) -> list[Pieces]:
+        """Each guard between two nodes, from its values at the inner ones by the quintic and by the cubics.
+
+        `touching`: the guards that have not left zero since the start, see `Pieces`.
+        """
         found, h, count = [], right.t - left.t, len(INNER)
-        for kind, begin, end, by_both in zip(self.guards.kinds, left.values, right.values, inner):
+        for kind, begin, end, by_both, at_zero in zip(self.guards.kinds, left.values, right.values, inner, touching):
             pairs = zip(by_both[:count], by_both[count:])
             off = [tuple(SAFETY * jnp.abs(x - z) for x, z in zip(*pair)) for pair in pairs]
             touches = TOUCHES * self.motion.tolerances.rtol[0] * h * jnp.maximum(jnp.abs(begin.rate), jnp.abs(end.rate))
-            pieces = pieces_of(begin, by_both[:count], off, end, h, touches)
+            zero = jnp.where(at_zero, jnp.maximum(self.at_zero(begin), self.at_zero(end)), -jnp.inf)
+            pieces = pieces_of(begin, by_both[:count], off, end, h, touches, zero)
             found.append(without_rest(pieces, begin, end, by_both, h) if kind.may_rest else pieces)
         return found
 
@@ -91,12 +95,16 @@ class Sight(eqx.Module):
         """The sign at the start of the motion: 0 if the start is on the guard."""
         on_guard = self.is_on(value)
         if kind.holds:
-            return jnp.where(on_guard & (value.rate > 0), 0.0, 1.0)
+            return jnp.where(on_guard, 0.0, 1.0)
         return jnp.where(on_guard | ~jnp.isfinite(value.g), 0.0, jnp.sign(value.g))
 
     def is_on(self, value: Value):
         """Whether a state is on a guard, within round-off."""
-        return jnp.abs(value.g) <= ON_GUARD * (value.noise + jnp.abs(value.rate) * self.resolution)
+        return jnp.abs(value.g) <= self.at_zero(value)
+
+    def at_zero(self, value: Value):
+        """How far from zero a guard may be, by round-off, where a motion starts on it."""
+        return ON_GUARD * (value.noise + jnp.abs(value.rate) * self.resolution)
 
     def touches(self, value: Value):
         """Whether an extremum with this value may be on either side of zero."""

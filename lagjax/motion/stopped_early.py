@@ -1,17 +1,16 @@
-"""Find out why an integration stopped before its last output, and say so in the user's terms.
+"""Say why an integration stopped before its last output: where, how fast it went on, and what is large there.
 
-If steps collapse or `max_steps` is used up, some more steps are taken from where the motion ended, one by one, and
-examined:
+If steps collapse or `max_steps` is used up, some more steps are taken from where the motion ended, one by one. A cause
+is said only where one of these numbers shows it, and with the number; otherwise the facts stand alone:
 
 - The rate of progress at the end, not the average rate, tells how many steps are missing.
-- A rejected step is bisected, always into the half in which the acceleration changes more: in the end a smooth function
-  no longer changes, one that jumps still changes by its jump. The derivative of the acceleration finds a kink in the
-  same way. Moving only time, position or velocity to the other side tells which of them the break depends on.
-- Steps that shrink while accelerations grow approach a singularity.
+- Velocities or accelerations that have grown a millionfold, or that grow while steps shrink, approach a singularity.
+- An acceleration that changes within the shortest rejected step, and did not along the accepted ones, jumps. With only
+  time, position or velocity on the other side, it is seen which of them the jump depends on.
 - Eigenvalues of d(v, a)/d(q, v) that are large compared with one over a step limit it: real negative ones by the
   stability of an explicit method (a stiff system), imaginary ones as frequencies to be resolved.
 
-This takes a compilation and some seconds, and is done only after a failure.
+This takes a compilation and some seconds, and is done only after a failure. `benchmarks/advice.py` applies each fix.
 
 Source: Hairer & Wanner, *Solving ODEs II*, §IV.2 (stiffness and its detection).
 """
@@ -40,24 +39,18 @@ from lagjax.motion.tolerances import tolerances_at
 LOOKED_AT, SETTLED = 160, 40
 # diffrax's constants for the choice of the next step.
 SAFETY, SHORTEST, LONGEST = 0.9, 0.2, 10.0
-# The number of rejected steps that are bisected, and how often each is.
-BISECTED, BISECTIONS = 12, 44
-# A change over 2^-44 of a rejected step is a jump (or kink) above this share of the largest acceleration in it.
-JUMP, KINK = 1e-4, 1e-2
-POLE = 1e3  # times as large inside a step as at its ends.
-# The velocities at the breaks of a sticking motion agree to this share.
-HELD = 1e-6
+# A jump: an acceleration that changes by this share within a rejected step this much shorter than the accepted ones,
+JUMP, SHORT = 0.05, 1e-2
+# or than this part of the time so far; more than so many times what its rate explains; in one of so many steps.
+NO_TIME, UNEXPLAINED, TRIED = 1e-7, 10.0, 12
 # A step times an eigenvalue that limits it; and the ratio of eigenvalues from which the larger one is fast.
 LIMITED, FAST = 0.3, 30.0
 # The same product for the stability of an explicit method, which ends at two to six.
 UNSTABLE = 1.5
-# Accelerations grew and steps shrank by these factors.
-GREW, SHRANK = 3.0, 0.3
-BLOWN_UP = 1e6  # times those at the start: a singularity in any case.
+# Velocities or accelerations grew and steps shrank by these factors; growth that is a singularity in any case.
+GREW, SHRANK, BLOWN_UP = 3.0, 0.3, (1e4, 1e6)
 # Above so many missing steps max_steps is not advised; above so many times those taken, only as the second advice.
 TOO_MANY, MANY_TIMES = 1e8, 10
-# The cause and the fix if no other cause is found.
-SPAN = "a span that takes more steps: of very many periods, or at a tight tolerance", "a looser rtol and atol"
 
 
 class Steps(NamedTuple):
@@ -98,50 +91,64 @@ def stopped_early(trajectory, settings) -> str:
     reason = explain_failure(trajectory.system, State(end.t, end.q, end.v, trajectory.params)) or _beyond(trajectory)
     if reason:
         return f"{what}: {reason}"
+    last = f"The last state is {describe(end.q)}, v = {describe(end.v)}."
     if bool(trajectory.result == RESULTS.max_steps_reached):
-        return f"{what}: max_steps = {settings.max_steps} is used up. {_used_up(trajectory, settings)}"
-    if bool(trajectory.result == RESULTS.unsolved_step) and settings.controller is not None:
-        return (
-            f"{what}: {RESULTS[trajectory.result]} The last state is {describe(end.q)}.\n"
-            "Usual cause: a fixed step that is too long for the method's stability, for an implicit method's root "
-            "finder, or for the return to the constraints.\n"
-            "Fix: a smaller dt0, or leave stepsize_controller out: failed steps are then repeated, shorter."
-        )
-    cause, fix = (
-        "a singularity of the motion (a collision, a singular configuration), a jump in a force, or NaN from L beyond "
-        "that state",
-        'stop before it with events={"near": lj.Crossing(...)}, or look at lj.accelerations at trajectory.end with '
-        "throw=False",
-    )
-    if settings.controller is None:
-        steps, path = last_steps(trajectory, settings), _Path(trajectory)
-        cause, fix = _jump(path, steps) or _singularity(path, steps) or (cause, fix)
+        return f"{what}: max_steps = {settings.max_steps} is used up. {last} {_used_up(trajectory, settings)}"
+    said = f"{what}: {RESULTS[trajectory.result]} {last}"
+    if settings.controller is not None:
+        return f"{said}\nFix: {_of_controller(trajectory, settings)}."
+    steps, path = last_steps(trajectory, settings), _Path(trajectory)
+    found = _singularity(path, steps) or _jump(path, steps) or _undefined(path, steps)
+    if found:
+        return _with_cause(said, found)
     return (
-        f"{what}: {RESULTS[trajectory.result]} The last state is {describe(end.q)}{_fastest(trajectory)}.\n"
-        f"Usual cause: {cause}.\nFix: {fix}."
+        f"{said} {path.largest(steps)}\nFix: look at lj.accelerations at trajectory.end, with throw=False; or end the "
+        'motion before, with events={"near": lj.Crossing(...)}.'
     )
+
+
+def _with_cause(said, found):
+    cause, fix = found
+    return f"{said}\nCause: {cause}." + (f"\nFix: {fix}." if fix else "")
 
 
 def _used_up(trajectory, settings):
     """The rate of progress, what keeps the steps short, and what to do."""
     end, taken = trajectory.end, int(trajectory.stats["num_steps"])
-    last = f"The last state is {describe(end.q)}, v = {describe(end.v)}."
     if settings.controller is not None or not taken:
         rate = abs(float(end.t - trajectory.t[0])) / max(1, taken)
         missing = abs(float(trajectory.t[-1] - end.t)) / rate if rate > 0 else np.inf
-        cause, fix = "steps that are short for the span", "longer steps"
+        found, facts, otherwise = None, "", "longer steps"
     else:
         steps, path = last_steps(trajectory, settings), _Path(trajectory)
         rate, missing = steps.rate, steps.missing
-        cause, fix = _jump(path, steps) or _singularity(path, steps) or _fast(path, steps) or SPAN
+        found = _singularity(path, steps) or _jump(path, steps) or _fast(path, steps)
+        rejected = int(np.sum(~steps.accepted))
+        facts = "" if found else f" {rejected} of the next {len(steps.h)} were rejected. {path.largest(steps)}"
+        otherwise = "a looser rtol and atol"
     if not missing < TOO_MANY:
-        progress = f"At the rate of its last steps ({rate:.2g} each) it does not arrive"
-        return f"{last} {progress}.\nUsual cause: {cause}.\nFix: {fix}."
+        said = f"At the rate of its last steps ({rate:.2g} each) it does not arrive.{facts}"
+        return _with_cause(said, found) if found else f"{said}\nFix: {otherwise}, or ts that end before."
+    said = f"At the rate of its last steps ({rate:.2g} each) it needs {missing:.2g} more.{facts}"
     # Half as many again, since the rate is that of one place.
     more = f"max_steps={_rounded_up(taken + 1.5 * missing)}"
-    fix = f"{fix}; else {more}" if missing > MANY_TIMES * taken and fix is not SPAN[1] else f"{more}, or {fix}"
-    progress = f"At the rate of its last steps ({rate:.2g} each) it needs {missing:.2g} more"
-    return f"{last} {progress}.\nUsual cause: {cause}.\nFix: {fix}."
+    if not found or not found[1]:
+        return _with_cause(said, (found[0], more)) if found else f"{said}\nFix: {more}, or {otherwise}."
+    fix = f"{found[1]}; else {more}" if missing > MANY_TIMES * taken else f"{more}, or {found[1]}"
+    return _with_cause(said, (found[0], fix))
+
+
+def _of_controller(trajectory, settings):
+    """The fix for steps of a user's controller: whether a shorter one can be taken from where it failed."""
+    if settings.dt0 is None or not isinstance(settings.controller, diffrax.ConstantStepSize):
+        return "leave stepsize_controller out: failed steps are then repeated, shorter"
+    attempt, (t, y), direction = _attempts(trajectory, settings)
+    for part in (2, 4, 8, 16, 32):
+        h = float(settings.dt0) / part
+        after, _ = attempt(t, t + direction * h, y)
+        if np.all(np.isfinite(coordinates.flatten(after)[0])):
+            return f"dt0={h:.3g}, which succeeds there; or leave stepsize_controller out"
+    return f"leave stepsize_controller out: there even a step of dt0 / 32 = {float(settings.dt0) / 32:.3g} fails"
 
 
 def _rounded_up(count):
@@ -150,31 +157,39 @@ def _rounded_up(count):
     return int(-(-count // unit) * unit)
 
 
-def last_steps(trajectory, settings) -> Steps:
-    """Continue the motion from where it ended, and return each step."""
+def _attempts(trajectory, settings):
+    """`attempt(t0, t1, y)` -> (state, error), where the motion ended, and the direction of time."""
     system, params, end = trajectory.system, trajectory.params, trajectory.end
     state = (end.t, end.q, end.v, params)
     method = method_alone(settings, method_of(settings, system, *state))
     terms = diffrax.ODETerm(Field(equations_of(system, *state)))
-    order = float(method.error_order(terms))
     # Tolerances from the start: near a singularity sizes differ from those at the start.
     first = State(*jax.tree.map(lambda x: x[0], (trajectory.t, trajectory.q, trajectory.v)), params)
     tolerance = tolerances_at(first, trajectory.t, settings)
-    direction, last = np.sign(float(trajectory.t[-1] - end.t)), float(trajectory.t[-1])
-    t, y = float(end.t), (end.q, end.v)
+
+    def attempt(t0, t1, y):
+        return _attempt(method, terms, jnp.asarray(t0), jnp.asarray(t1), y, params, tolerance)
+
+    attempt.order = float(method.error_order(terms))
+    return attempt, (float(end.t), (end.q, end.v)), np.sign(float(trajectory.t[-1] - end.t))
+
+
+def last_steps(trajectory, settings) -> Steps:
+    """Continue the motion from where it ended, and return each step."""
+    attempt, (t, y), direction = _attempts(trajectory, settings)
+    last = float(trajectory.t[-1])
     size = abs(t - float(trajectory.t[0])) / max(1, int(trajectory.stats["num_accepted_steps"]))
     size = size or 1e-3 * abs(last - t)
     taken_steps = []
     while len(taken_steps) < LOOKED_AT and abs(last - t) > 0:
         # The last step ends exactly at the last time.
         size = min(size, abs(last - t), float(settings.max_step))
-        times = jnp.asarray(t), jnp.asarray(t + direction * size)
-        after, error = _attempt(method, terms, *times, y, params, tolerance)
+        after, error = attempt(t, t + direction * size, y)
         error = float(error)
         taken_steps.append((t, y, direction * size, error < 1))
         if error < 1:
             t, y = (last if size == abs(last - t) else t + direction * size), after
-        factor = SAFETY * error ** (-1 / order) if error > 0 else LONGEST
+        factor = SAFETY * error ** (-1 / attempt.order) if error > 0 else LONGEST
         size *= np.clip(factor if np.isfinite(error) else 0.0, *((1.0, LONGEST) if error < 1 else (SHORTEST, SAFETY)))
         if size < 4 * np.finfo(float).eps * max(abs(t), 1e-300):
             break
@@ -193,23 +208,43 @@ def _attempt(method, terms, t0, t1, y, params, tolerance):
 
 
 class _Path:
-    """Accelerations along the parabola through a state: q + s v + s² a/2, v + s a."""
+    """Velocities and accelerations along the motion and along the parabola through a state."""
 
     def __init__(self, trajectory):
         self.system, self.params = trajectory.system, trajectory.params
-        self.names = coordinates.names(trajectory.end.q)
+        self.names, self.in_dict = coordinates.names(trajectory.end.q), isinstance(trajectory.end.q, dict)
         t, *y = jax.tree.map(lambda x: x[0], (trajectory.t, trajectory.q, trajectory.v))
-        x, u = (np.max(np.abs(coordinates.flatten(part)[0])) for part in y)
-        self.usual = max(np.max(np.abs(self.at(t, y, 0.0))), u**2 / max(x, 1e-300))
+        self.span = abs(float(trajectory.end.t - trajectory.t[0]))
+        # The largest velocity and acceleration that the start and the way so far account for.
+        a, u = np.max(np.abs(self.at(t, y, 0.0))), np.max(np.abs(self.velocity(y)))
+        x, x1 = (np.asarray(coordinates.flatten(part)[0]) for part in (y[0], trajectory.end.q))
+        moved = np.max(np.abs(x1 - x))
+        pace = max(u, np.sqrt(a * moved), moved / self.span if self.span > 0 else 0.0)
+        self.usual = pace, max(a, pace**2 / max(np.max(np.abs(x)), moved, 1e-300))
 
-    def at(self, t, y, s, order=0):
-        """The acceleration (order 0) or its derivative by s (1); t, q, v are taken at s, or at s[0], s[1], s[2]."""
+    def at(self, t, y, s):
+        """The acceleration at q + s v + s² a/2, v + s a; t, q, v are taken at s, or at s[0], s[1], s[2]."""
         s = jnp.broadcast_to(jnp.asarray(s, dtype=float), 3)
-        return np.asarray(_on_path(self.system, self.params, jnp.asarray(t), y, s, order))
+        return np.asarray(_on_path(self.system, self.params, jnp.asarray(t), y, s))
+
+    def velocity(self, y):
+        """The velocities of a state, (n,)."""
+        return np.asarray(coordinates.flatten(y[1])[0])
 
     def rates(self, t, y):
         """The eigenvalues of d(v, a)/d(q, v)."""
         return np.linalg.eigvals(np.asarray(_jacobian(self.system, self.params, jnp.asarray(t), y)))
+
+    def largest(self, steps):
+        """What is large at the last of the steps, in words."""
+        a, v = np.abs(self.at(steps.t[-1], steps.y[-1], 0.0)), np.abs(self.velocity(steps.y[-1]))
+        if not a.size or not np.all(np.isfinite(a)):
+            return ""
+        i, k = int(np.argmax(v)), int(np.argmax(a))
+        return (
+            f"The largest velocity there is that of '{self.names[i]}', {v[i]:.2g}, the largest acceleration that of "
+            f"'{self.names[k]}', {a[k]:.2g}."
+        )
 
 
 def _acceleration(system, params, t, q, v):
@@ -217,16 +252,12 @@ def _acceleration(system, params, t, q, v):
 
 
 @eqx.filter_jit
-def _on_path(system, params, t, y, s, order):
+def _on_path(system, params, t, y, s):
     q, v = y
     a = _acceleration(system, params, t, q, v)
     by = lambda scale, x, dx: jax.tree.map(lambda x, dx: x + scale * dx, x, dx)
-
-    def at(s):
-        place, velocity = by(0.5 * s[1] ** 2, by(s[1], q, v), a), by(s[2], v, a)
-        return coordinates.flatten(_acceleration(system, params, t + s[0], place, velocity))[0]
-
-    return at(s) if order == 0 else jax.jvp(at, (s,), (jnp.ones_like(s),))[1]
+    place, velocity = by(0.5 * s[1] ** 2, by(s[1], q, v), a), by(s[2], v, a)
+    return coordinates.flatten(_acceleration(system, params, t + s[0], place, velocity))[0]
 
 
 @eqx.filter_jit
@@ -240,99 +271,94 @@ def _jacobian(system, params, t, y):
     return jax.jacfwd(rates)(x)
 
 
-class _Break(NamedTuple):
-    """A jump of an acceleration or of its derivative: time, coordinate, the values, and what it depends on (`by`)."""
-
-    t: float
-    name: str
-    before: float
-    after: float
-    velocity: float
-    by: str
-
-
-def _jump(path, steps):
-    """A jump of the acceleration, or of its derivative, inside steps that were rejected."""
-    rejected = np.flatnonzero(~steps.accepted)
-    # The shortest ones, since least else happens in them.
-    shortest = rejected[np.argsort(np.abs(steps.h[rejected]))][:BISECTED]
-    for order in (0, 1):
-        breaks = [found for i in shortest if (found := _bisected(path, steps, i, order)) is not None]
-        if len(breaks) > len(shortest) // 2:
-            return _of_breaks(breaks, order, f"{len(rejected)} of {len(steps.h)} steps were rejected")
-    return None
-
-
-def _of_breaks(breaks, order, rejected):
-    first, velocities = breaks[0], np.array([found.velocity for found in breaks])
-    what = "has a kink" if order else f"jumps from {first.before:.3g} to {first.after:.3g}"
-    where = f"the acceleration of '{first.name}' {what} with the {first.by} at t = {first.t:.9g}"
-    if first.by == "velocity":
-        held = np.ptp(velocities) <= HELD * np.max(np.abs(velocities)) + 1e-9
-        sticks = ", and the motion stays there, pushed from both sides: it sticks" if held and not order else ""
-        return (
-            f"{where}, where its velocity is {first.velocity:.6g}{sticks} (dry friction, a sign of a velocity); "
-            f"{rejected}",
-            'jumps="found", the default, with the jump where it can be read: jnp.sign(v) in the force itself, no loop',
-        )
-    if first.by == "time":
-        return (
-            f"{where} (a force that is switched); {rejected}",
-            'jumps="found", the default, which reads such times off the force; or name them, jump_ts=jnp.array([...])',
-        )
-    return (
-        f"{where} (a contact, an end stop, a table that is interpolated); {rejected}",
-        'jumps="found", the default, which reads such places off the force; or a smooth function in its place',
-    )
-
-
-def _bisected(path, steps, i, order):
-    """Bisect a rejected step: where the acceleration (order 0) or its derivative (1) breaks, or None."""
-    t, y, low, high = steps.t[i], steps.y[i], 0.0, float(steps.h[i])
-    below, above = path.at(t, y, low, order), path.at(t, y, high, order)
-    size = at_ends = max(np.max(np.abs(below)), np.max(np.abs(above)))
-    for _ in range(BISECTIONS):
-        middle = 0.5 * (low + high)
-        between = path.at(t, y, middle, order)
-        if not np.all(np.isfinite([below, between, above])):
-            return None
-        size = max(size, np.max(np.abs(between)))
-        if np.max(np.abs(between - below)) > np.max(np.abs(above - between)):
-            high, above = middle, between
-        else:
-            low, below = middle, between
-    which = int(np.argmax(np.abs(above - below)))
-    change = abs(above - below)[which]
-    # A pole is not a jump: its values grow as the interval shrinks.
-    if size > POLE * at_ends:
-        return None
-    if not change > (KINK if order else JUMP) * size:
-        return None
-    # With only t, q or v on the other side of the break.
-    alone = [path.at(t, y, np.where(np.arange(3) == k, high, low), order)[which] for k in range(3)]
-    by = ("time", "position", "velocity")[int(np.argmax(np.abs(alone - below[which])))]
-    velocity = float(coordinates.flatten(y[1])[0][which])
-    return _Break(t + low, path.names[which], below[which], above[which], velocity, by)
-
-
 def _singularity(path, steps):
-    """Find a singularity: steps shrink while accelerations grow."""
-    kept = steps.kept
-    if not kept.size:
+    """Velocities or accelerations that have grown without bound, or that grow while steps shrink."""
+    kept = steps.kept if steps.kept.size else np.array([0])
+    sizes = lambda i: (np.abs(path.velocity(steps.y[i])), np.abs(path.at(steps.t[i], steps.y[i], 0.0)))
+    first, last, limit = sizes(kept[0]), sizes(kept[-1]), steps.t[kept[-1]]
+    if not all(np.all(np.isfinite(x)) and x.size for x in last):
         return None
-    lengths, at = np.abs(steps.h[kept]), lambda i: np.abs(path.at(steps.t[i], steps.y[i], 0.0))
-    last, limit = at(kept[-1]), steps.t[kept[-1]]
-    shrinks = lengths[-1] < SHRANK * lengths[0] and np.mean(np.diff(lengths) < 0) > 0.8
-    if len(kept) >= 6 and np.max(last) > GREW * np.max(at(kept[0])) and shrinks:
+    lengths = np.abs(steps.h[kept])
+    shrinks = len(kept) >= 6 and lengths[-1] < SHRANK * lengths[0] and np.mean(np.diff(lengths) < 0) > 0.8
+    grows = [np.max(x) > GREW * np.max(x0) for x, x0 in zip(last, first)]
+    blown_up = [np.max(x) > many * usual > 0 for x, many, usual in zip(last, BLOWN_UP, path.usual)]
+    if not (any(blown_up) or shrinks and any(grows)):
+        return None
+    if shrinks:
         # Steps in a geometric series converge to its limit.
         ratio = min(np.median(lengths[1:] / lengths[:-1]), 1 - 1e-9)
         limit += np.sign(steps.h[kept[-1]]) * lengths[-1] / (1 - ratio)
-    elif not np.max(last) > BLOWN_UP * path.usual:
-        return None
+    of_velocity = blown_up[0] or not any(blown_up) and grows[0]
+    which = last[0] if of_velocity else last[1]
+    i = int(np.argmax(which))
+    what = "velocity" if of_velocity else "acceleration"
+    usual = path.usual[0 if of_velocity else 1]
     return (
-        f"a singularity of the motion near t = {limit:.6g}: steps shrink and the acceleration of "
-        f"'{path.names[int(np.argmax(last))]}' grows (a collision, a motion that runs away)",
-        f"ts that end before {limit:.6g}, an event on the way there, or a softer potential",
+        f"a singularity of the motion: the {what} of '{path.names[i]}' grows without bound as t -> {limit:.6g}; it is "
+        f"{which[i]:.2g} already, where the start and the way so far have {usual:.2g}",
+        f"ts that end before {limit:.6g}" + (_event(path, i, usual) if of_velocity else ""),
+    )
+
+
+def _event(path, i, usual):
+    """An event where a velocity has grown a hundred times, in the user's names."""
+    name = path.names[i]
+    if not (path.in_dict and name.isidentifier() or name == "q" or name.startswith("q[")):
+        return ""
+    entry = f'v["{name}"]' if path.in_dict else f"v{name[1:]}"
+    guard = f"lambda t, q, v, params: {100 * usual:.2g} - abs({entry})"
+    return f', or an event on the way there, events={{"near": lj.Crossing({guard})}}'
+
+
+def _jump(path, steps):
+    """A change of the acceleration, within one of the shortest rejected steps, that its rate does not explain."""
+    rejected, lengths = np.flatnonzero(~steps.accepted), np.abs(steps.h)
+    longest = max(SHORT * np.max(lengths[steps.kept], initial=0.0), NO_TIME * path.span)
+    for i in rejected[np.argsort(lengths[rejected])][:TRIED]:
+        found = _jump_in(path, steps.t[i], steps.y[i], float(steps.h[i])) if lengths[i] < longest else None
+        if found:
+            cause, fix = found
+            return f"{cause}; {len(rejected)} of {len(lengths)} steps were rejected", fix
+    return None
+
+
+def _jump_in(path, t, y, h):
+    before, soon, after = (path.at(t, y, share * h) for share in (0.0, 1e-3, 1.0))
+    if not np.all(np.isfinite([before, after])):
+        return None
+    change, explained = np.abs(after - before), 1e3 * np.abs(soon - before)
+    which = int(np.argmax(change))
+    sizes = np.abs(before), np.abs(after)
+    if not change[which] > max(JUMP * np.max(sizes), UNEXPLAINED * explained[which]):
+        return None
+    # With only t, q or v on the other side of the jump.
+    alone = [path.at(t, y, np.where(np.arange(3) == k, h, 0.0))[which] for k in range(3)]
+    by = int(np.argmax(np.abs(alone - before[which])))
+    name, speed = path.names[which], path.velocity(y)[which]
+    return (
+        f"the acceleration of '{name}' changes from {before[which]:.3g} to {after[which]:.3g} within {abs(h):.1g} of "
+        f"t = {t:.9g}, with the {('time', 'position', 'velocity')[by]}",
+        'jumps="found", the default, which reads a comparison off the force itself; or '
+        + (
+            f"name the times at which it does, jump_ts=jnp.array([{t:.9g}, ...])",
+            'a lj.Hybrid with a switch at that position, lj.Switch("before", to="after", when=...)',
+            f"a lj.Hybrid with a switch where the velocity of '{name}' is {speed:.6g}, and, where both sides push back "
+            "to it, a phase that holds it there, when=lj.sticks(...)",
+        )[by],
+    )
+
+
+def _undefined(path, steps):
+    """Accelerations that are not finite just beyond the last state."""
+    t, y, h = steps.t[-1], steps.y[-1], float(steps.h[-1])
+    beyond = path.at(t, y, h)
+    if np.all(np.isfinite(beyond)) or not np.all(np.isfinite(path.at(t, y, 0.0))):
+        return None
+    name = path.names[int(np.argmax(~np.isfinite(beyond)))]
+    return (
+        f"the acceleration of '{name}' is {beyond[~np.isfinite(beyond)][0]} at t = {t + h:.9g}, {abs(h):.1g} beyond",
+        "an L that is defined there (a root or a logarithm of what becomes negative); or ts, or an event, that end "
+        "before",
     )
 
 
@@ -363,7 +389,7 @@ def _fast(path, steps):
     period = 2 * np.pi / abs(fastest.imag)
     cause = f"an oscillation of period {period:.3g}, of which {steps.left / period:.2g} are left"
     if not np.any(np.abs(rates) < abs(fastest) / FAST):
-        return cause, SPAN[1]
+        return cause, "a looser rtol and atol"
     return (
         f"{cause}: a stiff spring, or another high frequency on top of the motion",
         "a constraint in place of the stiff spring, or, where that oscillation does not matter, "
@@ -386,15 +412,3 @@ def _beyond(trajectory):
             "(Usual there: a loop that can close only so far, or one motion prescribed twice.)"
         )
     return None
-
-
-def _fastest(trajectory):
-    """The coordinate whose acceleration is largest at the end: that of a collision or a coordinate singularity."""
-    end = trajectory.end
-    a = _acceleration(trajectory.system, trajectory.params, *end[:3])
-    values = np.abs(coordinates.flatten(a)[0])
-    names = coordinates.names(end.q)
-    if len(names) == 0 or not np.all(np.isfinite(values)):
-        return ""
-    i = int(np.argmax(values))
-    return f", and the largest acceleration that of '{names[i]}', {values[i]:.2g}"

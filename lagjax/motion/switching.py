@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, ArrayLike
 
 from lagjax.mechanics import constraints, coordinates
 from lagjax.mechanics.arguments import OF_STATE, takes_of
@@ -222,7 +222,7 @@ def _alike(found, wanted):
     return same and shapes(found) == shapes(wanted)
 
 
-def starting(system, start: str | None):
+def starting(system, start: str | ArrayLike | None):
     """The system; a hybrid one starts in phase `start`."""
     if isinstance(system, Hybrid):
         return system.starting(start)

@@ -9,7 +9,8 @@ years. If `atol` is not given, each coordinate and each velocity is therefore ju
 out is followed over three decades; √(|a| |q|) is the velocity that goes with an extent and an acceleration, which is
 all there is at rest when a force sets in. To this is added only the round-off from the other coordinates: a motion in a
 plane leaves the third dimension at round-off, which no step can follow. Sizes are compared as √M_ii q_i and √M_ii v_i,
-which have the same unit for all coordinates. If everything is zero at the start, only the user's units tell a size.
+which have the same unit for all coordinates. If everything is zero at the start, the size is a part of what the
+acceleration there yields in the whole time, or, if that is zero too, the acceleration of the step.
 """
 
 from typing import NamedTuple
@@ -19,7 +20,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from lagjax.motion.consistency import stopped
 
@@ -52,6 +53,7 @@ class Scales(NamedTuple):
     - `root_mass`: √M_ii; `over_root_mass`: one over it, bounded.
     - `reach`: the largest of √M_ii times the numbers, never zero.
     - `time`: the time in which they change. `first`: the sizes of the numbers; if all are zero, a substitute.
+    - `unknown`: whether that is zero too, since nothing accelerates at the start.
     """
 
     root_mass: Float[Array, "1 n"]
@@ -59,6 +61,7 @@ class Scales(NamedTuple):
     reach: Float[Array, "2 1"]
     time: Float[Array, ""]
     first: Float[Array, "2 n"]
+    unknown: Bool[Array, ""]
 
 
 def tolerances_at(start, ts, settings, sizes_so_far=None) -> Tolerances:
@@ -100,10 +103,10 @@ def scales_of(mass, q, v, a, span) -> Scales:
     of_v = jnp.maximum(of_v, jnp.where(of_a > 0, of_a * time, of_q / span))
     of_q = jnp.maximum(of_q, of_v * time)
     reach = jnp.stack([of_q, of_v])[:, None]
-    moved = jnp.where(of_a > 0, np.array(FROM_NOTHING, reach.dtype)[:, None] * reach, 1.0)
-    least = jnp.minimum(moved * over_root_mass, 1.0) / DIED_OUT
+    least = np.array(FROM_NOTHING, reach.dtype)[:, None] * reach * over_root_mass / DIED_OUT
     reach = jnp.where(reach > 0, reach, 1.0)
-    return Scales(root_mass, over_root_mass, reach, time, jnp.where(nothing, least, sizes[:2]))
+    first = jnp.where(nothing, least, sizes[:2])
+    return Scales(root_mass, over_root_mass, reach, time, first, nothing & (of_a == 0))
 
 
 def shared(scales: Scales, sizes) -> Float[Array, "2 n"]:
@@ -185,7 +188,8 @@ class Weighing(diffrax.AbstractAdaptiveStepSizeController):
         else:
             now = jnp.maximum(size, largest)
             allowed = self._allowed_by_size(size, now, jnp.abs(after - before)[1] / h)
-        weights = (self.atol + self.rtol * size) / jnp.where(allowed > 0, allowed, 1.0)
+        # Where nothing is allowed nothing may be off: zero stays zero.
+        weights = (self.atol + self.rtol * size) / jnp.where(allowed > 0, allowed, jnp.finfo(size.dtype).tiny)
         return unravel(error * weights.ravel()), now
 
     def _allowed_by_size(self, size, largest, rate):
@@ -194,6 +198,10 @@ class Weighing(diffrax.AbstractAdaptiveStepSizeController):
         others = shared(scales, largest)
         q, v = self._capped_angles(jnp.maximum(size, DIED_OUT * largest))
         own_size = jnp.stack([q, jnp.maximum(v, jnp.sqrt(rate * (q + OF_OTHERS * others[0])))])
+        # The same substitute as at the start, from the first acceleration that there is.
+        reach = jnp.max(scales.root_mass[0] * rate) * jnp.stack([scales.time**2, scales.time])[:, None]
+        from_nothing = np.array(FROM_NOTHING, own_size.dtype)[:, None] * reach * scales.over_root_mass
+        own_size = jnp.where(scales.unknown, jnp.maximum(own_size, from_nothing), own_size)
         if any(self.angles):
             others = jnp.maximum(others, np.stack([self.angles, np.zeros(len(self.angles))]).astype(others.dtype))
         return self.tolerances.rtol[:, None] * own_size + rounding(others)

@@ -99,7 +99,8 @@ class Trajectory(eqx.Module):
     - `scaled_error`: the worst error in units of what is allowed (10,000 tolerances, and a thousandth of each number);
       above 1 the motion is less accurate than that, and `integrate` warns. Without `error` it is the change of the
       Jacobi integral, if it must be constant, and of the constraints, in units of what the tolerance lets expect; 0 if
-      nothing must be constant.
+      nothing must be constant. Infinite for a motion that failed. A number that is zero throughout has its error as
+      its size: no verdict depends on units.
     - `result`: a `RESULTS` item; `lj.RESULTS.successful`, `event_occurred`, or what went wrong.
     - `events`: by name, the `Crossings` of the requested events.
     - `params`, `system`: what was integrated; `asked`: the method and the steps that were asked for. `tolerance`:

@@ -218,11 +218,14 @@ class Watching(diffrax.AbstractStepSizeController):
         right = right._replace(values=tuple(v._replace(turns=x) for v, x in zip(right.values, turns)))
         values, times, inner = apart(self.sight.sample, left, right, args)
         right = right._replace(values=values)
-        of_guards = apart(self.sight.judged, left, right, inner)
+        # A guard that holds counts as above zero from the start on: if it leaves zero below, it has crossed.
+        touching = [jnp.asarray(kind.holds) & (f.sign == 0) for kind, f in zip(kinds, watched.followed)]
+        of_guards = apart(self.sight.judged, left, right, inner, touching)
         doubts = [_any(p.doubt) for p in of_guards]
         # If doubts remain, only the signs at the ends are used.
         signs = [[jnp.where(x, 0.0, sign) for sign in p.sign[:-1]] + p.sign[-1:] for p, x in zip(of_guards, doubts)]
-        crosses = [changes(f.sign, sign) for f, sign in zip(watched.followed, signs)]
+        since = [jnp.where(x, 1.0, f.sign) for x, f in zip(touching, watched.followed)]
+        crosses = [changes(before, sign) for before, sign in zip(since, signs)]
         # Nothing to look at more closely, as in most steps of most motions.
         calm = watched.begun & (part.root.guard < 0) & (part.asked < 0) & ~_any(doubts + [_any(c) for c in crosses])
         nothing, at_end = (jnp.asarray(False),) * len(kinds), t1 >= until
@@ -291,6 +294,7 @@ class Watching(diffrax.AbstractStepSizeController):
         root, at_one_time, followed, crossing = part.root, AT_ONCE * self.resolution, [], []
         for i, (kind, f, v) in enumerate(zip(self.kinds, watched.followed, segment.right.values)):
             known = jnp.where(jnp.abs(v.g) > v.noise, jnp.sign(v.g), 0.0)
+            known = jnp.where(jnp.asarray(kind.holds) & (f.sign == 0), jnp.maximum(known, 0.0), known)
             wanted = (f.sign != 0) & (True if kind.direction == 0 else kind.direction == -f.sign)
             close = jnp.abs(v.g) <= jnp.maximum(v.noise, at_one_time * jnp.abs(v.rate))
             together = wanted & ((close & (v.rate * f.sign < 0)) | (known == -f.sign))

@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from contextlib import contextmanager
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -53,7 +54,7 @@ class Program(NamedTuple):
 
     `call(point, count)`: (values, status, settled) of the first `count` points, as NumPy arrays; `point` has the values
     of `chunk` points by axis. Points that are not settled need the robust program; settled is None for the robust
-    program itself. `irregular` is set when many points turn out to need the robust program.
+    program itself (`settles` is then false). `irregular` is set when many points turn out to need the robust program.
     """
 
     call: Callable
@@ -62,6 +63,7 @@ class Program(NamedTuple):
     working: int
     digest: str
     irregular: threading.Event
+    settles: bool
 
 
 def point_of(run: Callable) -> Callable:
@@ -129,7 +131,7 @@ def compiled(
     shaped = tuple(jax.ShapeDtypeStruct((chunk, *x.shape[1:]), x.dtype, sharding=sharding) for x in axes.arrays)
     with _explained(run, axes, patience, robust):
         traced = jax.jit(function).trace(shaped)
-    shapes, *_ = traced.out_info
+    shapes, _, settled = traced.out_info
     program = traced.lower().compile()
     memory = program.memory_analysis()
     working = 0 if memory is None else memory.temp_size_in_bytes + memory.output_size_in_bytes
@@ -138,7 +140,21 @@ def compiled(
         return jax.tree.map(lambda x: np.asarray(x)[:count], program(tuple(point.values())))
 
     one = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), shapes)
-    return Program(call, chunk, one, working, program_digest(traced.jaxpr), threading.Event())
+    return Program(call, chunk, one, working, program_digest(traced.jaxpr), threading.Event(), settled is not None)
+
+
+def raised(program: Program) -> tuple[PyTree, Status]:
+    """The values and the status of one point at which a callback of the user's raised."""
+    values, status = not_run(program, 1)
+    code = RESULTS.raised._value
+
+    def with_result(x):
+        if not isinstance(x, Trajectory):
+            return x
+        return eqx.tree_at(lambda traj: traj.result._value, x, np.full_like(x.result._value, code))
+
+    values = jax.tree.map(with_result, values, is_leaf=lambda x: isinstance(x, Trajectory))
+    return values, status._replace(result=np.full(1, code, STATUS_TYPES.result))
 
 
 def not_run(program: Program, count: int) -> tuple[PyTree, Status]:

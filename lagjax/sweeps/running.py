@@ -4,6 +4,7 @@ import math
 import os
 import threading
 import time
+import warnings
 from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
 from itertools import islice
 
@@ -12,6 +13,7 @@ import numpy as np
 
 from lagjax.jax_internals.one_function import TOGETHER
 from lagjax.motion.results import RESULTS
+from lagjax.sweeps.lanes import raised
 from lagjax.sweeps.remembered import program_for
 
 # Each worker gets at least this many chunks, so that none waits long for the last one.
@@ -43,6 +45,8 @@ class Engine:
         # Seconds of compiling before anything ran, and since then.
         self._compiling = [seconds, 0.0]
         self._lock, self._single_lane_program, self._robust_program = threading.Lock(), None, None
+        # Whether a point at which a callback raised was already told of.
+        self._told = False
 
     def seconds_since(self, started):
         """The seconds of compiling (including those before `started`) and of computing since `started`."""
@@ -88,7 +92,33 @@ class Engine:
         return self._call(self._robust_lanes, indices)[:2]
 
     def _call(self, program, indices):
-        return program.call(self.axes.at(np.resize(indices, self.chunk)), len(indices))
+        """(values, status, settled) at no more than `chunk` indices; NaN at points where a callback raises.
+
+        JAX drops a whole call if a function in it raises in one lane: the call is halved until those lanes are found.
+        """
+        chunk = program.chunk
+        try:
+            return program.call(self.axes.at(np.resize(indices, chunk)), len(indices))
+        except jax.errors.JaxRuntimeError as error:
+            if "callback" not in str(error).lower():
+                raise
+            if len(indices) == 1:
+                return self._raised(program, indices, str(error))
+        halves = [self._call(program, part) for part in np.array_split(indices, 2)]
+        return jax.tree.map(lambda *x: np.concatenate(x), *halves)
+
+    def _raised(self, program, indices, message):
+        with self._lock:
+            told, self._told = self._told, True
+        if not told:
+            point = {name: np.asarray(x)[0] for name, x in self.axes.at(indices).items()}
+            lines = [line.strip() for line in message.splitlines() if line.strip()]
+            warnings.warn(
+                f"at {', '.join(f'{name} = {x}' for name, x in point.items())} a function that is called in Python "
+                f"raised: {lines[-1]:.200}. The point is NaN, as others like it; swept.counts() counts them.",
+                stacklevel=2,
+            )
+        return *raised(program), np.ones(1, bool) if program.settles else None
 
     def at(self, indices):
         """(values, status) at no more than `chunk` indices; lanes that were given up are run again alone."""
@@ -96,7 +126,7 @@ class Engine:
         given_up = (status.result == MAX_STEPS) & (status.steps >= PATIENCE) & (self.layout == "vmap")
         if not given_up.any():
             return values, status
-        alone = [self._single_lane.call(self.axes.at(indices[i : i + 1]), 1)[:2] for i in np.flatnonzero(given_up)]
+        alone = [self._call(self._single_lane, indices[i : i + 1])[:2] for i in np.flatnonzero(given_up)]
         return _replaced((values, status), given_up, jax.tree.map(lambda *x: np.concatenate(x), *alone))
 
     @property

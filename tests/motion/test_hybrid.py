@@ -167,7 +167,7 @@ def test_it_comes_to_rest():
     assert np.isnan(traj.multipliers["floor"][0])
     # Without a phase of rest no phase lasts, and the error says so.
     dead = lj.Hybrid({"flying": ball}, [lj.Switch("flying", to="flying", when=lj.touches(height, restitution=0.0))])
-    with pytest.raises(RuntimeError, match="no phase lasts"):
+    with pytest.raises(RuntimeError, match="No phase lasts"):
         lj.integrate(dead, 1.0, 0.0, {"g": G}, ts=np.array([0.0, 1.0]))
 
 
@@ -336,9 +336,9 @@ def test_a_body_that_rests_is_not_taken_to_fly():
     """A body in a flying phase that rests on its support would fall through it: this is refused."""
     touching = lj.Hybrid({"flying": ball}, [lj.Switch("flying", to="flying", when=lj.touches(height, restitution=0.0))])
     ts = np.array([0.0, 1.0])
-    with pytest.raises(RuntimeError, match="no phase lasts"):
+    with pytest.raises(RuntimeError, match="No phase lasts"):
         lj.integrate(touching, 0.0, 0.0, {"g": G}, ts=ts)
-    with pytest.raises(RuntimeError, match="no crossing of zero was found"):
+    with pytest.raises(RuntimeError, match="No phase lasts"):
         lj.integrate(touching, 0.0, 1e-18, {"g": G}, ts=ts)
 
 

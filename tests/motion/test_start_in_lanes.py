@@ -1,0 +1,51 @@
+"""Lanes that start in different phases."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import lagjax as lj
+
+ball = lj.System(lambda t, q, v, p: 0.5 * v**2 - p["g"] * q)
+lying = lj.System(lambda t, q, v, p: 0.5 * v**2 - p["g"] * q, {"floor": lj.Holonomic(lambda t, q, p: q)})
+bounce = lj.Switch("flying", to="flying", when=lj.touches(lambda t, q, p: q, restitution=0.5))
+hybrid = lj.Hybrid({"flying": ball, "lying": lying}, [bounce])
+TS = np.array([0.0, 0.5])
+
+
+def run(q, start):
+    """Half a second from rest at height q."""
+    return lj.integrate(hybrid, q, 0.0, {"g": 10.0}, ts=TS, start=start, throw=False, estimate_error=False)
+
+
+def test_lanes_start_in_their_own_phases():
+    """A ball falls from 5 to 3.75 while another lies; a number that no phase has is a failure, and nothing is finite.
+
+    Twin: in the other phase the lying one falls through, or rather bounces for ever: it is a failure.
+    """
+    together = jax.jit(jax.vmap(run))(np.array([5.0, 0.0, 5.0, 0.0]), np.array([0, 1, 7, 0]))
+    np.testing.assert_allclose(together.q[:2, -1], [3.75, 0.0], atol=1e-12)
+    np.testing.assert_allclose(together.multipliers["floor"][1, -1], 10.0)
+    np.testing.assert_array_equal(together.phase[:, -1], [0, 1, -1, -1])
+    assert np.isnan(together.q[2:, -1]).all() and np.isnan(together.end.q[2])
+    codes = [int(lj.RESULTS.no_such_phase._value), int(lj.RESULTS.too_many_switches._value)]
+    np.testing.assert_array_equal(np.asarray(together.result._value)[2:], codes)
+
+
+@pytest.mark.slow
+def test_by_number_and_by_name():
+    """A number known before tracing is the name's; in a sweep it is an axis."""
+    by = [run(0.0, start).multipliers["floor"][-1] for start in ("lying", 1, np.int64(1), jnp.asarray(1))]
+    np.testing.assert_allclose(by, 10.0)
+    swept = lj.sweep(
+        lambda p: run(0.0, p["phase"]).multipliers["floor"][-1], {"phase": np.array([1, 1])}, progress=False
+    )
+    np.testing.assert_allclose(swept.values, 10.0)
+
+
+@pytest.mark.parametrize("start", [2, -1, 0.0, True, np.array([0, 1]), "sliding"])
+def test_said_by_name(start):
+    """Numbers that no phase has, and what is no number, are refused in words."""
+    with pytest.raises(ValueError, match="phase"):
+        run(0.0, start)

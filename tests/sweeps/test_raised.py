@@ -1,0 +1,45 @@
+"""A callback of the user's that raises at some points: these are NaN with their reason, and the others are kept."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import lagjax as lj
+
+free = lj.System(lambda t, q, v, p: 0.5 * v**2 + p["k"] * q)
+
+
+def table(x):
+    """A look-up that refuses what is above 0.75."""
+    if np.any(np.asarray(x) > 0.75):
+        raise ValueError("outside of the table")
+    return np.asarray(2.0 * x)
+
+
+def looked_up(x):
+    """The same inside a program."""
+    return jax.pure_callback(table, jax.ShapeDtypeStruct((), jnp.result_type(float)), x, vmap_method="sequential")
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_the_rest_keeps_its_results(workers):
+    """x² for force 2 x over one unit of time is x; twin: an error that no callback raised ends the sweep."""
+    xs = np.linspace(0.0, 1.0, 41)
+    run = lambda point: lj.integrate(free, 0.0, 0.0, {"k": looked_up(point["x"])}, ts=np.array([0.0, 1.0])).q[-1]
+    with pytest.warns(UserWarning, match="at x = .* raised: .*outside of the table"):
+        swept = lj.sweep(run, {"x": xs}, workers=workers, chunk=16, progress=False)
+    good = xs <= 0.75
+    np.testing.assert_allclose(swept.values[good], xs[good], rtol=1e-9)
+    assert np.isnan(swept.values[~good]).all()
+    assert swept.counts() == {"successful": 31, "A function that is called in Python, by a callback, raised an "
+                              "exception.": 10}  # fmt: skip
+
+
+def test_a_trajectory_knows():
+    """Where whole trajectories are returned, that of the point has the reason as its result."""
+    run = lambda point: lj.integrate(free, 0.0, 0.0, {"k": looked_up(point["x"])}, ts=np.array([0.0, 1.0]))
+    with pytest.warns(UserWarning, match="outside of the table"):
+        swept = lj.sweep(run, {"x": np.array([0.5, 1.0])}, progress=False)
+    assert np.isnan(swept.values.q[1]).all() and np.isfinite(swept.values.q[0]).all()
+    assert int(np.asarray(swept.values.result._value)[1]) == int(lj.RESULTS.raised._value)
