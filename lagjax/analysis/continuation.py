@@ -143,7 +143,7 @@ def _solution(steady: Steady, v) -> np.ndarray | str:
     one = lambda tree: jax.tree.map(lambda x: np.asarray(x)[None], tree)
     s = State(steady.t, steady.like, v, steady.params)
     lasting = not steady.symmetries.count and is_autonomous(steady.system, *s)
-    row = jax.tree.map(lambda x: np.asarray(x)[0], searched(steady, one(steady.like), one(v), lasting, True))
+    row = jax.tree.map(lambda x: np.asarray(x)[0], searched(steady, one(steady.like), one(v), lasting, 0, True))
     if row.status != OK:
         return WORDS[row.status]
     flat = lambda tree: np.concatenate([np.ravel(x) for x in jax.tree.leaves(tree)] or [np.zeros(0)])

@@ -19,6 +19,7 @@ from jax import lax
 from jaxtyping import ArrayLike, PyTree
 
 from lagjax.analysis import balance as equations
+from lagjax.analysis import degenerate
 from lagjax.analysis.balance import MOMENTUM, VELOCITY, Steady
 from lagjax.analysis.found_equilibria import (
     CONSTRAINED,
@@ -36,7 +37,7 @@ from lagjax.jax_internals.tracing import is_eager
 from lagjax.mechanics import constraints, coordinates
 from lagjax.mechanics.compiled import compiled
 from lagjax.mechanics.refusals import by_name, check_system
-from lagjax.mechanics.structure import angles, is_autonomous
+from lagjax.mechanics.structure import angles, is_autonomous, unseen_coordinates
 from lagjax.motion.consistency import stopped
 from lagjax.numerics import lapack
 from lagjax.numerics.roots import MOST, differentiable, least_squares_root, zero_below
@@ -93,8 +94,9 @@ def equilibria(
     - `t`: the time of the balance; a balance that does not last is reported.
 
     **Returns:** `Equilibria`: the equilibria found, with duplicates merged (also angles that differ by whole turns),
-    differentiable by `params`; and the outcome of each start. Under `jit`, `vmap` and `grad` nothing is merged: there
-    is one row for each start, and `found` says which of them are equilibria.
+    differentiable by `params`; and the outcome of each start. Where a stiffness is zero, the first term that does not
+    vanish decides about stability. Under `jit`, `vmap` and `grad` nothing is merged, and such a point is undecided:
+    there is one row for each start, and `found` says which of them are equilibria.
 
     **Raises:** `TypeError`, `ValueError` for starts of the wrong structure, for an L that depends on a coordinate named
     in `cyclic`, and what `lj.accelerations` raises about functions that cannot be called.
@@ -126,11 +128,97 @@ def equilibria(
     q, v = jax.tree.map(lambda x: x.astype(s.t.dtype), (q, v))
     lasting = not symmetries.count and is_autonomous(system, *s)
     concrete = is_eager() and not coordinates.is_traced((steady, q, v))
-    rows = searched(steady, q, v, lasting, concrete)
-    found = Equilibria(t=s.t, params=s.params, symmetries=symmetries, starts=q, **rows._asdict())
+    unseen = unseen_coordinates(system, *s)
+    expected = int(np.sum(np.delete(unseen, list(symmetries.places))))
+    rows = searched(steady, q, v, lasting, expected, concrete)
+    as_table = lambda rows: Equilibria(t=s.t, params=s.params, symmetries=symmetries, starts=q, **rows._asdict())
     if not concrete:
-        return found
-    return merged(found, angles(system, *s))
+        return as_table(rows)
+    unseen[list(symmetries.places)] = False
+    search = lambda q, v: searched(steady, q, v, lasting, expected, True)
+    rows, radii = _decided(steady, rows, q, lasting, unseen, search)
+    return merged(as_table(rows), angles(system, *s), radii)
+
+
+def _decided(steady: Steady, rows: Row, starts, lasting, unseen, search) -> tuple[Row, np.ndarray]:
+    """The rows, those with an almost vanishing stiffness judged by the terms that decide there; and their radii.
+
+    A root that several starts reached is moved to where it is exactly, to within its radius (S,) otherwise.
+    """
+    radii = np.zeros(len(rows.found))
+    soft = rows.soft > int(np.sum(unseen))
+    pick = lambda tree, i: jax.tree.map(lambda x: x[i], tree)
+    size_of = lambda q, i: float(np.max(np.abs(_flat((q, pick(starts, i))))))
+    if np.any(lost := soft & (rows.status == NO_BALANCE)) and lasting and not steady.symmetries.count:
+        # A search that went far away fades there.
+        far = lambda i: np.max(np.abs(_flat(pick(rows.last, i)))) > 3 * np.max(np.abs(_flat(pick(starts, i))))
+        lost = [i for i in np.flatnonzero(lost) if not far(i)]
+        rows = _from_valleys(steady, rows, np.array(lost, int), unseen, search, size_of)
+    made = {}
+    for i in np.flatnonzero(rows.found & (rows.soft > int(np.sum(unseen)))):
+        row = pick(rows, i)
+        y, size = degenerate.unknowns(row), size_of(row.q, i)
+        at = degenerate.held_by_momentum(steady, y[: steady.n], row.rates)
+        made[i] = degenerate.decide(at, y, size, row.eigenvalues, unseen)
+    # Equilibria moved to where a multiple root is exactly are evaluated there.
+    moved = {i: d.y for i, d in made.items() if d.y is not None}
+    if moved:
+        q = jax.tree.map(lambda start, x: np.where(np.isfinite(x), x, start), starts, rows.q)
+        v = jax.tree.map(lambda x: np.nan_to_num(x), rows.v)
+        for i, y in moved.items():
+            _put(q, i, coordinates.like(pick(q, i), y[: steady.n].astype(steady.t.dtype)))
+        again = search(q, v)
+        for i in list(moved):
+            if not again.found[i]:
+                del moved[i]
+        places = np.array(list(moved), int)
+        rows = jax.tree.map(lambda old, new: _with(old, places, new), rows, again)
+    for i, decision in made.items():
+        if decision.verdict == degenerate.AS_LINEAR:
+            # One of a family of equilibria: nothing leads away along it.
+            stable, undecided = rows.stable[i] | rows.undecided[i], False
+            rows = rows._replace(stable=_with(rows.stable, i, stable), undecided=_with(rows.undecided, i, undecided))
+            continue
+        radii[i] = decision.radius
+        zero_modes = max(int(rows.zero_modes[i]), decision.zero_modes + int(np.sum(unseen)))
+        cleaned = degenerate.without_zeros(rows.eigenvalues[i], decision)
+        rows = rows._replace(
+            stable=_with(rows.stable, i, decision.verdict == degenerate.STABLE),
+            undecided=_with(rows.undecided, i, decision.verdict == degenerate.UNDECIDED),
+            zero_modes=_with(rows.zero_modes, i, zero_modes),
+            eigenvalues=_with(rows.eigenvalues, i, cleaned),
+        )
+    return rows, radii
+
+
+def _from_valleys(steady: Steady, rows: Row, lost, unseen, search, size_of) -> Row:
+    """The rows, with searches that crept along a valley towards a multiple root ended there."""
+    q = jax.tree.map(np.array, rows.last)
+    for i in lost:
+        at = jax.tree.map(lambda x, i=i: x[i], q)
+        x = degenerate.nearest(steady, np.asarray(_flat(at), float), size_of(at, i), unseen)
+        if x is not None:
+            _put(q, i, coordinates.like(at, x.astype(steady.t.dtype)))
+    again = search(q, jax.tree.map(np.zeros_like, q))
+    reached = lost[again.found[lost]]
+    return jax.tree.map(lambda old, new: _with(old, reached, new), rows, again)
+
+
+def _flat(tree) -> np.ndarray:
+    return np.concatenate([np.ravel(x) for x in jax.tree.leaves(tree)])
+
+
+def _put(trees, i, tree):
+    """Write one tree into trees of arrays with a leading axis."""
+    for x, new in zip(jax.tree.leaves(trees), jax.tree.leaves(tree)):
+        x[i] = new
+
+
+def _with(array, places, values):
+    """A copy of an array with other values (given for all places, or one for these) at some places."""
+    array = np.array(array)
+    array[places] = values[places] if np.shape(values) == array.shape else values
+    return array
 
 
 def _is_a_state(system, t, q, params) -> bool:
@@ -161,9 +249,9 @@ def _moving(v, count):
 
 
 @partial(compiled, in_numpy=True)
-def searched(steady: Steady, q, v, lasting, concrete) -> Row:
-    """Search from each start; one row each."""
-    return jax.vmap(lambda q, v: _search(steady, q, v, lasting, concrete))(q, v)
+def searched(steady: Steady, q, v, lasting, expected, concrete) -> Row:
+    """Search from each start; one row each. `expected`: the number of coordinates at rest that nothing depends on."""
+    return jax.vmap(lambda q, v: _search(steady, q, v, lasting, expected, concrete))(q, v)
 
 
 def held_at(steady: Steady, x, u):
@@ -176,7 +264,7 @@ def held_at(steady: Steady, x, u):
     return rates, steady.momenta(x, steady.velocity(x, rates)) if steady.symmetries.hold == MOMENTUM and k else rates
 
 
-def _search(steady: Steady, q, v, lasting, concrete) -> Row:
+def _search(steady: Steady, q, v, lasting, expected, concrete) -> Row:
     x0, u0 = coordinates.flatten(q)[0], coordinates.flatten(v)[0]
     rates, held = held_at(steady, x0, u0)
     steady = Steady(steady.system, steady.t, steady.params, held, steady.like, steady.symmetries)
@@ -184,10 +272,10 @@ def _search(steady: Steady, q, v, lasting, concrete) -> Row:
     fixed, linear = stopped(steady), np.arange(y0.size) >= steady.n + steady.symmetries.count
     root = least_squares_root(lambda y: equations.balance(fixed, y), lax.stop_gradient(y0), linear)
     y = root.y if concrete else differentiable(lambda y: equations.balance(steady, y), root)
-    return _row(steady, y, root, y0, lasting, concrete)
+    return _row(steady, y, root, y0, lasting, expected, concrete)
 
 
-def _row(steady: Steady, y, root, y0, lasting, concrete) -> Row:
+def _row(steady: Steady, y, root, y0, lasting, expected, concrete) -> Row:
     """The row of a root: the solution in the user's structure, its stability and its status."""
     x, rates, multipliers = steady.parts(y)
     u, a = steady.velocity_and_acceleration(x, rates)
@@ -200,21 +288,23 @@ def _row(steady: Steady, y, root, y0, lasting, concrete) -> Row:
         by_name = constraints.split(*problem)
     jacobian = root.jacobian if concrete else jax.jacfwd(lambda y: equations.balance(steady, y))(y)
     roots = equations.characteristic_roots(steady, y, jacobian, derivatives=not concrete)
-    status, imbalance, zero_modes = _verdict(steady, root, y0, lasting)
+    status, imbalance, zero_modes, soft = _verdict(steady, root, y0, lasting)
     grows = GROWS_ABOVE[np.dtype(x.dtype)] * jnp.nanmax(jnp.abs(roots))
-    stable = ~jnp.any(roots.real > grows) & jnp.any(jnp.isfinite(roots)) & (status == OK)
+    settled = ~jnp.any(roots.real > grows) & jnp.any(jnp.isfinite(roots)) & (status == OK)
+    # A zero root that no coordinate explains decides nothing.
+    undecided = settled & (zero_modes > expected)
     momenta = steady.momenta(x, u) if steady.symmetries.count else jnp.zeros(0, x.dtype)
     is_found = status == OK
     fill = lambda tree: jax.tree.map(lambda x: jnp.where(is_found, x, jnp.nan), tree)
     return Row(
         fill(steady.unflatten(x)), fill(steady.unflatten(u)), fill(by_name), fill(rates), fill(momenta),
-        stable, fill(roots), is_found, zero_modes, imbalance, status,
+        settled & ~undecided, undecided, fill(roots), is_found, zero_modes, soft, imbalance, status,
         steady.unflatten(root.y[: steady.n]),
     )  # fmt: skip
 
 
 def _verdict(steady: Steady, root, y0, lasting):
-    """The status of a root, its imbalance, and the number of its zero modes."""
+    """The status of a root, its imbalance, and the numbers of its zero modes and of its almost zero ones."""
     n, k = steady.n, steady.symmetries.count
     limit = BALANCED[np.dtype(y0.dtype)]
     larger = jnp.maximum(jnp.abs(root.y), jnp.abs(lax.stop_gradient(y0)))
@@ -238,11 +328,13 @@ def _verdict(steady: Steady, root, y0, lasting):
         status = jnp.where((violated > limit) & (violated >= jnp.max(off[:n])), CONSTRAINED, status)
     status = jnp.where((status == NO_BALANCE) & (root.steps >= MOST), UNFINISHED, status)
     status = jnp.where(jnp.isfinite(imbalance) & jnp.all(jnp.isfinite(root.y)), status, NOT_FINITE)
-    return lax.stop_gradient((status, imbalance, _zero_modes(steady, root)))
+    zero, soft, softer = _zero_modes(steady, root)
+    # A search that creeps along a curved valley stops farther from a multiple root than one that reaches it.
+    return lax.stop_gradient((status, imbalance, zero, jnp.where(status == OK, soft, softer)))
 
 
 def _zero_modes(steady: Steady, root):
-    """In how many directions of positions, apart from the symmetries, the balance holds to first order."""
+    """In how many directions of positions, apart from the symmetries, the balance holds to first order, or almost."""
     n, k, least = steady.n, steady.symmetries.count, 1e3 * zero_below(root.y.dtype)
     matrix = root.jacobian[: n + steady.m]
     along = jnp.concatenate([steady.fields(root.y[:n]), jnp.zeros((k, steady.m), matrix.dtype)], axis=1)
@@ -252,7 +344,14 @@ def _zero_modes(steady: Steady, root):
     of_rows = jnp.max(jnp.abs(matrix), axis=1).at[: n + steady.m].max(root.rows[: n + steady.m])
     matrix = matrix / positive(of_rows)[:, None]
     columns = jnp.max(jnp.abs(matrix), axis=0)
-    matrix = matrix / jnp.where(columns > least, columns, 1.0)[None, :]
-    matrix = jnp.where(jnp.isfinite(matrix), matrix, 0.0)
-    rank = lambda matrix: jnp.sum(lapack.singular_values(matrix) > least) if matrix.size else 0
-    return n + rank(matrix[:, n:]) - rank(matrix)
+    # A coordinate that is small now has small columns, so for almost zero modes all positions have one unit.
+    units = jnp.where(np.arange(columns.size) < n, jnp.max(columns[:n], initial=0.0), columns)
+    sizes = lambda matrix: lapack.singular_values(matrix) if matrix.size else jnp.zeros(0, matrix.dtype)
+
+    def count(columns, below):
+        scaled = matrix / jnp.where(columns > least, columns, 1.0)[None, :]
+        scaled = jnp.where(jnp.isfinite(scaled), scaled, 0.0)
+        return n + jnp.sum(sizes(scaled[:, n:]) > below) - jnp.sum(sizes(scaled) > below)
+
+    soft = degenerate.soft_below(root.y.dtype)
+    return count(columns, least), count(units, soft), count(units, degenerate.CREEPS_BELOW)

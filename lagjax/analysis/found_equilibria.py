@@ -35,9 +35,11 @@ class Row(NamedTuple):
     rates: Float[Array, " k"]
     momenta: Float[Array, " k"]
     stable: Bool[Array, ""]
+    undecided: Bool[Array, ""]
     eigenvalues: Complex[Array, " s"]
     found: Bool[Array, ""]
     zero_modes: Int[Array, ""]
+    soft: Int[Array, ""]
     imbalance: Float[Array, ""]
     status: Int[Array, ""]
     last: PyTree[Float[Array, "..."]]
@@ -49,12 +51,17 @@ class Equilibria(eqx.Module):
     - `t`; `q`, `v`: the states, each leaf with a leading axis E, `[q]`, `[q]/[t]`.
     - `multipliers`: by constraint name, (E, ...), `[L]/[g]`; with dependent constraints those of least norm.
     - `rates`, `momenta` (E, k): those of each cyclic motion, `1/[t]` (`[q]/[t]` for a coordinate) and `[L][t]`.
-    - `stable` (E,): no small departure grows. (If none decays either, as without friction, this holds for the linear
-      equations only, because roots on the imaginary axis are the limit of stability.)
+    - `stable` (E,): no small departure grows. (If none decays either, as without friction, and forces are gyroscopic or
+      circulatory, this holds for the linear equations only: roots on the imaginary axis are the limit of stability.)
+      At a point with a zero mode that is no family, the first term that does not vanish along it decides.
+    - `undecided` (E,): neither stable nor unstable for what the library can show: several zero modes, velocity
+      constraints, or forces beside a zero mode that neither conserve nor lose energy; while JAX traces, any zero mode
+      but those of coordinates that nothing depends on.
     - `eigenvalues` (E, 2n): the roots s of departures e^(st), `1/[t]`, padded with NaN; the derivative of a double root
       is that of the mean.
     - `zero_modes` (E,): in how many directions, besides the cyclic ones, the balance holds to first order: the
       equilibrium is the member of a family nearest to its start, or a critical point where branches meet.
+      `soft` (E,): the same for directions whose stiffness is so small that the root may be a multiple one.
     - `imbalance` (E,): the imbalance, relative to the effect of a displacement as large as the coordinates.
     - `found` (E,): whether the row is an equilibrium; `status` (S,): 0 where a start led to one, and
       `describe(status)` says what another number means.
@@ -71,9 +78,11 @@ class Equilibria(eqx.Module):
     rates: Float[Array, "E k"]
     momenta: Float[Array, "E k"]
     stable: Bool[Array, " E"]
+    undecided: Bool[Array, " E"]
     eigenvalues: Complex[Array, "E s"]
     found: Bool[Array, " E"]
     zero_modes: Int[Array, " E"]
+    soft: Int[Array, " E"]
     imbalance: Float[Array, " E"]
     status: Int[Array, " S"]
     last: PyTree[Float[Array, "S ..."]]
@@ -105,8 +114,11 @@ class Equilibria(eqx.Module):
         return by_line("\n".join(_lines(self)))
 
 
-def merged(rows: Equilibria, is_angle: PyTree[bool]) -> Equilibria:
-    """Merge duplicates; equilibria keep the order in which starts led to them."""
+def merged(rows: Equilibria, is_angle: PyTree[bool], radii: np.ndarray) -> Equilibria:
+    """Merge duplicates; equilibria keep the order in which starts led to them.
+
+    `radii` (S,): how far from each other searches may end at the same multiple root; 0 at simple ones.
+    """
     found_rows = np.flatnonzero(np.asarray(rows.found))
     first = jax.tree.map(lambda x: x[0], rows.q)
     angle = np.concatenate([np.full(np.size(x), yes) for yes, x in zip(*map(jax.tree.leaves, (is_angle, first)))])
@@ -121,10 +133,13 @@ def merged(rows: Equilibria, is_angle: PyTree[bool]) -> Equilibria:
         for place, j in enumerate(kept):
             off = x[i] - x[j]
             off = np.where(angle, off - 2 * np.pi * np.round(off / (2 * np.pi)), off)
-            same = _close(off, np.maximum(np.abs(x[i]), np.abs(x[j])), angle)
+            radius = max(radii[i], radii[j])
+            same = _close(off, np.maximum(np.abs(x[i]), np.abs(x[j])), angle) or np.max(np.abs(off)) <= radius
             # With half an angle in L, for example, states a whole turn apart can differ.
             alike = _close(other[i] - other[j], np.abs(other[i]), np.zeros(other.shape[1], bool))
-            if same and alike and rows.stable[i] == rows.stable[j] and _same_roots(roots[i], roots[j]):
+            verdicts = rows.stable[i] == rows.stable[j] and rows.undecided[i] == rows.undecided[j]
+            # Roots near zero are the root of a stiffness that is round-off.
+            if same and alike and verdicts and (radius > 0 or _same_roots(roots[i], roots[j])):
                 of_start[i] = place
                 break
         else:
@@ -192,7 +207,8 @@ def _row(found, i):
             row[f"λ {name}" + (f"[{j}]" if np.ndim(value) else "")] = _number(x)
     roots = np.asarray(found.eigenvalues[i])
     known = np.any(np.isfinite(roots))
-    row[""] = ("stable" if found.stable[i] else "unstable") if known else "stability not known"
+    verdict = "stable" if found.stable[i] else "undecided" if found.undecided[i] else "unstable"
+    row[""] = verdict if known else "stability not known"
     if found.zero_modes[i]:
         count = int(found.zero_modes[i])
         row[""] += f", {count} zero mode{'s' * (count > 1)}"

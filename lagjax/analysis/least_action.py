@@ -1,23 +1,29 @@
 """Hamilton's action of a path: S = ∫ L(t, q, dq/dt) dt, stationary on true motions among paths with the same ends.
 
-A path is a trajectory, or a function of time whose derivative is the velocity. Between the outputs of a trajectory, q
-is the cubic through their positions and velocities. Because S is stationary on true motions, its error is of the order
-of the square of the cubic's error; it is of the order of the error itself only if t0 or t1 lies between outputs.
+A path is a trajectory, or a function of time whose derivative is the velocity. Between the outputs of a trajectory the
+motion is integrated again, at the nodes of a quadrature that is refined until it is as accurate as the motion
+(`motion/works.py`), so that it does not matter how far apart the outputs lie. While JAX traces, the number of nodes must
+be known beforehand: then q is the cubic through the positions and velocities of the outputs. Because S is stationary on
+true motions, its error is of the order of the square of the cubic's error.
 
 Source: Goldstein, *Classical Mechanics*, Eq. (2.1), (2.2).
 """
 
 from collections.abc import Callable
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from lagjax.jax_internals.tracing import is_eager
 from lagjax.mechanics import coordinates
+from lagjax.mechanics.compiled import compiled
 from lagjax.mechanics.first_call import traced_system
 from lagjax.mechanics.refusals import check_system
 from lagjax.motion.trajectory import Trajectory
+from lagjax.motion.works import Motion
 
 # Points of Gauss's rule on each piece, which is exact up to degree 15.
 POINTS = 8
@@ -25,8 +31,8 @@ PIECES = 32
 
 
 def action(
-    system, path: Trajectory | Callable, params=None, t0=None, t1=None, *, pieces: int = PIECES
-) -> Float[Array, ""]:
+    system, path: Trajectory | Callable, params=None, t0=None, t1=None, *, pieces: int = PIECES, error: bool = False
+) -> Float[Array, ""] | tuple[Float[Array, ""], Float[Array, ""]]:
     """Return the action `S = ∫ L dt` of a path, differentiable in everything that the path and L depend on.
 
     >>> import lagjax as lj
@@ -39,10 +45,12 @@ def action(
     - `path`: `q(t)` -> coordinates, smooth between t0 and t1, or a `Trajectory`.
     - `params`: as L takes it; by default those of the trajectory.
     - `t0`, `t1`: the ends, `[t]`; by default those of the trajectory.
-    - `pieces`: the number of equal parts of the time span, each integrated by a rule of degree 15; for a trajectory
-      each interval between outputs is one part.
+    - `pieces`: for a function, the number of equal parts of the time span, each integrated by a rule of degree 15. A
+      trajectory is integrated again between its outputs, in parts as short as it takes. While JAX traces (under `jit`,
+      `grad`, `vmap`) its outputs must lie so close that a cubic through two of them follows the motion: see `error`.
+    - `error`: return the estimated error of the integral as well; that of the motion itself is `traj.error`.
 
-    **Returns:** S, scalar, `[L] [t]`; NaN for a trajectory that failed.
+    **Returns:** S, scalar, `[L] [t]`; NaN for a trajectory that failed. With `error=True` (S, its estimated error).
 
     **Raises:** `TypeError` for a path that is neither a function nor a trajectory; `ValueError` for a function without
     t0 and t1, a batch of trajectories, or one that ends before t1.
@@ -51,7 +59,8 @@ def action(
     """
     check_system(system, path, params)
     if isinstance(path, Trajectory):
-        return _action_of_trajectory(system, path, params, t0, t1)
+        found = _action_of_trajectory(system, path, params, t0, t1)
+        return found if error else found[0]
     if not callable(path):
         raise TypeError(
             f"a path is a function of t or a lj.Trajectory, not {type(path).__name__}.\n"
@@ -60,12 +69,13 @@ def action(
     if t0 is None or t1 is None:
         raise ValueError("a path that is a function needs its ends.\nFix: lj.action(system, path, params, 0.0, 1.0).")
     t0, t1 = (jnp.asarray(t, jnp.result_type(float)) for t in (t0, t1))
-    edges = t0 + (t1 - t0) * jnp.arange(pieces + 1) / pieces
+    edges = lambda pieces: t0 + (t1 - t0) * jnp.arange(pieces + 1) / pieces
     q, v = _position_and_velocity(path, t0)
     s = coordinates.state(t0, q, v, params)
     system = traced_system(system, s)
     at = lambda t: system.lagrangian(t, *_position_and_velocity(path, t), s.params)
-    return _integral(at, edges[:-1], edges[1:])
+    whole, halves = (_integral(at, edges(n)[:-1], edges(n)[1:]) for n in (pieces, 2 * pieces))
+    return (whole, jnp.abs(halves - whole)) if error else whole
 
 
 def _action_of_trajectory(system, path, params, t0, t1):
@@ -89,6 +99,8 @@ def _action_of_trajectory(system, path, params, t0, t1):
                 f"the trajectory goes from t = {low:.6g} to {high:.6g}, but the action is asked from "
                 f"{float(t0):.6g} to {float(t1):.6g}.\nFix: a trajectory with outputs at or beyond these times."
             )
+    if is_eager() and not coordinates.is_traced((path, t0, t1, s.params, eqx.filter(system, eqx.is_array))):
+        return _along_the_steps(system, path, s.params, float(t0), float(t1))
 
     def piece(a, b, x_a, x_b, u_a, u_b):
         def at(t):
@@ -101,7 +113,39 @@ def _action_of_trajectory(system, path, params, t0, t1):
         first, last = jnp.where(forward > 0, inside(t0), inside(t1)), jnp.where(forward > 0, inside(t1), inside(t0))
         return forward * _integral(at, first[None], last[None])
 
-    return jnp.sum(jax.vmap(piece)(t[:-1], t[1:], x[:-1], x[1:], u[:-1], u[1:]))
+    def total(t, x, u):
+        return jnp.sum(jax.vmap(piece)(t[:-1], t[1:], x[:-1], x[1:], u[:-1], u[1:]))
+
+    found = total(t, x, u)
+    # From every second output, the last included: an upper bound where outputs are close, no bound where they are not.
+    few = np.unique([*range(0, t.shape[0], 2), t.shape[0] - 1])
+    return found, jnp.abs(total(t[few], x[few], u[few]) - found)
+
+
+def _along_the_steps(system, path, params, t0, t1):
+    """The action of a motion that is integrated again, and the error of the quadrature."""
+    states = np.concatenate([np.ravel(y) for y in jax.tree.leaves((path.q, path.v))])
+    dtype = np.asarray(path.t).dtype
+    if not np.all(np.isfinite(states)):
+        return jnp.asarray(np.nan, dtype), jnp.asarray(np.nan, dtype)
+    if t0 == t1:
+        return jnp.zeros((), dtype), jnp.zeros((), dtype)
+    motion = Motion(path, path.system)
+    knots = motion.between(t0, t1)
+
+    def at_nodes(a, b):
+        _, t, q, v, _ = motion.again(a, b)
+        return np.asarray(_lagrangians(system, t, q, v, params))[:, None]
+
+    size = float(np.max(np.abs(at_nodes(knots[:-1], knots[1:]))))
+    rtol = max(float(np.max(np.asarray(path.tolerance[0]))), float(np.finfo(dtype).eps))
+    _, sums, errors = motion.integrals(knots, at_nodes, rtol * size * abs(t1 - t0))
+    return jnp.asarray(np.sum(sums), dtype), jnp.asarray(np.sum(np.abs(errors)), dtype)
+
+
+@compiled
+def _lagrangians(system, t, q, v, params):
+    return jax.vmap(lambda t, q, v: system.lagrangian(t, q, v, params))(t, q, v)
 
 
 def _cubic(s, h, x_a, x_b, u_a, u_b):

@@ -8,9 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int, PyTree
 
+from lagjax.analysis import degenerate
+from lagjax.analysis.balance import Steady, Symmetries
 from lagjax.analysis.drawn_modes import animated, drawn_mode, drawn_roots
 from lagjax.analysis.linearised import Linearisation, linearise, linearised
-from lagjax.analysis.motions import ASYMPTOTIC, GYROSCOPIC, STABLE, UNDECIDED, Motions, motions_of
+from lagjax.analysis.motions import ASYMPTOTIC, DIVERGENCE, GYROSCOPIC, STABLE, UNDECIDED, Motions, motions_of
 from lagjax.analysis.neutral import leads_to_others, with_neutral
 from lagjax.analysis.verdicts import VERDICTS, label_of, reason_of
 from lagjax.jax_internals.tracing import is_eager
@@ -206,7 +208,7 @@ def normal_modes(system, t=None, q=None, v=None, params=None) -> NormalModes:
 
 
 def _with_symmetries(system, linearisation, motions: Motions) -> Motions:
-    """The motions, with a stable verdict if the zero modes lead to other equilibria."""
+    """The motions, with a verdict if the zero modes lead to other equilibria, or if a term of higher order decides."""
     unseen = np.array(linearisation.kind.unseen, bool)
     explained = np.all(np.abs(motions.shapes[:, ~unseen]) <= 1e-6, axis=1)
     _, unflatten = coordinates.flatten(linearisation.state.q)
@@ -214,11 +216,32 @@ def _with_symmetries(system, linearisation, motions: Motions) -> Motions:
         linearisation.kind, system, linearisation.state._replace(q=unflatten(jnp.asarray(x, linearisation.mass.dtype)))
     )
     if not leads_to_others(linearisation, motions.shapes[motions.zero & ~explained], at):
-        return motions
+        verdict = _by_first_term(system, linearisation)
+        if verdict == degenerate.UNSTABLE:
+            return motions._replace(code=np.asarray(DIVERGENCE, motions.code.dtype))
+        if verdict != degenerate.STABLE:
+            return motions
     lasting = ~motions.zero
     decays = not linearisation.kind.conservative and bool(np.all(motions.roots.real[lasting] < 0))
     code = ASYMPTOTIC if decays else GYROSCOPIC if np.any(motions.energies < 0) else STABLE
     return motions._replace(code=np.asarray(code, motions.code.dtype), unexplained=np.zeros_like(motions.unexplained))
+
+
+def _by_first_term(system, linearisation) -> int:
+    """The verdict of the first term that does not vanish along the zero mode, for rest or motion along shifts."""
+    s, unseen = linearisation.state, np.array(linearisation.kind.unseen, bool)
+    x, u = (np.asarray(coordinates.vector(tree)) for tree in (s.q, s.v))
+    if np.any(u[~unseen]):
+        return degenerate.UNDECIDED
+    places = tuple(int(i) for i in np.flatnonzero(u))
+    symmetries = Symmetries(places=places)
+    steady = Steady(system, s.t, s.params, u[list(places)], s.q, symmetries)
+    multipliers = np.concatenate([np.ravel(y) for y in jax.tree.leaves(linearisation.multipliers)] or [u[:0]])
+    y = np.concatenate([x, u[list(places)], multipliers])
+    unseen[list(places)] = False
+    steady = degenerate.held_by_momentum(steady, x, u[list(places)])
+    roots = np.asarray(linearisation.eigenvalues())
+    return degenerate.decide(steady, y, float(np.max(np.abs(x), initial=0.0)), roots, unseen).verdict
 
 
 @compiled

@@ -26,6 +26,8 @@ def reason_of(modes) -> str:
     if code == UNSTEADY:
         off = float(modes.linearisation.residual)
         return f"the state is no equilibrium (residual {off:.2g}), or its mass matrix is singular"
+    if code == DIVERGENCE and not np.any(np.asarray(modes.growing)):
+        return "no root grows, but the first term that does not vanish along the zero mode pushes away"
     if code == DIVERGENCE:
         return f"mode {worst} grows by a factor e in {1 / growth[worst]:.4g}, without swinging"
     if code == FLUTTER:

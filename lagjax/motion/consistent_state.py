@@ -40,7 +40,17 @@ STAGES, PER_STAGE = 16, 3
 FRACTIONS = np.array([1.0, 0.5, 0.2, 0.05])
 
 
-def consistent_state(system, t, q, v, params, hold: str | Iterable[str] = ()):
+def consistent_state(
+    system,
+    t,
+    q,
+    v,
+    params,
+    hold: str | Iterable[str] = (),
+    *,
+    hold_position: str | Iterable[str] = (),
+    hold_velocity: str | Iterable[str] = (),
+):
     """Return the state nearest to the given one, in the mass matrix's metric, that satisfies the constraints.
 
     >>> import lagjax as lj
@@ -59,7 +69,8 @@ def consistent_state(system, t, q, v, params, hold: str | Iterable[str] = ()):
 
     **Arguments:** `t` scalar, `q` and `v` alike, `params` as the system takes it; `hold`, the names of coordinates that
     keep the values given for them and for their velocities: `"x"`, `["x", "r[0]"]`, `"r"` for all of a vector, or a
-    dict of true and false by name.
+    dict of true and false by name; `hold_position`, `hold_velocity`: the same for the position alone, as of a crank whose
+    speed a motor determines, or for the velocity alone.
 
     **Returns:** (q, v) in the same structure, differentiable in the state, `t` and `params`.
 
@@ -67,7 +78,7 @@ def consistent_state(system, t, q, v, params, hold: str | Iterable[str] = ()):
 
     - `ValueError` if no consistent state is reached, with the residual by constraint name (while JAX is tracing, the
       values are NaN instead).
-    - `ValueError` for a name in `hold` that is not a coordinate.
+    - `ValueError` for a name to hold that is not a coordinate.
     - `TypeError`, `ValueError` for a state of the wrong shape or dtype.
 
     Source: Hairer, Lubich & Wanner, *Geometric Numerical Integration*, Eq. (IV.4.3).
@@ -75,18 +86,20 @@ def consistent_state(system, t, q, v, params, hold: str | Iterable[str] = ()):
     check_system(system, t, q, v, params)
     s = coordinates.state(t, q, v, params)
     system = traced_system(system, s)
-    free = free_coordinates(s.q, hold)
+    both = free_coordinates(s.q, hold)
+    free = both & free_coordinates(s.q, hold_position, "hold_position")
+    free_velocity = both & free_coordinates(s.q, hold_velocity, "hold_velocity")
     if not system.constraints:
         return s.q, s.v
-    q, v, reached = _consistent_state(system, *s, jnp.asarray(free))
+    q, v, reached = _consistent_state(system, *s, jnp.asarray(free), jnp.asarray(free_velocity))
     if coordinates.is_traced((q, v)):
         return jax.tree.map(lambda x: jnp.where(reached, x, jnp.nan), (q, v))
     if not reached:
-        raise ValueError(_unreachable(system, s, q, v, np.asarray(coordinates.names(s.q))[~free]))
+        raise ValueError(_unreachable(system, s, q, v, free, free_velocity))
     return q, v
 
 
-def free_coordinates(q, hold) -> np.ndarray:
+def free_coordinates(q, hold, argument: str = "hold") -> np.ndarray:
     """Return which coordinates may move, (n,) booleans."""
     names = coordinates.names(q)
     if isinstance(hold, Mapping):
@@ -96,21 +109,27 @@ def free_coordinates(q, hold) -> np.ndarray:
     unknown = hold - set(names) - {name.split("[")[0] for name in names}
     if unknown:
         raise ValueError(
-            f"hold names {listed(sorted(map(str, unknown)))}, but the coordinates are {listed(names)}.\n"
+            f"{argument} names {listed(sorted(map(str, unknown)))}, but the coordinates are {listed(names)}.\n"
             "Fix: hold the coordinates by these names."
         )
     return ~held
 
 
-def _unreachable(system, s, q, v, held):
+def _unreachable(system, s, q, v, free, free_velocity):
     best = coordinates.State(s.t, q, v, s.params)
-    tolerance = _round_off(s.t)
-    among = f" with {listed(held)} held" if len(held) else ""
+    tolerance, names = _round_off(s.t), np.asarray(coordinates.names(s.q))
+    both = ~free & ~free_velocity
+    kinds = (("", both), ("the position of ", ~free & ~both), ("the velocity of ", ~free_velocity & ~both))
+    held = [f"{what}{listed(names[which])}" for what, which in kinds if np.any(which)]
+    among = f" with {' and '.join(held)} held" if held else ""
+    off = departures(system, best, tolerance, tolerance)
+    fix = "hold less, start nearer, or check each constraint with lj.constraint_residual(system, t, q, v, params)"
+    if np.any(both) and within(equations_of(system, *best), *best[:3], tolerance, np.array([tolerance, 1e30])):
+        fix = f"hold the position alone, hold_position={list(map(str, names[both]))}, if the velocity need not be kept"
     return (
-        f"no consistent state was found near q = {describe(s.q)}{among}: at the best state reached, constraint "
-        f"{departures(system, best, tolerance, tolerance)}.\n"
+        f"no consistent state was found near q = {describe(s.q)}{among}: at the best state reached, constraint {off}.\n"
         "Usual cause: constraints that contradict each other, too much held, or a start too far from the manifold.\n"
-        "Fix: hold less, start nearer, or check each constraint with lj.constraint_residual(system, t, q, v, params)."
+        f"Fix: {fix}."
     )
 
 
@@ -119,7 +138,7 @@ def _round_off(t):
 
 
 @compiled
-def _consistent_state(system, t, q, v, params, free):
+def _consistent_state(system, t, q, v, params, free, free_velocity):
     x0, unflatten = coordinates.flatten(q)
     u0, _ = coordinates.flatten(v)
     metric = mass_and_forcing(system, t, x0, u0, params, unflatten).mass
@@ -132,7 +151,7 @@ def _consistent_state(system, t, q, v, params, free):
         (system, t, params), x = problem_and_x
         return constraints.velocity_residual(system, t, x, u, params, unflatten)
 
-    u = _nearest(velocity, (live, x), u0, metric, free)
+    u = _nearest(velocity, (live, x), u0, metric, free_velocity)
     q, v = unflatten(x), unflatten(u)
     tolerance = _round_off(t)
     return q, v, within(equations_of(system, t, q, v, params), t, q, v, tolerance, tolerance)

@@ -118,12 +118,28 @@ class Motion:
     def _integrated(self, allowed):
         """The works until each instant, (T, n) by source, and the sum of their errors."""
         knots = self._knots()
+        ends, sums, errors = self.integrals(knots, lambda a, b: self._at_nodes(self.again(a, b)), allowed)
+        order, names = np.argsort(self.forward * ends), list(self.sources)
+        until = np.concatenate([np.zeros((1, sums.shape[1])), np.cumsum(sums[order], axis=0)])
+        place = np.searchsorted(self.forward * ends[order], self.forward * self.t, side="right")
+        columns = np.cumsum([0, *self.sources.values()])
+        works = {name: until[place, low:high] for name, low, high in zip(names, columns, columns[1:])}
+        return works, float(np.sum(errors))
+
+    def _at_nodes(self, rows):
+        powers = self._powers(*rows)
+        return np.concatenate([powers[name] for name in self.sources], axis=1)
+
+    def integrals(self, knots, at_nodes, allowed):
+        """The ends (m,), integrals (m, k) and errors (m,) of the intervals between knots, halved until accurate.
+
+        `at_nodes(a, b)`: the k functions at the nodes of the intervals from a to b, one after the other.
+        """
         apart = np.abs(np.diff(knots)) > self._shortest()
         a, b = self._cut(knots[:-1][apart], knots[1:][apart])
-        done, span, names = [], abs(float(self.t[-1] - self.t[0])), list(self.sources)
+        done, span = [], abs(float(knots[-1] - knots[0]))
         for halving in range(HALVINGS + 1):
-            powers = self._again(a, b)
-            rows = np.concatenate([powers[name] for name in names], axis=1)
+            rows = at_nodes(a, b)
             sums, errors, noise = quadrature.integrals(rows.reshape(len(a), len(quadrature.NODES), -1), a, b)
             good = errors <= np.maximum(allowed * np.abs(b - a) / span, noise)
             good |= np.abs(b - a) < 2 * self._shortest()
@@ -134,13 +150,13 @@ class Motion:
                 break
             middle = 0.5 * (a + b)[~good]
             a, b = np.concatenate([a[~good], middle]), np.concatenate([middle, b[~good]])
-        ends, sums, errors = (np.concatenate(x) for x in zip(*done))
-        order = np.argsort(self.forward * ends)
-        until = np.concatenate([np.zeros((1, sums.shape[1])), np.cumsum(sums[order], axis=0)])
-        place = np.searchsorted(self.forward * ends[order], self.forward * self.t, side="right")
-        columns = np.cumsum([0, *self.sources.values()])
-        works = {name: until[place, low:high] for name, low, high in zip(names, columns, columns[1:])}
-        return works, float(np.sum(errors))
+        return tuple(np.concatenate(x) for x in zip(*done))
+
+    def between(self, t0: float, t1: float):
+        """The instants between two times, these included, and the times at which forces may jump; from t0 to t1."""
+        low, high = sorted((t0, t1))
+        inside = np.unique([low, high, *(t for t in self._knots() if low < t < high)]).astype(self.t.dtype)
+        return inside if t1 >= t0 else inside[::-1]
 
     def _knots(self):
         """The instants, and the times between them at which forces may jump."""
@@ -162,8 +178,8 @@ class Motion:
         cuts = [np.linspace(x, y, n + 1) for x, y, n in zip(a, b, pieces)]
         return np.concatenate([c[:-1] for c in cuts]), np.concatenate([c[1:] for c in cuts])
 
-    def _again(self, a, b):
-        """The powers at the nodes of intervals, from integrating the motion again."""
+    def again(self, a, b):
+        """The phases, times, positions, velocities and multipliers at the nodes of intervals, integrated again."""
         t = quadrature.nodes(a, b).ravel()
         ts = self._with_others(t)
         traj, first = self.trajectory, self._at(0)[1:]
@@ -175,16 +191,16 @@ class Motion:
             settings["start"] = traj.system.names[self.entered[0]]
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            again = integrate(traj.system, *first, self.params, ts=ts, throw=False, estimate_error=False, **settings)
+            again = integrate(traj.system, *first, traj.params, ts=ts, throw=False, estimate_error=False, **settings)
         if not is_among(again.result, ENDED_WELL):
             raise ValueError(
-                f"the motion could not be integrated again for the work of its forces: {message(again.result)}\n"
+                f"the motion could not be integrated again between its outputs: {message(again.result)}\n"
                 "Usual cause: a motion that only just succeeds at its tolerance.\nFix: a tighter or looser rtol."
             )
         rows, place = again.rows(), np.searchsorted(self.forward * ts, self.forward * t)
         rows = jax.tree.map(lambda x: np.asarray(x)[place], {name: rows[name] for name in ("q", "v", "multipliers")})
         phase = self._phase_of(np.repeat(0.5 * (a + b), len(quadrature.NODES)))
-        return self._powers(phase, t, **rows)
+        return phase, t, rows["q"], rows["v"], rows["multipliers"]
 
     def _with_others(self, t):
         """These times in order, the first and last instant, and others: up to a length that one program serves."""

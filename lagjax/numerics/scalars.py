@@ -5,8 +5,11 @@ unit matrix along which a momentum is differentiated, a diagonal mass matrix. `w
 operations on single numbers: products with a known zero are dropped, products with a known one are not computed, and
 neither are unused numbers. XLA keeps the rest in registers.
 
-A product with a known zero is zero, even if the other factor is infinity or NaN. Primitives that are not known here,
-control flow, and arrays of more than `LARGE` entries are left unchanged.
+A product with a known zero is zero, even if the other factor turns out to be infinity or NaN: so it is where a known
+zero is the derivative of what does not matter. Two exceptions keep the meaning of what the user writes: a factor that is
+known to be infinity or NaN gives NaN; and in a program that asks whether a number is one (`isnan`, `isfinite`,
+`nan_to_num`), all products with zeros are computed. Primitives that are not known here, control flow, and arrays of more
+than `LARGE` entries are left unchanged.
 """
 
 import math
@@ -19,7 +22,7 @@ import numpy as np
 from jax.core import Tracer
 
 from lagjax.jax_internals.names import CALLS, ELEMENTWISE, IN_NUMPY
-from lagjax.jax_internals.programs import ClosedJaxpr, applied, interpreted
+from lagjax.jax_internals.programs import ClosedJaxpr, Literal, applied, equations, interpreted
 from lagjax.numerics.elementary import sincos_in_lanes
 
 LARGE = 512
@@ -41,15 +44,30 @@ def written_out(closed: ClosedJaxpr, *args, most: float = math.inf) -> list:
     # Known numbers follow the same rules as in the compiled program: 1/0 is infinite, without a warning.
     with np.errstate(all="ignore"):
         inputs = [_split(x) if _small(x.aval) else x for x in map(_Value, args)]
-        results = interpreted(closed, inputs, partial(_apply, closed.jaxpr, _Ledger(most)), _constant, _is_plain_call)
+        ledger = _Ledger(most, not asks_for_nan(closed))
+        results = interpreted(closed, inputs, partial(_apply, closed.jaxpr, ledger), _constant, _is_plain_call)
     return [_joined(x, aval) for x, aval in zip(results, closed.out_avals)]
 
 
-class _Ledger:
-    """The sines and cosines computed so far by their argument, and how many operations are still allowed."""
+def asks_for_nan(closed: ClosedJaxpr) -> bool:
+    """Whether a program asks of a number whether it is NaN or infinite."""
 
-    def __init__(self, most):
-        self.pairs, self.left = {}, most
+    def asks(equation):
+        name, operands = equation.primitive.name, equation.invars
+        if name not in ("eq", "ne"):
+            return name == "is_finite"
+        known = [x.val for x in operands if isinstance(x, Literal)]
+        return operands[0] is operands[1] or any(np.ndim(x) == 0 and not np.isfinite(x) for x in known)
+
+    return any(asks(equation) for equation in equations(closed.jaxpr))
+
+
+class _Ledger:
+    """The sines and cosines computed so far by their argument, how many operations are still allowed, and whether
+    products with known zeros are dropped."""
+
+    def __init__(self, most, drops_zeros=True):
+        self.pairs, self.left, self.drops_zeros = {}, most, drops_zeros
 
     def count(self, entries):
         """Count the entries that are not known numbers."""
@@ -116,6 +134,8 @@ def _apply(jaxpr, ledger, equation, operands):
     splittable = all(isinstance(x, np.ndarray) for x in operands) and all(_small(x.aval) for x in equation.outvars)
     if splittable and name in ELEMENTWISE:
         return [_elementwise(equation, operands, ledger)]
+    if splittable and name == "dot_general":
+        return _product(params, equation.outvars, *operands, ledger.drops_zeros)
     if splittable and name in MOVES:
         found = MOVES[name](params, equation.outvars, *operands)
         if found is not None:
@@ -135,7 +155,7 @@ def _elementwise(equation, operands, ledger):
     (variable,) = equation.outvars
     shape, dtype = variable.aval.shape, variable.aval.dtype
     rows = [np.broadcast_to(x, shape).reshape(-1) for x in operands]
-    entries = [_simplified(equation, dtype, ledger.pairs, *x) for x in zip(*rows)]
+    entries = [_simplified(equation, dtype, ledger, *x) for x in zip(*rows)]
     ledger.count(entries)
     return _filled(shape, entries)
 
@@ -144,7 +164,7 @@ def _is_known(x, number):
     return isinstance(x, np.generic) and x == number
 
 
-def _simplified(equation, dtype, pairs, *x):
+def _simplified(equation, dtype, ledger, *x):
     """The result of a primitive for one number, simplified if operands are known."""
     name = equation.primitive.name
     if name in ("add", "add_any"):
@@ -154,12 +174,12 @@ def _simplified(equation, dtype, pairs, *x):
     if name == "sub" and _is_known(x[0], 0):
         return _negative(x[1])
     if name == "mul":
-        return _multiply(*x)
+        return _multiply(*x, ledger.drops_zeros)
     if name == "neg":
         return _negative(x[0])
     if name == "div" and _is_known(x[1], 1):
         return x[0]
-    if name == "div" and _is_known(x[0], 0):
+    if name == "div" and ledger.drops_zeros and _is_known(x[0], 0) and not isinstance(x[1], np.generic):
         return x[0]
     if name == "select_n" and isinstance(x[0], np.generic):
         return x[1 + int(x[0])]
@@ -171,7 +191,7 @@ def _simplified(equation, dtype, pairs, *x):
         if x[0].dtype == dtype and not getattr(x[0], "weak_type", False):
             return x[0]
     if name in ("sin", "cos") and not isinstance(x[0], np.generic):
-        return _pair(x[0], pairs)[name == "cos"]
+        return _pair(x[0], ledger.pairs)[name == "cos"]
     if name == "div" and jnp.issubdtype(dtype, jnp.floating) and all(isinstance(y, np.generic) for y in x):
         return np.divide(*x)
     if name in IN_NUMPY and all(isinstance(y, np.generic) for y in x):
@@ -189,9 +209,10 @@ def _add(x, y):
     return jax.lax.add(*_arrays(x, y))
 
 
-def _multiply(x, y):
+def _multiply(x, y, drops_zeros):
     for a, b in ((x, y), (y, x)):
-        if _is_known(a, 0):
+        # A known factor may be infinite: the product is computed below.
+        if _is_known(a, 0) and drops_zeros and not isinstance(b, np.generic):
             return a
         if _is_known(a, 1):
             return b
@@ -277,7 +298,7 @@ def _cumulative_sum(params, variables, x):
     return [np.moveaxis(result, 0, axis)]
 
 
-def _product(params, variables, x, y):
+def _product(params, variables, x, y, drops_zeros):
     (contract_x, contract_y), (batch_x, batch_y) = params["dimension_numbers"]
     free_x = [i for i in range(x.ndim) if i not in (*contract_x, *batch_x)]
     free_y = [i for i in range(y.ndim) if i not in (*contract_y, *batch_y)]
@@ -289,7 +310,7 @@ def _product(params, variables, x, y):
     y = y.transpose([*batch_y, *free_y, *contract_y]).reshape(batch, -1, inner)
     zero = _zero(variables)
     entries = [
-        _total([_multiply(p, q) for p, q in zip(row, column)], zero)
+        _total([_multiply(p, q, drops_zeros) for p, q in zip(row, column)], zero)
         for rows, columns in zip(x, y)
         for row in rows
         for column in columns
@@ -318,7 +339,6 @@ MOVES: dict[str, Callable] = {
     "concatenate": lambda params, variables, *x: [np.concatenate(x, params["dimension"])],
     "copy": lambda params, variables, x: [x],
     "cumsum": _cumulative_sum,
-    "dot_general": _product,
     "dynamic_slice": _dynamic_slice,
     "iota": _counted,
     "pad": _padded,

@@ -126,7 +126,7 @@ def test_a_free_chain_and_a_hard_one():
 
 @pytest.mark.slow
 def test_symmetries_are_told_from_critical_points():
-    """A molecule free to move and turn in the plane is stable; q⁴, also without stiffness, is undecided."""
+    """A molecule free to move and turn in the plane is stable; so is q⁴, and twin: -q⁴ is not."""
 
     def spring(t, q, v, params):
         return 0.5 * jnp.sum(v**2) - 0.5 * params["k"] * (jnp.sqrt(jnp.sum((q[0] - q[1]) ** 2)) - 1.0) ** 2
@@ -135,8 +135,11 @@ def test_symmetries_are_told_from_critical_points():
     modes = lj.normal_modes(lj.System(spring), 0.0, ends, 0.0 * ends, {"k": 3.0})
     assert modes.verdict == "stable" and list(modes.zero) == [True, True, True, False]
     np.testing.assert_allclose(modes.frequency[3], np.sqrt(6.0), rtol=1e-12)
-    quartic = lj.System(lambda t, q, v, params: 0.5 * (v["x"] ** 2 + v["y"] ** 2) - q["x"] ** 4 - q["y"] ** 2)
-    assert lj.normal_modes(quartic, 0.0, STILL, STILL, None).verdict == "undecided"
+    quartic = lj.System(lambda t, q, v, p: 0.5 * (v["x"] ** 2 + v["y"] ** 2) - p["c"] * q["x"] ** 4 - q["y"] ** 2)
+    modes = lj.normal_modes(quartic, 0.0, STILL, STILL, {"c": 1.0})
+    assert modes.verdict == "stable" and list(modes.zero) == [True, False]
+    hill = lj.normal_modes(quartic, 0.0, STILL, STILL, {"c": -1.0})
+    assert hill.verdict == "divergence" and "first term that does not vanish" in repr(hill)
 
 
 def test_what_is_free_and_what_is_held():
