@@ -14,6 +14,7 @@ import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec, SingleDeviceSharding
 from jaxtyping import PyTree
 
+from lagjax.jax_internals.one_by_one import one_by_one
 from lagjax.jax_internals.tracing import REGULAR_FIRST
 from lagjax.mechanics.in_words import Call, check_arguments, in_words
 from lagjax.motion.reported import PATIENCE, reporting
@@ -113,7 +114,7 @@ def compiled(
     of_user = Call("run", run, (POINT,))
     check_arguments(of_user, "the axes taken one by one; a point is one dictionary")
     with PATIENCE(patience), REGULAR_FIRST(not robust), in_words(of_user, {POINT: axes.values}):
-        traced = jax.jit(function).trace(shaped)
+        traced = jax.jit(one_by_one(function)).trace(shaped)
     shapes, *_ = traced.out_info
     program = traced.lower().compile()
     memory = program.memory_analysis()
