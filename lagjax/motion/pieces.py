@@ -218,7 +218,8 @@ def root_of_cubic(begin, end):
     for _ in range(3):
         slope = c1 + x * (2 * c2 + x * 3 * c3)
         x = jnp.clip(x - (g0 + x * (c1 + x * (c2 + x * c3))) / jnp.where(slope != 0, slope, 1.0), 0.0, 1.0)
-    return t0 + x * h
+    # Where a rate is infinite, as that of sqrt(t) at 0, there is no cubic.
+    return t0 + jnp.where(jnp.isfinite(x), x, 0.5) * h
 
 
 def changes(sign, signs):
@@ -260,6 +261,7 @@ def next_node(left_end: Node, right_end: Node, times, of_guards, resolution) -> 
             left, right, length = p.rate[j], p.rate[j + 1], times[j + 1] - times[j]
             turning = mine & p.known[j] & p.known[j + 1] & (left * right < 0)
             at = times[j] + length * left / jnp.where(turning, left - right, 1.0)
+            turning = turning & jnp.isfinite(at)
             # An extremum within the resolution of a known end is that end.
             at_left = turning & (at - left_end.t <= resolution)
             at_right = turning & ~at_left & (right_end.t - at <= resolution)

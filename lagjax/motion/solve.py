@@ -159,7 +159,8 @@ class _Programs:
 def _of_arrays(static, robust, count, arrays):
     """The trajectory with the first `count` outputs, all padded outputs, and whether it is settled."""
     *motion, settings = static.together(arrays)
-    found, settled = one_by_one(_trajectory)(*motion, replace(settings, robust=robust, unroll_up_to=UNROLL_AT_ONCE_UP_TO))
+    settings = replace(settings, robust=robust, unroll_up_to=UNROLL_AT_ONCE_UP_TO)
+    found, settled = one_by_one(_trajectory)(*motion, settings)
     rows = found.rows()
     return replace(found, **jtu.tree_map(lambda x: x[:count], rows)), rows, settled
 
