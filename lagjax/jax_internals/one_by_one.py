@@ -57,6 +57,11 @@ def one_by_one(function: Callable) -> Callable:
     return called
 
 
+def jitted(function: Callable) -> Callable:
+    """Return equinox's `filter_jit` of the same function, with LAPACK called for one matrix at a time on a CPU."""
+    return eqx.filter_jit(one_by_one(function))
+
+
 def without_batches(program: ClosedJaxpr) -> ClosedJaxpr:
     """The program whose calls of LAPACK are loops over the matrices of a batch, now and after `vmap`."""
     return rewritten(program, _one_by_one)

@@ -115,14 +115,20 @@ class Pieces(NamedTuple):
     doubt: list
 
 
-def pieces_of(begin: Value, inner, off, end: Value, h, touches) -> Pieces:
+def pieces_of(begin: Value, inner, off, end: Value, h, touches, close) -> Pieces:
     """The pieces of an interval of length h between exact ends; `off`: the errors of the inner nodes (value, rate).
 
-    A piece that comes nearer to zero than `touches` is not clear.
+    A piece that comes nearer to zero than `touches` is not clear; nor is one longer than `close` to an end whose
+    rate is infinite or unknown.
     """
     zero, yes, lengths = jnp.zeros_like(h), jnp.asarray(True), [h * float(x) for x in np.diff(SHARES)]
     g = [begin.g, *(x for x, _ in inner), end.g]
     rate = [jnp.where(v.turns, 0.0, v.rate) for v in (begin, end)]
+    # At its very end a slope may be infinite, as that of arccos, or not known: close to it, the polygon takes that of
+    # the inner node, and is judged by how well it fits.
+    unknown_slope = [~jnp.isfinite(x) & (h > close) for x in rate]
+    near = inner[0][1], inner[-1][1]
+    rate = [jnp.where(jnp.isfinite(x), x, beside) for x, beside in zip(rate, near)]
     rate = [rate[0], *(x for _, x in inner), rate[1]]
     error = [zero, *(x for x, _ in off), zero]
     # The ends are known to all digits: a guard whose rate is zero there turns there.
@@ -148,6 +154,7 @@ def pieces_of(begin: Value, inner, off, end: Value, h, touches) -> Pieces:
             rises = rises | (flat & (sign[1] == direction[0]))
         monotone.append(same & rises)
         doubt.append(~(clear | monotone[i]))
+    doubt[0], doubt[-1] = doubt[0] | unknown_slope[0], doubt[-1] | unknown_slope[1]
     for i in range(1, PIECES):
         # The sign must be known where one monotone run ends and another begins, but not inside a run.
         inside = monotone[i - 1] & monotone[i] & (direction[i - 1] == direction[i])

@@ -46,8 +46,10 @@ class Sight(eqx.Module):
         places, along = [*places, places[0]], [*along, (right.t, uneven(right.y))]
         (g, rate), *found, (_, digits) = self._along(places, along, args)
         eps = ROUNDED * jnp.finfo(h.dtype).eps
+        # Where the slope is infinite, half of the digits remain.
+        half = jnp.sqrt(eps)
         values = tuple(
-            Value(x, dx, eps * (jnp.abs(d) + jnp.abs(x)), turning.turns)
+            Value(x, dx, jnp.where(jnp.isfinite(d), eps * (jnp.abs(d) + jnp.abs(x)), half * jnp.abs(x)), turning.turns)
             for x, dx, d, turning in zip(g, rate, digits, right.values)
         )
         return values, times, [[(x[i], dx[i]) for x, dx in found] for i in range(len(values))]
@@ -69,11 +71,13 @@ class Sight(eqx.Module):
     def judged(self, left: Node, right: Node, inner) -> list[Pieces]:
         """Each guard between two nodes, from its values at the inner ones by the quintic and by the cubics."""
         found, h, count = [], right.t - left.t, len(INNER)
+        close = self.resolution / jnp.sqrt(jnp.finfo(h.dtype).eps)
         for begin, end, by_both in zip(left.values, right.values, inner):
             pairs = zip(by_both[:count], by_both[count:])
             off = [tuple(SAFETY * jnp.abs(x - z) for x, z in zip(*pair)) for pair in pairs]
-            touches = TOUCHES * self.motion.tolerances.rtol[0] * h * jnp.maximum(jnp.abs(begin.rate), jnp.abs(end.rate))
-            found.append(pieces_of(begin, by_both[:count], off, end, h, touches))
+            steepest = jnp.maximum(*(jnp.where(jnp.isfinite(x.rate), jnp.abs(x.rate), 0.0) for x in (begin, end)))
+            touches = TOUCHES * self.motion.tolerances.rtol[0] * h * steepest
+            found.append(pieces_of(begin, by_both[:count], off, end, h, touches, close))
         return found
 
     def first_sign(self, value: Value, kind: Kind):

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from lagjax.jax_internals.compiling import compiler_options
-from lagjax.jax_internals.one_by_one import one_by_one
+from lagjax.jax_internals.one_by_one import jitted, one_by_one
 from lagjax.jax_internals.tracing import is_eager, takes_for_regular
 from lagjax.mechanics.hybrid import Hybrid, phases_of
 from lagjax.mechanics.kept import kept
@@ -165,9 +165,9 @@ def _of_arrays(static, robust, count, arrays):
     return replace(found, **jtu.tree_map(lambda x: x[:count], rows)), rows, settled
 
 
-@eqx.filter_jit
+@jitted
 def _trajectory_of(*problem):
-    return one_by_one(_trajectory)(*problem)
+    return _trajectory(*problem)
 
 
 def _trajectory(system, q0, v0, params, ts, guards, settings):

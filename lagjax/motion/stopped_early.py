@@ -19,11 +19,11 @@ Source: Hairer & Wanner, *Solving ODEs II*, §IV.2 (stiffness and its detection)
 from typing import NamedTuple
 
 import diffrax
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from lagjax.jax_internals.one_by_one import jitted
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.coordinates import State
 from lagjax.mechanics.diagnosis import describe, explain_failure
@@ -182,7 +182,7 @@ def last_steps(trajectory, settings) -> Steps:
     return Steps(np.array(ts), list(ys), np.array(h), np.array(accepted), abs(last - t))
 
 
-@eqx.filter_jit
+@jitted
 def _attempt(method, terms, t0, t1, y, params, tolerance):
     """One step, and its error in units of the tolerance."""
     after, error, _, _, result = method.step(terms, t0, t1, y, params, method.init(terms, t0, t1, y, params), True)
@@ -216,7 +216,7 @@ def _acceleration(system, params, t, q, v):
     return equations_of(system, t, q, v, params).accelerations(t, q, v)[0]
 
 
-@eqx.filter_jit
+@jitted
 def _on_path(system, params, t, y, s, order):
     q, v = y
     a = _acceleration(system, params, t, q, v)
@@ -229,7 +229,7 @@ def _on_path(system, params, t, y, s, order):
     return at(s) if order == 0 else jax.jvp(at, (s,), (jnp.ones_like(s),))[1]
 
 
-@eqx.filter_jit
+@jitted
 def _jacobian(system, params, t, y):
     x, unflatten = coordinates.flatten(y)
 
