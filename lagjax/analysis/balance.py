@@ -29,6 +29,7 @@ from jax import lax
 from jaxtyping import Array, Float, PyTree
 
 from lagjax.analysis.roots import roots_beside_zeros
+from lagjax.jax_internals.one_by_one import jitted
 from lagjax.mechanics import constraints, coordinates
 from lagjax.mechanics.lagrangian import forcing_and_inertia
 from lagjax.mechanics.reactions import response
@@ -106,7 +107,7 @@ class Steady(eqx.Module):
 
 
 # Jitted so that a Lagrangian is traced only once, however often its balance is evaluated.
-@eqx.filter_jit
+@jitted
 def imbalance(s: Steady, t, x, u, a, multipliers):
     """The residual `M a - F - Aᵀ λ - B λ` for any velocity and acceleration."""
     state = s.system, t, x, u, s.params, s.unflatten
@@ -117,7 +118,7 @@ def imbalance(s: Steady, t, x, u, a, multipliers):
     return residual.astype(x.dtype)
 
 
-@eqx.filter_jit
+@jitted
 def forces(s: Steady, t, x, u) -> Float[Array, "m n"]:
     """The force per unit of each multiplier: the rows of A, plus the response of forces that depend on multipliers."""
     state = s.system, t, x, u, s.params, s.unflatten
@@ -125,7 +126,7 @@ def forces(s: Steady, t, x, u) -> Float[Array, "m n"]:
     return rows if reaction is None else rows + reaction.T
 
 
-@eqx.filter_jit
+@jitted
 def constraint_residuals(s: Steady, t, x, u):
     """The residuals `g` or `phi` of all constraints, stacked in the order of their names."""
     q, v = s.unflatten(x), s.unflatten(u)

@@ -41,6 +41,7 @@ from lagjax.fitting.equations import (
 )
 from lagjax.fitting.misfit import OF_NORMAL, Misfit, misfit
 from lagjax.fitting.predicted import check_predicted
+from lagjax.jax_internals.one_by_one import jitted
 from lagjax.jax_internals.tracing import WATCHED
 from lagjax.mechanics.compiled import compiled
 from lagjax.motion.reported import PATIENCE
@@ -125,7 +126,7 @@ class Evaluation(NamedTuple):
     freedom: Float[Array, ""]
 
 
-@eqx.filter_jit
+@jitted
 def linearised(problem: Problem, u: Unknowns, stage: Stage, loss: str) -> Linear:
     """All equations and their slopes, in natural numbers, from one pass over the motions."""
     p = u.shared.size

@@ -5,6 +5,7 @@
 - `compiling.py`: how XLA is asked to compile the programs that we call.
 - `trial.py`: whether marked programs run and give right results with an unknown XLA.
 - `one_function.py`: a program as one machine function.
+- `one_by_one.py`: on a CPU no batch of LAPACK calls, which can stop a process for good.
 - `programs.py`: JAX programs (jaxprs) as data. `names.py`: the primitives that they are made of, by name.
 - `primitives.py`: primitives of our own. `tracing.py`: whether JAX is tracing, and the traces that it keeps.
 

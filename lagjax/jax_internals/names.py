@@ -44,3 +44,9 @@ EQUINOX_PRIMITIVES = {
     "maybe_set", "nonbatchable", "nondifferentiable_backward", "select_if_vmap", "unvmap_all", "unvmap_any",
     "unvmap_max", "vprim",
 }  # fmt: skip
+# LAPACK on a CPU, with the number of axes of the first operand for one matrix; others may hold solvers that call it.
+LAPACK = {
+    "cholesky": 2, "eig": 2, "eigh": 2, "geqp3": 2, "geqrf": 2, "hessenberg": 2, "householder_product": 2, "lu": 2,
+    "ormqr": 2, "qr": 2, "schur": 2, "svd": 2, "triangular_solve": 2, "tridiagonal": 2, "tridiagonal_solve": 1,
+}  # fmt: skip
+HOLDS_A_SOLVER = {"linear_solve"}

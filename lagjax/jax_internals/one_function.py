@@ -36,6 +36,7 @@ from lagjax.jax_internals.names import (
     MOVING,
     REDUCING,
 )
+from lagjax.jax_internals.one_by_one import one_by_one
 from lagjax.jax_internals.plain import is_plain
 from lagjax.jax_internals.programs import bodies, equations, rewritten, without_chains
 
@@ -371,7 +372,7 @@ def _define(name, evaluate, on_cpu, shapes, batch):
     ad.primitive_jvps[primitive] = partial(_jvp, primitive)
     batching.primitive_batchers[primitive] = batch
     mlir.register_lowering(primitive, mlir.lower_fun(evaluate, multiple_results=True))
-    mlir.register_lowering(primitive, mlir.lower_fun(on_cpu, multiple_results=True), platform="cpu")
+    mlir.register_lowering(primitive, mlir.lower_fun(one_by_one(on_cpu), multiple_results=True), platform="cpu")
     return primitive
 
 

@@ -5,6 +5,8 @@ from collections.abc import Callable
 from jax.extend.core import Primitive, jaxpr_as_fun
 from jax.interpreters import ad, batching, mlir
 
+from lagjax.jax_internals.one_by_one import one_by_one
+
 __all__ = ["Primitive", "ad", "jaxpr_as_fun", "primitive"]
 
 
@@ -29,7 +31,9 @@ def primitive(
     new.multiple_results = several
     new.def_impl(evaluate)
     new.def_abstract_eval(shapes)
-    mlir.register_lowering(new, mlir.lower_fun(compiled or evaluate, multiple_results=several))
+    # What such a primitive evaluates in Python becomes part of a program only here.
+    lowered = one_by_one(compiled or evaluate)
+    mlir.register_lowering(new, mlir.lower_fun(lowered, multiple_results=several))
     for rules, rule in (
         (ad.primitive_jvps, jvp),
         (ad.primitive_transposes, transpose),

@@ -3,12 +3,12 @@
 from collections.abc import Callable
 from functools import partial, wraps
 
-import equinox as eqx
 import jax
 import jax.tree_util as jtu
 import numpy as np
 
 from lagjax.jax_internals.compiling import compiler_options
+from lagjax.jax_internals.one_by_one import jitted, one_by_one
 from lagjax.jax_internals.tracing import is_eager
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.kept import kept
@@ -20,7 +20,7 @@ def compiled(function: Callable, in_numpy: bool = False) -> Callable:
 
     With `in_numpy`, a call from Python returns NumPy arrays.
     """
-    as_part = eqx.filter_jit(function)
+    as_part = jitted(function)
     finish = partial(jtu.tree_map, np.asarray) if in_numpy else jax.block_until_ready
 
     @wraps(function)
@@ -42,4 +42,4 @@ def _jitted(function, static):
 
 
 def _of_arrays(function, static, arrays):
-    return function(*static.together(arrays))
+    return one_by_one(function)(*static.together(arrays))

@@ -19,6 +19,7 @@ import jax.tree_util as jtu
 from jax import lax
 from jaxtyping import Array, Bool, Float, PyTree
 
+from lagjax.jax_internals.one_by_one import jitted
 from lagjax.jax_internals.one_function import kept_as_call
 from lagjax.jax_internals.tracing import WATCHED
 from lagjax.mechanics import constraints, coordinates
@@ -192,14 +193,14 @@ def _written(structure, leaves, watched) -> WrittenOut | None:
 
 
 # Jitted, so that JAX traces L once for all the places of a compiled trajectory that need it.
-@eqx.filter_jit
+@jitted
 def _accelerations(form, system, t, q, v, params, baumgarte_rate, independent):
     state = _vectors(system, t, q, v, params)
     a, multipliers = form.accelerations(*state, baumgarte_rate, independent)
     return state[-1](a), constraints.split(system, multipliers, t, q, v, params)
 
 
-@eqx.filter_jit
+@jitted
 def _independent(form, system, t, q, v, params, dependent_below):
     return form.independent(*_vectors(system, t, q, v, params), dependent_below)
 

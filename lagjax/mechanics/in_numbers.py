@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 
+from lagjax.jax_internals.one_by_one import one_by_one
 from lagjax.jax_internals.one_function import calls_host, poisoned
 from lagjax.jax_internals.programs import length, needed, staged
 from lagjax.jax_internals.tracing import WATCHED
@@ -88,7 +89,7 @@ class Numbers:
         of_problem, of_state = _leaves_of(arrays, (0, 4)), _leaves_of(arrays, (1, 2, 3))
         self.state_variables = [self.program.jaxpr.invars[i] for i in of_state]
         early, late = staged(self.program, of_problem, of_state)
-        self._early, self._late = jax.jit(early), jax.jit(late)
+        self._early, self._late = jax.jit(one_by_one(early)), jax.jit(one_by_one(late))
 
     @property
     def length(self) -> int:

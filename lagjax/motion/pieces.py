@@ -115,15 +115,21 @@ class Pieces(NamedTuple):
     doubt: list
 
 
-def pieces_of(begin: Value, inner, off, end: Value, h, touches, at_zero) -> Pieces:
+def pieces_of(begin: Value, inner, off, end: Value, h, touches, at_zero, close) -> Pieces:
     """The pieces of an interval of length h between exact ends; `off`: the errors of the inner nodes (value, rate).
 
-    A piece that comes nearer to zero than `touches` is not clear. A guard that holds, and has not left zero since the
-    start, has no sign up to `at_zero` from it, and is clear as long as it does not fall below that (-inf: any other).
+    A piece that comes nearer to zero than `touches` is not clear; nor is one longer than `close` to an end whose rate
+    is infinite or unknown. A guard that holds, and has not left zero since the start, has no sign up to `at_zero` from
+    it, and is clear as long as it does not fall below that (-inf: any other).
     """
     zero, yes, lengths = jnp.zeros_like(h), jnp.asarray(True), [h * float(x) for x in np.diff(SHARES)]
     g = [begin.g, *(x for x, _ in inner), end.g]
     rate = [jnp.where(v.turns, 0.0, v.rate) for v in (begin, end)]
+    # At its very end a slope may be infinite, as that of arccos, or not known: close to it, the polygon takes that of
+    # the inner node, and is judged by how well it fits.
+    unknown_slope = [~jnp.isfinite(x) & (h > close) for x in rate]
+    near = inner[0][1], inner[-1][1]
+    rate = [jnp.where(jnp.isfinite(x), x, beside) for x, beside in zip(rate, near)]
     rate = [rate[0], *(x for _, x in inner), rate[1]]
     error = [zero, *(x for x, _ in off), zero]
     # The ends are known to all digits: a guard whose rate is zero there turns there.
@@ -151,6 +157,7 @@ def pieces_of(begin: Value, inner, off, end: Value, h, touches, at_zero) -> Piec
             rises = rises | (flat & (sign[1] == direction[0]))
         monotone.append(same & rises)
         doubt.append(~(clear | monotone[i]))
+    doubt[0], doubt[-1] = doubt[0] | unknown_slope[0], doubt[-1] | unknown_slope[1]
     for i in range(1, PIECES):
         # The sign must be known where one monotone run ends and another begins, but not inside a run.
         inside = monotone[i - 1] & monotone[i] & (direction[i - 1] == direction[i])
@@ -230,7 +237,8 @@ def root_of_cubic(begin, end):
     for _ in range(3):
         slope = c1 + x * (2 * c2 + x * 3 * c3)
         x = jnp.clip(x - (g0 + x * (c1 + x * (c2 + x * c3))) / jnp.where(slope != 0, slope, 1.0), 0.0, 1.0)
-    return t0 + x * h
+    # Where a rate is infinite, as that of sqrt(t) at 0, there is no cubic.
+    return t0 + jnp.where(jnp.isfinite(x), x, 0.5) * h
 
 
 def changes(sign, signs):
@@ -272,6 +280,7 @@ def next_node(left_end: Node, right_end: Node, times, of_guards, resolution) -> 
             left, right, length = p.rate[j], p.rate[j + 1], times[j + 1] - times[j]
             turning = mine & p.known[j] & p.known[j + 1] & (left * right < 0)
             at = times[j] + length * left / jnp.where(turning, left - right, 1.0)
+            turning = turning & jnp.isfinite(at)
             # An extremum within the resolution of a known end is that end.
             at_left = turning & (at - left_end.t <= resolution)
             at_right = turning & ~at_left & (right_end.t - at <= resolution)

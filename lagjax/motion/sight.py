@@ -46,8 +46,10 @@ class Sight(eqx.Module):
         places, along = [*places, places[0]], [*along, (right.t, uneven(right.y))]
         (g, rate), *found, (_, digits) = self._along(places, along, args)
         eps = ROUNDED * jnp.finfo(h.dtype).eps
+        # Where the slope is infinite, half of the digits remain.
+        half = jnp.sqrt(eps)
         values = tuple(
-            Value(x, dx, eps * (jnp.abs(d) + jnp.abs(x)), turning.turns)
+            Value(x, dx, jnp.where(jnp.isfinite(d), eps * (jnp.abs(d) + jnp.abs(x)), half * jnp.abs(x)), turning.turns)
             for x, dx, d, turning in zip(g, rate, digits, right.values)
         )
         return values, times, [[(x[i], dx[i]) for x, dx in found] for i in range(len(values))]
@@ -82,12 +84,14 @@ class Sight(eqx.Module):
         `touching`: the guards that have not left zero since the start, see `Pieces`.
         """
         found, h, count = [], right.t - left.t, len(INNER)
+        close = self.resolution / jnp.sqrt(jnp.finfo(h.dtype).eps)
         for kind, begin, end, by_both, at_zero in zip(self.guards.kinds, left.values, right.values, inner, touching):
             pairs = zip(by_both[:count], by_both[count:])
             off = [tuple(SAFETY * jnp.abs(x - z) for x, z in zip(*pair)) for pair in pairs]
-            touches = TOUCHES * self.motion.tolerances.rtol[0] * h * jnp.maximum(jnp.abs(begin.rate), jnp.abs(end.rate))
+            steepest = jnp.maximum(*(jnp.where(jnp.isfinite(x.rate), jnp.abs(x.rate), 0.0) for x in (begin, end)))
+            touches = TOUCHES * self.motion.tolerances.rtol[0] * h * steepest
             zero = jnp.where(at_zero, jnp.maximum(self.at_zero(begin), self.at_zero(end)), -jnp.inf)
-            pieces = pieces_of(begin, by_both[:count], off, end, h, touches, zero)
+            pieces = pieces_of(begin, by_both[:count], off, end, h, touches, zero, close)
             found.append(without_rest(pieces, begin, end, by_both, h) if kind.may_rest else pieces)
         return found
 

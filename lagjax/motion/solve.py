@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from lagjax.jax_internals.compiling import compiler_options
+from lagjax.jax_internals.one_by_one import jitted, one_by_one
 from lagjax.jax_internals.tracing import is_eager, takes_for_regular
 from lagjax.jumps.found import found as jumps_found
 from lagjax.jumps.times import with_jumps_in_time
@@ -163,12 +164,13 @@ class _Programs:
 def _of_arrays(static, robust, count, arrays):
     """The trajectory with the first `count` outputs, all padded outputs, and whether it is settled."""
     *motion, settings = static.together(arrays)
-    found, settled = _trajectory(*motion, replace(settings, robust=robust, unroll_up_to=UNROLL_AT_ONCE_UP_TO))
+    settings = replace(settings, robust=robust, unroll_up_to=UNROLL_AT_ONCE_UP_TO)
+    found, settled = one_by_one(_trajectory)(*motion, settings)
     rows = found.rows()
     return replace(found, **jtu.tree_map(lambda x: x[:count], rows)), rows, settled
 
 
-@eqx.filter_jit
+@jitted
 def _trajectory_of(*problem):
     return _trajectory(*problem)
 

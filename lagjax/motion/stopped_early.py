@@ -18,11 +18,11 @@ Source: Hairer & Wanner, *Solving ODEs II*, §IV.2 (stiffness and its detection)
 from typing import NamedTuple
 
 import diffrax
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from lagjax.jax_internals.one_by_one import jitted
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.coordinates import State
 from lagjax.mechanics.diagnosis import describe, explain_failure
@@ -197,7 +197,7 @@ def last_steps(trajectory, settings) -> Steps:
     return Steps(np.array(ts), list(ys), np.array(h), np.array(accepted), abs(last - t))
 
 
-@eqx.filter_jit
+@jitted
 def _attempt(method, terms, t0, t1, y, params, tolerance):
     """One step, and its error in units of the tolerance."""
     after, error, _, _, result = method.step(terms, t0, t1, y, params, method.init(terms, t0, t1, y, params), True)
@@ -251,7 +251,7 @@ def _acceleration(system, params, t, q, v):
     return equations_of(system, t, q, v, params).accelerations(t, q, v)[0]
 
 
-@eqx.filter_jit
+@jitted
 def _on_path(system, params, t, y, s):
     q, v = y
     a = _acceleration(system, params, t, q, v)
@@ -260,7 +260,7 @@ def _on_path(system, params, t, y, s):
     return coordinates.flatten(_acceleration(system, params, t + s[0], place, velocity))[0]
 
 
-@eqx.filter_jit
+@jitted
 def _jacobian(system, params, t, y):
     x, unflatten = coordinates.flatten(y)
 

@@ -13,6 +13,7 @@ from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from lagjax import plot
 from lagjax.animation import Animation
+from lagjax.jax_internals.one_by_one import jitted
 from lagjax.mechanics import coordinates, packed
 from lagjax.mechanics.compiled import compiled
 from lagjax.mechanics.packed import Packed
@@ -301,7 +302,7 @@ class Trajectory(eqx.Module):
         return "\n".join(printed.batch_lines(self, lanes) if lanes else printed.lines(self))
 
 
-@eqx.filter_jit
+@jitted
 def jacobi_and_scale(system, t, q, v, params):
     """The Jacobi integral at each of a batch of states, and the size of its terms `|v·p| + |L|`."""
 

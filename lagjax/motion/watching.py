@@ -58,7 +58,7 @@ from lagjax.motion.pieces import (
 from lagjax.motion.sight import Sight
 
 # The most looks inside one step: an extremum takes three, a jump fifty.
-LOOKS = 200
+LOOKS = 400
 # The most steps to find a root: Newton's formula takes three, bisection fifty; and what still counts as few.
 ROOT_LOOKS, FEW_LOOKS = 100, 5
 # An extremum is found if the remaining distance changes its height by less than this part; and the most attempts.

@@ -21,6 +21,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
+from lagjax.jax_internals.one_by_one import one_by_one
 from lagjax.jax_internals.primitives import primitive
 
 ELIMINATE_UP_TO = 6
@@ -114,7 +115,7 @@ def _inverse_jvp(primals, tangents, **params):
 
 
 def _inverse_batched(operands, axes, **params):
-    return jax.vmap(partial(_inverse, **params))(jnp.moveaxis(operands[0], axes[0], 0)), 0
+    return one_by_one(jax.vmap(partial(_inverse, **params)))(jnp.moveaxis(operands[0], axes[0], 0)), 0
 
 
 # A primitive, so that a program compiled as one function can use it without calling LAPACK.

@@ -16,6 +16,7 @@ import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec, SingleDeviceSharding
 from jaxtyping import PyTree
 
+from lagjax.jax_internals.one_by_one import one_by_one
 from lagjax.jax_internals.programs import ClosedJaxpr
 from lagjax.jax_internals.tracing import REGULAR_FIRST
 from lagjax.mechanics.in_words import Call, check_arguments, in_words
@@ -130,7 +131,7 @@ def compiled(
         sharding = NamedSharding(mesh, split)
     shaped = tuple(jax.ShapeDtypeStruct((chunk, *x.shape[1:]), x.dtype, sharding=sharding) for x in axes.arrays)
     with _explained(run, axes, patience, robust):
-        traced = jax.jit(function).trace(shaped)
+        traced = jax.jit(one_by_one(function)).trace(shaped)
     shapes, _, settled = traced.out_info
     program = traced.lower().compile()
     memory = program.memory_analysis()

@@ -26,12 +26,12 @@ TABLES = {
 
 
 def primitives():
-    """The names of all primitives that JAX, equinox and lagjax have defined, in the modules that are loaded."""
+    """The names of all primitives that JAX, equinox, lineax and lagjax have defined, in the modules that are loaded."""
     # The primitive of the marks is not a variable of any module.
     program = jax.make_jaxpr(lambda x: marked(jnp.sin(x), STAYS_A_CALL))(1.0)
     found = {equation.primitive.name for equation in program.eqns}
     for name, module in list(sys.modules.items()):
-        if name.split(".")[0] in ("jax", "equinox", "lagjax"):
+        if name.split(".")[0] in ("jax", "equinox", "lagjax", "lineax"):
             found |= {x.name for x in list(vars(module).values()) if isinstance(x, Primitive)}
     return found
 
