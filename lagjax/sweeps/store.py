@@ -32,7 +32,7 @@ import jax
 import numpy as np
 
 from lagjax.sweeps.axes import Axes
-from lagjax.sweeps.chunks import CHECKSUM, UNREADABLE, as_number, checksum_of, read_array, read_chunk
+from lagjax.sweeps.chunks import CHECKSUM, UNREADABLE, as_number, checksum_of, content_size, read_array, read_chunk
 from lagjax.sweeps.described import MARKS, Described, Spec, check_files, check_room
 from lagjax.sweeps.fingerprint import ANOTHER_FUNCTION, differences, fingerprint, named_leaves, of_axis
 from lagjax.sweeps.grids import Blocks
@@ -170,6 +170,8 @@ class Store:
             else:
                 if as_number(data[-CHECKSUM:]) != checksum or read and checksum_of(data[:-CHECKSUM]) != checksum:
                     yield f"{file} is not as it was written"
+                elif read and content_size(data) != self.arrays[name].chunk_bytes:
+                    yield f"{file} does not hold the numbers of its block"
 
     def _file(self, name, number):
         """The file of a block; None for an empty array."""
