@@ -65,10 +65,11 @@ lying = lj.System(lambda t, q, v, p: 0.5 * v**2 - 10.0 * q, on_floor)
 def last(system, q0, v0, ts, **options):
     """The first coordinate at the last output."""
     traj = lj.integrate(system, q0, v0, ts=ts, **options)
-    return float(jax.tree.leaves(traj.q)[0][-1])
+    return float(np.ravel(jax.tree.leaves(traj.q)[0][-1])[0])
 
 
 def of_pendulum(span, **options):
+    """The pendulum's last angle."""
     return last(pendulum, 1.0, 0.0, np.array([0.0, span]), **options)
 
 
@@ -125,6 +126,7 @@ def row_of_balls(most=16):
 
 
 def of_row(most=16, **options):
+    """The first ball's last place."""
     return last(row_of_balls(most), np.array([-0.3, 0.1, 0.3]), np.array([1.0, 0, 0]), np.array([0, 1.2]), **options)
 
 
