@@ -56,7 +56,6 @@ damped = lj.System(lambda t, q, v, p: 0.5 * v**2 - 0.5 * q**2, dissipation=lambd
 switched = force(lambda t, q, v, p: jnp.sign(jnp.sin(50 * t)))
 cycloid = lj.System(lambda y, x, u, p: jnp.sqrt((1 + u**2) / (2 * 9.81 * y)))
 hole = lj.System(lambda t, q, v, p: 0.5 * (-(1 - 2 / q["r"]) * v["t"] ** 2 + v["r"] ** 2 / (1 - 2 / q["r"])))
-pulse = force(lambda t, q, v, p: jnp.exp(-(((t - 4.0) / 1e-3) ** 2)))
 ball = lj.System(lambda t, q, v, p: 0.5 * v**2 - 10.0 * q)
 on_floor = {"floor": lj.Holonomic(lambda t, q, p: q)}
 lying = lj.System(lambda t, q, v, p: 0.5 * v**2 - 10.0 * q, on_floor)
@@ -65,10 +64,11 @@ lying = lj.System(lambda t, q, v, p: 0.5 * v**2 - 10.0 * q, on_floor)
 def last(system, q0, v0, ts, **options):
     """The first coordinate at the last output."""
     traj = lj.integrate(system, q0, v0, ts=ts, **options)
-    return float(jax.tree.leaves(traj.q)[0][-1])
+    return float(np.ravel(jax.tree.leaves(traj.q)[0][-1])[0])
 
 
 def of_pendulum(span, **options):
+    """The pendulum's last angle."""
     return last(pendulum, 1.0, 0.0, np.array([0.0, span]), **options)
 
 
@@ -125,6 +125,7 @@ def row_of_balls(most=16):
 
 
 def of_row(most=16, **options):
+    """The first ball's last place."""
     return last(row_of_balls(most), np.array([-0.3, 0.1, 0.3]), np.array([1.0, 0, 0]), np.array([0, 1.2]), **options)
 
 
@@ -173,10 +174,6 @@ CASES = {
     "a loose tolerance: a tighter rtol": Case(
         lambda **o: of_pendulum(100.0, **o), {"rtol": 1e-3}, "errors of .* steps add up|amplifies errors",
         lambda m: (f := number("rtol=", m), of_pendulum(100.0, rtol=f)), swing(100.0), 5e-3),
-    "a force narrower than the steps: max_step": Case(
-        lambda **o: last(pulse, 0.0, 0.0, np.array([0.0, 10.0]), **o), {}, "narrower than the steps",
-        lambda m: ("max_step=1e-3", last(pulse, 0.0, 0.0, np.array([0.0, 10.0]), max_step=1e-3)),
-        6e-3 * np.sqrt(np.pi), 1e-8),
     "an infinite tolerance: fixed steps": Case(
         lambda **o: last(spring, 1.0, 0.0, np.array([0.0, 1.0]), **o), {"rtol": np.inf}, "rtol is infinite",
         lambda m: (f := number("dt0=", m), last(spring, 1.0, 0.0, np.array([0.0, 1.0]), dt0=f,

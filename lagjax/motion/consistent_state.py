@@ -237,3 +237,20 @@ def _two_or_more(residual):
         return found if found.size > 1 else jnp.concatenate([found, jnp.zeros(2 - found.size, found.dtype)])
 
     return padded
+
+
+def unreachable_ahead(trajectory) -> str | None:
+    """Explain that the constraints cannot be met a little after the end; None if they can."""
+    system, end = trajectory.system, trajectory.end
+    if not system.constraints:
+        return None
+    ahead = 1e-3 * (trajectory.t[-1] - trajectory.t[0])
+    q = jax.tree.map(lambda q, v: q + ahead * v, end.q, end.v)
+    try:
+        consistent_state(system, end.t + ahead, q, end.v, trajectory.params)
+    except ValueError as error:
+        return (
+            f"the constraints cannot be met a little later. {error}\n"
+            "(So ends a loop that can close only so far, or one motion that is prescribed twice.)"
+        )
+    return None

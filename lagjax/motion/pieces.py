@@ -26,12 +26,16 @@ CUBIC = np.array([[1, 0, -3, 2], [0, 1, -2, 1], [0, 0, -1, 1], [0, 0, 3, -2]])
 
 
 class Value(NamedTuple):
-    """A guard at a time: its value, its rate, the round-off of its value, and whether it is known to turn there."""
+    """A guard at a time: its value, its rate, the round-off of its value, and whether it is known to turn there.
+
+    `still`: whether its rate is round-off; known only of guards that hold.
+    """
 
     g: Float[Array, ""]
     rate: Float[Array, ""]
     noise: Float[Array, ""]
     turns: Bool[Array, ""]
+    still: Bool[Array, ""]
 
 
 class Node(NamedTuple):

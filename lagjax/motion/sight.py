@@ -18,6 +18,8 @@ from lagjax.motion.stepping import OnManifold
 SAFETY = 2.0
 # Round-off of a guard, in units of the change that its arguments' last digit makes; and that of a start on the guard.
 ROUNDED, ON_GUARD = 8, 64
+# A guard that holds may begin so many times as far below zero as it is on it.
+BELOW = 4
 # An extremum within this many tolerances of zero may be on either side of it.
 TOUCHES = 10.0
 
@@ -44,13 +46,24 @@ class Sight(eqx.Module):
         places, along = [(t, y) for t, y, _ in states], [(one, (y[1], a)) for _, y, a in states]
         # Along the state itself, to see how its last digit changes the guards.
         places, along = [*places, places[0]], [*along, (right.t, uneven(right.y))]
-        (g, rate), *found, (_, digits) = self._along(places, along, args)
+        holds = [kind.holds for kind in self.guards.kinds]
+        if any(holds):
+            # And how the last digits of v and a change the rates.
+            places, along = [*places, places[0]], [*along, (jnp.zeros_like(h), uneven((right.y[1], right.a)))]
+        (g, rate), *found = self._along(places, along, args)
+        _, digits_of_rate = found.pop() if any(holds) else (g, rate)
+        _, digits = found.pop()
         eps = ROUNDED * jnp.finfo(h.dtype).eps
+        still = [
+            jnp.asarray(hold) & (jnp.abs(dx) <= ON_GUARD * eps * jnp.abs(d))
+            for hold, dx, d in zip(holds, rate, digits_of_rate)
+        ]
         # Where the slope is infinite, half of the digits remain.
         half = jnp.sqrt(eps)
+        noise = lambda x, d: jnp.where(jnp.isfinite(d), eps * (jnp.abs(d) + jnp.abs(x)), half * jnp.abs(x))
         values = tuple(
-            Value(x, dx, jnp.where(jnp.isfinite(d), eps * (jnp.abs(d) + jnp.abs(x)), half * jnp.abs(x)), turning.turns)
-            for x, dx, d, turning in zip(g, rate, digits, right.values)
+            Value(x, dx, noise(x, d), turning.turns, at_rest)
+            for x, dx, d, turning, at_rest in zip(g, rate, digits, right.values, still)
         )
         return values, times, [[(x[i], dx[i]) for x, dx in found] for i in range(len(values))]
 
@@ -75,8 +88,8 @@ class Sight(eqx.Module):
 
     def unseen(self, t) -> Node:
         """A node at which nothing is known yet."""
-        zero = jnp.zeros_like(t)
-        return Node(t, None, None, (Value(zero, zero, zero, jnp.asarray(False)),) * len(self.guards.kinds))
+        zero, no = jnp.zeros_like(t), jnp.asarray(False)
+        return Node(t, None, None, (Value(zero, zero, zero, no, no),) * len(self.guards.kinds))
 
     def judged(self, left: Node, right: Node, inner, touching) -> list[Pieces]:
         """Each guard between two nodes, from its values at the inner ones by the quintic and by the cubics.
@@ -90,7 +103,10 @@ class Sight(eqx.Module):
             off = [tuple(SAFETY * jnp.abs(x - z) for x, z in zip(*pair)) for pair in pairs]
             steepest = jnp.maximum(*(jnp.where(jnp.isfinite(x.rate), jnp.abs(x.rate), 0.0) for x in (begin, end)))
             touches = TOUCHES * self.motion.tolerances.rtol[0] * h * steepest
-            zero = jnp.where(at_zero, jnp.maximum(self.at_zero(begin), self.at_zero(end)), -jnp.inf)
+            # What neither opens nor closes stays where it is; what opens may begin a little below.
+            zero = jnp.maximum(jnp.maximum(self.at_zero(begin), self.at_zero(end)), -begin.g)
+            zero = jnp.where(begin.still & end.still, jnp.inf, zero)
+            zero = jnp.where(at_zero, zero, -jnp.inf)
             pieces = pieces_of(begin, by_both[:count], off, end, h, touches, zero, close)
             found.append(without_rest(pieces, begin, end, by_both, h) if kind.may_rest else pieces)
         return found
@@ -99,7 +115,8 @@ class Sight(eqx.Module):
         """The sign at the start of the motion: 0 if the start is on the guard."""
         on_guard = self.is_on(value)
         if kind.holds:
-            return jnp.where(on_guard, 0.0, 1.0)
+            # A crossing ends a phase where it leaves round-off: the next one begins a little below.
+            return jnp.where(jnp.abs(value.g) <= BELOW * self.at_zero(value), 0.0, 1.0)
         return jnp.where(on_guard | ~jnp.isfinite(value.g), 0.0, jnp.sign(value.g))
 
     def is_on(self, value: Value):

@@ -28,7 +28,7 @@ from lagjax.mechanics.coordinates import State
 from lagjax.mechanics.diagnosis import describe, explain_failure
 from lagjax.mechanics.equations import equations_of
 from lagjax.motion.accuracy import of_a_step
-from lagjax.motion.consistent_state import consistent_state
+from lagjax.motion.consistent_state import unreachable_ahead
 from lagjax.motion.loop import method_alone
 from lagjax.motion.results import RESULTS
 from lagjax.motion.solve import method_of
@@ -88,7 +88,9 @@ def stopped_early(trajectory, settings) -> str:
         f"the integration stopped at t = {float(end.t):.9g}, {share:.3g} % of the way to {t1:.6g}, after "
         f"{accepted} accepted and {rejected} rejected steps"
     )
-    reason = explain_failure(trajectory.system, State(end.t, end.q, end.v, trajectory.params)) or _beyond(trajectory)
+    reason = explain_failure(trajectory.system, State(end.t, end.q, end.v, trajectory.params)) or unreachable_ahead(
+        trajectory
+    )
     if reason:
         return f"{what}: {reason}"
     last = f"The last state is {describe(end.q)}, v = {describe(end.v)}."
@@ -395,20 +397,3 @@ def _fast(path, steps):
         "a constraint in place of the stiff spring, or, where that oscillation does not matter, "
         "method=lj.Radau5(step_powers=(0, 1)), which does not follow it",
     )
-
-
-def _beyond(trajectory):
-    """Explain that the constraints cannot be met a little after the end; None if they can."""
-    system, end = trajectory.system, trajectory.end
-    if not system.constraints:
-        return None
-    ahead = 1e-3 * (trajectory.t[-1] - trajectory.t[0])
-    q = jax.tree.map(lambda q, v: q + ahead * v, end.q, end.v)
-    try:
-        consistent_state(system, end.t + ahead, q, end.v, trajectory.params)
-    except ValueError as error:
-        return (
-            f"the constraints cannot be met a little later. {error}\n"
-            "(Usual there: a loop that can close only so far, or one motion prescribed twice.)"
-        )
-    return None
