@@ -251,7 +251,7 @@ def test_the_action_of_a_trajectory():
 
 @pytest.mark.slow
 def test_the_action_does_not_depend_on_the_outputs():
-    """The brachistochrone's time from eleven outputs, where it starts steep; twin: the cubic through them is far off."""
+    """The brachistochrone's time from eleven outputs, steep at first; twin: the cubic through them is off."""
     g, y0 = 9.81, 1e-3
     # A cycloid of radius R from the angle a to b: x = R (a - sin a), y = R (1 - cos a), in the time (b - a) sqrt(R/g).
     R, a = 0.5, float(np.arccos(1 - y0 / 0.5))

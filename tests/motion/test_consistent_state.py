@@ -177,7 +177,7 @@ def test_a_held_coordinate_that_a_constraint_fixes():
 
 @pytest.mark.slow
 def test_a_position_alone_and_a_velocity_alone():
-    """A crank's position held while a motor sets its speed: b = (3, 0), a' = (0, 5); twin: held too, the speed fails."""
+    """A crank's position held while a motor sets its speed: b = (3, 0), a' = (0, 5); twin: the speed held too."""
 
     def joints(t, q, params):
         a, b = q["a"], q["b"]
