@@ -6,8 +6,8 @@ equations
     r(y) + β ψ = 0,    φ·(y - y₀) = s
 
 are regular; they eliminate everything but the amplitudes s, and leave the reduced force b(s) = -β(s) with which the
-equilibrium resists (Lyapunov-Schmidt). Near a root it is c₊ s^k on one side and c₋ |s|^k on the other. The exponent k is
-read off b at amplitudes that shrink by a constant factor, where |b| shrinks by a constant factor too: so round-off,
+equilibrium resists (Lyapunov-Schmidt). Near a root it is c₊ s^k on one side and c₋ |s|^k on the other. The exponent k
+is read off b at amplitudes that shrink by a constant factor, where |b| shrinks by a constant factor too: so round-off,
 which does not, is not taken for a force. A k-fold root is found by Newton's method only to ε^(1/k); between its
 neighbours it is the simple root of the derivative b^(k-1).
 
@@ -120,6 +120,7 @@ def _with_part(vectors, n):
 
 @compiled
 def fields_at(steady, x):
+    """The velocity along each symmetry at unit rate."""
     return steady.fields(x)
 
 
