@@ -1,12 +1,6 @@
 """Stability where a stiffness is zero: the first term decides that does not vanish along the zero mode.
 
-Let J be the Jacobian of the balance r(y) = 0 at an equilibrium y₀, with a right null vector φ and a left one ψ. The
-bordered equations
-
-    r(y) + β ψ = 0,    φ·(y - y₀) = s
-
-are regular; they eliminate everything but the amplitude s, and leave the reduced force b(s) = -β(s) with which the
-equilibrium resists (Lyapunov-Schmidt). Near s = 0 it is c₊ s^k on one side and c₋ |s|^k on the other:
+With the reduced force b(s) of `reduced_force.py`, which is c s^k near the equilibrium s = 0:
 
 - b = 0 at all amplitudes: the equilibrium is one of a family, as along a symmetry. The linear terms decide the rest.
 - With friction along the mode, d = ψ·Cφ ≠ 0, the motion on the centre manifold is d s' = -b(s) to leading order.
@@ -14,15 +8,10 @@ equilibrium resists (Lyapunov-Schmidt). Near s = 0 it is c₊ s^k on one side an
 
 Either way the equilibrium is stable if b pushes back on both sides, and unstable otherwise, at whatever order k. What
 satisfies neither premise is undecided. With several zero modes a conservative system is stable if b·s > 0 on all rays,
-and unstable if b·s < 0 on one.
-
-The exponent k is read off b at amplitudes that shrink by a constant factor, where |b| shrinks by a constant factor too:
-so round-off, which does not, is not taken for a force. A k-fold root is found by Newton's method only to ε^(1/k);
-between its neighbours it is the simple root of the derivative b^(k-1).
+and unstable if b·s < 0 on one and nothing turns.
 
 Source: Carr, *Applications of Centre Manifold Theory* (1981), §2; Kozlov & Furta, *Asymptotic Solutions of Strongly
-Nonlinear Systems of Differential Equations* (2013), ch. 4 (inverses of Lagrange's theorem); Govaerts, *Numerical
-Methods for Bifurcations of Dynamical Equilibria* (2000), ch. 3 (bordered systems).
+Nonlinear Systems of Differential Equations* (2013), ch. 4 (inverses of Lagrange's theorem).
 """
 
 from typing import NamedTuple
@@ -33,21 +22,26 @@ import numpy as np
 
 from lagjax.analysis import balance as equations
 from lagjax.analysis.balance import MOMENTUM, Steady
+from lagjax.analysis.reduced_force import (
+    SAMPLES,
+    WINDOW,
+    Bordered,
+    between,
+    bordered_at,
+    fields_at,
+    first_term,
+    padded,
+    reduced,
+    reduced_force,
+    values_at,
+)  # fmt: skip
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.compiled import compiled
 from lagjax.mechanics.constraints import Holonomic
 from lagjax.mechanics.reactions import force_at
 from lagjax.numerics.rank import null_space
-from lagjax.numerics.roots import with_value
 
 STABLE, UNSTABLE, UNDECIDED, AS_LINEAR = range(4)
-# Amplitudes that are evaluated together, half of them on each side.
-SAMPLES = 64
-NEWTON_STEPS = 10
-# Stiffness, relative to the typical one, along a valley in which a search has stopped short of a multiple root.
-CREEPS_BELOW = 1e-2
-# Exponents of neighbouring amplitudes agree to this; round-off has no exponent.
-SAME_EXPONENT, WINDOW = 0.15, 4
 # Rays of several zero modes; the smallest resistance of a minimum, relative to the largest.
 RAYS, SMALLEST_RESISTANCE = 64, 1e-3
 
@@ -59,36 +53,6 @@ class Decision(NamedTuple):
     y: np.ndarray | None = None
     radius: float = 0.0
     zero_modes: int = 0
-
-
-class _Side(NamedTuple):
-    """The first term on one side: its sign, its exponent, and the smallest amplitude at which it shows."""
-
-    sign: float
-    exponent: float
-    amplitude: float
-
-
-class _Bordered(NamedTuple):
-    """The equations about an equilibrium y₀ (N,): units of rows and columns, and the null vectors in these units."""
-
-    steady: Steady
-    y: np.ndarray
-    rows: np.ndarray
-    columns: np.ndarray
-    right: np.ndarray
-    left: np.ndarray
-
-
-def soft_below(dtype) -> float:
-    """Stiffness below this part of the typical one may be that of a multiple root, which is off by ε^(1/k)."""
-    return 1e2 * float(np.sqrt(np.finfo(dtype).eps))
-
-
-@compiled
-def _values(steady: Steady, points):
-    """The imbalance and its Jacobian at many points."""
-    return jax.vmap(lambda y: with_value(lambda y: equations.balance(steady, y), y))(points)
 
 
 @compiled
@@ -124,7 +88,7 @@ def decide(steady: Steady, y, size: float, roots, unseen: np.ndarray) -> Decisio
     dtype, n, k = np.dtype(steady.t.dtype), steady.n, steady.symmetries.count
     if not all(isinstance(c, Holonomic) for c in system.constraints.values()):
         return Decision(UNDECIDED)
-    bordered = _bordered(steady, y, size, np.flatnonzero(unseen))
+    bordered = bordered_at(steady, y, size, np.flatnonzero(unseen))
     z = zeros = bordered.right.shape[1]
     if z == 0:
         return Decision(AS_LINEAR)
@@ -136,16 +100,16 @@ def decide(steady: Steady, y, size: float, roots, unseen: np.ndarray) -> Decisio
         bordered, z = _only_active(bordered) if conservative else (bordered, z)
     if z > 1:
         return _of_rays(bordered, dtype) if conservative and not k else Decision(UNDECIDED)
-    amplitudes, b = _reduced_force(bordered, size)
-    behind, ahead = _first_term(amplitudes[::-1], b[: SAMPLES // 2]), _first_term(amplitudes, b[SAMPLES // 2 :])
+    amplitudes, b = reduced_force(bordered, size)
+    behind, ahead = first_term(amplitudes[::-1], b[: SAMPLES // 2]), first_term(amplitudes, b[SAMPLES // 2 :])
     if behind is None or ahead is None:
         return Decision(UNDECIDED)
     if behind.exponent < 1.5 and ahead.exponent < 1.5:
         return Decision(AS_LINEAR)
-    y = _between(bordered, ahead)
+    y = between(bordered, ahead)
     length = float(np.max(np.abs(bordered.columns * bordered.right[:, 0])[:n]))
     radius = 4 * max(behind.amplitude, ahead.amplitude) * length
-    r, jacobian = (np.asarray(x)[0] for x in _values(steady, _padded(y[None], dtype)))
+    r, jacobian = (np.asarray(x)[0] for x in values_at(steady, padded(y[None], dtype)))
     damping, mass = (np.asarray(x) for x in _velocity_terms(steady, y.astype(dtype), jacobian))
     phi, psi = (bordered.columns * bordered.right[:, 0])[:n], (bordered.left[:, 0] / bordered.rows)[:n]
     inertia, friction = float(psi @ mass @ phi), float(psi @ damping @ phi)
@@ -176,44 +140,6 @@ def decide(steady: Steady, y, size: float, roots, unseen: np.ndarray) -> Decisio
     return decision(STABLE if pushes_back else UNSTABLE)
 
 
-def nearest(steady: Steady, x, size: float, unseen: np.ndarray) -> np.ndarray | None:
-    """The multiple root of a system at rest to which a search at `x` (n,) creeps along a curved valley, or None."""
-    dtype = np.dtype(steady.t.dtype)
-    y = np.concatenate([x, np.zeros(steady.m)])
-    r, jacobian = (np.asarray(z)[0] for z in _values(steady, _padded(y[None], dtype)))
-    if not (np.all(np.isfinite(r)) and np.all(np.isfinite(jacobian))):
-        return None
-    # Multipliers enter linearly.
-    y[steady.n :] = -np.linalg.lstsq(jacobian[:, steady.n :], r, rcond=None)[0]
-    bordered = _bordered(steady, y, size, np.flatnonzero(unseen), CREEPS_BELOW)
-    if bordered.right.shape[1] != 1 or bordered.left.shape[1] != 1:
-        return None
-    s = 0.1 * _nodes()
-    b, _ = _reduced(bordered, s[:, None])
-    if not np.all(np.isfinite(b)):
-        return None
-    fitted = np.polynomial.Chebyshev.fit(s, b[:, 0], 16, domain=(-0.1, 0.1))
-    slope, curvature = fitted.deriv(), fitted.deriv(2)
-    root = 0.0
-    with np.errstate(all="ignore"):
-        # Schröder's iteration, which a multiple root does not slow down.
-        for _ in range(30):
-            value, first, second = fitted(root), slope(root), curvature(root)
-            step = value * first / (first**2 - value * second)
-            root = root - step if np.isfinite(step) else root
-    if abs(root) > 0.1:
-        return None
-    _, near = _reduced(bordered, np.full((1, 1), root))
-    if not np.all(np.isfinite(near)):
-        return None
-    bordered = _bordered(steady, near[0], size, np.flatnonzero(unseen))
-    if bordered.right.shape[1] != 1 or bordered.left.shape[1] != 1:
-        return None
-    amplitudes, b = _reduced_force(bordered, size)
-    term = _first_term(amplitudes, b[SAMPLES // 2 :])
-    return None if term is None else _between(bordered, term)[: steady.n]
-
-
 def without_zeros(roots: np.ndarray, decision: Decision) -> np.ndarray:
     """The characteristic roots, with that of the zero mode nearest to zero set to zero."""
     known = np.flatnonzero(_known(roots))
@@ -232,126 +158,23 @@ def _known(roots):
     return np.isfinite(roots)
 
 
-def _padded(points, dtype):
-    """Points (B, N), repeated to the number for which the program is compiled."""
-    return np.resize(points, (SAMPLES, points.shape[1])).astype(dtype)
-
-
-def _bordered(steady, y, size, unseen, soft=None) -> _Bordered:
-    """The null vectors of the balance at y: of positions, except the symmetries and the `unseen` coordinates."""
-    soft = soft_below(steady.t.dtype) if soft is None else soft
-    dtype, n = np.dtype(steady.t.dtype), steady.n
-    y = np.asarray(y, float)
-    unit = size if size > 0 else 1.0
-    # The row of a single number has no scale of its own, so it is taken at displaced points too.
-    shifts = np.random.default_rng(0).uniform(-0.5, 0.5, (SAMPLES, y.size)) * unit
-    shifts[0], shifts[:, n:] = 0.0, 0.0
-    _, jacobians = (np.asarray(x, float) for x in _values(steady, (y + shifts).astype(dtype)))
-    jacobian = jacobians[0]
-    positive = lambda x: np.where(x > 0, x, 1.0)
-    usable = np.where(np.isfinite(jacobians), np.abs(jacobians), 0.0)
-    rows = positive(np.max(np.median(usable, axis=0)[:, :n], axis=1) * unit)
-    of_columns = np.max(np.abs(jacobian) / rows[:, None], axis=0)
-    columns = np.concatenate([np.full(n, unit), 1 / positive(of_columns[n:])])
-    matrix = jacobian / rows[:, None] * columns[None, :]
-    along = np.asarray(_fields(steady, y[:n].astype(dtype)), float)
-    extra = np.zeros((len(along) + len(unseen), y.size))
-    extra[: len(along), :n] = along / positive(np.max(np.abs(along), axis=1, initial=0.0))[:, None]
-    extra[np.arange(len(unseen)) + len(along), unseen] = 1.0
-    # Multipliers of dependent constraints are no motion, and combinations of constraints are no force.
-    right = _with_part(_almost_null(np.concatenate([matrix, extra]), soft), n)
-    left = _with_part(_almost_null(matrix.T, soft), n)
-    if left.shape[1] > right.shape[1]:
-        # Unseen coordinates and symmetries have no reduced force.
-        of_extra = extra[:, :n] / rows[:n] if len(extra) else extra[:, :n]
-        kept = left.copy()
-        for row in np.linalg.qr(of_extra.T)[0].T if len(extra) else ():
-            weights = row @ kept[:n]
-            if np.linalg.norm(weights) > 1e-8:
-                kept = kept @ null_space(weights[None, :])
-        left = kept
-    return _Bordered(steady, y, rows, columns, right, left)
-
-
-def _almost_null(matrix, below):
-    """The right singular vectors (N, r) of the singular values up to `below`."""
-    _, sizes, right = np.linalg.svd(matrix)
-    return right[np.sum(sizes > below) :].T
-
-
-def _with_part(vectors, n):
-    """Combinations of null vectors (N, r) that have a part among the first n unknowns."""
-    if not vectors.shape[1]:
-        return vectors
-    _, sizes, combine = np.linalg.svd(vectors[:n], full_matrices=False)
-    return vectors @ combine[sizes > 1e-8].T
-
-
-@compiled
-def _fields(steady, x):
-    return steady.fields(x)
-
-
-def _reduced(bordered: _Bordered, amplitudes: np.ndarray):
-    """The reduced force b (B, z) at amplitudes s (B, z), and the unknowns there; NaN where there is no solution."""
-    steady, y0, rows, columns, right, left = bordered
-    dtype, z, count = np.dtype(steady.t.dtype), right.shape[1], len(amplitudes)
-    y, beta = y0 + columns * (amplitudes @ right.T), np.zeros((count, z))
-    with np.errstate(all="ignore"):
-        for _ in range(NEWTON_STEPS):
-            r, jacobian = (np.asarray(x, float)[:count] for x in _values(steady, _padded(y, dtype)))
-            matrix = np.zeros((count, len(rows) + z, y0.size + z))
-            matrix[:, : len(rows), : y0.size] = jacobian / rows[:, None] * columns
-            matrix[:, : len(rows), y0.size :] = left
-            matrix[:, len(rows) :, : y0.size] = right.T
-            off = np.concatenate([r / rows + beta @ left.T, ((y - y0) / columns) @ right - amplitudes], axis=1)
-            usable = np.all(np.isfinite(matrix), axis=(1, 2)) & np.all(np.isfinite(off), axis=1)
-            inverse = np.linalg.pinv(np.where(usable[:, None, None], matrix, 0.0), rcond=1e-11)
-            step = -np.einsum("bij,bj->bi", inverse, np.where(usable[:, None], off, np.nan))
-            y, beta = y + columns * step[:, : y0.size], beta + step[:, y0.size :]
-    small = np.max(np.abs(step[:, : y0.size]), axis=1) <= 1e-6 * np.max(np.abs(amplitudes), axis=1)
-    return np.where(small[:, None], -beta, np.nan), np.where(small[:, None], y, np.nan)
-
-
-def _reduced_force(bordered, size):
-    """Amplitudes (A,), ascending, and b at -A ... -a, a ... A."""
-    # Where nothing says how large the positions are, a wider range.
-    steps = np.arange(2, 2 + SAMPLES // 2)[::-1] * (1.0 if size > 0 else 2.0)
-    amplitudes = 2.0**-steps
-    return amplitudes, _reduced(bordered, np.concatenate([-amplitudes[::-1], amplitudes])[:, None])[0][:, 0]
-
-
-def _first_term(amplitudes, b) -> _Side | None:
-    """The first term of b on one side: from the smallest amplitude on at which |b| has an exponent."""
-    order = np.argsort(amplitudes)
-    s, b = np.asarray(amplitudes)[order], np.asarray(b)[order]
-    with np.errstate(all="ignore"):
-        exponents = np.diff(np.log2(np.abs(b))) / np.diff(np.log2(s))
-    for i in range(len(exponents) - WINDOW + 1):
-        some = exponents[i : i + WINDOW]
-        same_sign = np.all(np.sign(b[i : i + WINDOW + 1]) == np.sign(b[i]))
-        if same_sign and np.all(np.isfinite(some)) and np.ptp(some) <= SAME_EXPONENT and np.median(some) > 0.5:
-            return _Side(float(np.sign(b[i])), float(np.median(some)), float(s[i]))
-    return None
-
-
 def _is_flat(bordered) -> bool:
     """Whether the reduced force is round-off in all directions: the equilibrium is one of a family."""
     z, eps = bordered.right.shape[1], np.finfo(bordered.steady.t.dtype).eps
     directions = np.random.default_rng(1).normal(size=(SAMPLES // 8, z)) if z > 1 else np.ones((SAMPLES // 8, 1))
     directions /= np.max(np.abs(directions), axis=1, keepdims=True)
     sizes = np.array([0.25, -0.25, 0.11, -0.11, 0.03, -0.03, 0.004, -0.004])
-    b, _ = _reduced(bordered, np.concatenate([directions * size for size in sizes]))
+    b, _ = reduced(bordered, np.concatenate([directions * size for size in sizes]))
     known = np.all(np.isfinite(b), axis=1)
     largest = np.max(np.abs(bordered.y / bordered.columns), initial=1.0)
     return bool(np.mean(known) > 0.5 and np.all(np.abs(b[known]) <= 1e4 * eps * largest))
 
 
-def _only_active(bordered) -> tuple[_Bordered, int]:
+def _only_active(bordered) -> tuple[Bordered, int]:
     """The equations with the one zero mode that is no symmetry, if the reduced force has a single direction."""
     z = bordered.right.shape[1]
     directions = np.random.default_rng(2).normal(size=(SAMPLES, z)) * 0.02
-    b, _ = _reduced(bordered, directions)
+    b, _ = reduced(bordered, directions)
     b = b[np.all(np.isfinite(b), axis=1)]
     if len(b) < SAMPLES // 2:
         return bordered, z
@@ -362,7 +185,9 @@ def _only_active(bordered) -> tuple[_Bordered, int]:
     # In a conservative system force and displacement have the same directions.
     n, work = bordered.steady.n, left / bordered.rows
     weights = (bordered.columns[:, None] * bordered.right)[:n].T @ work[:n]
-    return bordered._replace(right=(bordered.right @ (weights / np.linalg.norm(weights)))[:, None], left=left[:, None]), 1
+    return bordered._replace(
+        right=(bordered.right @ (weights / np.linalg.norm(weights)))[:, None], left=left[:, None]
+    ), 1
 
 
 def _of_rays(bordered, dtype) -> Decision:
@@ -374,10 +199,12 @@ def _of_rays(bordered, dtype) -> Decision:
     n = bordered.steady.n
     to_work = (bordered.left / bordered.rows[:, None])[:n].T @ (bordered.columns[:, None] * bordered.right)[:n]
     amplitudes = 2.0 ** -np.arange(4.0, 4.0 + WINDOW + 3)
-    work = np.stack([np.sum((_reduced(bordered, s * rays)[0] @ to_work) * rays, axis=1) for s in amplitudes], axis=1)
-    terms = [_first_term(amplitudes, row) for row in work]
+    work = np.stack([np.sum((reduced(bordered, s * rays)[0] @ to_work) * rays, axis=1) for s in amplitudes], axis=1)
+    terms = [first_term(amplitudes, row) for row in work]
     known = [term.exponent for term in terms if term is not None]
-    radius = 4 * (1e2 * float(np.finfo(dtype).eps)) ** (1 / max(known, default=2.0)) * float(np.max(bordered.columns[:n]))
+    radius = (
+        4 * (1e2 * float(np.finfo(dtype).eps)) ** (1 / max(known, default=2.0)) * float(np.max(bordered.columns[:n]))
+    )
     decision = lambda verdict: Decision(verdict, None, radius, z)
     if any(term is not None and term.sign < 0 and term.exponent > 1.5 for term in terms):
         # Gyroscopic forces may hold what the potential does not.
@@ -389,33 +216,9 @@ def _of_rays(bordered, dtype) -> Decision:
     return decision(STABLE if smallest > SMALLEST_RESISTANCE else UNDECIDED)
 
 
-def _nodes():
-    """Chebyshev's nodes between -1 and 1."""
-    return np.cos(np.pi * (np.arange(SAMPLES) + 0.5) / SAMPLES)
-
-
 def _at(bordered):
     """The Jacobian at the equilibrium."""
-    return np.asarray(_values(bordered.steady, _padded(bordered.y[None], np.dtype(bordered.steady.t.dtype)))[1])[0]
-
-
-def _between(bordered, side: _Side) -> np.ndarray:
-    """The k-fold root to full accuracy: the simple root of the (k-1)-th derivative of b between its neighbours."""
-    k = round(side.exponent)
-    if abs(k - side.exponent) > SAME_EXPONENT or k < 2 or k > 9:
-        return bordered.y
-    reach = min(0.2, max(64 * side.amplitude, 0.05))
-    s = reach * _nodes()
-    b, _ = _reduced(bordered, s[:, None])
-    if not np.all(np.isfinite(b)):
-        return bordered.y
-    derivative = np.polynomial.Chebyshev.fit(s, b[:, 0], min(k + 10, 24), domain=(-reach, reach)).deriv(k - 1)
-    roots = derivative.roots()
-    roots = roots[(np.abs(roots.imag) <= 1e-9 * reach) & (np.abs(roots.real) <= 4 * side.amplitude)].real
-    if not roots.size:
-        return bordered.y
-    _, y = _reduced(bordered, np.full((1, 1), roots[np.argmin(np.abs(roots))]))
-    return y[0] if np.all(np.isfinite(y)) else bordered.y
+    return np.asarray(values_at(bordered.steady, padded(bordered.y[None], np.dtype(bordered.steady.t.dtype)))[1])[0]
 
 
 def _states_nearby(steady, y, size):
@@ -442,7 +245,9 @@ def _stiffness_is_positive(steady, y, jacobian, mass, zeros) -> bool:
         stiffness = stiffness - jacobian[:n, n : n + k] @ np.linalg.solve(
             jacobian[n + m :, n : n + k], jacobian[n + m :, :n]
         )
-    fixed = np.concatenate([jacobian[n : n + m, :n], np.asarray(_fields(steady, y[:n].astype(steady.t.dtype)), float)])
+    fixed = np.concatenate(
+        [jacobian[n : n + m, :n], np.asarray(fields_at(steady, y[:n].astype(steady.t.dtype)), float)]
+    )
     tangent = null_space(fixed, 1e-9) if len(fixed) else np.eye(n)
     inner = tangent.T @ mass @ tangent
     if np.linalg.eigvalsh(inner)[0] <= 0:

@@ -32,6 +32,7 @@ from lagjax.analysis.found_equilibria import (
     Row,
     merged,
 )  # fmt: skip
+from lagjax.analysis.reduced_force import CREEPS_BELOW, nearest, soft_below
 from lagjax.analysis.starts import checked, stacked, stacked_one, symmetries_of
 from lagjax.jax_internals.tracing import is_eager
 from lagjax.mechanics import constraints, coordinates
@@ -196,7 +197,7 @@ def _from_valleys(steady: Steady, rows: Row, lost, unseen, search, size_of) -> R
     q = jax.tree.map(np.array, rows.last)
     for i in lost:
         at = jax.tree.map(lambda x, i=i: x[i], q)
-        x = degenerate.nearest(steady, np.asarray(_flat(at), float), size_of(at, i), unseen)
+        x = nearest(steady, np.asarray(_flat(at), float), size_of(at, i), unseen)
         if x is not None:
             _put(q, i, coordinates.like(at, x.astype(steady.t.dtype)))
     again = search(q, jax.tree.map(np.zeros_like, q))
@@ -353,5 +354,5 @@ def _zero_modes(steady: Steady, root):
         scaled = jnp.where(jnp.isfinite(scaled), scaled, 0.0)
         return n + jnp.sum(sizes(scaled[:, n:]) > below) - jnp.sum(sizes(scaled) > below)
 
-    soft = degenerate.soft_below(root.y.dtype)
-    return count(columns, least), count(units, soft), count(units, degenerate.CREEPS_BELOW)
+    soft = soft_below(root.y.dtype)
+    return count(columns, least), count(units, soft), count(units, CREEPS_BELOW)

@@ -2,9 +2,9 @@
 
 A path is a trajectory, or a function of time whose derivative is the velocity. Between the outputs of a trajectory the
 motion is integrated again, at the nodes of a quadrature that is refined until it is as accurate as the motion
-(`motion/works.py`), so that it does not matter how far apart the outputs lie. While JAX traces, the number of nodes must
-be known beforehand: then q is the cubic through the positions and velocities of the outputs. Because S is stationary on
-true motions, its error is of the order of the square of the cubic's error.
+(`motion/works.py`), so that it does not matter how far apart the outputs lie. While JAX traces, the number of nodes
+must be known beforehand: then q is the cubic through the positions and velocities of the outputs. Because S is
+stationary on true motions, its error is of the order of the square of the cubic's error.
 
 Source: Goldstein, *Classical Mechanics*, Eq. (2.1), (2.2).
 """

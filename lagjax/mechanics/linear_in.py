@@ -11,10 +11,9 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import ClosedJaxpr, Literal
 
 from lagjax.jax_internals.names import ADDITIVE, BILINEAR, LINEAR_IN_FIRST
-from lagjax.jax_internals.programs import stands_for
+from lagjax.jax_internals.programs import ClosedJaxpr, Literal, stands_for
 
 CONSTANT, LINEAR, OTHER = range(3)
 # Sizes of the multipliers that are tried, with random signs, and the states at which they are.
@@ -96,7 +95,7 @@ def _holds(function, zero, rest) -> bool:
         at = lambda numbers, state=state: np.asarray(function(numbers, state), float)
         start, slope = at(zero), np.asarray(jax.jacfwd(function)(zero, state), float)
         for size in SIZES:
-            numbers = (size * random.uniform(0.5, 2.0, zero.shape) * random.choice([-1.0, 1.0], zero.shape))
+            numbers = size * random.uniform(0.5, 2.0, zero.shape) * random.choice([-1.0, 1.0], zero.shape)
             numbers = numbers.astype(zero.dtype)
             there, terms = at(numbers), np.abs(slope) @ np.abs(numbers)
             off = np.abs(there - start - slope @ numbers)

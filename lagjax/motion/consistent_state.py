@@ -69,8 +69,8 @@ def consistent_state(
 
     **Arguments:** `t` scalar, `q` and `v` alike, `params` as the system takes it; `hold`, the names of coordinates that
     keep the values given for them and for their velocities: `"x"`, `["x", "r[0]"]`, `"r"` for all of a vector, or a
-    dict of true and false by name; `hold_position`, `hold_velocity`: the same for the position alone, as of a crank whose
-    speed a motor determines, or for the velocity alone.
+    dict of true and false by name; `hold_position`, `hold_velocity`: for the position alone, as of a crank
+    whose speed a motor determines, or for the velocity alone.
 
     **Returns:** (q, v) in the same structure, differentiable in the state, `t` and `params`.
 

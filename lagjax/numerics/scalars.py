@@ -6,10 +6,10 @@ operations on single numbers: products with a known zero are dropped, products w
 neither are unused numbers. XLA keeps the rest in registers.
 
 A product with a known zero is zero, even if the other factor turns out to be infinity or NaN: so it is where a known
-zero is the derivative of what does not matter. Two exceptions keep the meaning of what the user writes: a factor that is
-known to be infinity or NaN gives NaN; and in a program that asks whether a number is one (`isnan`, `isfinite`,
-`nan_to_num`), all products with zeros are computed. Primitives that are not known here, control flow, and arrays of more
-than `LARGE` entries are left unchanged.
+zero is the derivative of what does not matter. Two exceptions keep the meaning of what the user writes: a factor that
+is known to be infinity or NaN gives NaN; and in a program that asks whether a number is one (`isnan`, `isfinite`,
+`nan_to_num`), all products with zeros are computed. Primitives that are not known here, control flow, and arrays of
+more than `LARGE` entries are left unchanged.
 """
 
 import math

@@ -173,3 +173,28 @@ def test_a_held_coordinate_that_a_constraint_fixes():
         lj.consistent_state(both, 0.0, on_it, moving | {"x": 0.25}, None, hold="x")
     slope = jax.jacfwd(lambda y: lj.consistent_state(both, 0.0, on_it | {"y": y}, moving, None, hold="x")[0]["z"])(1.5)
     np.testing.assert_allclose(slope, -1.5 * 0.25 / length**3, atol=1e-9)
+
+
+@pytest.mark.slow
+def test_a_position_alone_and_a_velocity_alone():
+    """A crank's position held while a motor sets its speed: b = (3, 0), a' = (0, 5); twin: the speed held too."""
+
+    def joints(t, q, params):
+        a, b = q["a"], q["b"]
+        rod, motor = (a - b) @ (a - b) - 4.0, a[1] * jnp.cos(5 * t) - a[0] * jnp.sin(5 * t)
+        return jnp.stack([a @ a - 1.0, rod, b[1], motor])
+
+    driven = lj.System(lambda t, q, v, p: 0.5 * (v["a"] @ v["a"] + v["b"] @ v["b"]), {"joints": lj.Holonomic(joints)})
+    guess = {"a": jnp.array([1.0, 0.0]), "b": jnp.array([2.7, 0.3])}
+    still = {"a": jnp.zeros(2), "b": jnp.zeros(2)}
+    q, v = lj.consistent_state(driven, 0.0, guess, still, None, hold_position="a", hold_velocity="b")
+    np.testing.assert_array_equal(q["a"], [1.0, 0.0])
+    np.testing.assert_array_equal(v["b"], [0.0, 0.0])
+    np.testing.assert_allclose(q["b"], [3.0, 0.0], atol=1e-12)
+    np.testing.assert_allclose(v["a"], [0.0, 5.0], atol=1e-12)
+    with pytest.raises(ValueError, match=r"(?s)Fix: hold the position alone, hold_position=\['a\[0\]', 'a\[1\]'\]"):
+        lj.consistent_state(driven, 0.0, guess, still, None, hold="a")
+    with pytest.raises(ValueError, match=r"with the velocity of 'a\[0\]' and 'a\[1\]' held"):
+        lj.consistent_state(driven, 0.0, guess, still, None, hold_velocity="a")
+    with pytest.raises(ValueError, match="hold_velocity names 'c'"):
+        lj.consistent_state(driven, 0.0, guess, still, None, hold_velocity="c")

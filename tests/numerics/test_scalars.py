@@ -109,3 +109,16 @@ def test_what_becomes_too_long_is_left_early():
     assert 600 <= len(written(650).jaxpr.eqns) <= 1200
     with pytest.raises(TooLong):
         written(550)
+
+
+def test_programs_that_ask_for_nan_keep_their_meaning():
+    """0 · ∞ is NaN where it is known or asked for; twin: elsewhere a product with a known zero leaves no trace."""
+    two = jnp.asarray(2.0)
+    asked = lambda x: jnp.nan_to_num(0.0 * (1 / (x - x)), nan=3.0)
+    known = lambda x: x + jnp.dot(jnp.array([0.0, 1.0]), jnp.array([np.inf, 1.0]))
+    for function in (asked, known, lambda x: jnp.where(jnp.isinf(1 / (0.0 * x)), 1.0, 2.0)):
+        program = jax.make_jaxpr(function)(2.0)
+        np.testing.assert_array_equal(jax.jit(lambda x, p=program: written_out(p, x)[0])(two), function(two))
+    assert float(asked(two)) == 3.0 and np.isnan(known(two))
+    dropped = jax.make_jaxpr(lambda x: 0.0 * (1 / (x - x)))(2.0)
+    assert float(jax.jit(lambda x: written_out(dropped, x)[0])(two)) == 0.0
