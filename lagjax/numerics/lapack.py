@@ -1,9 +1,7 @@
 """Decompositions by LAPACK, for the matrices of a batch one after the other, without derivatives.
 
-XLA on a CPU distributes a batch of LAPACK calls over the threads of its pool, and one of these threads waits for them.
-If a program has several such calls, or several programs run at the same time, all threads may wait forever (seen with
-jaxlib 0.10 for 100,000 solves and singular values in one program). A loop over the batch calls LAPACK for one matrix at
-a time in its own thread, and costs no more for small matrices.
+On a CPU a batch of LAPACK calls can stop a process for good (`jax_internals/one_by_one.py`), and every program of ours
+is a loop over the matrices of a batch. Here the loop is around all of a decomposition's steps, on each platform.
 """
 
 from collections.abc import Callable

@@ -456,3 +456,49 @@ def test_count_of_what_is_not_kept():
     found = lj.integrate(oscillator, 0.0, 1.0, params, ts=[0.0, 6.0], events=events).events["level"]
     assert len(found.found().t) == 1
     assert int(found.count) == 1
+
+
+# A guard whose slope is infinite or unknown at one instant.
+
+FREE = lj.System(lambda t, q, v, p: 0.5 * v**2)
+STEEP = {
+    "root": (lambda t, q, v, p: jnp.sqrt(t) - 1.0, [1.0]),
+    "cube root": (lambda t, q, v, p: jnp.cbrt(q) - 1.0, [1.0]),
+    "arc": (lambda t, q, v, p: jnp.arccos(jnp.clip(t / 5 - 1, -1, 1)) - 1.0, [5 * (1 + np.cos(1.0))]),
+    "at the end": (lambda t, q, v, p: jnp.sqrt(10 - t) - 1.0, [9.0]),
+    "logarithm": (lambda t, q, v, p: jnp.log(t), [1.0]),
+    "Chebyshev": (
+        lambda t, q, v, p: jnp.cos(30 * jnp.arccos(jnp.clip(t / 5 - 1, -1, 1))),
+        5 + 5 * np.cos(np.pi * (np.arange(30) + 0.5) / 30)[::-1],
+    ),
+}
+
+
+def steep(guards, **options):
+    """The free motion q = t from 0 to 10 with these guards, of which none ends it."""
+    events = {name: lj.Crossing(guard, terminal=False, most=40) for name, guard in guards.items()}
+    return lj.integrate(FREE, 0.0, 1.0, ts=jnp.array([0.0, 10.0]), events=events, max_step=2.5, **options)
+
+
+@pytest.mark.slow
+def test_an_infinite_slope_does_not_stop_the_motion():
+    """sqrt(t), ∛q, arccos, log and T₃₀, steep at the start or the end, cross at their roots, in a few hundred looks."""
+    motion = steep({name: guard for name, (guard, _) in STEEP.items()})
+    for name, (_, roots) in STEEP.items():
+        np.testing.assert_allclose(times(motion, name), roots, rtol=0, atol=2e-14, err_msg=name)
+        assert not bool(motion.events[name].uncertain)
+    assert int(motion.stats["num_rejected_steps"]) < 1000
+
+
+@pytest.mark.slow
+def test_a_guard_that_is_nowhere_known():
+    """Twin: a guard that is NaN or infinite throughout, or oscillates without end, is called unreliable, and soon."""
+    unknown = {
+        "nan": lambda t, q, v, p: t * jnp.nan,
+        "infinite": lambda t, q, v, p: t * jnp.inf,
+        "without end": lambda t, q, v, p: jnp.sin(1 / t),
+    }
+    with doubt:
+        motion = steep(unknown)
+    assert all(bool(found.uncertain) for found in motion.events.values()) and float(motion.q[-1]) == 10.0
+    assert int(motion.stats["num_rejected_steps"]) < 5000
