@@ -64,16 +64,22 @@ def warn_of_missed(missed: Sequence[str]):
     )
 
 
+def with_lost(stats, too_many):
+    """The statistics of a motion, with jumps in time that were too many to be followed."""
+    known = {"num_jumps": jnp.asarray(0), "lost_jumps": jnp.asarray(False)} | stats
+    return known | {"lost_jumps": known["lost_jumps"] | too_many}
+
+
 def warn_of_lost(trajectory):
     """Say that a motion could not be followed across all its jumps."""
     if "lost_jumps" in trajectory.stats and bool(trajectory.stats["lost_jumps"]):
         count = int(trajectory.stats["num_jumps"])
-        why = f"after {count} jumps, the most that are" if count >= MOST_JUMPS else f"after {count} of its jumps"
+        why = f"after {count} jumps" if count else "at all, or not across those in time, more than 256"
         warn(
-            f"the motion was not followed across the jumps of its forces {why}; from there on forces were taken as "
-            "they come: the motion is right to its tolerance, and derivatives lack the part that is due to later "
-            "jumps.\n"
-            "Usual cause: a comparison at the end of a function's domain (arccos, sqrt), or a control that chatters.\n"
+            f"the motion was not followed across the jumps of its forces {why}; there forces were taken as they come: "
+            "the motion is right to its tolerance, and derivatives lack the part that is due to those jumps.\n"
+            "Usual cause: a comparison at the end of a function's domain (arccos, sqrt), a control that chatters, a long "
+            "table of times.\n"
             'Fix: jumps="ignored" if the comparison only guards against NaN; a shorter time span.',
             JumpWarning,
         )
