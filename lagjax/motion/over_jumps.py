@@ -157,11 +157,12 @@ def solved_over_jumps(jumps: Jumps, system: System, q0, v0, params, ts, guards, 
     def next_leg(way: Way) -> Way:
         return _leg(model, both, guards, way, params, ts, settings, adjoint)
 
+    turns = MOST_JUMPS + 2 + (0 if settings.jump_ts is None else settings.jump_ts.size)
     if isinstance(adjoint, diffrax.ForwardMode):
         way = lax.while_loop(lambda way: way.continues, next_leg, first)
     else:
         step = lambda way, _: (lax.cond(eqxi.unvmap_any(way.continues), next_leg, lambda way: way, way), None)
-        way, _ = lax.scan(step, first, None, length=MOST_JUMPS + 2)
+        way, _ = lax.scan(step, first, None, length=turns)
     return {
         **way.rows,
         "end": way.end,
@@ -209,13 +210,19 @@ def _leg(model: Model, guards: Guards, recorded, way: Way, params, ts, settings,
     place, past, here = jnp.arange(ts.shape[0]), jnp.sum(ts <= way.t), way.continues
     ahead = jnp.where(place == 0, way.t, ts[jnp.minimum(place + past - 1, ts.shape[0] - 1)])
     times = jnp.where(here, ahead, way.t)
+    if model.sliding is not None and settings.jump_ts is not None:
+        # A share may jump with a force in time, and then has no zero: the next leg begins there, and ends at once.
+        times = jnp.minimum(times, _next(settings.jump_ts, way.t, resolution(ts)))
     given = Given(params, way.modes, way.slides, way.free)
     found = apart(solved, model.smooth, way.q, way.v, given, times, guards, settings, adjoint, way.sizes_so_far)
     crossings = [found["events"][kind.name] for kind in guards.kinds]
     when = jnp.stack([jnp.where(jnp.isfinite(x.t[0]), x.t[0], jnp.inf) for x in crossings])
-    ending = apart(_ending, model, guards, found["result"], found["end"], when, way, given, resolution(ts), settings)
+    ending = apart(_ending, model, guards, found["result"], found["end"], when, way, given, ts, settings)
     end, onward = ending.end, here & ending.onward
-    modes, slides = apart(_beyond, model, ending.first, end, given)
+    paused = here & (ending.result == RESULTS.successful) & ~onward & ~ending.wrong & (end.t < ts[-1])
+    # Not where a leg began, if it ended at once: what jumps with time has jumped only after that.
+    modes, slides = apart(_beyond, model, ending.first, found["end"], given)
+    moves = onward | paused
     # What a leg found whose mode was wrong does not count.
     counts = here & ~ending.wrong
     rows = jax.tree.map(lambda x: x[jnp.maximum(place - past + 1, 0)], {name: found[name] for name in ROWS})
@@ -224,10 +231,10 @@ def _leg(model: Model, guards: Guards, recorded, way: Way, params, ts, settings,
     least = way.least if not settings.by_size else jnp.maximum(way.least, stopped(found["tolerance"][1]))
     again = here & ending.wrong
     further = way._replace(
-        t=jnp.where(onward, end.t, way.t), q=_where(onward, end.q, way.q), v=_where(onward, end.v, way.v),
+        t=jnp.where(moves, end.t, way.t), q=_where(moves, end.q, way.q), v=_where(moves, end.v, way.v),
         modes=jnp.where(onward, modes, way.modes), slides=jnp.where(onward, slides, way.slides),
         free=way.free | again | (onward & (way.count + 1 >= MOST_JUMPS)), count=way.count + onward,
-        continues=again | (onward & (end.t < ts[-1])), rows=put(way.rows, rows),
+        continues=again | (moves & (end.t < ts[-1])), rows=put(way.rows, rows),
         events=_where(counts, with_those_of(found["events"], way.events), way.events), end=_where(counts, end, way.end),
         stats={name: n + found["stats"][name] for name, n in way.stats.items()},
         sizes_so_far=jnp.maximum(way.sizes_so_far, sizes_of(end.q, end.v)), least=least,
@@ -235,6 +242,11 @@ def _leg(model: Model, guards: Guards, recorded, way: Way, params, ts, settings,
         settled=way.settled & found["settled"], result=RESULTS.where(again, RESULTS.successful, ending.result),
     )  # fmt: skip
     return _where(here, further, way)
+
+
+def _next(jump_ts, t, resolution):
+    """The next of the times of jumps."""
+    return jnp.min(jnp.where(jump_ts > t + AT_ONCE * resolution, jump_ts, jnp.inf))
 
 
 class Ending(NamedTuple):
@@ -248,9 +260,9 @@ class Ending(NamedTuple):
     result: Any
 
 
-def _ending(model, guards: Guards, result, end: Snapshot, when, way: Way, given, resolution, settings) -> Ending:
+def _ending(model, guards: Guards, result, end: Snapshot, when, way: Way, given, ts, settings) -> Ending:
     """Find out what ends a leg; `when`: the times at which its guards cross, infinite for those that do not."""
-    count, at_one_time = len(model.guards), AT_ONCE * resolution
+    count, at_one_time, last = len(model.guards), AT_ONCE * resolution(ts), ts[-1]
     # An event of the user's that ends the motion at the time of a jump comes first.
     ends = jnp.where(guards.terminal, when, jnp.inf)[count:]
     when = when[:count]
@@ -260,7 +272,9 @@ def _ending(model, guards: Guards, result, end: Snapshot, when, way: Way, given,
     # A jump at once happens where the leg begins, so that its time has the derivatives of that.
     t, q, v = _where(at_once, (way.t, way.q, way.v), (end.t, end.q, end.v))
     end = Snapshot(t, q, v, end.multipliers)
-    below = ended_well(result) & ~onward & _is_below(end, given, guards, count, settings.rtol)
+    # Where a force jumps in time, the side of which a guard is belongs to the next leg.
+    whole = end.t >= last
+    below = ended_well(result) & ~onward & whole & _is_below(end, given, guards, count, settings.rtol)
     wrong = ~way.free & (below | ~ended_well(result) & (result != RESULTS.max_steps_reached))
     result = RESULTS.where(onward, RESULTS.successful, result)
     first = jnp.argmax(when <= jnp.min(when) + at_one_time)
