@@ -28,6 +28,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from lagjax.jax_internals.one_function import apart
+from lagjax.jax_internals.opened import IN_TIME
 from lagjax.jumps.found import Given, Jumps, OfParams, Smooth
 from lagjax.jumps.sliding import Mixed, Sliding, slidable
 from lagjax.mechanics import constraints
@@ -78,8 +79,8 @@ def warn_of_lost(trajectory):
         warn(
             f"the motion was not followed across the jumps of its forces {why}; there forces were taken as they come: "
             "the motion is right to its tolerance, and derivatives lack the part that is due to those jumps.\n"
-            "Usual cause: a comparison at the end of a function's domain (arccos, sqrt), a control that chatters, a long "
-            "table of times.\n"
+            "Usual cause: a comparison at the end of a function's domain (arccos, sqrt), a control that chatters, a "
+            "long table of times.\n"
             'Fix: jumps="ignored" if the comparison only guards against NaN; a shorter time span.',
             JumpWarning,
         )
@@ -104,12 +105,16 @@ class ModeGuard(eqx.Module):
 
 
 class Model(eqx.Module):
-    """A system in a mode: its `smooth` equations, the mixtures, and for each mode its guard and the mode beyond."""
+    """A system in a mode: its `smooth` equations, the mixtures, and for each mode its guard and the mode beyond.
+
+    `pauses`: whether guards may jump with time, so that legs end where forces do.
+    """
 
     smooth: System
     sliding: Sliding | None
     guards: tuple[ModeGuard, ...]
     beyond: tuple[Smooth, ...]
+    pauses: bool = eqx.field(static=True)
 
 
 def model_of(jumps: Jumps, system: System, small: bool) -> Model:
@@ -121,7 +126,9 @@ def model_of(jumps: Jumps, system: System, small: bool) -> Model:
         sliding = Sliding(smooth, tuple(differences[i] for i in which), which)
         smooth = System(smooth.lagrangian, smooth.constraints, Mixed(smooth.force, sliding), smooth.dissipation)
     of = lambda i, guard: ModeGuard(guard, sliding if i in which else None, i)
-    return Model(smooth, sliding, tuple(of(i, g) for i, g in enumerate(guards)), tuple(jumps.numbers(system, 1)))
+    guards = tuple(of(i, guard) for i, guard in enumerate(guards))
+    pauses = sliding is not None or any(IN_TIME in slot.depends for slot in jumps.slots)
+    return Model(smooth, sliding, guards, tuple(jumps.numbers(system, 1)), pauses)
 
 
 class Way(NamedTuple):
@@ -210,9 +217,11 @@ def _leg(model: Model, guards: Guards, recorded, way: Way, params, ts, settings,
     place, past, here = jnp.arange(ts.shape[0]), jnp.sum(ts <= way.t), way.continues
     ahead = jnp.where(place == 0, way.t, ts[jnp.minimum(place + past - 1, ts.shape[0] - 1)])
     times = jnp.where(here, ahead, way.t)
-    if model.sliding is not None and settings.jump_ts is not None:
-        # A share may jump with a force in time, and then has no zero: the next leg begins there, and ends at once.
-        times = jnp.minimum(times, _next(settings.jump_ts, way.t, resolution(ts)))
+    if model.pauses and settings.jump_ts is not None:
+        # A guard that jumps in time may have no zero: the next leg begins there, and ends at once. Not `minimum`, whose
+        # derivative is one half for an output at that time.
+        pause = _next(settings.jump_ts, way.t, resolution(ts))
+        times = jnp.where(times > pause, pause, times)
     given = Given(params, way.modes, way.slides, way.free)
     found = apart(solved, model.smooth, way.q, way.v, given, times, guards, settings, adjoint, way.sizes_so_far)
     crossings = [found["events"][kind.name] for kind in guards.kinds]
