@@ -25,6 +25,9 @@ from lagjax.jax_internals.programs import bodies, equations, evaluate, needed, s
 COMPARISONS = {"gt", "ge", "lt", "le"}
 KINKS = {"abs", "max", "min", "clamp"}
 LEVELS = {"floor", "ceil", "round", "rem", "convert_element_type"}
+OUTCOMES = {"sign", "floor", "ceil", "round"}
+# What a value may depend on besides t, q, v and multipliers: outcomes of comparisons, and of those of t alone.
+OUTCOME, IN_TIME = "outcome", "outcome in time"
 ELEMENTARY = COMPARISONS | KINKS | LEVELS | {"sign"}
 # They choose among numbers, one at a time; their jumps are not followed.
 CHOOSING = {"reduce_max", "reduce_min", "argmax", "argmin", "sort", "cummax", "cummin", "top_k"}
@@ -124,6 +127,8 @@ class Opening:
         self.table, self.role, self.mode = table, role, mode
         self.inside: dict[Any, Inside] = {}
         self.timed: dict[Any, Timed] = {}
+        # Inside of `interp`: by the number of what is looked up, whether it is below and above the whole table.
+        self._beyond_table: dict[int, tuple] = {}
 
     def run(self, closed: ClosedJaxpr, inputs: list[Known]) -> list[Known]:
         """The results of a program."""
@@ -148,17 +153,22 @@ class Opening:
 
     def _results(self, jaxpr, equation, operands):
         name, depends = equation.primitive.name, frozenset().union(*(x.depends for x in operands))
-        if depends:
+        # What depends on outcomes alone changes only with them.
+        if depends - {OUTCOME, IN_TIME}:
             inner = stands_for(equation)
             if name in ("jit", "closed_call") and inner is not None:
                 if str(equation.params.get("name")) in SMOOTH:
                     at = {x: k.value for x, k in zip(equation.invars, operands) if not isinstance(x, Literal)}
                     return self._known(equation, operands, depends, evaluate(jaxpr, equation, at))
                 if str(equation.params.get("name")) == "searchsorted":
+                    # Not a call of its own, so that `interp` knows the place.
                     found = self._searched(equation, operands, depends)
                     if found is not None:
                         return found
-                return self.run(inner, operands)
+                before = self._beyond_table
+                found = self.run(inner, operands)
+                self._beyond_table = before
+                return found
             if name == "remat2" and inner is not None:
                 return self.run(inner, operands)
             if name == "custom_jvp_call" and inner is not None and _called(equation) in WITH_KINKS:
@@ -188,6 +198,8 @@ class Opening:
         key = self.table.number(name, params, *(x.number for x in operands))
         if name == "neg":
             self.table.negative[self.table.number("result", 0, key)] = operands[0].number
+        if depends and (name in COMPARISONS | OUTCOMES or name == "convert_element_type" and _to_whole(equation)):
+            depends = frozenset({IN_TIME if depends <= {"t", IN_TIME} else OUTCOME})
         bounds = of_result(equation, [x.bounds for x in operands])
         each = enumerate(results)
         return [Known(y, self.table.number("result", i, key), depends, ALL if i else bounds) for i, y in each]
@@ -207,6 +219,8 @@ class Opening:
             self.table.missed[f"{_in_words(name)} of {size} numbers at once"] = None
             return None
         zero = self._constant(np.zeros((), operands[0].value.dtype))
+        if operands[0].number in self._beyond_table and name in ("lt", "gt"):
+            return [self._beyond_table[operands[0].number][name == "gt"]]
         if name in COMPARISONS:
             above = self._above(operands[0], operands[1], depends, True, name)
             return None if above is None else [above if name in ("gt", "ge") else ~above]
@@ -311,12 +325,14 @@ class Opening:
         up = x - low > high - x
         beyond = jnp.where(up, mode + 1, mode - 1)
         self.inside.setdefault(key, Inside((x - low) * (high - x), beyond, actual, x))
+        # `interp` also compares with the ends of its table; after it the same comparison stands for itself.
+        self._beyond_table = {numbers[0].number: (mode < 0.5, mode > n - 0.5)}
         dtype = equation.outvars[0].aval.dtype
-        return [Known(i.astype(dtype), self.table.number("place", *key), depends)]
+        return [Known(i.astype(dtype), self.table.number("place", *key), frozenset({OUTCOME}))]
 
     def _mode(self, key, slot: Slot, timed: Timed):
         """The mode; None for a jump in time alone, which stays as it is."""
-        if slot.depends == {"t"}:
+        if slot.depends <= {"t", IN_TIME}:
             self.timed.setdefault(key, timed)
             return None
         known = self.table.slots.get(key, slot)

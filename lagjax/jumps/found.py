@@ -122,7 +122,8 @@ class Jumps:
     def in_words(self) -> list[str]:
         """What was found, in words, and in which function."""
         of_state = [
-            f"{'a comparison' if slot.kind in COMPARISONS else slot.kind} of {', '.join(sorted(slot.depends))} "
+            f"{'a comparison' if slot.kind in COMPARISONS else slot.kind} of "
+            f"{', '.join(x for x in 'tqv' if x in slot.depends)} "
             f"in the {' and the '.join(NAMES[role] for role in ROLES if role in slot.roles)}"
             for slot in self.slots
         ]

@@ -33,16 +33,18 @@ class Results(NamedTuple):
 
 
 def with_jumps_in_time(jumps: Jumps, jump_ts, system, q, v, params, ts):
-    """The times of the jumps that the user named, and of those that were found, in no order."""
-    found, sought = [] if jump_ts is None else [jump_ts], []
+    """The times of the jumps that the user named, and of those that were found, in no order; and whether there are too
+    many of the latter, which are then left out."""
+    found, sought, too_many = [] if jump_ts is None else [jump_ts], [], jnp.asarray(False)
     for role, traced in jumps.traced.items():
         arguments = {"q": q, "v": v, "params": params, "multipliers": traced.zeros(ts.dtype)}
         of_role = traced, getattr(system, role), arguments
         found += [jnp.ravel(x) for x in _at(ts[0], [place for place, timed in traced.of_time if timed.at], *of_role)]
         sought += [of_role] if any(not timed.at for _, timed in traced.of_time) else []
     if sought:
-        found.append(_sought(sought, ts))
-    return jnp.concatenate([x.astype(ts.dtype) for x in found])
+        times, too_many = _sought(sought, ts)
+        found.append(times)
+    return jnp.concatenate([x.astype(ts.dtype) for x in found]), too_many
 
 
 def _at(t, outputs, traced: Traced, function, arguments):
@@ -96,7 +98,8 @@ def _sought(roles, ts):
     number = jnp.where(changes, jnp.arange(changes.size).reshape(changes.shape), changes.size)
     # The first ones, in order of time.
     number = jnp.sort(jnp.ravel(number))[:ROOM]
-    there, number = number < changes.size, jnp.minimum(number, changes.size - 1)
+    too_many = jnp.sum(changes) > ROOM
+    there, number = (number < changes.size) & ~too_many, jnp.minimum(number, changes.size - 1)
     low, high = grid[number // count], grid[number // count + 1]
     mine = lambda modes: jnp.take_along_axis(modes, (number % count)[:, None], axis=1)[:, 0]
     each = jax.vmap(modes_at)
@@ -122,4 +125,4 @@ def _sought(roles, ts):
         step = -g / jnp.where(rate != 0, rate, 1.0)
         near = (jnp.abs(step) <= SMALL * (last - first)) & (rate != 0)
         t = t + jnp.where(near, step, 0.0)
-    return jnp.where(there, t, ts[-1])
+    return jnp.where(there, t, ts[-1]), too_many

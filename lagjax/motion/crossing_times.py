@@ -185,7 +185,10 @@ def _wait_jvp(primals, tangents, *, flow):
     # Where the guard jumps, it determines no derivative.
     size = jnp.finfo(tau.dtype).eps * _terms(live, z, owner)
     jumps = jnp.abs(g) > JUMP_FACTOR * (jnp.abs(rate) * resolution + size)
-    return tau, -dg / jnp.where(jumps, jnp.nan, rate)
+    may_rest = jnp.asarray([kind.may_rest for kind in live[0].kinds])[owner]
+    # The jump of a force in time is where a leg begins, whose time has its derivatives; they are taken there.
+    none = jnp.where(may_rest, jnp.inf, jnp.nan)
+    return tau, -dg / jnp.where(jumps, none, rate)
 
 
 def _terms(live, z, owner):

@@ -28,6 +28,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from lagjax.jax_internals.one_function import apart
+from lagjax.jax_internals.opened import IN_TIME
 from lagjax.jumps.found import Given, Jumps, OfParams, Smooth
 from lagjax.jumps.sliding import Mixed, Sliding, slidable
 from lagjax.mechanics import constraints
@@ -64,16 +65,22 @@ def warn_of_missed(missed: Sequence[str]):
     )
 
 
+def with_lost(stats, too_many):
+    """The statistics of a motion, with jumps in time that were too many to be followed."""
+    known = {"num_jumps": jnp.asarray(0), "lost_jumps": jnp.asarray(False)} | stats
+    return known | {"lost_jumps": known["lost_jumps"] | too_many}
+
+
 def warn_of_lost(trajectory):
     """Say that a motion could not be followed across all its jumps."""
     if "lost_jumps" in trajectory.stats and bool(trajectory.stats["lost_jumps"]):
         count = int(trajectory.stats["num_jumps"])
-        why = f"after {count} jumps, the most that are" if count >= MOST_JUMPS else f"after {count} of its jumps"
+        why = f"after {count} jumps" if count else "at all, or not across those in time, more than 256"
         warn(
-            f"the motion was not followed across the jumps of its forces {why}; from there on forces were taken as "
-            "they come: the motion is right to its tolerance, and derivatives lack the part that is due to later "
-            "jumps.\n"
-            "Usual cause: a comparison at the end of a function's domain (arccos, sqrt), or a control that chatters.\n"
+            f"the motion was not followed across the jumps of its forces {why}; there forces were taken as they come: "
+            "the motion is right to its tolerance, and derivatives lack the part that is due to those jumps.\n"
+            "Usual cause: a comparison at the end of a function's domain (arccos, sqrt), a control that chatters, a "
+            "long table of times.\n"
             'Fix: jumps="ignored" if the comparison only guards against NaN; a shorter time span.',
             JumpWarning,
         )
@@ -98,12 +105,16 @@ class ModeGuard(eqx.Module):
 
 
 class Model(eqx.Module):
-    """A system in a mode: its `smooth` equations, the mixtures, and for each mode its guard and the mode beyond."""
+    """A system in a mode: its `smooth` equations, the mixtures, and for each mode its guard and the mode beyond.
+
+    `pauses`: whether guards may jump with time, so that legs end where forces do.
+    """
 
     smooth: System
     sliding: Sliding | None
     guards: tuple[ModeGuard, ...]
     beyond: tuple[Smooth, ...]
+    pauses: bool = eqx.field(static=True)
 
 
 def model_of(jumps: Jumps, system: System, small: bool) -> Model:
@@ -115,7 +126,9 @@ def model_of(jumps: Jumps, system: System, small: bool) -> Model:
         sliding = Sliding(smooth, tuple(differences[i] for i in which), which)
         smooth = System(smooth.lagrangian, smooth.constraints, Mixed(smooth.force, sliding), smooth.dissipation)
     of = lambda i, guard: ModeGuard(guard, sliding if i in which else None, i)
-    return Model(smooth, sliding, tuple(of(i, g) for i, g in enumerate(guards)), tuple(jumps.numbers(system, 1)))
+    guards = tuple(of(i, guard) for i, guard in enumerate(guards))
+    pauses = sliding is not None or any(IN_TIME in slot.depends for slot in jumps.slots)
+    return Model(smooth, sliding, guards, tuple(jumps.numbers(system, 1)), pauses)
 
 
 class Way(NamedTuple):
@@ -151,11 +164,12 @@ def solved_over_jumps(jumps: Jumps, system: System, q0, v0, params, ts, guards, 
     def next_leg(way: Way) -> Way:
         return _leg(model, both, guards, way, params, ts, settings, adjoint)
 
+    turns = MOST_JUMPS + 2 + (0 if settings.jump_ts is None else settings.jump_ts.size)
     if isinstance(adjoint, diffrax.ForwardMode):
         way = lax.while_loop(lambda way: way.continues, next_leg, first)
     else:
         step = lambda way, _: (lax.cond(eqxi.unvmap_any(way.continues), next_leg, lambda way: way, way), None)
-        way, _ = lax.scan(step, first, None, length=MOST_JUMPS + 2)
+        way, _ = lax.scan(step, first, None, length=turns)
     return {
         **way.rows,
         "end": way.end,
@@ -203,13 +217,21 @@ def _leg(model: Model, guards: Guards, recorded, way: Way, params, ts, settings,
     place, past, here = jnp.arange(ts.shape[0]), jnp.sum(ts <= way.t), way.continues
     ahead = jnp.where(place == 0, way.t, ts[jnp.minimum(place + past - 1, ts.shape[0] - 1)])
     times = jnp.where(here, ahead, way.t)
+    if model.pauses and settings.jump_ts is not None:
+        # A guard that jumps in time may have no zero: the next leg begins there, and ends at once. Not `minimum`, whose
+        # derivative is one half for an output at that time.
+        pause = _next(settings.jump_ts, way.t, resolution(ts))
+        times = jnp.where(times > pause, pause, times)
     given = Given(params, way.modes, way.slides, way.free)
     found = apart(solved, model.smooth, way.q, way.v, given, times, guards, settings, adjoint, way.sizes_so_far)
     crossings = [found["events"][kind.name] for kind in guards.kinds]
     when = jnp.stack([jnp.where(jnp.isfinite(x.t[0]), x.t[0], jnp.inf) for x in crossings])
-    ending = apart(_ending, model, guards, found["result"], found["end"], when, way, given, resolution(ts), settings)
+    ending = apart(_ending, model, guards, found["result"], found["end"], when, way, given, ts, settings)
     end, onward = ending.end, here & ending.onward
-    modes, slides = apart(_beyond, model, ending.first, end, given)
+    paused = here & (ending.result == RESULTS.successful) & ~onward & ~ending.wrong & (end.t < ts[-1])
+    # Not where a leg began, if it ended at once: what jumps with time has jumped only after that.
+    modes, slides = apart(_beyond, model, ending.first, found["end"], given)
+    moves = onward | paused
     # What a leg found whose mode was wrong does not count.
     counts = here & ~ending.wrong
     rows = jax.tree.map(lambda x: x[jnp.maximum(place - past + 1, 0)], {name: found[name] for name in ROWS})
@@ -218,10 +240,10 @@ def _leg(model: Model, guards: Guards, recorded, way: Way, params, ts, settings,
     least = way.least if not settings.by_size else jnp.maximum(way.least, stopped(found["tolerance"][1]))
     again = here & ending.wrong
     further = way._replace(
-        t=jnp.where(onward, end.t, way.t), q=_where(onward, end.q, way.q), v=_where(onward, end.v, way.v),
+        t=jnp.where(moves, end.t, way.t), q=_where(moves, end.q, way.q), v=_where(moves, end.v, way.v),
         modes=jnp.where(onward, modes, way.modes), slides=jnp.where(onward, slides, way.slides),
         free=way.free | again | (onward & (way.count + 1 >= MOST_JUMPS)), count=way.count + onward,
-        continues=again | (onward & (end.t < ts[-1])), rows=put(way.rows, rows),
+        continues=again | (moves & (end.t < ts[-1])), rows=put(way.rows, rows),
         events=_where(counts, with_those_of(found["events"], way.events), way.events), end=_where(counts, end, way.end),
         stats={name: n + found["stats"][name] for name, n in way.stats.items()},
         sizes_so_far=jnp.maximum(way.sizes_so_far, sizes_of(end.q, end.v)), least=least,
@@ -229,6 +251,11 @@ def _leg(model: Model, guards: Guards, recorded, way: Way, params, ts, settings,
         settled=way.settled & found["settled"], result=RESULTS.where(again, RESULTS.successful, ending.result),
     )  # fmt: skip
     return _where(here, further, way)
+
+
+def _next(jump_ts, t, resolution):
+    """The next of the times of jumps."""
+    return jnp.min(jnp.where(jump_ts > t + AT_ONCE * resolution, jump_ts, jnp.inf))
 
 
 class Ending(NamedTuple):
@@ -242,9 +269,9 @@ class Ending(NamedTuple):
     result: Any
 
 
-def _ending(model, guards: Guards, result, end: Snapshot, when, way: Way, given, resolution, settings) -> Ending:
+def _ending(model, guards: Guards, result, end: Snapshot, when, way: Way, given, ts, settings) -> Ending:
     """Find out what ends a leg; `when`: the times at which its guards cross, infinite for those that do not."""
-    count, at_one_time = len(model.guards), AT_ONCE * resolution
+    count, at_one_time, last = len(model.guards), AT_ONCE * resolution(ts), ts[-1]
     # An event of the user's that ends the motion at the time of a jump comes first.
     ends = jnp.where(guards.terminal, when, jnp.inf)[count:]
     when = when[:count]
@@ -254,7 +281,9 @@ def _ending(model, guards: Guards, result, end: Snapshot, when, way: Way, given,
     # A jump at once happens where the leg begins, so that its time has the derivatives of that.
     t, q, v = _where(at_once, (way.t, way.q, way.v), (end.t, end.q, end.v))
     end = Snapshot(t, q, v, end.multipliers)
-    below = ended_well(result) & ~onward & _is_below(end, given, guards, count, settings.rtol)
+    # Where a force jumps in time, the side of which a guard is belongs to the next leg.
+    whole = end.t >= last
+    below = ended_well(result) & ~onward & whole & _is_below(end, given, guards, count, settings.rtol)
     wrong = ~way.free & (below | ~ended_well(result) & (result != RESULTS.max_steps_reached))
     result = RESULTS.where(onward, RESULTS.successful, result)
     first = jnp.argmax(when <= jnp.min(when) + at_one_time)

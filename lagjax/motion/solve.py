@@ -32,7 +32,7 @@ from lagjax.motion.global_error import with_errors, with_errors_inside
 from lagjax.motion.hybrid_trajectory import HybridTrajectory
 from lagjax.motion.legs import solved_in_legs
 from lagjax.motion.one_solve import solved
-from lagjax.motion.over_jumps import solved_over_jumps, warn_of_missed
+from lagjax.motion.over_jumps import solved_over_jumps, warn_of_missed, with_lost
 from lagjax.motion.reported import report_settled
 from lagjax.motion.trajectory import Asked, How, Trajectory, pack
 from lagjax.numerics.evaluations import evaluations_a_step
@@ -193,12 +193,15 @@ def _trajectory(system, q0, v0, params, ts, guards, settings):
     def of_arrays(x, fixed, adjoint, differentiated):
         rest, settings = eqx.combine(fixed, static)
         *motion, jump_ts = eqx.combine(x, rest)
+        too_many = None
         if in_time is not None:
-            jump_ts = with_jumps_in_time(in_time, jump_ts, *motion[:5])
+            jump_ts, too_many = with_jumps_in_time(in_time, jump_ts, *motion[:5])
         unroll_up_to = 0 if differentiated else settings.unroll_up_to
         robust = settings.robust or differentiated and settings.adjoint is None
         settings = replace(settings, jump_ts=jump_ts, unroll_up_to=unroll_up_to, robust=robust)
         fields = solve(*motion, settings, adjoint)
+        if too_many is not None:
+            fields["stats"] = with_lost(fields["stats"], too_many)
         return fields, fields.pop("record", None)
 
     if settings.adjoint is None:

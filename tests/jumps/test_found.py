@@ -108,7 +108,7 @@ def times_of(force, params, last=10.0):
     system, jumps = jumps_of(force, params)
     zero = jnp.asarray(0.0)
     ts = jnp.array([0.0, last])
-    at = lambda params: with_jumps_in_time(jumps, None, system, zero, zero, jnp.asarray(params), ts)
+    at = lambda params: with_jumps_in_time(jumps, None, system, zero, zero, jnp.asarray(params), ts)[0]
     return jax.jit(lambda params: jnp.sort(at(params)))
 
 

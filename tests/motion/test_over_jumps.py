@@ -278,3 +278,21 @@ def test_what_cannot_be_followed_is_said():
     assert traj.stats["num_jumps"] == 1000 and np.isfinite(traj.q[-1])
     with pytest.raises(ValueError, match="jumps must be 'found' or 'ignored'"):
         lj.integrate(ringing, 1.0, 0.0, ts=[0.0, 1.0], jumps=[0.5])
+
+
+@pytest.mark.slow
+def test_a_push_sets_a_block_free():
+    """A block rests until a push in time is stronger than friction; derivatives by the push's ends and strength.
+
+    With d the duration it slides (F - 1) d²/2 during the push and ((F - 1) d)²/2 afterwards. Twin: a weak push.
+    """
+    pushed = lj.System(
+        kinetic, force=lambda t, q, v, p: -jnp.sign(v) + jnp.where((t > p[0]) & (t < p[1]), p[2], 0.0)
+    )
+    end = lambda *p: lj.integrate(pushed, 0.0, 0.0, p, ts=jnp.array([0.0, 1.2, 3.0])).q[-1]
+    right = lambda a, b, strength: (strength - 1) / 2 * (b - a) ** 2 + ((strength - 1) * (b - a)) ** 2 / 2
+    at = (1.0, 1.5, 2.0)
+    np.testing.assert_allclose(end(*at), right(*at), rtol=1e-12)
+    found = jax.jacfwd(end, argnums=(0, 1, 2))(*at)
+    np.testing.assert_allclose(found, jax.grad(right, argnums=(0, 1, 2))(*at), rtol=1e-9)
+    assert abs(end(1.0, 1.5, 0.5)) < 1e-12
