@@ -59,6 +59,8 @@ from lagjax.motion.sight import Sight
 
 # The most looks inside one step: an extremum takes three, a jump fifty.
 LOOKS = 400
+# After a part of a step in which guards had to be looked at closely, the next part is at most so many times as long.
+GROWS = 4
 # The most steps to find a root: Newton's formula takes three, bisection fifty; and what still counts as few.
 ROOT_LOOKS, FEW_LOOKS = 100, 5
 # An extremum is found if the remaining distance changes its height by less than this part; and the most attempts.
@@ -231,7 +233,7 @@ class Watching(diffrax.AbstractStepSizeController):
         nothing, at_end = (jnp.asarray(False),) * len(kinds), t1 >= until
         followed = tuple(f._replace(sign=last_known(f.sign, sign)) for f, sign in zip(watched.followed, signs))
         onward = Move(
-            jnp.asarray(True), until, part._replace(looks=jnp.where(at_end, 0, part.looks + 1)), followed,
+            jnp.asarray(True), _grown(t0, t1, until), part._replace(looks=jnp.where(at_end, 0, part.looks + 1)), followed,
             nothing, nothing, nothing,
         )  # fmt: skip
 
@@ -263,7 +265,8 @@ class Watching(diffrax.AbstractStepSizeController):
         sign = _chosen(root.guard, [v.g for v in left.values]) * root.after
         begin = jnp.where((sign >= 0) & (root.low <= left.t), left.t + self.resolution, root.guess)
         at = jnp.where(again, at_extremum, jnp.where(following.needed, following.at, right.t))
-        at = jnp.where(takes, until, jnp.where(crosses, self._inside(root, begin), at))
+        onward = jnp.where(narrow, until, _grown(left.t, right.t, until))
+        at = jnp.where(takes, onward, jnp.where(crosses, self._inside(root, begin), at))
         none = jnp.asarray(-1)
         later = part._replace(
             looks=jnp.where(takes & (right.t >= until), 0, part.looks + 1),
@@ -373,6 +376,11 @@ def _chosen(i, values):
     for k, x in enumerate(values[1:], 1):
         found = jnp.where(i == k, x, found)
     return found
+
+
+def _grown(t0, t1, until):
+    """The end of the part of a step after one from t0 to t1."""
+    return jnp.minimum(until, t1 + GROWS * (t1 - t0))
 
 
 def _where(condition, a, b):
