@@ -22,7 +22,7 @@ from lagjax.mechanics.linear_in import is_linear
 from lagjax.mechanics.memory import kinds, remembered
 from lagjax.mechanics.reactions import force_at, reacts
 from lagjax.mechanics.refusals import check_system
-from lagjax.mechanics.system import System
+from lagjax.mechanics.system import System, unchecked
 from lagjax.mechanics.traced import Program, Traced, traced
 
 CAUSE = "an argument left out as the function does not need it, or one too many: a constraint of positions takes no v"
@@ -43,14 +43,14 @@ def traced_system(system: System, s: State) -> System:
         role, function = ("g", constraint.g) if kind is Holonomic else ("phi", constraint.phi)
         call = Call(role, function, takes, f" of constraint '{name}'")
         constraints[name] = kind(traced_call(call, given, _check_constraint))
-    found = System(lagrangian, constraints, None, dissipation)
+    found = unchecked(lagrangian, constraints, None, dissipation)
     if system.force is None:
         return found
     # After the constraints, which determine the multipliers.
     given["multipliers"] = zero_multipliers(found, s)
     call = Call("force", system.force, takes_of(system.force))
     force = traced_call(call, given, partial(_check_force, q=s.q))
-    found = System(lagrangian, constraints, force, dissipation)
+    found = unchecked(lagrangian, constraints, force, dissipation)
     if reacts(found):
         remembered(found, (_check_linear, kinds(s)), lambda: _check_linear(found, *s))
     return found

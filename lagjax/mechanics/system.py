@@ -11,6 +11,9 @@ from lagjax.mechanics.pickling import check_functions
 from lagjax.mechanics.printable import by_line
 
 
+FIELDS = "lagrangian", "constraints", "force", "dissipation"
+
+
 class System(eqx.Module):
     """Describe a mechanical system by its Lagrangian.
 
@@ -120,6 +123,14 @@ class System(eqx.Module):
         if self.dissipation is not None:
             parts.append(f"dissipation: {_name(self.dissipation)}")
         return by_line(f"System({'; '.join(parts)})")
+
+
+def unchecked(lagrangian, constraints: dict, force, dissipation) -> System:
+    """A system of these functions, which have been checked: to make a module the usual way takes long."""
+    system = object.__new__(System)
+    for name, x in zip(FIELDS, (lagrangian, constraints, force, dissipation)):
+        object.__setattr__(system, name, x)
+    return system
 
 
 def _name(function):

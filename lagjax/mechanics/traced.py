@@ -118,8 +118,7 @@ class Traced(eqx.Module):
 
 
 def _traced_again(function, takes, like):
-    program = Program(function, takes, like)
-    return Traced(program.arrays, program)
+    return _of_program(Program(function, takes, like))
 
 
 def traced(function: Callable, args: tuple, make: Callable[[], Program]) -> Traced:
@@ -131,11 +130,15 @@ def traced(function: Callable, args: tuple, make: Callable[[], Program]) -> Trac
     if isinstance(function, Traced) and function.program.signature == signature:
         return function
     names = names_outside(function) if signature.is_plain(args) else None
-    program = make() if names is None else _known.made((names, signature), make)
+    new = lambda: _of_program(make())
+    return new() if names is None else _known.made((names, signature), new)
+
+
+def _of_program(program):
     return Traced(program.arrays, program)
 
 
-# The programs of functions that name nothing from outside that could change, and what they name.
+# Functions that name nothing from outside that could change, by what they name.
 _known: Recent = Recent(256)
 
 
