@@ -286,9 +286,7 @@ def test_a_push_sets_a_block_free():
 
     With d the duration it slides (F - 1) d²/2 during the push and ((F - 1) d)²/2 afterwards. Twin: a weak push.
     """
-    pushed = lj.System(
-        kinetic, force=lambda t, q, v, p: -jnp.sign(v) + jnp.where((t > p[0]) & (t < p[1]), p[2], 0.0)
-    )
+    pushed = lj.System(kinetic, force=lambda t, q, v, p: -jnp.sign(v) + jnp.where((t > p[0]) & (t < p[1]), p[2], 0.0))
     end = lambda *p: lj.integrate(pushed, 0.0, 0.0, p, ts=jnp.array([0.0, 1.2, 3.0])).q[-1]
     right = lambda a, b, strength: (strength - 1) / 2 * (b - a) ** 2 + ((strength - 1) * (b - a)) ** 2 / 2
     at = (1.0, 1.5, 2.0)
