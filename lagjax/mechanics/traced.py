@@ -71,7 +71,7 @@ class Program:
         self.arrays = (*(x for x in constants if not _is_small(x)), *jtu.tree_leaves(own))
         small = tuple((str(x.dtype), x.shape, np.asarray(x).tobytes()) for x in self._fixed if x is not None)
         rules = rules_of(of_arrays, closed, own, arrays)
-        self._meaning = Meaning((self.signature.kind, takes, str(self._structure), meaning_of(self.jaxpr), small, rules))
+        self._meaning = Meaning((self.signature.kind, takes, self._structure, meaning_of(self.jaxpr), small, rules))
 
     def __hash__(self):
         return hash(self._meaning)

@@ -163,21 +163,21 @@ def trajectory_of(found: dict, kept: System | Hybrid | UnknownSystem) -> Traject
 
 def same_system(system, known: UnknownSystem, path) -> System | Hybrid:
     """Return the integrated system, which the user passes again; raise if it is another one."""
-    check_same(system, known, path)
-    return system
+    return check_same(system, known, path)
 
 
-def check_same(system, known: UnknownSystem, path) -> None:
-    """Raise if a system is not the one that a file describes."""
+def check_same(system, known: UnknownSystem, path) -> System | Hybrid:
+    """The system, traced at a state of the motion; raises if it is not the one that a file describes."""
     if not isinstance(system, (System, Hybrid)):
         raise TypeError(
             f"system must be a lj.System, not {type(system).__name__}.\nFix: lj.load_trajectory(path, system=system)."
         )
     if known.state is None:
-        return
+        return system
     try:
         state = State(*known.state)
-        here = signature(traced_phases(system, state), state)
+        system = traced_phases(system, state)
+        here = signature(system, state)
     except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RuntimeError) as error:
         raise ValueError(
             f"this system is not the one of {path} ({known.words.splitlines()[0]}): it cannot be evaluated at a state "
@@ -190,6 +190,7 @@ def check_same(system, known: UnknownSystem, path) -> None:
             "Usual cause: a function that has changed since, or another file.\n"
             "Fix: pass the system that was integrated; or leave system out, and read the computed values alone."
         )
+    return system
 
 
 def made(cls: type, fields: dict[str, Any]) -> Any:

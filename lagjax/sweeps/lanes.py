@@ -103,11 +103,13 @@ def _explained(run, axes, patience, robust):
         yield
 
 
-def traced_point(run: Callable, axes: Axes, patience=None, robust=True) -> ClosedJaxpr:
-    """What a sweep computes at one point."""
+def traced_point(run: Callable, axes: Axes, patience=None, robust=True) -> tuple[ClosedJaxpr, PyTree]:
+    """What a sweep computes at one point, and the structure in which it does."""
     shaped = [jax.ShapeDtypeStruct(x.shape[1:], x.dtype) for x in axes.arrays]
     with _explained(run, axes, patience, robust):
-        return jax.make_jaxpr(lambda *values: point_of(run)(dict(zip(axes.names, values))))(*shaped)
+        at = lambda *values: point_of(run)(dict(zip(axes.names, values)))
+        program, shapes = jax.make_jaxpr(at, return_shape=True)(*shaped)
+    return program, jax.tree.structure(shapes)
 
 
 def compiled(

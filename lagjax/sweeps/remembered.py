@@ -39,8 +39,8 @@ def program_for(
         seconds = time.perf_counter() - started
         return program
 
-    program = traced_point(run, axes, patience, robust)
-    meaning = Meaning((meaning_of(program.jaxpr), tuple(map(content_of, program.consts))))
+    program, structure = traced_point(run, axes, patience, robust)
+    meaning = Meaning((meaning_of(program.jaxpr), structure, tuple(map(content_of, program.consts))))
     settings = (tuple(jax.config.values.items()), jax.sharding.get_abstract_mesh())
     key = meaning, axes.names, chunk, tuple(devices), layout, patience, robust, settings
     return PROGRAMS.made(key, make), seconds

@@ -182,3 +182,13 @@ def test_a_long_compile_is_announced(monkeypatch, capsys):
         # The first sweep uses another dtype than the second, so both compile.
         lj.sweep(slow, {"x": xs(3)["x"].astype(np.float64 if progress else np.float32)}, progress=progress)
         assert ("compiling" in capsys.readouterr().err) == words
+
+
+def test_the_structure_of_the_values_counts():
+    """The same numbers in another structure are not taken for the first; twin: the second compiles once, too."""
+    one, two = (lambda point: {"a": 2.0 * point["x"]}), (lambda point: (2.0 * point["x"],))
+    for run, structure in ((one, dict), (two, tuple), (one, dict)):
+        assert isinstance(quiet(run, xs(3)).values, structure)
+    with compiles() as found:
+        quiet(two, xs(3))
+    assert found == []
