@@ -4,10 +4,12 @@ from collections.abc import Callable, Mapping
 from dataclasses import fields
 
 import equinox as eqx
+import jax
 
 from lagjax.mechanics.constraints import Holonomic, Nonholonomic
 from lagjax.mechanics.memory import kinds, same
 from lagjax.mechanics.pickling import check_functions
+from lagjax.mechanics.traced import Traced
 from lagjax.mechanics.printable import by_line
 
 
@@ -105,10 +107,11 @@ class System(eqx.Module):
         return {"the Lagrangian": self.lagrangian, **of_constraints, **others}
 
     def __hash__(self):
-        return hash(kinds(self))
+        return hash(kinds(untraced(self)))
 
     def __eq__(self, other):
-        return isinstance(other, System) and same(self, other)
+        # A trajectory has its system as it was traced.
+        return isinstance(other, System) and same(untraced(self), untraced(other))
 
     def __reduce_ex__(self, protocol):
         check_functions(self.functions())
@@ -123,6 +126,12 @@ class System(eqx.Module):
         if self.dissipation is not None:
             parts.append(f"dissipation: {_name(self.dissipation)}")
         return by_line(f"System({'; '.join(parts)})")
+
+
+def untraced(tree):
+    """A system with the user's functions in place of their jaxprs."""
+    traced = lambda x: isinstance(x, Traced)
+    return jax.tree.map(lambda x: x.function if traced(x) else x, tree, is_leaf=traced)
 
 
 def unchecked(lagrangian, constraints: dict, force, dissipation) -> System:

@@ -85,10 +85,16 @@ class Program:
         constants = [next(given) if x is None else x for x in self._fixed]
         own = list(given)
         if signature_of(args) != self.signature:
-            structure = jtu.tree_structure(eqx.filter(self.function, is_array))
-            return eqx.combine(jtu.tree_unflatten(structure, own), self._rest)(*args)
+            return self.function_with(arrays)(*args)
         results = eval_jaxpr(self.jaxpr, constants, *own, *_arrays(args))
         return jtu.tree_unflatten(self._structure, results)
+
+
+    def function_with(self, arrays) -> Callable:
+        """The user's function; if it is a module, with its own ones among these arrays."""
+        structure = jtu.tree_structure(eqx.filter(self.function, is_array))
+        own = arrays[len(arrays) - structure.num_leaves :]
+        return eqx.combine(jtu.tree_unflatten(structure, own), self._rest)
 
 
 class Traced(eqx.Module):
@@ -107,11 +113,11 @@ class Traced(eqx.Module):
     @property
     def function(self) -> Callable:
         """The user's function."""
-        return self.program.function
+        return self.program.function_with(self.arrays) if self.arrays else self.program.function
 
     @property
     def __name__(self) -> str:
-        return getattr(self.function, "__name__", type(self.function).__name__)
+        return getattr(self.program.function, "__name__", type(self.program.function).__name__)
 
     def __reduce__(self):
         return _traced_again, (self.function, self.takes, self.program.like)

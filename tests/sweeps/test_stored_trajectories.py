@@ -124,9 +124,9 @@ def test_the_system_given_again(store):
         assert one.system is spring or one.system == spring
     other = lj.System(lambda t, q, v, params: 0.5 * v["x"] ** 2 - 0.6 * params["k"] ** params["power"] * q["x"] ** 2)
     with pytest.raises(ValueError, match="this system is not the one of .*store(.|\n)*the Lagrangian: its"):
-        lj.open_sweep(store, system=other)
+        lj.open_sweep(store, system=other, classes=[Pair])
     with pytest.raises(TypeError, match="system must be a lj.System, not int"):
-        lj.open_sweep(store, system=3)
+        lj.open_sweep(store, system=3, classes=[Pair])
     with pytest.raises(ValueError, match="run returns"):
         lj.open_sweep(store, run=swing)
 
@@ -212,4 +212,4 @@ def test_a_system_with_arrays(tmp_path):
         np.testing.assert_allclose(found.values.q, exact, atol=1e-8)
         assert found.values.asked.drift == swept.values.asked.drift
     whole = lane(lj.open_sweep(tmp_path / "store", system=stiff).values, 1)
-    assert whole.system.lagrangian.k == 4.0 and repr(whole) == repr(lane(swept.values, 1))
+    assert whole.system.lagrangian.function.k == 4.0 and repr(whole) == repr(lane(swept.values, 1))
