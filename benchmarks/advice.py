@@ -160,7 +160,8 @@ CASES = {
         {"max_steps": 3000}, "velocity of 't' grows without bound as t -> 5.5948",
         lambda m: ("the event", at_horizon(m)), 0.0),
     "dry friction that holds: jumps that are found": Case(
-        lambda **o: last(belt(False), 0.0, 1.0, np.array([0.0, 10.0]), **o), IGNORED, 'with the velocity.*jumps="found"',
+        lambda **o: last(belt(False), 0.0, 1.0, np.array([0.0, 10.0]), **o), IGNORED,
+        'with the velocity.*jumps="found"',
         lambda m: ('jumps="found"', last(belt(False), 0.0, 1.0, np.array([0.0, 10.0]))), 0.1875 + 9.75 * 0.5),
     "dry friction that holds: a phase that sticks": Case(
         lambda **o: last(belt(False), 0.0, 1.0, np.array([0.0, 10.0]), **o), IGNORED, "with the velocity",

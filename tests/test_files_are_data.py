@@ -220,7 +220,7 @@ def test_a_network_comes_back(good, tmp_path):
         ("mlp", 3),
         ("other", 1),
     ):
-        wrong = node | {"fields": node["fields"] | {field: value}}
+        wrong = node | {"fields": node["fields"] | {field: value}}  # pyright: ignore
         with pytest.raises(ValueError, match=f"field {field}"):
             written_trees.Reader(dict(writer.arrays).pop).up(wrong)
 

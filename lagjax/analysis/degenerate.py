@@ -71,8 +71,9 @@ def _pushes(steady: Steady, x, u):
         if system.force is not None:
             force = force_at(system, t, q, steady.unflatten(u), params, jnp.zeros(steady.m, x.dtype))
             total = total + coordinates.flatten(force)[0]
-        if system.dissipation is not None:
-            total = total - jax.grad(lambda u: system.dissipation(t, q, steady.unflatten(u), params))(u)
+        dissipation = system.dissipation
+        if dissipation is not None:
+            total = total - jax.grad(lambda u: dissipation(t, q, steady.unflatten(u), params))(u)
         return total
 
     return jax.vmap(push)(x, u)
@@ -210,7 +211,8 @@ def _of_rays(bordered, dtype) -> Decision:
         # Gyroscopic forces may hold what the potential does not.
         turns = np.any(np.asarray(_velocity_terms(bordered.steady, bordered.y.astype(dtype), _at(bordered))[0]))
         return decision(UNDECIDED if turns else UNSTABLE)
-    if any(term is None for term in terms) or np.ptp([term.exponent for term in terms]) > 0.5:
+    exponents = [term.exponent for term in terms if term is not None]
+    if len(exponents) < len(terms) or np.ptp(exponents) > 0.5:
         return decision(UNDECIDED)
     smallest = np.min(work[:, -1]) / np.max(work[:, -1])
     return decision(STABLE if smallest > SMALLEST_RESISTANCE else UNDECIDED)

@@ -22,6 +22,7 @@ import numpy as np
 from lagjax.analysis import balance as equations
 from lagjax.analysis.balance import Steady
 from lagjax.mechanics.compiled import compiled
+from lagjax.numerics.rank import null_space
 from lagjax.numerics.roots import with_value
 
 # Amplitudes that are evaluated together, half of them on each side.
@@ -129,6 +130,7 @@ def reduced(bordered: Bordered, amplitudes: np.ndarray):
     steady, y0, rows, columns, right, left = bordered
     dtype, z, count = np.dtype(steady.t.dtype), right.shape[1], len(amplitudes)
     y, beta = y0 + columns * (amplitudes @ right.T), np.zeros((count, z))
+    step = np.zeros((count, y0.size + z))
     with np.errstate(all="ignore"):
         for _ in range(NEWTON_STEPS):
             r, jacobian = (np.asarray(x, float)[:count] for x in values_at(steady, padded(y, dtype)))

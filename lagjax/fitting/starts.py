@@ -114,7 +114,7 @@ class Starts(NamedTuple):
 def starts(
     system, records: Sequence[Record], windows: Windows, params_of: Callable, options
 ) -> tuple[Starts, Callable, State]:
-    """The guessed starts of all windows, the function that turns a vector of coordinates into a pytree, and one start."""
+    """The guessed starts of all windows, the function from a vector of coordinates to a pytree, and one start."""
     guesses = []
     for r, record in enumerate(records):
         here = np.flatnonzero(windows.record == r)

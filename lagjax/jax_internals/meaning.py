@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
+from jax.core import Tracer
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
 from lagjax.jax_internals.programs import equations, evaluate
@@ -120,7 +121,8 @@ def _in_line(jaxpr, constants, args):
     read = lambda x: x.val if isinstance(x, Literal) else values[x]
     for equation in jaxpr.eqns:
         inner = equation.params.get("jaxpr")
-        if equation.primitive.name in ("jit", "pjit") and (inner.consts or any(map(_holds_constants, equations(inner.jaxpr)))):
+        is_call = equation.primitive.name in ("jit", "pjit")
+        if is_call and (inner.consts or any(map(_holds_constants, equations(inner.jaxpr)))):
             results = _in_line(inner.jaxpr, inner.consts, [read(x) for x in equation.invars])
         else:
             results = evaluate(jaxpr, equation, values)
@@ -157,7 +159,7 @@ def _key(x):
 
 def content_of(x):
     """The content of an array or a number; of an array that JAX is tracing, itself."""
-    if isinstance(x, jax.core.Tracer):
+    if isinstance(x, Tracer):
         return Itself(x)
     if jnp.issubdtype(getattr(x, "dtype", float), jax.dtypes.extended):
         x = jax.random.key_data(x)

@@ -106,8 +106,9 @@ class Sliding(eqx.Module):
         found = jnp.zeros_like(u)
         if self.system.force is not None:
             found = found + coordinates.flatten(self.system.force(t, q, v, given))[0]
-        if self.system.dissipation is not None:
-            found = found - jax.grad(lambda u: self.system.dissipation(t, q, unflatten(u), given))(u)
+        dissipation = self.system.dissipation
+        if dissipation is not None:
+            found = found - jax.grad(lambda u: dissipation(t, q, unflatten(u), given))(u)
         return found
 
     def extra(self, t, q, v, given):

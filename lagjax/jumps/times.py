@@ -68,7 +68,8 @@ def _results(roles, t, before=None, after=None) -> Results:
             table = next(values) if timed.rule == "place" else None
             here = slice(start, start + mode.size)
             modes, x, start = [*modes, mode], [*x, number], start + mode.size
-            at.append(mode if before is None else _between(timed.rule, before[here], after[here], table))
+            known = before is not None and after is not None
+            at.append(_between(timed.rule, before[here], after[here], table) if known else mode)
     return Results(*(jnp.concatenate(y).astype(t.dtype) for y in (modes, x, at)))
 
 

@@ -244,7 +244,7 @@ def name_of_function(value: Any) -> dict[str, str] | None:
 def fields_of(cls: type) -> tuple[str, ...] | None:
     """The names of the fields of a named tuple or a dataclass; None for other classes."""
     if issubclass(cls, tuple) and hasattr(cls, "_fields"):
-        return tuple(cls._fields)
+        return tuple(getattr(cls, "_fields"))
     return tuple(field.name for field in dataclasses.fields(cls)) if dataclasses.is_dataclass(cls) else None
 
 

@@ -39,10 +39,13 @@ def traced_system(system: System, s: State) -> System:
     lagrangian, dissipation = energy("L", system.lagrangian), energy("dissipation", system.dissipation)
     constraints = {}
     for name, constraint in system.constraints.items():
-        kind, takes = (Holonomic, OF_POSITION) if isinstance(constraint, Holonomic) else (Nonholonomic, OF_STATE)
-        role, function = ("g", constraint.g) if kind is Holonomic else ("phi", constraint.phi)
-        call = Call(role, function, takes, f" of constraint '{name}'")
-        constraints[name] = kind(traced_call(call, given, _check_constraint))
+        owner = f" of constraint '{name}'"
+        if isinstance(constraint, Holonomic):
+            call = Call("g", constraint.g, OF_POSITION, owner)
+            constraints[name] = Holonomic(traced_call(call, given, _check_constraint))
+        else:
+            call = Call("phi", constraint.phi, OF_STATE, owner)
+            constraints[name] = Nonholonomic(traced_call(call, given, _check_constraint))
     found = unchecked(lagrangian, constraints, None, dissipation)
     if system.force is None:
         return found
@@ -57,7 +60,7 @@ def traced_system(system: System, s: State) -> System:
 
 
 def traced_call(call: Call, given: Mapping[str, Any], check: Callable, usual_cause: str = CAUSE) -> Traced:
-    """A function traced on the `given` arguments; raises in the user's words, also if `check` refuses what it returns."""
+    """A function traced on the `given` arguments; raises in the user's words, or if `check` refuses its result."""
     args = tuple(given[name] for name in call.takes)
 
     def make():

@@ -109,5 +109,5 @@ def _holds(function, zero, rest) -> bool:
 def _made_up(x, random):
     """Numbers for an array of which only the shape is used; whole numbers that are known stay."""
     if not jnp.issubdtype(jnp.result_type(x), jnp.floating):
-        return np.ones(np.shape(x), jnp.result_type(x)) if isinstance(x, jax.core.Tracer) else x
+        return np.ones(np.shape(x), jnp.result_type(x)) if isinstance(x, Tracer) else x
     return random.uniform(0.5, 1.5, np.shape(x)).astype(jnp.result_type(x))

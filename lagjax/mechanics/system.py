@@ -9,9 +9,8 @@ import jax
 from lagjax.mechanics.constraints import Holonomic, Nonholonomic
 from lagjax.mechanics.memory import kinds, same
 from lagjax.mechanics.pickling import check_functions
-from lagjax.mechanics.traced import Traced
 from lagjax.mechanics.printable import by_line
-
+from lagjax.mechanics.traced import Traced
 
 FIELDS = "lagrangian", "constraints", "force", "dissipation"
 

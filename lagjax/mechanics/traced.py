@@ -54,17 +54,17 @@ class Program:
         self.function, self.takes, self.signature = function, takes, signature_of(args)
         self.like = _shaped(args)
         own, self._rest = eqx.partition(function, is_array)
-        returned = []
+        returned, structures = [], []
 
         def of_arrays(own, arrays):
             found = eqx.combine(own, self._rest)(*_with_arrays(args, arrays))
             returned.append(_shaped(found))
-            self._structure = jtu.tree_structure(found)
+            structures.append(jtu.tree_structure(found))
             return [x for x in jtu.tree_leaves(found) if is_array(x) or isinstance(x, NUMBERS)]
 
         arrays = _arrays(args)
         closed = with_own_constants(jax.make_jaxpr(of_arrays)(own, arrays))
-        (self.value,), self.jaxpr = returned[:1], closed.jaxpr
+        self.value, self._structure, self.jaxpr = returned[0], structures[0], closed.jaxpr
         # A user may write to a NumPy array afterwards.
         constants = [np.array(x) if isinstance(x, np.ndarray) else x for x in closed.consts]
         self._fixed = [x if _is_small(x) else None for x in constants]

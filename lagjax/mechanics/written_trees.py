@@ -263,7 +263,7 @@ class Reader:
 
 def _defaults(cls) -> dict[str, Any]:
     if issubclass(cls, tuple):
-        return dict(cls._field_defaults)
+        return dict(getattr(cls, "_field_defaults"))
     fields, missing = dataclasses.fields(cls), dataclasses.MISSING
     found = {x.name: x.default for x in fields if x.default is not missing}
     return found | {x.name: x.default_factory() for x in fields if x.default_factory is not missing}

@@ -151,8 +151,8 @@ class Crossings(eqx.Module):
 class Kind(NamedTuple):
     """The static properties of a guard: see `Crossing`. `long`: it takes long to compile.
 
-    `holds`: it is assumed to be above zero at the start; if it is not, it counts as crossed there. `may_rest`: it may be
-    zero for a while, which is not in doubt.
+    `holds`: it is assumed to be above zero at the start; if it is not, it counts as crossed there. `may_rest`: it may
+    be zero for a while, which is not in doubt.
     """
 
     name: str

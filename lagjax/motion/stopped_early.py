@@ -144,7 +144,7 @@ def _of_controller(trajectory, settings):
     """The fix for steps of a user's controller: whether a shorter one can be taken from where it failed."""
     if settings.dt0 is None or not isinstance(settings.controller, diffrax.ConstantStepSize):
         return "leave stepsize_controller out: failed steps are then repeated, shorter"
-    attempt, (t, y), direction = _attempts(trajectory, settings)
+    attempt, _, (t, y), direction = _attempts(trajectory, settings)
     for part in (2, 4, 8, 16, 32):
         h = float(settings.dt0) / part
         after, _ = attempt(t, t + direction * h, y)
@@ -160,7 +160,7 @@ def _rounded_up(count):
 
 
 def _attempts(trajectory, settings):
-    """`attempt(t0, t1, y)` -> (state, error), where the motion ended, and the direction of time."""
+    """`attempt(t0, t1, y)` -> (state, error), its order, where the motion ended, and the direction of time."""
     system, params, end = trajectory.system, trajectory.params, trajectory.end
     state = (end.t, end.q, end.v, params)
     method = method_alone(settings, method_of(settings, system, *state))
@@ -172,13 +172,13 @@ def _attempts(trajectory, settings):
     def attempt(t0, t1, y):
         return _attempt(method, terms, jnp.asarray(t0), jnp.asarray(t1), y, params, tolerance)
 
-    attempt.order = float(method.error_order(terms))
-    return attempt, (float(end.t), (end.q, end.v)), np.sign(float(trajectory.t[-1] - end.t))
+    order = float(method.error_order(terms))
+    return attempt, order, (float(end.t), (end.q, end.v)), np.sign(float(trajectory.t[-1] - end.t))
 
 
 def last_steps(trajectory, settings) -> Steps:
     """Continue the motion from where it ended, and return each step."""
-    attempt, (t, y), direction = _attempts(trajectory, settings)
+    attempt, order, (t, y), direction = _attempts(trajectory, settings)
     last = float(trajectory.t[-1])
     size = abs(t - float(trajectory.t[0])) / max(1, int(trajectory.stats["num_accepted_steps"]))
     size = size or 1e-3 * abs(last - t)
@@ -191,7 +191,7 @@ def last_steps(trajectory, settings) -> Steps:
         taken_steps.append((t, y, direction * size, error < 1))
         if error < 1:
             t, y = (last if size == abs(last - t) else t + direction * size), after
-        factor = SAFETY * error ** (-1 / attempt.order) if error > 0 else LONGEST
+        factor = SAFETY * error ** (-1 / order) if error > 0 else LONGEST
         size *= np.clip(factor if np.isfinite(error) else 0.0, *((1.0, LONGEST) if error < 1 else (SHORTEST, SAFETY)))
         if size < 4 * np.finfo(float).eps * max(abs(t), 1e-300):
             break

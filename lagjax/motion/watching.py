@@ -233,8 +233,8 @@ class Watching(diffrax.AbstractStepSizeController):
         nothing, at_end = (jnp.asarray(False),) * len(kinds), t1 >= until
         followed = tuple(f._replace(sign=last_known(f.sign, sign)) for f, sign in zip(watched.followed, signs))
         onward = Move(
-            jnp.asarray(True), _grown(t0, t1, until), part._replace(looks=jnp.where(at_end, 0, part.looks + 1)), followed,
-            nothing, nothing, nothing,
+            jnp.asarray(True), _grown(t0, t1, until), part._replace(looks=jnp.where(at_end, 0, part.looks + 1)),
+            followed, nothing, nothing, nothing,
         )  # fmt: skip
 
         def closer():

@@ -57,7 +57,7 @@ def test_the_bead():
 
 
 def test_verdicts_of_the_bead():
-    """Stable or divergent at the bottom and the top, below and above the critical speed; at it V = θ⁴/2 + ... decides."""
+    """Stable or divergent at the bottom and the top, below and above the critical speed; at it θ⁴ decides."""
     says = lambda at, omega: lj.normal_modes(small.bead, 0.0, at, 0.0, BEAD | {"omega": omega}).verdict
     assert [says(0.0, 2.0), says(0.0, 3.0), says(np.pi, 2.0)] == ["stable", "divergence", "divergence"]
     exactly = BEAD | {"a": 1.0, "g": 4.0, "omega": 2.0}

@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 
 import lagjax as lj
-from lagjax.mechanics import kept, memory, traced
+from lagjax.mechanics import coordinates, kept, memory, traced
 from lagjax.mechanics.first_call import traced_system
 from tests.counting import compiles
 
@@ -32,6 +32,16 @@ CONTEXT: contextvars.ContextVar = contextvars.ContextVar("gravity", default=0.0)
 def strength():
     """A function that L calls."""
     return G
+
+
+def weight():
+    """A function that is defined anew."""
+    return G
+
+
+def helper(q):
+    """Another one."""
+    return q
 
 
 class Planet:
@@ -58,11 +68,15 @@ class Planet:
 
 @dataclasses.dataclass
 class Inner:
+    """An inner part."""
+
     g: float
 
 
 @dataclasses.dataclass
 class Outer:
+    """An outer part."""
+
     inner: Inner
 
 
@@ -82,21 +96,25 @@ def falling(read):
 
 # Each returns L and the function that sets the number which it reads.
 def in_a_global():
+    """In a global."""
     return lambda t, q, v, p: 0.5 * v**2 - G * q, lambda g: globals().__setitem__("G", g)
 
 
 def in_a_global_of_a_function():
+    """In a global of a function."""
     return lambda t, q, v, p: 0.5 * v**2 - strength() * q, lambda g: globals().__setitem__("G", g)
 
 
 def in_a_function_defined_anew():
+    """In a function defined anew."""
     return (
-        lambda t, q, v, p: 0.5 * v**2 - weight() * q,  # noqa: F821
+        lambda t, q, v, p: 0.5 * v**2 - weight() * q,
         lambda g: globals().__setitem__("weight", lambda: g),
     )
 
 
 def in_a_cell():
+    """In a cell."""
     number = 0.0
 
     def put(g):
@@ -107,75 +125,89 @@ def in_a_cell():
 
 
 def in_a_list_of_a_dictionary():
+    """In a list of a dictionary."""
     held = {"nested": [0.0]}
     return falling(lambda: held["nested"][0]), lambda g: held["nested"].__setitem__(0, g)
 
 
 def in_a_new_dictionary():
+    """In a new dictionary."""
     held = types.SimpleNamespace(table={})
     return falling(lambda: held.table["g"]), lambda g: setattr(held, "table", {"g": g})
 
 
 def in_a_new_object():
+    """In a new object."""
     held = types.SimpleNamespace()
     return falling(lambda: held.inner.g), lambda g: setattr(held, "inner", types.SimpleNamespace(g=g))
 
 
 def in_a_table_of_a_method():
+    """In a table of a method."""
     planet = Planet()
     return planet.by_table, lambda g: planet.table.__setitem__("g", g)
 
 
 def in_a_property():
+    """In a property."""
     planet = Planet()
     return planet.by_property, lambda g: setattr(planet.inner, "g", g)
 
 
 def in_an_object_that_is_called():
+    """In an object that is called."""
     planet = Planet()
     return planet, lambda g: setattr(planet, "inner", types.SimpleNamespace(g=g))
 
 
 def in_a_class():
+    """In a class."""
     cls = type("OfOne", (Planet,), {})
     return falling(lambda: cls.factor), lambda g: setattr(cls, "factor", g)
 
 
 def in_dataclasses():
+    """In dataclasses."""
     outer = Outer(Inner(0.0))
     return falling(lambda: outer.inner.g), lambda g: setattr(outer.inner, "g", g)
 
 
 def in_one_entry_of_a_large_array():
+    """In one entry of a large array."""
     table = np.zeros(20_000)
     return falling(lambda: table[12_345]), lambda g: table.__setitem__(12_345, g)
 
 
 def in_a_large_array_that_is_summed():
+    """In a large array that is summed."""
     table = np.zeros(5_000)
     return falling(lambda: jnp.sum(table)), lambda g: table.__setitem__(77, g)
 
 
 def in_a_long_list():
+    """In a long list."""
     table = [0.0] * 100
     return falling(lambda: table[99]), lambda g: table.__setitem__(99, g)
 
 
 def in_a_large_dictionary():
+    """In a large dictionary."""
     table = dict.fromkeys(range(100), 0.0)
     return falling(lambda: table[99]), lambda g: table.__setitem__(99, g)
 
 
 def in_a_module():
+    """In a module."""
     module = types.ModuleType("constants_of_the_user")
     return falling(lambda: module.g), lambda g: setattr(module, "g", g)
 
 
 def in_an_import():
+    """In an import."""
     sys.modules["lagjax_test_constants"] = module = types.ModuleType("lagjax_test_constants")
 
     def lagrangian(t, q, v, p):
-        import lagjax_test_constants
+        import lagjax_test_constants  # pyright: ignore
 
         return 0.5 * v**2 - lagjax_test_constants.g * q
 
@@ -183,26 +215,31 @@ def in_an_import():
 
 
 def in_a_deque():
+    """In a deque."""
     held = collections.deque([0.0], maxlen=1)
     return falling(lambda: held[0]), held.append
 
 
 def in_a_context_variable():
+    """In a context variable."""
     # Threads have contexts of their own, and see the default.
     name = CONTEXT
     return falling(lambda: name.get()), name.set
 
 
 def in_the_environment():
+    """In the environment."""
     return falling(lambda: float(os.environ["LAGJAX_TEST_G"])), lambda g: os.environ.update(LAGJAX_TEST_G=str(g))
 
 
 def in_a_default():
+    """In a default."""
     held = np.zeros(1)
     return lambda t, q, v, p, k=held: 0.5 * v**2 - k[0] * q, lambda g: held.__setitem__(0, g)
 
 
 def in_defaults_that_are_replaced():
+    """In defaults that are replaced."""
     def lagrangian(t, q, v, p, k=0.0, *, more=0.0):
         return 0.5 * v**2 - (k + more) * q
 
@@ -213,18 +250,21 @@ def in_defaults_that_are_replaced():
 
 
 def in_a_partial():
+    """In a partial."""
     held = {"g": 0.0}
     return functools.partial(lambda k, t, q, v, p: 0.5 * v**2 - k["g"] * q, held), lambda g: held.update(g=g)
 
 
 def in_an_attribute_of_the_function():
+    """In an attribute of the function."""
     def lagrangian(t, q, v, p):
-        return 0.5 * v**2 - lagrangian.g * q
+        return 0.5 * v**2 - getattr(lagrangian, "g") * q
 
     return lagrangian, lambda g: setattr(lagrangian, "g", g)
 
 
 def in_code_that_is_replaced():
+    """In code that is replaced."""
     def lagrangian(t, q, v, p):
         return 0.5 * v**2
 
@@ -235,10 +275,12 @@ def in_code_that_is_replaced():
 
 
 def in_a_static_field():
+    """In a static field."""
     return falling(lambda: BOX.inner.g), lambda g: setattr(BOX, "inner", Module(g))
 
 
 def in_a_rule_of_differentiation():
+    """In a rule of differentiation."""
     held = [0.0]
 
     @jax.custom_jvp
@@ -250,11 +292,13 @@ def in_a_rule_of_differentiation():
 
 
 def in_an_array_of_jax():
+    """In an array of jax."""
     held = [jnp.zeros(300)]
     return falling(lambda: held[0][250]), lambda g: held.__setitem__(0, held[0].at[250].set(g))
 
 
 def inside_a_jitted_helper():
+    """Inside a jitted helper."""
     held = np.zeros(300)
     return (
         lambda t, q, v, p: 0.5 * v**2 - jax.jit(lambda q: jnp.sum(held * q))(q),
@@ -340,12 +384,10 @@ def test_equal_functions_share_a_program():
     with compiles() as found:
         assert [weight_at(system) for system in ones] == [8.87] * 3
     assert found == []
-    s = lj.mechanics.coordinates.state(0.0, 1.0, 0.0, None)
-    programs = {
-        traced_system(lj.System(lambda t, q, v, p, k=k: 0.5 * v**2 + jnp.sum(k) * q), s).lagrangian.program
-        for k in (1.0, 2.0, 0.0, -0.0, np.ones(2), np.ones((2, 1)), np.ones(2, np.float32), np.ones(2, int), np.zeros(2),
-                  -np.zeros(2))  # fmt: skip
-    }
+    s = coordinates.state(0.0, 1.0, 0.0, None)
+    arrays = np.ones(2), np.ones((2, 1)), np.ones(2, np.float32), np.ones(2, int), np.zeros(2), -np.zeros(2)
+    systems = [lj.System(lambda t, q, v, p, k=k: 0.5 * v**2 + jnp.sum(k) * q) for k in (1.0, 2.0, 0.0, -0.0, *arrays)]
+    programs = {getattr(traced_system(system, s).lagrangian, "program") for system in systems}
     assert len(programs) == 10
 
 
@@ -479,10 +521,12 @@ SPRING = types.SimpleNamespace(k=1.0)
 
 
 def by_default(k):
+    """A spring's L with its stiffness by default."""
     return lambda t, q, v, p, k=k: 0.5 * v**2 - 0.5 * k * q**2
 
 
 def by_keyword(k):
+    """A spring's L with its stiffness by keyword."""
     def lagrangian(t, q, v, p, *, k=k):
         return 0.5 * v**2 - 0.5 * k * q**2
 
@@ -490,13 +534,15 @@ def by_keyword(k):
 
 
 def by_attribute(k):
+    """A spring's L with its stiffness by attribute."""
     SPRING.k = k
     return lambda t, q, v, p: 0.5 * v**2 - 0.5 * SPRING.k * q**2
 
 
 def by_helper(k):
+    """A spring's L with its stiffness by helper."""
     globals()["helper"] = lambda q: 0.5 * k * q**2
-    return lambda t, q, v, p: 0.5 * v**2 - helper(q)  # noqa: F821
+    return lambda t, q, v, p: 0.5 * v**2 - helper(q)
 
 
 @pytest.mark.parametrize("lagrangian", [by_default, by_keyword, by_attribute, by_helper])

@@ -84,6 +84,7 @@ def test_balls_that_touch(q, v, right, count):
     """A gap at round-off, of either sign, is touched: an impact happens only where it closes."""
     traj = lj.integrate(cradle, np.array(q), np.array(v), ts=[0.0, 0.5])
     np.testing.assert_allclose(traj.v[-1], right, atol=1e-14)
+    assert isinstance(traj, lj.HybridTrajectory)
     assert int(traj.switches.count) == count and not bool(traj.switches.uncertain)
 
 

@@ -30,7 +30,7 @@ def traces(call):
 
 
 def test_a_second_call_traces_nothing():
-    """Numbers of any type trace at most L, if that reads a global; after the global has changed, all is traced again."""
+    """Numbers of any type trace at most L, if it reads a global; after the global has changed, all is traced again."""
     fall = lambda q0, m, ts: lj.integrate(drop, q0, 0.0, {"m": m}, ts=ts).q[-1]
     assert fall(1.0, 2.0, [0.0, 0.5, 1.0]) == pytest.approx(1.0 - 9.81 / 2, abs=1e-8)
     for q0, m, ts in (

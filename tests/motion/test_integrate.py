@@ -239,7 +239,7 @@ def test_float32_says_what_it_is():
 
 
 def test_one_compilation_for_all_tolerances_states_and_parameters():
-    """New numbers do not compile again: an L that reads the outside is traced once in each call, and nothing else is."""
+    """New numbers do not compile again: an L that reads the outside is traced once in each call, nothing else."""
     traced, traces, compiled = [], [], []
 
     def counted(t, q, v, params):
