@@ -11,6 +11,7 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 
 from lagjax.jax_internals.names import ADDITIVE, BILINEAR, LINEAR_IN_FIRST
 from lagjax.jax_internals.programs import ClosedJaxpr, Literal, stands_for
