@@ -42,6 +42,7 @@ from lagjax.motion.one_solve import solved
 from lagjax.motion.recorded import nothing, with_those_of
 from lagjax.motion.results import RESULTS, ended_well
 from lagjax.motion.sight import uneven
+from lagjax.motion.tolerances import DIED_OUT
 from lagjax.motion.trajectory import Snapshot
 
 # The most jumps that are followed in a motion.
@@ -200,6 +201,8 @@ def _first(system, q0, v0, params, ts, guards, modes, settings) -> Way:
     multipliers = {name: nan(shape) for name, shape in constraints.shapes(system, ts[0], q0, v0, params).items()}
     rows = {"q": of_rows(q0), "v": of_rows(v0), "multipliers": of_rows(multipliers)}
     sizes, zero = sizes_of(q0, v0), jnp.asarray(0)
+    # A motion that rests at zero, held by friction, has round-off alone to tell its size.
+    sizes = jnp.where(jnp.any(sizes > 0), sizes, 1 / DIED_OUT)
     names = () if guards is None else [kind.name for kind in guards.kinds]
     return Way(
         t=ts[0], q=q0, v=v0, modes=modes, slides=jnp.zeros(modes.shape, bool), free=jnp.asarray(False), count=zero,
