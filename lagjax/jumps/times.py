@@ -68,8 +68,10 @@ def _results(roles, t, before=None, after=None) -> Results:
             table = next(values) if timed.rule == "place" else None
             here = slice(start, start + mode.size)
             modes, x, start = [*modes, mode], [*x, number], start + mode.size
-            known = before is not None and after is not None
-            at.append(_between(timed.rule, before[here], after[here], table) if known else mode)
+            if before is None or after is None:
+                at.append(mode)
+            else:
+                at.append(_between(timed.rule, before[here], after[here], table))
     return Results(*(jnp.concatenate(y).astype(t.dtype) for y in (modes, x, at)))
 
 

@@ -98,7 +98,9 @@ def know_kinds(system: System, s: State):
 
 
 def _known_kinds(system) -> dict:
-    return remembered(system, _known_kinds, dict)
+    # A system that a function makes again has new functions of the same code.
+    functions = [f for f in system.functions().values() if f is not None]
+    return remembered((), (_known_kinds, *(getattr(f, "__code__", type(f)) for f in functions)), dict)
 
 
 def _whole_numbers(params):
