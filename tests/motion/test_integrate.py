@@ -244,7 +244,7 @@ def test_one_compilation_for_all_tolerances_states_and_parameters():
 
     def counted(t, q, v, params):
         traced.append(1)
-        return pendulum_lagrangian(t, q, v, params)
+        return 0.8125 * pendulum_lagrangian(t, q, v, params)  # No other test's: programs belong to what L computes.
 
     system = lj.System(counted)
     for i, tolerance in enumerate((1e-6, 1e-7, 1e-8)):
