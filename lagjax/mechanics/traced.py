@@ -89,7 +89,6 @@ class Program:
         results = eval_jaxpr(self.jaxpr, constants, *own, *_arrays(args))
         return jtu.tree_unflatten(self._structure, results)
 
-
     def function_with(self, arrays) -> Callable:
         """The user's function; if it is a module, with its own ones among these arrays."""
         structure = jtu.tree_structure(eqx.filter(self.function, is_array))

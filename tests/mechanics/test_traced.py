@@ -240,6 +240,7 @@ def in_a_default():
 
 def in_defaults_that_are_replaced():
     """In defaults that are replaced."""
+
     def lagrangian(t, q, v, p, k=0.0, *, more=0.0):
         return 0.5 * v**2 - (k + more) * q
 
@@ -257,6 +258,7 @@ def in_a_partial():
 
 def in_an_attribute_of_the_function():
     """In an attribute of the function."""
+
     def lagrangian(t, q, v, p):
         return 0.5 * v**2 - getattr(lagrangian, "g") * q
 
@@ -265,6 +267,7 @@ def in_an_attribute_of_the_function():
 
 def in_code_that_is_replaced():
     """In code that is replaced."""
+
     def lagrangian(t, q, v, p):
         return 0.5 * v**2
 
@@ -527,6 +530,7 @@ def by_default(k):
 
 def by_keyword(k):
     """A spring's L with its stiffness by keyword."""
+
     def lagrangian(t, q, v, p, *, k=k):
         return 0.5 * v**2 - 0.5 * k * q**2
 

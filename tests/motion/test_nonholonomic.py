@@ -739,6 +739,8 @@ def test_an_error_in_the_equations_would_show(flaw, monkeypatch):
     q, v, force = driven_exact(DRIVEN, ts)
     # A method that is not ours: the written-out equations would use their own elimination, not this one.
     method = diffrax.Dopri8(scan_kind="lax")
-    traj = lj.integrate(system, q[:, 0], v[:, 0], DRIVEN | {"of": str(flaw)}, ts=ts, rtol=TIGHT, atol=TIGHT, method=method)
+    traj = lj.integrate(
+        system, q[:, 0], v[:, 0], DRIVEN | {"of": str(flaw)}, ts=ts, rtol=TIGHT, atol=TIGHT, method=method
+    )
     off = departure([traj.q.T, traj.v.T, traj.multipliers["drive"]], [q, v, force])
     assert off < 1e-9 if flaw is None else off > 1.0
