@@ -130,7 +130,7 @@ def forces(s: Steady, t, x, u) -> Float[Array, "m n"]:
 def constraint_residuals(s: Steady, t, x, u):
     """The residuals `g` or `phi` of all constraints, stacked in the order of their names."""
     q, v = s.unflatten(x), s.unflatten(u)
-    residuals = [constraints.evaluate(c, t, q, v, s.params) for c in s.system.constraints.values()]
+    residuals = [c.residual(t, q, v, s.params) for c in s.system.constraints.values()]
     return (
         jnp.concatenate([jnp.atleast_1d(r).astype(x.dtype) for r in residuals]) if residuals else jnp.zeros(0, x.dtype)
     )

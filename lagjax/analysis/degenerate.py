@@ -37,7 +37,6 @@ from lagjax.analysis.reduced_force import (
 )  # fmt: skip
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.compiled import compiled
-from lagjax.mechanics.constraints import Holonomic
 from lagjax.mechanics.reactions import force_at
 from lagjax.numerics.rank import null_space
 
@@ -87,7 +86,7 @@ def decide(steady: Steady, y, size: float, roots, unseen: np.ndarray) -> Decisio
     """
     system, conservative = steady.system, steady.system.force is None and steady.system.dissipation is None
     dtype, n, k = np.dtype(steady.t.dtype), steady.n, steady.symmetries.count
-    if not all(isinstance(c, Holonomic) for c in system.constraints.values()):
+    if not system.is_holonomic:
         return Decision(UNDECIDED)
     bordered = bordered_at(steady, y, size, np.flatnonzero(unseen))
     z = zeros = bordered.right.shape[1]

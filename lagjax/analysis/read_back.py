@@ -19,7 +19,6 @@ from lagjax.analysis import expressions, typeset
 from lagjax.analysis.expressions import Formula, function, number, symbol, tidy
 from lagjax.jax_internals.programs import Literal
 from lagjax.mechanics import constraints, coordinates
-from lagjax.mechanics.constraints import evaluate
 from lagjax.mechanics.diagnosis import equation_names
 from lagjax.mechanics.first_call import traced_system
 from lagjax.mechanics.in_numbers import Numbers, in_numbers
@@ -112,7 +111,7 @@ def _parts(system, t, q, v, params):
     rows = constraints.jacobian(system, t, x, u, params, unflatten)
     if linear.response is not None:
         rows = rows + linear.response.T
-    held = [jnp.ravel(evaluate(c, t, q, v, params)) for c in system.constraints.values()]
+    held = [jnp.ravel(c.residual(t, q, v, params)) for c in system.constraints.values()]
     return [*_numbers(linear.mass), *_numbers(linear.forcing), *_numbers(rows), *(y for x in held for y in _numbers(x))]
 
 

@@ -15,7 +15,6 @@ from lagjax.analysis.precision import precision_of
 from lagjax.analysis.rates import Affine, rates
 from lagjax.analysis.states import draws
 from lagjax.mechanics import constraints, coordinates
-from lagjax.mechanics.constraints import Holonomic
 from lagjax.mechanics.diagnosis import describe
 from lagjax.mechanics.first_call import traced_system
 from lagjax.mechanics.generators import as_generator
@@ -142,7 +141,7 @@ def is_symmetry(system, generator, q, v, params=None, *, t=0.0) -> SymmetryTest:
         for name, value in constraints.split(system, xp.max(xp.abs(y[:, :, 0]), axis=0), *s).items()
     }
     displacement, invariance = by_name(found.displacement), by_name(found.invariance)
-    of_velocities = {name for name, c in system.constraints.items() if not isinstance(c, Holonomic)}
+    of_velocities = {name for name, c in system.constraints.items() if not c.of_positions}
     residual = xp.max(xp.stack([largest(found.charge), *displacement.values()]))
     _, unflatten = coordinates.flatten(s.q)
     at = s._replace(t=found.states.t[0], q=unflatten(found.states.x[0]), v=unflatten(found.states.u[0]))

@@ -21,7 +21,6 @@ from jaxtyping import Array, Bool, Float
 
 from lagjax.analysis.flow import Flow
 from lagjax.mechanics import coordinates
-from lagjax.mechanics.constraints import Holonomic
 from lagjax.mechanics.structure import conserves_jacobi_integral, is_autonomous, unseen_coordinates
 
 # A direction shorter than this, relative to its possible length, is round-off.
@@ -56,7 +55,7 @@ def reasons_of(system, t, q, v, params) -> Reasons:
     state = t, q, v, params
     autonomous = is_autonomous(system, *state)
     potential = system.force is None and system.dissipation is None
-    momenta = potential and all(isinstance(c, Holonomic) for c in system.constraints.values())
+    momenta = potential and system.is_holonomic
     return Reasons(
         autonomous,
         autonomous and conserves_jacobi_integral(system, *state),

@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Float, PyTree
 from lagjax.jax_internals.opened import COMPARISONS, Known, Opening, Slot, Table, Timed, has_jumps
 from lagjax.jax_internals.programs import outputs_of, run
 from lagjax.mechanics.arguments import OF_STATE, takes_of
-from lagjax.mechanics.constraints import Holonomic, Nonholonomic, zero_multipliers
+from lagjax.mechanics.constraints import zero_multipliers
 from lagjax.mechanics.coordinates import State
 from lagjax.mechanics.system import System
 
@@ -137,15 +137,9 @@ class Jumps:
 
     def smooth(self, system: System) -> System:
         """The system as a function of `Given` in place of its parameters."""
-        of = lambda role: None if getattr(system, role) is None else self._smooth(system, role)
-        rewrite = lambda c: Holonomic(OfParams(c.g)) if isinstance(c, Holonomic) else Nonholonomic(OfParams(c.phi))
-        return System(
-            of("lagrangian"), {name: rewrite(c) for name, c in system.constraints.items()}, of("force"),
-            of("dissipation"),
-        )  # fmt: skip
+        return system.map(self._smooth)
 
-    def _smooth(self, system, role):
-        function = getattr(system, role)
+    def _smooth(self, function, role):
         if role not in self.traced:
             return OfParams(function)
         traced = self.traced[role]

@@ -22,6 +22,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from lagjax.mechanics import coordinates
+from lagjax.mechanics.arguments import OF_POSITION, OF_STATE
 from lagjax.mechanics.memory import kinds, remembered, shape_of
 
 
@@ -40,9 +41,29 @@ class Holonomic(eqx.Module):
 
     g: Callable
     kind: ClassVar[str] = "holonomic"
+    role: ClassVar[str] = "g"
+    takes: ClassVar[tuple[str, ...]] = OF_POSITION
+    of_positions: ClassVar[bool] = True
 
     def __check_init__(self):
         _check_callable(self.g, "Holonomic", "g(t, q, params)")
+
+    @property
+    def function(self) -> Callable:
+        return self.g
+
+    def residual(self, t, q, v, params):
+        """`g` at a state, as the user wrote it."""
+        return self.g(t, q, params)
+
+    def velocity_residual(self, t, x, u, params, unflatten):
+        """`dg/dt`, in vector form."""
+        return jax.jvp(lambda t, x: self.g(t, unflatten(x), params), (t, x), (jnp.ones_like(t), u))[1]
+
+    def feedback(self, t, x, u, params, unflatten, rate):
+        """The term in gamma with which g'' + 2 rate g' + rate² g = 0."""
+        position = jnp.atleast_1d(self.g(t, unflatten(x), params))
+        return -2 * rate * jnp.atleast_1d(self.velocity_residual(t, x, u, params, unflatten)) - rate**2 * position
 
     def __repr__(self):
         return f"Holonomic({getattr(self.g, '__name__', 'g')})"
@@ -62,9 +83,28 @@ class Nonholonomic(eqx.Module):
 
     phi: Callable
     kind: ClassVar[str] = "velocity"
+    role: ClassVar[str] = "phi"
+    takes: ClassVar[tuple[str, ...]] = OF_STATE
+    of_positions: ClassVar[bool] = False
 
     def __check_init__(self):
         _check_callable(self.phi, "Nonholonomic", "phi(t, q, v, params)")
+
+    @property
+    def function(self) -> Callable:
+        return self.phi
+
+    def residual(self, t, q, v, params):
+        """`phi` at a state, as the user wrote it."""
+        return self.phi(t, q, v, params)
+
+    def velocity_residual(self, t, x, u, params, unflatten):
+        """`phi`, in vector form."""
+        return self.phi(t, unflatten(x), unflatten(u), params)
+
+    def feedback(self, t, x, u, params, unflatten, rate):
+        """The term in gamma with which phi' + rate phi = 0."""
+        return -rate * jnp.atleast_1d(self.velocity_residual(t, x, u, params, unflatten))
 
     def __repr__(self):
         return f"Nonholonomic({getattr(self.phi, '__name__', 'phi')})"
@@ -90,7 +130,7 @@ def shapes(system, t, q, v, params) -> dict[str, tuple[int, ...]]:
     if not system.constraints:
         return {}
     find = lambda: {
-        name: jnp.shape(shape_of(evaluate, constraint, t, q, v, params))
+        name: jnp.shape(shape_of(constraint.residual, t, q, v, params))
         for name, constraint in system.constraints.items()
     }
     return remembered(system, (shapes, kinds((t, q, v, params))), find)
@@ -118,12 +158,12 @@ def zero_multipliers(system, s: coordinates.State) -> dict[str, np.ndarray]:
 
 def position_residual(system, t, x, params, unflatten) -> Float[Array, " mh"]:
     """`g(t, q)` of the holonomic constraints, stacked."""
-    return _stack([c.g(t, unflatten(x), params) for c in _holonomic(system)], x.dtype)
+    return _stack([c.g(t, unflatten(x), params) for c in _all(system) if c.of_positions], x.dtype)
 
 
 def velocity_residual(system, t, x, u, params, unflatten) -> Float[Array, " m"]:
     """`dg/dt` or `phi(t, q, v)` of each constraint, stacked in the order of their names."""
-    return _stack([_velocity_level(c, t, x, u, params, unflatten) for c in _all(system)], x.dtype)
+    return _stack([c.velocity_residual(t, x, u, params, unflatten) for c in _all(system)], x.dtype)
 
 
 def jacobian(system, t, x, u, params, unflatten) -> Float[Array, "m n"]:
@@ -139,50 +179,25 @@ def acceleration_rows(system, t, x, u, params, unflatten) -> Rows:
     return Rows(jacobian(system, t, x, u, params, unflatten), -rate)
 
 
-def evaluate(constraint, t, q, v, params):
-    """The residual of one constraint as the user wrote it: `g` or `phi`."""
-    if isinstance(constraint, Holonomic):
-        return constraint.g(t, q, params)
-    return constraint.phi(t, q, v, params)
-
-
 def baumgarte_feedback(system, t, x, u, params, unflatten, rate):
     """Baumgarte's term in gamma, with which g'' + 2 rate g' + rate² g = 0, or phi' + rate phi = 0.
 
     Source: Baumgarte, Comput. Methods Appl. Mech. Eng. 1 (1972) 1.
     """
-    feedback = []
-    for constraint in _all(system):
-        velocity = jnp.atleast_1d(_velocity_level(constraint, t, x, u, params, unflatten))
-        if isinstance(constraint, Holonomic):
-            position = jnp.atleast_1d(constraint.g(t, unflatten(x), params))
-            feedback.append(-2 * rate * velocity - rate**2 * position)
-        else:
-            feedback.append(-rate * velocity)
-    return _stack(feedback, x.dtype)
+    return _stack([c.feedback(t, x, u, params, unflatten, rate) for c in _all(system)], x.dtype)
 
 
 def holonomic_equations(system, t, q, v, params) -> np.ndarray:
     """Which of the stacked equations constrain positions, (m,) booleans."""
     kinds = [
-        np.full(int(np.prod(shape)), isinstance(system.constraints[name], Holonomic))
+        np.full(int(np.prod(shape)), system.constraints[name].of_positions)
         for name, shape in shapes(system, t, q, v, params).items()
     ]
     return np.concatenate(kinds) if kinds else np.zeros(0, bool)
 
 
-def _velocity_level(constraint, t, x, u, params, unflatten):
-    if isinstance(constraint, Holonomic):
-        return jax.jvp(lambda t, x: constraint.g(t, unflatten(x), params), (t, x), (jnp.ones_like(t), u))[1]
-    return constraint.phi(t, unflatten(x), unflatten(u), params)
-
-
 def _all(system):
     return list(system.constraints.values())
-
-
-def _holonomic(system):
-    return [c for c in _all(system) if isinstance(c, Holonomic)]
 
 
 def _stack(parts, dtype):

@@ -14,8 +14,8 @@ import jax.tree_util as jtu
 import numpy as np
 
 from lagjax.mechanics import coordinates
-from lagjax.mechanics.arguments import OF_POSITION, OF_STATE, takes_of
-from lagjax.mechanics.constraints import Holonomic, Nonholonomic, count, zero_multipliers
+from lagjax.mechanics.arguments import OF_STATE, takes_of
+from lagjax.mechanics.constraints import count, zero_multipliers
 from lagjax.mechanics.coordinates import State
 from lagjax.mechanics.in_words import Call, check_arguments, in_words
 from lagjax.mechanics.linear_in import is_linear
@@ -38,14 +38,9 @@ def traced_system(system: System, s: State) -> System:
     energy = lambda role, f: None if f is None else traced_call(Call(role, f, OF_STATE), given, _check_energy)
     lagrangian, dissipation = energy("L", system.lagrangian), energy("dissipation", system.dissipation)
     constraints = {}
-    for name, constraint in system.constraints.items():
-        owner = f" of constraint '{name}'"
-        if isinstance(constraint, Holonomic):
-            call = Call("g", constraint.g, OF_POSITION, owner)
-            constraints[name] = Holonomic(traced_call(call, given, _check_constraint))
-        else:
-            call = Call("phi", constraint.phi, OF_STATE, owner)
-            constraints[name] = Nonholonomic(traced_call(call, given, _check_constraint))
+    for name, c in system.constraints.items():
+        call = Call(c.role, c.function, c.takes, f" of constraint '{name}'")
+        constraints[name] = type(c)(traced_call(call, given, _check_constraint))
     found = unchecked(lagrangian, constraints, None, dissipation)
     if system.force is None:
         return found

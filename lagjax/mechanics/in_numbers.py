@@ -19,7 +19,6 @@ from lagjax.jax_internals.programs import length, needed, staged
 from lagjax.jax_internals.tracing import WATCHED
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.arguments import takes_of
-from lagjax.mechanics.constraints import Holonomic, Nonholonomic
 from lagjax.mechanics.system import System
 from lagjax.numerics.scalars import written_out
 
@@ -49,16 +48,7 @@ class InNumbers(eqx.Module):
 
 def in_numbers(system: System, unflatten: Callable) -> System:
     """The same system, with a tuple of numbers for q and for v."""
-    wrap = lambda function, **kw: InNumbers(function, unflatten, **kw)
-    return System(
-        wrap(system.lagrangian),
-        {
-            name: Holonomic(wrap(c.g)) if isinstance(c, Holonomic) else Nonholonomic(wrap(c.phi))
-            for name, c in system.constraints.items()
-        },
-        force=None if system.force is None else wrap(system.force, returns_coordinates=True),
-        dissipation=None if system.dissipation is None else wrap(system.dissipation),
-    )
+    return system.map(lambda function, role: InNumbers(function, unflatten, returns_coordinates=role == "force"))
 
 
 class Numbers:

@@ -140,4 +140,4 @@ def _constraint_residual(system, t, q, v, params, level):
         u, _ = coordinates.flatten(v)
         stacked = constraints.velocity_residual(system, t, x, u, params, unflatten)
         return constraints.split(system, stacked, t, q, v, params)
-    return {name: constraints.evaluate(constraint, t, q, v, params) for name, constraint in system.constraints.items()}
+    return {name: constraint.residual(t, q, v, params) for name, constraint in system.constraints.items()}

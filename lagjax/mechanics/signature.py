@@ -16,7 +16,7 @@ from jaxtyping import Array, PyTree
 
 from lagjax.mechanics.arguments import takes_of
 from lagjax.mechanics.compiled import compiled
-from lagjax.mechanics.constraints import Holonomic, zero_multipliers
+from lagjax.mechanics.constraints import zero_multipliers
 from lagjax.mechanics.coordinates import State
 from lagjax.mechanics.hybrid import Hybrid
 from lagjax.mechanics.system import System
@@ -99,10 +99,8 @@ def _signature(system, t, q, v, params):
     if system.dissipation is not None:
         found["the dissipation"] = values_and_slopes(system.dissipation, *s, slopes=(2,))
     for name, c in system.constraints.items():
-        if isinstance(c, Holonomic):
-            found[f"the constraint '{name}'"] = values_and_slopes(c.g, t, q, params, slopes=(1,))
-        else:
-            found[f"the constraint '{name}', of velocities,"] = values_and_slopes(c.phi, *s, slopes=(1, 2))
+        words, slopes = ("", (1,)) if c.of_positions else (", of velocities,", (1, 2))
+        found[f"the constraint '{name}'{words}"] = values_and_slopes(c.residual, *s, slopes=slopes)
     if system.force is not None:
         ones = jax.tree.map(np.ones_like, zero_multipliers(system, s))
         given = s._asdict() | {"multipliers": ones}

@@ -28,8 +28,6 @@ from jaxtyping import PyTree
 from lagjax.jax_internals.names import ADDITIVE, BILINEAR, LINEAR_IN_FIRST, PERIODIC
 from lagjax.jax_internals.programs import Literal, depends, interpreted
 from lagjax.mechanics import constraints, coordinates
-from lagjax.mechanics.constraints import Holonomic
-from lagjax.mechanics.constraints import evaluate as constraint_value
 from lagjax.mechanics.hybrid import phases_of
 from lagjax.mechanics.in_numbers import WRITTEN, Numbers, in_numbers
 from lagjax.mechanics.lagrangian import mass_and_forcing
@@ -182,11 +180,9 @@ def _depends_on(numbers, names):
 
 
 def _constraint_structure(constraint, args, names):
-    by = 1 if isinstance(constraint, Holonomic) else 2
-    value = _numbers(lambda _, *state: constraint_value(constraint, *state), args)
-    slope = _numbers(
-        lambda _, *state: jax.jacfwd(lambda *s: constraint_value(constraint, *s), argnums=by)(*state), args
-    )
+    by = 1 if constraint.of_positions else 2
+    value = _numbers(lambda _, *state: constraint.residual(*state), args)
+    slope = _numbers(lambda _, *state: jax.jacfwd(lambda *s: constraint.residual(*s), argnums=by)(*state), args)
     return ConstraintStructure(linear=not _depends_on(slope, names), moving="t" in _depends_on(value, names))
 
 
@@ -215,8 +211,8 @@ def angles(system, t, q, v, params) -> PyTree[bool]:
 def conserved_momenta(system, t, q, v, params) -> list[str]:
     """The coordinates with a momentum known to be conserved: not in L or a constraint, and no force acts."""
     names = coordinates.names(q)
-    holonomic = all(isinstance(c, Holonomic) for c in system.constraints.values())
-    if system.force is not None or system.dissipation is not None or not holonomic or len(names) > UP_TO:
+    forced = system.force is not None or system.dissipation is not None
+    if forced or not system.is_holonomic or len(names) > UP_TO:
         return []
     _, unflatten = coordinates.flatten(q)
     system = in_numbers(system, unflatten)
@@ -238,8 +234,8 @@ def what_changes_momentum(system, name, t, q, v, params) -> Iterator[str]:
         yield "dissipation acts on it"
     functions = {"L contains it": system.lagrangian}
     for other, c in system.constraints.items():
-        if isinstance(c, Holonomic):
-            functions[f"constraint '{other}' contains it"] = _of_state(c)
+        if c.of_positions:
+            functions[f"constraint '{other}' contains it"] = c.residual
         else:
             yield f"constraint '{other}' restricts velocities"
     for words, function in functions.items():
@@ -297,22 +293,18 @@ def what_changes_jacobi_integral(system, t, q, v, params) -> Iterator[str]:
     if system.dissipation is not None:
         yield "there is dissipation"
     for name, c in system.constraints.items():
-        if not isinstance(c, Holonomic):
+        if not c.of_positions:
             yield f"constraint '{name}' restricts velocities"
     if sees_time(system.lagrangian, t, q, v, params):
         yield "L depends on t"
     for name, c in system.constraints.items():
-        if isinstance(c, Holonomic) and sees_time(_of_state(c), t, q, v, params):
+        if c.of_positions and sees_time(c.residual, t, q, v, params):
             yield f"constraint '{name}' depends on t"
 
 
 def sees_time(function, *state) -> bool:
     """Whether a function of (t, q, v, params) depends on t."""
     return _dependence(function, state, lambda args: args[0]) != Depends.NOT
-
-
-def _of_state(constraint):
-    return lambda t, q, v, params: constraint.g(t, q, params)
 
 
 def is_autonomous(system, t, q, v, params) -> bool:
@@ -325,7 +317,7 @@ def functions_of(system):
     functions = []
     for phase in phases_of(system):
         functions += [phase.lagrangian, None if phase.force is None else force_with_ones(phase), phase.dissipation]
-        functions += [_of_state(c) if isinstance(c, Holonomic) else c.phi for c in phase.constraints.values()]
+        functions += [c.residual for c in phase.constraints.values()]
     return [f for f in functions if f is not None]
 
 

@@ -1,7 +1,6 @@
 """A mechanical system: a Lagrangian, its constraints, and the forces that do not come from a potential."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import fields
 
 import equinox as eqx
 import jax
@@ -65,10 +64,9 @@ class System(eqx.Module):
                     f"Fix: pass the function itself, {role}=f, not its value f(...)."
                 )
         if constraints is not None and not isinstance(constraints, Mapping):
-            separate = callable(constraints) and not isinstance(constraints, Holonomic | Nonholonomic)
             raise TypeError(
                 f"constraints must be given by name, not as {type(constraints).__name__}.\n"
-                + ("Usual cause: kinetic and potential energy given separately.\n" if separate else "")
+                + ("Usual cause: kinetic and potential energy given separately.\n" if callable(constraints) else "")
                 + 'Fix: constraints={"rod": lj.Holonomic(g)}'
                 + ("; L is one function, return kinetic - potential." if separate else ".")
             )
@@ -95,13 +93,27 @@ class System(eqx.Module):
         self.force = force
         self.dissipation = dissipation
 
+    def map(self, change: Callable[[Callable, str], Callable]) -> "System":
+        """The system with `change(function, role)` in place of each of its functions, unchecked.
+
+        Roles: "lagrangian", "force", "dissipation", and those of constraints, "g" and "phi".
+        """
+        change_if = lambda function, role: None if function is None else change(function, role)
+        return unchecked(
+            change(self.lagrangian, "lagrangian"),
+            {name: type(c)(change(c.function, c.role)) for name, c in self.constraints.items()},
+            change_if(self.force, "force"),
+            change_if(self.dissipation, "dissipation"),
+        )
+
+    @property
+    def is_holonomic(self) -> bool:
+        """Whether no constraint restricts velocities alone."""
+        return all(c.of_positions for c in self.constraints.values())
+
     def functions(self) -> dict[str, Callable | None]:
         """The user's functions by role."""
-        of_constraints = {
-            f"{name} of constraint '{key}'": getattr(c, name)
-            for key, c in self.constraints.items()
-            for name in [field.name for field in fields(c)]
-        }
+        of_constraints = {f"{c.role} of constraint '{name}'": c.function for name, c in self.constraints.items()}
         others = {"the force": self.force, "the dissipation": self.dissipation}
         return {"the Lagrangian": self.lagrangian, **of_constraints, **others}
 

@@ -26,7 +26,6 @@ import jax
 import numpy as np
 
 from lagjax.mechanics.arguments import takes_of
-from lagjax.mechanics.constraints import Holonomic, Nonholonomic
 from lagjax.mechanics.coordinates import is_traced
 from lagjax.mechanics.system import System
 from lagjax.motion.solve import trajectory_of
@@ -90,15 +89,7 @@ def runs_backward(ts) -> bool:
 
 def reflect_system(system: System) -> System:
     """Return the system whose forward motion is the backward motion of `system`."""
-    constraints = {
-        name: Holonomic(Reflected(c.g, of_velocities=False))
-        if isinstance(c, Holonomic)
-        else Nonholonomic(Reflected(c.phi, odd=True))
-        for name, c in system.constraints.items()
-    }
-    force = None if system.force is None else Reflected(system.force)
-    dissipation = None if system.dissipation is None else Reflected(system.dissipation, odd=True)
-    return System(Reflected(system.lagrangian), constraints, force, dissipation)
+    return system.map(lambda f, role: Reflected(f, of_velocities=role != "g", odd=role in ("phi", "dissipation")))
 
 
 def reflect_snapshot(snapshot: Snapshot) -> Snapshot:

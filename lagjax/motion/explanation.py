@@ -9,7 +9,6 @@ import numpy as np
 
 from lagjax.jumps.found import found as jumps_found
 from lagjax.mechanics import constraints, coordinates
-from lagjax.mechanics.constraints import Holonomic
 from lagjax.mechanics.diagnosis import dependencies, describe, equation_names, explain_failure, listed
 from lagjax.mechanics.equations import equations_of
 from lagjax.mechanics.first_call import traced_system
@@ -122,7 +121,7 @@ def _explain(system: System, s: coordinates.State) -> Explanation:
     if turned := _in_turns(system, s, names):
         rows.append(("angles", f"in radians: {turned}; for degrees use jnp.radians(...)"))
     if equations:
-        kinds = {name: "position" if isinstance(c, Holonomic) else "velocity" for name, c in system.constraints.items()}
+        kinds = {name: "position" if c.of_positions else "velocity" for name, c in system.constraints.items()}
         rows.append(("constraints", ", ".join(f"'{name}' ({kind})" for name, kind in kinds.items())))
         rows.append(("equations", f"{len(equations)}, of which {independent} independent"))
     rows += [("dependent", _in_words(group)) for group in groups]
