@@ -12,7 +12,6 @@ from lagjax.fitting.equations import WHOLE, Problem
 from lagjax.fitting.records import channel_name
 from lagjax.mechanics import constraints
 from lagjax.mechanics.diagnosis import listed
-from lagjax.mechanics.hybrid import phases_of
 from lagjax.motion.integrate import integrate
 
 
@@ -23,7 +22,7 @@ def check_predicted(problem: Problem):
     t, params = jax.ShapeDtypeStruct((), problem.windows.ts.dtype), problem.found.params
 
     def one_time(t, q, v, params):
-        shapes = [constraints.shapes(phase, t, q, v, params) for phase in phases_of(problem.system)]
+        shapes = [constraints.shapes(phase, t, q, v, params) for phase in problem.system.phases]
         multipliers = {name: jnp.zeros(shape) for phase in shapes for name, shape in phase.items()}
         values = {"q": q, "v": v, "multipliers": multipliers}
         if problem.observe is not None:

@@ -18,11 +18,10 @@ from lagjax.mechanics.arguments import OF_STATE
 from lagjax.mechanics.constraints import zero_multipliers
 from lagjax.mechanics.diagnosis import listed
 from lagjax.mechanics.first_call import traced_call, traced_system
-from lagjax.mechanics.hybrid import Hybrid, first_phase
 from lagjax.mechanics.in_words import Call
 from lagjax.mechanics.refusals import check_system
 from lagjax.motion.crossings import Crossing, traced_guard
-from lagjax.motion.switching import starting, traced_phases
+from lagjax.motion.switching import traced_phases
 
 # Arguments of `integrate` that a fit sets itself.
 SET_BY_FIT = {"ts", "throw", "adjoint"}
@@ -32,7 +31,7 @@ def problem_of(system, records, params, free, observe, bounds, priors, loss, win
     """Check all arguments and make arrays of them."""
     check_system(system, records, params, phases=True)
     system = _system_at_start(system, window, options)
-    first = first_phase(system)
+    first = system.first_phase
     records = [records] if isinstance(records, Record) else list(records)
     if not records or not all(isinstance(record, Record) for record in records):
         raise TypeError("records must be a lj.Record or a list of them.\nFix: lj.Record(t, q=measured).")
@@ -50,7 +49,7 @@ def problem_of(system, records, params, free, observe, bounds, priors, loss, win
     params_of = lambda r: replace(found.params, {name: values[r] for name, values in overrides.items()})
     guessed, unflatten, guess = starts(first, records, windows, params_of, options)
     system = traced_phases(system, guess)
-    first, observe, options = first_phase(system), _traced(observe, guess), _with_traced_events(options, first, guess)
+    first, observe, options = system.first_phase, _traced(observe, guess), _with_traced_events(options, first, guess)
     measured = {kind: _gathered(windows, [record.measured[kind] for record in records], kind)
                 for kind in records[0].measured}  # fmt: skip
     _check_anything_measured(measured)
@@ -82,8 +81,8 @@ def _with_traced_events(options, system, guess):
 
 def _system_at_start(system, window, options):
     """The system; a motion in phases starts in that of `start=`, which is removed from the options."""
-    system = starting(system, options.pop("start", None))
-    if isinstance(system, Hybrid) and window is not None:
+    system = system.starting(options.pop("start", None))
+    if system.in_phases and window is not None:
         raise ValueError(
             "window= cuts records into windows, but for a lj.Hybrid the phase in which each window would start is not "
             "known.\nFix: leave window out; or a lj.Record for each part, with start= the phase of all of them."

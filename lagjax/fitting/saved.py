@@ -15,7 +15,7 @@ from lagjax.fitting.starts import unflatten_of
 from lagjax.mechanics import files
 from lagjax.mechanics.diagnosis import listed
 from lagjax.mechanics.file_table import Table
-from lagjax.mechanics.hybrid import Hybrid, first_phase, replace_fields
+from lagjax.mechanics.hybrid import Hybrid, replace_fields
 from lagjax.mechanics.memory import kinds
 from lagjax.mechanics.printable import printable
 from lagjax.mechanics.signature import UnknownSystem
@@ -102,7 +102,7 @@ def _with(found: Fit, known: dict[str, Any], described: UnknownSystem, path) -> 
             if not isinstance(system, Hybrid) or not 0 <= described.phase < len(system.systems):
                 raise ValueError(f"{path} starts in phase {described.phase}, which this system does not have.")
             system = replace_fields(system, first=np.asarray(described.phase, np.int32))
-        fields |= {"system": system, "first": first_phase(system)}
+        fields |= {"system": system, "first": system.first_phase}
     options = {name: known.get(f"options.{name}", x) for name, x in problem.options.items()}
     training = found.training
     if training is not None and training.held_back is not None:

@@ -9,6 +9,7 @@ Source: Brogliato, *Nonsmooth Mechanics*, §1.3; Acary & Brogliato, *Numerical M
 """
 
 from collections.abc import Callable, Mapping, Sequence
+from typing import ClassVar
 
 import equinox as eqx
 import jax
@@ -195,6 +196,18 @@ class Hybrid(eqx.Module):
         self.switches, self.most_switches = tuple(listed), most_switches
         self.first = np.zeros((), np.int32)
 
+    in_phases: ClassVar[bool] = True
+
+    @property
+    def phases(self) -> tuple[System, ...]:
+        """The systems of all phases."""
+        return self.systems
+
+    @property
+    def first_phase(self) -> System:
+        """The system of the phase in which motions start. Not while JAX is tracing."""
+        return self.systems[int(self.first)]
+
     def starting(self, start: str | ArrayLike | None) -> "Hybrid":
         """The same hybrid with motions that start in this phase, a name or a number; None keeps the present one.
 
@@ -267,13 +280,3 @@ def replace_fields(hybrid: Hybrid, **fields) -> Hybrid:
     for name in ("systems", "switches", "first", "names", "most_switches"):
         object.__setattr__(same, name, fields.get(name, getattr(hybrid, name)))
     return same
-
-
-def first_phase(system: System | Hybrid) -> System:
-    """The system of the phase in which motions start, or the system itself. Not while JAX is tracing."""
-    return system.systems[int(system.first)] if isinstance(system, Hybrid) else system
-
-
-def phases_of(system: System | Hybrid) -> tuple[System, ...]:
-    """The systems of all phases; a `System` is its own only phase."""
-    return system.systems if isinstance(system, Hybrid) else (system,)

@@ -28,7 +28,6 @@ from jaxtyping import PyTree
 from lagjax.jax_internals.names import ADDITIVE, BILINEAR, LINEAR_IN_FIRST, PERIODIC
 from lagjax.jax_internals.programs import Literal, depends, interpreted
 from lagjax.mechanics import constraints, coordinates
-from lagjax.mechanics.hybrid import phases_of
 from lagjax.mechanics.in_numbers import WRITTEN, Numbers, in_numbers
 from lagjax.mechanics.lagrangian import mass_and_forcing
 from lagjax.mechanics.reactions import force_with_ones
@@ -315,7 +314,7 @@ def is_autonomous(system, t, q, v, params) -> bool:
 def functions_of(system):
     """All functions that the motion depends on, of (t, q, v, params)."""
     functions = []
-    for phase in phases_of(system):
+    for phase in system.phases:
         functions += [phase.lagrangian, None if phase.force is None else force_with_ones(phase), phase.dissipation]
         functions += [c.residual for c in phase.constraints.values()]
     return [f for f in functions if f is not None]

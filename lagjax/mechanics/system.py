@@ -1,6 +1,7 @@
 """A mechanical system: a Lagrangian, its constraints, and the forces that do not come from a potential."""
 
 from collections.abc import Callable, Mapping
+from typing import ClassVar
 
 import equinox as eqx
 import jax
@@ -105,6 +106,26 @@ class System(eqx.Module):
             change_if(self.force, "force"),
             change_if(self.dissipation, "dissipation"),
         )
+
+    in_phases: ClassVar[bool] = False
+
+    @property
+    def phases(self) -> "tuple[System, ...]":
+        """The system itself: the only phase of its motions. A `Hybrid` has several."""
+        return (self,)
+
+    @property
+    def first_phase(self) -> "System":
+        """The system itself."""
+        return self
+
+    def starting(self, start) -> "System":
+        """The system itself; raise if `start` names a phase."""
+        if start is not None:
+            raise ValueError(
+                "start= names the first phase of a lj.Hybrid, and this is one lj.System.\nFix: leave it out."
+            )
+        return self
 
     @property
     def is_holonomic(self) -> bool:

@@ -23,7 +23,6 @@ from jaxtyping import Array, ArrayLike, Int
 from lagjax.jax_internals.tracing import is_eager
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.compiled import compiled
-from lagjax.mechanics.hybrid import Hybrid
 from lagjax.mechanics.memory import filled_up
 from lagjax.mechanics.multipliers import accelerations
 from lagjax.motion.arriving import WHOLE_STEPS
@@ -138,7 +137,7 @@ def _before(known: Known, t, backward: bool):
 
 def _traced(trajectory, t):
     """Return the motion at t in a traced program: NaN where there is no motion."""
-    if isinstance(trajectory.system, Hybrid):
+    if isinstance(trajectory, HybridTrajectory):
         raise TypeError(
             "at(t) of a motion in phases needs the values of its switches, but this one is being traced, or a batch.\n"
             "Fix: call at(t) of one motion outside the program; or give these times to lj.integrate as ts."
@@ -238,7 +237,7 @@ def _of_length_zero(system, params, node: Snapshot, t):
 
 
 def _check_can_be_continued(trajectory):
-    if isinstance(trajectory.system, Hybrid) and trajectory.t.ndim > 1:
+    if isinstance(trajectory, HybridTrajectory) and trajectory.t.ndim > 1:
         raise ValueError(
             f"this is a batch of motions in phases, of shape {trajectory.t.shape[:-1]}: at(t) needs one of them.\n"
             "Fix: jax.tree.map(lambda x: x[0], traj).at(t)"
@@ -258,7 +257,7 @@ def _check_can_be_continued(trajectory):
 
 
 def _has_constraints(system):
-    return any(phase.constraints for phase in (system.systems if isinstance(system, Hybrid) else (system,)))
+    return any(phase.constraints for phase in system.phases)
 
 
 def _check_ended(trajectory, t):

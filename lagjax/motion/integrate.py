@@ -16,7 +16,7 @@ from jaxtyping import Array, ArrayLike, PyTree
 from lagjax.jax_internals.tracing import SILENT, WATCHED, is_eager
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.first_call import know_kinds, with_known_kinds
-from lagjax.mechanics.hybrid import Hybrid, phases_of
+from lagjax.mechanics.hybrid import Hybrid
 from lagjax.mechanics.refusals import by_name, check_system
 from lagjax.mechanics.system import System
 from lagjax.motion import problem
@@ -33,7 +33,7 @@ from lagjax.motion.reported import patient, report
 from lagjax.motion.results import ENDED_WELL, is_among
 from lagjax.motion.slips import warn_of_odd_dissipation
 from lagjax.motion.solve import Settings
-from lagjax.motion.switching import phases_in, refuse_beside_switches, starting, traced_phases
+from lagjax.motion.switching import phases_in, refuse_beside_switches, traced_phases
 from lagjax.motion.trajectory import BY_INTEGRATION, Trajectory
 
 BY_INTEGRATION["at"] = at
@@ -159,13 +159,13 @@ def integrate(
     ts = problem.vector_of_times(ts)
     state = coordinates.prepared(ts[0], q0, v0, params)
     dtype = state.t.dtype
-    system = starting(system, start)
-    given = phases_of(system)[0]
+    system = system.starting(start)
+    given = system.phases[0]
     if is_eager():
         state = with_known_kinds(given, state)
     system = traced_phases(system, state)
     know_kinds(given, state)
-    for phase in phases_of(system):
+    for phase in system.phases:
         warn_of_odd_dissipation(phase.dissipation, state)
     if isinstance(system, Hybrid):
         refuse_beside_switches(system, state, ts, adjoint, event)

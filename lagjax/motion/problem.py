@@ -10,7 +10,7 @@ import numpy as np
 
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.coordinates import State
-from lagjax.mechanics.hybrid import Hybrid, phases_of
+from lagjax.mechanics.hybrid import Hybrid
 from lagjax.mechanics.system import System
 from lagjax.mechanics.warned import warn
 from lagjax.motion.account import account_of, warning_of
@@ -114,7 +114,7 @@ def _kind(thing):
 
 def check_drift(drift: Any, system: System | Hybrid) -> str:
     """Return the drift control to use; raise if it is unknown."""
-    constrained = any(phase.constraints for phase in phases_of(system))
+    constrained = any(phase.constraints for phase in system.phases)
     if drift is None:
         return "project" if constrained else "none"
     if drift not in ("project", "baumgarte", "none"):

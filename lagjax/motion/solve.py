@@ -19,7 +19,6 @@ from lagjax.jax_internals.one_by_one import jitted, one_by_one
 from lagjax.jax_internals.tracing import is_eager, takes_for_regular
 from lagjax.jumps.found import found as jumps_found
 from lagjax.jumps.times import with_jumps_in_time
-from lagjax.mechanics.hybrid import Hybrid, phases_of
 from lagjax.mechanics.kept import kept
 from lagjax.mechanics.memory import filled_up, parted
 from lagjax.mechanics.memory_maps import share_used
@@ -179,7 +178,7 @@ def _trajectory(system, q0, v0, params, ts, guards, settings):
     """The trajectory, and whether it is settled: the robust solve would give the same."""
     s, method = settings, method_of(settings, system, ts[0], q0, v0, params)
     asked = Asked(s.method, s.controller, s.dt0, s.max_step, s.jump_ts, s.drift, s.jumps)
-    how = _how(method, s.method, settings, isinstance(system, Hybrid))
+    how = _how(method, s.method, settings, system.in_phases)
     settings = eqx.tree_at(lambda s: s.method, settings, method, is_leaf=lambda x: x is None)
     # Derivatives flow to the floating-point arrays of these; the settings are constants.
     x, rest = eqx.partition((system, q0, v0, params, ts, guards, settings.jump_ts), eqx.is_inexact_array)
@@ -188,7 +187,7 @@ def _trajectory(system, q0, v0, params, ts, guards, settings):
     jumps = followed(settings, system, ts[0], q0, v0, params)
     in_time = jumps if jumps is not None and jumps.in_time else None
     jumps = jumps if jumps is not None and jumps.count else None
-    solve = solved_in_legs if isinstance(system, Hybrid) else partial(solved_over_jumps, jumps) if jumps else solved
+    solve = solved_in_legs if system.in_phases else partial(solved_over_jumps, jumps) if jumps else solved
 
     def of_arrays(x, fixed, adjoint, differentiated):
         rest, settings = eqx.combine(fixed, static)
@@ -212,7 +211,7 @@ def _trajectory(system, q0, v0, params, ts, guards, settings):
         fields, _ = of_arrays(x, fixed, settings.adjoint, True)
     arrays, described = pack(system, params, asked, how)
     settled = fields.pop("settled")
-    of = HybridTrajectory if isinstance(system, Hybrid) else Trajectory
+    of = HybridTrajectory if system.in_phases else Trajectory
     return of(t=ts, **fields, arrays=arrays, static=described), settled
 
 
@@ -220,8 +219,8 @@ def followed(settings, system, t, q, v, params):
     """The jumps of a system that a motion follows; None if there are none. Says which are not followed."""
     if settings.jumps == "ignored":
         return None
-    found = [jumps for phase in phases_of(system) if (jumps := jumps_found(phase, t, q, v, params)) is not None]
-    if isinstance(system, Hybrid):
+    found = [jumps for phase in system.phases if (jumps := jumps_found(phase, t, q, v, params)) is not None]
+    if system.in_phases:
         why = "in the phases of a lj.Hybrid"
     elif settings.controller is not None or settings.event is not None:
         why = "with a stepsize_controller, or a condition for diffrax, of your own"
@@ -256,7 +255,7 @@ def method_of(settings, system, *state):
             return Dopri8()
         return nystrom_for(system, state[-1])
     if isinstance(chosen, Nystrom) and not _are_free_of_velocities(system, *state):
-        cause = "there are constraints" if any(phase.constraints for phase in phases_of(system)) else "these do"
+        cause = "there are constraints" if any(phase.constraints for phase in system.phases) else "these do"
         raise ValueError(
             f"{type(chosen).__name__} is for accelerations that do not depend on velocities, and {cause}.\n"
             "Usual cause: a kinetic energy that depends on q (polar coordinates, joint angles), friction, or a "
@@ -276,4 +275,4 @@ def nystrom_for(system, params) -> Nystrom:
 
 
 def _are_free_of_velocities(system, *state):
-    return all(is_free_of_velocities(phase, *state) for phase in phases_of(system))
+    return all(is_free_of_velocities(phase, *state) for phase in system.phases)

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array, ArrayLike
+from jaxtyping import Array
 
 from lagjax.mechanics import constraints, coordinates
 from lagjax.mechanics.arguments import OF_STATE, takes_of
@@ -220,12 +220,3 @@ def _alike(found, wanted):
     same = jtu.tree_structure(found) == jtu.tree_structure(wanted)
     shapes = lambda tree: [jnp.shape(x) for x in jtu.tree_leaves(tree)]
     return same and shapes(found) == shapes(wanted)
-
-
-def starting(system, start: str | ArrayLike | None):
-    """The system; a hybrid one starts in phase `start`."""
-    if isinstance(system, Hybrid):
-        return system.starting(start)
-    if start is not None:
-        raise ValueError("start= names the first phase of a lj.Hybrid, and this is one lj.System.\nFix: leave it out.")
-    return system

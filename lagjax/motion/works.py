@@ -17,7 +17,6 @@ from jaxtyping import Array, Float, PyTree
 
 from lagjax.mechanics import constraints, coordinates
 from lagjax.mechanics.compiled import compiled
-from lagjax.mechanics.hybrid import phases_of
 from lagjax.mechanics.reactions import force_at
 from lagjax.mechanics.structure import sees_time
 from lagjax.motion.hybrid_trajectory import HybridTrajectory
@@ -54,7 +53,7 @@ class Motion:
     """
 
     def __init__(self, trajectory: Trajectory, accounted):
-        self.trajectory, self.systems, self.params = trajectory, phases_of(accounted), trajectory.params
+        self.trajectory, self.systems, self.params = trajectory, accounted.phases, trajectory.params
         # The number of outputs when the motion is integrated again.
         self.room = 0
         rows, end = jax.tree.map(np.asarray, (trajectory.rows(), trajectory.end))
