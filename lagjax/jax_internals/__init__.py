@@ -3,7 +3,6 @@
 - `plain.py`: the fallback to plain JAX programs, `LAGJAX_PLAIN=1`, and when it is taken automatically.
 - `marks.py`: the two attributes by which XLA compiles a program as one machine function; what each version needs.
 - `compiling.py`: how XLA is asked to compile the programs that we call.
-- `trial.py`: whether marked programs run and give right results with an unknown XLA.
 - `one_function.py`: a program as one machine function.
 - `one_by_one.py`: on a CPU no batch of LAPACK calls, which can stop a process for good.
 - `programs.py`: JAX programs (jaxprs) as data. `names.py`: the primitives that they are made of, by name.

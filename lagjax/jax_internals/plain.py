@@ -1,17 +1,14 @@
 """The fallback: `LAGJAX_PLAIN=1` in the environment runs every program as plain JAX.
 
 Nothing is then written out number by number and nothing compiled as one function: the same results to round-off,
-several times slower. It serves for comparison, and in case a new XLA mishandles one of these programs. That case is
-detected: with an unknown XLA, `trial.py` first tries marked programs in a process of their own, once, and if that fails
-the fallback is taken, with a warning. `LAGJAX_PLAIN=0` skips the trial.
+several times slower. It serves for comparison, and for versions of XLA with which no test was run: XLA does not check
+what our marks promise, and where it mishandles one it ends the process. `LAGJAX_PLAIN=0` compiles as ever with any.
 """
 
 import os
 import warnings
 
 import jaxlib.version
-
-from lagjax.jax_internals.trial import survives
 
 # Run with 0.10.2: all tests; with 0.10.1: the fast ones; with 0.12.0.1: those of this package, a pendulum and a rod.
 KNOWN = {"0.10.1", "0.10.2", "0.12.0.1"}
@@ -23,19 +20,14 @@ _decided: list[bool] = []
 def is_plain() -> bool:
     """Whether every program runs as plain JAX; decided when the first one is made."""
     if not _decided:
-        _decided.append(_WANTED != "0" if _WANTED else jaxlib.version.__version__ not in KNOWN and not _is_trusted())
+        known = jaxlib.version.__version__ in KNOWN
+        _decided.append(_WANTED != "0" if _WANTED else not known)
+        if not _WANTED and not known:
+            warnings.warn(
+                f"lagjax was not tested with jaxlib {jaxlib.version.__version__}, so motions are compiled as plain "
+                "JAX programs: the same results, several times slower.\n"
+                f"Fix: a tested jaxlib ({', '.join(sorted(KNOWN))}), or a newer lagjax; LAGJAX_PLAIN=1 in the "
+                "environment for no warning, LAGJAX_PLAIN=0 to compile for speed all the same.",
+                stacklevel=2,
+            )
     return _decided[0]
-
-
-def _is_trusted():
-    trusted = survives()
-    if not trusted:
-        warnings.warn(
-            f"lagjax does not know jaxlib {jaxlib.version.__version__}, and small programs compiled as lagjax compiles "
-            "them did not run, or gave wrong answers. Motions are therefore compiled as plain JAX programs: the same "
-            "results, several times slower.\n"
-            f"Fix: a known jaxlib ({', '.join(sorted(KNOWN))}), or a newer lagjax; LAGJAX_PLAIN=1 in the "
-            "environment for no warning, LAGJAX_PLAIN=0 for no trial.",
-            stacklevel=2,
-        )
-    return trusted
