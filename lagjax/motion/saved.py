@@ -161,17 +161,17 @@ def trajectory_of(found: dict, kept: System | Hybrid | UnknownSystem) -> Traject
     return HybridTrajectory(**fields, phase=found["phase"], switches=made(Switches, found["switches"]))
 
 
-def same_system(system, known: UnknownSystem, path) -> System | Hybrid:
-    """Return the integrated system, which the user passes again; raise if it is another one."""
-    return check_same(system, known, path)
-
-
-def check_same(system, known: UnknownSystem, path) -> System | Hybrid:
-    """The system, traced at a state of the motion; raises if it is not the one that a file describes."""
+def check_is_system(system: Any) -> None:
+    """Raise if what the user passes again is no system."""
     if not isinstance(system, (System, Hybrid)):
         raise TypeError(
             f"system must be a lj.System, not {type(system).__name__}.\nFix: lj.load_trajectory(path, system=system)."
         )
+
+
+def same_system(system, known: UnknownSystem, path) -> System | Hybrid:
+    """The system, which the user passes again, traced at a state of the motion; raise if the file has another one."""
+    check_is_system(system)
     if known.state is None:
         return system
     try:

@@ -14,14 +14,13 @@ from jaxtyping import ArrayLike
 from lagjax.meter import meter
 from lagjax.sweeps.axes import axes_of
 from lagjax.sweeps.blocks import Filling, compare_versions, groups_of_blocks, new_store
-from lagjax.sweeps.fingerprint import check_file_names
+from lagjax.sweeps.fingerprint import check_file_names, shapes_of
 from lagjax.sweeps.labels import labels_of
 from lagjax.sweeps.lanes import LAYOUTS, not_run
 from lagjax.sweeps.memory import check_memory
 from lagjax.sweeps.result import Stored, Sweep, of_store
 from lagjax.sweeps.running import CHUNKS_EACH, Engine, chunk_length, usable_cores
 from lagjax.sweeps.store import chunk_of, open_store, warn_of_damage
-from lagjax.sweeps.travelling import pickled, shapes_of, unpickled
 
 # Points per call of the compiled program. On a CPU a call costs 0.2 ms, and larger chunks gain nothing; a GPU needs
 # more to be fully used.
@@ -141,10 +140,7 @@ def _in_memory(engine, indices, before):
 
 
 class _Again:
-    """Runs points of a sweep in memory again: with the engine that ran it, or in another process with a similar one.
-
-    The compiled program is not pickled. `run` is, if pickle can do so, and is unpickled only when it is used.
-    """
+    """Runs points of a sweep in memory again, with the engine that ran it; a pickle has neither that nor `run`."""
 
     def __init__(self, engine: Engine):
         self._engine = engine
@@ -154,8 +150,7 @@ class _Again:
 
     def __reduce__(self):
         engine = self._engine
-        settings = engine.chunk, engine.workers, engine.sort, engine.layout
-        return Elsewhere, (pickled(engine.run), getattr(engine.run, "__name__", "run"), settings)
+        return Elsewhere, (engine.chunk, engine.workers, engine.sort, engine.layout)
 
     def __call__(self, swept, other, which):
         engine = self._engine if other is None else self._engine.with_run(other, len(which))
@@ -163,17 +158,21 @@ class _Again:
 
 
 class Elsewhere(NamedTuple):
-    """Runs points of an unpickled sweep again."""
+    """Runs points of an unpickled sweep again, with the function that is passed."""
 
-    run: bytes | None
-    name: str
-    settings: tuple
+    chunk: int
+    workers: int
+    sort: bool
+    layout: str
 
     def __call__(self, swept, other, which):
-        chunk, *settings = self.settings
-        run = unpickled(self.run, self.name) if other is None else other
-        chunk = chunk_length(len(which), self.settings[1], chunk)
-        return _again(swept, Engine(run, swept.axes, chunk, *settings, jax.local_devices(), None), which)
+        if other is None:
+            raise ValueError(
+                "a sweep that was unpickled does not know the function that ran it.\nFix: swept.resweep(run)."
+            )
+        chunk = chunk_length(len(which), self.workers, self.chunk)
+        settings = self.workers, self.sort, self.layout
+        return _again(swept, Engine(other, swept.axes, chunk, *settings, jax.local_devices(), None), which)
 
 
 def _again(swept, engine, which):

@@ -7,6 +7,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from jaxtyping import PyTree
 
 from lagjax.mechanics.printable import printable
 from lagjax.sweeps.axes import Axes
@@ -95,3 +96,9 @@ def differences(there: dict, here: dict, under: str = "") -> list[str]:
         elif a != b:
             found.append(f"{name}: {a} there, {b} here")
     return found
+
+
+def shapes_of(values: PyTree, lead: int) -> str:
+    """The names and shapes of a point's values as text; the first `lead` dimensions are those of the sweep."""
+    of_one = lambda x: f"{x.dtype}{list(np.shape(x)[lead:]) or ''}"
+    return ", ".join(sorted(f"{name} {of_one(x)}" for name, x in named_leaves(values)))

@@ -72,14 +72,6 @@ class Sweep:
         same._values = values if isinstance(values, Stored) else jax.tree.map(np.copy, values)
         return same
 
-    def __getstate__(self):
-        values = self._values
-        return self.__dict__ | {"_values": values if isinstance(values, Stored) else structures.Travelling.of(values)}
-
-    def __setstate__(self, state):
-        values = state["_values"]
-        self.__dict__ = state | {"_values": values if isinstance(values, Stored) else values.unpacked()}
-
     @property
     def dims(self) -> dict[str, int]:
         """The dimensions and their lengths."""
@@ -351,12 +343,11 @@ def of_store(swept, run, indices):
 class Stored:
     """The values of a store, read on access; `like` has the shapes of one point. A pickle holds only the path."""
 
-    def __init__(self, store: Store | Path, like: PyTree):
+    def __init__(self, store: Store | Path, like: PyTree = None):
         self._store, self._like = store, like
 
     def __reduce__(self):
-        like = None if self._like is None else structures.Travelling.of(self._like)
-        return _stored, (Path(os.path.abspath(self.store.path)), like)
+        return Stored, (Path(os.path.abspath(self.store.path)),)
 
     @property
     def store(self) -> Store:
@@ -368,11 +359,14 @@ class Stored:
     @property
     def like(self) -> Any:
         """One point's values, as shapes."""
-        return self.store.one() if self._like is None else self._like
+        if self._like is None:
+            # Unpickled.
+            self._like = structures.as_stored(self.store, None, Table())
+        return self._like
 
     def read(self, known: np.ndarray) -> tuple[PyTree, np.ndarray]:
         """(the values, which points are lost); warns of lost points that are not yet `known`."""
-        values, lost = self.store.values(self._like)
+        values, lost = self.store.values(self.like)
         where, new = known.copy(), []
         for number, wrong in lost.items():
             here = self.store.blocks.points(number)
@@ -383,7 +377,3 @@ class Stored:
         for x in jax.tree.leaves(values):
             x[where] = nothing(x.dtype)
         return values, where
-
-
-def _stored(path, like):
-    return Stored(path, None if like is None else like.unpacked())

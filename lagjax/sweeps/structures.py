@@ -1,4 +1,4 @@
-"""The structure of what `run` returned, described in JSON for values that are read from a store or a pickle.
+"""The structure of what `run` returned, described in JSON for values that are read from a store.
 
 Leaves are named, and trajectories are described as in their own files, without the functions of their systems. Values
 that contain a function, or an object of a class that cannot be described in JSON, have no such description: they are
@@ -7,10 +7,9 @@ read as a dictionary by name.
 
 import base64
 import math
-import pickle
 import warnings
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -22,13 +21,12 @@ from lagjax.mechanics.files import MALFORMED
 from lagjax.mechanics.printable import by_line, printable
 from lagjax.mechanics.signature import UnknownSystem
 from lagjax.mechanics.written_trees import KINDS_OF_ARRAY, NotWritable, Reader, Writer
-from lagjax.motion.saved import described_system, same_system, trajectory_of
+from lagjax.motion.saved import check_is_system, described_system, same_system, trajectory_of
 from lagjax.motion.saving import described, parts
 from lagjax.motion.trajectory import Trajectory
 from lagjax.sweeps.axes import Axes
-from lagjax.sweeps.fingerprint import named_leaves
+from lagjax.sweeps.fingerprint import named_leaves, shapes_of
 from lagjax.sweeps.store import Store
-from lagjax.sweeps.travelling import pickled, shapes_of
 
 LEAF, MOTION = "leaf", "trajectory"
 
@@ -40,11 +38,8 @@ class _Marker:
         self.role = role
 
 
-def description_of(like: PyTree, one: PyTree | None, classes: list[type] | None = None) -> dict[str, Any] | None:
-    """The description of values like these, or None. Systems are described from `one`, a point with numbers.
-
-    The classes of the objects among them are appended to `classes`.
-    """
+def description_of(like: PyTree, one: PyTree | None) -> dict[str, Any] | None:
+    """The description of values like these, or None. Systems are described from `one`, a point with numbers."""
     names = iter([name for name, _ in named_leaves(like)])
     named = jax.tree.map(lambda x: _Marker(f"{LEAF} {next(names)}"), like)
     motions, found = jax.tree.leaves(named, is_leaf=_is_motion), []
@@ -63,8 +58,6 @@ def description_of(like: PyTree, one: PyTree | None, classes: list[type] | None 
         description = {"tree": writer.down(tree, "values"), "trajectories": found}
     except NotWritable:
         return None
-    if classes is not None:
-        classes += writer.classes
     return description | {"arrays": {name: _in_json(x) for name, x in writer.arrays.items()}}
 
 
@@ -74,6 +67,8 @@ def tree_of(description: dict[str, Any], system: Any, path: Any, table: Table) -
     **Raises:** `ValueError` if none of its trajectories was integrated with `system`, a class was not passed, or the
     description is malformed.
     """
+    if system is not None:
+        check_is_system(system)
     arrays, motions = dict(description["arrays"]), dict(enumerate(description["trajectories"]))
     mismatches, matching = [], []
 
@@ -105,8 +100,8 @@ def tree_of(description: dict[str, Any], system: Any, path: Any, table: Table) -
     return tree
 
 
-def as_stored(store: Store, system: Any, table: Table) -> PyTree | None:
-    """The shapes of one point's values, as the store describes them; None without description or if a class is missing.
+def as_stored(store: Store, system: Any, table: Table) -> PyTree:
+    """The shapes of one point's values, as the store describes them, or by name: without description or a class.
 
     **Raises:** `ValueError` if no trajectory has this `system`, or there are no trajectories.
     """
@@ -116,9 +111,9 @@ def as_stored(store: Store, system: Any, table: Table) -> PyTree | None:
             f"{store.path} has no trajectories that need a system.\n"
             "Usual cause: run returned numbers.\nFix: leave system out, or pass run=."
         )
-    if description is None:
-        return None
     one = store.one()
+    if description is None:
+        return one
     try:
         tree = tree_of(description, system, store.path, table)
         # A store also has the arrays of a system, which is not known here.
@@ -132,7 +127,7 @@ def as_stored(store: Store, system: Any, table: Table) -> PyTree | None:
             + "\nIn any case: lj.open_sweep(path, run=run), with the function that was swept.",
             stacklevel=3,
         )
-        return None
+        return one
     names = iter([name for name, _ in named_leaves(tree)])
     return jax.tree.map(lambda _: one[next(names)], tree)
 
@@ -149,60 +144,6 @@ def as_run_returns(run: Callable, axes: Axes, store: Store) -> PyTree:
             f"run returns {here}, but {store.path} has {stored}.\nFix: the function that was swept; or leave run out."
         )
     return like
-
-
-class Travelling(NamedTuple):
-    """Values in a pickle: their leaves, and their structure, both pickled and described in JSON.
-
-    Functions that pickle does not find, on either side, are left out; trajectories then do not know their system.
-    """
-
-    leaves: list
-    structure: bytes | None
-    described: dict[str, Any] | None
-    # The names of the leaves. An unknown system has lost its own leaves, so they are matched by name.
-    names: list[str]
-    # The classes of objects in the description, each pickled: by name, as pickle writes any class.
-    classes: tuple[bytes, ...] = ()
-
-    @classmethod
-    def of(cls, values: PyTree) -> "Travelling":
-        """Prepare values for a pickle."""
-        leaves, structure = jax.tree.flatten(values)
-        has_motions = any(map(_is_motion, jax.tree.leaves(values, is_leaf=_is_motion)))
-        classes: list[type] = []
-        description = description_of(values, None, classes) if has_motions else None
-        names = [] if description is None else [name for name, _ in named_leaves(values)]
-        numbered = jax.tree.unflatten(structure, range(len(leaves)))
-        # Without a description, pickle raises its own error for what it cannot pickle.
-        structure = pickle.dumps(numbered) if description is None else pickled(numbered)
-        found = tuple(x for x in map(pickled, set(classes)) if x is not None)
-        return cls(leaves, structure, description, names, found)
-
-    def unpacked(self) -> PyTree:
-        """The values, restored."""
-        try:
-            if self.structure is not None:
-                return jax.tree.unflatten(jax.tree.structure(pickle.loads(self.structure)), self.leaves)
-        except (AttributeError, ImportError):
-            # A function or class was importable only in the process that wrote the pickle.
-            pass
-        if self.described is not None:
-            table = Table(x for x in map(_unpickled, self.classes) if x is not None)
-            tree = tree_of(self.described, None, None, table)
-            leaves = dict(zip(self.names, self.leaves))
-            return jax.tree.unflatten(jax.tree.structure(tree), [leaves[name] for name, _ in named_leaves(tree)])
-        raise pickle.UnpicklingError(
-            "the values of this sweep contain functions, or objects of a class, that are not found here.\n"
-            "Fix: first import the module that defines them; or lj.open_sweep, for a sweep in a store."
-        )
-
-
-def _unpickled(cls):
-    try:
-        return pickle.loads(cls)
-    except (AttributeError, ImportError):
-        return None
 
 
 def _is_motion(x):
