@@ -10,8 +10,6 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import jax.tree_util as jtu
-import numpy as np
 
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.arguments import OF_STATE, takes_of
@@ -66,42 +64,6 @@ def traced_call(call: Call, given: Mapping[str, Any], check: Callable, usual_cau
         return program
 
     return traced(call.function, args, make)
-
-
-def with_known_kinds(system: System, s: State) -> State:
-    """The state with whole numbers in `params` as floats, where the system was given floats there before.
-
-    `g=10` after `g=9.81` must not compile another program. A function that needs a whole number (an index, a count) has
-    already refused the float.
-    """
-    known_kinds, kind = _known_kinds(system), kinds(s.params)
-    if kind not in known_kinds and (places := _whole_numbers(s.params)):
-        leaves, structure = jtu.tree_flatten(s.params)
-        for known in known_kinds:
-            differing = [i for i, (a, b) in enumerate(zip(known[1:], kind[1:])) if a != b]
-            if known[0] != structure or not places.issuperset(differing):
-                continue
-            changed = [np.asarray(x, s.t.dtype) if i in differing else x for i, x in enumerate(leaves)]
-            if kinds(changed)[1:] == known[1:]:
-                return s._replace(params=jtu.tree_unflatten(structure, changed))
-    return s
-
-
-def know_kinds(system: System, s: State):
-    """Note what the system's functions have taken."""
-    _known_kinds(system)[kinds(s.params)] = True
-
-
-def _known_kinds(system) -> dict:
-    # A system that a function makes again has new functions of the same code.
-    functions = [f for f in system.functions().values() if f is not None]
-    return remembered((), (_known_kinds, *(getattr(f, "__code__", type(f)) for f in functions)), dict)
-
-
-def _whole_numbers(params):
-    """Which of the leaves are whole numbers."""
-    is_whole = lambda x: type(x) is int or isinstance(x, np.ndarray) and np.issubdtype(x.dtype, np.integer)
-    return {i for i, x in enumerate(jtu.tree_leaves(params)) if is_whole(x)}
 
 
 def _check_energy(call, value):

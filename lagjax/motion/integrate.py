@@ -13,9 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, PyTree
 
-from lagjax.jax_internals.tracing import SILENT, WATCHED, is_eager
+from lagjax.jax_internals.tracing import SILENT, WATCHED
 from lagjax.mechanics import coordinates
-from lagjax.mechanics.first_call import know_kinds, with_known_kinds
 from lagjax.mechanics.hybrid import Hybrid
 from lagjax.mechanics.refusals import by_name, check_system
 from lagjax.mechanics.system import System
@@ -159,12 +158,7 @@ def integrate(
     ts = problem.vector_of_times(ts)
     state = coordinates.prepared(ts[0], q0, v0, params)
     dtype = state.t.dtype
-    system = system.starting(start)
-    given = system.phases[0]
-    if is_eager():
-        state = with_known_kinds(given, state)
-    system = traced_phases(system, state)
-    know_kinds(given, state)
+    system = traced_phases(system.starting(start), state)
     for phase in system.phases:
         warn_of_odd_dissipation(phase.dissipation, state)
     if isinstance(system, Hybrid):

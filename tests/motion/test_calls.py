@@ -56,7 +56,7 @@ def falling(g, shift=0.0):
 
 @pytest.mark.exhaustive
 def test_the_same_program_serves():
-    """One program serves whole numbers, any number of outputs, and functions that mean the same, but no others."""
+    """One program serves any number of outputs, and functions that mean the same, but no others."""
     at = np.linspace(0.0, 1.0, 100)
     fall = lambda system, m=2.0, ts=at, **kw: np.asarray(lj.integrate(system, 1.0, 0.0, {"m": m}, ts=ts, **kw).q)
     (first, kept), (again, kept_too) = falling(9.81), falling(9.81)
@@ -64,8 +64,6 @@ def test_the_same_program_serves():
     expected = fall(first)
     with_event = fall(first, events=floor())
     with compiles() as count:
-        np.testing.assert_array_equal(fall(first, 2), expected)
-        np.testing.assert_array_equal(fall(first, np.int64(2)), expected)
         np.testing.assert_allclose(fall(first, ts=np.linspace(0.0, 1.0, 101))[[0, -1]], expected[[0, -1]], atol=1e-9)
         np.testing.assert_array_equal(fall(again), expected)
         np.testing.assert_array_equal(fall(again, events=floor()), with_event)
@@ -82,15 +80,13 @@ def test_the_same_program_serves():
 
 
 def test_a_whole_number_that_counts_stays_whole():
-    """A whole number used as an index stays whole; elsewhere it is treated as the float that was passed before."""
+    """A whole number in params stays whole, as an index must; the motion is that of the float, also after a float."""
     table = jnp.array([1.0, 4.0, 9.0])
     spring = lj.System(lambda t, q, v, p: 0.5 * v**2 - 0.5 * p["k"] * table[p["which"]] * q**2)
     swing = lambda k, which: float(lj.integrate(spring, 1.0, 0.0, {"k": k, "which": which}, ts=TS).q[-1])
     assert swing(1.0, 1) == pytest.approx(np.cos(2.0 * TS[-1]), abs=1e-7)
     assert swing(1, 2) == pytest.approx(np.cos(3.0 * TS[-1]), abs=1e-7)
-    with compiles() as count:
-        assert swing(4, 1) == pytest.approx(np.cos(4.0 * TS[-1]), abs=1e-7)
-    assert not count
+    assert swing(4, 1) == pytest.approx(np.cos(4.0 * TS[-1]), abs=1e-7)
 
 
 def test_another_function_is_looked_at():
