@@ -15,8 +15,8 @@ from lagjax.jax_internals.marks import STAYS_A_CALL, marked
 from lagjax.mechanics import sparsity
 from lagjax.numerics import scalars
 
-# jax 0.12 no longer has these.
-UP_TO_0_11 = {"closed_call"}
+# From jax 0.11.1 on there are none of these.
+UP_TO_0_11_0 = {"closed_call"}
 TABLES = {
     f"{module.__name__.removeprefix('lagjax.')}.{name}": set(table)
     for module in (names, one_function, scalars, sparsity)
@@ -38,7 +38,7 @@ def primitives():
 
 def unknown(table):
     """The names of a table that belong to no primitive."""
-    gone = UP_TO_0_11 if jax.__version_info__ >= (0, 12) else set()
+    gone = UP_TO_0_11_0 if jax.__version_info__ >= (0, 11, 1) else set()
     return sorted(table - primitives() - gone)
 
 
