@@ -10,8 +10,8 @@ import warnings
 
 import jaxlib.version
 
-# Run with 0.10.2: all tests; with 0.10.1: the fast ones; with 0.12.0.1: those of this package, a pendulum and a rod.
-KNOWN = {"0.10.1", "0.10.2", "0.12.0.1"}
+# Run with 0.10.2: all tests; with 0.10.1: the fast ones; with the others: those of this package, a pendulum and a rod.
+KNOWN = {"0.10.1", "0.10.2", "0.11.0", "0.11.1", "0.11.2", "0.12.0", "0.12.0.1"}
 # Read once: compiled programs are kept, and the two kinds must not mix.
 _WANTED = os.environ.get("LAGJAX_PLAIN", "")
 _decided: list[bool] = []
