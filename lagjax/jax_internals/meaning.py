@@ -18,7 +18,7 @@ import numpy as np
 from jax.core import Tracer
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
-from lagjax.jax_internals.programs import equations, evaluate
+from lagjax.jax_internals.programs import equations, evaluate, once_per_program
 
 # The rules of functions with rules of their own, and what only belongs to these.
 RULES = {
@@ -64,6 +64,12 @@ def meaning_of(jaxpr: Jaxpr) -> tuple:
         found.append((equation.primitive, params, operands, tuple(x.aval for x in equation.outvars)))
     found.append(tuple(operand(x) for x in jaxpr.outvars))
     return tuple(found)
+
+
+@once_per_program
+def _meaning_inside(jaxpr: Jaxpr) -> Meaning:
+    """The meaning of a program inside another one, which is often one that JAX has traced before."""
+    return Meaning(meaning_of(jaxpr))
 
 
 def rules_of(function: Callable, program: ClosedJaxpr, *args) -> tuple:
@@ -137,9 +143,9 @@ def _key(x):
     if x is None or isinstance(x, (str, bytes, np.dtype)):
         return x
     if isinstance(x, ClosedJaxpr) and x.jaxpr is not x:
-        return meaning_of(x.jaxpr), tuple(map(_key, x.consts))
+        return _meaning_inside(x.jaxpr), tuple(map(_key, x.consts))
     if isinstance(x, Jaxpr):
-        return meaning_of(x), tuple(map(_key, getattr(x, "consts", ())))
+        return _meaning_inside(x), tuple(map(_key, getattr(x, "consts", ())))
     if isinstance(x, (tuple, list)):
         return type(x), *map(_key, x)
     if isinstance(x, dict):

@@ -19,13 +19,17 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import numpy as np
 from jax import lax
 from jax.custom_derivatives import SymbolicZero
-from jax.extend.core import ClosedJaxpr, Jaxpr, Primitive, jaxpr_as_fun
+from jax.extend.core import ClosedJaxpr, Primitive, jaxpr_as_fun
 from jax.interpreters import ad, batching, mlir
 
 from lagjax.jax_internals.names import HOLDS_A_SOLVER, LAPACK
-from lagjax.jax_internals.programs import applied, equations, rewritten
+from lagjax.jax_internals.programs import anywhere, applied, bodies, rewritten
+
+# The name of a function whose backward pass is rewritten already.
+WITH_WAY_BACK = "with_rewritten_way_back"
 
 
 def one_by_one(function: Callable) -> Callable:
@@ -64,7 +68,7 @@ def jitted(function: Callable) -> Callable:
 
 def without_batches(program: ClosedJaxpr) -> ClosedJaxpr:
     """The program whose calls of LAPACK are loops over the matrices of a batch, now and after `vmap`."""
-    return rewritten(program, _one_by_one)
+    return rewritten(program, _one_by_one) if _may_call_library(program.jaxpr) else program
 
 
 def _one_by_one(equation):
@@ -73,18 +77,21 @@ def _one_by_one(equation):
         name, params = params["prim"].name, dict(params["params"])
     if name in LAPACK or name in HOLDS_A_SOLVER:
         return equation.replace(primitive=_library_p, params={"of": _Call(equation.primitive, equation.params)})
-    if name == "custom_jvp_call" and _has_library(equation):
+    if name == "custom_jvp_call" and any(map(_has_library, bodies(equation))):
         return _with_rewritten_derivative(equation)
+    if name == "custom_vjp_call" and not any(map(_is_rewritten, bodies(equation))):
+        return _with_rewritten_way_back(equation)
     return equation
 
 
-def _has_library(equation):
-    inside = {e.primitive.name for body in equation.params.values() for e in _equations(body)}
-    return not inside.isdisjoint({*LAPACK, *HOLDS_A_SOLVER})
+_has_library = anywhere(lambda equation: equation.primitive.name in {*LAPACK, *HOLDS_A_SOLVER})
+_may_call_library = anywhere(
+    lambda equation: equation.primitive.name in {*LAPACK, *HOLDS_A_SOLVER, "vprim", "custom_vjp_call"}
+)
 
 
-def _equations(body):
-    return equations(getattr(body, "jaxpr", body)) if isinstance(body, (ClosedJaxpr, Jaxpr)) else ()
+def _is_rewritten(jaxpr):
+    return [equation.params.get("name") for equation in jaxpr.eqns] == [WITH_WAY_BACK]
 
 
 class _Call:
@@ -191,6 +198,31 @@ def _with_rewritten_derivative(equation):
     def _(primals, tangents):
         return _pushed(original, primals, [None if isinstance(t, SymbolicZero) else t for t in tangents])
 
+    like = [jax.ShapeDtypeStruct(x.aval.shape, x.aval.dtype) for x in equation.invars]
+    (call,) = jax.make_jaxpr(lambda *x: function(*x))(*like).eqns
+    return equation.replace(params=call.params)
+
+
+def _with_rewritten_way_back(equation):
+    """A function with a backward pass of its own, which may call LAPACK though the function does not."""
+    program = equation.params["call_jaxpr"]
+    original = lambda *operands: applied(program.jaxpr, equation, operands)
+    primal = lambda *operands: jaxpr_as_fun(without_batches(program))(*operands)
+    primal.__name__ = WITH_WAY_BACK
+    function = jax.custom_vjp(jax.jit(primal))
+
+    def forward(*primals):
+        # What does not vary is kept still inside: the rule of the user's may depend on it.
+        still = lambda x, primal: x if primal.perturbed else lax.stop_gradient(x)
+        of_varying = lambda *operands: original(*map(still, operands, primals))
+        return one_by_one(partial(jax.vjp, of_varying))(*(primal.value for primal in primals))
+
+    def backward(way_back, slopes):
+        zero = lambda x: np.zeros(x.shape, x.dtype) if x.dtype == jax.dtypes.float0 else jnp.zeros(x.shape, x.dtype)
+        slopes = [zero(x) if isinstance(x, SymbolicZero) else x for x in slopes]
+        return one_by_one(lambda way_back, slopes: way_back(slopes))(way_back, slopes)
+
+    function.defvjp(forward, backward, symbolic_zeros=True)
     like = [jax.ShapeDtypeStruct(x.aval.shape, x.aval.dtype) for x in equation.invars]
     (call,) = jax.make_jaxpr(lambda *x: function(*x))(*like).eqns
     return equation.replace(params=call.params)

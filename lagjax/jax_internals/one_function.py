@@ -38,7 +38,7 @@ from lagjax.jax_internals.names import (
 )
 from lagjax.jax_internals.one_by_one import one_by_one
 from lagjax.jax_internals.plain import is_plain
-from lagjax.jax_internals.programs import bodies, equations, rewritten, without_chains
+from lagjax.jax_internals.programs import anywhere, bodies, equations, rewritten, without_chains
 
 # Reductions and products above this become library calls.
 LARGE = 1024
@@ -184,9 +184,8 @@ def _without_check(equation):
     return equation.replace(params={**equation.params, "branches": tuple(silent * len(branches))})
 
 
-def calls_host(jaxpr: Jaxpr) -> bool:
-    """Whether a program calls functions of Python while it runs."""
-    return any("callback" in equation.primitive.name for equation in equations(jaxpr))
+# Whether a program calls functions of Python while it runs.
+calls_host = anywhere(lambda equation: "callback" in equation.primitive.name)
 
 
 def _only_raises(jaxpr):

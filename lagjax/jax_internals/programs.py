@@ -1,8 +1,10 @@
 """JAX programs (jaxprs) as data: evaluate and rewrite equations, find what depends on what, split a program."""
 
+import weakref
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from typing import cast
+from functools import wraps
+from typing import TypeVar, cast
 
 import jax
 import jax.numpy as jnp
@@ -12,6 +14,8 @@ from jax.core import ShapedArray
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, jaxpr_as_fun
 
 from lagjax.jax_internals.names import CALLS, CALLS_WITH_RULES
+
+T = TypeVar("T")
 
 # Chains of at least so many calls are worth a loop.
 LONG_CHAIN = 16
@@ -25,6 +29,30 @@ def bodies(equation) -> list[Jaxpr]:
             if isinstance(item, (ClosedJaxpr, Jaxpr)):
                 found.append(getattr(item, "jaxpr", item))
     return found
+
+
+def once_per_program(find: Callable[[Jaxpr], T]) -> Callable[[Jaxpr], T]:
+    """Keep what `find` says of a program as long as this lives: it never changes, and JAX traces a function once."""
+    known: weakref.WeakKeyDictionary = weakref.WeakKeyDictionary()
+
+    @wraps(find)
+    def found(jaxpr):
+        # Two tests of one dictionary: an entry may go between them only if the program does.
+        if jaxpr not in known:
+            known[jaxpr] = find(jaxpr)
+        return known[jaxpr]
+
+    return found
+
+
+def anywhere(test: Callable) -> Callable[[Jaxpr], bool]:
+    """Return the function that says whether `test` holds for an equation of a program, or of one inside it."""
+
+    @once_per_program
+    def holds(jaxpr):
+        return any(test(equation) or any(map(holds, bodies(equation))) for equation in jaxpr.eqns)
+
+    return holds
 
 
 def rewritten(closed: ClosedJaxpr, change: Callable) -> ClosedJaxpr:

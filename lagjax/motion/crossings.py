@@ -26,7 +26,6 @@ from lagjax.mechanics.in_words import Call
 from lagjax.mechanics.pickling import check_functions
 from lagjax.mechanics.system import System
 from lagjax.mechanics.traced import Traced
-from lagjax.mechanics.warned import warn
 
 # A guard of more operations is compiled once for all places where it is evaluated.
 LONG = 100
@@ -312,23 +311,3 @@ def _check(call, value):
 
 class EventWarning(UserWarning):
     """Crossings of a guard may be missing, or were not kept."""
-
-
-def warn_of_events(events: Mapping[str, Crossings]):
-    """Warn if crossings may be missing, and if there were more than are kept."""
-    for name, found in events.items():
-        if bool(found.uncertain):
-            warn(
-                f"crossings of event '{name}' may be missing: its guard touches zero within round-off, or changes too "
-                "fast between steps to be followed.\n"
-                "Usual cause: a guard that is zero all along (a conserved quantity), grazes its surface, or oscillates "
-                "far faster than the motion.\n"
-                "Fix: shift the level of the guard a little; or make the motion take shorter steps, max_step=.",
-                EventWarning,
-            )
-        elif int(found.count) > found.t.shape[-1] > 1:
-            warn(
-                f"event '{name}' happened {int(found.count)} times, but only the first {found.t.shape[-1]} are kept.\n"
-                f"Fix: lj.Crossing(..., most={int(found.count)}), or terminal=True to end at the first.",
-                EventWarning,
-            )

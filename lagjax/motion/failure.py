@@ -11,10 +11,11 @@ from lagjax.mechanics.diagnosis import describe, explain_failure
 from lagjax.mechanics.multipliers import accelerations
 from lagjax.motion import problem
 from lagjax.motion.accuracy import columns
+from lagjax.motion.doubt import of_guards
 from lagjax.motion.hybrid_trajectory import HybridTrajectory
 from lagjax.motion.one_solve import START_TOLERANCES
 from lagjax.motion.results import RESULTS, is_among, message
-from lagjax.motion.solve import Settings
+from lagjax.motion.solve import Settings, trajectory_of
 from lagjax.motion.stopped_early import stopped_early
 from lagjax.motion.tolerances import tolerances_at
 from lagjax.motion.trajectory import Trajectory, pack
@@ -27,14 +28,15 @@ ENOUGH = 12
 STILL = 1e-12
 
 
-def raise_failure(trajectory: Trajectory, start: State, settings: Settings) -> NoReturn:
-    """Raise the error of a failed motion; `start` is its first state."""
+def raise_failure(trajectory: Trajectory, start: State, settings: Settings, guards=None) -> NoReturn:
+    """Raise the error of a failed motion; `start` is its first state, `guards` those of each phase."""
+    about_guards = of_guards(trajectory, guards)
     if isinstance(trajectory, HybridTrajectory):
-        _raise_in_phase(trajectory, start, settings)
-    _raise(trajectory, start, settings)
+        _raise_in_phase(trajectory, start, settings, about_guards)
+    _raise(trajectory, start, settings, about_guards)
 
 
-def _raise(trajectory, start, settings, where="") -> NoReturn:
+def _raise(trajectory, start, settings, about_guards, where="") -> NoReturn:
     result = trajectory.result
     system, start = trajectory.system, coordinates.as_arrays(start, start.t.dtype)
     if is_among(result, [RESULTS.start_off_constraints]):
@@ -43,10 +45,10 @@ def _raise(trajectory, start, settings, where="") -> NoReturn:
     if is_among(result, problem.REFUSED):
         problem.check_finite(start)
         raise ValueError(where + (explain_failure(system, start) or message(result)))
-    raise RuntimeError(where + stopped_early(trajectory, settings))
+    raise RuntimeError(where + stopped_early(trajectory, settings, about_guards))
 
 
-def _raise_in_phase(trajectory, start, settings) -> NoReturn:
+def _raise_in_phase(trajectory, start, settings, about_guards) -> NoReturn:
     hybrid, switches, result = trajectory.system, trajectory.switches, trajectory.result
     if is_among(result, [RESULTS.too_many_switches]):
         raise RuntimeError(_too_many(trajectory))
@@ -56,7 +58,7 @@ def _raise_in_phase(trajectory, start, settings) -> NoReturn:
         raise RuntimeError(
             f"a guard of phase '{hybrid.names[trajectory.last_phase()]}', which began at t = "
             f"{float(trajectory.end.t):.9g}, is below zero at t = {float(trajectory.t[-1]):.9g}, but no crossing of "
-            "zero was found.\n"
+            f"zero was found{_not_seen(trajectory, settings)}.\n"
             "Fix: a guard that is continuous and above zero as long as its phase lasts; or max_step=, so that steps "
             "see where it dips below."
         )
@@ -78,7 +80,7 @@ def _raise_in_phase(trajectory, start, settings) -> NoReturn:
     alone = Trajectory(
         t=trajectory.t, multipliers=of_phase(trajectory.multipliers), events={}, arrays=arrays, static=static, **fields
     )
-    _raise(alone, entered, settings, there)
+    _raise(alone, entered, settings, about_guards, there)
 
 
 def _too_many(trajectory):
@@ -136,6 +138,20 @@ def _no_state_after(trajectory):
         "next phase that cannot be satisfied.\n"
         "Fix: look at reset(t, q, v, params) at that state, in traj.switches with throw=False."
     )
+
+
+def _not_seen(trajectory, settings):
+    """The guards that are below zero at the end of the last phase, which is integrated without them."""
+    hybrid, end, i = trajectory.system, trajectory.end, trajectory.last_phase()
+    ts = np.array([end.t, trajectory.t[-1]], np.asarray(trajectory.t).dtype)
+    alone = trajectory_of(hybrid.systems[i], end.q, end.v, trajectory.params, ts, None, settings)
+    values = {}
+    for switch in (hybrid.switches[k] for k in hybrid.leaving(i)):
+        of = lambda at, switch=switch: float(switch.value(at.t, at.q, at.v, at.multipliers, trajectory.params))
+        values[switch.in_words()] = of(end), of(alone.end)
+    below = {name: pair for name, pair in values.items() if not pair[1] >= 0}
+    said = "; ".join(f"that of {name} is {g1:.3g}, and {g0:.3g} at the start" for name, (g0, g1) in below.items())
+    return f": {said}" if said else ""
 
 
 def _phases_along(trajectory):

@@ -21,8 +21,9 @@ from lagjax.mechanics.system import System
 from lagjax.motion import problem
 from lagjax.motion.arriving import WHOLE_STEPS
 from lagjax.motion.backward import in_either_direction, runs_backward
-from lagjax.motion.crossings import Crossing, crossings_of, guards_of, left_to_diffrax, warn_of_events
+from lagjax.motion.crossings import Crossing, crossings_of, guards_of, left_to_diffrax
 from lagjax.motion.dense_output import at
+from lagjax.motion.doubt import warn_of_events, warn_of_missed_end
 from lagjax.motion.failure import raise_failure
 from lagjax.motion.global_error import steps_to_repeat
 from lagjax.motion.no_lanes import raise_at_run_time
@@ -192,19 +193,20 @@ def integrate(
     trajectory = in_either_direction(system, state.q, state.v, state.params, ts, guards, settings, backward)
     trajectory = report(trajectory)
     if throw:
-        trajectory = _raise_or_warn(trajectory, state._replace(t=ts[0]), settings)
+        trajectory = _raise_or_warn(trajectory, state._replace(t=ts[0]), settings, guards)
     return trajectory
 
 
-def _raise_or_warn(trajectory, start, settings):
+def _raise_or_warn(trajectory, start, settings, guards):
     """Raise or warn in the user's words; while tracing, at run time with the result's own message."""
     if coordinates.is_traced(trajectory):
         # A caller that watches learns the result from the report.
         return trajectory if WATCHED.value or SILENT.value else raise_at_run_time(trajectory)
     result = trajectory.result
     if not is_among(result, ENDED_WELL):
-        raise_failure(trajectory, start, settings)
-    problem.warn_of_inaccuracy(trajectory)
-    warn_of_events(trajectory.events)
+        raise_failure(trajectory, start, settings, guards)
+    if not warn_of_missed_end(trajectory, guards):
+        problem.warn_of_inaccuracy(trajectory)
+    warn_of_events(trajectory, guards)
     warn_of_lost(trajectory)
     return trajectory

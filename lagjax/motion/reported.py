@@ -16,7 +16,15 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from lagjax.jax_internals.one_function import poisoned
 from lagjax.jax_internals.primitives import primitive
-from lagjax.jax_internals.programs import applied, bodies, equations, interpreted, stands_for
+from lagjax.jax_internals.programs import (
+    ClosedJaxpr,
+    anywhere,
+    applied,
+    bodies,
+    interpreted,
+    once_per_program,
+    stands_for,
+)
 from lagjax.jax_internals.tracing import REGULAR_FIRST, WATCHED
 from lagjax.motion.consistency import stopped
 from lagjax.motion.results import RESULTS
@@ -89,25 +97,7 @@ def reporting(function: Callable) -> Callable:
     """
 
     def wrapped(*args):
-        leaves, structure = jtu.tree_flatten(args)
-        rest = []
-
-        def of_leaves(*leaves):
-            found, shape = jtu.tree_flatten(function(*jtu.tree_unflatten(structure, leaves)))
-            rest.append(shape)
-            for x in found:
-                if not isinstance(x, Array | np.ndarray | np.generic | bool | int | float | complex):
-                    raise TypeError(
-                        f"run must return numbers and arrays, and returned {x!r:.60}, a {type(x).__name__}.\n"
-                        "Fix: return only what differs from point to point."
-                    )
-            return [jnp.asarray(x) for x in found]
-
-        with WATCHED(True):
-            program = jax.make_jaxpr(of_leaves)(*leaves)
-            if _hides(program.jaxpr):
-                with REGULAR_FIRST(False):
-                    program = jax.make_jaxpr(of_leaves)(*leaves)
+        program, structure = watched(function, *args)
         program, marks = poisoned(program), []
 
         def collect(equation, operands):
@@ -117,28 +107,55 @@ def reporting(function: Callable) -> Callable:
                 return operands
             return applied(program.jaxpr, equation, operands)
 
-        found = interpreted(program, leaves, collect, lambda x, _: x, _reports)
+        found = interpreted(program, jtu.tree_leaves(args), collect, lambda x, _: x, _reports)
         reports = [x for x in marks if isinstance(x, Report)]
         settled = [jnp.all(x.settled) for x in marks if isinstance(x, Settled)]
         all_settled = jnp.all(jnp.stack(settled)) if settled else None
-        return jtu.tree_unflatten(rest[0], found), _together(reports), all_settled
+        return jtu.tree_unflatten(structure, found), _together(reports), all_settled
 
     return wrapped
 
 
+def watched(function: Callable, *args) -> tuple[ClosedJaxpr, PyTree]:
+    """The program of a function, with the reports of its integrations in it, and the structure of its results."""
+    leaves, structure = jtu.tree_flatten(args)
+    rest = []
+
+    def of_leaves(*leaves):
+        found, shape = jtu.tree_flatten(function(*jtu.tree_unflatten(structure, leaves)))
+        rest.append(shape)
+        for x in found:
+            if not isinstance(x, Array | np.ndarray | np.generic | bool | int | float | complex):
+                raise TypeError(
+                    f"run must return numbers and arrays, and returned {x!r:.60}, a {type(x).__name__}.\n"
+                    "Fix: return only what differs from point to point."
+                )
+        return [jnp.asarray(x) for x in found]
+
+    with WATCHED(True):
+        program = jax.make_jaxpr(of_leaves)(*leaves)
+        if _hides(program.jaxpr):
+            with REGULAR_FIRST(False):
+                program = jax.make_jaxpr(of_leaves)(*leaves)
+    return program, rest[-1]
+
+
+_has_report = anywhere(lambda equation: equation.primitive is _report_p)
+_says_settled = anywhere(lambda equation: equation.primitive is _report_p and equation.params["kind"] is Settled)
+
+
 def _reports(equation):
-    return any(inner.primitive is _report_p for body in bodies(equation) for inner in equations(body))
+    return any(map(_has_report, bodies(equation)))
 
 
+@once_per_program
 def _hides(jaxpr):
     """Whether a motion assumed regular is in a part of the program that the interpreter does not enter."""
     entered = [(equation, stands_for(equation)) for equation in jaxpr.eqns]
-    return any(_reports_settled(equation) if inner is None else _hides(inner.jaxpr) for equation, inner in entered)
-
-
-def _reports_settled(equation):
-    inside = (inner for body in bodies(equation) for inner in equations(body))
-    return any(inner.primitive is _report_p and inner.params["kind"] is Settled for inner in inside)
+    return any(
+        any(map(_says_settled, bodies(equation))) if inner is None else _hides(inner.jaxpr)
+        for equation, inner in entered
+    )
 
 
 def _together(reports):

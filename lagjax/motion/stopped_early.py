@@ -49,6 +49,8 @@ LIMITED, FAST = 0.3, 30.0
 UNSTABLE = 1.5
 # Velocities or accelerations grew and steps shrank by these factors; growth that is a singularity in any case.
 GREW, SHRANK, BLOWN_UP = 3.0, 0.3, (1e4, 1e6)
+# Guards are why steps are rejected if so many are, and less than this share of these without guards.
+MANY_REJECTED, FEWER = 0.5, 0.5
 # Above so many missing steps max_steps is not advised; above so many times those taken, only as the second advice.
 TOO_MANY, MANY_TIMES = 1e8, 10
 
@@ -79,8 +81,8 @@ class Steps(NamedTuple):
         return np.flatnonzero(self.accepted)[1:]
 
 
-def stopped_early(trajectory, settings) -> str:
-    """Say where and why an integration stopped before its last output."""
+def stopped_early(trajectory, settings, guards: str = "") -> str:
+    """Say where and why an integration stopped before its last output; `guards`: these, in words."""
     end, t0, t1 = trajectory.end, float(trajectory.t[0]), float(trajectory.t[-1])
     share = 100 * (float(end.t) - t0) / (t1 - t0)
     accepted, rejected = (int(trajectory.stats[f"num_{kind}_steps"]) for kind in ("accepted", "rejected"))
@@ -95,7 +97,8 @@ def stopped_early(trajectory, settings) -> str:
         return f"{what}: {reason}"
     last = f"The last state is {describe(end.q)}, v = {describe(end.v)}."
     if bool(trajectory.result == RESULTS.max_steps_reached):
-        return f"{what}: max_steps = {settings.max_steps} is used up. {last} {_used_up(trajectory, settings)}"
+        why = _used_up(trajectory, settings, guards)
+        return f"{what}: max_steps = {settings.max_steps} is used up. {last} {why}"
     said = f"{what}: {RESULTS[trajectory.result]} {last}"
     if settings.controller is not None:
         return f"{said}\nFix: {_of_controller(trajectory, settings)}."
@@ -114,7 +117,7 @@ def _with_cause(said, found):
     return f"{said}\nCause: {cause}." + (f"\nFix: {fix}." if fix else "")
 
 
-def _used_up(trajectory, settings):
+def _used_up(trajectory, settings, guards):
     """The rate of progress, what keeps the steps short, and what to do."""
     end, taken = trajectory.end, int(trajectory.stats["num_steps"])
     if settings.controller is not None or not taken:
@@ -123,10 +126,16 @@ def _used_up(trajectory, settings):
         found, facts, otherwise = None, "", "longer steps"
     else:
         steps, path = last_steps(trajectory, settings), _Path(trajectory)
-        rate, missing = steps.rate, steps.missing
+        rate, missing, rejected = steps.rate, steps.missing, np.mean(~steps.accepted)
+        with_guards = int(trajectory.stats["num_rejected_steps"]) / taken
+        if guards and with_guards > MANY_REJECTED and rejected < FEWER * with_guards:
+            return (
+                f"{100 * with_guards:.3g} % of the steps were rejected; without its guards the motion goes on with "
+                f"{100 * rejected:.3g} %. {guards}" + ("" if "Fix:" in guards else f"\nFix: max_steps={10 * taken}.")
+            )
         found = _singularity(path, steps) or _jump(path, steps) or _fast(path, steps)
-        rejected = int(np.sum(~steps.accepted))
-        facts = "" if found else f" {rejected} of the next {len(steps.h)} were rejected. {path.largest(steps)}"
+        of_next = f"{np.sum(~steps.accepted)} of the next {len(steps.h)}"
+        facts = "" if found else f" {of_next} were rejected. {path.largest(steps)}"
         otherwise = "a looser rtol and atol"
     if not missing < TOO_MANY:
         said = f"At the rate of its last steps ({rate:.2g} each) it does not arrive.{facts}"

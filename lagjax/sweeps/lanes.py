@@ -20,7 +20,7 @@ from lagjax.jax_internals.one_by_one import one_by_one
 from lagjax.jax_internals.programs import ClosedJaxpr
 from lagjax.jax_internals.tracing import REGULAR_FIRST
 from lagjax.mechanics.in_words import Call, check_arguments, in_words
-from lagjax.motion.reported import PATIENCE, reporting
+from lagjax.motion.reported import PATIENCE, reporting, watched
 from lagjax.motion.results import ENDED_WELL, RESULTS
 from lagjax.motion.trajectory import Trajectory
 from lagjax.sweeps.axes import POINT, Axes
@@ -104,12 +104,10 @@ def _explained(run, axes, patience, robust):
 
 
 def traced_point(run: Callable, axes: Axes, patience=None, robust=True) -> tuple[ClosedJaxpr, PyTree]:
-    """What a sweep computes at one point, and the structure in which it does."""
+    """What the user's function computes at one point, and the structure in which it does."""
     shaped = [jax.ShapeDtypeStruct(x.shape[1:], x.dtype) for x in axes.arrays]
     with _explained(run, axes, patience, robust):
-        at = lambda *values: point_of(run)(dict(zip(axes.names, values)))
-        program, shapes = jax.make_jaxpr(at, return_shape=True)(*shaped)
-    return program, jax.tree.structure(shapes)
+        return watched(run, dict(zip(axes.names, shaped)))
 
 
 def compiled(

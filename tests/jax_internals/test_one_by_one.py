@@ -21,6 +21,24 @@ def by_lineax(a, b):
     return lineax.linear_solve(lineax.MatrixLinearOperator(a), b, lineax.LU()).value
 
 
+@jax.custom_vjp
+def with_way_back(a, b):
+    """Σ a² b, whose derivative has LAPACK in both passes though its values have none."""
+    return jnp.sum(a**2) * b
+
+
+def forward(a, b):
+    """The values, and what the backward pass needs."""
+    return with_way_back(a, b), (a, b, jnp.linalg.inv(a))
+
+
+def backward(residuals, slope):
+    """2 a b = 2 (a (a⁻¹ a) a⁻¹) a b, and Σ a²."""
+    a, b, inverse = residuals
+    return 2 * a @ jnp.linalg.solve(a, a) @ inverse @ a * jnp.sum(slope * b), jnp.sum(a**2) * slope
+
+
+with_way_back.defvjp(forward, backward)
 FUNCTIONS = {
     "solve": jnp.linalg.solve,
     "cholesky": lambda a, b: jnp.linalg.cholesky(a @ a.T) @ b,
@@ -64,6 +82,24 @@ def test_the_same_values(name, kind):
     expected = jax.jit(transform(function))(A, B)
     for rewritten in (one_by_one(transform(function)), transform(one_by_one(function))):
         np.testing.assert_allclose(jax.jit(rewritten)(A, B), expected, rtol=1e-11, atol=1e-11)
+
+
+def test_a_backward_pass_of_the_users():
+    """LAPACK that only a backward pass calls is one matrix at a time too, however often rewritten; the slope is 2 a b.
+
+    Twin: JAX's own program has batches.
+    """
+    slopes = lambda function: jax.vmap(jax.grad(lambda a, b: jnp.sum(function(a, b))))
+    assert batches_in(text_of(slopes(with_way_back), A, B)) != []
+    once = one_by_one(with_way_back)
+    for function, factor in ((once, 1), (one_by_one(lambda a, b: once(a, 2 * b)), 2)):
+        text = text_of(slopes(function), A, B)
+        assert calls_in(text) != [] and batches_in(text) == []
+        expected = 2 * factor * A * jnp.sum(B, axis=1)[:, None, None]
+        np.testing.assert_allclose(slopes(function)(A, B), expected, rtol=1e-12)
+    # An operand that does not vary, and a result that is not used.
+    both = one_by_one(lambda a, b: (with_way_back(a, 1.0), with_way_back(a, b)[0]))
+    np.testing.assert_allclose(jax.grad(lambda a: both(a, B[0])[0])(A[0]), 2 * A[0], rtol=1e-12)
 
 
 def test_a_batch_of_solves_and_its_derivative():
