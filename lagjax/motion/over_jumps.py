@@ -167,7 +167,8 @@ def solved_over_jumps(jumps: Jumps, system: System, q0, v0, params, ts, guards, 
 
     turns = MOST_JUMPS + 2 + (0 if settings.jump_ts is None else settings.jump_ts.size)
     if isinstance(adjoint, diffrax.ForwardMode):
-        way = lax.while_loop(lambda way: way.continues, next_leg, first)
+        # On one number alone XLA would try to count the turns, in a copy of all that is inside, at each of its passes.
+        way = lax.while_loop(lambda way: way.continues & (way.count <= MOST_JUMPS), next_leg, first)
     else:
         step = lambda way, _: (lax.cond(eqxi.unvmap_any(way.continues), next_leg, lambda way: way, way), None)
         way, _ = lax.scan(step, first, None, length=turns)
