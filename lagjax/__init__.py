@@ -83,13 +83,13 @@ if TYPE_CHECKING:
     from lagjax.analysis.found import Symmetries
     from lagjax.analysis.found_equilibria import Equilibria
     from lagjax.analysis.hamilton import Hamiltonian, hamiltonian
+    from lagjax.analysis.latex import EquationsOfMotion, latex
     from lagjax.analysis.least_action import action
     from lagjax.analysis.linearised import Linearisation, linearise
     from lagjax.analysis.lyapunov import LyapunovExponents, lyapunov_exponents
     from lagjax.analysis.modes import Mode, NormalModes, normal_modes
     from lagjax.analysis.orbit import PeriodicOrbit
     from lagjax.analysis.orbit_branch import CriticalOrbit, OrbitBranch
-    from lagjax.analysis.read_back import EquationsOfMotion, latex
     from lagjax.analysis.routh import Routhian, routhian
     from lagjax.analysis.symmetries import symmetries
     from lagjax.analysis.symmetry import SymmetryTest, is_symmetry
@@ -121,7 +121,7 @@ LATER = {
     "lagjax.analysis.modes": "Mode NormalModes normal_modes",
     "lagjax.analysis.orbit": "PeriodicOrbit",
     "lagjax.analysis.orbit_branch": "CriticalOrbit OrbitBranch",
-    "lagjax.analysis.read_back": "EquationsOfMotion latex",
+    "lagjax.analysis.latex": "EquationsOfMotion latex",
     "lagjax.analysis.routh": "Routhian routhian",
     "lagjax.analysis.symmetries": "symmetries",
     "lagjax.analysis.symmetry": "SymmetryTest is_symmetry",

@@ -8,7 +8,7 @@ import pytest
 
 import lagjax as lj
 from lagjax import plot
-from lagjax.analysis.typeset import written
+from lagjax.analysis.latex import written
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.printable import by_line, printable
 

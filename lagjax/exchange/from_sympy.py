@@ -10,6 +10,7 @@ along -∂g/∂q; the last unknowns of `mass_matrix_full` and `rhs()` push along
 
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from importlib import import_module
 from typing import Any
 
 from lagjax.exchange.sympy_source import NotInJax, SymPyFunction, function_of, sympy_itself
@@ -71,6 +72,7 @@ def from_sympy(
     Source: Goldstein, *Classical Mechanics*, Eq. (1.53), (2.26); SymPy, `sympy.physics.mechanics.LagrangesMethod`.
     """
     sympy = sympy_itself()
+    import_module("sympy.physics.mechanics")
     if isinstance(lagrangian, sympy.physics.mechanics.LagrangesMethod):
         method, lagrangian = lagrangian, lagrangian._L[0]
         for word, value in (("coordinates", coordinates), ("constraints", constraints), ("force", force)):

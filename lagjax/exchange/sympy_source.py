@@ -37,13 +37,12 @@ WHOLE = 2**31 - 1
 RESERVED = {"t", "q", "v", "params", "jax", "jnp", "multipliers"}
 
 
-def sympy_itself() -> Any:
-    """Import SymPy, or say how to get it."""
+def sympy_itself(user: str = "lj.from_sympy") -> Any:
+    """Import SymPy, or say how to get it; `user` is the function that needs it."""
     try:
         import sympy
-        import sympy.physics.mechanics
     except ImportError as error:
-        raise ImportError("lj.from_sympy needs SymPy.\nFix: pip install 'lagjax[sympy]'.") from error
+        raise ImportError(f"{user} needs SymPy.\nFix: pip install 'lagjax[sympy]'.") from error
     return sympy
 
 
