@@ -18,6 +18,8 @@ from lagjax.motion.results import RESULTS, is_among
 OUTPUTS, SHARE, MORE, ZERO = 16, 0.1, 100.0, 64
 # What is said where no number shows more.
 UNKNOWN = "touches zero within round-off, or changes too fast between steps to be followed"
+# Guards are why steps are rejected if so many are, and less than this share of these without guards.
+MANY_REJECTED, FEWER = 0.5, 0.5
 # A guard is too fast if it changes by so many times its size in a step.
 FAST = 10.0
 
@@ -70,6 +72,16 @@ def of_guards(trajectory, guards) -> str:
     known = [f"The guard of {which} {cause}.\nFix: {fix}." for which, cause, fix in found if cause]
     names = " and ".join(which for which, *_ in found)
     return "\n".join(known) or (names and f"The guards looked at are those of {names}.")
+
+
+def rejected_by_guards(guards: str, stats: Mapping, without: float) -> str:
+    """Why all steps were used up, if by guards, of which `guards` tells; `without`: the share rejected without them."""
+    taken = int(stats["num_steps"])
+    share = int(stats["num_rejected_steps"]) / taken
+    if not guards or share <= MANY_REJECTED or without >= FEWER * share:
+        return ""
+    said = f"{100 * share:.3g} % of the steps were rejected; without its guards the motion goes on with "
+    return f"{said}{100 * without:.3g} %. {guards}" + ("" if "Fix:" in guards else f"\nFix: max_steps={10 * taken}.")
 
 
 def _in_doubt(trajectory, guards, name: str) -> tuple[str, str, str]:

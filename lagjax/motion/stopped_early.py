@@ -29,6 +29,7 @@ from lagjax.mechanics.diagnosis import describe, explain_failure
 from lagjax.mechanics.equations import equations_of
 from lagjax.motion.accuracy import of_a_step
 from lagjax.motion.consistent_state import unreachable_ahead
+from lagjax.motion.doubt import rejected_by_guards
 from lagjax.motion.loop import method_alone
 from lagjax.motion.results import RESULTS
 from lagjax.motion.solve import method_of
@@ -49,8 +50,6 @@ LIMITED, FAST = 0.3, 30.0
 UNSTABLE = 1.5
 # Velocities or accelerations grew and steps shrank by these factors; growth that is a singularity in any case.
 GREW, SHRANK, BLOWN_UP = 3.0, 0.3, (1e4, 1e6)
-# Guards are why steps are rejected if so many are, and less than this share of these without guards.
-MANY_REJECTED, FEWER = 0.5, 0.5
 # Above so many missing steps max_steps is not advised; above so many times those taken, only as the second advice.
 TOO_MANY, MANY_TIMES = 1e8, 10
 
@@ -90,15 +89,12 @@ def stopped_early(trajectory, settings, guards: str = "") -> str:
         f"the integration stopped at t = {float(end.t):.9g}, {share:.3g} % of the way to {t1:.6g}, after "
         f"{accepted} accepted and {rejected} rejected steps"
     )
-    reason = explain_failure(trajectory.system, State(end.t, end.q, end.v, trajectory.params)) or unreachable_ahead(
-        trajectory
-    )
-    if reason:
+    reason = explain_failure(trajectory.system, State(end.t, end.q, end.v, trajectory.params))
+    if reason := reason or unreachable_ahead(trajectory):
         return f"{what}: {reason}"
     last = f"The last state is {describe(end.q)}, v = {describe(end.v)}."
     if bool(trajectory.result == RESULTS.max_steps_reached):
-        why = _used_up(trajectory, settings, guards)
-        return f"{what}: max_steps = {settings.max_steps} is used up. {last} {why}"
+        return f"{what}: max_steps = {settings.max_steps} is used up. {last} " + _used_up(trajectory, settings, guards)
     said = f"{what}: {RESULTS[trajectory.result]} {last}"
     if settings.controller is not None:
         return f"{said}\nFix: {_of_controller(trajectory, settings)}."
@@ -126,16 +122,11 @@ def _used_up(trajectory, settings, guards):
         found, facts, otherwise = None, "", "longer steps"
     else:
         steps, path = last_steps(trajectory, settings), _Path(trajectory)
-        rate, missing, rejected = steps.rate, steps.missing, np.mean(~steps.accepted)
-        with_guards = int(trajectory.stats["num_rejected_steps"]) / taken
-        if guards and with_guards > MANY_REJECTED and rejected < FEWER * with_guards:
-            return (
-                f"{100 * with_guards:.3g} % of the steps were rejected; without its guards the motion goes on with "
-                f"{100 * rejected:.3g} %. {guards}" + ("" if "Fix:" in guards else f"\nFix: max_steps={10 * taken}.")
-            )
+        rate, missing, rejected = steps.rate, steps.missing, np.sum(~steps.accepted)
+        if said := rejected_by_guards(guards, trajectory.stats, rejected / len(steps.h)):
+            return said
         found = _singularity(path, steps) or _jump(path, steps) or _fast(path, steps)
-        of_next = f"{np.sum(~steps.accepted)} of the next {len(steps.h)}"
-        facts = "" if found else f" {of_next} were rejected. {path.largest(steps)}"
+        facts = "" if found else f" {rejected} of the next {len(steps.h)} were rejected. {path.largest(steps)}"
         otherwise = "a looser rtol and atol"
     if not missing < TOO_MANY:
         said = f"At the rate of its last steps ({rate:.2g} each) it does not arrive.{facts}"

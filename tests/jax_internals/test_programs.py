@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from jax.extend.core import jaxpr_as_fun
 
-from lagjax.jax_internals.programs import applied, interpreted, length, without_chains
+from lagjax.jax_internals.programs import anywhere, applied, interpreted, length, without_chains
 
 
 def below(x, count=100):
@@ -93,3 +93,14 @@ def test_calls_that_are_not_entered():
     """Twin: calls that are not entered stay primitives, which the rule evaluates."""
     _, met, _ = entered(lambda equation: equation.primitive.name == "jit")
     assert "custom_jvp_call" in met and "sin" not in met
+
+
+def test_what_is_anywhere_in_a_program():
+    """An equation inside a loop is found, and a program is looked through once; twin: none in another one."""
+    looked_at = []
+    has_sine = anywhere(lambda equation: looked_at.append(equation) or equation.primitive.name == "sin")
+    looped = jax.make_jaxpr(lambda x: jax.lax.fori_loop(0, 3, lambda _, x: jnp.sin(x), x))(1.0).jaxpr
+    for _ in range(2):
+        assert has_sine(looped) and not has_sine(jax.make_jaxpr(jnp.cos)(1.0).jaxpr)
+    seen = len(looked_at)
+    assert seen >= 3 and has_sine(looped) and len(looked_at) == seen

@@ -9,6 +9,7 @@ import pytest
 
 import lagjax as lj
 from lagjax import meter
+from lagjax.jax_internals import meaning
 from lagjax.sweeps import remembered
 from tests.counting import compiles
 
@@ -192,3 +193,18 @@ def test_the_structure_of_the_values_counts():
     with compiles() as found:
         quiet(two, xs(3))
     assert found == []
+
+
+@pytest.mark.slow
+def test_a_second_sweep_compares_little(monkeypatch):
+    """Of a motion's program, which JAX traced before, a second sweep compares no equation; twin: the first."""
+    calls, whole = [], meaning.meaning_of
+    monkeypatch.setattr(meaning, "meaning_of", lambda jaxpr: calls.append(jaxpr) or whole(jaxpr))
+    fall = lj.System(lambda t, q, v, p: 0.5 * v**2 - p * q)
+    run = lambda point: lj.integrate(fall, 0.0, 0.0, point["x"], ts=jnp.array([0.0, 1.0])).q[-1]
+    counts = []
+    for _ in range(2):
+        calls.clear()
+        np.testing.assert_allclose(quiet(run, xs(5)).values, -xs(5)["x"] / 2, rtol=1e-12)
+        counts.append(len(calls))
+    assert counts[0] > 50 and counts[1] < 20
