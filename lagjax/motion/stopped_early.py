@@ -167,7 +167,8 @@ def _attempts(trajectory, settings):
     terms = diffrax.ODETerm(Field(equations_of(system, *state)))
     # Tolerances from the start: near a singularity sizes differ from those at the start.
     first = State(*jax.tree.map(lambda x: x[0], (trajectory.t, trajectory.q, trajectory.v)), params)
-    tolerance = tolerances_at(first, trajectory.t, settings)
+    at_start = _on_path(system, params, first.t, (first.q, first.v), jnp.zeros(3))
+    tolerance = tolerances_at(first, trajectory.t, settings, a=at_start)
 
     def attempt(t0, t1, y):
         return _attempt(method, terms, jnp.asarray(t0), jnp.asarray(t1), y, params, tolerance)
