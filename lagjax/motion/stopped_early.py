@@ -124,7 +124,9 @@ def _used_up(trajectory, settings):
     else:
         steps, path = last_steps(trajectory, settings), _Path(trajectory)
         rate, missing = steps.rate, steps.missing
-        found = _singularity(path, steps) or _jump(path, steps) or _fast(path, steps)
+        method = method_of(settings, trajectory.system, *_end_of(trajectory))
+        implicit = isinstance(method, diffrax.AbstractImplicitSolver)
+        found = _singularity(path, steps) or _jump(path, steps) or _fast(path, steps, implicit)
         rejected = int(np.sum(~steps.accepted))
         facts = "" if found else f" {rejected} of the next {len(steps.h)} were rejected. {path.largest(steps)}"
         otherwise = "a looser rtol and atol"
@@ -162,7 +164,7 @@ def _rounded_up(count):
 def _attempts(trajectory, settings):
     """`attempt(t0, t1, y)` -> (state, error), its order, where the motion ended, and the direction of time."""
     system, params, end = trajectory.system, trajectory.params, trajectory.end
-    state = (end.t, end.q, end.v, params)
+    state = _end_of(trajectory)
     method = method_alone(settings, method_of(settings, system, *state))
     terms = diffrax.ODETerm(Field(equations_of(system, *state)))
     # Tolerances from the start: near a singularity sizes differ from those at the start.
@@ -175,6 +177,11 @@ def _attempts(trajectory, settings):
 
     order = float(method.error_order(terms))
     return attempt, order, (float(end.t), (end.q, end.v)), np.sign(float(trajectory.t[-1] - end.t))
+
+
+def _end_of(trajectory):
+    end = trajectory.end
+    return end.t, end.q, end.v, trajectory.params
 
 
 def last_steps(trajectory, settings) -> Steps:
@@ -365,8 +372,8 @@ def _undefined(path, steps):
     )
 
 
-def _fast(path, steps):
-    """Find eigenvalues that are large compared with one over a step."""
+def _fast(path, steps, implicit):
+    """Find eigenvalues that are large compared with one over a step; decay does not limit an implicit method."""
     kept = steps.kept
     if not kept.size:
         return None
@@ -377,7 +384,7 @@ def _fast(path, steps):
         return None
     fastest = rates[np.argmax(np.abs(rates))]
     if -fastest.real > abs(fastest.imag):
-        if -fastest.real * step < UNSTABLE:
+        if implicit or -fastest.real * step < UNSTABLE:
             return None
         return (
             f"a stiff system: something decays at a rate of {-fastest.real:.2g} per unit of time, and an explicit "
