@@ -105,15 +105,14 @@ def _action_of_trajectory(system, path, params, t0, t1, pieces):
     turned = runs * ends[0] > runs * ends[1]
     first, last = jnp.where(turned, ends[::-1], ends)
     edges = first + (last - first) * jnp.linspace(0.0, 1.0, max(pieces, len(t) - 1) + 1, dtype=t.dtype)
-    a, b = edges[:-1, None], edges[1:, None]
-    nodes = (0.5 * (a + b) + 0.5 * (b - a) * quadrature.NODES.astype(t.dtype)).ravel()
+    nodes = quadrature.nodes(edges[:-1], edges[1:]).ravel()
     at = in_one_solve(path, nodes)
     values = jax.vmap(lambda t, q, v: system.lagrangian(t, q, v, s.params))(nodes, at.q, at.v)
     values = values.reshape(-1, quadrature.NODES.size)
     # NaN for a motion that failed, also where the nodes lie before that.
     complete = jnp.all(jnp.isfinite(jnp.concatenate([x.ravel() for x in jax.tree.leaves((q, v))])))
     values = jnp.where(complete, jnp.where(turned, -values, values), jnp.nan)
-    integral = lambda weights: jnp.sum(0.5 * (b - a)[:, 0] * (values @ weights.astype(t.dtype)))
+    integral = lambda weights: jnp.sum(0.5 * jnp.diff(edges) * (values @ weights.astype(t.dtype)))
     found = integral(quadrature.KRONROD)
     return found, jnp.abs(found - integral(quadrature.GAUSS))
 
