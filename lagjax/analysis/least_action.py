@@ -1,10 +1,8 @@
 """Hamilton's action of a path: S = ∫ L(t, q, dq/dt) dt, stationary on true motions among paths with the same ends.
 
-A path is a trajectory, or a function of time whose derivative is the velocity. Between the outputs of a trajectory the
-motion is integrated again, at the nodes of a quadrature that is refined until it is as accurate as the motion
-(`motion/works.py`), so that it does not matter how far apart the outputs lie. While JAX traces, the number of nodes
-must be known beforehand: then q is the cubic through the positions and velocities of the outputs. Because S is
-stationary on true motions, its error is of the order of the square of the cubic's error.
+A path is a trajectory, or a function of time whose derivative is the velocity. A trajectory is integrated again, at the
+nodes of a quadrature, so that it does not matter how far apart its outputs lie. The quadrature is refined until it is
+as accurate as the motion (`motion/works.py`); while JAX traces, its nodes must be known beforehand.
 
 Source: Goldstein, *Classical Mechanics*, Eq. (2.1), (2.2).
 """
@@ -22,8 +20,10 @@ from lagjax.mechanics import coordinates
 from lagjax.mechanics.compiled import compiled
 from lagjax.mechanics.first_call import traced_system
 from lagjax.mechanics.refusals import check_system
+from lagjax.motion.dense_output import in_one_solve
 from lagjax.motion.trajectory import Trajectory
 from lagjax.motion.works import Motion
+from lagjax.numerics import quadrature
 
 # Points of Gauss's rule on each piece, which is exact up to degree 15.
 POINTS = 8
@@ -45,21 +45,21 @@ def action(
     - `path`: `q(t)` -> coordinates, smooth between t0 and t1, or a `Trajectory`.
     - `params`: as L takes it; by default those of the trajectory.
     - `t0`, `t1`: the ends, `[t]`; by default those of the trajectory.
-    - `pieces`: for a function, the number of equal parts of the time span, each integrated by a rule of degree 15. A
-      trajectory is integrated again between its outputs, in parts as short as it takes. While JAX traces (under `jit`,
-      `grad`, `vmap`) its outputs must lie so close that a cubic through two of them follows the motion: see `error`.
+    - `pieces`: the number of equal parts of the time span, each integrated by a rule of degree 15. A trajectory is
+      integrated again, in parts as short as it takes; while JAX traces (under `jit`, `grad`, `vmap`) in this number of
+      parts, or one for each output if these are more: `error` tells whether they suffice.
     - `error`: return the estimated error of the integral as well; that of the motion itself is `traj.error`.
 
     **Returns:** S, scalar, `[L] [t]`; NaN for a trajectory that failed. With `error=True` (S, its estimated error).
 
     **Raises:** `TypeError` for a path that is neither a function nor a trajectory; `ValueError` for a function without
-    t0 and t1, a batch of trajectories, or one that ends before t1.
+    t0 and t1, a batch of trajectories, or one that ends before t1; `TypeError` for a motion in phases while JAX traces.
 
     Source: Goldstein, Eq. (2.1).
     """
     check_system(system, path, params)
     if isinstance(path, Trajectory):
-        found = _action_of_trajectory(system, path, params, t0, t1)
+        found = _action_of_trajectory(system, path, params, t0, t1, pieces)
         return found if error else found[0]
     if not callable(path):
         raise TypeError(
@@ -78,7 +78,7 @@ def action(
     return (whole, jnp.abs(halves - whole)) if error else whole
 
 
-def _action_of_trajectory(system, path, params, t0, t1):
+def _action_of_trajectory(system, path, params, t0, t1, pieces):
     if path.t.ndim != 1:
         raise ValueError(
             f"this trajectory is a batch of shape {path.t.shape[:-1]}: take the action of one lane of it.\n"
@@ -86,11 +86,8 @@ def _action_of_trajectory(system, path, params, t0, t1):
         )
     params = path.params if params is None else params
     t, q, v = path.t, path.q, path.v
-    _, unflatten = coordinates.flatten(jax.tree.map(lambda x: x[0], q))
     s = coordinates.state(t[0], *jax.tree.map(lambda x: x[0], (q, v)), params)
     system = traced_system(system, s)
-    flat = lambda tree: jax.vmap(lambda y: coordinates.flatten(y)[0])(tree)
-    x, u = flat(q), flat(v)
     t0, t1 = (t[0] if t0 is None else t0), (t[-1] if t1 is None else t1)
     if not coordinates.is_traced((t, t0, t1)):
         low, high = float(np.min(t)), float(np.max(t))
@@ -102,24 +99,22 @@ def _action_of_trajectory(system, path, params, t0, t1):
     if is_eager() and not coordinates.is_traced((path, t0, t1, s.params, eqx.filter(system, eqx.is_array))):
         return _along_the_steps(system, path, s.params, float(t0), float(t1))
 
-    def piece(a, b, x_a, x_b, u_a, u_b):
-        def at(t):
-            where = lambda t: unflatten(_cubic((t - a) / (b - a), b - a, x_a, x_b, u_a, u_b))
-            return system.lagrangian(t, *_position_and_velocity(where, t), s.params)
-
-        # Only the part of the piece between t0 and t1 counts.
-        inside = lambda end: jnp.clip(end, jnp.minimum(a, b), jnp.maximum(a, b))
-        forward = jnp.where(t1 >= t0, 1.0, -1.0) * jnp.where(b >= a, 1.0, -1.0)
-        first, last = jnp.where(forward > 0, inside(t0), inside(t1)), jnp.where(forward > 0, inside(t1), inside(t0))
-        return forward * _integral(at, first[None], last[None])
-
-    def total(t, x, u):
-        return jnp.sum(jax.vmap(piece)(t[:-1], t[1:], x[:-1], x[1:], u[:-1], u[1:]))
-
-    found = total(t, x, u)
-    # From every second output, the last included: an upper bound where outputs are close, no bound where they are not.
-    few = np.unique([*range(0, t.shape[0], 2), t.shape[0] - 1])
-    return found, jnp.abs(total(t[few], x[few], u[few]) - found)
+    # From the earlier end, as the motion runs, to the later one.
+    runs = -1 if path.static.how.backward else 1
+    ends = jnp.stack([jnp.asarray(end, t.dtype) for end in (t0, t1)])
+    turned = runs * ends[0] > runs * ends[1]
+    first, last = jnp.where(turned, ends[::-1], ends)
+    edges = first + (last - first) * jnp.linspace(0.0, 1.0, max(pieces, len(t) - 1) + 1, dtype=t.dtype)
+    nodes = quadrature.nodes(edges[:-1], edges[1:]).ravel()
+    at = in_one_solve(path, nodes)
+    values = jax.vmap(lambda t, q, v: system.lagrangian(t, q, v, s.params))(nodes, at.q, at.v)
+    values = values.reshape(-1, quadrature.NODES.size)
+    # NaN for a motion that failed, also where the nodes lie before that.
+    complete = jnp.all(jnp.isfinite(jnp.concatenate([x.ravel() for x in jax.tree.leaves((q, v))])))
+    values = jnp.where(complete, jnp.where(turned, -values, values), jnp.nan)
+    integral = lambda weights: jnp.sum(0.5 * jnp.diff(edges) * (values @ weights.astype(t.dtype)))
+    found = integral(quadrature.KRONROD)
+    return found, jnp.abs(found - integral(quadrature.GAUSS))
 
 
 def _along_the_steps(system, path, params, t0, t1):
@@ -146,15 +141,6 @@ def _along_the_steps(system, path, params, t0, t1):
 @compiled
 def _lagrangians(system, t, q, v, params):
     return jax.vmap(lambda t, q, v: system.lagrangian(t, q, v, params))(t, q, v)
-
-
-def _cubic(s, h, x_a, x_b, u_a, u_b):
-    """Hermite's cubic between two outputs, for s from 0 to 1."""
-    return (
-        (1 + 2 * s) * (1 - s) ** 2 * x_a
-        + s**2 * (3 - 2 * s) * x_b
-        + h * (s * (1 - s) ** 2 * u_a - s**2 * (1 - s) * u_b)
-    )
 
 
 def _position_and_velocity(path, t):

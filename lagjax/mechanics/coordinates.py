@@ -161,7 +161,33 @@ def given_params(params, dtype):
             return np.asarray(x, dtype)
         return _as_array(x) if isinstance(x, (np.ndarray, np.generic)) else x
 
-    return jtu.tree_map(convert, params)
+    converted = jtu.tree_map(convert, params)
+    _check_hashable(converted)
+    return converted
+
+
+def _check_hashable(params):
+    """Raise for an entry of params that is not a number and not hashable: programs are kept by such values."""
+    if not any(map(_unhashable, jtu.tree_leaves(params))):
+        return
+    path, x = next(pair for pair in jtu.tree_leaves_with_path(params) if _unhashable(pair[1]))
+    name = jtu.keystr(path, simple=True, separator=".")
+    raise TypeError(
+        f"{f'entry {name!r} of params' if name else 'params'} is {x!r:.60}, a {type(x).__name__}, which is neither "
+        "numbers nor hashable, and a program is kept for the values of all that is not numbers.\n"
+        "Usual cause: a set, or an object of a class that defines __eq__ alone, as a dataclass does.\n"
+        "Fix: a frozenset or a tuple; for a class @dataclass(frozen=True), or jax.tree_util.register_dataclass."
+    )
+
+
+def _unhashable(x):
+    if isinstance(x, NUMBERS):
+        return False
+    try:
+        hash(x)
+    except TypeError:
+        return True
+    return False
 
 
 def _as_array(x):

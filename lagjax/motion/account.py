@@ -30,6 +30,8 @@ BY_STABILITY, BY_LONGEST = 0.35, 1.6
 ENOUGH = 40
 # A tolerance below this many round-offs is close to round-off.
 NEAR_ROUND_OFF = 1e3
+# An error that grows by this share of its digits between two outputs does not grow steadily.
+AT_ONCE = 0.8
 
 
 class Account(NamedTuple):
@@ -191,16 +193,26 @@ def _cause(trajectory, account, row, column, rtol):
     speeds = abs(account.value[:, len(account.names) // 2 :])
     typical = np.median(speeds, axis=0)
     peaks = speeds.max(axis=0) / np.where(typical > 0, typical, np.inf)
-    if peaks.max() > PEAK and not round_off:
-        i = int(np.argmax(peaks))
+    i, times = int(np.argmax(peaks)), account.amplified[row, column]
+    # The digits lost in each interval, beyond the errors of the steps.
+    lost = np.diff(np.log10(np.maximum(account.amplified[: row + 1, column], 1.0)))
+    near = speeds[: row + 1, i] > PEAK * typical[i]
+    there = np.sum(lost[near[1:] | near[:-1]])
+    if peaks.max() > PEAK and there > 0.5 * np.sum(lost) and not round_off:
         return (
             f"the motion passes near a singularity: {account.names[len(account.names) // 2 + i]} grows to "
-            f"{peaks[i]:.2g} times its median, and digits lost there do not come back",
+            f"{peaks[i]:.2g} times its median, and there {there:.2g} of {np.sum(lost):.2g} digits were lost",
             f"{tighter}, or coordinates that are regular there",
         )
-    times = account.amplified[row, column]
     limit = f"rtol = {rtol:.1g} is {rtol / np.finfo(dtype).eps:.3g} round-offs of {dtype}"
     beyond = "study what does not depend on a single motion: averages, sections, energies"
+    if times > AMPLIFIED and not round_off and not np.max(lost) < AT_ONCE * np.sum(lost):
+        a, b = account.t[np.argmax(lost) :][:2]
+        return (
+            f"between t = {a:.6g} and {b:.6g} the error grows {10 ** np.max(lost):.0e} times beyond what the steps may "
+            "have; possible causes: the motion amplifies errors, or a force there is narrower than the steps",
+            f"ts with outputs in between, which show where; {tighter}; for a narrow force max_step= or jump_ts=",
+        )
     if times > AMPLIFIED:
         kept = "float64" if single and round_off else None if round_off else tighter
         return (

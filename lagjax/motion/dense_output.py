@@ -42,6 +42,10 @@ ASIDE = 1e-6
 MAX_STEPS = 2**20
 # The number of times solved for in one batch: each then takes 7 microseconds, or 20 alone, if one step is enough.
 LANES = 256
+IN_PHASES = (
+    "a motion in phases between its outputs needs the values of its switches, but this one is being traced, or a "
+    "batch.\nFix: take one motion outside the program; or give these times to lj.integrate as ts."
+)
 
 
 class Known(NamedTuple):
@@ -137,11 +141,16 @@ def _before(known: Known, t, backward: bool):
 
 def _traced(trajectory, t):
     """Return the motion at t in a traced program: NaN where there is no motion."""
+<<<<<<< HEAD
     if isinstance(trajectory, HybridTrajectory):
         raise TypeError(
             "at(t) of a motion in phases needs the values of its switches, but this one is being traced, or a batch.\n"
             "Fix: call at(t) of one motion outside the program; or give these times to lj.integrate as ts."
         )
+=======
+    if isinstance(trajectory.system, Hybrid):
+        raise TypeError(IN_PHASES)
+>>>>>>> h2
     of_one = partial(_at_one, trajectory)
     for _ in range(t.ndim):
         of_one = jax.vmap(of_one)
@@ -178,6 +187,26 @@ def _at_one(trajectory, t):
 
 def _continued(system, params, asked, tolerance, node: Snapshot, t, backward):
     """Continue the motion from a node to t; return it there, and the result."""
+    found, result = _solved_from(system, params, asked, tolerance, node, t[None], backward)
+    return jax.tree.map(lambda x: x[-1], found)._replace(t=t), result
+
+
+def in_one_solve(trajectory, t):
+    """The motion at times (N,), in its own order, by one solve from its start, while JAX traces; NaN where it fails.
+
+    The span stays that of the trajectory, on which some settings depend.
+    """
+    if isinstance(trajectory.system, Hybrid):
+        raise TypeError(IN_PHASES)
+    first = jax.tree.map(lambda x: x[0], _known_of(trajectory).at)
+    of_system = trajectory.system, trajectory.params, trajectory.asked, trajectory.tolerance
+    ts = jnp.append(t, trajectory.t[-1])
+    found, _ = _solved_from(*of_system, first, ts, trajectory.static.how.backward)
+    return jax.tree.map(lambda x: x[1:-1], found)
+
+
+def _solved_from(system, params, asked, tolerance, node: Snapshot, ts, backward):
+    """Integrate from a node to the times ts, (N,); return the motion at the node and at these, and the result."""
     rtol, atol = tolerance
     by_size = atol.ndim == 2
     settings = Settings(
@@ -199,10 +228,9 @@ def _continued(system, params, asked, tolerance, node: Snapshot, t, backward):
         progress=False,
         jumps=asked.jumps,
     )
-    ts = jnp.stack([node.t, t])
+    ts = jnp.append(node.t, ts)
     found = in_either_direction(system, node.q, node.v, params, ts, None, settings, backward)
-    last = lambda tree: jax.tree.map(lambda x: x[-1], tree)
-    return Snapshot(t, *map(last, (found.q, found.v, found.multipliers))), found.result
+    return Snapshot(ts, found.q, found.v, found.multipliers), found.result
 
 
 @partial(compiled, in_numpy=True)

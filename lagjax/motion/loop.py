@@ -25,7 +25,7 @@ from lagjax.motion.recording import Problem, Recorded, with_room
 from lagjax.motion.replay import Replay, replayed
 from lagjax.motion.sight import Sight
 from lagjax.motion.stepping import FastField, Field, OnManifold, forward_differentiable
-from lagjax.motion.tolerances import Scales, Tolerances, Weighing, as_nothing
+from lagjax.motion.tolerances import AsNothing, Scales, Tolerances, Weighing
 from lagjax.motion.watching import Watching
 from lagjax.numerics.nystrom import Nystrom
 from lagjax.numerics.radau import Radau5
@@ -183,7 +183,9 @@ def _with_root_finder(settings, scales):
     """An implicit method with diffrax's default root finder gets ours; all get the solve's tolerances."""
     method, tolerances = settings.method, (settings.rtol[0], settings.atol[0])
     if scales is not None and isinstance(method, Radau5):
-        tolerances = settings.rtol[0], as_nothing(scales, settings.rtol)
+        as_nothing = AsNothing(scales, settings.rtol)
+        ours = isinstance(method.root_finder, SimplifiedNewton)
+        tolerances = settings.rtol[0], as_nothing if ours else as_nothing(jnp.zeros_like(scales.first))
     if isinstance(getattr(method, "root_finder", None), diffrax.VeryChord):
         return eqx.tree_at(lambda method: method.root_finder, method, SimplifiedNewton(*tolerances))
     return with_tolerances(method, *tolerances)

@@ -56,9 +56,8 @@ def solved(system, q0, v0, params, ts, guards, settings, adjoint, sizes_so_far=N
     if guards is not None and equations.unflatten is not None:
         guards = guards.in_numbers(equations.unflatten)
     q, v = equations.inside(q0), equations.inside(v0)
-    _, atol = tolerances_at(State(ts[0], q, v, params), ts, settings, sizes_so_far)
-    settings = replace(settings, atol=atol)
     start = _start(equations, q, v, ts, settings, sizes_so_far)
+    settings = replace(settings, atol=start.atol)
     solution = _stepped(equations, start, ts, guards, settings, adjoint)
     outputs = _outputs(equations, start, solution, ts, settings)
     fields = _result(equations, start, solution, outputs, guards, settings)
@@ -76,13 +75,14 @@ def solved(system, q0, v0, params, ts, guards, settings, adjoint, sizes_so_far=N
 class Start(NamedTuple):
     """The first state, moved onto the constraints; `against`: which reasons to refuse it hold, by names of `RESULTS`.
 
-    `scales`: those of the motion, if tolerances are relative to its size.
+    `atol`: as given, or by the state's size; `scales`: those of the motion, if tolerances are relative to its size.
     """
 
     q: PyTree[Float[Array, "..."]]
     v: PyTree[Float[Array, "..."]]
     against: dict[str, Bool[Array, ""]]
     refused: Bool[Array, ""]
+    atol: Float[Array, " 2"]
     scales: Scales | None
 
 
@@ -99,13 +99,15 @@ class Outputs(NamedTuple):
 
 def _start(equations: Equations, q, v, ts, settings, sizes_so_far) -> Start:
     """Prepare the start; of the reasons to refuse it, the last one that holds becomes the result."""
-    t, off_constraints, holds = ts[0], jnp.asarray(False), jnp.asarray(True)
-    if equations.system.constraints:
-        tolerances = START_TOLERANCES * settings.rtol, START_TOLERANCES * settings.atol
-        off_constraints = ~within(equations, t, q, v, *tolerances)
+    t, given, off_constraints = ts[0], State(ts[0], q, v, equations.params), jnp.asarray(False)
     if settings.drift == "project":
-        q, v, holds = returned(equations, t, q, v, settings.rtol, settings.atol)
+        q, v, _ = returned(equations, t, q, v, *tolerances_at(given, ts, settings, sizes_so_far))
     a, _, finite, singular, contradictory, mass = stopped(equations.verdict(t, q, v))
+    tolerances = rtol, atol = tolerances_at(given, ts, settings, sizes_so_far, a)
+    if equations.system.constraints:
+        off_constraints = ~within(equations, *given[:3], START_TOLERANCES * rtol, START_TOLERANCES * atol)
+        if settings.drift == "project" and not equations.are_taken_for_regular:
+            off_constraints |= finite & ~singular & ~within(equations, t, q, v, *tolerances)
     scales = scales_of(mass, *stopped((q, v)), a, stopped(span_of(ts))) if settings.by_size else None
     if scales is not None and sizes_so_far is not None:
         scales = scales._replace(first=jnp.maximum(scales.first, sizes_so_far))
@@ -115,11 +117,11 @@ def _start(equations: Equations, q, v, ts, settings, sizes_so_far) -> Start:
         "start_singular": singular,
         "start_not_finite": ~finite,
         "contradictory": contradictory,
-        "start_off_constraints": off_constraints | (finite & ~singular & ~holds),
+        "start_off_constraints": off_constraints,
         "tolerance_too_small": jnp.asarray(too_small),
         "unordered": jnp.any(ts[1:] < ts[:-1]) | ~jnp.all(jnp.asarray([True, *(length > 0 for length in lengths)])),
     }
-    return Start(q, v, against, jnp.any(jnp.stack([*against.values()])), scales)
+    return Start(q, v, against, jnp.any(jnp.stack([*against.values()])), atol, scales)
 
 
 def _stepped(equations, start, ts, guards, settings, adjoint) -> Solution:

@@ -291,7 +291,7 @@ def check_finite(s: State):
 def off_constraints(system: System, s: State, rtol, atol) -> str:
     """Say which constraints the initial state violates."""
     check_finite(s)
-    violated = departures(system, s, rtol, atol)
+    violated = departures(system, s, rtol, atol) or departures(system, s, 0.0, 0.0)
     if any(f"= {word}" in violated for word in ("nan", "inf", "-inf")):
         return (
             f"constraints are not finite at the initial state: {violated}.\n"

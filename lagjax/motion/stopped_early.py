@@ -122,10 +122,18 @@ def _used_up(trajectory, settings, guards):
         found, facts, otherwise = None, "", "longer steps"
     else:
         steps, path = last_steps(trajectory, settings), _Path(trajectory)
+<<<<<<< HEAD
         rate, missing, rejected = steps.rate, steps.missing, np.sum(~steps.accepted)
         if said := rejected_by_guards(guards, trajectory.stats, rejected / len(steps.h)):
             return said
         found = _singularity(path, steps) or _jump(path, steps) or _fast(path, steps)
+=======
+        rate, missing = steps.rate, steps.missing
+        method = method_of(settings, trajectory.system, *_end_of(trajectory))
+        implicit = isinstance(method, diffrax.AbstractImplicitSolver)
+        found = _singularity(path, steps) or _jump(path, steps) or _fast(path, steps, implicit)
+        rejected = int(np.sum(~steps.accepted))
+>>>>>>> h2
         facts = "" if found else f" {rejected} of the next {len(steps.h)} were rejected. {path.largest(steps)}"
         otherwise = "a looser rtol and atol"
     if not missing < TOO_MANY:
@@ -162,18 +170,24 @@ def _rounded_up(count):
 def _attempts(trajectory, settings):
     """`attempt(t0, t1, y)` -> (state, error), its order, where the motion ended, and the direction of time."""
     system, params, end = trajectory.system, trajectory.params, trajectory.end
-    state = (end.t, end.q, end.v, params)
+    state = _end_of(trajectory)
     method = method_alone(settings, method_of(settings, system, *state))
     terms = diffrax.ODETerm(Field(equations_of(system, *state)))
     # Tolerances from the start: near a singularity sizes differ from those at the start.
     first = State(*jax.tree.map(lambda x: x[0], (trajectory.t, trajectory.q, trajectory.v)), params)
-    tolerance = tolerances_at(first, trajectory.t, settings)
+    at_start = _on_path(system, params, first.t, (first.q, first.v), jnp.zeros(3))
+    tolerance = tolerances_at(first, trajectory.t, settings, a=at_start)
 
     def attempt(t0, t1, y):
         return _attempt(method, terms, jnp.asarray(t0), jnp.asarray(t1), y, params, tolerance)
 
     order = float(method.error_order(terms))
     return attempt, order, (float(end.t), (end.q, end.v)), np.sign(float(trajectory.t[-1] - end.t))
+
+
+def _end_of(trajectory):
+    end = trajectory.end
+    return end.t, end.q, end.v, trajectory.params
 
 
 def last_steps(trajectory, settings) -> Steps:
@@ -364,8 +378,8 @@ def _undefined(path, steps):
     )
 
 
-def _fast(path, steps):
-    """Find eigenvalues that are large compared with one over a step."""
+def _fast(path, steps, implicit):
+    """Find eigenvalues that are large compared with one over a step; decay does not limit an implicit method."""
     kept = steps.kept
     if not kept.size:
         return None
@@ -376,7 +390,7 @@ def _fast(path, steps):
         return None
     fastest = rates[np.argmax(np.abs(rates))]
     if -fastest.real > abs(fastest.imag):
-        if -fastest.real * step < UNSTABLE:
+        if implicit or -fastest.real * step < UNSTABLE:
             return None
         return (
             f"a stiff system: something decays at a rate of {-fastest.real:.2g} per unit of time, and an explicit "

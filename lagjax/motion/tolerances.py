@@ -51,9 +51,9 @@ class Scales(NamedTuple):
     """The size of a motion as told by its start; rows are coordinates and velocities.
 
     - `root_mass`: √M_ii; `over_root_mass`: one over it, bounded.
-    - `reach`: the largest of √M_ii times the numbers, never zero.
+    - `reach`: the largest of √M_ii times the numbers.
     - `time`: the time in which they change. `first`: the sizes of the numbers; if all are zero, a substitute.
-    - `unknown`: whether that is zero too, since nothing accelerates at the start.
+    - `unknown`: whether all of this is zero, since nothing accelerates at the start either.
     """
 
     root_mass: Float[Array, "1 n"]
@@ -64,19 +64,18 @@ class Scales(NamedTuple):
     unknown: Bool[Array, ""]
 
 
-def tolerances_at(start, ts, settings, sizes_so_far=None) -> Tolerances:
+def tolerances_at(start, ts, settings, sizes_so_far=None, a=None) -> Tolerances:
     """The tolerances of the whole state, as given or from the start's size; for constraints, which mix coordinates.
 
-    `sizes_so_far` (2, n): the largest coordinates and velocities before it.
+    `sizes_so_far` (2, n): the largest coordinates and velocities before it; `a`: the accelerations there, which are its
+    size where all of the state is zero. Where nothing accelerates either there is none, and it counts as one.
     """
     if not settings.by_size:
         return Tolerances(settings.rtol, settings.atol)
-    sizes = jnp.abs(_rows(start.q, start.v))
-    span, (of_q, of_v) = (
-        span_of(ts),
-        jnp.max(sizes if sizes_so_far is None else jnp.maximum(sizes, sizes_so_far), axis=1),
-    )
-    of_q = jnp.where(of_q > 0, of_q, jnp.where(of_v > 0, of_v * span, 1.0))
+    sizes, span = jnp.abs(_rows(start.q, start.v)), span_of(ts)
+    of_q, of_v = jnp.max(sizes if sizes_so_far is None else jnp.maximum(sizes, sizes_so_far), axis=1)
+    of_a = 0.0 if a is None else jnp.max(jnp.abs(jnp.nan_to_num(_rows(a), posinf=0.0, neginf=0.0)))
+    of_q = jnp.where(of_q > 0, of_q, jnp.where(of_v > 0, of_v * span, jnp.where(of_a > 0, of_a * span**2, 1.0)))
     return Tolerances(settings.rtol, stopped(settings.rtol * jnp.stack([of_q, jnp.maximum(of_v, of_q / span)])))
 
 
@@ -104,7 +103,6 @@ def scales_of(mass, q, v, a, span) -> Scales:
     of_q = jnp.maximum(of_q, of_v * time)
     reach = jnp.stack([of_q, of_v])[:, None]
     least = np.array(FROM_NOTHING, reach.dtype)[:, None] * reach * over_root_mass / DIED_OUT
-    reach = jnp.where(reach > 0, reach, 1.0)
     first = jnp.where(nothing, least, sizes[:2])
     return Scales(root_mass, over_root_mass, reach, time, first, nothing & (of_a == 0))
 
@@ -119,11 +117,22 @@ def rounding(others: Float[Array, "2 n"]) -> Float[Array, "2 n"]:
     return ROUNDED * jnp.finfo(others.dtype).eps * others
 
 
-def as_nothing(scales: Scales, rtol) -> Float[Array, " 2n"]:
-    """The `atol` of each coordinate and each velocity from the start alone, for iterations inside a step."""
-    others = scales.reach * scales.over_root_mass
-    own_size = jnp.where(scales.first > 0, scales.first, others)
-    return jnp.ravel(DIED_OUT * rtol[:, None] * own_size + rounding(others))
+class AsNothing(eqx.Module):
+    """The `atol` of each coordinate and each velocity for iterations inside a step, from the start alone.
+
+    If that says nothing, since all is at rest at zero, it follows the unknown, (..., 2n), as in `Weighing`.
+    """
+
+    scales: Scales
+    rtol: Float[Array, " 2"]
+
+    def __call__(self, y: Float[Array, "..."]) -> Float[Array, " 2n"]:
+        """The tolerances beside those relative to each number."""
+        scales = self.scales
+        now = jnp.max(jnp.abs(y).reshape(-1, *scales.first.shape), axis=0)
+        others = jnp.where(scales.unknown, shared(scales, now), scales.reach * scales.over_root_mass)
+        own_size = jnp.where(scales.first > 0, scales.first, others)
+        return jnp.ravel(DIED_OUT * self.rtol[:, None] * own_size + rounding(others))
 
 
 class Weighing(diffrax.AbstractAdaptiveStepSizeController):

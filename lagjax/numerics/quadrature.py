@@ -45,7 +45,7 @@ class Integrals(NamedTuple):
 
 def nodes(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """The nodes (m, 15) of the intervals from a to b, (m,)."""
-    return 0.5 * (a + b)[:, None] + 0.5 * (b - a)[:, None] * NODES.astype(a.dtype)
+    return 0.5 * (a + b)[:, None] + 0.5 * (b - a)[:, None] * NODES.astype(a.dtype)[None]
 
 
 def integrals(values: np.ndarray, a: np.ndarray, b: np.ndarray) -> Integrals:

@@ -262,8 +262,9 @@ def _error(equations, z, rate, to_error, finder, weights):
     weighted = jnp.asarray(E, z.dtype) @ z
     error = to_error @ (rate + weighted)
     y0 = equations.y0
-    scale = finder.atol + finder.rtol * jnp.maximum(jnp.abs(y0), jnp.abs(y0 + z[2]))
-    rejects = finder.norm(equations.unravel(weights * error / scale)) >= 1
+    largest = jnp.maximum(jnp.abs(y0), jnp.abs(y0 + z[2]))
+    scale = (finder.atol(largest) if callable(finder.atol) else finder.atol) + finder.rtol * largest
+    rejects = finder.norm(equations.unravel(weights * error / jnp.where(scale > 0, scale, 1.0))) >= 1
     # (8.20): for a fast component that has already decayed, the estimate (8.19) is completely wrong.
     again = lambda error: to_error @ (equations.increment(equations.t0, y0 + error) + weighted)
     return lax.cond(rejects, again, lambda error: error, error)

@@ -82,10 +82,10 @@ class SimplifiedNewton(optx.AbstractRootFinder):
 
     and with its own tolerances for constant steps: `SimplifiedNewton(rtol=1e-10, atol=1e-12)`.
 
-    **Fields:** `rtol`, `atol`: the tolerances of the step (`atol` may be a vector); `norm`: the norm of a correction
-    in units of them; `kappa`: the part of the tolerance that the iteration error may take, by default
-    `min(0.03, 0.3 rtol^(1/3))` as in RADAU5; `slow`: the rate above which the Jacobian is recomputed (infinite: never,
-    as in RADAU5).
+    **Fields:** `rtol`, `atol`: the tolerances of the step (`atol` may be a vector, or a function of the unknown that
+    returns one); `norm`: the norm of a correction in units of them; `kappa`: the part of the tolerance that the
+    iteration error may take, by default `min(0.03, 0.3 rtol^(1/3))` as in RADAU5; `slow`: the rate above which the
+    Jacobian is recomputed (infinite: never, as in RADAU5).
 
     **Options** of a single solve: `init_state`, the state of another solve, whose Jacobian is used first; `offset`,
     added to the unknown when its size sets the tolerance; `inverse_at`, a function from an unknown to the `Inverse`.
@@ -97,7 +97,7 @@ class SimplifiedNewton(optx.AbstractRootFinder):
     """
 
     rtol: float
-    atol: ArrayLike
+    atol: ArrayLike | Callable[[Array], Array]
     norm: Callable[[PyTree], Array] = optx.max_norm
     kappa: float | None = None
     slow: float = eqx.field(static=True, default=0.3)
@@ -117,8 +117,8 @@ class SimplifiedNewton(optx.AbstractRootFinder):
         correction = inverse(residual)
         new = jtu.tree_map(lambda y, d: y - d, y, correction)
         full = jtu.tree_map(jnp.add, new, options["offset"]) if "offset" in options else new
-        tolerance = lambda y: jnp.broadcast_to(self.atol, y.shape) + self.rtol * jnp.abs(y)
-        units = jtu.tree_map(lambda d, y: d / tolerance(y), correction, full)
+        known = lambda allowed: jnp.where(allowed > 0, allowed, 1.0)
+        units = jtu.tree_map(lambda d, y: d / known(self.allowed(y)), correction, full)
         size = self.norm(units).astype(state.size.dtype)
         first = state.count == 0
         now = Iteration(
@@ -137,6 +137,10 @@ class SimplifiedNewton(optx.AbstractRootFinder):
         restart = stale & ~now.renewed & ~(now.rate() < 1)
         new = jtu.tree_map(lambda x, start: jnp.where(restart, start, x), new, now.start)
         return new, eqx.tree_at(lambda state: state.stale, now, stale), aux
+
+    def allowed(self, y: Array) -> Array:
+        """The tolerance of each number of an unknown."""
+        return jnp.broadcast_to(self.atol(y) if callable(self.atol) else self.atol, y.shape) + self.rtol * jnp.abs(y)
 
     def _converged(self, state):
         rate, size, previous = state.rate(), state.size, state.previous

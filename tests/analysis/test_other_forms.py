@@ -251,7 +251,7 @@ def test_the_action_of_a_trajectory():
 
 @pytest.mark.slow
 def test_the_action_does_not_depend_on_the_outputs():
-    """The brachistochrone's time from eleven outputs, steep at first; twin: the cubic through them is off."""
+    """The brachistochrone's time from eleven outputs, steep at first; twin: in too few parts it is off, and says so."""
     g, y0 = 9.81, 1e-3
     # A cycloid of radius R from the angle a to b: x = R (a - sin a), y = R (1 - cos a), in the time (b - a) sqrt(R/g).
     R, a = 0.5, float(np.arccos(1 - y0 / 0.5))
@@ -265,5 +265,32 @@ def test_the_action_does_not_depend_on_the_outputs():
     action, error = lj.action(fall, motion, error=True)
     np.testing.assert_allclose(action, (end - a) * np.sqrt(R / g), rtol=1e-7)
     assert float(error) < 1e-9
-    by_cubics, off = jax.jit(lambda motion: lj.action(fall, motion, error=True))(motion)
-    assert abs(by_cubics - action) > 0.01 and 0.01 < off
+    in_parts = lambda pieces: jax.jit(lambda motion: lj.action(fall, motion, error=True, pieces=pieces))(motion)
+    (few, off), (many, _) = in_parts(10), in_parts(320)
+    assert 1e-6 < abs(few - action) < 2 * off
+    # The slope is steep in a thousandth of the way: equal parts converge slowly there.
+    assert abs(many - action) < 0.02 * abs(few - action)
+
+
+@pytest.mark.slow
+def test_the_action_in_a_program():
+    """The action of a motion with two outputs and its derivative, in lanes; twin: the chord between them is far off."""
+    system, ts = lj.System(swinging), np.array([0.0, 10.0])
+
+    def found(k):
+        motion = lj.integrate(system, 1.0, 0.5, {"k": k}, ts=ts)
+        return lj.action(system, motion)
+
+    def exact(k):
+        w = jnp.sqrt(k)
+        q = jnp.cos(w * ts) + 0.5 / w * jnp.sin(w * ts)
+        v = 0.5 * jnp.cos(w * ts) - w * jnp.sin(w * ts)
+        # Homogeneous of degree two: L = d(qv/2)/dt on motions.
+        return 0.5 * (q[1] * v[1] - q[0] * v[0]), 0.5 * (q[1] - q[0]) ** 2 / 10.0 - k * jnp.sum(q**2) / 6 * 10.0
+
+    stiffness = jnp.array([2.0, 3.0])
+    values, slopes = jax.jit(jax.vmap(jax.value_and_grad(found)))(stiffness)
+    right, by_chord = jax.vmap(exact)(stiffness)
+    np.testing.assert_allclose(values, right, rtol=1e-8)
+    np.testing.assert_allclose(slopes, jax.vmap(jax.grad(lambda k: exact(k)[0]))(stiffness), rtol=1e-7)
+    assert np.all(np.abs(by_chord - right) > 0.1)

@@ -53,6 +53,21 @@ def test_no_numbers_in_the_start():
             lj.integrate(pendulum, start, start, PARAMS, ts=TS)
 
 
+def test_not_hashable_in_params():
+    """A set in params is named, in a call and in a compiled one; twin: a frozenset is fine."""
+    choice = lambda kind: {"rules": {"axes": kind(["psi"])}}
+    system = lj.System(lambda t, q, v, p: 0.5 * v**2 - (2.0 * q if "psi" in p["rules"]["axes"] else 0.0))
+    calls = (
+        lambda kind: lj.accelerations(system, 0.0, 0.0, 0.0, choice(kind))[0],
+        lambda kind: jax.jit(lambda q: lj.accelerations(system, 0.0, q, 0.0, choice(kind))[0])(0.0),
+        lambda kind: 2 * lj.integrate(system, 0.0, 0.0, choice(kind), ts=[0.0, 1.0]).q[-1],
+    )
+    for call in calls:
+        np.testing.assert_allclose(call(frozenset), -2.0, rtol=1e-9)
+        with refusal(TypeError, r"'rules\.axes' of params is \{'psi'\}", "frozenset"):
+            call(set)
+
+
 def test_float32_out_of_reach():
     """A tolerance below float32's round-off is refused, with the switch to float64 as the fix."""
     with refusal(ValueError, "rtol = 1e-09", "float32", "jax_enable_x64"):

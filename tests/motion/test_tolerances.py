@@ -9,6 +9,7 @@ import pytest
 
 import lagjax as lj
 from lagjax.motion.tolerances import Tolerances, Weighing, rounding, scales_of, shared
+from lagjax.numerics.simplified_newton import SimplifiedNewton
 
 # The units of length and of time are powers of four, so that scaling by them is exact, also in square roots.
 UNITS = {"nanometres": (2.0**-30, 1.0), "light years": (2.0**54, 1.0), "years": (1.0, 2.0**-24)}
@@ -169,3 +170,52 @@ def test_at_round_off_without_mass():
     q0 = np.array([np.sin(1.25), -np.cos(1.25), 0.0])
     traj = lj.integrate(massless, q0, np.zeros(3), ts=np.linspace(0.0, 20.0, 9))
     np.testing.assert_allclose(traj.q[:, :2], on_rod().q, rtol=0, atol=1e-8)
+
+
+@pytest.mark.slow
+def test_rest_at_zero_in_any_units():
+    """From rest at zero, where only the forces to come have a size, any unit of length gives the same steps.
+
+    Twin: with a root finder whose tolerance is of the order of a metre, nanometres take other steps.
+    """
+    late = lj.System(
+        lambda t, q, v, p: 0.5 * v**2,
+        force=lambda t, q, v, p: p["unit"] * t**3 - 100 * q - 50 * v - 1e3 * q**3 / p["unit"] ** 2,
+    )
+
+    def of(unit, method):
+        traj = lj.integrate(late, 0.0, 0.0, {"unit": unit}, ts=np.array([0.0, 2.0]), method=method, rtol=1e-6)
+        return float(traj.q[-1]) / unit, int(traj.stats["num_steps"])
+
+    in_metres = lj.Radau5(root_finder=SimplifiedNewton(rtol=1e-6, atol=1e-9))
+    (q, steps), (absolute, of_absolute) = of(1.0, lj.Radau5()), of(1.0, in_metres)
+    for unit in (2.0**-30, 2.0**54):
+        found, count = of(unit, lj.Radau5())
+        assert count == steps
+        np.testing.assert_allclose(found, q, rtol=1e-13)
+    found, count = of(2.0**-30, in_metres)
+    assert abs(found / absolute - 1) > 1e-10 or count != of_absolute
+
+
+@pytest.mark.slow
+def test_off_a_constraint_at_zero_in_any_units():
+    """How far a start at zero may be off a constraint follows from its acceleration, in any unit of length.
+
+    Twin: without a force there is no size, and what is refused in metres is not in nanometres.
+    """
+    pair = lj.System(
+        lambda t, q, v, p: 0.5 * jnp.sum(v**2) + p["push"] * q[0],
+        constraints={"bar": lj.Holonomic(lambda t, q, p: q[0] - q[1] - p["gap"])},
+    )
+
+    def accepted(gap, push, unit):
+        params = {"gap": gap * unit, "push": push * unit}
+        traj = lj.integrate(pair, np.zeros(2), np.zeros(2), params, ts=np.array([0.0, 1.0]), throw=False)
+        return bool(traj.result == lj.RESULTS.successful)
+
+    units = (1.0, *(length for length, _ in UNITS.values()))
+    assert all(accepted(1e-8, 1.0, unit) and not accepted(1e-6, 1.0, unit) for unit in units)
+    assert accepted(1e-6, 0.0, UNITS["nanometres"][0]) and not accepted(1e-6, 0.0, 1.0)
+    with pytest.raises(ValueError, match="off the constraints: 'bar' = -9.31e-16"):
+        params = {"gap": 1e-6 * 2.0**-30, "push": 2.0**-30}
+        lj.integrate(pair, np.zeros(2), np.zeros(2), params, ts=np.array([0.0, 1.0]))
