@@ -141,16 +141,8 @@ def _before(known: Known, t, backward: bool):
 
 def _traced(trajectory, t):
     """Return the motion at t in a traced program: NaN where there is no motion."""
-<<<<<<< HEAD
     if isinstance(trajectory, HybridTrajectory):
-        raise TypeError(
-            "at(t) of a motion in phases needs the values of its switches, but this one is being traced, or a batch.\n"
-            "Fix: call at(t) of one motion outside the program; or give these times to lj.integrate as ts."
-        )
-=======
-    if isinstance(trajectory.system, Hybrid):
         raise TypeError(IN_PHASES)
->>>>>>> h2
     of_one = partial(_at_one, trajectory)
     for _ in range(t.ndim):
         of_one = jax.vmap(of_one)
@@ -196,7 +188,7 @@ def in_one_solve(trajectory, t):
 
     The span stays that of the trajectory, on which some settings depend.
     """
-    if isinstance(trajectory.system, Hybrid):
+    if isinstance(trajectory, HybridTrajectory):
         raise TypeError(IN_PHASES)
     first = jax.tree.map(lambda x: x[0], _known_of(trajectory).at)
     of_system = trajectory.system, trajectory.params, trajectory.asked, trajectory.tolerance

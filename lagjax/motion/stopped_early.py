@@ -122,18 +122,12 @@ def _used_up(trajectory, settings, guards):
         found, facts, otherwise = None, "", "longer steps"
     else:
         steps, path = last_steps(trajectory, settings), _Path(trajectory)
-<<<<<<< HEAD
-        rate, missing, rejected = steps.rate, steps.missing, np.sum(~steps.accepted)
+        rate, missing, rejected = steps.rate, steps.missing, int(np.sum(~steps.accepted))
         if said := rejected_by_guards(guards, trajectory.stats, rejected / len(steps.h)):
             return said
-        found = _singularity(path, steps) or _jump(path, steps) or _fast(path, steps)
-=======
-        rate, missing = steps.rate, steps.missing
         method = method_of(settings, trajectory.system, *_end_of(trajectory))
         implicit = isinstance(method, diffrax.AbstractImplicitSolver)
         found = _singularity(path, steps) or _jump(path, steps) or _fast(path, steps, implicit)
-        rejected = int(np.sum(~steps.accepted))
->>>>>>> h2
         facts = "" if found else f" {rejected} of the next {len(steps.h)} were rejected. {path.largest(steps)}"
         otherwise = "a looser rtol and atol"
     if not missing < TOO_MANY:
