@@ -150,9 +150,9 @@ def test_no_import_cycles():
 
 
 def test_files_are_small():
-    """A file stays under 400 lines, the front door under 250."""
+    """A file stays under 600 lines, the front door under 250."""
     lines = {path: len(path.read_text().splitlines()) for path in FILES}
-    limit = lambda path: 250 if path.name == "integrate.py" else 400
+    limit = lambda path: 250 if path.name == "integrate.py" else 600
     assert {module_name(path): count for path, count in lines.items() if count > limit(path)} == {}
 
 
