@@ -69,7 +69,7 @@ class System(eqx.Module):
                 f"constraints must be given by name, not as {type(constraints).__name__}.\n"
                 + ("Usual cause: kinetic and potential energy given separately.\n" if callable(constraints) else "")
                 + 'Fix: constraints={"rod": lj.Holonomic(g)}'
-                + ("; L is one function, return kinetic - potential." if separate else ".")
+                + ("; L is one function, return kinetic - potential." if callable(constraints) else ".")
             )
         for name, constraint in (constraints or {}).items():
             if not isinstance(name, str):
