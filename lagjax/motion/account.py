@@ -17,6 +17,7 @@ from lagjax.motion.accuracy import (
     of_a_step,
     sizes_of,
 )
+from lagjax.motion.results import ENDED_WELL, RESULTS, is_among, message
 from lagjax.motion.tolerances import TURN
 
 # A motion whose velocity grows to this many times its median has passed near a singularity.
@@ -62,8 +63,8 @@ def account_of(trajectory) -> Account | None:
         return None
     t = np.asarray(trajectory.t)
     value, error = (columns(np, (x.q, x.v), rows=len(t)) for x in (trajectory, trajectory.error))
-    reached = np.isfinite(value).all(axis=1) & ~np.isnan(error).any(axis=1)
-    if reached.sum() < 2:
+    reached = np.isfinite(value).all(axis=1)
+    if reached.sum() < 2 or np.isnan(error[reached]).any():
         return None
     t, value, error = t[reached], value[reached], error[reached]
     names = coordinates.names(jax.tree.map(lambda x: np.asarray(x)[0], trajectory.q))
@@ -86,8 +87,12 @@ def of_error(trajectory) -> list[tuple[str, str]]:
         return []
     times = {name: np.asarray(x)[~np.isnan(np.asarray(x))] for name, x in trajectory.error.events.items()}
     of_times = [(f"error of '{name}'", _of_times(x)) for name, x in times.items() if len(x)]
-    account = account_of(trajectory)
-    return of_times if account is None else [("error", _at_the_end(account) + _lost(trajectory, account)), *of_times]
+    account, result = account_of(trajectory), trajectory.error.result
+    if account is not None:
+        return [("error", _at_the_end(account) + _lost(trajectory, account)), *of_times]
+    if is_among(result, [*ENDED_WELL, RESULTS.not_estimated, trajectory.result]):
+        return of_times
+    return [("error", f"not known: of a second, more precise motion, {message(result)}"), *of_times]
 
 
 def _of_times(errors):

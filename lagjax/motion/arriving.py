@@ -65,8 +65,9 @@ class Arriving(diffrax.AbstractStepSizeController):
         left = self.ts[index] - t
         step = jnp.minimum(step, self.shares[1] * (self.ts[index] - self.ts[index - 1]))
         halfway = t + jnp.where(step < 0.5 * left, step, 0.5 * left)
-        # At the last time there is nothing left, and diffrax ends the solve.
-        return jnp.where((step < left) | (left <= 0), jnp.where(left > 0, halfway, t + step), self.ts[index])
+        # At the last time there is nothing left, and diffrax ends the solve. Times a round-off apart cannot be parted.
+        partly = (step < left) & (halfway > t)
+        return jnp.where(partly | (left <= 0), jnp.where(left > 0, halfway, t + step), self.ts[index])
 
 
 def together(ts: Float[Array, " T"], jump_ts: Float[Array, " J"]) -> Float[Array, " T+J"]:

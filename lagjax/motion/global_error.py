@@ -103,7 +103,7 @@ def _compared(xp, first, second, ts) -> Trajectory:
     """Return the first trajectory with its errors: the difference of the two, plus the least effect of round-off."""
     steps = xp.asarray(second.stats["num_accepted_steps"])
     share = ROUND_OFF * np.finfo(ts.dtype).eps * xp.sqrt(1.0 + steps)
-    x, y = _columns(xp, first), _columns(xp, second)
+    x, y, well = _columns(xp, first), _columns(xp, second), True
     if xp is jnp or np.isnan(y).any():
         # The second run, which an event may have ended a little sooner, keeps its last state after its end.
         well = ended_well(second.result) if xp is jnp else is_among(second.result, ENDED_WELL)
@@ -117,6 +117,8 @@ def _compared(xp, first, second, ts) -> Trajectory:
     of_motion = lambda row: row[: 2 * sum(np.size(x) for x in jax.tree.leaves(first.end.q))].reshape(2, -1)
     worst = of_motion(np.fmax.reduce(errors) if xp is np else jnp.nanmax(errors, axis=0))
     excess = scaled_error(xp, worst, of_motion(sizes[-1]), first, ts, tuple(map(xp.asarray, first.tolerance)))
+    # Where the second run failed, no error is known from there on.
+    excess = xp.where(well, excess, xp.maximum(excess, xp.asarray(first.scaled_error))).astype(ts.dtype)
     return replace(first, error=found, scaled_error=excess)
 
 

@@ -201,11 +201,11 @@ def test_refused_crossings():
 # Slow tests: each compiles a program.
 
 
-def at_ends_of_steps(begin, inner, off, end, h, touches, pieces=sight.pieces_of):
+def at_ends_of_steps(*between, pieces=sight.pieces_of):
     """Return the pieces of a twin that looks only at the ends of steps."""
-    found = pieces(begin, inner, off, end, h, touches)
-    no = jnp.asarray(False)
-    return found._replace(sign=[0.0 * h] * (len(found.sign) - 1) + found.sign[-1:], doubt=[no] * len(found.doubt))
+    found, no = pieces(*between), jnp.asarray(False)
+    ends = [0.0 * x for x in found.sign[:-1]] + found.sign[-1:]
+    return found._replace(sign=ends, doubt=[no] * len(found.doubt))
 
 
 @pytest.mark.slow

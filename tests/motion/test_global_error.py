@@ -1,6 +1,7 @@
 """Estimated errors compared with true ones: Kepler's motion, whose position is known at any time, and chaos."""
 
 import warnings
+from dataclasses import replace
 
 import diffrax
 import jax
@@ -198,3 +199,15 @@ def test_what_chose_the_steps():
     assert "stability" in said(lj.integrate(drag, 1.0, 0.0, 1e4, ts=np.array([0.0, 0.5]), method=lj.Tsit5()))
     traj = orbit(FEW, method=lj.Dopri8())
     assert f"{13 * int(traj.stats['num_steps']):,} evaluations" in repr(traj)
+
+
+def test_outputs_a_round_off_apart():
+    """An output a round-off after a jump does not stop the second run; twin: if it fails, the error is not known."""
+    pulsed = lj.System(lambda t, q, v, p: 0.5 * v**2 + q * jnp.where((t > p["lo"]) & (t < p["hi"]), 1.0, 0.0))
+    ts, params = np.array([0.0, 4.0, np.nextafter(4.1, 5.0), 10.0]), {"lo": 4.0, "hi": 4.1}
+    found = lj.integrate(pulsed, 0.0, 0.0, params, ts=ts)
+    assert abs(found.q[-1] - 0.595) <= found.error.q[-1] + 1e-14 and found.error.q[-1] < 1e-12
+    nothing = np.full(4, np.nan)
+    failed = found.error._replace(q=nothing, v=nothing, result=lj.RESULTS.max_steps_reached)
+    unknown = replace(found, error=failed)
+    assert "not known: of a second, more precise motion" in repr(unknown) and "not known" not in repr(found)
