@@ -162,7 +162,7 @@ def routhian(system: System, cyclic: str | Iterable[str]) -> System:
 
         return of_rest
 
-    left = {name: Holonomic(constraint(c.g)) for name, c in system.constraints.items() if c.of_positions}
+    left = {name: Holonomic(constraint(c.function)) for name, c in system.constraints.items() if c.of_positions}
     return System(
         reduced, left, force=None if system.force is None else reduced.force,
         dissipation=None if system.dissipation is None else reduced.dissipation,
