@@ -117,8 +117,9 @@ def _compared(xp, first, second, ts) -> Trajectory:
     of_motion = lambda row: row[: 2 * sum(np.size(x) for x in jax.tree.leaves(first.end.q))].reshape(2, -1)
     worst = of_motion(np.fmax.reduce(errors) if xp is np else jnp.nanmax(errors, axis=0))
     excess = scaled_error(xp, worst, of_motion(sizes[-1]), first, ts, tuple(map(xp.asarray, first.tolerance)))
-    # Where the second run failed, no error is known from there on.
-    excess = xp.where(well, excess, xp.maximum(excess, xp.asarray(first.scaled_error))).astype(ts.dtype)
+    if well is not True:
+        # Where the second run failed, no error is known from there on.
+        excess = xp.where(well, excess, xp.maximum(excess, xp.asarray(first.scaled_error))).astype(ts.dtype)
     return replace(first, error=found, scaled_error=excess)
 
 
