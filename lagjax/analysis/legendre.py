@@ -17,6 +17,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
+from lagjax.jax_internals.opened import judging
 from lagjax.jax_internals.programs import depends
 from lagjax.mechanics.saddle_point import SINGULAR_BELOW
 from lagjax.numerics import dense
@@ -49,10 +50,7 @@ def velocity_of(momentum: Callable, p: Float[Array, " n"]) -> Velocity:
     v = lax.custom_root(lambda v: momentum(v) - p, zero, _newton, _tangent)
     at, target = lax.stop_gradient(v), lax.stop_gradient(p)
     matrix = mass(at)
-    terms = jnp.abs(target) + jnp.abs(matrix) @ jnp.abs(at)
-    allowed = ROUND_OFFS * jnp.finfo(p.dtype).eps * jnp.max(terms)
-    reached = jnp.max(jnp.abs(momentum(at) - target)) <= allowed
-    return Velocity(v, matrix, _regular(matrix), reached)
+    return Velocity(v, matrix, _regular(matrix), _reached(momentum(at), target, matrix, at))
 
 
 def is_linear(momentum: Callable, like) -> bool:
@@ -61,8 +59,15 @@ def is_linear(momentum: Callable, like) -> bool:
     return not depends(program, program.invars)
 
 
+@judging
 def _regular(matrix):
     return dense.reciprocal_condition(lax.stop_gradient(matrix)) > SINGULAR_BELOW[np.dtype(matrix.dtype)]
+
+
+@judging
+def _reached(found, target, matrix, v):
+    terms = jnp.abs(target) + jnp.abs(matrix) @ jnp.abs(v)
+    return jnp.max(jnp.abs(found - target)) <= ROUND_OFFS * jnp.finfo(v.dtype).eps * jnp.max(terms)
 
 
 def _newton(residual, start):

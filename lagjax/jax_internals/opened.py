@@ -15,6 +15,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
@@ -37,11 +38,24 @@ WITH_KINKS = {"relu", "relu6", "hard_tanh", "leaky_relu"}
 SMOOTH = {
     "hypot", "i0", "i0e", "i1", "i1e", "expi", "exp1", "expn", "betainc", "spence", "zeta", "polygamma", "log_ndtr",
     "ndtr", "ndtri", "erfcx", "sinc", "entr", "gammainc", "gammaincc", "bessel_jn", "fresnel", "hyp1f1", "lambertw",
-    # Equinox's checks, which `one_function.poisoned` knows by this name.
-    "branched_error_if_impl",
+    # Equinox's checks, which `one_function.poisoned` knows by this name; and `judging`.
+    "branched_error_if_impl", "judgement",
 }  # fmt: skip
 # Operations on arrays of more numbers are not followed: those of a network, or of a picture.
 LARGEST = 16
+
+
+def judging(function: Callable) -> Callable:
+    """The same function, in which no jumps are looked for: it judges whether numbers are good, as checks do.
+
+    >>> print(judging(lambda x: x > 0)(jnp.asarray(2.0)))
+    True
+    """
+
+    def judgement(*args):
+        return function(*args)
+
+    return jax.jit(judgement)
 
 
 class Slot(NamedTuple):

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import lagjax as lj
+from lagjax.analysis import legendre
 from lagjax.jumps.found import Given, found
 from lagjax.jumps.times import with_jumps_in_time
 
@@ -132,3 +133,22 @@ def test_times_of_jumps():
     table = times_of(lambda t, q, v, p: jnp.interp(t, p * KNOTS, HEIGHTS), 2.0)
     # The first knot lies before the motion; unused places hold its end.
     assert {1.0, 4.0} <= set(np.round(np.asarray(table(2.0)), 12)) <= {-2.0, 0.0, 1.0, 4.0, 10.0}
+
+
+@pytest.mark.parametrize("marked", [True, False])
+def test_a_solver_of_ours_is_no_jump(marked, monkeypatch):
+    """Routh's function of a kinetic energy that is not quadratic, found by Newton's method: only the jump in V counts.
+
+    Twin: whether the method arrived is a comparison, if it is not said to be a judgement.
+    """
+    if not marked:
+        for name in ("_regular", "_reached"):
+            monkeypatch.setattr(legendre, name, getattr(legendre, name).__wrapped__)
+
+    def lagrangian(t, q, v, p):
+        slow = 1 - 0.01 * (v["r"] ** 2 + (q["r"] * v["angle"]) ** 2)
+        return -100 * jnp.sqrt(slow) - 0.3 * jnp.maximum(q["r"] - 2.0, 0.0)
+
+    radial, params = lj.routhian(lj.System(lagrangian), "angle"), {"params": None, "momenta": {"angle": 1.2}}
+    jumps = found(radial, jnp.asarray(0.0), {"r": jnp.asarray(1.0)}, {"r": jnp.asarray(0.0)}, params)
+    assert jumps is not None and (len(jumps.slots) + len(jumps.missed) == 1) == marked
