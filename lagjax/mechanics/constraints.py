@@ -18,12 +18,9 @@ from typing import ClassVar, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
-from lagjax.mechanics import coordinates
 from lagjax.mechanics.arguments import OF_POSITION, OF_STATE
-from lagjax.mechanics.memory import kinds, remembered, shape_of
 
 
 class Holonomic(eqx.Module):
@@ -56,14 +53,14 @@ class Holonomic(eqx.Module):
         """`g` at a state, as the user wrote it."""
         return self.g(t, q, params)
 
-    def velocity_residual(self, t, x, u, params, unflatten):
+    def velocity_residual(self, model, t, x, u):
         """`dg/dt`, in vector form."""
-        return jax.jvp(lambda t, x: self.g(t, unflatten(x), params), (t, x), (jnp.ones_like(t), u))[1]
+        return jax.jvp(lambda t, x: self.g(t, model.tree(x), model.params), (t, x), (jnp.ones_like(t), u))[1]
 
-    def feedback(self, t, x, u, params, unflatten, rate):
+    def feedback(self, model, t, x, u, rate):
         """The term in gamma with which g'' + 2 rate g' + rate² g = 0."""
-        position = jnp.atleast_1d(self.g(t, unflatten(x), params))
-        return -2 * rate * jnp.atleast_1d(self.velocity_residual(t, x, u, params, unflatten)) - rate**2 * position
+        position = jnp.atleast_1d(self.g(t, model.tree(x), model.params))
+        return -2 * rate * jnp.atleast_1d(self.velocity_residual(model, t, x, u)) - rate**2 * position
 
     def __repr__(self):
         return f"Holonomic({getattr(self.g, '__name__', 'g')})"
@@ -98,13 +95,13 @@ class Nonholonomic(eqx.Module):
         """`phi` at a state, as the user wrote it."""
         return self.phi(t, q, v, params)
 
-    def velocity_residual(self, t, x, u, params, unflatten):
+    def velocity_residual(self, model, t, x, u):
         """`phi`, in vector form."""
-        return self.phi(t, unflatten(x), unflatten(u), params)
+        return self.phi(t, model.tree(x), model.tree(u), model.params)
 
-    def feedback(self, t, x, u, params, unflatten, rate):
+    def feedback(self, model, t, x, u, rate):
         """The term in gamma with which phi' + rate phi = 0."""
-        return -rate * jnp.atleast_1d(self.velocity_residual(t, x, u, params, unflatten))
+        return -rate * jnp.atleast_1d(self.velocity_residual(model, t, x, u))
 
     def __repr__(self):
         return f"Nonholonomic({getattr(self.phi, '__name__', 'phi')})"
@@ -125,79 +122,37 @@ def _check_callable(function, kind, signature):
         )
 
 
-def shapes(system, t, q, v, params) -> dict[str, tuple[int, ...]]:
-    """The shape of each constraint's residual, by name, found without computing anything."""
-    if not system.constraints:
-        return {}
-    find = lambda: {
-        name: jnp.shape(shape_of(constraint.residual, t, q, v, params))
-        for name, constraint in system.constraints.items()
-    }
-    return remembered(system, (shapes, kinds((t, q, v, params))), find)
-
-
-def count(system, t, q, v, params) -> int:
-    """How many constraint equations there are."""
-    return sum(int(np.prod(shape)) for shape in shapes(system, t, q, v, params).values())
-
-
-def split(system, stacked, t, q, v, params) -> dict[str, Array]:
-    """Undo the stacking: a vector over all constraint equations -> one array per name."""
-    parts, start = {}, 0
-    for name, shape in shapes(system, t, q, v, params).items():
-        size = shape[0] if shape else 1
-        parts[name] = stacked[start : start + size].reshape(shape)
-        start += size
-    return parts
-
-
-def zero_multipliers(system, s: coordinates.State) -> dict[str, np.ndarray]:
-    """Zero multipliers of the right shapes, by name."""
-    return {name: np.zeros(shape, s.t.dtype) for name, shape in shapes(system, *s).items()}
-
-
-def position_residual(system, t, x, params, unflatten) -> Float[Array, " mh"]:
+def position_residual(model, t, x) -> Float[Array, " mh"]:
     """`g(t, q)` of the holonomic constraints, stacked."""
-    return _stack([c.g(t, unflatten(x), params) for c in _all(system) if c.of_positions], x.dtype)
+    return _stack([c.g(t, model.tree(x), model.params) for c in _all(model) if c.of_positions], x.dtype)
 
 
-def velocity_residual(system, t, x, u, params, unflatten) -> Float[Array, " m"]:
+def velocity_residual(model, t, x, u) -> Float[Array, " m"]:
     """`dg/dt` or `phi(t, q, v)` of each constraint, stacked in the order of their names."""
-    return _stack([c.velocity_residual(t, x, u, params, unflatten) for c in _all(system)], x.dtype)
+    return _stack([c.velocity_residual(model, t, x, u) for c in _all(model)], x.dtype)
 
 
-def jacobian(system, t, x, u, params, unflatten) -> Float[Array, "m n"]:
-    """`A` of all constraints, in vector form."""
-    return jax.jacfwd(lambda u: velocity_residual(system, t, x, u, params, unflatten))(u)
+def jacobian(model, t, x, u) -> Float[Array, "m n"]:
+    """`A` of all constraints."""
+    return jax.jacfwd(lambda u: velocity_residual(model, t, x, u))(u)
 
 
-def acceleration_rows(system, t, x, u, params, unflatten) -> Rows:
-    """`A` and `gamma` of all constraints, in vector form."""
-
-    at = lambda t, x: velocity_residual(system, t, x, u, params, unflatten)
-    _, rate = jax.jvp(at, (t, x), (jnp.ones_like(t), u))
-    return Rows(jacobian(system, t, x, u, params, unflatten), -rate)
+def acceleration_rows(model, t, x, u) -> Rows:
+    """`A` and `gamma` of all constraints."""
+    _, rate = jax.jvp(lambda t, x: velocity_residual(model, t, x, u), (t, x), (jnp.ones_like(t), u))
+    return Rows(jacobian(model, t, x, u), -rate)
 
 
-def baumgarte_feedback(system, t, x, u, params, unflatten, rate):
+def baumgarte_feedback(model, t, x, u, rate):
     """Baumgarte's term in gamma, with which g'' + 2 rate g' + rate² g = 0, or phi' + rate phi = 0.
 
     Source: Baumgarte, Comput. Methods Appl. Mech. Eng. 1 (1972) 1.
     """
-    return _stack([c.feedback(t, x, u, params, unflatten, rate) for c in _all(system)], x.dtype)
+    return _stack([c.feedback(model, t, x, u, rate) for c in _all(model)], x.dtype)
 
 
-def holonomic_equations(system, t, q, v, params) -> np.ndarray:
-    """Which of the stacked equations constrain positions, (m,) booleans."""
-    kinds = [
-        np.full(int(np.prod(shape)), system.constraints[name].of_positions)
-        for name, shape in shapes(system, t, q, v, params).items()
-    ]
-    return np.concatenate(kinds) if kinds else np.zeros(0, bool)
-
-
-def _all(system):
-    return list(system.constraints.values())
+def _all(model):
+    return list(model.system.constraints.values())
 
 
 def _stack(parts, dtype):

@@ -13,17 +13,23 @@ import jax.numpy as jnp
 
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.arguments import OF_STATE, takes_of
-from lagjax.mechanics.constraints import count, zero_multipliers
 from lagjax.mechanics.coordinates import State
 from lagjax.mechanics.in_words import Call, check_arguments, in_words
 from lagjax.mechanics.linear_in import is_linear
 from lagjax.mechanics.memory import kinds, remembered
-from lagjax.mechanics.reactions import force_at, reacts
+from lagjax.mechanics.model import Model, model_of
 from lagjax.mechanics.refusals import check_system
 from lagjax.mechanics.system import System, unchecked
 from lagjax.mechanics.traced import Program, Traced, traced
 
 CAUSE = "an argument left out as the function does not need it, or one too many: a constraint of positions takes no v"
+
+
+def prepare(system: System, t, q, v, params) -> tuple[Model, State]:
+    """The model of a system and a state of it, all checked: what a front door does first."""
+    check_system(system, t, q, v, params)
+    s = coordinates.state(t, q, v, params)
+    return model_of(traced_system(system, s), *s), s
 
 
 def traced_system(system: System, s: State) -> System:
@@ -43,12 +49,13 @@ def traced_system(system: System, s: State) -> System:
     if system.force is None:
         return found
     # After the constraints, which determine the multipliers.
-    given["multipliers"] = zero_multipliers(found, s)
+    given["multipliers"] = model_of(found, *s).zero_multipliers()
     call = Call("force", system.force, takes_of(system.force))
     force = traced_call(call, given, partial(_check_force, q=s.q))
     found = unchecked(lagrangian, constraints, force, dissipation)
-    if reacts(found):
-        remembered(found, (_check_linear, kinds(s)), lambda: _check_linear(found, *s))
+    model = model_of(found, *s)
+    if model.reacts:
+        remembered(found, (_check_linear, kinds(s)), lambda: _check_linear(model, s))
     return found
 
 
@@ -106,14 +113,15 @@ def _check_force(call, force, q):
         )
 
 
-def _check_linear(system, t, q, v, params):
+def _check_linear(model: Model, s: State):
     """Raise where the force is not linear in the multipliers."""
-    arrays, static = eqx.partition((system, t, q, v, params), eqx.is_array_like)
+    arrays, static = eqx.partition((model, s), eqx.is_array_like)
 
     def force(multipliers, arrays):
-        return coordinates.flatten(force_at(*eqx.combine(arrays, static), multipliers))[0]
+        model, s = eqx.combine(arrays, static)
+        return model.vector(model.force_at(s.t, s.q, s.v, multipliers))
 
-    if not is_linear(force, count(system, t, q, v, params), coordinates.flatten(q)[0].dtype, arrays):
+    if not is_linear(force, model.m, model.form.dtype, arrays):
         raise ValueError(
             "force(t, q, v, multipliers, params) must be linear in the multipliers, and is not.\n"
             "Usual cause: the size of a normal force, jnp.abs(multipliers[...]) or jnp.maximum(multipliers[...], 0).\n"

@@ -19,7 +19,8 @@ from lagjax.jax_internals.programs import length, needed, staged
 from lagjax.jax_internals.tracing import WATCHED
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.arguments import takes_of
-from lagjax.mechanics.system import System
+from lagjax.mechanics.memory import varies
+from lagjax.mechanics.model import Model, unchecked
 from lagjax.numerics.scalars import written_out
 
 # The most operations that are written out, before it is known which are needed. Writing a hundred thousand, as for an L
@@ -31,7 +32,7 @@ class InNumbers(eqx.Module):
     """A function of (t, q, v, params) or (t, q, params), taking each state as a tuple of numbers."""
 
     function: Callable
-    unflatten: Callable = eqx.field(static=True)
+    tree: Callable = eqx.field(static=True)
     returns_coordinates: bool = eqx.field(static=True, default=False)
 
     @property
@@ -41,25 +42,28 @@ class InNumbers(eqx.Module):
     def __call__(self, t, *states_and_params):
         *states, params = states_and_params
         # Multipliers come by name, and pass unchanged.
-        together = lambda state: self.unflatten(jnp.stack(state)) if isinstance(state, tuple) else state
+        together = lambda state: self.tree(jnp.stack(state)) if isinstance(state, tuple) else state
         result = self.function(t, *map(together, states), params)
         return coordinates.numbers(result) if self.returns_coordinates else result
 
 
-def in_numbers(system: System, unflatten: Callable) -> System:
+def in_numbers(model: Model) -> Model:
     """The same system, with a tuple of numbers for q and for v."""
-    return system.map(lambda function, role: InNumbers(function, unflatten, returns_coordinates=role == "force"))
+    change = lambda function, role: InNumbers(function, model.form.tree, returns_coordinates=role == "force")
+    structure = jtu.tree_structure((0,) * model.n)
+    form = model.form._replace(structure=structure, shapes=((),) * model.n)
+    return unchecked(model.system.map(change), model.params, form)
 
 
 class Numbers:
-    """A function of (system, t, q, v, params), traced once and written out.
+    """A function of (model, t, q, v), traced once and written out; q and v are tuples of numbers (`in_numbers`).
 
-    What depends on the system and the parameters alone is computed by `prepare`, once; `at` does the rest. `calls_host`
-    says whether a user's function calls Python at run time. Beyond about `most` operations it raises `TooLong`.
+    What depends on the model alone is computed by `prepare`, once; `at` does the rest. `calls_host` says whether a
+    user's function calls Python at run time. Beyond about `most` operations it raises `TooLong`.
     """
 
-    def __init__(self, function, args, most=math.inf):
-        arrays, static = eqx.partition(args, eqx.is_array)
+    def __init__(self, function, model: Model, most=math.inf):
+        arrays, static = eqx.partition((model, *model.example), varies)
         self.shapes = []
 
         def of_leaves(*leaves):
@@ -76,7 +80,7 @@ class Numbers:
         program = _without_unused(program)
         full = jax.make_jaxpr(lambda *leaves: written_out(program, *leaves, most=most))(*like)
         self.program = _without_unused(full)
-        of_problem, of_state = _leaves_of(arrays, (0, 4)), _leaves_of(arrays, (1, 2, 3))
+        of_problem, of_state = _leaves_of(arrays, (0,)), _leaves_of(arrays, (1, 2, 3))
         self.state_variables = [self.program.jaxpr.invars[i] for i in of_state]
         early, late = staged(self.program, of_problem, of_state)
         self._early, self._late = jax.jit(one_by_one(early)), jax.jit(one_by_one(late))
@@ -86,17 +90,17 @@ class Numbers:
         """How many operations it consists of."""
         return length(self.program.jaxpr)
 
-    def prepare(self, system, params) -> tuple | None:
+    def prepare(self, model: Model) -> tuple | None:
         """What does not depend on the state; None if there is nothing, since equinox mishandles `()`."""
-        return tuple(self._early(*jtu.tree_leaves(eqx.filter((system, params), eqx.is_array)))) or None
+        return tuple(self._early(*jtu.tree_leaves(eqx.filter(model, varies)))) or None
 
     def at(self, prepared, t, q, v):
         """The function's result at a state."""
         return jtu.tree_unflatten(self.shapes[0], self._late(prepared or (), *jtu.tree_leaves((t, q, v))))
 
-    def __call__(self, system, t, q, v, params):
+    def __call__(self, model: Model, t, q, v):
         """The function's result."""
-        return self.at(self.prepare(system, params), t, q, v)
+        return self.at(self.prepare(model), t, q, v)
 
 
 def _without_unused(program):

@@ -89,6 +89,11 @@ def is_array(x) -> bool:
     return isinstance(x, jax.Array | np.ndarray)
 
 
+def varies(x) -> bool:
+    """Whether something is an array, or stands for one in a program that is only traced."""
+    return is_array(x) or isinstance(x, jax.ShapeDtypeStruct)
+
+
 def shape_of(function: Callable, *args):
     """The shapes that a function returns for JAX or NumPy arrays; nothing is computed."""
     shaped = lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype) if isinstance(x, np.ndarray) else x

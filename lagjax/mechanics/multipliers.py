@@ -14,7 +14,8 @@ from lagjax.mechanics import constraints, coordinates
 from lagjax.mechanics.compiled import compiled
 from lagjax.mechanics.diagnosis import explain_failure, explain_singular, where
 from lagjax.mechanics.equations import equations_of
-from lagjax.mechanics.first_call import traced_system
+from lagjax.mechanics.first_call import prepare, traced_system
+from lagjax.mechanics.model import Model, model_of
 from lagjax.mechanics.refusals import check_system
 from lagjax.mechanics.saddle_point import examined
 from lagjax.mechanics.sparse_saddle_point import Banded
@@ -49,23 +50,27 @@ def accelerations(system, t, q, v, params) -> tuple[PyTree[Array], dict[str, Arr
     """
     check_system(system, t, q, v, params)
     s = coordinates.prepared(t, q, v, params)
-    system = traced_system(system, s)
+    return accelerations_at(model_of(traced_system(system, s), *s), s)
+
+
+def accelerations_at(model: Model, s: coordinates.State) -> tuple[PyTree[Array], dict[str, Array]]:
+    """The accelerations and the multipliers of a prepared system."""
     # A value that a function closes over may be traced where no argument is.
-    if not is_eager() or coordinates.is_traced((s, eqx.filter(system, eqx.is_array))):
-        equations = equations_of(system, *s, fast=True)
+    if not is_eager() or coordinates.is_traced((s, eqx.filter(model, eqx.is_array))):
+        equations = equations_of(model, fast=True)
         a, multipliers = equations.solution_or_nan(s.t, equations.inside(s.q), equations.inside(s.v))
         return equations.outside(a), multipliers
-    equations = equations_of(system, *s)
+    equations = equations_of(model)
     if isinstance(equations.form, Banded):
         found = equations.verdict(s.t, s.q, s.v)
         if found.finite and not found.singular and not found.contradictory:
             return found.a, found.multipliers
-    found = examined(system, *s)
+    found = examined(model, s)
     solution = found.a, found.multipliers
     finite = all(np.all(np.isfinite(x)) for x in jax.tree.leaves((solution, found.lagrangian)))
     valid = finite and bool(found.unique) and not np.any(np.asarray(found.contradictory))
-    if not valid or explain_singular(np.asarray(found.matrix), system, s):
-        raise ValueError(explain_failure(system, s) or f"the accelerations are not finite {where(s)}.")
+    if not valid or explain_singular(np.asarray(found.matrix), model, s):
+        raise ValueError(explain_failure(model, s) or f"the accelerations are not finite {where(s)}.")
     return solution
 
 
@@ -88,11 +93,8 @@ def constraint_force(system, t, q, v, params) -> dict[str, PyTree[Array]]:
 
     Source: Goldstein, Eq. (2.26).
     """
-    check_system(system, t, q, v, params)
-    s = coordinates.state(t, q, v, params)
-    system = traced_system(system, s)
-    _, multipliers = accelerations(system, *s)
-    return _constraint_force(system, *s, multipliers)
+    model, s = prepare(system, t, q, v, params)
+    return _constraint_force(model, s, accelerations_at(model, s)[1])
 
 
 def constraint_residual(system, t, q, v, params, level: str = "constraint") -> dict[str, Array]:
@@ -115,29 +117,19 @@ def constraint_residual(system, t, q, v, params, level: str = "constraint") -> d
         raise ValueError(
             f'level must be "constraint" or "velocity", not {level!r}.\nFix: leave it out, or level="velocity".'
         )
-    check_system(system, t, q, v, params)
-    s = coordinates.state(t, q, v, params)
-    system = traced_system(system, s)
-    return _constraint_residual(system, *s, level)
+    model, s = prepare(system, t, q, v, params)
+    return _constraint_residual(model, s, level)
 
 
 @compiled
-def _constraint_force(system, t, q, v, params, multipliers):
-    x, unflatten = coordinates.flatten(q)
-    u, _ = coordinates.flatten(v)
-    forces = {}
-    for name, constraint in system.constraints.items():
-        alone = eqx.tree_at(lambda s: s.constraints, system, {name: constraint})
-        rows = constraints.acceleration_rows(alone, t, x, u, params, unflatten)
-        forces[name] = unflatten(rows.jacobian.T @ jnp.atleast_1d(multipliers[name]))
-    return forces
+def _constraint_force(model, s, multipliers):
+    x, u = model.vectors(s.q, s.v)
+    rows, stacked = constraints.jacobian(model, s.t, x, u), model.stacked(multipliers)
+    return {name: model.tree(jnp.where(model.belongs_to(name), stacked, 0.0) @ rows) for name in multipliers}
 
 
 @compiled
-def _constraint_residual(system, t, q, v, params, level):
+def _constraint_residual(model, s, level):
     if level == "velocity":
-        x, unflatten = coordinates.flatten(q)
-        u, _ = coordinates.flatten(v)
-        stacked = constraints.velocity_residual(system, t, x, u, params, unflatten)
-        return constraints.split(system, stacked, t, q, v, params)
-    return {name: constraint.residual(t, q, v, params) for name, constraint in system.constraints.items()}
+        return model.split(constraints.velocity_residual(model, s.t, *model.vectors(s.q, s.v)))
+    return {name: constraint.residual(*s) for name, constraint in model.system.constraints.items()}

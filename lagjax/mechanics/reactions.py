@@ -22,9 +22,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from lagjax.mechanics import constraints, coordinates
-from lagjax.mechanics.arguments import WITH_MULTIPLIERS, takes_of
-
 # The pivots of I - R must be above this; without friction they are one.
 PIVOT_ABOVE = 1e-10
 
@@ -37,35 +34,16 @@ class Reactions(NamedTuple):
     unique: Bool[Array, ""]
 
 
-def reacts(system) -> bool:
-    """Whether the force of a system depends on multipliers."""
-    return system.force is not None and takes_of(system.force) == WITH_MULTIPLIERS and bool(system.constraints)
-
-
-def force_at(system, t, q, v, params, multipliers):
-    """The generalized force that L does not contain, like q; `multipliers` stacked."""
-    if takes_of(system.force) != WITH_MULTIPLIERS:
-        return system.force(t, q, v, params)
-    return system.force(t, q, v, constraints.split(system, multipliers, t, q, v, params), params)
-
-
-def force_with_ones(system) -> Callable:
+def force_with_ones(model) -> Callable:
     """The force with all multipliers one: a function of the state alone that depends on the same arguments."""
-
-    def of_state(t, q, v, params):
-        ones = jnp.ones(constraints.count(system, t, q, v, params), jnp.result_type(t))
-        return force_at(system, t, q, v, params, ones)
-
-    return of_state
+    return lambda t, q, v, params: model.of(params).force_at(t, q, v, jnp.ones(model.m, jnp.result_type(t)))
 
 
-def response(system, t, x, u, params, unflatten) -> Float[Array, "n m"] | None:
+def response(model, t, x, u) -> Float[Array, "n m"] | None:
     """B, the change of the force with each multiplier; None if it does not depend on them."""
-    if not reacts(system):
+    if not model.reacts:
         return None
-    q, v = unflatten(x), unflatten(u)
-    at = lambda multipliers: coordinates.flatten(force_at(system, t, q, v, params, multipliers))[0].astype(x.dtype)
-    return jax.jacfwd(at)(jnp.zeros(constraints.count(system, t, q, v, params), x.dtype))
+    return jax.jacfwd(lambda multipliers: model.force(t, x, u, multipliers))(jnp.zeros(model.m, x.dtype))
 
 
 def with_reactions(solve: Callable, forcing, gamma, response) -> Reactions:

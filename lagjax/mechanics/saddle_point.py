@@ -34,8 +34,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
-from lagjax.mechanics import constraints, coordinates
+from lagjax.mechanics import constraints
 from lagjax.mechanics.compiled import compiled
+from lagjax.mechanics.coordinates import State
 from lagjax.mechanics.lagrangian import Linear, mass_and_forcing
 from lagjax.mechanics.reactions import Reactions, with_reactions
 from lagjax.mechanics.verdict import Verdict, acceleration_round_off, slightly_off, vanishing
@@ -47,7 +48,7 @@ SINGULAR_BELOW = {np.dtype("float64"): 1e-13, np.dtype("float32"): 1e-6}
 
 
 class Dense(NamedTuple):
-    """The equations solved as one matrix of `unknowns` rows. A state is given as (system, t, x, u, params, unflatten).
+    """The equations solved as one matrix of `unknowns` rows. A state is given as (model, t, x, u).
 
     `diagonal`: there are no constraints, and the mass matrix is known to be diagonal.
     """
@@ -55,26 +56,26 @@ class Dense(NamedTuple):
     unknowns: int
     diagonal: bool = False
 
-    def accelerations(self, system, t, x, u, params, unflatten, baumgarte_rate=None, independent=None):
+    def accelerations(self, model, t, x, u, baumgarte_rate=None, independent=None):
         """The accelerations and the stacked multipliers, as vectors; `independent` (m,): which equations to solve with.
 
         If None, they are chosen at this state.
         """
-        linear = mass_and_forcing(system, t, x, u, params, unflatten)
-        if not system.constraints:
+        linear = mass_and_forcing(model, t, x, u)
+        if not model.m:
             no_multipliers = jnp.zeros(0, x.dtype)
             if self.diagonal:
                 return linear.forcing / jnp.sum(linear.mass, axis=1), no_multipliers
             return dense.solve(linear.mass, linear.forcing), no_multipliers
-        jacobian, gamma = constraints.acceleration_rows(system, t, x, u, params, unflatten)
+        jacobian, gamma = constraints.acceleration_rows(model, t, x, u)
         if baumgarte_rate is not None:
-            gamma = gamma + constraints.baumgarte_feedback(system, t, x, u, params, unflatten, baumgarte_rate)
+            gamma = gamma + constraints.baumgarte_feedback(model, t, x, u, baumgarte_rate)
         independent = independent_rows(jacobian) if independent is None else independent
         return _solved(linear, jacobian, gamma, independent)[:2]
 
-    def independent(self, system, t, x, u, params, unflatten, dependent_below=None) -> Bool[Array, " m"]:
+    def independent(self, model, t, x, u, dependent_below=None) -> Bool[Array, " m"]:
         """Which constraint equations to solve with."""
-        return independent_rows(constraints.jacobian(system, t, x, u, params, unflatten), dependent_below)
+        return independent_rows(constraints.jacobian(model, t, x, u), dependent_below)
 
     def displacement(self, *state) -> Callable:
         """`displacement(which, r)`: the shortest one, in the metric of M, that changes the residuals `which` by r."""
@@ -230,18 +231,16 @@ class Examined(NamedTuple):
 
 
 @compiled
-def examined(system, t, q, v, params) -> Examined:
+def examined(model, s: State) -> Examined:
     """Solve the equations at one state, and keep their matrix and which dependent constraints disagree."""
-    x, unflatten = coordinates.flatten(q)
-    found = _examined(system, t, x, coordinates.flatten(v)[0], params, unflatten)
-    by_name = constraints.split(system, found.multipliers, t, q, v, params)
-    return found._replace(a=unflatten(found.a), multipliers=by_name)
+    found = _examined(model, s.t, *model.vectors(s.q, s.v))
+    return found._replace(a=model.tree(found.a), multipliers=model.split(found.multipliers))
 
 
-def _examined(system, t, x, u, params, unflatten) -> Examined:
+def _examined(model, t, x, u) -> Examined:
     """The same in vector form."""
-    linear = mass_and_forcing(system, t, x, u, params, unflatten)
-    rows = _without_vanishing(system, t, x, u, params, unflatten)
+    linear = mass_and_forcing(model, t, x, u)
+    rows = _without_vanishing(model, t, x, u)
     independent = independent_rows(rows.jacobian)
     a, multipliers, unique = _solved(linear, rows.jacobian, rows.gamma, independent)
     return Examined(
@@ -250,19 +249,19 @@ def _examined(system, t, x, u, params, unflatten) -> Examined:
         linear=linear,
         rows=rows,
         independent=independent,
-        lagrangian=jnp.asarray(system.lagrangian(t, unflatten(x), unflatten(u), params)),
+        lagrangian=jnp.asarray(model.lagrangian(t, x, u)),
         matrix=_scaled_matrix(linear.mass, rows.jacobian, independent),
         contradictory=_contradictory(linear, rows, independent, a, multipliers, x, u),
         unique=unique,
     )
 
 
-def _without_vanishing(system, t, x, u, params, unflatten):
+def _without_vanishing(model, t, x, u):
     """The rows of all constraints; those that are round-off, being far larger at a nearby state, are set to zero."""
-    rows = constraints.acceleration_rows(system, t, x, u, params, unflatten)
+    rows = constraints.acceleration_rows(model, t, x, u)
     if not rows.gamma.size:
         return rows
-    nearby = constraints.jacobian(system, t, *map(slightly_off, (x, u)), params, unflatten)
+    nearby = constraints.jacobian(model, t, *map(slightly_off, (x, u)))
     size = lambda rows: jnp.max(jnp.abs(rows), axis=1)
     vanishes = vanishing(size(rows.jacobian), size(nearby))
     return rows._replace(jacobian=jnp.where(vanishes[:, None], 0.0, rows.jacobian))

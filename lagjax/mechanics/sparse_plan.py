@@ -14,8 +14,8 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Int
 
-from lagjax.mechanics import constraints, coordinates
-from lagjax.mechanics.reactions import reacts
+from lagjax.mechanics import constraints
+from lagjax.mechanics.model import Model
 from lagjax.mechanics.sparsity import pattern
 from lagjax.numerics import banded, dense
 
@@ -48,12 +48,11 @@ class Plan:
         return f"banded, half bandwidth {half_bandwidth}, {len(rows)} equations; {mass}"
 
 
-def plan(system, t, q, v, params) -> Plan | None:
+def plan(model: Model) -> Plan | None:
     """How to solve a system sparsely; None where the dense solve is as good. Only shapes and dtypes count."""
-    n = sum(np.size(x) for x in jax.tree.leaves(q))
-    if reacts(system) or n + constraints.count(system, t, q, v, params) < UNKNOWNS_AT_LEAST:
+    if model.reacts or model.n + model.m < UNKNOWNS_AT_LEAST:
         return None
-    leaves, structure = jtu.tree_flatten((system, t, q, v, params))
+    leaves, structure = jtu.tree_flatten(model)
     leaves = tuple(jax.ShapeDtypeStruct(x.shape, x.dtype) if eqx.is_array(x) else x for x in leaves)
     try:
         hash((structure, leaves))
@@ -65,24 +64,23 @@ def plan(system, t, q, v, params) -> Plan | None:
 # The equations are traced at several places of one program.
 @lru_cache(maxsize=64)
 def _plan(structure, leaves) -> Plan | None:
-    arrays = [x if isinstance(x, jax.ShapeDtypeStruct) else None for x in leaves]
+    model = jtu.tree_unflatten(structure, leaves)
+    t, u = (jax.ShapeDtypeStruct(shape, model.form.dtype) for shape in ((), (model.n,)))
+    given = [x if isinstance(x, jax.ShapeDtypeStruct) else None for x in leaves], t, u
 
-    def at(arrays):
-        filled = [x if x is not None else leaf for x, leaf in zip(arrays, leaves)]
-        system, t, q, v, params = jtu.tree_unflatten(structure, filled)
-        return system, t, coordinates.flatten(q)[0], params, coordinates.flatten(v)[1]
+    def at(given):
+        arrays, t, x = given
+        filled = [leaf if x is None else x for x, leaf in zip(arrays, leaves)]
+        return jtu.tree_unflatten(structure, filled), t, x
 
-    def momentum(u, arrays):
-        system, t, x, params, unflatten = at(arrays)
-        return jax.grad(lambda u: system.lagrangian(t, unflatten(x), unflatten(u), params))(u)
+    def momentum(u, given):
+        model, t, x = at(given)
+        return jax.grad(model.lagrangian, argnums=2)(t, x, u)
 
-    def residual(u, arrays):
-        system, t, x, params, unflatten = at(arrays)
-        return constraints.velocity_residual(system, t, x, u, params, unflatten)
+    def residual(u, given):
+        return constraints.velocity_residual(*at(given), u)
 
-    _, t, q, _, _ = jtu.tree_unflatten(structure, leaves)
-    u = jax.ShapeDtypeStruct((sum(x.size for x in jax.tree.leaves(q)),), t.dtype)
-    of_mass = pattern(momentum, u, arrays)
+    of_mass = pattern(momentum, u, given)
     blocks = banded.blocks(of_mass)
     if max(map(len, blocks)) > BLOCK_AT_MOST:
         return None
@@ -91,7 +89,7 @@ def _plan(structure, leaves) -> Plan | None:
     for k, block in enumerate(blocks):
         members[k, : len(block)] = block
         coupled[np.ix_(block, block)] = 1
-    of_rows = pattern(residual, u, arrays)
+    of_rows = pattern(residual, u, given)
     m, band = len(of_rows), None
     if m:
         rows = of_rows.astype(np.float32)

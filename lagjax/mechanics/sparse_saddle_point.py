@@ -57,36 +57,36 @@ class Operators(NamedTuple):
 
 
 class Banded(NamedTuple):
-    """The equations solved through S, by a plan. A state is given as (system, t, x, u, params, unflatten)."""
+    """The equations solved through S, by a plan. A state is given as (model, t, x, u)."""
 
     plan: Plan
 
-    def accelerations(self, system, t, x, u, params, unflatten, baumgarte_rate=None, kept=None):
+    def accelerations(self, model, t, x, u, baumgarte_rate=None, kept=None):
         """The accelerations and the stacked multipliers, as vectors; `kept` (m,) says which equations to solve with."""
         plan = self.plan
-        forcing, inertia = forcing_and_inertia(system, t, x, u, params, unflatten)
+        forcing, inertia = forcing_and_inertia(model, t, x, u)
         if plan.band is None:
             return _unconstrained(plan, inertia, forcing), jnp.zeros(0, x.dtype)
-        push, pull, rate = _rows(system, t, x, u, params, unflatten)
+        push, pull, rate = _rows(model, t, x, u)
         gamma = -rate
         if baumgarte_rate is not None:
-            gamma = gamma + constraints.baumgarte_feedback(system, t, x, u, params, unflatten, baumgarte_rate)
+            gamma = gamma + constraints.baumgarte_feedback(model, t, x, u, baumgarte_rate)
         kept = _independent(plan, push, pull, x.dtype) if kept is None else kept
         operators = Operators(inertia, *_mass_inverse(plan, inertia, x), push, pull, kept)
         a, multipliers = _solve(plan, operators, forcing, gamma)
         shortest = partial(_shortest, plan, push, pull)
         return a, lax.cond(jnp.all(kept), lambda x: x, shortest, multipliers)
 
-    def independent(self, system, t, x, u, params, unflatten, dependent_below=None) -> Bool[Array, " m"]:
+    def independent(self, model, t, x, u, dependent_below=None) -> Bool[Array, " m"]:
         """Which constraint equations to solve with; see `numerics.banded.independent`."""
-        push, pull, _ = _rows(system, t, x, u, params, unflatten)
+        push, pull, _ = _rows(model, t, x, u)
         return _independent(self.plan, push, pull, x.dtype, dependent_below)
 
-    def displacement(self, system, t, x, u, params, unflatten) -> Callable:
+    def displacement(self, model, t, x, u) -> Callable:
         """`displacement(which, r)`: the shortest one, in the metric of M, that changes the residuals `which` by r."""
         plan = self.plan
-        _, inertia = forcing_and_inertia(system, t, x, u, params, unflatten)
-        push, pull, _ = _rows(system, t, x, u, params, unflatten)
+        _, inertia = forcing_and_inertia(model, t, x, u)
+        push, pull, _ = _rows(model, t, x, u)
         kept = _independent(plan, push, pull, x.dtype)
         operators = Operators(inertia, *_mass_inverse(plan, inertia, x), push, pull, kept)
         schur, invert = _schur(plan, operators, x.dtype)
@@ -98,25 +98,25 @@ class Banded(NamedTuple):
 
         return of_residuals
 
-    def row_sizes(self, system, t, x, u, params, unflatten, norm=jnp.sum) -> Float[Array, " m"]:
+    def row_sizes(self, model, t, x, u, norm=jnp.sum) -> Float[Array, " m"]:
         """`Σ_j |A_ij|` of each constraint equation, or another norm: columns of one colour share no row."""
         if self.plan.band is None:
             return jnp.zeros(0, x.dtype)
-        push, _, _ = _rows(system, t, x, u, params, unflatten)
+        push, _, _ = _rows(model, t, x, u)
         return norm(jnp.abs(banded.compressed(push, self.plan.of_rows, x.dtype)), axis=0)
 
-    def verdict(self, system, t, x, u, params, unflatten) -> Verdict:
+    def verdict(self, model, t, x, u) -> Verdict:
         """Solve the equations at one state, and say whether they are finite, regular, and agree with each other."""
-        plan, state = self.plan, (system, t, x, u, params, unflatten)
+        plan, state = self.plan, (model, t, x, u)
         a, multipliers = self.accelerations(*state)
         forcing, inertia = forcing_and_inertia(*state)
-        known = [forcing, system.lagrangian(t, unflatten(x), unflatten(u), params)]
+        known = [forcing, model.lagrangian(t, x, u)]
         singular, contradictory = jnp.zeros((), bool), jnp.zeros((), bool)
         if plan.band is not None:
             push, pull, rate = _rows(*state)
             known.append(rate)
             kept = _independent(plan, push, pull, x.dtype)
-            at = lambda x, u: self.row_sizes(system, t, x, u, params, unflatten, jnp.max)
+            at = lambda x, u: self.row_sizes(model, t, x, u, jnp.max)
             vanishes = vanishing(at(x, u), at(*map(slightly_off, (x, u))))
             operators = Operators(inertia, *_mass_inverse(plan, inertia, x), push, pull, kept)
             singular = jnp.any(vanishes) | _undetermined(plan, operators, x.dtype)
@@ -158,11 +158,11 @@ def _largest_inertia(plan, inertia, x):
     return jnp.max(jnp.abs(banded.compressed(inertia, plan.of_mass, x.dtype)), axis=0)
 
 
-def _rows(system, t, x, u, params, unflatten):
+def _rows(model, t, x, u):
     """The products with A and Aᵀ, and d/dt of the velocity residual at constant velocity: -gamma."""
 
     def residual(t, x, u):
-        return constraints.velocity_residual(system, t, x, u, params, unflatten)
+        return constraints.velocity_residual(model, t, x, u)
 
     _, rate = jax.jvp(lambda t, x: residual(t, x, u), (t, x), (jnp.ones_like(t), u))
     _, push = jax.linearize(lambda u: residual(t, x, u), u)

@@ -24,9 +24,10 @@ from jax import lax
 from jaxtyping import Array
 
 from lagjax.jax_internals.plain import is_plain
-from lagjax.mechanics import constraints, coordinates
+from lagjax.mechanics import constraints
 from lagjax.mechanics.in_numbers import WRITTEN, Numbers
 from lagjax.mechanics.lagrangian import mass_and_forcing
+from lagjax.mechanics.model import Model
 from lagjax.mechanics.reactions import with_reactions
 from lagjax.mechanics.structure import is_diagonal
 from lagjax.numerics import dense
@@ -45,7 +46,7 @@ SMALL_CORRECTION = 1e-7
 
 
 class WrittenOut(NamedTuple):
-    """`equations(system, t, q, v, params)` -> (a, multipliers stacked); `project(same)` -> (q, v).
+    """`equations(model, t, q, v)` -> (a, multipliers stacked); `project(same)` -> (q, v).
 
     `may_fail` says whether either may give NaN where the robust way does not.
     """
@@ -54,77 +55,67 @@ class WrittenOut(NamedTuple):
     project: Numbers | None
     may_fail: bool
 
-    def prepare(self, system, params) -> tuple[tuple | None, tuple | None]:
+    def prepare(self, model: Model) -> tuple[tuple | None, tuple | None]:
         """The parts that do not depend on the state, of the equations and of the return to the constraints."""
-        prepare = lambda numbers: None if numbers is None else numbers.prepare(system, params)
+        prepare = lambda numbers: None if numbers is None else numbers.prepare(model)
         return prepare(self.equations), prepare(self.project)
 
 
-def has_networks(system, params) -> bool:
+def has_networks(model: Model) -> bool:
     """Whether a system or its parameters have matrices as large as those of a network."""
-    arrays = [x for x in jtu.tree_leaves((system, params)) if eqx.is_array(x)]
+    arrays = [x for x in jtu.tree_leaves(model) if eqx.is_array(x)]
     return any(x.ndim > 1 and x.size >= MATRIX for x in arrays)
 
 
-def is_small(system, t, q, v, params) -> bool:
+def is_small(model: Model) -> bool:
     """Whether the equations of a system are to be written out."""
-    if is_plain() or has_networks(system, params):
+    if is_plain() or has_networks(model):
         return False
-    size = sum(leaf.size for leaf in jtu.tree_leaves(q))
-    count = constraints.count(system, t, q, v, params)
-    return size + count <= (CONSTRAINED_UP_TO if count else UP_TO)
+    return model.n + model.m <= (CONSTRAINED_UP_TO if model.m else UP_TO)
 
 
-def write_out(system, t, q, v, params) -> WrittenOut | None:
-    """Write out the equations of a small system; only the state's shapes count. None if L makes them too long."""
-    count = constraints.count(system, t, q, v, params)
-    args = (system, t, q, v, params)
-    diagonal = count == 0 and is_diagonal(*args)
+def write_out(model: Model) -> WrittenOut | None:
+    """Write out the equations of a small system in single numbers. None if L makes them too long."""
+    diagonal = model.m == 0 and is_diagonal(model)
     try:
-        equations = Numbers(partial(_equations, diagonal), args, most=WRITTEN)
+        equations = Numbers(partial(_equations, diagonal), model, most=WRITTEN)
     except TooLong:
         return None
     if equations.length > LONG:
         return None
-    return WrittenOut(equations, Numbers(_projected, args) if count else None, may_fail=not diagonal)
+    return WrittenOut(equations, Numbers(_projected, model) if model.m else None, may_fail=not diagonal)
 
 
-def _equations(diagonal, system, t, q, v, params):
-    x, unflatten = coordinates.flatten(q)
-    u, _ = coordinates.flatten(v)
-    linear = mass_and_forcing(system, t, x, u, params, unflatten)
-    if x.size == 1 and not system.constraints:
-        return unflatten(linear.forcing / linear.mass[0]), jnp.zeros(0, x.dtype)
-    rows = constraints.acceleration_rows(system, t, x, u, params, unflatten)
+def _equations(diagonal, model: Model, t, q, v):
+    x, u = model.vectors(q, v)
+    linear = mass_and_forcing(model, t, x, u)
+    if model.n == 1 and not model.m:
+        return model.tree(linear.forcing / linear.mass[0]), jnp.zeros(0, x.dtype)
+    rows = constraints.acceleration_rows(model, t, x, u)
     solver = dense.Saddle(linear.mass, rows.jacobian, diagonal)
     a, multipliers, unique = with_reactions(solver.solve, linear.forcing, rows.gamma, linear.response)
     valid = solver.valid if linear.response is None else solver.valid & unique
-    return unflatten(a if diagonal else jnp.where(valid, a, jnp.nan)), multipliers
+    return model.tree(a if diagonal else jnp.where(valid, a, jnp.nan)), multipliers
 
 
-def _projected(system, t, q, v, params):
-    x, unflatten = coordinates.flatten(q)
-    u, _ = coordinates.flatten(v)
-    mass = mass_and_forcing(system, t, x, u, params, unflatten).mass
-    jacobian = constraints.jacobian(system, t, x, u, params, unflatten)
+def _projected(model: Model, t, q, v):
+    x, u = model.vectors(q, v)
+    mass, jacobian = mass_and_forcing(model, t, x, u).mass, constraints.jacobian(model, t, x, u)
     # The residual vanishes at the solution, so that the derivative of the matrix does not count.
     solver = dense.Saddle(*map(lax.stop_gradient, (mass, jacobian)))
-    holonomic = constraints.holonomic_equations(system, t, q, v, params)
     no_force = jnp.zeros_like(x)
     last_x = last_u = no_force
-    if holonomic.any():
+    if model.holonomic.any():
         for _ in range(2):
-            position = iter(constraints.position_residual(system, t, x, params, unflatten))
-            wanted = jnp.stack([-next(position) if restored else jnp.zeros_like(x[0]) for restored in holonomic])
+            position = iter(constraints.position_residual(model, t, x))
+            wanted = jnp.stack([-next(position) if restored else jnp.zeros_like(x[0]) for restored in model.holonomic])
             last_x, _ = solver.solve(no_force, wanted, refine=False)
             x = x + last_x
     for _ in range(2):
-        last_u, _ = solver.solve(
-            no_force, -constraints.velocity_residual(system, t, x, u, params, unflatten), refine=False
-        )
+        last_u, _ = solver.solve(no_force, -constraints.velocity_residual(model, t, x, u), refine=False)
         u = u + last_u
     near = solver.valid & _tiny(last_x, x) & _tiny(last_u, u)
-    return unflatten(jnp.where(near, x, jnp.nan)), unflatten(u)
+    return model.tree(jnp.where(near, x, jnp.nan)), model.tree(u)
 
 
 def _tiny(correction, y) -> Array:
