@@ -66,6 +66,23 @@ def test_a_lagrangian_that_asks_for_nan(nan):
     np.testing.assert_allclose(lj.integrate(asked, 1.0, 0.0, ts=ONE).q[-1], np.cos(np.sqrt(2 * nan)), rtol=1e-9)
 
 
+# Advice.
+
+
+@pytest.mark.slow
+def test_no_advice_to_take_what_is_there():
+    """In float64 at 1e-13 neither float64 nor a tighter rtol is advised, but a shorter span. Twin: that one helps."""
+    lagrangian = lambda t, q, v, p: (
+        0.5 * v @ v + 0.5 * v[0] ** 2 + v[0] * v[1] * jnp.cos(q[0] - q[1]) + 9.81 * (2 * jnp.cos(q[0]) + jnp.cos(q[1]))
+    )
+    until = lambda t: lj.integrate(lj.System(lagrangian), np.array([2.0, 2.5]), np.zeros(2), ts=[0.0, t], rtol=1e-13)
+    with pytest.warns(lj.AccuracyWarning, match="(?s)amplifies errors.*\nFix: a shorter span") as said:
+        until(30.0)
+    fix = str(said[0].message).split("Fix:")[1]
+    assert "float64" not in fix and "rtol" not in fix
+    assert until(5.0).scaled_error < 1
+
+
 # Dry friction in phases.
 
 
