@@ -46,8 +46,9 @@ def action(
     - `params`: as L takes it; by default those of the trajectory.
     - `t0`, `t1`: the ends, `[t]`; by default those of the trajectory.
     - `pieces`: the number of equal parts of the time span, each integrated by a rule of degree 15. A trajectory is
-      integrated again, in parts as short as it takes; while JAX traces (under `jit`, `grad`, `vmap`) in this number of
-      parts, or one for each output if these are more: `error` tells whether they suffice.
+      integrated again, however far apart its outputs lie, in parts as short as it takes; while JAX traces (under `jit`,
+      `grad`, `vmap`) in this number of parts, or one for each output if these are more: `error` tells whether they
+      suffice.
     - `error`: return the estimated error of the integral as well; that of the motion itself is `traj.error`.
 
     **Returns:** S, scalar, `[L] [t]`; NaN for a trajectory that failed. With `error=True` (S, its estimated error).

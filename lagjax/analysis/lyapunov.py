@@ -53,7 +53,8 @@ class LyapunovExponents(eqx.Module):
     - `settled`: the time from which growth is counted.
     - `ended`: whether the motion could be followed to its end; if not, the exponents are NaN.
 
-    Under `vmap` every array has the batch's axes in front.
+    Growth is that of the motion over a whole interval, whatever happens inside it. Under `vmap` every array has the
+    batch's axes in front.
     """
 
     exponents: Float[Array, " count"]

@@ -50,7 +50,8 @@ class WorkPrecision:
       `found["Dopri8"]` is one.
     - `reference`: what errors are measured against, and its own possible error; None if a function `error` was given.
       Points with an error below twice that are marked as not to be trusted.
-    - `measured`: the definition of an error, in words. `call_seconds`: the overhead of a call, which is subtracted.
+    - `measured`: the definition of an error, in words, with the number of times at which states are compared: between
+      these, errors are not seen. `call_seconds`: the overhead of a call, which is subtracted.
     """
 
     curves: dict[str, Curve]

@@ -74,7 +74,7 @@ def work_precision(
       `lj.Radau5()`.
     - `tolerances`: each is used as rtol, by other tools also as atol; by default decades from 1e-3 to 1e-12 in float64.
     - `events`: as `integrate` takes them. If one ends the motion, errors are those of its time and of the state there;
-      else those of the states at `ts`, and of the times of crossings.
+      else those of the states at `ts`, and of the times of crossings. An error between two times of `ts` is not seen.
     - `reference`: the right answer: a `Trajectory` at `ts`, states `(q, v)` with a row for each time, or a function
       of times that returns these. By default two methods of different kinds at 1e-13; if they do not agree, the result
       says how many digits can be trusted.

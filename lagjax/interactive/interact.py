@@ -69,8 +69,8 @@ def interact(
 
     - `run(point)`: any JAX function, as in `lj.sweep`: `point` is a dictionary with the value of each knob as an array,
       so that nothing is compiled anew when it changes; what `run` reads from outside stays as it was. A `Trajectory` is
-      drawn as its coordinates against time; a dictionary or an array as curves, against its entry `t` or else their
-      index; numbers stand above the picture.
+      drawn as its coordinates at the outputs, linked by straight lines; a dictionary or an array as curves, against its
+      entry `t` or else their index; numbers stand above the picture.
     - `knobs`: what may be turned, by name. `(low, high)` or `(low, high, step)`: a slider, whose values are floats. A
       list or an array of numbers: these, in their dtype. `True` or `False`: a switch. A list of anything else (names,
       methods, functions): a choice that `run` gets as it is; each has a program of its own, compiled when it is first

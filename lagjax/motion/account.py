@@ -162,9 +162,9 @@ def warning_of(trajectory) -> str:
     span, steps = abs(float(account.t[-1] - account.t[0])), int(trajectory.stats["num_accepted_steps"])
     cause, fix = _cause(trajectory, account, row, column, rtol)
     return (
-        f"over a time of {span:.6g} ({steps} steps) the error of '{account.names[column]}' grows to about {error:.1g}, "
-        f"while {'a turn' if turn else 'the largest value'} is {size:.3g}: {_left(error, size)}. From t = {since:.6g} "
-        f"on it is larger than {_expected(size, account.limit[column])} at rtol = {rtol:.1g}.\n"
+        f"over a time of {span:.6g} ({steps} steps) the error of '{account.names[column]}' grows to about {error:.1g} "
+        f"at the outputs, while {'a turn' if turn else 'the largest value'} is {size:.3g}: {_left(error, size)}. "
+        f"From t = {since:.6g} on it is larger than {_expected(size, account.limit[column])} at rtol = {rtol:.1g}.\n"
         f"Cause: {cause}.\nFix: {fix}."
     )
 

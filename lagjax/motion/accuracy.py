@@ -29,6 +29,8 @@ AMPLIFIED = 100.0
 class Errors(NamedTuple):
     """Estimates of the errors of a motion: how far each number may be from the true one, in its own unit.
 
+    Those of `q`, `v` and `multipliers` are at the outputs: a larger error between two of them is not seen.
+
     - `q`, `v`, `multipliers`: like those of the trajectory; NaN where the trajectory is NaN.
     - `events`: by name, the errors of the crossings' times, (K,); infinite if the second run did not find the crossing.
     - `result`: `lj.RESULTS.successful`, or why there is no estimate; the errors are then NaN.

@@ -17,7 +17,7 @@ from lagjax.mechanics.noether import NoetherCharge
 from lagjax.mechanics.structure import conserved_momenta, conserves_jacobi_integral
 from lagjax.motion.curves import columns, curves
 
-PANEL, LONG = "change of charges", 28
+PANEL, LONG = "change of charges\nat the outputs", 28
 
 
 def panels(trajectory, charges) -> dict[str, dict[str, np.ndarray]]:
@@ -40,7 +40,7 @@ def panels(trajectory, charges) -> dict[str, dict[str, np.ndarray]]:
 
 
 def changes(trajectory, charges) -> dict[str, np.ndarray]:
-    """Return the change of each charge since its first value, (T,), relative to its largest term on the motion."""
+    """Return the change of each charge since its first value, (T,), relative to its largest term at the outputs."""
     of_system = charges is True
     functions = known_charges(trajectory) if of_system else _by_name(charges)
     if not functions:

@@ -115,12 +115,14 @@ class HybridTrajectory(Trajectory):
         return jnp.full_like(self.scaled_error, jnp.nan)
 
     def residual(self) -> Float[Array, ""]:
-        """The worst constraint residual over all outputs, each in its own phase, relative."""
+        """The worst constraint residual over all outputs, but not between them, each in its own phase, relative."""
         worst = [_residual_in(system, i, self) for i, system in enumerate(self.system.systems) if system.constraints]
         return jnp.max(jnp.stack([*worst, jnp.zeros_like(self.scaled_error)]))
 
     def plot(self, charges=False):
         """Plot coordinates, velocities and multipliers against time, with the switches; returns a matplotlib `Figure`.
+
+        Switches stand at their own times; else what happens between two outputs is not seen.
 
         **Raises:** `ImportError` without matplotlib; `ValueError` for a batched trajectory.
         """
@@ -137,7 +139,7 @@ class HybridTrajectory(Trajectory):
         if isinstance(self.any_system, UnknownSystem):
             lines = [("system", repr(self.any_system))]
         elif any(system.constraints for system in self.system.systems):
-            lines = [("worst constraint residual", f"{float(self.residual()):.1e} (relative)")]
+            lines = [("worst constraint residual", f"{float(self.residual()):.1e} (relative, at the outputs)")]
         else:
             lines = []
         names, counts = np.unique(self.named_phases(), return_counts=True)

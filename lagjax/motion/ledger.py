@@ -44,9 +44,12 @@ class EnergyLedger(eqx.Module):
       neither moves nor is inhomogeneous in v is zero.
     - `impacts` (S,): the jump of h at each switch of a `lj.Hybrid`, at the times `impact_times`; `switches`: from
       which phase to which; `impact_total` (T,): the sum of the jumps until each output.
-    - `closure` (T,): the change of h less all works and jumps, `[L]`; `scale`: the largest energy on the motion, to
-      which it is compared; `allowed`: 100 tolerances.
+    - `closure` (T,): the change of h less all works and jumps, `[L]`; `scale`: the largest energy, to which it is
+      compared; `allowed`: 100 tolerances.
     - `quadrature`: the estimated error of the works by quadrature, relative to `scale`.
+
+    Works are integrated along the motion, however far apart its outputs lie; energies, `closure` and `scale` are those
+    at the outputs, so an imbalance that comes and goes between two of them is not seen.
     """
 
     t: np.ndarray
@@ -66,7 +69,7 @@ class EnergyLedger(eqx.Module):
 
     @property
     def relative_closure(self) -> float:
-        """The largest `closure`, relative to `scale`."""
+        """The largest `closure` at the outputs, relative to `scale`."""
         return float(np.max(np.abs(self.closure)) / self.scale)
 
     @property
@@ -107,12 +110,13 @@ class EnergyLedger(eqx.Module):
         widths = [max(len(row[i]) for row in [heads, *cells] if i < len(row)) for i in range(len(heads))]
         width = max(len(name) for name, _ in rows)
         line = lambda name, cells: "  ".join([f"  {name:<{width}}", *(f"{x:>{w}}" for x, w in zip(cells, widths))])
+        closure = f"{self.relative_closure:.0e} of the largest energy at the outputs, {self.scale:.6g}"
         verdict = "" if self.closes else f"; DOES NOT CLOSE: above {self.allowed:.0e}"
         return "\n".join([
             f"EnergyLedger, t = {self.t[0]:.6g} to {self.t[-1]:.6g}, {len(self.t)} instants",
             line("", heads),
             *(line(name, row) for (name, _), row in zip(rows, cells)),
-            f"  {'closure':<{width}}  {self.relative_closure:.0e} of the largest energy, {self.scale:.6g}{verdict}",
+            f"  {'closure':<{width}}  {closure}{verdict}",
             *(f"  {note}" for note in self._odd()),
         ])  # fmt: skip
 

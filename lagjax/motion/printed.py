@@ -18,7 +18,8 @@ def lines(traj) -> list[str]:
     ]
     rows += traj._of_system()
     if 1 < float(traj.scaled_error) < np.inf:
-        rows.append(("WARNING", f"the error is {float(traj.scaled_error):.2g} times what the tolerance lets expect"))
+        times = f"{float(traj.scaled_error):.2g} times"
+        rows.append(("WARNING", f"the error at the outputs is {times} what the tolerance lets expect"))
     rows += _shape_rows(traj)
     return ["Trajectory", *_aligned(rows)]
 

@@ -326,6 +326,6 @@ def _of_drift(trajectory):
     off = f", and a constraint is off by {float(trajectory.residual()):.1g}" if trajectory.system.constraints else ""
     return (
         f"over a time of {span:.6g} ({steps} steps) the Jacobi integral, which should stay constant, changed by "
-        f"{drift:.1g} of its size{off}, at rtol = {rtol:.1g}.\n"
+        f"{drift:.1g} of its size{off}, at the outputs, at rtol = {rtol:.1g}.\n"
         f"Fix: {fix}. What caused it, estimate_error=True says."
     )

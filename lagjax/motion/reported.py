@@ -37,7 +37,7 @@ PATIENCE = jax.make_user_context(default_value=None)
 class Report(NamedTuple):
     """How motions went, taken together: the first bad result, all steps, the worst scaled_error and residual.
 
-    `scaled_error`: as in `Trajectory`; `residual`: the worst constraint residual at the outputs, relative.
+    `scaled_error`: as in `Trajectory`; `residual`: the worst constraint residual, relative; both at the outputs.
     """
 
     result: Int[Array, ""]

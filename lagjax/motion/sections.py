@@ -51,7 +51,8 @@ class PoincareSection(eqx.Module):
     - `count`: how many crossings there were, including those that were not kept.
     - `uncertain`: whether some may be missing; see `lj.Crossings`.
 
-    Under `vmap` every array has the batch's axes in front.
+    Crossings are found along the steps: they do not depend on the outputs of the motion. Under `vmap` every array
+    has the batch's axes in front.
 
     **Raises:** `ValueError` for an event that the trajectory did not record.
     """
@@ -212,7 +213,7 @@ def poincare(
 
 
 def periods(crossings: Crossings | PoincareSection) -> Float[Array, " C-1"]:
-    """The times between consecutive crossings, which are the periods of a periodic motion.
+    """The times between consecutive crossings, which are the periods of a periodic motion; outputs do not matter.
 
     >>> import jax.numpy as jnp
     >>> import lagjax as lj
@@ -249,7 +250,7 @@ def periods(crossings: Crossings | PoincareSection) -> Float[Array, " C-1"]:
 def turning_points(
     coordinate: str | None = None, direction: int = 0, terminal: bool = False, most: int = 32
 ) -> Crossing:
-    """An event for `lj.integrate`: a coordinate turns, that is, its velocity changes sign.
+    """An event for `lj.integrate`: a coordinate turns, that is, its velocity changes sign, at outputs or between them.
 
     >>> import lagjax as lj
     >>> spring = lj.System(lambda t, q, v, params: 0.5 * v**2 - 0.5 * params["k"] * q**2)

@@ -102,7 +102,8 @@ class Trajectory(eqx.Module):
       above 1 the motion is less accurate than that, and `integrate` warns. Without `error` it is the change of the
       Jacobi integral, if it must be constant, and of the constraints, in units of what the tolerance lets expect; 0 if
       nothing must be constant. Infinite for a motion that failed. A number that is zero throughout has its error as
-      its size: no verdict depends on units.
+      its size: no verdict depends on units. Errors, changes and sizes are those at the outputs: one that is larger
+      between two of them is not seen.
     - `result`: a `RESULTS` item; `lj.RESULTS.successful`, `event_occurred`, or what went wrong.
     - `events`: by name, the `Crossings` of the requested events.
     - `params`, `system`: what was integrated; `asked`: the method and the steps that were asked for. `tolerance`:
@@ -155,11 +156,17 @@ class Trajectory(eqx.Module):
         return jacobi_and_scale(self.system, self.t, self.q, self.v, self.params)[0]
 
     def drift(self) -> Float[Array, ""]:
-        """The largest change of the Jacobi integral, relative to the largest `|v·p| + |L|`."""
+        """The largest change of the Jacobi integral at the outputs, relative to the largest `|v·p| + |L|` there.
+
+        One that comes and goes between two outputs is not seen.
+        """
         return _worst_drift(self.system, self.t, self.q, self.v, self.params)
 
     def residual(self) -> Float[Array, ""]:
-        """The worst constraint residual over all outputs, positions and velocities, relative; 0 without constraints."""
+        """The worst constraint residual over all outputs, positions and velocities, relative; 0 without constraints.
+
+        Between outputs it is not computed: `at(t)` is on the constraints there.
+        """
         if not self.system.constraints:
             return jnp.zeros_like(self.scaled_error)
         return _worst_residual(self.system, self.t, self.q, self.v, self.params)
@@ -223,7 +230,8 @@ class Trajectory(eqx.Module):
         """Plot coordinates, velocities and multipliers against time; returns a matplotlib `Figure`.
 
         `charges=True` adds the relative change of the quantities known to be conserved; `lj.symmetries(...)`, or
-        functions of (t, q, v, params) by name, add that of others.
+        functions of (t, q, v, params) by name, add that of others. The outputs are drawn, linked by straight lines:
+        what happens between two of them is not seen.
 
         **Raises:** `ImportError` without matplotlib; `ValueError` for a batched trajectory, or without any charges.
         """
@@ -234,7 +242,8 @@ class Trajectory(eqx.Module):
         """Plot velocities against coordinates, one panel per coordinate; returns a matplotlib `Figure`.
 
         A dot marks the start. An angle (a coordinate that enters only through sines and cosines) that goes around is
-        drawn between -π and π. For a batched trajectory every lane is drawn.
+        drawn between -π and π. For a batched trajectory every lane is drawn. The outputs are linked by straight lines:
+        what happens between two of them is not seen.
 
         **Raises:** `ImportError` without matplotlib.
         """
@@ -263,7 +272,8 @@ class Trajectory(eqx.Module):
         - `positions`: `positions(t, q, params)` -> a point `(x, y)`; or points (k, 2), linked by lines in order; or a
           dictionary of these, each name in its own colour. The last point of each leaves a trail. Plain NumPy works.
         - `seconds`: how long it plays; by default as long as the motion takes in units of t, but 2 to 20 s.
-        - `rate`: frames per second. Between outputs q is interpolated, cubically, with v as its slope.
+        - `rate`: frames per second. Between outputs q is interpolated, cubically, with v as its slope: an impact or a
+          pulse between two of them is smoothed away.
         - `trail`: how many seconds of playing the trails reach back.
 
         **Returns:** an `Animation`. It ends with the motion: at an event, or at the last output before it failed.
@@ -282,11 +292,12 @@ class Trajectory(eqx.Module):
             return [("system", repr(self.any_system)), *of_events]
         found = []
         if self.system.constraints:
-            found.append(("worst constraint residual", f"{float(self.residual()):.1e} (relative)"))
+            found.append(("worst constraint residual", f"{float(self.residual()):.1e} (relative, at the outputs)"))
         first = jax.tree.map(lambda x: np.asarray(x)[0], (self.t, self.q, self.v))
         changed_by = next(what_changes_jacobi_integral(self.system, *first, self.params), None)
         as_it_may = "" if changed_by is None else f"; need not be conserved: {changed_by}"
-        found.append(("change of the Jacobi integral", f"{float(self.drift()):.1e} (relative){as_it_may}"))
+        drift = f"{float(self.drift()):.1e} (relative, at the outputs)"
+        found.append(("change of the Jacobi integral", drift + as_it_may))
         return found + of_events
 
     def _check_alone(self, call):

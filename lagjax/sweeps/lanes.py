@@ -35,7 +35,7 @@ class Status(NamedTuple):
 
     `result` is the code of a `RESULTS` item, -1 if the point was not run, -2 if it is lost from its store; `steps`
     counts the steps of all its integrations; `scaled_error` and `residual` are the worst values of its integrations
-    (`Trajectory`), 0 if nothing was integrated.
+    at their outputs (`Trajectory`), 0 if nothing was integrated.
     """
 
     result: Any

@@ -190,7 +190,8 @@ class Sweep:
 
         It shows how the chosen point ended, in words. A value with one number per point is shown as a number, and as a
         curve over the axis that was moved last; a `Trajectory` as curves against time; an array as curves, one per
-        column, against the array `t` in the same dictionary, or else against the index.
+        column, against the array `t` in the same dictionary, or else against the index. What happens between two
+        outputs is not seen.
 
         **Arguments:**
 
@@ -250,7 +251,7 @@ class Sweep:
             )
         residual = self.status.residual[np.isfinite(self.status.residual)]
         if residual.any():
-            rows.append(("worst constraint residual", f"{residual.max():.1e} (relative)"))
+            rows.append(("worst constraint residual", f"{residual.max():.1e} (relative, at the outputs)"))
         rows.append(("values", ", ".join(self._shapes())))
         rows.append(("run", self.how))
         if self.ran:

@@ -216,7 +216,8 @@ def test_charges_of_a_trajectory_are_drawn():
     panel = motion.plot(charges=found).axes[-1]
     labels = [text.get_text() for text in panel.get_legend().get_texts()]
     assert "p_X + p_x" in labels and all(np.max(np.abs(line.get_ydata())) < 1e-12 for line in panel.get_lines())
-    assert "Jacobi integral" in motion.plot(charges=True).axes[-1].get_ylabel()
+    label = motion.plot(charges=True).axes[-1].get_ylabel()
+    assert "Jacobi integral" in label and "at the outputs" in label
     moved = motion.plot(charges={"p_x": lj.noether_charge(sliding_wedge.system, lj.Generator.shift("x"))})
     assert np.max(np.abs(moved.axes[-1].get_lines()[0].get_ydata())) > 0.1
     with pytest.raises(TypeError, match="charge 'p' must be a function"):

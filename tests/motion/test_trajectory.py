@@ -45,7 +45,7 @@ def test_says_what_need_not_be_conserved(traj):
     assert "need not be conserved" not in repr(traj)
     driven = lj.System(lambda t, q, v, params: 0.5 * v**2 - 0.5 * q**2 + jnp.cos(t) * q)
     swing = lj.integrate(driven, 1.0, 0.0, None, ts=TS)
-    assert "(relative); need not be conserved: L depends on t" in repr(swing)
+    assert "(relative, at the outputs); need not be conserved: L depends on t" in repr(swing)
     assert "L depends on t" in repr(jax.tree.map(np.asarray, swing)), "of a sweep's trajectories, too"
     assert "RESULTS<successful>" in repr(traj.result)
 
