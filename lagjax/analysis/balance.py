@@ -30,8 +30,9 @@ from jaxtyping import Array, Float, PyTree
 
 from lagjax.analysis.roots import roots_beside_zeros
 from lagjax.jax_internals.one_by_one import jitted
-from lagjax.mechanics import constraints, coordinates
+from lagjax.mechanics import constraints
 from lagjax.mechanics.lagrangian import forcing_and_inertia
+from lagjax.mechanics.model import Model
 from lagjax.mechanics.reactions import response
 from lagjax.mechanics.system import System
 from lagjax.numerics import dense, lapack
@@ -57,26 +58,38 @@ class Symmetries(eqx.Module):
 
 
 class Steady(eqx.Module):
-    """The equations of steady motion; `like` has the structure of q, `held` (k,) are the held rates or momenta."""
+    """The equations of steady motion near the positions `x0`; `held` (k,) are the held rates or momenta."""
 
-    system: System
+    model: Model
     t: Float[Array, ""]
-    params: PyTree
     held: Float[Array, " k"]
-    like: PyTree[Float[Array, "..."]]
+    x0: Float[Array, " n"]
     symmetries: Symmetries = eqx.field(static=True)
 
     @property
+    def system(self) -> System:
+        return self.model.system
+
+    @property
+    def params(self) -> PyTree:
+        return self.model.params
+
+    @property
     def n(self) -> int:
-        return sum(x.size for x in jax.tree.leaves(self.like))
+        return self.model.n
 
     @property
     def m(self) -> int:
-        return constraints.count(self.system, self.t, self.like, self.like, self.params)
+        return self.model.m
+
+    def of(self, params) -> "Steady":
+        """The same with other parameters."""
+        return Steady(self.model.of(params), self.t, self.held, self.x0, self.symmetries)
 
     @property
-    def unflatten(self) -> Callable:
-        return coordinates.flatten(self.like)[1]
+    def conservative(self) -> bool:
+        """Whether there is neither a force nor dissipation."""
+        return self.system.force is None and self.system.dissipation is None
 
     def parts(self, y):
         """Split a vector of unknowns into positions, rates and multipliers."""
@@ -86,8 +99,8 @@ class Steady(eqx.Module):
     def fields(self, x) -> Float[Array, "k n"]:
         """The velocity along each symmetry at unit rate."""
         rows = [jnp.asarray(np.eye(self.n)[i], x.dtype) for i in self.symmetries.places]
-        q = self.unflatten(x)
-        rows += [coordinates.flatten(field(q, self.params))[0].astype(x.dtype) for field in self.symmetries.fields]
+        q = self.model.tree(x)
+        rows += [self.model.vector(field(q, self.params)).astype(x.dtype) for field in self.symmetries.fields]
         return jnp.stack(rows) if rows else jnp.zeros((0, self.n), x.dtype)
 
     def velocity(self, x, rates):
@@ -102,16 +115,14 @@ class Steady(eqx.Module):
 
     def momenta(self, x, u) -> Float[Array, " k"]:
         """The conserved momenta `p·G_k`, one for each symmetry."""
-        lagrangian_of = lambda u: self.system.lagrangian(self.t, self.unflatten(x), self.unflatten(u), self.params)
-        return self.fields(x) @ jax.grad(lagrangian_of)(u)
+        return self.fields(x) @ jax.grad(self.model.lagrangian, argnums=2)(self.t, x, u)
 
 
 # Jitted so that a Lagrangian is traced only once, however often its balance is evaluated.
 @jitted
 def imbalance(s: Steady, t, x, u, a, multipliers):
     """The residual `M a - F - Aᵀ λ - B λ` for any velocity and acceleration."""
-    state = s.system, t, x, u, s.params, s.unflatten
-    forcing, inertia = forcing_and_inertia(*state)
+    forcing, inertia = forcing_and_inertia(s.model, t, x, u)
     residual = inertia(a) - forcing
     if multipliers.size:
         residual = residual - multipliers @ forces(s, t, x, u)
@@ -121,24 +132,18 @@ def imbalance(s: Steady, t, x, u, a, multipliers):
 @jitted
 def forces(s: Steady, t, x, u) -> Float[Array, "m n"]:
     """The force per unit of each multiplier: the rows of A, plus the response of forces that depend on multipliers."""
-    state = s.system, t, x, u, s.params, s.unflatten
-    rows, reaction = constraints.jacobian(*state), response(*state)
+    rows, reaction = constraints.jacobian(s.model, t, x, u), response(s.model, t, x, u)
     return rows if reaction is None else rows + reaction.T
 
 
 @jitted
 def constraint_residuals(s: Steady, t, x, u):
     """The residuals `g` or `phi` of all constraints, stacked in the order of their names."""
-    q, v = s.unflatten(x), s.unflatten(u)
+    q, v = s.model.tree(x), s.model.tree(u)
     residuals = [c.residual(t, q, v, s.params) for c in s.system.constraints.values()]
     return (
         jnp.concatenate([jnp.atleast_1d(r).astype(x.dtype) for r in residuals]) if residuals else jnp.zeros(0, x.dtype)
     )
-
-
-def holonomic(s: Steady) -> np.ndarray:
-    """Which of the stacked constraint equations are holonomic, (m,)."""
-    return constraints.holonomic_equations(s.system, s.t, s.like, s.like, s.params)
 
 
 def held_residual(s: Steady, x, rates):
@@ -166,8 +171,7 @@ def balance(s: Steady, y):
 
 def holonomic_rates(s: Steady, x, u):
     """The residual `dg/dt` of the holonomic constraints, which a velocity must satisfy as well; 0 for the others."""
-    rates = constraints.velocity_residual(s.system, s.t, x, u, s.params, s.unflatten)
-    return jnp.where(holonomic(s), rates, 0.0)
+    return jnp.where(s.model.holonomic, constraints.velocity_residual(s.model, s.t, x, u), 0.0)
 
 
 def drift_rates(s: Steady, y):
@@ -212,17 +216,17 @@ def departures(s: Steady, y, jacobian) -> Departures:
         return imbalance(s, s.t, x, u + rate, total, multipliers)
 
     damping, mass = jax.jacfwd(residual, argnums=(0, 1))(jnp.zeros_like(x), jnp.zeros_like(x))
-    by_position, is_holonomic = jacobian[n : n + m, :n], holonomic(s)[:, None]
+    by_position, is_holonomic = jacobian[n : n + m, :n], s.model.holonomic[:, None]
     rows = by_position
-    if not holonomic(s).all():
-        rows = constraints.jacobian(s.system, s.t, x, u, s.params, s.unflatten)
+    if not s.model.holonomic.all():
+        rows = constraints.jacobian(s.model, s.t, x, u)
     slopes = jnp.where(is_holonomic, 0.0, by_position)
     return Departures(jacobian[:n, :n], damping, mass, rows, slopes, -jacobian[:n, n + k : n + k + m].T)
 
 
 def directions(s: Steady, d: Departures, y):
     """The projector (2n, 2n) onto allowed departures (ξ, ξ') that leave the steady motion; and its rank."""
-    n, rows, restricts_positions = s.n, d.rows, holonomic(s)
+    n, rows, restricts_positions = s.n, d.rows, s.model.holonomic
     zero = jnp.zeros_like(rows)
     of_positions = jnp.where(restricts_positions[:, None], rows, 0.0)
     along = s.fields(s.parts(y)[0])

@@ -34,7 +34,6 @@ from jaxtyping import Array, Float
 from lagjax.analysis import balance as equations
 from lagjax.analysis.balance import Steady
 from lagjax.analysis.numbers_in import Number, no_such_number, numbers_in
-from lagjax.mechanics import coordinates
 from lagjax.mechanics.compiled import compiled
 from lagjax.numerics.rank import independent_rows
 
@@ -52,7 +51,7 @@ class Place(eqx.Module):
         """The problem with this value of the parameter."""
         if self.of_params is None:
             return replace(s, held=s.held.at[self.entry].set(value))
-        return replace(s, params=self.of_params.put(s.params, value))
+        return s.of(self.of_params.put(s.params, value))
 
     def get(self, s: Steady):
         """The value of the parameter in the problem."""
@@ -88,7 +87,7 @@ class Frame(eqx.Module):
 
 def place_of(steady: Steady, along: str) -> Place:
     """Find a parameter by name, `"omega"`, `"spring.k"`, `"k[1]"`; or a held rate `"v.psi"` or momentum `"p.psi"`."""
-    names = coordinates.names(steady.like)
+    names = steady.model.names
     for kind, hold in (("v", equations.VELOCITY), ("p", equations.MOMENTUM)):
         held_names = [f"{kind}.{names[i]}" if names[i] != "q" else kind for i in steady.symmetries.places]
         held_names = held_names or [f"{kind}[{i}]" for i in range(steady.symmetries.count)]
@@ -125,10 +124,10 @@ def outputs_at(frame: Frame, z):
     if s.m > 1:
         pushes = equations.forces(s, s.t, x, u)
         multipliers = equations.shortest_multipliers(pushes, multipliers @ pushes)
-    by_name = equations.constraints.split(s.system, multipliers, s.t, s.like, s.like, s.params) if s.m else {}
+    by_name = s.model.split(multipliers) if s.m else {}
     jacobian = jax.jacfwd(lambda y: equations.balance(s, y))(y)
     roots = equations.characteristic_roots(s, y, jacobian, derivatives=False)
-    return z[-1] * frame.unit, s.unflatten(x), s.unflatten(u), by_name, roots
+    return z[-1] * frame.unit, s.model.tree(x), s.model.tree(u), by_name, roots
 
 
 @compiled
@@ -209,7 +208,7 @@ def extended_by_params(kind: str, frame: Frame, big, guide):
     floats, rest = eqx.partition(frame.steady.params, eqx.is_inexact_array)
 
     def residual(floats):
-        steady = replace(frame.steady, params=eqx.combine(floats, rest))
+        steady = frame.steady.of(eqx.combine(floats, rest))
         return extended(kind, replace(frame, steady=steady), big, guide)
 
     return jax.jacfwd(residual)(floats)

@@ -31,8 +31,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from lagjax.analysis.flow import Flow, flow_of
 from lagjax.analysis.guessing import TURN, Asked, Guess, guessed
-from lagjax.mechanics import coordinates
 from lagjax.mechanics.compiled import compiled
+from lagjax.mechanics.model import model_of
 
 MOST = 40
 # The damping in units of the residual: its least and first values, its growth after a failed step, where to give up.
@@ -115,10 +115,10 @@ class Goal(NamedTuple):
 
 
 @compiled
-def closed(system, t, q, v, params, period, rtol, asked: Asked, rows, parts, turns, most) -> SearchResult:
+def closed(system, s, period, rtol, asked: Asked, rows, parts, turns, most) -> SearchResult:
     """Search for an orbit near a state; `turns` (n,): the turns of the angles, or None for those of the guess."""
-    flow = flow_of(system, t, q, v, params, rtol, rows)
-    guess = guessed(flow, t, flow.vector(q, v), period, asked, parts, turns)
+    flow, t = flow_of(model_of(system, *s), rtol, rows), s.t
+    guess = guessed(flow, t, flow.vector(s.q, s.v), period, asked, parts, turns)
     goal = Goal(integral_at(flow, t, guess.z), guess.z)
     zero, size = jnp.zeros((), t.dtype), 2 * flow.size - len(flow.rows)
     rows_of = parts * 2 * flow.size + asked.moves + asked.energy + len(asked.held)
@@ -156,12 +156,12 @@ def closed(system, t, q, v, params, period, rtol, asked: Asked, rows, parts, tur
     return SearchResult(search.best, guess, search.evaluation, converged, search.iterations, apart)
 
 
-def implicit(system, t, q, v, params, rtol, asked: Asked, rows, found: SearchResult) -> SearchResult:
+def implicit(system, s, rtol, asked: Asked, rows, found: SearchResult) -> SearchResult:
     """The same orbit with its derivatives by the system, parameters and held quantities, from one more Newton step."""
-    flow = flow_of(system, t, q, v, params, rtol, rows)
+    flow, t = flow_of(model_of(system, *s), rtol, rows), s.t
     found = lax.stop_gradient(found)
     evaluation, scale = found.evaluation, found.guess.scale
-    goal_z = flow.onto_constraints(t, flow.vector(q, v), scale)
+    goal_z = flow.onto_constraints(t, flow.vector(s.q, s.v), scale)
     goal = Goal(integral_at(flow, t, goal_z), goal_z)
     nodes = jax.vmap(lambda z: flow.onto_constraints(t, z, scale))(found.candidate.nodes)
     candidate = Candidate(nodes, found.candidate.period)
@@ -252,7 +252,7 @@ def _residual(flow, t, candidate, ends, asked, goal, guess):
         size = lax.stop_gradient(jnp.linalg.norm(slope))
         excess = integral_at(flow, t, candidate.nodes[0]) - goal.integral
         # A value below the round-off of its terms is set to zero, but keeps its derivative.
-        terms = jnp.abs(goal.integral) + jnp.abs(flow.system.lagrangian(t, *flow.state(goal.z), flow.params))
+        terms = jnp.abs(goal.integral) + jnp.abs(flow.model.lagrangian(t, *jnp.split(goal.z, 2)))
         is_round_off = lax.stop_gradient(jnp.abs(excess) <= ROUND_OFFS * jnp.finfo(excess.dtype).eps * terms)
         excess = jnp.where(is_round_off, excess - lax.stop_gradient(excess), excess)
         parts.append(HELD_WEIGHT * (excess / jnp.where(size > 0, size, 1.0))[None])
@@ -291,9 +291,9 @@ def _step(matrix, residual, bases, asked, rtol, damping):
 
 def integral_at(flow, t, z):
     """The Jacobi integral v·p - L."""
-    q, v = flow.state(z)
-    value, p = jax.value_and_grad(flow.system.lagrangian, argnums=2)(t, q, v, flow.params)
-    return z[flow.size :] @ coordinates.flatten(p)[0] - value
+    x, u = jnp.split(z, 2)
+    value, p = jax.value_and_grad(flow.model.lagrangian, argnums=2)(t, x, u)
+    return u @ p - value
 
 
 def _changed(flow: Flow, t, candidate, scale):

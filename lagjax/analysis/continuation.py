@@ -23,10 +23,10 @@ from lagjax.analysis.tracing import AGAIN, FIRST, Path, Point
 from lagjax.jax_internals.tracing import is_eager
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.compiled import compiled
-from lagjax.mechanics.coordinates import State
 from lagjax.mechanics.diagnosis import describe
+from lagjax.mechanics.model import model_of
 from lagjax.mechanics.refusals import by_name, check_system
-from lagjax.mechanics.structure import angles, is_autonomous
+from lagjax.mechanics.structure import are_angles, is_autonomous
 
 # Critical points closer than this are the same.
 SAME = 1e-5
@@ -102,9 +102,10 @@ def continue_equilibria(
     system, s = checked(system, t, q, v, params)
     moving = np.concatenate([np.ravel(x) for x in jax.tree.leaves(s.v)]) != 0
     symmetries = symmetries_of(system, s, cyclic, hold, None if velocity is None else moving)
-    steady = Steady(system, s.t, s.params, np.zeros(symmetries.count, s.t.dtype), s.q, symmetries)
+    model, x0 = model_of(system, *s), coordinates.vector(s.q)
+    steady = Steady(model, s.t, np.zeros(symmetries.count, s.t.dtype), x0, symmetries)
     held = _held(steady, coordinates.vector(s.q), coordinates.vector(s.v)) if symmetries.count else steady.held
-    steady = Steady(system, s.t, s.params, held, s.q, symmetries)
+    steady = Steady(model, s.t, held, x0, symmetries)
     place = place_of(steady, along)
     first, last = float(place.get(steady)), float(to)
     if not np.isfinite(last) or first == last:
@@ -137,13 +138,13 @@ def _velocity(steady, x):
 
 
 def _solution(steady: Steady, v) -> np.ndarray | str:
-    """The unknowns of the equilibrium near `steady.like`, or a message that says why there is none."""
+    """The unknowns of the equilibrium near `steady.x0`, or a message that says why there is none."""
     if steady.symmetries.count and steady.symmetries.hold == VELOCITY:
-        v = coordinates.like(v, np.asarray(_velocity(steady, coordinates.vector(steady.like))))
+        v = coordinates.like(v, np.asarray(_velocity(steady, steady.x0)))
     one = lambda tree: jax.tree.map(lambda x: np.asarray(x)[None], tree)
-    s = State(steady.t, steady.like, v, steady.params)
-    lasting = not steady.symmetries.count and is_autonomous(steady.system, *s)
-    row = jax.tree.map(lambda x: np.asarray(x)[0], searched(steady, one(steady.like), one(v), lasting, 0, True))
+    lasting = not steady.symmetries.count and is_autonomous(steady.model)
+    q = steady.model.tree(np.asarray(steady.x0))
+    row = jax.tree.map(lambda x: np.asarray(x)[0], searched(steady, one(q), one(v), lasting, 0, True))
     if row.status != OK:
         return WORDS[row.status]
     flat = lambda tree: np.concatenate([np.ravel(x) for x in jax.tree.leaves(tree)] or [np.zeros(0)])
@@ -152,26 +153,23 @@ def _solution(steady: Steady, v) -> np.ndarray | str:
 
 def _frame(steady: Steady, place: Place, first: float, last: float, v, units) -> tuple[Frame, np.ndarray]:
     """The units and the combinations of equations that are solved; and the point at which the branch begins."""
-    y = _solution(steady, v)
+    y, x0 = _solution(steady, v), steady.model.tree(steady.x0)
     if isinstance(y, str):
         raise ValueError(
-            f"no equilibrium was found from the start {describe(steady.like)}, {place.name} = {first:.6g}: {y}.\n"
+            f"no equilibrium was found from the start {describe(x0)}, {place.name} = {first:.6g}: {y}.\n"
             "Usual cause: a start far from an equilibrium, or a parameter at which there is none.\n"
             "Fix: found = lj.equilibria(system, params, starts=[...]) from several starts lists the equilibria; "
             "start from one of them."
         )
     unit = abs(last - first)
     n = steady.n
-    angle = np.concatenate(
-        [np.full(np.size(x), yes) for yes, x in zip(*map(jax.tree.leaves, (_angles(steady), steady.like)))]
-    )
+    angle = are_angles(steady.model)
     length = np.max(np.abs(y[:n])[~angle], initial=0.0)
     positions = np.where(angle, 1.0, units * length if length > 0 else 1.0)
     rows, columns, u, sizes, vt = _parts(steady, y, positions)
     rank = int(np.sum(sizes > DEPENDENT * sizes[0]))
     # More equations are dependent at a critical point than elsewhere, so the rank is computed again close by.
-    x = coordinates.like(steady.like, np.asarray(y[:n], steady.t.dtype))
-    nearby = Steady(steady.system, steady.t, steady.params, steady.held, x, steady.symmetries)
+    nearby = Steady(steady.model, steady.t, steady.held, np.asarray(y[:n], steady.t.dtype), steady.symmetries)
     nearby = place.put(nearby, first + NEARBY * (last - first))
     nearby_y = _solution(nearby, v)
     if not isinstance(nearby_y, str):
@@ -205,10 +203,6 @@ def _parts(steady, y, positions, units=None):
     u, sizes, vt = np.linalg.svd(jacobian / rows[:, None] * columns[None, :])
     sizes = np.append(sizes, np.zeros(max(0, vt.shape[0] - sizes.size)))
     return rows, columns, u, sizes, vt
-
-
-def _angles(steady):
-    return angles(steady.system, steady.t, steady.like, steady.like, steady.params)
 
 
 class _Launch(NamedTuple):

@@ -30,6 +30,7 @@ from lagjax.analysis.tracing import Path, Point
 from lagjax.jax_internals.tracing import is_eager
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.compiled import compiled
+from lagjax.mechanics.model import model_of
 from lagjax.mechanics.packed import pack
 
 # Singular values of the equations below this fraction of the largest count as zero.
@@ -154,8 +155,8 @@ def _guess(flow, t, z, period, asked):
 def _frame(orbit, problem, place: Along, asked, rtol, to) -> tuple[OrbitFrame, np.ndarray]:
     """The units, the held quantities, and the point at which the branch begins."""
     s, system = problem.state, problem.system
-    flow = flow_of(system, *s, rtol, problem.rows)
-    flow = replace(flow, params=jax.tree.map(lambda x: jnp.asarray(x) if isinstance(x, np.ndarray) else x, s.params))
+    params = jax.tree.map(lambda x: jnp.asarray(x) if isinstance(x, np.ndarray) else x, s.params)
+    flow = flow_of(model_of(system, s.t, s.q, s.v, params), rtol, problem.rows)
     nodes, period = np.asarray(orbit.nodes, s.t.dtype), np.asarray(orbit.period, s.t.dtype)
     flat = coordinates.vector
     nodes = np.concatenate([np.concatenate([flat(s.q), flat(s.v)])[None], nodes[1:]])

@@ -266,7 +266,7 @@ def _slopes(tracer, point, value):
             leaf = np.array(leaves[i])
             leaf.reshape(-1)[entry] += sign * step
             params = eqx.combine(structure.unflatten([*leaves[:i], jnp.asarray(leaf), *leaves[i + 1 :]]), rest)
-            frame = replace(tracer.frame, steady=replace(steady, params=params))
+            frame = replace(tracer.frame, steady=steady.of(params))
             return at(SteadyTracer(frame, tracer.low, tracer.high), point.z, here)
 
         return -tracer.unit * (moved(1) - moved(-1)) / (2 * step) / by_parameter

@@ -101,26 +101,16 @@ def periodic_orbit(
     given_turns = None if turns is None else _turns(turns, names, dtype)
     eager = is_eager() and not coordinates.is_traced((s, period))
     search = lambda state, period: closing.closed(
-        problem.system, *state, period, rtol, asked, problem.rows, parts, given_turns, most
+        problem.system, state, period, rtol, asked, problem.rows, parts, given_turns, most
     )
     if eager:
         found = search(s, period)
         _raise_or_warn(found, float(period), problem)
     else:
         state = coordinates.state(*s)
-        stopped_inputs = stopped((state, jnp.asarray(period)))
-        found = closing.closed(
-            stopped(problem.system),
-            *stopped_inputs[0],
-            stopped_inputs[1],
-            rtol,
-            asked,
-            problem.rows,
-            parts,
-            given_turns,
-            most,
-        )
-        found = closing.implicit(problem.system, *state, rtol, asked, problem.rows, found)
+        given = stopped((problem.system, state, jnp.asarray(period)))
+        found = closing.closed(*given, rtol, asked, problem.rows, parts, given_turns, most)
+        found = closing.implicit(problem.system, state, rtol, asked, problem.rows, found)
     orbit = _orbit(problem, found, asked)
     report_of = lambda orbit: Report(
         jnp.where(orbit.converged, RESULTS.successful._value, RESULTS.not_converged._value),

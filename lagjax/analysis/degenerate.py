@@ -14,10 +14,10 @@ Source: Carr, *Applications of Centre Manifold Theory* (1981), §2; Kozlov & Fur
 Nonlinear Systems of Differential Equations* (2013), ch. 4 (inverses of Lagrange's theorem).
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from lagjax.analysis import balance as equations
@@ -35,9 +35,8 @@ from lagjax.analysis.reduced_force import (
     reduced_force,
     values_at,
 )  # fmt: skip
-from lagjax.mechanics import coordinates
 from lagjax.mechanics.compiled import compiled
-from lagjax.mechanics.reactions import force_at
+from lagjax.mechanics.lagrangian import applied_force
 from lagjax.numerics.rank import null_space
 
 STABLE, UNSTABLE, UNDECIDED, AS_LINEAR = range(4)
@@ -63,19 +62,7 @@ def _velocity_terms(steady: Steady, y, jacobian):
 @compiled
 def _pushes(steady: Steady, x, u):
     """The force Q - ∂R/∂v that L does not contain, at many states (B, n)."""
-    system, t, params = steady.system, steady.t, steady.params
-
-    def push(x, u):
-        q, total = steady.unflatten(x), jnp.zeros_like(x)
-        if system.force is not None:
-            force = force_at(system, t, q, steady.unflatten(u), params, jnp.zeros(steady.m, x.dtype))
-            total = total + coordinates.flatten(force)[0]
-        dissipation = system.dissipation
-        if dissipation is not None:
-            total = total - jax.grad(lambda u: dissipation(t, q, steady.unflatten(u), params))(u)
-        return total
-
-    return jax.vmap(push)(x, u)
+    return jax.vmap(partial(applied_force, steady.model, steady.t))(x, u)
 
 
 def decide(steady: Steady, y, size: float, roots, unseen: np.ndarray) -> Decision:
@@ -84,7 +71,7 @@ def decide(steady: Steady, y, size: float, roots, unseen: np.ndarray) -> Decisio
     `size`: of the positions, zero if it is not known; `roots`: its characteristic roots; `unseen` (n,): coordinates
     that nothing depends on.
     """
-    system, conservative = steady.system, steady.system.force is None and steady.system.dissipation is None
+    system, conservative = steady.system, steady.conservative
     dtype, n, k = np.dtype(steady.t.dtype), steady.n, steady.symmetries.count
     if not system.is_holonomic:
         return Decision(UNDECIDED)
@@ -263,12 +250,11 @@ def _stiffness_is_positive(steady, y, jacobian, mass, zeros) -> bool:
 
 def held_by_momentum(steady: Steady, x, rates) -> Steady:
     """The same steady motion with the symmetries' momenta held, which is what is conserved."""
-    conservative = steady.system.force is None and steady.system.dissipation is None
-    if not steady.symmetries.count or steady.symmetries.hold is None or not conservative:
+    if not steady.symmetries.count or steady.symmetries.hold is None or not steady.conservative:
         return steady
     held = np.asarray(_momenta(steady, x, rates))
     symmetries = equations.Symmetries(steady.symmetries.places, steady.symmetries.fields, MOMENTUM)
-    return Steady(steady.system, steady.t, steady.params, held, steady.like, symmetries)
+    return Steady(steady.model, steady.t, held, steady.x0, symmetries)
 
 
 @compiled

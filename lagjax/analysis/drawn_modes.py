@@ -99,7 +99,6 @@ def animated(mode, positions: Callable, amplitude: float, seconds: float, rate: 
         )
     s = mode.linearisation.state
     flat = lambda tree: np.concatenate([np.ravel(np.asarray(x)) for x in jax.tree.leaves(tree)])
-    _, unflatten = coordinates.flatten(s.q)
     t = np.linspace(0.0, _span(complex(mode.root)), count)
     growing = np.exp(complex(mode.root) * t)
     growing = amplitude * growing / np.max(np.abs(growing))
@@ -107,6 +106,6 @@ def animated(mode, positions: Callable, amplitude: float, seconds: float, rate: 
         # A shift is shown as one oscillation.
         growing = amplitude * np.sin(2 * np.pi * t / t[-1]).astype(complex)
     path = flat(s.q) + t[:, None] * flat(s.v) + np.real(growing[:, None] * flat(mode.shape))
-    q = jax.tree.map(lambda *rows: np.stack(rows), *[jax.tree.map(np.asarray, unflatten(row)) for row in path])
+    q = coordinates.like(s.q, path)
     at = float(s.t) + t
     return Animation(at, drawn(positions, at, q, s.params), rate, int(min(trail * rate, count)))

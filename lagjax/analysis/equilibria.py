@@ -35,8 +35,9 @@ from lagjax.analysis.found_equilibria import (
 from lagjax.analysis.reduced_force import CREEPS_BELOW, nearest, soft_below
 from lagjax.analysis.starts import checked, stacked, stacked_one, symmetries_of
 from lagjax.jax_internals.tracing import is_eager
-from lagjax.mechanics import constraints, coordinates
+from lagjax.mechanics import coordinates
 from lagjax.mechanics.compiled import compiled
+from lagjax.mechanics.model import model_of
 from lagjax.mechanics.refusals import by_name, check_system
 from lagjax.mechanics.structure import angles, is_autonomous, unseen_coordinates
 from lagjax.motion.consistency import stopped
@@ -125,11 +126,12 @@ def equilibria(
         )
     symmetries = symmetries_of(system, s, cyclic, hold, moving)
     # A function may close over traced values although no argument is traced.
-    steady = Steady(system, s.t, s.params, np.zeros(symmetries.count, s.t.dtype), s.q, symmetries)
+    model = model_of(system, *s)
+    steady = Steady(model, s.t, np.zeros(symmetries.count, s.t.dtype), coordinates.vector(s.q), symmetries)
     q, v = jax.tree.map(lambda x: x.astype(s.t.dtype), (q, v))
-    lasting = not symmetries.count and is_autonomous(system, *s)
+    lasting = not symmetries.count and is_autonomous(model)
     concrete = is_eager() and not coordinates.is_traced((steady, q, v))
-    unseen = unseen_coordinates(system, *s)
+    unseen = unseen_coordinates(model)
     expected = int(np.sum(np.delete(unseen, list(symmetries.places))))
     rows = searched(steady, q, v, lasting, expected, concrete)
     as_table = lambda rows: Equilibria(t=s.t, params=s.params, symmetries=symmetries, starts=q, **rows._asdict())
@@ -138,7 +140,7 @@ def equilibria(
     unseen[list(symmetries.places)] = False
     search = lambda q, v: searched(steady, q, v, lasting, expected, True)
     rows, radii = _decided(steady, rows, q, lasting, unseen, search)
-    return merged(as_table(rows), angles(system, *s), radii)
+    return merged(as_table(rows), angles(model), radii)
 
 
 def _decided(steady: Steady, rows: Row, starts, lasting, unseen, search) -> tuple[Row, np.ndarray]:
@@ -268,7 +270,7 @@ def held_at(steady: Steady, x, u):
 def _search(steady: Steady, q, v, lasting, expected, concrete) -> Row:
     x0, u0 = coordinates.flatten(q)[0], coordinates.flatten(v)[0]
     rates, held = held_at(steady, x0, u0)
-    steady = Steady(steady.system, steady.t, steady.params, held, steady.like, steady.symmetries)
+    steady = Steady(steady.model, steady.t, held, steady.x0, steady.symmetries)
     y0 = jnp.concatenate([x0, rates, jnp.zeros(steady.m, x0.dtype)])
     fixed, linear = stopped(steady), np.arange(y0.size) >= steady.n + steady.symmetries.count
     root = least_squares_root(lambda y: equations.balance(fixed, y), lax.stop_gradient(y0), linear)
@@ -285,8 +287,7 @@ def _row(steady: Steady, y, root, y0, lasting, expected, concrete) -> Row:
         pushes = equations.forces(steady, steady.t, x, u)
         multipliers = equations.shortest_multipliers(pushes, multipliers @ pushes)
     if steady.m:
-        problem = steady.system, multipliers, steady.t, steady.like, steady.like, steady.params
-        by_name = constraints.split(*problem)
+        by_name = steady.model.split(multipliers)
     jacobian = root.jacobian if concrete else jax.jacfwd(lambda y: equations.balance(steady, y))(y)
     roots = equations.characteristic_roots(steady, y, jacobian, derivatives=not concrete)
     status, imbalance, zero_modes, soft = _verdict(steady, root, y0, lasting)
@@ -298,9 +299,9 @@ def _row(steady: Steady, y, root, y0, lasting, expected, concrete) -> Row:
     is_found = status == OK
     fill = lambda tree: jax.tree.map(lambda x: jnp.where(is_found, x, jnp.nan), tree)
     return Row(
-        fill(steady.unflatten(x)), fill(steady.unflatten(u)), fill(by_name), fill(rates), fill(momenta),
+        fill(steady.model.tree(x)), fill(steady.model.tree(u)), fill(by_name), fill(rates), fill(momenta),
         settled & ~undecided, undecided, fill(roots), is_found, zero_modes, soft, imbalance, status,
-        steady.unflatten(root.y[: steady.n]),
+        steady.model.tree(root.y[: steady.n]),
     )  # fmt: skip
 
 

@@ -16,7 +16,6 @@ spans it grows by Liouville's formula, with P the orthogonal projection onto the
 Source: Hairer, Nørsett & Wanner, *Solving ODEs I*, §I.14; Coddington & Levinson, *Theory of ODEs*, Eq. (3.1.5).
 """
 
-from collections.abc import Callable
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -32,7 +31,7 @@ from lagjax.jax_internals.tracing import is_eager
 from lagjax.mechanics import constraints, coordinates
 from lagjax.mechanics.compiled import compiled
 from lagjax.mechanics.equations import equations_of
-from lagjax.mechanics.system import System
+from lagjax.mechanics.model import Model
 from lagjax.motion.both_modes import solve_in_both_modes
 from lagjax.numerics.runge_kutta import Dopri8
 
@@ -74,31 +73,32 @@ class Changes(NamedTuple):
 class Flow(eqx.Module):
     """The motion of a system in vector form; `rows` are the indices of independent constraint equations."""
 
-    system: System
-    params: PyTree
+    model: Model
     rtol: Float[Array, ""]
-    unflatten: Callable = eqx.field(static=True)
-    size: int = eqx.field(static=True)
     rows: tuple[int, ...] = eqx.field(static=True)
     in_a_loop: bool = eqx.field(static=True)
 
+    @property
+    def size(self) -> int:
+        """The number of coordinates."""
+        return self.model.n
+
     def state(self, z):
         """(q, v) in the user's structure."""
-        return self.unflatten(z[: self.size]), self.unflatten(z[self.size :])
+        return self.model.tree(z[: self.size]), self.model.tree(z[self.size :])
 
     def vector(self, q, v):
         """The vector z of (q, v)."""
-        return jnp.concatenate([coordinates.flatten(q)[0], coordinates.flatten(v)[0]])
+        return jnp.concatenate(self.model.vectors(q, v))
 
     def rate(self, t, z):
         """f(t, z): the velocities and accelerations."""
-        q, v = self.state(z)
-        a, _ = equations_of(self.system, t, q, v, self.params).accelerations(t, q, v)
-        return jnp.concatenate([z[self.size :], coordinates.flatten(a)[0]])
+        a, _ = equations_of(self.model).accelerations(t, *self.state(z))
+        return jnp.concatenate([z[self.size :], self.model.vector(a)])
 
     def residual(self, t, z):
         """c(t, z): the independent constraint equations of positions and velocities."""
-        return _residual(self.system, t, z, self.params, self.unflatten)[np.array(self.rows, int)]
+        return _residual(self.model, t, z)[np.array(self.rows, int)]
 
     def normals(self, t, z, scale):
         """C = ∂c/∂z, with z in units of `scale`."""
@@ -160,12 +160,9 @@ class Flow(eqx.Module):
         return jnp.concatenate([path[::substeps], last[None]])
 
 
-def flow_of(system, t, q, v, params, rtol, rows=None, in_a_loop=True) -> Flow:
-    """The flow of a system for states like this one; `rows` come from `independent_rows_of`, by default all."""
-    x, unflatten = coordinates.flatten(q)
-    if rows is None:
-        rows = all_rows(system, t, q, v, params)
-    return Flow(system, params, jnp.asarray(rtol, x.dtype), unflatten, x.size, rows, in_a_loop)
+def flow_of(model: Model, rtol, rows=None, in_a_loop=True) -> Flow:
+    """The flow of a system; `rows` come from `independent_rows_of`, by default all."""
+    return Flow(model, jnp.asarray(rtol, model.form.dtype), all_rows(model) if rows is None else rows, in_a_loop)
 
 
 def scale_of(z, period):
@@ -181,13 +178,13 @@ def scale_of(z, period):
     return lax.stop_gradient(jnp.concatenate([sizes, sizes * rate]))
 
 
-def independent_rows_of(system, t, q, v, params) -> tuple[int, ...] | None:
+def independent_rows_of(model: Model, s: coordinates.State) -> tuple[int, ...] | None:
     """The indices of independent constraint equations near a state; None, for all, where JAX is tracing."""
-    if not system.constraints:
+    if not model.m:
         return ()
-    if not is_eager() or coordinates.is_traced((t, q, v, params)):
+    if not is_eager() or coordinates.is_traced(s):
         return None
-    rows, chosen = np.asarray(_normals(system, t, q, v, params)), []
+    rows, chosen = np.asarray(_normals(model, s)), []
     for i, row in enumerate(rows):
         rest = row
         if chosen:
@@ -198,22 +195,18 @@ def independent_rows_of(system, t, q, v, params) -> tuple[int, ...] | None:
 
 
 @compiled
-def _normals(system, t, q, v, params):
-    x, unflatten = coordinates.flatten(q)
-    z = jnp.concatenate([x, coordinates.flatten(v)[0]])
-    return jax.jacfwd(lambda z: _residual(system, t, z, params, unflatten))(z)
+def _normals(model, s):
+    return jax.jacfwd(lambda z: _residual(model, s.t, z))(jnp.concatenate(model.vectors(s.q, s.v)))
 
 
-def all_rows(system, t, q, v, params) -> tuple[int, ...]:
+def all_rows(model: Model) -> tuple[int, ...]:
     """The indices of all constraint equations, of positions and of velocities."""
-    holonomic = constraints.holonomic_equations(system, t, q, v, params)
-    return tuple(range(int(holonomic.sum()) + len(holonomic)))
+    return tuple(range(int(model.holonomic.sum()) + model.m))
 
 
-def _residual(system, t, z, params, unflatten):
+def _residual(model, t, z):
     x, u = jnp.split(z, 2)
-    position = constraints.position_residual(system, t, x, params, unflatten)
-    return jnp.concatenate([position, constraints.velocity_residual(system, t, x, u, params, unflatten)])
+    return jnp.concatenate([constraints.position_residual(model, t, x), constraints.velocity_residual(model, t, x, u)])
 
 
 def _shortest(rows, residual):
@@ -267,10 +260,10 @@ def _passage(flow, t0, z, span, frame, scale, changes, volume, adjoint) -> Passa
 
 def _with_changes(flow, part, y, t0, span, scale, changes):
     """The rates of the state and its frame if parameters and times change with the columns."""
-    floats, rest = eqx.partition(flow.params, eqx.is_inexact_array)
+    floats, rest = eqx.partition(flow.model.params, eqx.is_inexact_array)
 
     def rate(z, floats, t0, span):
-        now = replace(flow, params=eqx.combine(floats, rest))
+        now = replace(flow, model=flow.model.of(eqx.combine(floats, rest)))
         return span * now.rate(t0 + span * part, z * scale) / scale
 
     motion, push = jax.linearize(rate, y["z"], floats, t0, span)

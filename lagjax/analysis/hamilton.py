@@ -19,8 +19,8 @@ from lagjax.mechanics import coordinates
 from lagjax.mechanics.compiled import compiled
 from lagjax.mechanics.diagnosis import describe
 from lagjax.mechanics.first_call import traced_system
-from lagjax.mechanics.noether import applied_force
-from lagjax.mechanics.reactions import reacts
+from lagjax.mechanics.lagrangian import applied_force
+from lagjax.mechanics.model import model_of
 from lagjax.mechanics.refusals import check_system
 from lagjax.mechanics.system import System
 
@@ -98,16 +98,15 @@ def hamiltonian(system: System) -> Hamiltonian:
 
 @compiled
 def _hamiltonian(system, t, q, p, params):
-    x, unflatten = coordinates.flatten(q)
-    momentum, _ = coordinates.flatten(p)
-    lagrangian_of = lambda x, u: system.lagrangian(t, unflatten(x), unflatten(u), params)
+    model = model_of(system, t, q, q, params)
+    x, momentum = model.vectors(q, p)
+    lagrangian_of = lambda x, u: model.lagrangian(t, x, u)
     found = velocity_of(lambda u: jax.grad(lagrangian_of, argnums=1)(x, u), momentum)
     value, slope = jax.value_and_grad(lagrangian_of)(x, found.v)
-    q, v = unflatten(x), unflatten(found.v)
     # -∂H/∂q at constant p equals ∂L/∂q at constant v.
-    if not system.constraints and not reacts(system):
-        slope = slope + applied_force(system, t, q, v, params, jnp.zeros(0, x.dtype))
-    return momentum @ found.v - value, v, unflatten(slope), found.mass, found.regular, found.reached
+    if not model.m:
+        slope = slope + applied_force(model, t, x, found.v)
+    return momentum @ found.v - value, model.tree(found.v), model.tree(slope), found.mass, found.regular, found.reached
 
 
 def _no_velocity(s, mass, regular):

@@ -27,10 +27,10 @@ from lagjax.exchange.sympy_source import sympy_itself
 from lagjax.jax_internals.names import MOVING
 from lagjax.jax_internals.programs import interpreted
 from lagjax.mechanics import constraints, coordinates
-from lagjax.mechanics.diagnosis import equation_names
 from lagjax.mechanics.first_call import traced_system
 from lagjax.mechanics.in_numbers import Numbers, in_numbers
 from lagjax.mechanics.lagrangian import mass_and_forcing
+from lagjax.mechanics.model import model_of
 from lagjax.mechanics.refusals import check_system
 from lagjax.numerics.scalars import MOVES, TooLong
 
@@ -109,36 +109,38 @@ def latex(system, q, v, params=None, *, t=0.0) -> EquationsOfMotion:
         # An integer that is used as a count or an index must stay an integer.
         s = coordinates.state(t, q, v, params)
         system = traced_system(system, s)
-    names = coordinates.names(s.q)
+    model = model_of(system, *s)
+    names = model.names
     if len(names) > COORDINATES:
         raise ValueError(
             f"the system has {len(names)} coordinates, but equations are written only for up to {COORDINATES}."
         )
-    _, unflatten = coordinates.flatten(s.q)
-    scalarised = in_numbers(system, unflatten)
-    args = scalarised, s.t, coordinates.numbers(s.q), coordinates.numbers(s.v), s.params
+    scalarised = in_numbers(model)
     try:
-        program = Numbers(_parts, args, most=OPERATIONS).program
+        program = Numbers(_parts, scalarised, most=OPERATIONS).program
         symbols = _symbols(s)
-        formulas = jaxpr_to_formula(program, _arrays(scalarised), list(symbols))
+        formulas = jaxpr_to_formula(program, _arrays(scalarised.system), _as_inputs(list(symbols), model.n))
     except TooLong:
         raise ValueError(
             "the equations are too long to be read.\n"
             "Usual cause: an L with sums over many parts, or a quadrature.\nFix: print a system with fewer parts."
         ) from None
-    error = _verified(program, formulas, list(symbols), scalarised, s)
-    return EquationsOfMotion(tuple(_lines(names, equation_names(system, s), symbols, formulas)), error, STATES)
+    error = _verified(program, formulas, _as_inputs(list(symbols), model.n), scalarised, s)
+    return EquationsOfMotion(tuple(_lines(names, model.equation_names, symbols, formulas)), error, STATES)
 
 
-def _parts(system, t, q, v, params) -> list[jax.Array]:
+def _as_inputs(symbols: list, n: int) -> list:
+    """The symbols of t, q, v and parameters in the order in which the program takes them: parameters first."""
+    return symbols[1 + 2 * n :] + symbols[: 1 + 2 * n]
+
+
+def _parts(model, t, q, v) -> list[jax.Array]:
     """The entries of M, F, A and the constraints; A includes the derivative of a force by the multipliers."""
-    x, unflatten = coordinates.flatten(q)
-    u, _ = coordinates.flatten(v)
-    linear = mass_and_forcing(system, t, x, u, params, unflatten)
-    rows = constraints.jacobian(system, t, x, u, params, unflatten)
+    x, u = model.vectors(q, v)
+    linear, rows = mass_and_forcing(model, t, x, u), constraints.jacobian(model, t, x, u)
     if linear.response is not None:
         rows = rows + linear.response.T
-    held = [jnp.ravel(c.residual(t, q, v, params)) for c in system.constraints.values()]
+    held = [jnp.ravel(c.residual(t, q, v, model.params)) for c in model.system.constraints.values()]
     return [y for x in (linear.mass, linear.forcing, rows, *held) for y in jnp.ravel(x)]
 
 
@@ -301,7 +303,7 @@ def _combined(waves) -> Any:
 
 def _verified(program, formulas, symbols, scalarised, s) -> float:
     """The largest relative difference of formulas and program at random states; raises if they do not agree."""
-    given, flat = _arrays(scalarised), np.concatenate([np.ravel(x) for x in _arrays((s.t, *s[1:]))])
+    given, flat = _arrays(scalarised.system), np.concatenate([np.ravel(x) for x in _arrays((s.params, *s[:3]))])
     run = jax.jit(lambda *inputs: eval_jaxpr(program.jaxpr, program.consts, *inputs))
     evaluate = sympy_itself().lambdify(symbols, formulas, "numpy", dummify=True, cse=True)
     variables = program.jaxpr.invars[len(given) :]

@@ -30,8 +30,10 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, PyTree
 
-from lagjax.mechanics import constraints, coordinates
+from lagjax.mechanics import constraints
+from lagjax.mechanics.coordinates import State
 from lagjax.mechanics.lagrangian import forcing_and_inertia
+from lagjax.mechanics.model import Model
 from lagjax.mechanics.reactions import response
 from lagjax.numerics import dense, lapack
 from lagjax.numerics.rank import independent_rows
@@ -95,22 +97,20 @@ class Parts(NamedTuple):
     raw: Raw
 
 
-def parts_of(kind: Kind, system, t, q, v, params) -> Parts:
+def parts_of(kind: Kind, model: Model, s: State) -> Parts:
     """The reduced equations at one state."""
-    x, unflatten = coordinates.flatten(q)
-    u, _ = coordinates.flatten(v)
-    n, m = x.size, len(kind.holonomic)
-    problem = system, t, x, u, params, unflatten
+    t, (x, u) = s.t, model.vectors(s.q, s.v)
+    n, m = model.n, len(kind.holonomic)
     unseen, holonomic = np.array(kind.unseen, bool), np.array(kind.holonomic, bool)
     chosen = np.array(kind.independent, bool)
 
-    mass = jax.jacfwd(lambda u: _momentum(system, t, x, u, params, unflatten))(u).astype(x.dtype)
+    mass = jax.jacfwd(lambda u: jax.grad(model.lagrangian, argnums=2)(t, x, u))(u).astype(x.dtype)
     mass = (mass + mass.T) / 2
-    velocity, position, forcing = _forces(kind, problem)
-    rows, gamma = constraints.acceleration_rows(*problem)
-    slopes = jax.jacfwd(lambda x: constraints.velocity_residual(system, t, x, u, params, unflatten))(x)
+    velocity, position, forcing = _forces(kind, model, t, x, u)
+    rows, gamma = constraints.acceleration_rows(model, t, x, u)
+    slopes = jax.jacfwd(lambda x: constraints.velocity_residual(model, t, x, u))(x)
     slopes = jnp.where(holonomic[:, None], 0.0, slopes).astype(x.dtype)
-    friction = response(*problem)
+    friction = response(model, t, x, u)
     pushing = rows.T if friction is None else rows.T + friction
 
     all_independent = independent_rows(rows) if m else jnp.zeros(0, bool)
@@ -127,15 +127,13 @@ def parts_of(kind: Kind, system, t, q, v, params) -> Parts:
     stacked = _spread(rows, live, lift, chosen, -_least_squares(pushing[:, chosen], forcing))
 
     if m:
-        constraint_force = lambda x, u: jax.grad(
-            lambda u: stacked @ constraints.velocity_residual(system, t, x, u, params, unflatten)
-        )(u)
+        constraint_force = lambda x, u: jax.grad(lambda u: stacked @ constraints.velocity_residual(model, t, x, u))(u)
         by_position, by_velocity = jax.jacfwd(constraint_force, argnums=(0, 1))(x, u)
         velocity, position = velocity - by_velocity.astype(x.dtype), position - by_position.astype(x.dtype)
     if friction is not None:
 
         def friction_force(x, u):
-            by_multipliers = response(system, t, x, u, params, unflatten)
+            by_multipliers = response(model, t, x, u)
             assert by_multipliers is not None
             return by_multipliers @ stacked
 
@@ -176,34 +174,29 @@ def parts_of(kind: Kind, system, t, q, v, params) -> Parts:
     sound = sound & (_reciprocal_condition(reduced_mass) > SINGULAR_BELOW[np.dtype(x.dtype)])
     safe = jnp.where(sound, reduced_mass, jnp.eye(reduced_mass.shape[0], dtype=x.dtype))
     a = onto + velocities @ lapack.solve(safe, (left.T @ (forcing - mass @ onto))[:, None])[:, 0]
-    off = [constraints.position_residual(system, t, x, params, unflatten)] if holonomic.any() else []
-    off += [constraints.velocity_residual(*problem)] if m else []
+    off = [constraints.position_residual(model, t, x)] if holonomic.any() else []
+    off += [constraints.velocity_residual(model, t, x, u)] if m else []
     constraint_force = pushing @ stacked if m else jnp.zeros_like(x)
     diagonal = jnp.abs(jnp.diag(mass))
     forces = (jnp.abs(forcing) + jnp.abs(constraint_force)) / jnp.where(diagonal > 0, diagonal, 1.0)
     return Parts(
         *parts, positions, velocities, turning @ positions,
-        constraints.split(system, stacked, t, q, v, params), a,
+        model.split(stacked), a,
         jnp.concatenate(off) if off else jnp.zeros(0, x.dtype), forces, sound, all_independent,
         Raw(mass, velocity, position, rows, slopes),
     )  # fmt: skip
 
 
-def _momentum(system, t, x, u, params, unflatten):
-    return jax.grad(lambda u: system.lagrangian(t, unflatten(x), unflatten(u), params))(u)
-
-
-def _forces(kind: Kind, problem):
+def _forces(kind: Kind, model, t, x, u):
     """-∂F/∂u, -∂F/∂x and F, without constraint forces."""
-    system, t, x, u, params, unflatten = problem
     if kind.at_rest:
         # At rest there is no momentum, so the force is that of the potential.
-        slope = jax.grad(lambda x: system.lagrangian(t, unflatten(x), unflatten(jnp.zeros_like(u)), params))
+        slope = lambda x: jax.grad(model.lagrangian, argnums=1)(t, x, jnp.zeros_like(u))
         position, forcing = jax.jacfwd(lambda x: 2 * (slope(x),), has_aux=True)(x)
         return jnp.zeros((x.size, x.size), x.dtype), -position.astype(x.dtype), forcing.astype(x.dtype)
 
     def force(x, u):
-        forcing, _ = forcing_and_inertia(system, t, x, u, params, unflatten)
+        forcing, _ = forcing_and_inertia(model, t, x, u)
         return forcing, forcing
 
     (position, velocity), forcing = jax.jacfwd(force, argnums=(0, 1), has_aux=True)(x, u)

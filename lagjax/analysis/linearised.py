@@ -17,9 +17,8 @@ from lagjax.jax_internals.tracing import is_eager
 from lagjax.mechanics import constraints, coordinates
 from lagjax.mechanics.compiled import compiled
 from lagjax.mechanics.coordinates import State
-from lagjax.mechanics.first_call import traced_system
-from lagjax.mechanics.memory import kinds, remembered
-from lagjax.mechanics.refusals import check_system
+from lagjax.mechanics.first_call import prepare
+from lagjax.mechanics.memory import remembered
 from lagjax.mechanics.structure import structure, unseen_coordinates
 from lagjax.numerics import dense
 from lagjax.numerics.rank import DEPENDENT_BELOW
@@ -132,15 +131,13 @@ def linearise(system, t, q, v, params) -> Linearisation:
 
     Source: Goldstein, *Classical Mechanics*, §6.1-6.2; Meijaard et al., *Proc. R. Soc. A* 463 (2007) 1955, Appendix B.
     """
-    check_system(system, t, q, v, params)
-    s = coordinates.state(t, q, v, params)
-    system = traced_system(system, s)
-    traced = not is_eager() or coordinates.is_traced((s, eqx.filter(system, eqx.is_array)))
-    kind = _kind(system, s)
+    model, s = prepare(system, t, q, v, params)
+    traced = not is_eager() or coordinates.is_traced((s, eqx.filter(model, eqx.is_array)))
+    kind = _kind(model, s)
     n, m = len(kind.unseen), len(kind.holonomic)
     if m >= n:
         # With so many equations some may depend on others, and only their values show which.
-        kind = kind._replace(independent=_chosen(kind, system, s, traced))
+        kind = kind._replace(independent=_chosen(kind, model, s, traced))
     if sum(kind.independent) >= n:
         raise ValueError(
             f"{sum(kind.independent)} independent constraint equations on {n} coordinates leave no motion at all.\n"
@@ -148,33 +145,32 @@ def linearise(system, t, q, v, params) -> Linearisation:
             "Fix: leave out the constraint on what should move; print(lj.explain(system, t, q, v, params)) lists them."
         )
     if traced:
-        return _linearised(kind, system, *s)[0]
-    linearisation, steadiness = _linearised(kind, system, *s)
+        return _linearised(kind, model, s)[0]
+    linearisation, steadiness = _linearised(kind, model, s)
     if not np.all(np.asarray(linearisation.parts.independent)[list(kind.independent)]):
-        kind = kind._replace(independent=_chosen(kind, system, s, traced))
-        linearisation, steadiness = _linearised(kind, system, *s)
-    check_steady(system, linearisation, steadiness, lambda *later: linearised(kind, system, State(*later)))
+        kind = kind._replace(independent=_chosen(kind, model, s, traced))
+        linearisation, steadiness = _linearised(kind, model, s)
+    check_steady(model, linearisation, steadiness, lambda *later: linearised(kind, model, State(*later)))
     return linearisation
 
 
-def _kind(system, s: State) -> Kind:
+def _kind(model, s: State) -> Kind:
     """The static part of the linearisation."""
-    holonomic = tuple(bool(x) for x in constraints.holonomic_equations(system, *s))
-    key = (_kind, kinds(s))
-    unseen, linear_terms, timeless = remembered(system, key, lambda: _structure_facts(system, s))
+    system, holonomic = model.system, tuple(model.holonomic.tolist())
+    unseen, linear_terms, timeless = remembered(model, _kind, lambda: _structure_facts(model))
     at_rest = not coordinates.is_traced(s.v) and not any(np.any(x) for x in jax.tree.leaves(s.v))
     conservative = system.force is None and system.dissipation is None and all(holonomic)
     at_rest = conservative and at_rest and not linear_terms
     return Kind(unseen, holonomic, (True,) * len(holonomic), conservative, at_rest, timeless)
 
 
-def _structure_facts(system, s):
-    known = structure(system, *s)
-    unseen = tuple(bool(x) for x in unseen_coordinates(system, *s))
+def _structure_facts(model):
+    known = structure(model)
+    unseen = tuple(bool(x) for x in unseen_coordinates(model))
     return unseen, known is None or bool(known.linear_terms), known is not None and not known.explicit_time
 
 
-def _chosen(kind, system, s, traced) -> tuple[bool, ...]:
+def _chosen(kind, model, s, traced) -> tuple[bool, ...]:
     """A largest set of independent constraint equations, preferring those on positions."""
     if traced:
         raise ValueError(
@@ -182,9 +178,7 @@ def _chosen(kind, system, s, traced) -> tuple[bool, ...]:
             "which ones cannot be determined while JAX is tracing.\n"
             "Fix: leave out the dependent ones; print(lj.explain(system, t, q, v, params)) names them."
         )
-    x, unflatten = coordinates.flatten(s.q)
-    u, _ = coordinates.flatten(s.v)
-    rest = np.array(constraints.jacobian(system, s.t, x, u, s.params, unflatten))
+    rest = np.array(constraints.jacobian(model, s.t, *model.vectors(s.q, s.v)))
     size = np.linalg.norm(rest, axis=1)
     rest /= np.where(size > 0, size, 1.0)[:, None]
     holonomic, chosen = np.array(kind.holonomic, bool), np.zeros(len(size), bool)
@@ -200,21 +194,19 @@ def _chosen(kind, system, s, traced) -> tuple[bool, ...]:
     return tuple(bool(x) for x in chosen)
 
 
-def linearised(kind: Kind, system, s: State) -> Linearisation:
+def linearised(kind: Kind, model, s: State) -> Linearisation:
     """The linear equations at another state of the same kind, steady or not."""
-    return _linearised(kind, system, *s)[0]
+    return _linearised(kind, model, s)[0]
 
 
 @compiled
-def _linearised(kind: Kind, system, t, q, v, params) -> tuple[Linearisation, Steadiness]:
+def _linearised(kind: Kind, model, s: State) -> tuple[Linearisation, Steadiness]:
     """The linearisation, and how far the state is from a steady motion."""
-    s = State(t, q, v, params)
-    parts = parts_of(kind, system, *s)
+    parts = parts_of(kind, model, s)
     # `transfer` is P⁺ V: the positions η of displacements along the velocity directions.
     along = parts.position @ parts.transfer
     half = lambda matrix, sign: (matrix + sign * matrix.T) / 2
-    n, _ = coordinates.flatten(q)
-    shifts = jnp.eye(n.size, dtype=n.dtype)[:, np.array(kind.unseen, bool)]
+    shifts = jnp.eye(model.n, dtype=s.t.dtype)[:, np.array(kind.unseen, bool)]
     steadiness = steadiness_of(kind, s, parts)
     sound = parts.sound
     if all(kind.independent) and kind.independent:
@@ -233,6 +225,6 @@ def _linearised(kind: Kind, system, t, q, v, params) -> tuple[Linearisation, Ste
         state=s,
         parts=parts,
         kind=kind,
-        names=tuple(coordinates.names(q)),
+        names=tuple(model.names),
     )
     return linearisation, steadiness

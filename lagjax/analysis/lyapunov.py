@@ -23,10 +23,11 @@ from jax import lax
 from jaxtyping import Array, ArrayLike, Bool, Float, PyTree
 
 from lagjax import plot
-from lagjax.analysis.flow import flow_of
+from lagjax.analysis.flow import all_rows, flow_of
 from lagjax.analysis.monodromy import problem_of, refuse_singular
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.compiled import compiled
+from lagjax.mechanics.model import model_of
 from lagjax.mechanics.refusals import by_name
 from lagjax.mechanics.system import System
 
@@ -153,15 +154,15 @@ def lyapunov_exponents(
     _check(ts)
     problem = problem_of(system, ts[0], q, v, params)
     s = problem.state
-    flow = flow_of(problem.system, *coordinates.state(*s), 1.0, problem.rows)
-    most = 2 * flow.size - len(flow.rows)
+    model = model_of(problem.system, *s)
+    most = 2 * model.n - len(all_rows(model) if problem.rows is None else problem.rows)
     if not (isinstance(count, int) and 1 <= count <= most):
         raise ValueError(
             f"count must be between 1 and {most}, not {count!r}: the state space has {most} directions.\n"
             f"Fix: count={most} for all of them."
         )
     rtol = np.asarray(TOLERANCE.get(np.dtype(s.t.dtype), 1e-5) if rtol is None else rtol, s.t.dtype)
-    estimates = _followed(problem.system, *s, ts.astype(s.t.dtype), rtol, problem.rows, count)
+    estimates = _followed(model, s, ts.astype(s.t.dtype), rtol, problem.rows, count)
     exponents = LyapunovExponents(*estimates, count == most)
     if not coordinates.is_traced(exponents) and not bool(exponents.ended):
         refuse_singular(problem)
@@ -180,9 +181,9 @@ def _check(ts):
 
 
 @compiled
-def _followed(system, t, q, v, params, ts, rtol, rows, count):
-    flow = flow_of(system, t, q, v, params, rtol, rows)
-    z = flow.vector(q, v)
+def _followed(model, s, ts, rtol, rows, count):
+    flow, t = flow_of(model, rtol, rows), s.t
+    z = flow.vector(s.q, s.v)
     scale = _scale(flow, t, z)
     z = flow.onto_constraints(t, z, scale)
     basis = flow.tangent_space(t, z, scale)

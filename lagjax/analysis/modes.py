@@ -18,6 +18,7 @@ from lagjax.analysis.verdicts import VERDICTS, label_of, reason_of
 from lagjax.jax_internals.tracing import is_eager
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.compiled import compiled
+from lagjax.mechanics.model import model_of
 
 
 class Mode(eqx.Module):
@@ -211,10 +212,9 @@ def _with_symmetries(system, linearisation, motions: Motions) -> Motions:
     """The motions, with a verdict if the zero modes lead to other equilibria, or if a term of higher order decides."""
     unseen = np.array(linearisation.kind.unseen, bool)
     explained = np.all(np.abs(motions.shapes[:, ~unseen]) <= 1e-6, axis=1)
-    _, unflatten = coordinates.flatten(linearisation.state.q)
-    at = lambda x: linearised(
-        linearisation.kind, system, linearisation.state._replace(q=unflatten(jnp.asarray(x, linearisation.mass.dtype)))
-    )
+    s = linearisation.state
+    model, dtype = model_of(system, *s), linearisation.mass.dtype
+    at = lambda x: linearised(linearisation.kind, model, s._replace(q=model.tree(jnp.asarray(x, dtype))))
     if not leads_to_others(linearisation, motions.shapes[motions.zero & ~explained], at):
         verdict = _by_first_term(system, linearisation)
         if verdict == degenerate.UNSTABLE:
@@ -235,7 +235,7 @@ def _by_first_term(system, linearisation) -> int:
         return degenerate.UNDECIDED
     places = tuple(int(i) for i in np.flatnonzero(u))
     symmetries = Symmetries(places=places)
-    steady = Steady(system, s.t, s.params, u[list(places)], s.q, symmetries)
+    steady = Steady(model_of(system, *s), s.t, u[list(places)], x, symmetries)
     multipliers = np.concatenate([np.ravel(y) for y in jax.tree.leaves(linearisation.multipliers)] or [u[:0]])
     y = np.concatenate([x, u[list(places)], multipliers])
     unseen[list(places)] = False

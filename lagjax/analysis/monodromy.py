@@ -25,8 +25,9 @@ from lagjax.mechanics.compiled import compiled
 from lagjax.mechanics.coordinates import State
 from lagjax.mechanics.diagnosis import explain_failure
 from lagjax.mechanics.first_call import traced_system
+from lagjax.mechanics.model import model_of
 from lagjax.mechanics.refusals import check_system
-from lagjax.mechanics.structure import angles
+from lagjax.mechanics.structure import are_angles
 
 # The factor on the tolerance of the second run, which measures the error of the first.
 LOOSER = 10.0
@@ -66,21 +67,23 @@ def problem_of(system, t, q, v, params) -> Problem:
     s = coordinates.prepared(t, q, v, params)
     system = traced_system(system, s)
     state = coordinates.state(*s)
-    rows = independent_rows_of(system, *state)
-    _check_freedom(system, state, rows)
-    return Problem(system, s, reasons_of(system, *state), rows, angle_entries(system, *state))
+    model = model_of(system, *state)
+    rows = independent_rows_of(model, state)
+    _check_freedom(model, rows)
+    return Problem(system, s, reasons_of(model), rows, tuple(are_angles(model).tolist()))
 
 
 def refuse_singular(problem: Problem):
     """After a motion could not be followed: raise, in the user's names, if the equations fail at its start."""
-    words = explain_failure(problem.system, coordinates.state(*problem.state))
+    s = coordinates.state(*problem.state)
+    words = explain_failure(model_of(problem.system, *s), s)
     if words is not None:
         raise ValueError(words)
 
 
-def _check_freedom(system, state, rows):
-    n, known = sum(np.size(x) for x in jax.tree.leaves(state.q)), rows is not None
-    rows = all_rows(system, *state) if rows is None else rows
+def _check_freedom(model, rows):
+    n, known = model.n, rows is not None
+    rows = all_rows(model) if rows is None else rows
     if len(rows) < 2 * n:
         return
     cause = "constraints that fix every coordinate" if known else "constraints that depend on each other"
@@ -89,12 +92,6 @@ def _check_freedom(system, state, rows):
         f"there are {2 * n} coordinates and velocities, and {len(rows)} equations restrict them: nothing is left to "
         f"move.\nUsual cause: {cause}.\nFix: {fix}."
     )
-
-
-def angle_entries(system, t, q, v, params) -> tuple[bool, ...]:
-    """For each coordinate, whether it is an angle."""
-    leaves = zip(*map(jax.tree.leaves, (angles(system, t, q, v, params), q)))
-    return tuple(bool(yes) for yes, x in leaves for _ in range(np.size(x)))
 
 
 def tolerance_of(rtol, dtype):
@@ -109,7 +106,7 @@ def period_of(problem: Problem, period, rtol, nodes=None) -> tuple[Period, Float
     # Unrolled stages run in a third of the time but take three times as long to compile, which pays off in sweeps.
     in_a_loop = not WATCHED.value or sum(np.size(x) for x in jax.tree.leaves(s.q)) > 1
     rtol, period = tolerance_of(rtol, s.t.dtype), coordinates.numpy_of(period).asarray(period, s.t.dtype)
-    run = lambda rtol: _period(system, *s, nodes, period, rtol, reasons, rows, is_angle, in_a_loop, not eager)
+    run = lambda rtol: _period(system, s, nodes, period, rtol, reasons, rows, is_angle, in_a_loop, not eager)
     first = run(rtol)
     if eager:
         second = run(LOOSER * rtol)
@@ -121,9 +118,9 @@ def period_of(problem: Problem, period, rtol, nodes=None) -> tuple[Period, Float
 
 
 @compiled
-def _period(system, t, q, v, params, nodes, period, rtol, reasons, rows, is_angle, in_a_loop, differentiable) -> Period:
-    flow = flow_of(system, t, q, v, params, rtol, rows, in_a_loop)
-    first = flow.vector(q, v)
+def _period(system, s, nodes, period, rtol, reasons, rows, is_angle, in_a_loop, differentiable) -> Period:
+    flow, t = flow_of(model_of(system, *s), rtol, rows, in_a_loop), s.t
+    first = flow.vector(s.q, s.v)
     scale = scale_of(first, period)
     first = flow.onto_constraints(t, first, scale)
     nodes = first[None] if nodes is None else nodes.at[0].set(first)

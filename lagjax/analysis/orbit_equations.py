@@ -99,7 +99,7 @@ class OrbitFrame(eqx.Module):
         """The flow at a point, the nodes and the period."""
         flow, value = self.flow, z[-1] * self.unit
         if self.along.number is not None:
-            flow = replace(flow, params=self.along.number.put(flow.params, value))
+            flow = replace(flow, model=flow.model.of(self.along.number.put(flow.model.params, value)))
         nodes = z[:-2].reshape(self.parts, -1) * self.scale[None]
         return flow, nodes, self.period * jnp.exp(z[-2])
 
@@ -162,7 +162,7 @@ def _times(frame, period):
 def _changes(frame, flow, z, j, span) -> Changes:
     """How parameters and times change with the frame columns: with μ, with log T, and not at all with the state."""
     last = jnp.eye(z.size, dtype=z.dtype)[-1]
-    floats = lambda z: eqx.filter(frame.split(z)[0].params, eqx.is_inexact_array)
+    floats = lambda z: eqx.filter(frame.split(z)[0].model.params, eqx.is_inexact_array)
     if frame.along.number is None:
         by_number = jax.tree.map(jnp.zeros_like, floats(z))
     else:

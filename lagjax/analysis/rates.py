@@ -25,8 +25,8 @@ from lagjax.mechanics import constraints, coordinates
 from lagjax.mechanics.compiled import compiled
 from lagjax.mechanics.equations import equations_of
 from lagjax.mechanics.generators import Generator
-from lagjax.mechanics.noether import Flow, applied_force, flow
-from lagjax.mechanics.reactions import reacts
+from lagjax.mechanics.lagrangian import applied_force
+from lagjax.mechanics.noether import Flow, flow
 
 
 class Affine(eqx.Module):
@@ -91,10 +91,10 @@ class _StateRates(NamedTuple):
     charges: Array
 
 
-def rates(system, affine: Affine, generators: tuple[Generator, ...], s, places) -> Rates:
+def rates(model, affine: Affine, generators: tuple[Generator, ...], s, places) -> Rates:
     """The rates of change of all charges at states around the given one."""
-    states, scales = around(system, s, places)
-    raw = _rates(system, affine, generators, s, states, scales)
+    states, scales = around(model, s, places)
+    raw = _rates(model, affine, generators, states, scales)
     xp = coordinates.numpy_of(raw)
     raw = _StateRates(*(xp.asarray(y) for y in raw))
     finite = xp.isfinite(raw.energy) & xp.all(xp.isfinite(raw.by_lagrangian + raw.by_force), axis=1)
@@ -117,15 +117,13 @@ def rates(system, affine: Affine, generators: tuple[Generator, ...], s, places) 
 
 
 @compiled
-def _rates(system, affine, generators, s, states, scales) -> _StateRates:
-    _, unflatten = coordinates.flatten(s.q)
-    equations = equations_of(system, *s) if reacts(system) else None
+def _rates(model, affine, generators, states, scales) -> _StateRates:
+    params, equations = model.params, equations_of(model) if model.reacts else None
 
     def at(t, x, u):
-        lagrangian = lambda t, x, u: system.lagrangian(t, unflatten(x), unflatten(u), s.params)
-        value, (slope_t, slope, p) = jax.value_and_grad(lagrangian, argnums=(0, 1, 2))(t, x, u)
-        q, v = unflatten(x), unflatten(u)
-        flows = [flow(generator, t, q, v, s.params) for generator in generators]
+        value, (slope_t, slope, p) = jax.value_and_grad(model.lagrangian, argnums=(0, 1, 2))(t, x, u)
+        q, v = model.tree(x), model.tree(u)
+        flows = [flow(generator, t, q, v, params) for generator in generators]
         moved = jtu.tree_map(
             lambda first, *rest: jnp.concatenate([first, *(y[None] for y in rest)]), affine.at(t, x, u), *flows
         )
@@ -134,26 +132,23 @@ def _rates(system, affine, generators, s, states, scales) -> _StateRates:
         # ρ and C of `noether.py`.
         of_L = moved.tau * slope_t + moved.xi @ slope + turned @ p + value * moved.tau_rate - moved.gauge_rate
         charges = displaced @ p + moved.tau * value - moved.gauge
-        multipliers = jnp.zeros(constraints.count(system, t, q, v, s.params), x.dtype)
-        if equations is not None:
-            by_name = equations.accelerations(t, q, v)[1]
-            multipliers = jnp.concatenate([jnp.atleast_1d(by_name[name]) for name in system.constraints])
-        force = applied_force(system, t, q, v, s.params, multipliers)
+        multipliers = None if equations is None else model.stacked(equations.accelerations(t, q, v)[1])
+        force = applied_force(model, t, x, u, multipliers)
         energy = jnp.abs(p) @ jnp.abs(u) + (jnp.abs(slope) + jnp.abs(force)) @ scales.x
         size = jnp.sqrt(moved.xi**2 @ (1 / scales.x**2)) + jnp.abs(moved.tau) / scales.t
-        rows = _constraint_rates(system, s.params, unflatten, scales, (t, x, u), moved, turned, displaced)
+        rows = _constraint_rates(model, scales, (t, x, u), moved, turned, displaced)
         return _StateRates(of_L, displaced @ force, *rows, size, energy, moved.xi, moved.tau, value, charges)
 
     return jax.vmap(at)(*states[:3])
 
 
-def _constraint_rates(system, params, unflatten, scales, state, moved, turned, displaced):
+def _constraint_rates(model, scales, state, moved, turned, displaced):
     """A (ξ - τ v) (m, K), the size of each row of A (m,), and the change of each velocity constraint (m, K)."""
     t, x, u = state
-    if not system.constraints:
+    if not model.m:
         empty = jnp.zeros((0, moved.tau.size), x.dtype)
         return empty, jnp.zeros(0, x.dtype), empty
-    residual = lambda t, x, u: constraints.velocity_residual(system, t, x, u, params, unflatten)
+    residual = lambda t, x, u: constraints.velocity_residual(model, t, x, u)
     of_t, of_x, rows = jax.jacfwd(residual, argnums=(0, 1, 2))(t, x, u)
     change = jnp.outer(of_t, moved.tau) + of_x @ moved.xi.T + rows @ turned.T
     return rows @ displaced.T, jnp.abs(rows) @ scales.x, change

@@ -20,10 +20,11 @@ from jaxtyping import Array
 
 from lagjax.analysis.legendre import velocity_of
 from lagjax.mechanics import coordinates
+from lagjax.mechanics.arguments import WITH_MULTIPLIERS, takes_of
 from lagjax.mechanics.constraints import Holonomic
 from lagjax.mechanics.diagnosis import listed
-from lagjax.mechanics.memory import kinds, remembered
-from lagjax.mechanics.reactions import reacts
+from lagjax.mechanics.memory import remembered
+from lagjax.mechanics.model import model_of
 from lagjax.mechanics.refusals import check_system
 from lagjax.mechanics.structure import forced_by, what_changes_momentum
 from lagjax.mechanics.system import System
@@ -75,8 +76,8 @@ class Routhian(eqx.Module):
         shaped = coordinates.flatten(v)[0]
         zeros = [jnp.zeros_like(shaped[0])] * len(self.cyclic)
         q = _together(q, self.cyclic, zeros)
-        key = (Routhian, self.cyclic, kinds((t, q, params)))
-        remembered(self.system, key, lambda: self._check(t, q, _together(v, self.cyclic, zeros), params))
+        model = model_of(self.system, t, q, q, params)
+        remembered(model, (Routhian, self.cyclic), lambda: self._check(model))
         of = lambda u: self.system.lagrangian(t, q, _together(v, self.cyclic, list(u)), params)
         p = jnp.stack([jnp.asarray(momenta[name], shaped.dtype) for name in self.cyclic])
         found = velocity_of(jax.grad(of), p)
@@ -97,10 +98,10 @@ class Routhian(eqx.Module):
             )
         return params["params"], params["momenta"]
 
-    def _check(self, t, q, v, params):
+    def _check(self, model):
         for name in self.cyclic:
-            reason = next(what_changes_momentum(self.system, name, t, q, v, params), None)
-            depends = next(forced_by(self.system, name, t, q, v, params), None)
+            reason = next(what_changes_momentum(model, name), None)
+            depends = next(forced_by(model, name), None)
             if reason is None and depends is not None:
                 raise ValueError(
                     f"'{name}' cannot be eliminated: {depends}, so the motion of the others depends on where it is.\n"
@@ -147,7 +148,7 @@ def routhian(system: System, cyclic: str | Iterable[str]) -> System:
     names = (cyclic,) if isinstance(cyclic, str) else tuple(cyclic)
     if not names or len(set(names)) < len(names):
         raise ValueError('cyclic must name at least one coordinate, and each only once.\nFix: cyclic=["phi", "psi"].')
-    if reacts(system):
+    if system.force is not None and takes_of(system.force) == WITH_MULTIPLIERS and system.constraints:
         raise ValueError(
             "the force depends on multipliers, which a Routhian does not support.\n"
             "Fix: lj.routhian of a system whose force is a function of (t, q, v, params)."

@@ -15,18 +15,17 @@ from lagjax.analysis.combinations import independent, null_space
 from lagjax.analysis.found import Scaling
 from lagjax.analysis.precision import Precision
 from lagjax.analysis.rates import Rates
-from lagjax.mechanics import constraints, coordinates
 
 
-def scalings_of(system, s, tried: Basis, sampled: Rates, precision: Precision) -> tuple[Scaling, ...]:
+def scalings_of(model, tried: Basis, sampled: Rates, precision: Precision) -> tuple[Scaling, ...]:
     """The scalings that multiply L by a factor."""
-    if system.force is not None or system.dissipation is not None:
+    if model.system.force is not None or model.system.dissipation is not None:
         return ()
     chosen = np.flatnonzero(np.array(tried.kinds) == "scaling")
     flat = lambda i: np.append(tried.affine.matrix[i].ravel(), tried.affine.clock_rate[i])
     chosen = chosen[independent(np.stack([flat(i) for i in chosen], axis=1), precision)]
     size = sampled.size[chosen]
-    holonomic = constraints.holonomic_equations(system, *s)
+    holonomic = model.holonomic
     root = np.sqrt(len(sampled.value))
     rows = lambda y: y.reshape(-1, y.shape[-1])
     # The set g = 0 and the velocity constraints must be preserved.
@@ -37,7 +36,7 @@ def scalings_of(system, s, tried: Basis, sampled: Rates, precision: Precision) -
     kept = np.concatenate([kept, np.zeros((len(kept), 1))], axis=1)
     found = null_space(np.concatenate([changed, kept]) / root, precision)
     scalings = []
-    known = coordinates.names(s.q)
+    known = model.names
     for vector in found.vectors:
         if abs(vector[-1]) <= precision.zero * 100 * np.max(np.abs(vector)):
             continue

@@ -13,6 +13,7 @@ from lagjax.mechanics import coordinates
 from lagjax.mechanics.coordinates import State
 from lagjax.mechanics.diagnosis import listed
 from lagjax.mechanics.first_call import traced_system
+from lagjax.mechanics.model import model_of
 from lagjax.mechanics.structure import structure
 
 AS_STARTS = 'starts=[{"theta": 0.1}, {"theta": 3.0}], or starts={"theta": jnp.linspace(-3.0, 3.0, 20)}'
@@ -109,7 +110,7 @@ def _names_in(names, given: Iterable):
 
 
 def _check_cyclic(system, s, chosen):
-    known = structure(system, *s) if chosen else None
+    known = structure(model_of(system, *s)) if chosen else None
     not_cyclic = [name for name in chosen if known is not None and name not in known.cyclic]
     if not_cyclic:
         raise ValueError(

@@ -18,8 +18,8 @@ from jaxtyping import Array, Bool, Float
 from lagjax.mechanics import constraints, coordinates
 from lagjax.mechanics.cartesian import points
 from lagjax.mechanics.compiled import compiled
-from lagjax.mechanics.memory import kinds, remembered
-from lagjax.mechanics.structure import angles
+from lagjax.mechanics.memory import remembered
+from lagjax.mechanics.structure import are_angles
 
 WIDTHS = np.array([1.5, 1.0, 0.5, 0.1])
 VELOCITY_WIDTHS = np.array([1.0, 0.3, 1.0, 0.0])
@@ -60,44 +60,42 @@ def draws(count: int, n: int) -> np.ndarray:
     return random
 
 
-def around(system, s: coordinates.State, places) -> tuple[States, Scales]:
+def around(model, s: coordinates.State, places) -> tuple[States, Scales]:
     """The states at the displacements `places` from a given one, moved onto the constraints."""
     # With concrete values only the program that moves states is compiled, and all questions about a system share it.
-    xp = coordinates.numpy_of((s, system))
+    xp = coordinates.numpy_of((s, model))
     vector = lambda tree: xp.concatenate([xp.ravel(xp.asarray(x)) for x in jax.tree.leaves(tree)])
     x, u = vector(s.q), vector(s.v)
-    n, scales = len(x), sizes(system, s, x, u)
+    n, scales = len(x), sizes(model, s, x, u)
     places = places.astype(x.dtype)
     t = s.t + scales.t * places[:, 0]
     xs, us = x[None] + scales.x[None] * places[:, 1 : n + 1], u[None] + scales.u[None] * places[:, n + 1 :]
     # A velocity width of zero means a state at rest, not the velocity of the given state.
     resting = np.all(places[:, n + 1 :] == 0, axis=1) & (np.arange(len(places)) > 0)
     us = xp.where(resting[:, None], xp.zeros_like(us), us)
-    if not system.constraints:
+    if not model.m:
         return States(t, xs, us, np.ones(len(places), bool)), scales
-    states = States(t, *(xp.asarray(y) for y in _onto_constraints(system, s, scales, t, xs, us)))
+    states = States(t, *(xp.asarray(y) for y in _onto_constraints(model, scales, t, xs, us)))
     # With concrete values, states that failed to reach the constraints are tried again closer to the given one.
     for nearer in NEARER if xp is np else ():
         if np.mean(states.found) > ENOUGH:
             break
         xs, us = x[None] + nearer * (xs - x[None]), u[None] + nearer * (us - u[None])
-        again = [np.asarray(y) for y in _onto_constraints(system, s, scales, t, xs, us)]
+        again = [np.asarray(y) for y in _onto_constraints(model, scales, t, xs, us)]
         taken = (~states.found & again[2])[:, None]
         found = states.found | again[2]
         states = States(t, np.where(taken, again[0], states.x), np.where(taken, again[1], states.u), found)
     return states, scales
 
 
-def sizes(system, s: coordinates.State, x, u) -> Scales:
+def sizes(model, s: coordinates.State, x, u) -> Scales:
     """The size of each coordinate and velocity of a state."""
     xp, same = coordinates.numpy_of((x, u)), _groups(s.q)
     together = lambda y: xp.sqrt(same.astype(y.dtype) @ y**2)
     of_x = together(x)
     of_x = xp.where(of_x > 0, of_x, xp.ones_like(x))
     # Angles are at least 1: with small angles only, a pendulum would look like a harmonic oscillator.
-    known = remembered(system, (angles, kinds(s)), lambda: angles(system, *s))
-    leaves = zip(jax.tree.leaves(known), jax.tree.leaves(s.q))
-    is_angle = np.concatenate([np.full(int(np.prod(np.shape(leaf))), angle) for angle, leaf in leaves])
+    is_angle = remembered(model, are_angles, lambda: are_angles(model))
     of_x = xp.where(is_angle, xp.maximum(of_x, 1.0).astype(of_x.dtype), of_x)
     of_u = together(u)
     # A zero velocity has no size: it gets the pace of the others, or one length per unit of time.
@@ -118,18 +116,15 @@ def _groups(q) -> np.ndarray:
 
 
 @compiled
-def _onto_constraints(system, s, scales, t, xs, us):
-    _, unflatten = coordinates.flatten(s.q)
-    move = lambda t, x, u: _on_constraints(system, s.params, unflatten, scales, t, x, u)
-    return jax.vmap(move)(t, xs, us)
+def _onto_constraints(model, scales, t, xs, us):
+    return jax.vmap(lambda t, x, u: _on_constraints(model, scales, t, x, u))(t, xs, us)
 
 
-def _on_constraints(system, params, unflatten, scales, t, x, u):
-    position = lambda x: constraints.position_residual(system, t, x, params, unflatten)
-    velocity = lambda x, u: constraints.velocity_residual(system, t, x, u, params, unflatten)
-    at = unflatten(x), unflatten(u)
+def _on_constraints(model, scales, t, x, u):
+    position = lambda x: constraints.position_residual(model, t, x)
+    velocity = lambda x, u: constraints.velocity_residual(model, t, x, u)
     holds = jnp.asarray(True)
-    if constraints.holonomic_equations(system, t, *at, params).any():
+    if model.holonomic.any():
         x = _newton(position, x, scales.x)
         holds = _vanishes(position, x, scales.x)
     u = _newton(lambda u: velocity(x, u), u, scales.u)

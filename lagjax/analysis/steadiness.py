@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 from lagjax.analysis.linear_parts import Kind, Parts
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.coordinates import State
-from lagjax.mechanics.diagnosis import equation_names, explain_failure, where
+from lagjax.mechanics.diagnosis import explain_failure, where
 from lagjax.numerics import lapack
 
 # A state given with seven digits is accepted; frequencies are then accurate to about as many.
@@ -57,7 +57,7 @@ def steadiness_of(kind: Kind, s: State, parts: Parts) -> Steadiness:
     return Steadiness(relative, jnp.max(relative, initial=0.0))
 
 
-def check_steady(system, linearisation, steadiness: Steadiness, linearised: Callable) -> None:
+def check_steady(model, linearisation, steadiness: Steadiness, linearised: Callable) -> None:
     """Raise if a state is not in steady motion, or its linear equations are singular or change with time.
 
     `linearisation`: the `Linearisation` at the state; `linearised(t, q, v, params)`: the `Linearisation` at another
@@ -67,8 +67,8 @@ def check_steady(system, linearisation, steadiness: Steadiness, linearised: Call
     relative, a = np.asarray(steadiness.relative), np.asarray(parts.a)
     dtype, n = relative.dtype, len(kind.unseen)
     if not parts.sound:
-        raise ValueError(explain_failure(system, s) or _singular(kind, parts, s))
-    names, equations = coordinates.names(s.q), equation_names(system, s)
+        raise ValueError(explain_failure(model, s) or _singular(kind, parts, s))
+    names, equations = model.names, model.equation_names
     holonomic = [name for name, h in zip(equations, kind.holonomic) if h]
     labels = [f"'{name}'" for name in holonomic]
     labels += [f"d/dt '{name}'" if h else f"'{name}'" for name, h in zip(equations, kind.holonomic)]
@@ -95,7 +95,7 @@ def check_steady(system, linearisation, steadiness: Steadiness, linearised: Call
                 else "Fix: found = lj.equilibria(system, params, starts=q) gives the equilibrium nearby."
             )
         )
-    _check_time(system, linearisation, linearised)
+    _check_time(model, linearisation, linearised)
 
 
 def _singular(kind, parts, s):
@@ -109,7 +109,7 @@ def _singular(kind, parts, s):
     )
 
 
-def _check_time(system, linearisation, linearised):
+def _check_time(model, linearisation, linearised):
     """Raise if the matrices differ further along the motion."""
     kind, s, parts = linearisation.kind, linearisation.state, linearisation.parts
     u = np.concatenate([np.ravel(x) for x in jax.tree.leaves(s.v)])
@@ -126,7 +126,7 @@ def _check_time(system, linearisation, linearised):
         if changed is None:
             continue
         what, i, j, before, after = changed
-        names, equations = coordinates.names(s.q), equation_names(system, s)
+        names, equations = model.names, model.equation_names
         entry = f"'{equations[i]}' by '{names[j]}'" if what.startswith("constraint") else f"'{names[i]}', '{names[j]}'"
         raise ValueError(
             f"the linear equations change along the motion: {what} of {entry} is {before:.6g}, and {time:.3g} later it "

@@ -29,7 +29,8 @@ from lagjax.mechanics import coordinates
 from lagjax.mechanics.diagnosis import describe
 from lagjax.mechanics.first_call import traced_system
 from lagjax.mechanics.generators import Generator, as_generator
-from lagjax.mechanics.memory import filled_up, kinds, remembered
+from lagjax.mechanics.memory import filled_up, remembered
+from lagjax.mechanics.model import model_of
 from lagjax.mechanics.noether import NoetherCharge
 from lagjax.mechanics.refusals import check_system
 from lagjax.mechanics.structure import conserved_momenta
@@ -71,16 +72,16 @@ def symmetries(system, q, v, params=None, *, basis: Iterable | Mapping | None = 
             "symmetries are found from values, but JAX is tracing here.\n"
             "Fix: call it outside of jax.jit, jax.vmap and sweeps; lj.is_symmetry(...).holds tests one symmetry inside."
         )
-    system = traced_system(system, s)
+    model = model_of(traced_system(system, s), *s)
     own = _given(basis, s)
     tried = motions(s.q)
     gauge = gauges(s.q)
     count = filled_up(max(STATES, 4 * (len(tried.names) + len(own)) + 2 * len(gauge.names)))
-    sampled = rates(system, tried.affine, own, s, draws(count, coordinates.flatten(s.q)[0].size))
+    sampled = rates(model, tried.affine, own, s, draws(count, model.n))
     sampled = _those_found(sampled)
     if len(sampled.value) < AT_LEAST:
-        raise ValueError(too_few(system, s, len(sampled.value)))
-    return _found(system, s, tried, own, gauge, sampled)
+        raise ValueError(too_few(model.system, s, len(sampled.value)))
+    return _found(model, s, tried, own, gauge, sampled)
 
 
 def _given(basis, s) -> tuple[Generator, ...]:
@@ -138,12 +139,12 @@ class _Spaces(NamedTuple):
     gap: float
 
 
-def _found(system, s, tried: Basis, own, gauge: Gauge, sampled: Rates) -> Symmetries:
+def _found(model, s, tried: Basis, own, gauge: Gauge, sampled: Rates) -> Symmetries:
     precision = precision_of(s.t.dtype)
     columns = _columns(tried, own, gauge, sampled)
     spaces = _spaces(columns, gauge, precision)
     parameters = named_parameters(s.params)
-    shown = remembered(system, (conserved_momenta, kinds(s)), lambda: conserved_momenta(system, *s))
+    shown = remembered(model, conserved_momenta, lambda: conserved_momenta(model))
     cyclic = {f"p_{name}" for name in shown}
     # Motions in time come last, as energies do in a list of constants.
     clocks = [kind == "time" for kind in columns.kinds]
@@ -161,11 +162,11 @@ def _found(system, s, tried: Basis, own, gauge: Gauge, sampled: Rates) -> Symmet
         generator = _generator(physical, weights * words.factor, tried, own, gauge, words.text)
         single = len(np.flatnonzero(whole)) == 1 and not np.any(weights)
         is_cyclic = single and columns.names[int(np.flatnonzero(whole)[0])] in cyclic
-        details[words.text] = Found(NoetherCharge(system, generator), residual, timed, physical, is_cyclic)
+        details[words.text] = Found(NoetherCharge(model.system, generator), residual, timed, physical, is_cyclic)
     return Symmetries(
-        details, scalings_of(system, s, tried, sampled, precision), columns.names, len(sampled.value),
+        details, scalings_of(model, tried, sampled, precision), columns.names, len(sampled.value),
         spaces.singular_values, spaces.gap if len(sampled.value) > len(columns.names) + len(gauge.names) else 0.0,
-        f"t = {float(s.t):.6g}, q = {describe(s.q)}, v = {describe(s.v)}", repr(system),
+        f"t = {float(s.t):.6g}, q = {describe(s.q)}, v = {describe(s.v)}", repr(model.system),
     )  # fmt: skip
 
 

@@ -14,11 +14,12 @@ from jaxtyping import Array, Float
 from lagjax.analysis.precision import precision_of
 from lagjax.analysis.rates import Affine, rates
 from lagjax.analysis.states import draws
-from lagjax.mechanics import constraints, coordinates
+from lagjax.mechanics import coordinates
 from lagjax.mechanics.diagnosis import describe
 from lagjax.mechanics.first_call import traced_system
 from lagjax.mechanics.generators import as_generator
-from lagjax.mechanics.multipliers import accelerations
+from lagjax.mechanics.model import model_of
+from lagjax.mechanics.multipliers import accelerations_at
 from lagjax.mechanics.refusals import check_system
 
 STATES, AT_LEAST = 64, 8
@@ -125,29 +126,26 @@ def is_symmetry(system, generator, q, v, params=None, *, t=0.0) -> SymmetryTest:
     check_system(system, generator, q, v, params)
     generator = as_generator(generator)
     s = coordinates.state(t, q, v, params)
-    system = traced_system(system, s)
+    model = model_of(traced_system(system, s), *s)
     generator.check(s)
-    n = len(coordinates.names(s.q))
+    system, n = model.system, model.n
     empty = np.zeros((0, n))
     affine = Affine(empty, np.zeros((0, n, n)), empty, np.zeros(0), np.zeros(0))
-    found = rates(system, affine, (generator,), s, draws(STATES, n))
+    found = rates(model, affine, (generator,), s, draws(STATES, n))
     xp = coordinates.numpy_of(found)
     count = xp.sum(found.states.found)
     if xp is np and count < AT_LEAST:
         raise ValueError(too_few(system, s, int(count)))
     largest = lambda y: xp.max(xp.abs(y))
-    by_name = lambda y: {
-        name: largest(value)
-        for name, value in constraints.split(system, xp.max(xp.abs(y[:, :, 0]), axis=0), *s).items()
-    }
+    worst = lambda y: model.split(xp.max(xp.abs(y[:, :, 0]), axis=0))
+    by_name = lambda y: {name: largest(value) for name, value in worst(y).items()}
     displacement, invariance = by_name(found.displacement), by_name(found.invariance)
     of_velocities = {name for name, c in system.constraints.items() if not c.of_positions}
     residual = xp.max(xp.stack([largest(found.charge), *displacement.values()]))
-    _, unflatten = coordinates.flatten(s.q)
-    at = s._replace(t=found.states.t[0], q=unflatten(found.states.x[0]), v=unflatten(found.states.u[0]))
+    at = s._replace(t=found.states.t[0], q=model.tree(found.states.x[0]), v=model.tree(found.states.u[0]))
     rate = found.first[0]
-    if system.constraints:
-        multipliers = accelerations(system, *at)[1]
+    if model.m:
+        multipliers = accelerations_at(model, at)[1]
         rate = rate + xp.concatenate([xp.ravel(multipliers[name]) for name in system.constraints]) @ found.pushed[:, 0]
     return SymmetryTest(
         generator.name,

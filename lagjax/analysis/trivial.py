@@ -50,16 +50,15 @@ class Reasons(NamedTuple):
         )
 
 
-def reasons_of(system, t, q, v, params) -> Reasons:
-    """The reasons that the programs of a system show; only the shapes of the state matter."""
-    state = t, q, v, params
-    autonomous = is_autonomous(system, *state)
+def reasons_of(model) -> Reasons:
+    """The reasons that the programs of a system show."""
+    system, autonomous = model.system, is_autonomous(model)
     potential = system.force is None and system.dissipation is None
     momenta = potential and system.is_holonomic
     return Reasons(
         autonomous,
-        autonomous and conserves_jacobi_integral(system, *state),
-        tuple(bool(x) for x in unseen_coordinates(system, *state)),
+        autonomous and conserves_jacobi_integral(model),
+        tuple(bool(x) for x in unseen_coordinates(model)),
         momenta,
     )
 
@@ -70,13 +69,12 @@ def directions(flow: Flow, reasons: Reasons, t, z, scale, basis) -> Float[Array,
     shifts = [jnp.eye(2 * n, dtype=z.dtype)[i] for i in np.flatnonzero(reasons.ignorable)]
 
     def momentum(z):
-        q, v = flow.state(z)
-        return coordinates.flatten(jax.grad(flow.system.lagrangian, argnums=2)(t, q, v, flow.params))[0]
+        return jax.grad(flow.model.lagrangian, argnums=2)(t, z[:n], z[n:])
 
     if reasons.autonomous:
         rows.append(flow.rate(t, z) / scale)
     if reasons.energy:
-        integral = lambda z: momentum(z) @ z[n:] - flow.system.lagrangian(t, *flow.state(z), flow.params)
+        integral = lambda z: momentum(z) @ z[n:] - flow.model.lagrangian(t, z[:n], z[n:])
         rows.append(jax.grad(integral)(z) * scale)
     rows += shifts
     if reasons.momenta and shifts:

@@ -7,6 +7,7 @@ import diffrax
 import numpy as np
 
 from lagjax.mechanics.coordinates import State
+from lagjax.mechanics.model import model_of
 from lagjax.mechanics.structure import is_free_of_velocities
 from lagjax.mechanics.system import System
 from lagjax.motion import problem
@@ -27,7 +28,7 @@ FIX = 'methods={"Dopri8": lj.Dopri8(), "Tsit5": lj.Tsit5()}, or leave it out'
 def usual(system: System, start: State) -> dict[str, diffrax.AbstractSolver]:
     """The explicit methods that suit a system, starting with the default of `integrate`."""
     by_stages: dict[str, diffrax.AbstractSolver] = {"Dopri8": Dopri8(), "Tsit5": Tsit5()}
-    return ({"Nystrom12": Nystrom12()} if is_free_of_velocities(system, *start) else {}) | by_stages
+    return ({"Nystrom12": Nystrom12()} if is_free_of_velocities(model_of(system, *start)) else {}) | by_stages
 
 
 def chosen(methods: Any, system: System, start: State) -> dict[str, diffrax.AbstractSolver]:
@@ -71,7 +72,7 @@ def _check(name, method, system, start):
         problem.check_method(method)
     except TypeError as error:
         raise TypeError(f"method {name!r}: {error}") from None
-    if isinstance(method, Nystrom) and not is_free_of_velocities(system, *start):
+    if isinstance(method, Nystrom) and not is_free_of_velocities(model_of(system, *start)):
         cause = "there are constraints" if system.constraints else "these do depend on them"
         raise ValueError(
             f"method {name!r} is for accelerations that do not depend on velocities, but {cause}.\n"

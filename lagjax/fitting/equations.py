@@ -24,6 +24,7 @@ from lagjax.fitting.parameters import Found, leaf_name
 from lagjax.fitting.records import PADDING, Windows
 from lagjax.fitting.starts import Starts
 from lagjax.mechanics.compiled import compiled
+from lagjax.mechanics.model import model_of
 from lagjax.motion.integrate import integrate
 from lagjax.motion.results import ended_well
 from lagjax.numerics.chained import Equations, Slopes, Unknowns
@@ -118,7 +119,9 @@ class Problem:
     def state(self, x, s, w):
         """(q, v) from which the motion of window w starts."""
         starts, t = jax.tree.map(lambda a: a[w], self.starts), jnp.asarray(self.windows.ts)[w, 0]
-        return starts.state(s, self.first, t, self.params(x, w), self.unflatten)
+        like = self.unflatten(starts.q.guess)
+        model = model_of(self.first, t, like, like, self.params(x, w))
+        return tuple(map(self.unflatten, starts.vectors(s, s, model, t)))
 
     def motion(self, x, s, w, stage: Stage, adjoint=None):
         """The motion of window w, and the state it starts from."""

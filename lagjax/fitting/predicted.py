@@ -10,8 +10,8 @@ import numpy as np
 
 from lagjax.fitting.equations import WHOLE, Problem
 from lagjax.fitting.records import channel_name
-from lagjax.mechanics import constraints
 from lagjax.mechanics.diagnosis import listed
+from lagjax.mechanics.model import model_of
 from lagjax.motion.integrate import integrate
 
 
@@ -22,8 +22,8 @@ def check_predicted(problem: Problem):
     t, params = jax.ShapeDtypeStruct((), problem.windows.ts.dtype), problem.found.params
 
     def one_time(t, q, v, params):
-        shapes = [constraints.shapes(phase, t, q, v, params) for phase in problem.system.phases]
-        multipliers = {name: jnp.zeros(shape) for phase in shapes for name, shape in phase.items()}
+        phases = model_of(problem.system, t, q, v, params).phases
+        multipliers = {name: jnp.asarray(x) for phase in phases for name, x in phase.zero_multipliers().items()}
         values = {"q": q, "v": v, "multipliers": multipliers}
         if problem.observe is not None:
             values["observed"] = problem.observe(t, q, v, params)

@@ -15,10 +15,10 @@ from lagjax.fitting.result import FitWarning
 from lagjax.fitting.starts import starts
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.arguments import OF_STATE
-from lagjax.mechanics.constraints import zero_multipliers
 from lagjax.mechanics.diagnosis import listed
 from lagjax.mechanics.first_call import traced_call, traced_system
 from lagjax.mechanics.in_words import Call
+from lagjax.mechanics.model import model_of
 from lagjax.mechanics.refusals import check_system
 from lagjax.motion.crossings import Crossing, traced_guard
 from lagjax.motion.switching import traced_phases
@@ -74,7 +74,7 @@ def _with_traced_events(options, system, guess):
     events = options.get("events")
     if not isinstance(events, Mapping) or not all(isinstance(event, Crossing) for event in events.values()):
         return options
-    given = guess._asdict() | {"multipliers": zero_multipliers(traced_system(system, guess), guess)}
+    given = guess._asdict() | {"multipliers": model_of(traced_system(system, guess), *guess).zero_multipliers()}
     traced = {name: event.with_guard(traced_guard(name, event.guard, given)) for name, event in events.items()}
     return options | {"events": traced}
 

@@ -30,6 +30,7 @@ from lagjax.mechanics.diagnosis import listed
 from lagjax.mechanics.equations import equations_of
 from lagjax.mechanics.first_call import traced_system
 from lagjax.mechanics.memory import kinds
+from lagjax.mechanics.model import Model, model_of
 from lagjax.motion.consistency import departures, stopped, within
 from lagjax.motion.consistent_state import free_coordinates
 from lagjax.motion.integrate import integrate
@@ -91,24 +92,10 @@ class Starts(NamedTuple):
         """The number of unknowns in a window's start."""
         return self.q.along.shape[-1]
 
-    def state(self, s: Float[Array, " k"], system, t, params, unflatten):
-        """(q, v) of one window, where `self` holds this window's entries and `s` its unknowns."""
-        x, u = self.vectors(s, s, system, t, params, unflatten)
-        return unflatten(x), unflatten(u)
-
-    def vectors(self, s, r, system, t, params, unflatten):
-        """Coordinates at `s` and velocities at `r`."""
-
-        def of_position(problem, x):
-            system, t, params = problem
-            return constraints.position_residual(system, t, x, params, unflatten)
-
-        def of_velocity(problem, u):
-            (system, t, params), x = problem
-            return constraints.velocity_residual(system, t, x, u, params, unflatten)
-
-        x = self.q.at(s, of_position, (system, t, params))
-        return x, self.v.at(r, of_velocity, ((system, t, params), x))
+    def vectors(self, s: Float[Array, " k"], r: Float[Array, " k"], model: Model, t):
+        """Coordinates at `s` and velocities at `r` of one window, where `self` holds this window's entries."""
+        x = self.q.at(s, lambda problem, x: constraints.position_residual(*problem, x), (model, t))
+        return x, self.v.at(r, lambda problem, u: constraints.velocity_residual(*problem, u), (model, t, x))
 
 
 def starts(
@@ -279,18 +266,18 @@ def _charts(system, s: State, free_q, free_v, r) -> Starts:
         nothing = np.zeros((len(free_q), 0))
         return Starts(*(Chart(y, np.eye(len(f))[:, f], nothing) for y, f in ((x, free_q), (u, free_v))))
     with jax.ensure_compile_time_eval():
-        unflatten = unflatten_of(kinds(s.q))
+        model = model_of(system, *s)
 
         def charts(x, u, of_q, of_v):
             return Starts(_chart(x, of_q, free_q), _chart(u, of_v, free_v))
 
-        near = charts(x, u, *_rows(system, s.t, x, u, s.params, unflatten))
-        moved = _move_onto_constraints(near, system, s.t, s.params, unflatten)
+        near = charts(x, u, *_rows(model, s.t, x, u))
+        moved = _move_onto_constraints(near, model, s.t)
         if not moved.holds:
-            nearest = State(s.t, unflatten(moved.x), unflatten(moved.u), s.params)
+            nearest = State(s.t, model.tree(moved.x), model.tree(moved.u), s.params)
             raise ValueError(
                 f"the start of record {r} cannot be moved onto the constraints: at the nearest state found, "
-                f"{departures(system, nearest, OFF, OFF)}.\n"
+                f"{departures(model, nearest, OFF, OFF)}.\n"
                 "Usual cause: a guess too far off, or too many coordinates held.\n"
                 "Fix: q0, v0 = lj.consistent_state(system, t[0], q0, v0, params), and hold less."
             )
@@ -323,16 +310,15 @@ class Moved(NamedTuple):
 
 
 @partial(compiled, in_numpy=True)
-def _move_onto_constraints(near: Starts, system, t, params, unflatten) -> Moved:
+def _move_onto_constraints(near: Starts, model: Model, t) -> Moved:
     nothing = (jnp.zeros(chart.along.shape[1], t.dtype) for chart in near)
-    x, u = near.vectors(*nothing, system, t, params, unflatten)
-    state = t, unflatten(x), unflatten(u)
-    holds = within(equations_of(system, *state, params), *state, OFF, OFF)
-    return Moved(x, u, *_rows(system, t, x, u, params, unflatten), holds)
+    x, u = near.vectors(*nothing, model, t)
+    holds = within(equations_of(model), t, model.tree(x), model.tree(u), OFF, OFF)
+    return Moved(x, u, *_rows(model, t, x, u), holds)
 
 
 @partial(compiled, in_numpy=True)
-def _rows(system, t, x, u, params, unflatten):
-    of_q = jax.jacfwd(lambda x: constraints.position_residual(system, t, x, params, unflatten))(x)
-    of_v = jax.jacfwd(lambda u: constraints.velocity_residual(system, t, x, u, params, unflatten))(u)
+def _rows(model, t, x, u):
+    of_q = jax.jacfwd(lambda x: constraints.position_residual(model, t, x))(x)
+    of_v = jax.jacfwd(lambda u: constraints.velocity_residual(model, t, x, u))(u)
     return of_q, of_v

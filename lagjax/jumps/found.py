@@ -19,8 +19,8 @@ from jaxtyping import Array, Bool, Float, PyTree
 from lagjax.jax_internals.opened import COMPARISONS, Known, Opening, Slot, Table, Timed, has_jumps
 from lagjax.jax_internals.programs import outputs_of, run
 from lagjax.mechanics.arguments import OF_STATE, takes_of
-from lagjax.mechanics.constraints import zero_multipliers
 from lagjax.mechanics.coordinates import State
+from lagjax.mechanics.model import model_of
 from lagjax.mechanics.system import System
 
 # More modes than this are not followed: each adds to the program that watches the motion.
@@ -200,7 +200,7 @@ class _Program(NamedTuple):
 def _traced(function, system, state: State) -> _Program:
     """The program of a function, with the numbers of its inputs, and on what of the state each depends."""
     takes = takes_of(function)
-    zeros = zero_multipliers(system, state) if "multipliers" in takes else {}
+    zeros = model_of(system, *state).zero_multipliers() if "multipliers" in takes else {}
     given = state._asdict() | {"multipliers": zeros}
     arguments = tuple(given[name] for name in takes)
     shapes = []

@@ -24,7 +24,8 @@ from jaxtyping import Array, Float
 from lagjax.jumps.found import Given, Jumps, Smooth
 from lagjax.mechanics import constraints, coordinates
 from lagjax.mechanics.arguments import OF_STATE, WITH_MULTIPLIERS, takes_of
-from lagjax.mechanics.lagrangian import mass_and_forcing
+from lagjax.mechanics.lagrangian import applied_force, mass_and_forcing
+from lagjax.mechanics.model import model_of
 from lagjax.mechanics.system import System
 from lagjax.numerics import dense
 
@@ -66,13 +67,13 @@ class Sliding(eqx.Module):
 
     def mixture(self, t, q, v, given: Given) -> Mixture:
         """Solve for the shares."""
-        x, unflatten = coordinates.flatten(q)
-        u, _ = coordinates.flatten(v)
-        a, solve = self._accelerations(t, x, u, given, unflatten)
+        model = model_of(self.system, t, q, v, given)
+        x, u = model.vectors(q, v)
+        a, solve = self._accelerations(model, t, x, u)
         changes = [solve(self._change(i, t, q, v, given)) for i in self.which]
 
         def difference(t, x, u):
-            return jnp.stack([f(t, unflatten(x), unflatten(u), given) for f in self.differences])
+            return jnp.stack([f(t, model.tree(x), model.tree(u), given) for f in self.differences])
 
         _, rates = jax.jvp(difference, (t, x, u), (jnp.ones_like(t), u, a))
         push = lambda change: jax.jvp(lambda u: difference(t, x, u), (u,), (change,))[1]
@@ -86,12 +87,12 @@ class Sliding(eqx.Module):
         total = [rates[i] + sum(share * pushes[j][i] for j, share in enumerate(shares)) for i in range(count)]
         return Mixture(shares, total)
 
-    def _accelerations(self, t, x, u, given, unflatten):
+    def _accelerations(self, model, t, x, u):
         """The accelerations without sliding, and the function that gives those of one more force."""
-        linear = mass_and_forcing(self.system, t, x, u, given, unflatten)
-        if x.size == 1 and not self.system.constraints:
+        linear = mass_and_forcing(model, t, x, u)
+        if model.n == 1 and not model.m:
             return linear.forcing / linear.mass[0], lambda force: force / linear.mass[0]
-        rows = constraints.acceleration_rows(self.system, t, x, u, given, unflatten)
+        rows = constraints.acceleration_rows(model, t, x, u)
         solver = dense.Saddle(linear.mass, rows.jacobian)
         still = jnp.zeros_like(rows.gamma)
         return solver.solve(linear.forcing, rows.gamma)[0], lambda force: solver.solve(force, still)[0]
@@ -102,14 +103,8 @@ class Sliding(eqx.Module):
         return self._force(t, q, v, beyond) - self._force(t, q, v, given)
 
     def _force(self, t, q, v, given):
-        u, unflatten = coordinates.flatten(v)
-        found = jnp.zeros_like(u)
-        if self.system.force is not None:
-            found = found + coordinates.flatten(self.system.force(t, q, v, given))[0]
-        dissipation = self.system.dissipation
-        if dissipation is not None:
-            found = found - jax.grad(lambda u: dissipation(t, q, unflatten(u), given))(u)
-        return found
+        model = model_of(self.system, t, q, v, given)
+        return applied_force(model, t, *model.vectors(q, v))
 
     def extra(self, t, q, v, given):
         """The force that is added to that of the system, as a vector."""

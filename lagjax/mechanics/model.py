@@ -9,7 +9,6 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
-
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np

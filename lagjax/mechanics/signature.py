@@ -16,9 +16,9 @@ from jaxtyping import Array, PyTree
 
 from lagjax.mechanics.arguments import takes_of
 from lagjax.mechanics.compiled import compiled
-from lagjax.mechanics.constraints import zero_multipliers
 from lagjax.mechanics.coordinates import State
 from lagjax.mechanics.hybrid import Hybrid
+from lagjax.mechanics.model import model_of
 from lagjax.mechanics.system import System
 
 # Values that differ by more than this, relative to the largest of their row, come from another function. Round-off is
@@ -102,7 +102,7 @@ def _signature(system, t, q, v, params):
         words, slopes = ("", (1,)) if c.of_positions else (", of velocities,", (1, 2))
         found[f"the constraint '{name}'{words}"] = values_and_slopes(c.residual, *s, slopes=slopes)
     if system.force is not None:
-        ones = jax.tree.map(np.ones_like, zero_multipliers(system, s))
+        ones = jax.tree.map(np.ones_like, model_of(system, *s).zero_multipliers())
         given = s._asdict() | {"multipliers": ones}
         found["the force"] = flat(system.force(*(given[name] for name in takes_of(system.force))))
     return found

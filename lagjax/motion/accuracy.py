@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, PyTree
 
 from lagjax.mechanics.signature import UnknownSystem
-from lagjax.mechanics.structure import angles
+from lagjax.mechanics.structure import are_angles
 from lagjax.motion.tolerances import TURN
 
 # An error of up to this many tolerances is expected, if it is also below this share of the number.
@@ -104,6 +104,4 @@ def angle_mask(trajectory) -> np.ndarray:
     """Return which coordinates are angles, (n,) booleans."""
     if isinstance(trajectory.any_system, UnknownSystem):
         return np.array(trajectory.any_system.angles, bool)
-    first = jax.tree.map(lambda x: x[0], (trajectory.t, trajectory.q, trajectory.v))
-    found = angles(trajectory.system, *first, trajectory.params)
-    return np.concatenate([np.full(np.size(x), yes) for yes, x in zip(*map(jax.tree.leaves, (found, first[1])))])
+    return are_angles(trajectory.model)

@@ -9,7 +9,6 @@ from collections.abc import Callable, Mapping
 import jax
 import numpy as np
 
-from lagjax.mechanics import coordinates
 from lagjax.mechanics.compiled import compiled
 from lagjax.mechanics.generators import Generator
 from lagjax.mechanics.hybrid import Hybrid
@@ -68,18 +67,16 @@ def changes(trajectory, charges) -> dict[str, np.ndarray]:
 
 def known_charges(trajectory) -> dict[str, NoetherCharge]:
     """Return the charges that follow from the structure of the system."""
-    system, params = trajectory.system, trajectory.params
-    first = jax.tree.map(lambda x: np.asarray(x)[0], (trajectory.t, trajectory.q, trajectory.v))
-    state = coordinates.state(*first, params)
-    if isinstance(system, Hybrid):
+    model = trajectory.model
+    if isinstance(model.system, Hybrid):
         raise ValueError(
             "it is not known what a motion conserves in all its phases.\n"
             'Fix: traj.plot(charges={"name": function}) with functions of (t, q, v, params), or draw one phase.'
         )
-    found = [Generator.shift(name) for name in conserved_momenta(system, *state)]
-    if conserves_jacobi_integral(system, *state):
+    found = [Generator.shift(name) for name in conserved_momenta(model)]
+    if conserves_jacobi_integral(model):
         found.append(Generator.time_translation())
-    return {generator.name: NoetherCharge(system, generator) for generator in found}
+    return {generator.name: NoetherCharge(model.system, generator) for generator in found}
 
 
 def _by_name(charges) -> dict[str, Callable]:

@@ -24,7 +24,6 @@ from jaxtyping import Array, Bool, PyTree
 
 from lagjax.mechanics import constraints, coordinates
 from lagjax.mechanics.compiled import compiled
-from lagjax.mechanics.diagnosis import equation_names
 from lagjax.mechanics.equations import Equations, equations_of
 
 # With a fixed matrix, an iteration multiplies the residual by about the initial one: one iteration is enough if that is
@@ -55,31 +54,23 @@ def to_manifold(equations: Equations, t, q, v, rtol, atol) -> Projected:
     `holds` is true if a displacement of `atol + rtol |y|` accounts for what is left of each residual, including those
     of dependent constraints; `rtol` and `atol` are one number, or one for q and one for v.
     """
-    x, unflatten = coordinates.flatten(q)
-    u, _ = coordinates.flatten(v)
+    model, (x, u) = equations.model, equations.model.vectors(q, v)
     # Not differentiated: where the residual vanishes, the derivative of the matrix does not contribute.
     frozen, at = stopped(equations), stopped((t, q, v))
     displacement, slope = frozen.displacement(*at), frozen.row_sizes(*at)
     of_q, of_v = _allowed(jnp.abs(jnp.concatenate([x, u])), rtol, atol)
-    system, params = equations.system, equations.params
-    live = (system, t, params)
+    live, holonomic = (model, t), model.holonomic
     fixed = stopped(live)
-
-    holonomic = constraints.holonomic_equations(system, t, q, v, params)
-    position_residual = lambda problem, x: constraints.position_residual(*problem[:2], x, problem[2], unflatten)
+    position_residual = lambda problem, x: constraints.position_residual(*problem, x)
     if holonomic.any():
         # Positions move only in directions that the velocity constraints allow: a rolling body keeps rolling.
         x = _newton(position_residual, live, x, partial(displacement, holonomic), slope[holonomic])
-
-    def velocity_residual(problem_and_x, u):
-        (system, t, params), x = problem_and_x
-        return constraints.velocity_residual(system, t, x, u, params, unflatten)
-
-    u = _newton(velocity_residual, (live, x), u, partial(displacement, np.ones_like(holonomic)), slope)
-    left = jnp.concatenate([position_residual(fixed, x), velocity_residual((fixed, x), u)])
+    velocity_residual = lambda problem, u: constraints.velocity_residual(*problem, u)
+    u = _newton(velocity_residual, (*live, x), u, partial(displacement, np.ones_like(holonomic)), slope)
+    left = jnp.concatenate([position_residual(fixed, x), velocity_residual((*fixed, x), u)])
     allowed = jnp.concatenate([slope[holonomic] * of_q, slope * of_v])
     holds = jnp.all(jnp.abs(left) <= allowed)
-    return Projected(unflatten(x), unflatten(u), lax.stop_gradient(holds))
+    return Projected(model.tree(x), model.tree(u), lax.stop_gradient(holds))
 
 
 def _newton(residual: Callable, problem: PyTree, y, displacement, slope):
@@ -106,14 +97,12 @@ def _newton(residual: Callable, problem: PyTree, y, displacement, slope):
     return y - displacement(residual(problem, y))
 
 
-def velocity_change(system, t, q, v, params, change):
+def velocity_change(model, t, q, v, change):
     """Return the least change of v, in the metric of M, that changes the residuals of all constraints by `change`.
 
     `change` (m,): that of `constraints.velocity_residual`. The result has the structure of v, to be added to it.
     """
-    _, unflatten = coordinates.flatten(v)
-    displacement = equations_of(system, t, q, v, params).displacement(t, q, v)
-    return unflatten(displacement(np.ones(change.size, bool), change))
+    return model.tree(equations_of(model).displacement(t, q, v)(np.ones(change.size, bool), change))
 
 
 def stopped(tree):
@@ -121,14 +110,13 @@ def stopped(tree):
     return jax.tree.map(lambda leaf: lax.stop_gradient(leaf) if eqx.is_array(leaf) else leaf, tree)
 
 
-def worst_residual(system, t, q, v, params):
+def worst_residual(model, t, q, v):
     """Return the largest relative residual along a trajectory, of positions and velocities.
 
     A residual is taken relative to `Σ_j |A_ij| Q`, with Q the largest coordinate on the trajectory (the largest
     velocity for the velocity level): to the residual that a displacement as large as the motion would cause.
     """
-    equations = equations_of(system, *jax.tree.map(lambda x: x[0], (t, q, v)), params)
-    residual, slope, size = jax.vmap(partial(residuals_and_slopes, equations))(t, q, v)
+    residual, slope, size = jax.vmap(partial(residuals_and_slopes, equations_of(model)))(t, q, v)
     # Outputs after an event or a failure are NaN and say nothing about the constraints.
     scale = slope @ level_size(jnp.nanmax(size, axis=0))
     return jnp.nanmax(jnp.abs(residual) / jnp.where(scale > 0, scale, 1.0))
@@ -153,25 +141,22 @@ def _allowed(size, rtol, atol):
 @compiled
 def residuals_and_slopes(equations: Equations, t, q, v):
     """Return the residuals of both levels, the sums of their slopes over q and over v (two columns), and `|(q, v)|`."""
-    system, params = equations.system, equations.params
-    x, unflatten = coordinates.flatten(q)
-    u, _ = coordinates.flatten(v)
-    position = constraints.position_residual(system, t, x, params, unflatten)
-    velocity = constraints.velocity_residual(system, t, x, u, params, unflatten)
+    model, (x, u) = equations.model, equations.model.vectors(q, v)
+    position, velocity = constraints.position_residual(model, t, x), constraints.velocity_residual(model, t, x, u)
     slope = equations.row_sizes(t, q, v)
     # ∂(dg/dt)/∂v = ∂g/∂q: the holonomic rows serve both levels.
-    of_q = slope[constraints.holonomic_equations(system, t, q, v, params)]
+    of_q = slope[model.holonomic]
     columns = [jnp.concatenate([of_q, jnp.zeros_like(slope)]), jnp.concatenate([jnp.zeros_like(of_q), slope])]
     return jnp.concatenate([position, velocity]), jnp.stack(columns, axis=1), jnp.abs(jnp.concatenate([x, u]))
 
 
-def departures(system, s: coordinates.State, rtol, atol) -> str:
+def departures(model, s: coordinates.State, rtol, atol) -> str:
     """Name the constraints that a state violates by more than a displacement `atol + rtol |y|`; else ''."""
-    residual, slope, size = (np.asarray(part) for part in residuals_and_slopes(equations_of(system, *s), *s[:3]))
+    residual, slope, size = (np.asarray(part) for part in residuals_and_slopes(equations_of(model), *s[:3]))
     allowed = np.asarray(_allowed(size, rtol, atol))
     # NaN is a violation too.
     off = np.flatnonzero(~(np.abs(residual) <= slope @ allowed))
-    equations = list(zip(equation_names(system, s), constraints.holonomic_equations(system, *s)))
+    equations = list(zip(model.equation_names, model.holonomic))
     labels = [f"'{name}'" for name, holonomic in equations if holonomic]
     labels += [f"d/dt '{name}'" if holonomic else f"'{name}'" for name, holonomic in equations]
     return ", ".join(f"{labels[i]} = {residual[i]:.3g}" for i in off)

@@ -26,9 +26,8 @@ from lagjax.mechanics import constraints, coordinates
 from lagjax.mechanics.compiled import compiled
 from lagjax.mechanics.diagnosis import describe, listed
 from lagjax.mechanics.equations import equations_of
-from lagjax.mechanics.first_call import traced_system
+from lagjax.mechanics.first_call import prepare
 from lagjax.mechanics.lagrangian import mass_and_forcing
-from lagjax.mechanics.refusals import check_system
 from lagjax.mechanics.saddle_point import displacement_map
 from lagjax.motion.consistency import departures, stopped, within
 from lagjax.numerics import dense
@@ -83,19 +82,17 @@ def consistent_state(
 
     Source: Hairer, Lubich & Wanner, *Geometric Numerical Integration*, Eq. (IV.4.3).
     """
-    check_system(system, t, q, v, params)
-    s = coordinates.state(t, q, v, params)
-    system = traced_system(system, s)
+    model, s = prepare(system, t, q, v, params)
     both = free_coordinates(s.q, hold)
     free = both & free_coordinates(s.q, hold_position, "hold_position")
     free_velocity = both & free_coordinates(s.q, hold_velocity, "hold_velocity")
-    if not system.constraints:
+    if not model.m:
         return s.q, s.v
-    q, v, reached = _consistent_state(system, *s, jnp.asarray(free), jnp.asarray(free_velocity))
+    q, v, reached = _consistent_state(model, s, jnp.asarray(free), jnp.asarray(free_velocity))
     if coordinates.is_traced((q, v)):
         return jax.tree.map(lambda x: jnp.where(reached, x, jnp.nan), (q, v))
     if not reached:
-        raise ValueError(_unreachable(system, s, q, v, free, free_velocity))
+        raise ValueError(_unreachable(model, s, q, v, free, free_velocity))
     return q, v
 
 
@@ -115,16 +112,16 @@ def free_coordinates(q, hold, argument: str = "hold") -> np.ndarray:
     return ~held
 
 
-def _unreachable(system, s, q, v, free, free_velocity):
+def _unreachable(model, s, q, v, free, free_velocity):
     best = coordinates.State(s.t, q, v, s.params)
-    tolerance, names = _round_off(s.t), np.asarray(coordinates.names(s.q))
+    tolerance, names = _round_off(s.t), np.asarray(model.names)
     both = ~free & ~free_velocity
     kinds = (("", both), ("the position of ", ~free & ~both), ("the velocity of ", ~free_velocity & ~both))
     held = [f"{what}{listed(names[which])}" for what, which in kinds if np.any(which)]
     among = f" with {' and '.join(held)} held" if held else ""
-    off = departures(system, best, tolerance, tolerance)
+    off = departures(model, best, tolerance, tolerance)
     fix = "hold less, start nearer, or check each constraint with lj.constraint_residual(system, t, q, v, params)"
-    if np.any(both) and within(equations_of(system, *best), *best[:3], tolerance, np.array([tolerance, 1e30])):
+    if np.any(both) and within(equations_of(model), *best[:3], tolerance, np.array([tolerance, 1e30])):
         fix = f"hold the position alone, hold_position={list(map(str, names[both]))}, if the velocity need not be kept"
     return (
         f"no consistent state was found near q = {describe(s.q)}{among}: at the best state reached, constraint {off}.\n"
@@ -138,23 +135,16 @@ def _round_off(t):
 
 
 @compiled
-def _consistent_state(system, t, q, v, params, free, free_velocity):
-    x0, unflatten = coordinates.flatten(q)
-    u0, _ = coordinates.flatten(v)
-    metric = mass_and_forcing(system, t, x0, u0, params, unflatten).mass
-    x, u, live = x0, u0, (system, t, params)
-    if constraints.holonomic_equations(system, t, q, v, params).any():
-        position = lambda problem, x: constraints.position_residual(*problem[:2], x, problem[2], unflatten)
-        x = _nearest(position, live, x0, metric, free)
-
-    def velocity(problem_and_x, u):
-        (system, t, params), x = problem_and_x
-        return constraints.velocity_residual(system, t, x, u, params, unflatten)
-
-    u = _nearest(velocity, (live, x), u0, metric, free_velocity)
-    q, v = unflatten(x), unflatten(u)
-    tolerance = _round_off(t)
-    return q, v, within(equations_of(system, t, q, v, params), t, q, v, tolerance, tolerance)
+def _consistent_state(model, s, free, free_velocity):
+    t, (x0, u0) = s.t, model.vectors(s.q, s.v)
+    metric = mass_and_forcing(model, t, x0, u0).mass
+    x, live = x0, (model, t)
+    if model.holonomic.any():
+        x = _nearest(lambda problem, x: constraints.position_residual(*problem, x), live, x0, metric, free)
+    velocity_residual = lambda problem, u: constraints.velocity_residual(*problem, u)
+    u = _nearest(velocity_residual, (*live, x), u0, metric, free_velocity)
+    q, v, tolerance = model.tree(x), model.tree(u), _round_off(t)
+    return q, v, within(equations_of(model), t, q, v, tolerance, tolerance)
 
 
 def _nearest(residual: Callable, problem, y0, metric, free):

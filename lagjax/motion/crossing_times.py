@@ -136,7 +136,7 @@ def _rate(live, z):
 
 def _guard(live, z, owner):
     (guards, equations), (t, y) = live, z
-    return jnp.stack(guards(t, *y, equations.accelerations(t, *y)[1], equations.params))[owner]
+    return jnp.stack(guards(t, *y, equations.accelerations(t, *y)[1], equations.model.params))[owner]
 
 
 @eqx.filter_custom_jvp

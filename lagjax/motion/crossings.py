@@ -19,10 +19,10 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from lagjax.jax_internals.programs import length
 from lagjax.mechanics.arguments import OF_STATE, WITH_MULTIPLIERS, takes_of
-from lagjax.mechanics.constraints import zero_multipliers
 from lagjax.mechanics.coordinates import State
 from lagjax.mechanics.first_call import traced_call
 from lagjax.mechanics.in_words import Call
+from lagjax.mechanics.model import model_of
 from lagjax.mechanics.pickling import check_functions
 from lagjax.mechanics.system import System
 from lagjax.mechanics.traced import Traced
@@ -198,9 +198,9 @@ class Guards(eqx.Module):
         """For each of these places, which of its guard's crossings is kept there, counted from zero."""
         return np.concatenate([np.arange(kind.most) for kind in self.kinds])
 
-    def in_numbers(self, unflatten: Callable) -> "Guards":
+    def in_numbers(self, tree: Callable) -> "Guards":
         """Return the same for states that are tuples of numbers."""
-        return Guards(self.functions, self.kinds, lambda numbers: unflatten(jnp.stack(numbers)))
+        return Guards(self.functions, self.kinds, lambda numbers: tree(jnp.stack(numbers)))
 
     def __call__(self, t, q, v, multipliers, params) -> tuple[Float[Array, ""], ...]:
         """Return the value of each guard; true counts as one, false as minus one."""
@@ -280,7 +280,7 @@ def guards_of(crossings: Mapping[str, Crossing], system: System, start: State, h
     if not crossings:
         return None
     functions, of_guards = [], []
-    given = dict(zip(OF_STATE, start)) | {"multipliers": zero_multipliers(system, start)}
+    given = dict(zip(OF_STATE, start)) | {"multipliers": model_of(system, *start).zero_multipliers()}
     for name, crossing in crossings.items():
         guard = traced_guard(name, crossing.guard, given)
         takes_multipliers = guard.takes == WITH_MULTIPLIERS

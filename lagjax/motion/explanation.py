@@ -3,20 +3,20 @@
 from dataclasses import dataclass
 from typing import NamedTuple, overload
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
 from lagjax.jumps.found import found as jumps_found
-from lagjax.mechanics import constraints, coordinates
-from lagjax.mechanics.diagnosis import dependencies, describe, equation_names, explain_failure, listed
+from lagjax.mechanics import coordinates
+from lagjax.mechanics.diagnosis import dependencies, describe, explain_failure, listed
 from lagjax.mechanics.equations import equations_of
 from lagjax.mechanics.first_call import traced_system
 from lagjax.mechanics.hybrid import Hybrid
+from lagjax.mechanics.model import model_of
 from lagjax.mechanics.printable import by_line
 from lagjax.mechanics.refusals import check_system
 from lagjax.mechanics.saddle_point import examined
-from lagjax.mechanics.structure import Structure, angles, is_free_of_velocities, structure
+from lagjax.mechanics.structure import Structure, are_angles, is_free_of_velocities, structure
 from lagjax.mechanics.system import System
 from lagjax.motion.consistency import departures, to_manifold, within
 from lagjax.motion.consistent_state import consistent_state
@@ -103,22 +103,22 @@ def explain(system, t, q, v, params=None):
 
 def _explain(system: System, s: coordinates.State) -> Explanation:
     system = traced_system(system, s)
-    place = _on_the_constraints(system, s) if system.constraints else _Place(s)
+    model = model_of(system, *s)
+    place = _on_the_constraints(model, s) if model.m else _Place(s)
     s = place.state
-    found = examined(system, *s)
-    names, equations = coordinates.names(s.q), equation_names(system, s)
+    found = examined(model, s)
+    names, equations, holonomic = model.names, model.equation_names, model.holonomic
     jacobian = found.rows.jacobian
-    holonomic = constraints.holonomic_equations(system, *s)
     independent = int(found.independent.sum())
     groups = tuple(dependencies(jacobian, found.independent, equations)) if independent < len(equations) else ()
-    problem = place.unreachable or explain_failure(system, s)
+    problem = place.unreachable or explain_failure(model, s)
     mass = _definiteness(np.asarray(found.linear.mass), names)
 
     rows = [("at", f"t = {float(s.t):.6g}, q = {describe(s.q)}, v = {describe(s.v)}")]
     if place.off:
         rows.append(("off the constraints", place.off))
     rows.append(("coordinates", f"{len(names)}: {', '.join(names)}"))
-    if turned := _in_turns(system, s, names):
+    if turned := _in_turns(model, s):
         rows.append(("angles", f"in radians: {turned}; for degrees use jnp.radians(...)"))
     if equations:
         kinds = {name: "position" if c.of_positions else "velocity" for name, c in system.constraints.items()}
@@ -126,7 +126,7 @@ def _explain(system: System, s: coordinates.State) -> Explanation:
         rows.append(("equations", f"{len(equations)}, of which {independent} independent"))
     rows += [("dependent", _in_words(group)) for group in groups]
     rows.append(("degrees of freedom", f"{len(names) - independent}"))
-    found_structure = structure(system, *s)
+    found_structure = structure(model)
     rows.append(("mass matrix", mass if found_structure is None else f"{mass}, {_of_mass(found_structure)}"))
     if found_structure is not None:
         rows += _of_structure(found_structure)
@@ -134,9 +134,9 @@ def _explain(system: System, s: coordinates.State) -> Explanation:
     if (jumps := jumps_found(system, *s)) is not None:
         rows += [("jumps and kinks", "; ".join(words))] if (words := jumps.in_words()) else []
         rows += [("not followed", "; ".join(jumps.missed))] if jumps.missed else []
-    rows.append(("solved", _how_solved(equations_of(system, *s, fast=True), found_structure)))
-    if is_free_of_velocities(system, *s):
-        by = type(nystrom_for(system, s.params)).__name__
+    rows.append(("solved", _how_solved(equations_of(model, fast=True), found_structure)))
+    if is_free_of_velocities(model):
+        by = type(nystrom_for(model)).__name__
         rows.append(("velocities", f"accelerations do not depend on them: stepped by {by}"))
     if problem:
         rows.append(("problem", problem.replace("\n", "\n    ")))
@@ -161,30 +161,28 @@ class _Place(NamedTuple):
     unreachable: str | None = None
 
 
-def _on_the_constraints(system, s) -> _Place:
+def _on_the_constraints(model, s) -> _Place:
     """Find the nearest state on the constraints; off them, dependent constraints contradict each other that much."""
     tolerance = jnp.asarray(ROUNDED, s.t.dtype)
-    equations = equations_of(system, *s)
+    equations = equations_of(model)
     if within(equations, *s[:3], tolerance, tolerance):
         moved = to_manifold(equations, *s[:3], tolerance, tolerance)
         return _Place(s._replace(q=moved.q, v=moved.v))
-    off = departures(system, s, ROUNDED, ROUNDED)
+    off = departures(model, s, ROUNDED, ROUNDED)
     try:
-        q, v = consistent_state(system, *s)
+        q, v = consistent_state(model.system, *s)
     except ValueError as error:
         return _Place(s, f"by {off}, and no state near it is on them", str(error))
     return _Place(s._replace(q=q, v=v), f"by {off} as given; everything here describes the nearest state on them")
 
 
-def _in_turns(system, s, names):
+def _in_turns(model, s):
     """List angles of more than a turn, which may have been meant in degrees."""
-    x, _ = coordinates.flatten(s.q)
-    large = np.abs(np.asarray(x)) > 2 * np.pi
+    x = np.asarray(model.vector(s.q))
+    large = np.abs(x) > 2 * np.pi
     if not large.any():
         return ""
-    leaves = zip(jax.tree.leaves(angles(system, *s)), jax.tree.leaves(s.q))
-    is_angle = np.concatenate([np.full(np.size(leaf), angle) for angle, leaf in leaves])
-    found = [(name, float(y)) for name, y, show in zip(names, x, large & is_angle) if show]
+    found = [(name, float(y)) for name, y, show in zip(model.names, x, large & are_angles(model)) if show]
     return ", ".join(f"{name} = {y:.6g} is {y / (2 * np.pi):.3g} turns" for name, y in found)
 
 

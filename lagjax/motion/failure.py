@@ -38,13 +38,13 @@ def raise_failure(trajectory: Trajectory, start: State, settings: Settings, guar
 
 def _raise(trajectory, start, settings, about_guards, where="") -> NoReturn:
     result = trajectory.result
-    system, start = trajectory.system, coordinates.as_arrays(start, start.t.dtype)
+    model, start = trajectory.model, coordinates.as_arrays(start, start.t.dtype)
     if is_among(result, [RESULTS.start_off_constraints]):
         tolerances = (START_TOLERANCES * np.asarray(tol) for tol in tolerances_at(start, trajectory.t, settings))
-        raise ValueError(where + problem.off_constraints(system, start, *tolerances))
+        raise ValueError(where + problem.off_constraints(model, start, *tolerances))
     if is_among(result, problem.REFUSED):
         problem.check_finite(start)
-        raise ValueError(where + (explain_failure(system, start) or message(result)))
+        raise ValueError(where + (explain_failure(model, start) or message(result)))
     raise RuntimeError(where + stopped_early(trajectory, settings, about_guards))
 
 

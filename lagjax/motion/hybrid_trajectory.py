@@ -13,9 +13,9 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 from lagjax import plot
 from lagjax.mechanics.compiled import compiled
 from lagjax.mechanics.hybrid import Hybrid
+from lagjax.mechanics.model import Model
 from lagjax.mechanics.printable import by_line
 from lagjax.mechanics.signature import UnknownSystem, known_system
-from lagjax.mechanics.system import System
 from lagjax.motion.consistency import worst_residual
 from lagjax.motion.crossings import Crossings
 from lagjax.motion.trajectory import Trajectory, jacobi_and_scale
@@ -116,7 +116,7 @@ class HybridTrajectory(Trajectory):
 
     def residual(self) -> Float[Array, ""]:
         """The worst constraint residual over all outputs, but not between them, each in its own phase, relative."""
-        worst = [_residual_in(system, i, self) for i, system in enumerate(self.system.systems) if system.constraints]
+        worst = [_residual_in(model, i, self) for i, model in enumerate(self.model.phases) if model.m]
         return jnp.max(jnp.stack([*worst, jnp.zeros_like(self.scaled_error)]))
 
     def plot(self, charges=False):
@@ -155,27 +155,27 @@ class HybridTrajectory(Trajectory):
         ]
 
 
-def _integral(system, t, q, v, params):
-    return jacobi_and_scale(system, t, q, v, params)[0]
+def _integral(model, t, q, v):
+    return jacobi_and_scale(model, t, q, v)[0]
 
 
 def _of_phases(function, trajectory):
-    """Return `function(system, t, q, v, params)` at all outputs, each with the system of its own phase."""
+    """Return `function(model, t, q, v)` at all outputs, each with the model of its own phase."""
     found = jnp.full_like(trajectory.t, jnp.nan)
-    for i, system in enumerate(trajectory.system.systems):
-        values = function(system, trajectory.t, trajectory.q, trajectory.v, trajectory.params)
+    for i, model in enumerate(trajectory.model.phases):
+        values = function(model, trajectory.t, trajectory.q, trajectory.v)
         found = jnp.where(trajectory.phase == i, values, found)
     return found
 
 
-def _residual_in(system: System, i, trajectory):
-    return _worst(system, i, trajectory.phase, trajectory.t, trajectory.q, trajectory.v, trajectory.params)
+def _residual_in(model: Model, i, trajectory):
+    return _worst(model, i, trajectory.phase, trajectory.t, trajectory.q, trajectory.v)
 
 
 @compiled
-def _worst(system, i, phase, t, q, v, params):
+def _worst(model, i, phase, t, q, v):
     in_phase = phase == i
     # Outputs of other phases are replaced by the first of this phase, which does not change the maximum.
     at = jnp.where(in_phase, jnp.arange(phase.size), jnp.argmax(in_phase))
     t, q, v = jax.tree.map(partial(jnp.take, indices=at, axis=0), (t, q, v))
-    return lax.cond(jnp.any(in_phase), lambda: worst_residual(system, t, q, v, params), lambda: jnp.zeros_like(t[0]))
+    return lax.cond(jnp.any(in_phase), lambda: worst_residual(model, t, q, v), lambda: jnp.zeros_like(t[0]))

@@ -31,13 +31,11 @@ Source: Pfeiffer & Glocker, *Multibody Dynamics with Unilateral Contacts*, ch. 7
 Laws*, §6; Kane, *A dynamics puzzle* (1984), on the energy.
 """
 
-import math
 from collections.abc import Callable
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import ArrayLike
 
 from lagjax.jax_internals.programs import depends
@@ -45,6 +43,7 @@ from lagjax.mechanics import constraints, coordinates
 from lagjax.mechanics.arguments import OF_POSITION, OF_STATE
 from lagjax.mechanics.constraints import Holonomic, Nonholonomic
 from lagjax.mechanics.memory import shape_of
+from lagjax.mechanics.model import model_of
 from lagjax.mechanics.system import System
 from lagjax.motion.consistency import stopped, velocity_change
 from lagjax.motion.switching import OfPhases
@@ -105,11 +104,10 @@ class _Rebound(eqx.Module):
         but no other residual, of `contact` or of the constraints that hold; and whether there is such a change."""
         before = self.before
         system = System(before.lagrangian, before.constraints | contact, before.force, before.dissipation)
-        x, unflatten = coordinates.flatten(q)
-        change = _equations_of(list(contact)[-1], constraints.shapes(system, t, q, v, params)).astype(x.dtype)
-        found = velocity_change(system, t, q, v, params, jnp.asarray(change))
-        rows = constraints.jacobian(system, t, x, coordinates.flatten(v)[0], params, unflatten)
-        d = coordinates.flatten(found)[0]
+        model = model_of(system, t, q, v, params)
+        change = model.belongs_to(list(contact)[-1]).astype(model.form.dtype)
+        found = velocity_change(model, t, q, v, jnp.asarray(change))
+        rows, d = constraints.jacobian(model, t, *model.vectors(q, v)), model.vector(found)
         off = jnp.abs(rows @ d - change) > DEPENDENT * (change + jnp.abs(rows) @ jnp.abs(d))
         return found, ~jnp.any(off)
 
@@ -147,20 +145,14 @@ class _Opened(eqx.Module):
     takes: tuple[str, ...] = eqx.field(static=True, default=OF_STATE)
 
     def __call__(self, t, q, v, params):
-        x, unflatten = coordinates.flatten(q)
-        u, _ = coordinates.flatten(v)
-        sizes = jnp.abs(constraints.jacobian(self.before, t, x, u, params, unflatten)) @ jnp.abs(u)
-        mine = _equations_of(self.contact, constraints.shapes(self.before, t, q, v, params))
-        opening = constraints.velocity_residual(self.before, t, x, u, params, unflatten)
+        model = model_of(self.before, t, q, v, params)
+        x, u = model.vectors(q, v)
+        sizes = jnp.abs(constraints.jacobian(model, t, x, u)) @ jnp.abs(u)
+        mine, opening = model.belongs_to(self.contact), constraints.velocity_residual(model, t, x, u)
         # The speed must be above zero for a body at rest, too.
         least = OPENS * jnp.finfo(x.dtype).eps * sizes + jnp.sqrt(jnp.finfo(x.dtype).tiny)
         change = stopped(jnp.where(mine, jnp.maximum(least - opening, 0.0), 0.0))
-        return _moved(v, 1.0, velocity_change(self.before, t, q, v, params, change))
-
-
-def _equations_of(name, shapes):
-    """Return which of the equations of all constraints, with these shapes, belong to the constraint `name`."""
-    return np.concatenate([np.full(math.prod(shape), other == name) for other, shape in shapes.items()])
+        return _moved(v, 1.0, velocity_change(model, t, q, v, change))
 
 
 def _moved(v, size, along):

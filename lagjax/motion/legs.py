@@ -27,9 +27,10 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from lagjax.jax_internals.one_function import apart
-from lagjax.mechanics import constraints, coordinates
+from lagjax.mechanics import coordinates
 from lagjax.mechanics.equations import all_finite
 from lagjax.mechanics.hybrid import Hybrid
+from lagjax.mechanics.model import model_of
 from lagjax.motion.consistency import stopped
 from lagjax.motion.crossings import Crossings, Guards
 from lagjax.motion.hybrid_trajectory import NO_PHASE, SWITCHES, Switches
@@ -134,10 +135,10 @@ def _first_leg(hybrid, q0, v0, params, ts, phase, settings):
     dtype, many, room = ts.dtype, ts.shape[0], hybrid.most_switches
     nan = lambda shape: jnp.full(shape, jnp.nan, dtype)
     of_rows = lambda tree, n: jax.tree.map(lambda x: nan((n, *x.shape)), tree)
-    shapes = reduce(lambda all, of: all | of, (constraints.shapes(s, ts[0], q0, v0, params) for s in hybrid.systems))
-    n = coordinates.flatten(q0)[0].size
+    model = model_of(hybrid, ts[0], q0, v0, params)
+    multipliers = reduce(lambda all, of: all | of, (phase.zero_multipliers() for phase in model.phases))
     rows = Rows(
-        of_rows(q0, many), of_rows(v0, many), {name: nan((many, *shape)) for name, shape in shapes.items()},
+        of_rows(q0, many), of_rows(v0, many), of_rows(multipliers, many),
         jnp.full(many, NO_PHASE, jnp.int32),
     )  # fmt: skip
     record = lambda tree: of_rows(tree, room)
@@ -151,8 +152,8 @@ def _first_leg(hybrid, q0, v0, params, ts, phase, settings):
     first, phases = jnp.asarray(hybrid.first, jnp.int32), len(hybrid.systems)
     exists = (first >= 0) & (first < phases)
     known = lambda tree: jax.tree.map(lambda x: jnp.where(exists, x, jnp.nan), tree)
-    start = Snapshot(ts[0], known(q0), known(v0), {name: nan(shape) for name, shape in shapes.items()})
-    zero, least = jnp.asarray(0), jnp.zeros((2, n), dtype) if settings.by_size else settings.atol
+    start = Snapshot(ts[0], known(q0), known(v0), jax.tree.map(lambda x: nan(x.shape), multipliers))
+    zero, least = jnp.asarray(0), jnp.zeros((2, model.n), dtype) if settings.by_size else settings.atol
     stats = {name: zero for name in ("num_steps", "num_accepted_steps", "num_rejected_steps")}
     return Way(
         t=ts[0], q=q0, v=v0, phase=jnp.clip(first, 0, phases - 1), continues=exists, rows=rows,

@@ -14,10 +14,9 @@ import optimistix as optx
 from jaxtyping import Array, Float, PyTree
 
 from lagjax.jax_internals.one_function import calls_host, one_function
-from lagjax.mechanics import constraints
 from lagjax.mechanics.coordinates import State
 from lagjax.mechanics.equations import Equations
-from lagjax.mechanics.structure import angles
+from lagjax.mechanics.structure import are_angles
 from lagjax.motion.arriving import Arriving, together
 from lagjax.motion.consistency import stopped
 from lagjax.motion.crossing_times import Located, at_known_times, first_end, locate
@@ -164,7 +163,7 @@ def _user_calls_python(equations, terms, start, guards, settings, controller):
         if any(numbers.calls_host for numbers in (written.equations, written.project) if numbers is not None):
             return True
     if guards is not None:
-        multipliers = constraints.zero_multipliers(equations.system, start)
+        multipliers = equations.model.zero_multipliers()
         traced.append(jax.make_jaxpr(lambda t, q, v: guards(t, q, v, multipliers, params))(t, q, v))
     conditions = jax.tree.leaves(settings.event.cond_fn, is_leaf=callable) if settings.event is not None else ()
     given = dict(terms=terms, solver=settings.method, t0=t, t1=t, dt0=None, max_steps=settings.max_steps)
@@ -233,8 +232,7 @@ def _controller(equations, start, ts, settings, scales, bare, repeated):
         rtol=settings.rtol[0], atol=settings.atol[0], norm=optx.max_norm, dtmin=dtmin, dtmax=settings.max_step,
         force_dtmin=False,
     )  # fmt: skip
-    kinds = zip(jax.tree.leaves(angles(equations.system, *start)), jax.tree.leaves(start.q))
-    angle = tuple(bool(kind) for kind, x in kinds for _ in range(x.size))
+    angle = tuple(are_angles(equations.model).tolist())
     if not bare and (scales is not None or settings.apart or any(angle)):
         controller = Weighing(controller, Tolerances(settings.rtol, settings.atol), scales, angle)
     arriving = _arriving(settings) and not bare

@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Float, PyTree
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.coordinates import State
 from lagjax.mechanics.equations import Equations, all_finite, equations_of
+from lagjax.mechanics.model import model_of
 from lagjax.mechanics.structure import conserves_jacobi_integral
 from lagjax.motion.arriving import apart_from_jumps
 from lagjax.motion.consistency import returned, stopped, within, worst_residual
@@ -52,9 +53,9 @@ def solved(system, q0, v0, params, ts, guards, settings, adjoint, sizes_so_far=N
     ours = isinstance(settings.method, (ExplicitRungeKutta, Nystrom))
     # A condition for diffrax evaluates the vector field at the state that it gets, which is the user's.
     fast = ours and settings.event is None
-    equations = equations_of(system, ts[0], q0, v0, params, fast=fast, fallback=settings.robust)
-    if guards is not None and equations.unflatten is not None:
-        guards = guards.in_numbers(equations.unflatten)
+    equations = equations_of(model_of(system, ts[0], q0, v0, params), fast=fast, fallback=settings.robust)
+    if guards is not None and equations.users is not None:
+        guards = guards.in_numbers(equations.users.tree)
     q, v = equations.inside(q0), equations.inside(v0)
     start = _start(equations, q, v, ts, settings, sizes_so_far)
     settings = replace(settings, atol=start.atol)
@@ -99,12 +100,12 @@ class Outputs(NamedTuple):
 
 def _start(equations: Equations, q, v, ts, settings, sizes_so_far) -> Start:
     """Prepare the start; of the reasons to refuse it, the last one that holds becomes the result."""
-    t, given, off_constraints = ts[0], State(ts[0], q, v, equations.params), jnp.asarray(False)
+    t, given, off_constraints = ts[0], State(ts[0], q, v, equations.model.params), jnp.asarray(False)
     if settings.drift == "project":
         q, v, _ = returned(equations, t, q, v, *tolerances_at(given, ts, settings, sizes_so_far))
     a, _, finite, singular, contradictory, mass = stopped(equations.verdict(t, q, v))
     tolerances = rtol, atol = tolerances_at(given, ts, settings, sizes_so_far, a)
-    if equations.system.constraints:
+    if equations.model.m:
         off_constraints = ~within(equations, *given[:3], START_TOLERANCES * rtol, START_TOLERANCES * atol)
         if settings.drift == "project" and not equations.are_taken_for_regular:
             off_constraints |= finite & ~singular & ~within(equations, t, q, v, *tolerances)
@@ -126,7 +127,7 @@ def _start(equations: Equations, q, v, ts, settings, sizes_so_far) -> Start:
 
 def _stepped(equations, start, ts, guards, settings, adjoint) -> Solution:
     y0 = jax.tree.map(lambda x: jnp.where(start.refused, 0.0, x), (start.q, start.v))
-    first = State(ts[0], start.q, start.v, equations.params)
+    first = State(ts[0], start.q, start.v, equations.model.params)
     if settings.dt0 is not None:
         # A motion with dt0 <= 0 is refused; diffrax's own check would end the program.
         settings = replace(settings, dt0=jnp.where(settings.dt0 > 0, settings.dt0, 1.0))
@@ -200,11 +201,11 @@ def _scaled_error(equations, t, q, v, stats, settings):
     An error of the Jacobi integral that grows steadily shifts the phase by about its size per radian, so over very
     many steps less of it is allowed. If the tolerance does not choose the steps, only the change itself counts.
     """
-    system, params, drift, residual = equations.system, equations.params, jnp.zeros_like(t[0]), jnp.zeros_like(t[0])
-    if conserves_jacobi_integral(system, t[0], *jax.tree.map(lambda x: x[0], (q, v)), params):
-        drift = worst_drift(system, t, q, v, params)
-    if system.constraints and settings.drift != "project":
-        residual = worst_residual(system, t, q, v, params)
+    model, drift, residual = equations.model, jnp.zeros_like(t[0]), jnp.zeros_like(t[0])
+    if conserves_jacobi_integral(model):
+        drift = worst_drift(model, t, q, v)
+    if model.m and settings.drift != "project":
+        residual = worst_residual(model, t, q, v)
     if settings.controller is not None:
         return jnp.maximum(drift, residual) / FIXED_STEPS_ALLOW
     rtol = jnp.maximum(settings.rtol[0], jnp.finfo(t.dtype).eps)

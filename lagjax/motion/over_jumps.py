@@ -23,7 +23,6 @@ import equinox as eqx
 import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
-import jax.tree_util as jtu
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
@@ -31,7 +30,7 @@ from lagjax.jax_internals.one_function import apart
 from lagjax.jax_internals.opened import IN_TIME
 from lagjax.jumps.found import Given, Jumps, OfParams, Smooth
 from lagjax.jumps.sliding import Mixed, Sliding, slidable
-from lagjax.mechanics import constraints
+from lagjax.mechanics.model import model_of
 from lagjax.mechanics.system import System
 from lagjax.mechanics.warned import warn
 from lagjax.motion.consistency import stopped
@@ -105,7 +104,7 @@ class ModeGuard(eqx.Module):
         return jnp.where(given.free, 1.0, value)
 
 
-class Model(eqx.Module):
+class Piecewise(eqx.Module):
     """A system in a mode: its `smooth` equations, the mixtures, and for each mode its guard and the mode beyond.
 
     `pauses`: whether guards may jump with time, so that legs end where forces do.
@@ -118,7 +117,7 @@ class Model(eqx.Module):
     pauses: bool = eqx.field(static=True)
 
 
-def model_of(jumps: Jumps, system: System, small: bool) -> Model:
+def piecewise_of(jumps: Jumps, system: System, small: bool) -> Piecewise:
     """The smooth system with its guards; motions slide in `small` systems."""
     smooth, guards, sliding = jumps.smooth(system), jumps.numbers(system, 0), None
     which = slidable(jumps, system) if small else ()
@@ -129,7 +128,7 @@ def model_of(jumps: Jumps, system: System, small: bool) -> Model:
     of = lambda i, guard: ModeGuard(guard, sliding if i in which else None, i)
     guards = tuple(of(i, guard) for i, guard in enumerate(guards))
     pauses = sliding is not None or any(IN_TIME in slot.depends for slot in jumps.slots)
-    return Model(smooth, sliding, guards, tuple(jumps.numbers(system, 1)), pauses)
+    return Piecewise(smooth, sliding, guards, tuple(jumps.numbers(system, 1)), pauses)
 
 
 class Way(NamedTuple):
@@ -156,14 +155,15 @@ class Way(NamedTuple):
 
 def solved_over_jumps(jumps: Jumps, system: System, q0, v0, params, ts, guards, settings, adjoint):
     """Return the fields of the trajectory, like `one_solve.solved`."""
-    small = sum(x.size for x in jtu.tree_leaves(q0)) + constraints.count(system, ts[0], q0, v0, params) <= 24
-    model = model_of(jumps, system, small)
+    model = model_of(system, ts[0], q0, v0, params)
+    small = model.n + model.m <= 24
+    piecewise = piecewise_of(jumps, system, small)
     modes = stopped(jumps.modes(system, ts[0], q0, v0, params))
-    both = _together(model, guards)
-    first = _first(system, q0, v0, params, ts, guards, modes, settings)
+    both = _together(piecewise, guards)
+    first = _first(model, q0, v0, ts, guards, modes, settings)
 
     def next_leg(way: Way) -> Way:
-        return _leg(model, both, guards, way, params, ts, settings, adjoint)
+        return _leg(piecewise, both, guards, way, params, ts, settings, adjoint)
 
     turns = MOST_JUMPS + 2 + (0 if settings.jump_ts is None else settings.jump_ts.size)
     if isinstance(adjoint, diffrax.ForwardMode):
@@ -184,22 +184,22 @@ def solved_over_jumps(jumps: Jumps, system: System, q0, v0, params, ts, guards, 
     }
 
 
-def _together(model: Model, guards: Guards | None) -> Guards:
+def _together(piecewise: Piecewise, guards: Guards | None) -> Guards:
     """The guards of the modes, and then those of the user's events."""
-    long = any(len(f.guard.program.jaxpr.eqns) > LONG for f in model.guards) or model.sliding is not None
+    long = any(len(f.guard.program.jaxpr.eqns) > LONG for f in piecewise.guards) or piecewise.sliding is not None
     kinds = tuple(
-        Kind(f"mode {i}", -1, True, 1, False, long, holds=True, may_rest=True) for i in range(len(model.guards))
+        Kind(f"mode {i}", -1, True, 1, False, long, holds=True, may_rest=True) for i in range(len(piecewise.guards))
     )  # fmt: skip
     if guards is None:
-        return Guards(model.guards, kinds)
-    return Guards((*model.guards, *map(OfParams, guards.functions)), (*kinds, *guards.kinds))
+        return Guards(piecewise.guards, kinds)
+    return Guards((*piecewise.guards, *map(OfParams, guards.functions)), (*kinds, *guards.kinds))
 
 
-def _first(system, q0, v0, params, ts, guards, modes, settings) -> Way:
+def _first(model, q0, v0, ts, guards, modes, settings) -> Way:
     dtype, many = ts.dtype, ts.shape[0]
     nan = lambda shape: jnp.full(shape, jnp.nan, dtype)
     of_rows = lambda tree: jax.tree.map(lambda x: nan((many, *x.shape)), tree)
-    multipliers = {name: nan(shape) for name, shape in constraints.shapes(system, ts[0], q0, v0, params).items()}
+    multipliers = {name: nan(x.shape) for name, x in model.zero_multipliers().items()}
     rows = {"q": of_rows(q0), "v": of_rows(v0), "multipliers": of_rows(multipliers)}
     sizes, zero = sizes_of(q0, v0), jnp.asarray(0)
     # A motion that rests at zero, held by friction, has round-off alone to tell its size.
@@ -215,26 +215,26 @@ def _first(system, q0, v0, params, ts, guards, modes, settings) -> Way:
     )  # fmt: skip
 
 
-def _leg(model: Model, guards: Guards, recorded, way: Way, params, ts, settings, adjoint) -> Way:
+def _leg(piecewise: Piecewise, guards: Guards, recorded, way: Way, params, ts, settings, adjoint) -> Way:
     """Return the way after one more leg."""
     # Past outputs would cost a step each: those ahead come first, padded with the last.
     place, past, here = jnp.arange(ts.shape[0]), jnp.sum(ts <= way.t), way.continues
     ahead = jnp.where(place == 0, way.t, ts[jnp.minimum(place + past - 1, ts.shape[0] - 1)])
     times = jnp.where(here, ahead, way.t)
-    if model.pauses and settings.jump_ts is not None:
+    if piecewise.pauses and settings.jump_ts is not None:
         # A guard that jumps in time may have no zero: the next leg begins there, and ends at once. Not `minimum`, whose
         # derivative is one half for an output at that time.
         pause = _next(settings.jump_ts, way.t, resolution(ts))
         times = jnp.where(times > pause, pause, times)
     given = Given(params, way.modes, way.slides, way.free)
-    found = apart(solved, model.smooth, way.q, way.v, given, times, guards, settings, adjoint, way.sizes_so_far)
+    found = apart(solved, piecewise.smooth, way.q, way.v, given, times, guards, settings, adjoint, way.sizes_so_far)
     crossings = [found["events"][kind.name] for kind in guards.kinds]
     when = jnp.stack([jnp.where(jnp.isfinite(x.t[0]), x.t[0], jnp.inf) for x in crossings])
-    ending = apart(_ending, model, guards, found["result"], found["end"], when, way, given, ts, settings)
+    ending = apart(_ending, piecewise, guards, found["result"], found["end"], when, way, given, ts, settings)
     end, onward = ending.end, here & ending.onward
     paused = here & (ending.result == RESULTS.successful) & ~onward & ~ending.wrong & (end.t < ts[-1])
     # Not where a leg began, if it ended at once: what jumps with time has jumped only after that.
-    modes, slides = apart(_beyond, model, ending.first, found["end"], given)
+    modes, slides = apart(_beyond, piecewise, ending.first, found["end"], given)
     moves = onward | paused
     # What a leg found whose mode was wrong does not count.
     counts = here & ~ending.wrong
@@ -273,9 +273,9 @@ class Ending(NamedTuple):
     result: Any
 
 
-def _ending(model, guards: Guards, result, end: Snapshot, when, way: Way, given, ts, settings) -> Ending:
+def _ending(piecewise, guards: Guards, result, end: Snapshot, when, way: Way, given, ts, settings) -> Ending:
     """Find out what ends a leg; `when`: the times at which its guards cross, infinite for those that do not."""
-    count, at_one_time, last = len(model.guards), AT_ONCE * resolution(ts), ts[-1]
+    count, at_one_time, last = len(piecewise.guards), AT_ONCE * resolution(ts), ts[-1]
     # An event of the user's that ends the motion at the time of a jump comes first.
     ends = jnp.where(guards.terminal, when, jnp.inf)[count:]
     when = when[:count]
@@ -302,22 +302,24 @@ def _is_below(end: Snapshot, given, guards: Guards, count: int, rtol):
     return jnp.any(g < -NOT_BELOW * rtol[0] * jnp.abs(terms))
 
 
-def _beyond(model: Model, first, end: Snapshot, given: Given):
+def _beyond(piecewise: Piecewise, first, end: Snapshot, given: Given):
     """The modes after the guard `first` has crossed zero, and along which jumps the motion then slides."""
     state, given = stopped((end.t, end.q, end.v)), stopped(given)
-    n = len(model.guards)
+    n = len(piecewise.guards)
     mine, slid = jnp.arange(n) == first, given.slides
-    beyond = jnp.stack([f(*state, given) for f in model.beyond]).astype(given.modes.dtype)
+    beyond = jnp.stack([f(*state, given) for f in piecewise.beyond]).astype(given.modes.dtype)
     modes = jnp.where(mine, beyond, given.modes)
-    if model.sliding is None:
+    if piecewise.sliding is None:
         return modes, slid
-    which = model.sliding.which
-    shares = model.sliding.mixture(*state, given).shares
+    which = piecewise.sliding.which
+    shares = piecewise.sliding.mixture(*state, given).shares
     # A motion that slides leaves to the side of the share that it has.
     stays = jnp.zeros(n, bool).at[jnp.asarray(which)].set(jnp.stack(shares) < 0.5) & slid
     modes = jnp.where(mine & stays, given.modes, modes)
     after = given._replace(modes=modes, slides=slid & ~mine)
-    rates = jnp.zeros(n, modes.dtype).at[jnp.asarray(which)].set(jnp.stack(model.sliding.mixture(*state, after).rates))
+    rates = (
+        jnp.zeros(n, modes.dtype).at[jnp.asarray(which)].set(jnp.stack(piecewise.sliding.mixture(*state, after).rates))
+    )
     back = mine & ~slid & (rates * (2 * modes - 1) < 0)
     return modes, (slid & ~mine) | back
 

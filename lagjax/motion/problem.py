@@ -11,6 +11,7 @@ import numpy as np
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.coordinates import State
 from lagjax.mechanics.hybrid import Hybrid
+from lagjax.mechanics.model import Model
 from lagjax.mechanics.system import System
 from lagjax.mechanics.warned import warn
 from lagjax.motion.account import account_of, warning_of
@@ -288,10 +289,10 @@ def check_finite(s: State):
                 )
 
 
-def off_constraints(system: System, s: State, rtol, atol) -> str:
+def off_constraints(model: Model, s: State, rtol, atol) -> str:
     """Say which constraints the initial state violates."""
     check_finite(s)
-    violated = departures(system, s, rtol, atol) or departures(system, s, 0.0, 0.0)
+    violated = departures(model, s, rtol, atol) or departures(model, s, 0.0, 0.0)
     if any(f"= {word}" in violated for word in ("nan", "inf", "-inf")):
         return (
             f"constraints are not finite at the initial state: {violated}.\n"

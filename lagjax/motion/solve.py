@@ -22,6 +22,7 @@ from lagjax.jumps.times import with_jumps_in_time
 from lagjax.mechanics.kept import kept
 from lagjax.mechanics.memory import filled_up, parted
 from lagjax.mechanics.memory_maps import share_used
+from lagjax.mechanics.model import Model, model_of
 from lagjax.mechanics.structure import is_free_of_velocities
 from lagjax.mechanics.written_out import has_networks
 from lagjax.meter import waiting
@@ -176,7 +177,8 @@ def _trajectory_of(*problem):
 
 def _trajectory(system, q0, v0, params, ts, guards, settings):
     """The trajectory, and whether it is settled: the robust solve would give the same."""
-    s, method = settings, method_of(settings, system, ts[0], q0, v0, params)
+    model = model_of(system, ts[0], q0, v0, params)
+    s, method = settings, method_of(settings, model)
     asked = Asked(s.method, s.controller, s.dt0, s.max_step, s.jump_ts, s.drift, s.jumps)
     how = _how(method, s.method, settings, system.in_phases)
     settings = eqx.tree_at(lambda s: s.method, settings, method, is_leaf=lambda x: x is None)
@@ -245,17 +247,17 @@ def _how(method, asked, settings, in_legs):
     return How(name, method.error_order(terms), evaluations_a_step(method), chosen)
 
 
-def method_of(settings, system, *state):
+def method_of(settings, model: Model):
     """Return the method asked for, raising if it cannot do it; by default the fastest that can."""
     chosen = settings.method
     if chosen is None:
         # BacksolveAdjoint integrates a state that is not a pair (q, v).
         pairs = not isinstance(settings.adjoint, diffrax.BacksolveAdjoint)
-        if not pairs or not _are_free_of_velocities(system, *state):
+        if not pairs or not _are_free_of_velocities(model):
             return Dopri8()
-        return nystrom_for(system, state[-1])
-    if isinstance(chosen, Nystrom) and not _are_free_of_velocities(system, *state):
-        cause = "there are constraints" if any(phase.constraints for phase in system.phases) else "these do"
+        return nystrom_for(model)
+    if isinstance(chosen, Nystrom) and not _are_free_of_velocities(model):
+        cause = "there are constraints" if any(phase.m for phase in model.phases) else "these do"
         raise ValueError(
             f"{type(chosen).__name__} is for accelerations that do not depend on velocities, and {cause}.\n"
             "Usual cause: a kinetic energy that depends on q (polar coordinates, joint angles), friction, or a "
@@ -267,12 +269,12 @@ def method_of(settings, system, *state):
     return chosen if ours is None else ours
 
 
-def nystrom_for(system, params) -> Nystrom:
+def nystrom_for(model: Model) -> Nystrom:
     """The default method for accelerations that do not depend on velocities."""
     # The motion of a network is less smooth than that of closed forms: at equal error, from 1e-3 to 1e-11, order 8
     # takes two thirds to nine tenths of the evaluations of order 12, and half with many outputs.
-    return Nystrom8() if has_networks(system, params) else Nystrom12()
+    return Nystrom8() if has_networks(model) else Nystrom12()
 
 
-def _are_free_of_velocities(system, *state):
-    return all(is_free_of_velocities(phase, *state) for phase in system.phases)
+def _are_free_of_velocities(model):
+    return all(is_free_of_velocities(phase) for phase in model.phases)

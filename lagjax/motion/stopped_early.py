@@ -89,7 +89,7 @@ def stopped_early(trajectory, settings, guards: str = "") -> str:
         f"the integration stopped at t = {float(end.t):.9g}, {share:.3g} % of the way to {t1:.6g}, after "
         f"{accepted} accepted and {rejected} rejected steps"
     )
-    reason = explain_failure(trajectory.system, State(end.t, end.q, end.v, trajectory.params))
+    reason = explain_failure(trajectory.model, State(end.t, end.q, end.v, trajectory.params))
     if reason := reason or unreachable_ahead(trajectory):
         return f"{what}: {reason}"
     last = f"The last state is {describe(end.q)}, v = {describe(end.v)}."
@@ -125,7 +125,7 @@ def _used_up(trajectory, settings, guards):
         rate, missing, rejected = steps.rate, steps.missing, int(np.sum(~steps.accepted))
         if said := rejected_by_guards(guards, trajectory.stats, rejected / len(steps.h)):
             return said
-        method = method_of(settings, trajectory.system, *_end_of(trajectory))
+        method = method_of(settings, trajectory.model)
         implicit = isinstance(method, diffrax.AbstractImplicitSolver)
         found = _singularity(path, steps) or _jump(path, steps) or _fast(path, steps, implicit)
         facts = "" if found else f" {rejected} of the next {len(steps.h)} were rejected. {path.largest(steps)}"
@@ -163,13 +163,12 @@ def _rounded_up(count):
 
 def _attempts(trajectory, settings):
     """`attempt(t0, t1, y)` -> (state, error), its order, where the motion ended, and the direction of time."""
-    system, params, end = trajectory.system, trajectory.params, trajectory.end
-    state = _end_of(trajectory)
-    method = method_alone(settings, method_of(settings, system, *state))
-    terms = diffrax.ODETerm(Field(equations_of(system, *state)))
+    model, params, end = trajectory.model, trajectory.params, trajectory.end
+    method = method_alone(settings, method_of(settings, model))
+    terms = diffrax.ODETerm(Field(equations_of(model)))
     # Tolerances from the start: near a singularity sizes differ from those at the start.
     first = State(*jax.tree.map(lambda x: x[0], (trajectory.t, trajectory.q, trajectory.v)), params)
-    at_start = _on_path(system, params, first.t, (first.q, first.v), jnp.zeros(3))
+    at_start = _on_path(model, first.t, (first.q, first.v), jnp.zeros(3))
     tolerance = tolerances_at(first, trajectory.t, settings, a=at_start)
 
     def attempt(t0, t1, y):
@@ -177,11 +176,6 @@ def _attempts(trajectory, settings):
 
     order = float(method.error_order(terms))
     return attempt, order, (float(end.t), (end.q, end.v)), np.sign(float(trajectory.t[-1] - end.t))
-
-
-def _end_of(trajectory):
-    end = trajectory.end
-    return end.t, end.q, end.v, trajectory.params
 
 
 def last_steps(trajectory, settings) -> Steps:
@@ -221,8 +215,8 @@ class _Path:
     """Velocities and accelerations along the motion and along the parabola through a state."""
 
     def __init__(self, trajectory):
-        self.system, self.params = trajectory.system, trajectory.params
-        self.names, self.in_dict = coordinates.names(trajectory.end.q), isinstance(trajectory.end.q, dict)
+        self.model, self.names = trajectory.model, trajectory.model.names
+        self.in_dict = isinstance(trajectory.end.q, dict)
         t, *y = jax.tree.map(lambda x: x[0], (trajectory.t, trajectory.q, trajectory.v))
         self.span = abs(float(trajectory.end.t - trajectory.t[0]))
         # The largest velocity and acceleration that the start and the way so far account for.
@@ -235,7 +229,7 @@ class _Path:
     def at(self, t, y, s):
         """The acceleration at q + s v + s² a/2, v + s a; t, q, v are taken at s, or at s[0], s[1], s[2]."""
         s = jnp.broadcast_to(jnp.asarray(s, dtype=float), 3)
-        return np.asarray(_on_path(self.system, self.params, jnp.asarray(t), y, s))
+        return np.asarray(_on_path(self.model, jnp.asarray(t), y, s))
 
     def velocity(self, y):
         """The velocities of a state, (n,)."""
@@ -243,7 +237,7 @@ class _Path:
 
     def rates(self, t, y):
         """The eigenvalues of d(v, a)/d(q, v)."""
-        return np.linalg.eigvals(np.asarray(_jacobian(self.system, self.params, jnp.asarray(t), y)))
+        return np.linalg.eigvals(np.asarray(_jacobian(self.model, jnp.asarray(t), y)))
 
     def largest(self, steps):
         """What is large at the last of the steps, in words."""
@@ -257,28 +251,23 @@ class _Path:
         )
 
 
-def _acceleration(system, params, t, q, v):
-    return equations_of(system, t, q, v, params).accelerations(t, q, v)[0]
-
-
 @jitted
-def _on_path(system, params, t, y, s):
+def _on_path(model, t, y, s):
     q, v = y
-    a = _acceleration(system, params, t, q, v)
+    a, _ = equations_of(model).accelerations(t, q, v)
     by = lambda scale, x, dx: jax.tree.map(lambda x, dx: x + scale * dx, x, dx)
     place, velocity = by(0.5 * s[1] ** 2, by(s[1], q, v), a), by(s[2], v, a)
-    return coordinates.flatten(_acceleration(system, params, t + s[0], place, velocity))[0]
+    return model.vector(equations_of(model).accelerations(t + s[0], place, velocity)[0])
 
 
 @jitted
-def _jacobian(system, params, t, y):
-    x, unflatten = coordinates.flatten(y)
+def _jacobian(model, t, y):
+    def rates(z):
+        u = z[model.n :]
+        a, _ = equations_of(model).accelerations(t, model.tree(z[: model.n]), model.tree(u))
+        return jnp.concatenate([u, model.vector(a)])
 
-    def rates(x):
-        q, v = unflatten(x)
-        return coordinates.flatten((v, _acceleration(system, params, t, q, v)))[0]
-
-    return jax.jacfwd(rates)(x)
+    return jax.jacfwd(rates)(jnp.concatenate(model.vectors(*y)))
 
 
 def _singularity(path, steps):

@@ -12,13 +12,13 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array
 
-from lagjax.mechanics import constraints, coordinates
+from lagjax.mechanics import constraints
 from lagjax.mechanics.arguments import OF_STATE, takes_of
-from lagjax.mechanics.constraints import zero_multipliers
 from lagjax.mechanics.coordinates import State
 from lagjax.mechanics.first_call import traced_call, traced_system
 from lagjax.mechanics.hybrid import Hybrid, Switch, replace_fields
 from lagjax.mechanics.in_words import Call
+from lagjax.mechanics.model import model_of
 from lagjax.mechanics.system import System
 from lagjax.motion.backward import runs_backward
 from lagjax.motion.consistency import velocity_change
@@ -69,8 +69,8 @@ def traced_phases(system: System | Hybrid, start: State) -> Any:
 def check_phases(hybrid: Hybrid, start: State):
     """Raise if constraints of the same name have different shapes in two phases."""
     first: dict[str, tuple[tuple, str]] = {}
-    for name, system in zip(hybrid.names, hybrid.systems):
-        for constraint, shape in constraints.shapes(system, *start).items():
+    for name, model in zip(hybrid.names, model_of(hybrid, *start).phases):
+        for constraint, shape, _ in model.form.residuals:
             other, phase = first.setdefault(constraint, (shape, name))
             if other != shape:
                 raise ValueError(
@@ -153,7 +153,8 @@ def traced_hybrid(hybrid: Hybrid, start: State) -> Hybrid:
 def _traced_switch(hybrid, k, start):
     switch = hybrid.switches[k]
     system = hybrid.systems[hybrid.names.index(switch.phase)]
-    given: dict[str, Any] = start._asdict() | {"multipliers": zero_multipliers(system, start), "speed": start.t}
+    multipliers = model_of(system, *start).zero_multipliers()
+    given: dict[str, Any] = start._asdict() | {"multipliers": multipliers, "speed": start.t}
     when, reset = traced_guard(_name(hybrid, k), switch.when, given), switch.reset
     of_switch = f" of the switch {switch.in_words()}"
     if isinstance(reset, OfPhases):
@@ -208,12 +209,11 @@ class Nearest(eqx.Module):
     takes: tuple[str, ...] = eqx.field(static=True, default=OF_STATE)
 
     def __call__(self, t, q, v, params):
-        if not self.system.constraints:
+        model = model_of(self.system, t, q, v, params)
+        if not model.m:
             return v
-        x, unflatten = coordinates.flatten(q)
-        u, _ = coordinates.flatten(v)
-        off = constraints.velocity_residual(self.system, t, x, u, params, unflatten)
-        return jtu.tree_map(jnp.add, v, velocity_change(self.system, t, q, v, params, -off))
+        off = constraints.velocity_residual(model, t, *model.vectors(q, v))
+        return jtu.tree_map(jnp.add, v, velocity_change(model, t, q, v, -off))
 
 
 def _alike(found, wanted):

@@ -16,6 +16,7 @@ from lagjax.animation import Animation
 from lagjax.jax_internals.one_by_one import jitted
 from lagjax.mechanics import coordinates, packed
 from lagjax.mechanics.compiled import compiled
+from lagjax.mechanics.model import Model, model_of
 from lagjax.mechanics.packed import Packed
 from lagjax.mechanics.signature import UnknownSystem, known_system
 from lagjax.mechanics.structure import what_changes_jacobi_integral
@@ -151,16 +152,21 @@ class Trajectory(eqx.Module):
         """The fields with one row per output, by name."""
         return {"t": self.t, "q": self.q, "v": self.v, "multipliers": self.multipliers}
 
+    @property
+    def model(self) -> Model:
+        """The system prepared for states of this form. Not for batched trajectories."""
+        return model_of(self.system, *jax.tree.map(lambda x: x[0], (self.t, self.q, self.v)), self.params)
+
     def jacobi_integral(self) -> Float[Array, " T"]:
         """The Jacobi integral `v·p - L` at every output, (T,), `[L]`. Not for batched trajectories."""
-        return jacobi_and_scale(self.system, self.t, self.q, self.v, self.params)[0]
+        return jacobi_and_scale(self.model, self.t, self.q, self.v)[0]
 
     def drift(self) -> Float[Array, ""]:
         """The largest change of the Jacobi integral at the outputs, relative to the largest `|v·p| + |L|` there.
 
         One that comes and goes between two outputs is not seen.
         """
-        return _worst_drift(self.system, self.t, self.q, self.v, self.params)
+        return _worst_drift(self.model, self.t, self.q, self.v)
 
     def residual(self) -> Float[Array, ""]:
         """The worst constraint residual over all outputs, positions and velocities, relative; 0 without constraints.
@@ -169,7 +175,7 @@ class Trajectory(eqx.Module):
         """
         if not self.system.constraints:
             return jnp.zeros_like(self.scaled_error)
-        return _worst_residual(self.system, self.t, self.q, self.v, self.params)
+        return _worst_residual(self.model, self.t, self.q, self.v)
 
     def at(self, t: ArrayLike) -> Snapshot:
         """Return the motion at any time, at the order of its method: continued from the output before by its own steps.
@@ -293,8 +299,7 @@ class Trajectory(eqx.Module):
         found = []
         if self.system.constraints:
             found.append(("worst constraint residual", f"{float(self.residual()):.1e} (relative, at the outputs)"))
-        first = jax.tree.map(lambda x: np.asarray(x)[0], (self.t, self.q, self.v))
-        changed_by = next(what_changes_jacobi_integral(self.system, *first, self.params), None)
+        changed_by = next(what_changes_jacobi_integral(self.model), None)
         as_it_may = "" if changed_by is None else f"; need not be conserved: {changed_by}"
         drift = f"{float(self.drift()):.1e} (relative, at the outputs)"
         found.append(("change of the Jacobi integral", drift + as_it_may))
@@ -315,20 +320,21 @@ class Trajectory(eqx.Module):
 
 
 @jitted
-def jacobi_and_scale(system, t, q, v, params):
+def jacobi_and_scale(model, t, q, v):
     """The Jacobi integral at each of a batch of states, and the size of its terms `|v·p| + |L|`."""
 
     def at(t, q, v):
-        value, p = jax.value_and_grad(system.lagrangian, argnums=2)(t, q, v, params)
-        power = coordinates.flatten(v)[0] @ coordinates.flatten(p)[0]
+        x, u = model.vectors(q, v)
+        value, p = jax.value_and_grad(model.lagrangian, argnums=2)(t, x, u)
+        power = u @ p
         return power - value, jnp.abs(power) + jnp.abs(value)
 
     return jax.vmap(at)(t, q, v)
 
 
-def worst_drift(system, t, q, v, params):
+def worst_drift(model, t, q, v):
     """The largest change of the Jacobi integral from the first state on, relative to its largest terms."""
-    h, scale = jacobi_and_scale(system, t, q, v, params)
+    h, scale = jacobi_and_scale(model, t, q, v)
     largest = jnp.nanmax(scale)
     return jnp.nanmax(jnp.abs(h - h[0])) / jnp.where(largest > 0, largest, 1.0)
 
@@ -340,10 +346,10 @@ def pack(system, params, asked: Asked, how: How) -> tuple[PyTree, Static]:
 
 
 @compiled
-def _worst_drift(system, t, q, v, params):
-    return worst_drift(system, t, q, v, params)
+def _worst_drift(model, t, q, v):
+    return worst_drift(model, t, q, v)
 
 
 @compiled
-def _worst_residual(system, t, q, v, params):
-    return worst_residual(system, t, q, v, params)
+def _worst_residual(model, t, q, v):
+    return worst_residual(model, t, q, v)

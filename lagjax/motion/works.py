@@ -9,15 +9,14 @@ Source: Piessens et al., *QUADPACK* (1983), §2.2.
 import warnings
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
-from lagjax.mechanics import constraints, coordinates
+from lagjax.mechanics import constraints
 from lagjax.mechanics.compiled import compiled
-from lagjax.mechanics.reactions import force_at
+from lagjax.mechanics.model import model_of
 from lagjax.mechanics.structure import sees_time
 from lagjax.motion.hybrid_trajectory import HybridTrajectory
 from lagjax.motion.integrate import integrate
@@ -80,8 +79,9 @@ class Motion:
             self.switch_times, to = np.asarray(self.switches.t)[:count], np.asarray(self.switches.to)[:count]
             self.entered = np.array([int(trajectory.system.first), *to])
         self.sources: dict[str, int] = {}
-        for system in self.systems:
-            self.sources |= _sources(system, self._at(0), self.params)
+        self.models = [model_of(system, *self._at(0), self.params) for system in self.systems]
+        for model in self.models:
+            self.sources |= _sources(model)
 
     def _at(self, row):
         return jax.tree.map(lambda x: x[row], (self.t, self.q, self.v))
@@ -93,7 +93,7 @@ class Motion:
     def _energies(self, phase, *state):
         found = Energies(*(np.full(len(phase), np.nan, self.t.dtype) for _ in Energies._fields))
         for i in np.unique(phase):
-            values = _energies(self.systems[i], *state, self.params)
+            values = _energies(self.models[i], *state)
             found = Energies(*(np.where(phase == i, new, old) for new, old in zip(values, found)))
         return found
 
@@ -107,10 +107,10 @@ class Motion:
         """The powers by source, (rows, n)."""
         powers = {name: np.zeros((len(t), size), self.t.dtype) for name, size in self.sources.items()}
         for i in np.unique(phase):
-            system = self.systems[i]
+            model = self.models[i]
             # Other phases have other multipliers.
-            of_phase = {name: multipliers[name] for name in system.constraints}
-            for name, power in _powers(system, t, q, v, of_phase, self.params).items():
+            of_phase = {name: multipliers[name] for name in model.zero_multipliers()}
+            for name, power in _powers(model, t, q, v, of_phase).items():
                 powers[name] = np.where((phase == i)[:, None], power, powers[name])
         return powers
 
@@ -234,8 +234,7 @@ class Motion:
         total = np.sum(work, axis=1)
         if name == TIME:
             return Work(power[:, 0], total, total)
-        unflatten = jax.vmap(coordinates.flatten(self._at(0)[2])[1])
-        return Work(*(jax.tree.map(np.asarray, unflatten(x)) for x in (power, work)), total)
+        return Work(*(self.models[0].tree(np.asarray(x)) for x in (power, work)), total)
 
 
 class Energies(NamedTuple):
@@ -248,51 +247,44 @@ class Energies(NamedTuple):
 
 
 @compiled
-def _energies(system, t, q, v, params):
+def _energies(model, t, q, v):
     """The `Energies` at each of a batch of states."""
 
     def at(t, q, v):
-        lagrangian = lambda v: system.lagrangian(t, q, v, params)
-        value, p = jax.value_and_grad(lagrangian)(v)
-        rest, p_at_rest = jax.value_and_grad(lagrangian)(jax.tree.map(jnp.zeros_like, v))
-        dot = lambda x, y: coordinates.flatten(x)[0] @ coordinates.flatten(y)[0]
-        power = dot(v, p)
-        return power - value, 0.5 * dot(v, jax.tree.map(jnp.subtract, p, p_at_rest)), -rest, abs(power) + abs(value)
+        x, u = model.vectors(q, v)
+        energy = jax.value_and_grad(model.lagrangian, argnums=2)
+        (value, p), (rest, p_at_rest) = energy(t, x, u), energy(t, x, jnp.zeros_like(u))
+        power = u @ p
+        return power - value, 0.5 * u @ (p - p_at_rest), -rest, abs(power) + abs(value)
 
     return jax.vmap(at)(t, q, v)
 
 
-def _sources(system, state, params) -> dict[str, int]:
+def _sources(model) -> dict[str, int]:
     """The sources of work in a system, and the size of each power."""
-    n = coordinates.flatten(state[1])[0].size
+    system, n = model.system, model.n
     found = {FORCE: n} if system.force is not None else {}
     found |= {DISSIPATION: n} if system.dissipation is not None else {}
-    found |= {TIME: 1} if sees_time(system.lagrangian, *state, params) else {}
+    found |= {TIME: 1} if sees_time(system.lagrangian, model) else {}
     return found | {constraint_in_words(name): n for name in system.constraints}
 
 
 @compiled
-def _powers(system, t, q, v, multipliers, params):
+def _powers(model, t, q, v, multipliers):
     """The power of each source at each of a batch of states, (rows, n)."""
-    timed = sees_time(system.lagrangian, *jax.tree.map(lambda x: x[0], (t, q, v)), params)
+    system, timed = model.system, sees_time(model.system.lagrangian, model)
 
     def at(t, q, v, multipliers):
-        x, unflatten = coordinates.flatten(q)
-        u, _ = coordinates.flatten(v)
-        powers = {}
+        (x, u), stacked, powers = model.vectors(q, v), model.stacked(multipliers), {}
         if system.force is not None:
-            stacked = [jnp.atleast_1d(multipliers[name]).ravel() for name in system.constraints]
-            force = force_at(system, t, q, v, params, jnp.concatenate([jnp.zeros(0, x.dtype), *stacked]))
-            powers[FORCE] = coordinates.flatten(force)[0] * u
+            powers[FORCE] = model.force(t, x, u, stacked) * u
         if system.dissipation is not None:
-            slope = jax.grad(lambda u: system.dissipation(t, q, unflatten(u), params))(u)
-            powers[DISSIPATION] = -slope * u
+            powers[DISSIPATION] = -jax.grad(model.dissipation, argnums=2)(t, x, u) * u
         if timed:
-            powers[TIME] = -jax.grad(lambda t: system.lagrangian(t, q, v, params))(t)[None]
-        for name, constraint in system.constraints.items():
-            alone = eqx.tree_at(lambda s: s.constraints, system, {name: constraint})
-            rows = constraints.jacobian(alone, t, x, u, params, unflatten)
-            powers[constraint_in_words(name)] = (rows.T @ jnp.atleast_1d(multipliers[name])) * u
+            powers[TIME] = -jax.grad(model.lagrangian)(t, x, u)[None]
+        rows = constraints.jacobian(model, t, x, u)
+        for name in system.constraints:
+            powers[constraint_in_words(name)] = (jnp.where(model.belongs_to(name), stacked, 0.0) @ rows) * u
         return powers
 
     return jax.vmap(at)(t, q, v, multipliers)
