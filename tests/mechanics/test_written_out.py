@@ -10,6 +10,7 @@ import pytest
 import lagjax as lj
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.equations import equations_of
+from lagjax.mechanics.model import model_of
 from lagjax.mechanics.written_out import is_small, write_out
 from lagjax.motion.consistency import to_manifold
 from lagjax.scenes import bead_on_hoop
@@ -55,8 +56,8 @@ def test_the_same_accelerations(name):
     system, like, params = SYSTEMS[name]
     for q, v in states(like):
         s = coordinates.state(0.4, q, v, params)
-        a, stacked = write_out(system, *s).equations(system, *s)
-        expected, multipliers = equations_of(system, *s).accelerations(*s[:3])
+        a, stacked = write_out(model_of(system, *s)).equations(model_of(system, *s), *s[:3])
+        expected, multipliers = equations_of(model_of(system, *s)).accelerations(*s[:3])
         flat = lambda tree: coordinates.flatten(tree)[0]
         np.testing.assert_allclose(flat(a), flat(expected), rtol=1e-12, atol=1e-13)
         np.testing.assert_allclose(stacked, flat(multipliers), rtol=1e-12)
@@ -66,22 +67,22 @@ def test_the_same_projection():
     """From 1e-5 off, the same nearest state as by the robust way; from far off, NaN."""
     q, v = {"x": 1.25 + 1e-5, "y": 2e-5}, {"x": 1e-5, "y": 3.0}
     s = coordinates.state(0.0, q, v, PARAMS)
-    project = write_out(rod_pendulum, *s).project
+    project = write_out(model_of(rod_pendulum, *s)).project
     assert project is not None
-    found = project(rod_pendulum, *s)
-    expected = to_manifold(equations_of(rod_pendulum, *s), *s[:3], 1e-9, 1e-9)
+    found = project(model_of(rod_pendulum, *s), *s[:3])
+    expected = to_manifold(equations_of(model_of(rod_pendulum, *s)), *s[:3], 1e-9, 1e-9)
     for a, b in zip(found, (expected.q, expected.v)):
         np.testing.assert_allclose(coordinates.flatten(a)[0], coordinates.flatten(b)[0], rtol=1e-14, atol=1e-15)
     far = coordinates.state(0.0, {"x": 1.4, "y": 0.3}, v, PARAMS)
-    assert np.isnan(project(rod_pendulum, *far)[0]["x"])
+    assert np.isnan(project(model_of(rod_pendulum, *far), *far[:3])[0]["x"])
 
 
 def evaluated(name):
     """The program of one evaluation, without the part computed once before the loop."""
     system, like, params = SYSTEMS[name]
     s = coordinates.state(0.4, *states(like, 1)[0], params)
-    numbers = write_out(system, *s).equations
-    prepared = numbers.prepare(system, s.params)
+    numbers = write_out(model_of(system, *s)).equations
+    prepared = numbers.prepare(model_of(system, *s))
     return operations(jax.make_jaxpr(numbers.at)(prepared, s.t, s.q, s.v).jaxpr)
 
 
@@ -114,11 +115,11 @@ def test_the_compiled_program():
     many = lj.System(lambda t, q, v, params: 0.5 * jnp.sum(v**2) + 0.1 * jnp.sum(v) ** 2 * jnp.cos(q[0]) ** 2)
     text = compiled(many, np.ones(9), np.ones(9), PARAMS)
     assert "lapack" in text.lower()
-    assert not is_small(many, *coordinates.state(0.0, np.ones(9), np.ones(9), PARAMS))
-    assert is_small(seven, *coordinates.state(0.0, np.ones(7), np.ones(7), PARAMS))
+    assert not is_small(model_of(many, *coordinates.state(0.0, np.ones(9), np.ones(9), PARAMS)))
+    assert is_small(model_of(seven, *coordinates.state(0.0, np.ones(7), np.ones(7), PARAMS)))
     # A network in L is left to arrays; twin: the same count of numbers in a vector is not.
-    assert not is_small(seven, *coordinates.state(0.0, np.ones(7), np.ones(7), np.ones((8, 8))))
-    assert is_small(seven, *coordinates.state(0.0, np.ones(7), np.ones(7), np.ones(64)))
+    assert not is_small(model_of(seven, *coordinates.state(0.0, np.ones(7), np.ones(7), np.ones((8, 8)))))
+    assert is_small(model_of(seven, *coordinates.state(0.0, np.ones(7), np.ones(7), np.ones(64))))
 
 
 @pytest.mark.exhaustive

@@ -18,6 +18,7 @@ import pytest
 import lagjax as lj
 from lagjax.mechanics import constraints, saddle_point
 from lagjax.mechanics.equations import equations_of
+from lagjax.mechanics.model import model_of
 from lagjax.motion.consistency import to_manifold
 from tests.tiers import exhaustive_but
 
@@ -651,7 +652,7 @@ def test_returning_to_a_velocity_constraint_leaves_positions():
     names = ("angle", "heading", "x", "y")
     q, v = dict(zip(names, x)), dict(zip(names, u))
     state = 0.0, q, v
-    projected = to_manifold(equations_of(vertical_disk, *state, DISK), *state, 1e-12, 1e-12)
+    projected = to_manifold(equations_of(model_of(vertical_disk, *state, DISK)), *state, 1e-12, 1e-12)
     assert [float(projected.q[name]).hex() for name in names] == [float(q[name]).hex() for name in names]
     mass, _, rows, *_ = (np.asarray(part) for part in disk_by_hand(DISK)(0.0, x, u))
     nearest = u - np.linalg.solve(mass, rows.T @ np.linalg.solve(rows @ np.linalg.solve(mass, rows.T), rows @ u))
@@ -664,7 +665,7 @@ def test_returning_to_the_plane_rolls():
     q, v = coin_state(COIN, 0.25, 1.25, 0.375, 1.5, -6.0)
     lifted = q | {"z": q["z"] + 1e-4}
     state = 0.0, lifted, v
-    moved = to_manifold(equations_of(tilting_disk, *state, COIN), *state, 1e-12, 1e-12).q
+    moved = to_manifold(equations_of(model_of(tilting_disk, *state, COIN)), *state, 1e-12, 1e-12).q
     step = {name: float(moved[name]) - lifted[name] for name in q}
     slid = np.asarray(contact_at_rest(0.0, lifted, step, COIN))
     assert abs(float(touches(0.0, moved, COIN))) < ROUND_OFF
@@ -717,8 +718,8 @@ def test_gradients_of_cruising_in_reverse():
 def test_an_error_in_the_equations_would_show(flaw, monkeypatch):
     """With one of the usual errors built into the library itself, the driven particle leaves its closed form."""
 
-    def rows(system, t, x, u, params, unflatten):
-        level = lambda t, x, u: constraints.velocity_residual(system, t, x, u, params, unflatten)
+    def rows(model, t, x, u):
+        level = lambda t, x, u: constraints.velocity_residual(model, t, x, u)
         time = jnp.where(flaw == "no d(phi)/dt", 0.0, jnp.ones_like(t))
         along = jnp.where(flaw == "no (d phi/dq) v", 0.0, u)
         _, rate = jax.jvp(lambda t, x: level(t, x, u), (t, x), (time, along))

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import lagjax as lj
+from lagjax.mechanics.model import model_of
 from lagjax.mechanics.structure import what_changes_jacobi_integral
 from lagjax.motion import solve
 from tests.systems import HORIZONTAL, PARAMS, TS, pendulum, rod_pendulum
@@ -63,8 +64,8 @@ def test_what_changes_the_jacobi_integral(words):
     """Each cause is named, and a system that conserves the Jacobi integral has none."""
     state = jnp.asarray(0.0), jnp.asarray(1.0), jnp.asarray(1.0), None
     free = lambda t, q, v, params: 0.5 * v**2
-    assert list(what_changes_jacobi_integral(lj.System(free, **CHANGES[words]), *state)) == [words]
-    assert not list(what_changes_jacobi_integral(lj.System(free), *state))
+    assert list(what_changes_jacobi_integral(model_of(lj.System(free, **CHANGES[words]), *state))) == [words]
+    assert not list(what_changes_jacobi_integral(model_of(lj.System(free), *state)))
 
 
 def test_carries_its_system_and_parameters(traj):
