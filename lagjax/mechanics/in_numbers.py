@@ -20,7 +20,7 @@ from lagjax.jax_internals.tracing import WATCHED
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.arguments import takes_of
 from lagjax.mechanics.memory import varies
-from lagjax.mechanics.model import Model, unchecked
+from lagjax.mechanics.model import Form, Model, unchecked
 from lagjax.numerics.scalars import written_out
 
 # The most operations that are written out, before it is known which are needed. Writing a hundred thousand, as for an L
@@ -32,7 +32,7 @@ class InNumbers(eqx.Module):
     """A function of (t, q, v, params) or (t, q, params), taking each state as a tuple of numbers."""
 
     function: Callable
-    tree: Callable = eqx.field(static=True)
+    form: Form = eqx.field(static=True)
     returns_coordinates: bool = eqx.field(static=True, default=False)
 
     @property
@@ -42,14 +42,14 @@ class InNumbers(eqx.Module):
     def __call__(self, t, *states_and_params):
         *states, params = states_and_params
         # Multipliers come by name, and pass unchanged.
-        together = lambda state: self.tree(jnp.stack(state)) if isinstance(state, tuple) else state
+        together = lambda state: self.form.tree(jnp.stack(state)) if isinstance(state, tuple) else state
         result = self.function(t, *map(together, states), params)
         return coordinates.numbers(result) if self.returns_coordinates else result
 
 
 def in_numbers(model: Model) -> Model:
     """The same system, with a tuple of numbers for q and for v."""
-    change = lambda function, role: InNumbers(function, model.form.tree, returns_coordinates=role == "force")
+    change = lambda function, role: InNumbers(function, model.form, returns_coordinates=role == "force")
     structure = jtu.tree_structure((0,) * model.n)
     form = model.form._replace(structure=structure, shapes=((),) * model.n)
     return unchecked(model.system.map(change), model.params, form)
