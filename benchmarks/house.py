@@ -11,7 +11,7 @@
     lambdas                 lambdas that get a name
     tested                  per cent of the files that have a test file of their name
 
-A walk counts the functions that are called with the system at the first call from Python: `stays` distinct functions,
+A walk counts the functions that are called with the system, or its model, at the first call from Python: `stays` distinct functions,
 `files` in which they lie, `returns` to a file that had been left (stays less files), `climbs` from a file to one of a
 package above it.
 
@@ -33,6 +33,7 @@ import numpy as np
 from measure import main, row
 
 import lagjax as lj
+from lagjax.mechanics.model import Model
 
 jax.config.update("jax_enable_x64", True)
 
@@ -135,7 +136,7 @@ def walk(call):
         if event != "call" or not code.co_filename.startswith(root):
             return
         for name in code.co_varnames[: code.co_argcount + code.co_kwonlyargcount]:
-            if isinstance(frame.f_locals.get(name), lj.System | lj.Hybrid):
+            if isinstance(frame.f_locals.get(name), lj.System | lj.Hybrid | Model):
                 found.setdefault((Path(code.co_filename).relative_to(ROOT), code.co_name))
 
     sys.setprofile(seen)
@@ -161,7 +162,7 @@ def walks(wanted):
         "integrate": (lambda: lj.integrate(mass, start, at_rest, params, ts=ts), 35, 6, 15),
         "fit": (lambda: lj.fit(mass, measured, params, free="g", progress=False), 60, None, 30),
         "normal modes": (lambda: lj.normal_modes(mass, 0.0, {"x": 0.0, "y": -1.0}, at_rest, params), 35, None, 20),
-        "periodic orbit": (lambda: lj.periodic_orbit(swing, 1.0, 0.0, 2.1, params), None, None, None),
+        "periodic orbit": (lambda: lj.periodic_orbit(swing, (1.0, 0.0), 2.1, params), None, None, None),
     }
     for name, (call, most, most_climbs, most_returns) in doors.items():
         if not wanted(name):

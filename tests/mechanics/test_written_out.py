@@ -143,4 +143,4 @@ def test_a_long_program_is_not_written_out(monkeypatch):
     s = coordinates.state(0.0, np.array([2.0, 0.0, 0.3]), np.zeros(3), None)
     assert write_out(model_of(system, *s)) is None
     short = lj.System(lambda t, q, v, params: 0.5 * v @ v + 1 / jnp.sqrt(q @ q))
-    assert write_out(short, *s) is not None
+    assert write_out(model_of(short, *s)) is not None
