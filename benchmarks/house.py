@@ -11,9 +11,9 @@
     lambdas                 lambdas that get a name
     tested                  per cent of the files that have a test file of their name
 
-A walk counts the functions that are called with the system, or its model, at the first call from Python: `stays` distinct functions,
-`files` in which they lie, `returns` to a file that had been left (stays less files), `climbs` from a file to one of a
-package above it.
+A walk counts the functions that are called with the system, or its model, at the first call from Python: `stays`
+distinct functions, `files` in which they lie, `returns` to a file that had been left (stays less files), `climbs` from
+a file to one of a package above it.
 
     python benchmarks/house.py [--json FILE]
 """

@@ -191,7 +191,7 @@ def _ticks_in_pi(axis):
     axis.xaxis.set_major_formatter(FuncFormatter(label))
 
 
-class Drawn(NamedTuple):
+class DrawnAxes(NamedTuple):
     """One panel of a work-precision diagram.
 
     - `label`: the label of the work axis. `floor`: the error of the reference; 0 if unknown.
@@ -204,7 +204,7 @@ class Drawn(NamedTuple):
     floor: float
 
 
-def work_precision(panels: Sequence[Drawn]):
+def work_precision(panels: Sequence[DrawnAxes]):
     """Draw error against work, one panel each; the number at a curve is its order. Returns a matplotlib `Figure`.
 
     Errors of zero are drawn at half a unit of round-off; untrusted points are hollow, and errors below that of the

@@ -45,7 +45,7 @@ SINGULAR_BELOW = {np.dtype("float64"): 1e-13, np.dtype("float32"): 1e-6}
 VELOCITY, MOMENTUM = "velocity", "momentum"
 
 
-class Symmetries(eqx.Module):
+class SteadySymmetries(eqx.Module):
     """The symmetries of a steady motion: cyclic coordinates by index, or fields `field(q, params)` shaped like v."""
 
     places: tuple[int, ...] = eqx.field(static=True, default=())
@@ -64,7 +64,7 @@ class Steady(eqx.Module):
     t: Float[Array, ""]
     held: Float[Array, " k"]
     x0: Float[Array, " n"]
-    symmetries: Symmetries = eqx.field(static=True)
+    symmetries: SteadySymmetries = eqx.field(static=True)
 
     @property
     def system(self) -> System:

@@ -40,7 +40,7 @@ from lagjax.numerics.rank import independent_rows
 FOLD, BRANCH, MULTIPLE, FLUTTER, COLLISION, ESCAPE = "fold", "branch", "multiple", "flutter", "collision", "escape"
 
 
-class Place(eqx.Module):
+class ParameterPlace(eqx.Module):
     """The location of a branch's parameter: a number in `params`, or a held rate or momentum (`of_params` is None)."""
 
     name: str = eqx.field(static=True)
@@ -72,7 +72,7 @@ class Frame(eqx.Module):
     rows: Float[Array, " R"]
     columns: Float[Array, " N"]
     unit: Float[Array, ""]
-    place: Place
+    place: ParameterPlace
 
     def split(self, z):
         """The problem at a point, and its unknowns in the user's units."""
@@ -85,19 +85,19 @@ class Frame(eqx.Module):
         return jnp.concatenate([self.combinations @ full, self.free @ (z[:-1] - self.reference)])
 
 
-def place_of(steady: Steady, along: str) -> Place:
+def place_of(steady: Steady, along: str) -> ParameterPlace:
     """Find a parameter by name, `"omega"`, `"spring.k"`, `"k[1]"`; or a held rate `"v.psi"` or momentum `"p.psi"`."""
     names = steady.model.names
     for kind, hold in (("v", equations.VELOCITY), ("p", equations.MOMENTUM)):
         held_names = [f"{kind}.{names[i]}" if names[i] != "q" else kind for i in steady.symmetries.places]
         held_names = held_names or [f"{kind}[{i}]" for i in range(steady.symmetries.count)]
         if along in held_names and steady.symmetries.hold == hold:
-            return Place(along, None, held_names.index(along))
+            return ParameterPlace(along, None, held_names.index(along))
     numbers = numbers_in(steady.params)
     if along not in numbers:
         more = 'and "v.psi" for the velocity of a cyclic coordinate psi that is held (with hold="momentum": "p.psi")'
         raise no_such_number(along, steady.params, more)
-    return Place(along, numbers[along])
+    return ParameterPlace(along, numbers[along])
 
 
 @compiled

@@ -30,7 +30,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from lagjax.analysis.flow import Flow, flow_of
-from lagjax.analysis.guessing import TURN, Asked, Guess, guessed
+from lagjax.analysis.guessing import TURN, Guess, OrbitRequest, guessed
 from lagjax.mechanics.compiled import compiled
 from lagjax.mechanics.model import model_of
 
@@ -51,14 +51,14 @@ LONGEST_STEP = 0.5
 HELD_WEIGHT = 100.0
 
 
-class Candidate(NamedTuple):
+class OrbitCandidate(NamedTuple):
     """A candidate orbit: its states (K, 2n) and its period."""
 
     nodes: Float[Array, "K 2n"]
     period: Float[Array, ""]
 
 
-class Evaluation(NamedTuple):
+class OrbitEvaluation(NamedTuple):
     """The flow evaluated at a candidate: the residual, its root mean square `size`, and the matrix of a Newton step.
 
     The columns of `matrix` are coordinates along the `bases`. `amplified`: the largest entry of a tangent frame.
@@ -78,9 +78,9 @@ class Evaluation(NamedTuple):
 class SearchResult(NamedTuple):
     """The best candidate and how the search went; `apart`: how much a driven system changes from period to period."""
 
-    candidate: Candidate
+    candidate: OrbitCandidate
     guess: Guess
-    evaluation: Evaluation
+    evaluation: OrbitEvaluation
     converged: Bool[Array, ""]
     iterations: Int[Array, ""]
     apart: Float[Array, ""]
@@ -92,8 +92,8 @@ class Search(NamedTuple):
     `moves`: how far the guess moves in its period.
     """
 
-    best: Candidate
-    evaluation: Evaluation
+    best: OrbitCandidate
+    evaluation: OrbitEvaluation
     damping: Float[Array, ""]
     moves: Float[Array, ""]
     iterations: Int[Array, ""]
@@ -115,7 +115,7 @@ class Goal(NamedTuple):
 
 
 @compiled
-def closed(system, s, period, rtol, asked: Asked, rows, parts, turns, most) -> SearchResult:
+def closed(system, s, period, rtol, asked: OrbitRequest, rows, parts, turns, most) -> SearchResult:
     """Search for an orbit near a state; `turns` (n,): the turns of the angles, or None for those of the guess."""
     flow, t = flow_of(model_of(system, *s), rtol, rows), s.t
     guess = guessed(flow, t, flow.vector(s.q, s.v), period, asked, parts, turns)
@@ -123,8 +123,10 @@ def closed(system, s, period, rtol, asked: Asked, rows, parts, turns, most) -> S
     zero, size = jnp.zeros((), t.dtype), 2 * flow.size - len(flow.rows)
     rows_of = parts * 2 * flow.size + asked.moves + asked.energy + len(asked.held)
     matrix, bases = jnp.zeros((rows_of, parts * size + 1), t.dtype), jnp.zeros((parts, 2 * flow.size, size), t.dtype)
-    unevaluated = Evaluation(zero + jnp.inf, matrix[:, 0], matrix, bases, zero + 1, guess.z, zero)
-    begin = Search(Candidate(guess.nodes, guess.period), unevaluated, zero + FIRST_DAMPING, zero, jnp.zeros((), int))
+    unevaluated = OrbitEvaluation(zero + jnp.inf, matrix[:, 0], matrix, bases, zero + 1, guess.z, zero)
+    begin = Search(
+        OrbitCandidate(guess.nodes, guess.period), unevaluated, zero + FIRST_DAMPING, zero, jnp.zeros((), int)
+    )
 
     def unfinished(search):
         limit = rtol * jnp.maximum(1.0, search.evaluation.amplified)
@@ -156,7 +158,7 @@ def closed(system, s, period, rtol, asked: Asked, rows, parts, turns, most) -> S
     return SearchResult(search.best, guess, search.evaluation, converged, search.iterations, apart)
 
 
-def implicit(system, s, rtol, asked: Asked, rows, found: SearchResult) -> SearchResult:
+def implicit(system, s, rtol, asked: OrbitRequest, rows, found: SearchResult) -> SearchResult:
     """The same orbit with its derivatives by the system, parameters and held quantities, from one more Newton step."""
     flow, t = flow_of(model_of(system, *s), rtol, rows), s.t
     found = lax.stop_gradient(found)
@@ -164,7 +166,7 @@ def implicit(system, s, rtol, asked: Asked, rows, found: SearchResult) -> Search
     goal_z = flow.onto_constraints(t, flow.vector(s.q, s.v), scale)
     goal = Goal(integral_at(flow, t, goal_z), goal_z)
     nodes = jax.vmap(lambda z: flow.onto_constraints(t, z, scale))(found.candidate.nodes)
-    candidate = Candidate(nodes, found.candidate.period)
+    candidate = OrbitCandidate(nodes, found.candidate.period)
     no_frame = jnp.zeros((flow.size * 2, 0), nodes.dtype)
     part = lambda t, z: flow.passage(t, z, found.candidate.period / len(nodes), no_frame, scale, differentiable=True).z
     ends = jnp.stack([part(t, z) for t, z in zip(_times(t, candidate), nodes)])
@@ -172,7 +174,7 @@ def implicit(system, s, rtol, asked: Asked, rows, found: SearchResult) -> Search
     # The value is that of the search, the derivative that of the step.
     change = residual - lax.stop_gradient(residual)
     step = _step(evaluation.matrix, change, evaluation.bases, asked, lax.stop_gradient(flow.rtol), 0.0)
-    candidate = Candidate(nodes + scale[None] * step.moves, candidate.period * (1 + step.log_period))
+    candidate = OrbitCandidate(nodes + scale[None] * step.moves, candidate.period * (1 + step.log_period))
     displacement = ends[-1] - nodes[0] + scale * step.displacement
     return found._replace(candidate=candidate, evaluation=evaluation._replace(displacement=displacement))
 
@@ -189,12 +191,12 @@ def _next_candidate(flow, t, search, asked, scale):
     moves, log_period, _ = _step(evaluation.matrix, evaluation.residual, evaluation.bases, asked, flow.rtol, damping)
     longest = jnp.maximum(jnp.max(jnp.abs(moves)), jnp.abs(log_period))
     part = jnp.minimum(1.0, LONGEST_STEP / jnp.where(longest > 0, longest, 1.0))
-    candidate = Candidate(best.nodes + part * scale[None] * moves, best.period * jnp.exp(part * log_period))
+    candidate = OrbitCandidate(best.nodes + part * scale[None] * moves, best.period * jnp.exp(part * log_period))
     onto = lambda t, z: flow.onto_constraints(t, z, scale)
     return candidate._replace(nodes=jax.vmap(onto)(_times(t, candidate), candidate.nodes))
 
 
-def _evaluate(flow, t, candidate, asked, goal, guess) -> Evaluation:
+def _evaluate(flow, t, candidate, asked, goal, guess) -> OrbitEvaluation:
     """Follow the flow from each node to the next, with the tangent spaces."""
     times, span, scale = _times(t, candidate), candidate.period / len(candidate.nodes), guess.scale
     bases = jax.vmap(lambda t, z: flow.tangent_space(t, z, scale))(times, candidate.nodes)
@@ -211,7 +213,7 @@ def _evaluate(flow, t, candidate, asked, goal, guess) -> Evaluation:
     finished = jnp.all(passed.ended) & jnp.isfinite(size) & jnp.all(jnp.isfinite(matrix))
     clean = lambda x: jnp.where(finished, x, 0.0)
     amplified, size = clean(jnp.max(jnp.abs(passed.frame))), jnp.where(finished, size, jnp.inf)
-    return Evaluation(size, clean(residual), clean(matrix), bases, amplified, displacement, moves)
+    return OrbitEvaluation(size, clean(residual), clean(matrix), bases, amplified, displacement, moves)
 
 
 def _equations(flow, t, candidate, passed, bases, scale, asked):

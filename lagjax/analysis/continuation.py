@@ -12,14 +12,14 @@ import numpy as np
 from jaxtyping import ArrayLike, PyTree
 
 from lagjax.analysis.balance import VELOCITY, Steady
-from lagjax.analysis.branch_equations import Frame, Place, full_jacobian, place_of
+from lagjax.analysis.branch_equations import Frame, ParameterPlace, full_jacobian, place_of
 from lagjax.analysis.branches import Branch, Branches, Critical
 from lagjax.analysis.critical_points import CriticalPoint, between, escape
 from lagjax.analysis.equilibria import held_at, searched
 from lagjax.analysis.found_equilibria import OK, WORDS
 from lagjax.analysis.starts import checked, stacked, stacked_one, symmetries_of
 from lagjax.analysis.steady_tracer import SteadyTracer
-from lagjax.analysis.tracing import AGAIN, FIRST, Path, Point
+from lagjax.analysis.tracing import AGAIN, FIRST, BranchPoint, Path
 from lagjax.jax_internals.tracing import is_eager
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.compiled import compiled
@@ -151,7 +151,7 @@ def _solution(steady: Steady, v) -> np.ndarray | str:
     return np.concatenate([flat(row.q), row.rates, flat(row.multipliers)])
 
 
-def _frame(steady: Steady, place: Place, first: float, last: float, v, units) -> tuple[Frame, np.ndarray]:
+def _frame(steady: Steady, place: ParameterPlace, first: float, last: float, v, units) -> tuple[Frame, np.ndarray]:
     """The units and the combinations of equations that are solved; and the point at which the branch begins."""
     y, x0 = _solution(steady, v), steady.model.tree(steady.x0)
     if isinstance(y, str):
@@ -241,7 +241,7 @@ class _Run:
                 for branches_at in self.branches_at:
                     branches_at.discard(len(self.paths))
 
-    def _follow(self, begin: Point):
+    def _follow(self, begin: BranchPoint):
         path = self.tracer.trace(begin, self.most, self._step)
         self._describe_infinity(path)
         self.paths.append(path)
@@ -253,7 +253,7 @@ class _Run:
         point = self.tracer.point(critical.z, sign * launch.direction)
         if isinstance(point, str):
             return Path([], point)
-        begin = Point(
+        begin = BranchPoint(
             critical.z, jacobian, sign * launch.direction, 0.0, point.outputs, None, point.negative, launch.critical
         )
         path = self.tracer.trace(begin, self.most, self._step, FIRST)
@@ -272,7 +272,7 @@ class _Run:
             self.found.append(found)
             self.branches_at.append({len(self.paths)})
 
-    def _step(self, before: Point, after: Point, path: Path) -> str | None:
+    def _step(self, before: BranchPoint, after: BranchPoint, path: Path) -> str | None:
         """Put the critical points between two points into the path; return why the branch ends, or None."""
         points = path.points
         if len(points) >= LINE and points[0].critical is not None:
@@ -312,7 +312,9 @@ class _Run:
         point = self.tracer.point(found.z, after.tangent)
         if isinstance(point, str):
             point = after
-        return Point(found.z, point.jacobian, after.tangent, after.sign, point.outputs, None, after.negative, number)
+        return BranchPoint(
+            found.z, point.jacobian, after.tangent, after.sign, point.outputs, None, after.negative, number
+        )
 
     def _number(self, found: CriticalPoint) -> tuple[int, bool]:
         """The number of a critical point among those found, and whether it was known already."""

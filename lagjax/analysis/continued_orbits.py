@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax.analysis.flow import flow_of
-from lagjax.analysis.guessing import Asked, guessed
-from lagjax.analysis.monodromy import Problem, problem_of, tolerance_of
+from lagjax.analysis.guessing import OrbitRequest, guessed
+from lagjax.analysis.monodromy import OrbitProblem, problem_of, tolerance_of
 from lagjax.analysis.numbers_in import no_such_number, numbers_in
 from lagjax.analysis.orbit import PeriodicOrbit
 from lagjax.analysis.orbit_branch import CriticalOrbit, OrbitBranch
@@ -26,7 +26,7 @@ from lagjax.analysis.orbit_equations import (
 )  # fmt: skip
 from lagjax.analysis.orbit_tracer import OrbitTracer
 from lagjax.analysis.starts import checked
-from lagjax.analysis.tracing import Path, Point
+from lagjax.analysis.tracing import BranchPoint, Path
 from lagjax.jax_internals.tracing import is_eager
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.compiled import compiled
@@ -113,7 +113,7 @@ def _check(orbit):
         )
 
 
-def _along(along, orbit: PeriodicOrbit, problem: Problem) -> tuple[Along, Asked]:
+def _along(along, orbit: PeriodicOrbit, problem: OrbitProblem) -> tuple[Along, OrbitRequest]:
     """What changes along the branch, and what the orbits still hold."""
     asked, reasons, names = orbit.asked, problem.reasons, coordinates.names(orbit.q)
     numbers = numbers_in(problem.state.params)
@@ -236,7 +236,7 @@ class _Follower:
     def __init__(self, tracer: OrbitTracer):
         self.tracer, self.found = tracer, []
 
-    def step(self, before: Point, after: Point, path: Path) -> str | None:
+    def step(self, before: BranchPoint, after: BranchPoint, path: Path) -> str | None:
         """Put the critical points between two points into the path; return why the branch ends, or None."""
         tracer, name = self.tracer, self.tracer.frame.along.name
         if tracer.frame.asked.moves:

@@ -32,7 +32,7 @@ from lagjax.analysis.branch_equations import (
     extended_by_params,
 )  # fmt: skip
 from lagjax.analysis.steady_tracer import SteadyTracer
-from lagjax.analysis.tracing import Point
+from lagjax.analysis.tracing import BranchPoint
 
 NEWTON = 12
 # A direction whose component along the parameter is smaller leaves the parameter constant.
@@ -56,7 +56,7 @@ class CriticalPoint:
     used: list[np.ndarray]
 
 
-def between(tracer: SteadyTracer, a: Point, b: Point) -> list[CriticalPoint]:
+def between(tracer: SteadyTracer, a: BranchPoint, b: BranchPoint) -> list[CriticalPoint]:
     """All critical points between two neighbouring points of a branch."""
     found = []
     if max(abs(b.z[-1] - a.z[-1]), abs(a.tangent[-1]), abs(b.tangent[-1])) < CONSTANT:
@@ -170,7 +170,7 @@ def _fold(tracer, a, b):
     return CriticalPoint("fold", big[: z.size], [], 0.0, _derivative(tracer, FOLD, big, np.zeros(1)), accuracy, [])
 
 
-def escape(tracer: SteadyTracer, point: Point) -> CriticalPoint | None:
+def escape(tracer: SteadyTracer, point: BranchPoint) -> CriticalPoint | None:
     """The critical point where the solution of linear equations goes to infinity, from a point far out."""
     n = tracer.frame.columns.size
     half, here = point.z.copy(), tracer.at(point.z)[1][:, :-1]

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import ArrayLike, PyTree
 
 from lagjax.analysis import closing
-from lagjax.analysis.guessing import Asked
+from lagjax.analysis.guessing import OrbitRequest
 from lagjax.analysis.monodromy import problem_of, refuse_singular, tolerance_of
 from lagjax.analysis.orbit import PeriodicOrbit
 from lagjax.jax_internals.tracing import is_eager
@@ -128,7 +128,7 @@ def _pair(start):
     return start
 
 
-def _asked(problem, names, hold, relative) -> Asked:
+def _asked(problem, names, hold, relative) -> OrbitRequest:
     driven = not problem.reasons.autonomous
     all_names = [*names, *(_velocity(name) for name in names)]
     wanted = {relative} if isinstance(relative, str) else set(relative)
@@ -148,7 +148,7 @@ def _asked(problem, names, hold, relative) -> Asked:
                 f"the system depends on time, so the orbit has the period of the drive and cannot also hold={hold!r}.\n"
                 "Fix: leave hold out."
             )
-        return Asked(False, False, False, (), mask, problem.is_angle)
+        return OrbitRequest(False, False, False, (), mask, problem.is_angle)
     if hold is None:
         hold = ("energy",) if problem.reasons.energy else ()
     hold = (hold,) if isinstance(hold, str) else tuple(hold)
@@ -165,7 +165,7 @@ def _asked(problem, names, hold, relative) -> Asked:
             "Fix: hold=(), or leave hold out."
         )
     held = tuple(all_names.index(name) for name in entries)
-    return Asked("period" not in hold, True, "energy" in hold, held, mask, problem.is_angle)
+    return OrbitRequest("period" not in hold, True, "energy" in hold, held, mask, problem.is_angle)
 
 
 def _velocity(name):

@@ -253,7 +253,7 @@ def held_by_momentum(steady: Steady, x, rates) -> Steady:
     if not steady.symmetries.count or steady.symmetries.hold is None or not steady.conservative:
         return steady
     held = np.asarray(_momenta(steady, x, rates))
-    symmetries = equations.Symmetries(steady.symmetries.places, steady.symmetries.fields, MOMENTUM)
+    symmetries = equations.SteadySymmetries(steady.symmetries.places, steady.symmetries.fields, MOMENTUM)
     return Steady(steady.model, steady.t, held, steady.x0, symmetries)
 
 

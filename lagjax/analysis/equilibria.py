@@ -29,7 +29,7 @@ from lagjax.analysis.found_equilibria import (
     OK,
     UNFINISHED,
     Equilibria,
-    Row,
+    EquilibriumRow,
     merged,
 )  # fmt: skip
 from lagjax.analysis.reduced_force import CREEPS_BELOW, nearest, soft_below
@@ -143,7 +143,9 @@ def equilibria(
     return merged(as_table(rows), angles(model), radii)
 
 
-def _decided(steady: Steady, rows: Row, starts, lasting, unseen, search) -> tuple[Row, np.ndarray]:
+def _decided(
+    steady: Steady, rows: EquilibriumRow, starts, lasting, unseen, search
+) -> tuple[EquilibriumRow, np.ndarray]:
     """The rows, those with an almost vanishing stiffness judged by the terms that decide there; and their radii.
 
     A root that several starts reached is moved to where it is exactly, to within its radius (S,) otherwise.
@@ -194,7 +196,7 @@ def _decided(steady: Steady, rows: Row, starts, lasting, unseen, search) -> tupl
     return rows, radii
 
 
-def _from_valleys(steady: Steady, rows: Row, lost, unseen, search, size_of) -> Row:
+def _from_valleys(steady: Steady, rows: EquilibriumRow, lost, unseen, search, size_of) -> EquilibriumRow:
     """The rows, with searches that crept along a valley towards a multiple root ended there."""
     q = jax.tree.map(np.array, rows.last)
     for i in lost:
@@ -252,7 +254,7 @@ def _moving(v, count):
 
 
 @partial(compiled, in_numpy=True)
-def searched(steady: Steady, q, v, lasting, expected, concrete) -> Row:
+def searched(steady: Steady, q, v, lasting, expected, concrete) -> EquilibriumRow:
     """Search from each start; one row each. `expected`: the number of coordinates at rest that nothing depends on."""
     return jax.vmap(lambda q, v: _search(steady, q, v, lasting, expected, concrete))(q, v)
 
@@ -267,7 +269,7 @@ def held_at(steady: Steady, x, u):
     return rates, steady.momenta(x, steady.velocity(x, rates)) if steady.symmetries.hold == MOMENTUM and k else rates
 
 
-def _search(steady: Steady, q, v, lasting, expected, concrete) -> Row:
+def _search(steady: Steady, q, v, lasting, expected, concrete) -> EquilibriumRow:
     x0, u0 = coordinates.flatten(q)[0], coordinates.flatten(v)[0]
     rates, held = held_at(steady, x0, u0)
     steady = Steady(steady.model, steady.t, held, steady.x0, steady.symmetries)
@@ -278,7 +280,7 @@ def _search(steady: Steady, q, v, lasting, expected, concrete) -> Row:
     return _row(steady, y, root, y0, lasting, expected, concrete)
 
 
-def _row(steady: Steady, y, root, y0, lasting, expected, concrete) -> Row:
+def _row(steady: Steady, y, root, y0, lasting, expected, concrete) -> EquilibriumRow:
     """The row of a root: the solution in the user's structure, its stability and its status."""
     x, rates, multipliers = steady.parts(y)
     u, a = steady.velocity_and_acceleration(x, rates)
@@ -298,7 +300,7 @@ def _row(steady: Steady, y, root, y0, lasting, expected, concrete) -> Row:
     momenta = steady.momenta(x, u) if steady.symmetries.count else jnp.zeros(0, x.dtype)
     is_found = status == OK
     fill = lambda tree: jax.tree.map(lambda x: jnp.where(is_found, x, jnp.nan), tree)
-    return Row(
+    return EquilibriumRow(
         fill(steady.model.tree(x)), fill(steady.model.tree(u)), fill(by_name), fill(rates), fill(momenta),
         settled & ~undecided, undecided, fill(roots), is_found, zero_modes, soft, imbalance, status,
         steady.model.tree(root.y[: steady.n]),

@@ -8,7 +8,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int, PyTree
 
-from lagjax.analysis.balance import Symmetries
+from lagjax.analysis.balance import SteadySymmetries
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.diagnosis import describe
 from lagjax.mechanics.printable import by_line
@@ -26,7 +26,7 @@ WORDS = (
 SAME = 1e-6
 
 
-class Row(NamedTuple):
+class EquilibriumRow(NamedTuple):
     """The result of one start; the names are those of `Equilibria`."""
 
     q: PyTree[Float[Array, "..."]]
@@ -88,7 +88,7 @@ class Equilibria(eqx.Module):
     last: PyTree[Float[Array, "S ..."]]
     starts: PyTree[Float[Array, "S ..."]]
     params: PyTree
-    symmetries: Symmetries = eqx.field(static=True)
+    symmetries: SteadySymmetries = eqx.field(static=True)
     of_start: Int[Array, " S"] | None = None
 
     def __len__(self):
@@ -146,7 +146,7 @@ def merged(rows: Equilibria, is_angle: PyTree[bool], radii: np.ndarray) -> Equil
             of_start[i] = len(kept)
             kept.append(i)
     pick = lambda tree: jax.tree.map(lambda x: x[np.array(kept, int)], tree)
-    row_fields = [name for name in Row._fields if name not in ("status", "last")]
+    row_fields = [name for name in EquilibriumRow._fields if name not in ("status", "last")]
     return replace(rows, **{name: pick(getattr(rows, name)) for name in row_fields}, of_start=of_start)
 
 

@@ -25,7 +25,7 @@ STILL = 1e-6
 BEGINNING = 0.4
 
 
-class Asked(NamedTuple):
+class OrbitRequest(NamedTuple):
     """The kind of orbit that is searched; all fields are static.
 
     - `free`: whether the period is unknown; `moves`: whether the start may move along the orbit (no dependence on t).
@@ -51,7 +51,7 @@ class Guess(NamedTuple):
     turns: Float[Array, " n"]
 
 
-def guessed(flow: Flow, t, z, period, asked: Asked, parts: int, turns) -> Guess:
+def guessed(flow: Flow, t, z, period, asked: OrbitRequest, parts: int, turns) -> Guess:
     """Follow a guess; `turns` (n,): the turns of the angles, or None to count those of the guess."""
     z = flow.onto_constraints(t, z, scale_of(z, period))
     find_period = asked.free and parts == 1

@@ -29,7 +29,7 @@ FRACTIONS = 0.5 ** np.arange(16.0)
 ROUND_OFFS = 1e3
 
 
-class Velocity(NamedTuple):
+class SolvedVelocity(NamedTuple):
     """The velocity for a given momentum, whether M is regular there, and whether the momentum was reached."""
 
     v: Float[Array, " n"]
@@ -38,7 +38,7 @@ class Velocity(NamedTuple):
     reached: Bool[Array, ""]
 
 
-def velocity_of(momentum: Callable, p: Float[Array, " n"]) -> Velocity:
+def velocity_of(momentum: Callable, p: Float[Array, " n"]) -> SolvedVelocity:
     """Solve `momentum(v) = p`, the gradient of a function of v, in vector form."""
     zero = jnp.zeros_like(p)
     mass = jax.jacfwd(momentum)
@@ -46,11 +46,11 @@ def velocity_of(momentum: Callable, p: Float[Array, " n"]) -> Velocity:
         matrix = mass(zero)
         v = dense.solve(matrix, p - momentum(zero))
         reached = jnp.all(jnp.isfinite(v))
-        return Velocity(v, matrix, _regular(matrix), reached)
+        return SolvedVelocity(v, matrix, _regular(matrix), reached)
     v = lax.custom_root(lambda v: momentum(v) - p, zero, _newton, _tangent)
     at, target = lax.stop_gradient(v), lax.stop_gradient(p)
     matrix = mass(at)
-    return Velocity(v, matrix, _regular(matrix), _reached(momentum(at), target, matrix, at))
+    return SolvedVelocity(v, matrix, _regular(matrix), _reached(momentum(at), target, matrix, at))
 
 
 def is_linear(momentum: Callable, like) -> bool:

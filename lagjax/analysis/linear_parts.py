@@ -42,7 +42,7 @@ from lagjax.numerics.rank import independent_rows
 SINGULAR_BELOW = {np.dtype("float64"): 1e-13, np.dtype("float32"): 1e-6}
 
 
-class Kind(NamedTuple):
+class LinearisationKind(NamedTuple):
     """The static part of a linearisation, known before its numbers are; hashable.
 
     - `unseen` (n,): coordinates that nothing depends on. `holonomic` (m,): which constraint equations are holonomic.
@@ -70,7 +70,7 @@ class Raw(NamedTuple):
     slopes: Float[Array, "m n"]
 
 
-class Parts(NamedTuple):
+class LinearParts(NamedTuple):
     """The reduced equations, `mass ẇ + velocity w + position η = 0` and `η̇ = drift η + transfer w`.
 
     - `positions` (n, n_p): P, with zero rows for coordinates that nothing depends on; `velocities`: V; `turning`: W P.
@@ -97,7 +97,7 @@ class Parts(NamedTuple):
     raw: Raw
 
 
-def parts_of(kind: Kind, model: Model, s: State) -> Parts:
+def parts_of(kind: LinearisationKind, model: Model, s: State) -> LinearParts:
     """The reduced equations at one state."""
     t, (x, u) = s.t, model.vectors(s.q, s.v)
     n, m = model.n, len(kind.holonomic)
@@ -179,7 +179,7 @@ def parts_of(kind: Kind, model: Model, s: State) -> Parts:
     constraint_force = pushing @ stacked if m else jnp.zeros_like(x)
     diagonal = jnp.abs(jnp.diag(mass))
     forces = (jnp.abs(forcing) + jnp.abs(constraint_force)) / jnp.where(diagonal > 0, diagonal, 1.0)
-    return Parts(
+    return LinearParts(
         *parts, positions, velocities, turning @ positions,
         model.split(stacked), a,
         jnp.concatenate(off) if off else jnp.zeros(0, x.dtype), forces, sound, all_independent,
@@ -187,7 +187,7 @@ def parts_of(kind: Kind, model: Model, s: State) -> Parts:
     )  # fmt: skip
 
 
-def _forces(kind: Kind, model, t, x, u):
+def _forces(kind: LinearisationKind, model, t, x, u):
     """-∂F/∂u, -∂F/∂x and F, without constraint forces."""
     if kind.at_rest:
         # At rest there is no momentum, so the force is that of the potential.

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float
 
-from lagjax.analysis.linear_parts import Kind, Parts, parts_of
+from lagjax.analysis.linear_parts import LinearisationKind, LinearParts, parts_of
 from lagjax.analysis.steadiness import Steadiness, check_steady, steadiness_of
 from lagjax.jax_internals.tracing import is_eager
 from lagjax.mechanics import constraints, coordinates
@@ -56,8 +56,8 @@ class Linearisation(eqx.Module):
     residual: Float[Array, ""]
     sound: Bool[Array, ""]
     state: State
-    parts: Parts
-    kind: Kind = eqx.field(static=True)
+    parts: LinearParts
+    kind: LinearisationKind = eqx.field(static=True)
     names: tuple[str, ...] = eqx.field(static=True)
 
     @property
@@ -154,14 +154,14 @@ def linearise(system, t, q, v, params) -> Linearisation:
     return linearisation
 
 
-def _kind(model, s: State) -> Kind:
+def _kind(model, s: State) -> LinearisationKind:
     """The static part of the linearisation."""
     system, holonomic = model.system, tuple(model.holonomic.tolist())
     unseen, linear_terms, timeless = remembered(model, _kind, lambda: _structure_facts(model))
     at_rest = not coordinates.is_traced(s.v) and not any(np.any(x) for x in jax.tree.leaves(s.v))
     conservative = system.force is None and system.dissipation is None and all(holonomic)
     at_rest = conservative and at_rest and not linear_terms
-    return Kind(unseen, holonomic, (True,) * len(holonomic), conservative, at_rest, timeless)
+    return LinearisationKind(unseen, holonomic, (True,) * len(holonomic), conservative, at_rest, timeless)
 
 
 def _structure_facts(model):
@@ -194,13 +194,13 @@ def _chosen(kind, model, s, traced) -> tuple[bool, ...]:
     return tuple(bool(x) for x in chosen)
 
 
-def linearised(kind: Kind, model, s: State) -> Linearisation:
+def linearised(kind: LinearisationKind, model, s: State) -> Linearisation:
     """The linear equations at another state of the same kind, steady or not."""
     return _linearised(kind, model, s)[0]
 
 
 @compiled
-def _linearised(kind: Kind, model, s: State) -> tuple[Linearisation, Steadiness]:
+def _linearised(kind: LinearisationKind, model, s: State) -> tuple[Linearisation, Steadiness]:
     """The linearisation, and how far the state is from a steady motion."""
     parts = parts_of(kind, model, s)
     # `transfer` is P⁺ V: the positions η of displacements along the velocity directions.

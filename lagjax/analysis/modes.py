@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int, PyTree
 
 from lagjax.analysis import degenerate
-from lagjax.analysis.balance import Steady, Symmetries
+from lagjax.analysis.balance import Steady, SteadySymmetries
 from lagjax.analysis.drawn_modes import animated, drawn_mode, drawn_roots
 from lagjax.analysis.linearised import Linearisation, linearise, linearised
 from lagjax.analysis.motions import ASYMPTOTIC, DIVERGENCE, GYROSCOPIC, STABLE, UNDECIDED, Motions, motions_of
@@ -234,7 +234,7 @@ def _by_first_term(system, linearisation) -> int:
     if np.any(u[~unseen]):
         return degenerate.UNDECIDED
     places = tuple(int(i) for i in np.flatnonzero(u))
-    symmetries = Symmetries(places=places)
+    symmetries = SteadySymmetries(places=places)
     steady = Steady(model_of(system, *s), s.t, u[list(places)], x, symmetries)
     multipliers = np.concatenate([np.ravel(y) for y in jax.tree.leaves(linearisation.multipliers)] or [u[:0]])
     y = np.concatenate([x, u[list(places)], multipliers])

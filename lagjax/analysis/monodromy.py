@@ -51,7 +51,7 @@ class Period(NamedTuple):
     ended: Bool[Array, ""]
 
 
-class Problem(NamedTuple):
+class OrbitProblem(NamedTuple):
     """A checked system and its state, and what its programs show; all but these two are static."""
 
     system: object
@@ -61,7 +61,7 @@ class Problem(NamedTuple):
     is_angle: tuple[bool, ...]
 
 
-def problem_of(system, t, q, v, params) -> Problem:
+def problem_of(system, t, q, v, params) -> OrbitProblem:
     """Check a system at a state; unless JAX is tracing, dependent constraints are found and left out."""
     check_system(system, q, v, params)
     s = coordinates.prepared(t, q, v, params)
@@ -70,10 +70,10 @@ def problem_of(system, t, q, v, params) -> Problem:
     model = model_of(system, *state)
     rows = independent_rows_of(model, state)
     _check_freedom(model, rows)
-    return Problem(system, s, reasons_of(model), rows, tuple(are_angles(model).tolist()))
+    return OrbitProblem(system, s, reasons_of(model), rows, tuple(are_angles(model).tolist()))
 
 
-def refuse_singular(problem: Problem):
+def refuse_singular(problem: OrbitProblem):
     """After a motion could not be followed: raise, in the user's names, if the equations fail at its start."""
     s = coordinates.state(*problem.state)
     words = explain_failure(model_of(problem.system, *s), s)
@@ -99,7 +99,7 @@ def tolerance_of(rtol, dtype):
     return np.asarray(TOLERANCE.get(np.dtype(dtype), 1e-5) if rtol is None else rtol, dtype)
 
 
-def period_of(problem: Problem, period, rtol, nodes=None) -> tuple[Period, Float[Array, ""]]:
+def period_of(problem: OrbitProblem, period, rtol, nodes=None) -> tuple[Period, Float[Array, ""]]:
     """The results of a period, and the error of the entries of N; measured by a second run unless JAX is tracing."""
     system, s, reasons, rows, is_angle = problem
     eager = is_eager() and not coordinates.is_traced((s, period, nodes))

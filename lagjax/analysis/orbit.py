@@ -4,7 +4,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from lagjax.analysis.guessing import Asked
+from lagjax.analysis.guessing import OrbitRequest
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.diagnosis import describe
 from lagjax.mechanics.packed import Packed
@@ -42,7 +42,7 @@ class PeriodicOrbit(eqx.Module):
     nodes: Float[Array, "K 2n"]
     arrays: PyTree
     static: Packed = eqx.field(static=True)
-    asked: Asked = eqx.field(static=True)
+    asked: OrbitRequest = eqx.field(static=True)
 
     @property
     def system(self) -> System:

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from lagjax.analysis.orbit_tracer import OrbitTracer
-from lagjax.analysis.tracing import Point
+from lagjax.analysis.tracing import BranchPoint
 
 HALVINGS = 40
 # A function whose middle value at three points is below this fraction of the outer ones may be zero twice in between.
@@ -16,11 +16,11 @@ class FoundOrbit(NamedTuple):
     """The kind of a critical point, the point, and how far off its parameter may be."""
 
     kind: str
-    point: Point
+    point: BranchPoint
     accuracy: float
 
 
-def between(tracer: OrbitTracer, a: Point, b: Point) -> list[FoundOrbit]:
+def between(tracer: OrbitTracer, a: BranchPoint, b: BranchPoint) -> list[FoundOrbit]:
     """All critical points between two neighbouring points."""
     found = []
     crosses, folds = a.sign * b.sign < 0, a.tangent[-1] * b.tangent[-1] < 0
@@ -37,7 +37,7 @@ def between(tracer: OrbitTracer, a: Point, b: Point) -> list[FoundOrbit]:
     return [one for one in found if one is not None]
 
 
-def dips(tracer: OrbitTracer, a: Point, b: Point, c: Point) -> list[FoundOrbit | Point]:
+def dips(tracer: OrbitTracer, a: BranchPoint, b: BranchPoint, c: BranchPoint) -> list[FoundOrbit | BranchPoint]:
     """The two edges of a narrow resonance tongue that lies within two steps, and a point in the tongue."""
     for kind, of in (("branch point", lambda p: p.outputs.plus), ("period doubling", lambda p: p.outputs.minus)):
         left, middle, right = of(a), of(b), of(c)

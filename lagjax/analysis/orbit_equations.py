@@ -32,7 +32,7 @@ from jaxtyping import Array, Bool, Float
 
 from lagjax.analysis.closing import integral_at
 from lagjax.analysis.flow import Changes, Flow
-from lagjax.analysis.guessing import TURN, Asked
+from lagjax.analysis.guessing import TURN, OrbitRequest
 from lagjax.analysis.numbers_in import Number
 from lagjax.analysis.trivial import Reasons, directions, orthonormal
 from lagjax.mechanics.compiled import compiled
@@ -91,7 +91,7 @@ class OrbitFrame(eqx.Module):
     free: Float[Array, "d N"]
     reference: Float[Array, " N"]
     along: Along
-    asked: Asked = eqx.field(static=True)
+    asked: OrbitRequest = eqx.field(static=True)
     reasons: Reasons = eqx.field(static=True)
     parts: int = eqx.field(static=True)
 

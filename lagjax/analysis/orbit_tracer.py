@@ -17,7 +17,7 @@ import jax
 import numpy as np
 
 from lagjax.analysis.orbit_equations import Evaluated, Guide, OrbitFrame, orbit_at, path_at
-from lagjax.analysis.tracing import Point, Tracer
+from lagjax.analysis.tracing import BranchPoint, Tracer
 
 # A driven system repeats if it changes by less than this from one period to the next, relative to its change in a
 # period.
@@ -80,7 +80,7 @@ class OrbitTracer(Tracer):
     def moved_to(self, point):
         self.guide = self.evaluated(point.z).guide
 
-    def described(self, z, jacobian, tangent) -> Point | str:
+    def described(self, z, jacobian, tangent) -> BranchPoint | str:
         evaluation = self.evaluated(z)
         if float(evaluation.apart) > max(SAME, 1e3 * self.eps):
             return "the system is not the same after any period near the last one: its drive has no common period"
@@ -98,7 +98,7 @@ class OrbitTracer(Tracer):
             z[-1] * self.unit, period, nodes, multipliers, low, high, plus if self.crosses else 1.0, minus,
             self._pairs(left), float(np.max((high - low) / np.asarray(self.frame.scale)[: len(low)])),
         )  # fmt: skip
-        return Point(z, jacobian, tangent, float(np.sign(outputs.plus)), outputs, growing, below)
+        return BranchPoint(z, jacobian, tangent, float(np.sign(outputs.plus)), outputs, growing, below)
 
     def _multipliers(self, evaluation: Evaluated) -> tuple[np.ndarray, np.ndarray]:
         """All multipliers, the trivial ones first as exactly 1; and the nontrivial ones alone, by falling size."""

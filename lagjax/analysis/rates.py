@@ -26,7 +26,7 @@ from lagjax.mechanics.compiled import compiled
 from lagjax.mechanics.equations import equations_of
 from lagjax.mechanics.generators import Generator
 from lagjax.mechanics.lagrangian import applied_force
-from lagjax.mechanics.noether import Flow, flow
+from lagjax.mechanics.noether import GeneratorFlow, flow
 
 
 class Affine(eqx.Module):
@@ -38,13 +38,13 @@ class Affine(eqx.Module):
     clock: np.ndarray
     clock_rate: np.ndarray
 
-    def at(self, t, x, u) -> Flow:
+    def at(self, t, x, u) -> GeneratorFlow:
         """The flow of each generator at a state."""
         to = lambda y: jnp.asarray(y, x.dtype)
         xi = to(self.shift) + to(self.matrix) @ x + t * to(self.drift)
         xi_rate = to(self.matrix) @ u + to(self.drift)
         tau, tau_rate = to(self.clock) + t * to(self.clock_rate), to(self.clock_rate)
-        return Flow(xi, tau, jnp.zeros_like(tau), xi_rate, tau_rate, jnp.zeros_like(tau))
+        return GeneratorFlow(xi, tau, jnp.zeros_like(tau), xi_rate, tau_rate, jnp.zeros_like(tau))
 
 
 class Rates(NamedTuple):

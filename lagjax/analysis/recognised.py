@@ -19,20 +19,20 @@ WHOLE = [Fraction(n) for n in (1, 2, 3, 4)] + [Fraction(1, 2)]
 FRACTIONS = [Fraction(n, d) for d in range(1, 13) for n in range(1, 13)]
 
 
-class Number(NamedTuple):
+class RecognisedNumber(NamedTuple):
     """A fraction times a power of π times powers of parameters."""
 
     fraction: Fraction
     pi: int = 0
     params: tuple[tuple[str, int], ...] = ()
 
-    def times(self, other: "Number") -> "Number":
+    def times(self, other: "RecognisedNumber") -> "RecognisedNumber":
         """The product of two numbers."""
         powers = dict(self.params)
         for name, power in other.params:
             powers[name] = powers.get(name, 0) + power
         params = tuple((name, power) for name, power in powers.items() if power)
-        return Number(self.fraction * other.fraction, self.pi + other.pi, params)
+        return RecognisedNumber(self.fraction * other.fraction, self.pi + other.pi, params)
 
     def __str__(self):
         above, below = self.fraction.numerator, self.fraction.denominator
@@ -75,7 +75,9 @@ def in_words(coefficients, names, params: dict[str, float], agrees: float, first
             below[name] = max(below.get(name, 0), -power)
     common = int(np.lcm.reduce([number.fraction.denominator for number in known]))
     pi = max(-number.pi for number in known)
-    factor = Number(Fraction(common), max(pi, 0), tuple((name, power) for name, power in below.items() if power > 0))
+    factor = RecognisedNumber(
+        Fraction(common), max(pi, 0), tuple((name, power) for name, power in below.items() if power > 0)
+    )
     size = _value(factor, params)
     text, used = "", []
     for i, (c, name, number) in enumerate(zip(coefficients, names, found)):
@@ -94,22 +96,25 @@ def in_words(coefficients, names, params: dict[str, float], agrees: float, first
     return Words(text + (f" with {values}" if values else ""), size / leading)
 
 
-def _value(number: Number, params) -> float:
+def _value(number: RecognisedNumber, params) -> float:
     return float(number.fraction) * np.pi**number.pi * float(np.prod([params[p] ** e for p, e in number.params]))
 
 
-def _recognised(value: float, params, agrees, parameters_first) -> Number | None:
+def _recognised(value: float, params, agrees, parameters_first) -> RecognisedNumber | None:
     """The form in which a number is recognised; None if there is none."""
     if abs(value - 1.0) <= agrees:
-        return Number(Fraction(1))
-    plain = [Number(fraction) for fraction in WHOLE]
-    single = [Number(f, 0, ((name, e),)) for f in WHOLE for name in params for e in (1, -1)]
+        return RecognisedNumber(Fraction(1))
+    plain = [RecognisedNumber(fraction) for fraction in WHOLE]
+    single = [RecognisedNumber(f, 0, ((name, e),)) for f in WHOLE for name in params for e in (1, -1)]
     pitch = [
-        n for name in params for n in (Number(Fraction(2), 1, ((name, -1),)), Number(Fraction(1, 2), -1, ((name, 1),)))
+        n
+        for name in params
+        for n in (RecognisedNumber(Fraction(2), 1, ((name, -1),)), RecognisedNumber(Fraction(1, 2), -1, ((name, 1),)))
     ]
-    rest = [Number(f) for f in FRACTIONS] + [Number(f, pi) for pi in (1, -1) for f in FRACTIONS]
+    rest = [RecognisedNumber(f) for f in FRACTIONS] + [RecognisedNumber(f, pi) for pi in (1, -1) for f in FRACTIONS]
     pairs = [
-        Number(f, 0, ((a, 1), (b, e))) for f in WHOLE for a in params for b in params if a != b for e in (1, -1)
+        RecognisedNumber(f, 0, ((a, 1), (b, e)))
+        for f in WHOLE for a in params for b in params if a != b for e in (1, -1)
     ]  # fmt: skip
     if parameters_first:
         order = [*plain[:1], *single, *pairs, *plain, *pitch, *rest]
@@ -121,14 +126,14 @@ def _recognised(value: float, params, agrees, parameters_first) -> Number | None
     return (clear or [found for found in alike if not found.params] or [None])[0]
 
 
-def _agreeing(value, number: Number, params, agrees):
+def _agreeing(value, number: RecognisedNumber, params, agrees):
     recognised = _value(number, params) if all(params[p] for p, _ in number.params) else 0.0
     if not recognised or abs(abs(value) - abs(recognised)) > agrees * abs(value):
         return None
     return number._replace(fraction=number.fraction * int(np.sign(value * recognised)))
 
 
-def _only(found: Number, alike):
+def _only(found: RecognisedNumber, alike):
     same = [other for other in alike if [power for _, power in other.params] == [power for _, power in found.params]
             and abs(other.fraction) == abs(found.fraction) and other.pi == found.pi]  # fmt: skip
     return len({frozenset(other.params) for other in same}) == 1

@@ -8,7 +8,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import PyTree
 
-from lagjax.analysis.balance import MOMENTUM, VELOCITY, Symmetries
+from lagjax.analysis.balance import MOMENTUM, VELOCITY, SteadySymmetries
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.coordinates import State
 from lagjax.mechanics.diagnosis import listed
@@ -70,20 +70,20 @@ def checked(system, t, q, v, params):
     return traced_system(system, s), s
 
 
-def symmetries_of(system, s: State, cyclic, hold, moving: np.ndarray | None) -> Symmetries:
+def symmetries_of(system, s: State, cyclic, hold, moving: np.ndarray | None) -> SteadySymmetries:
     """The symmetries along which the motion is steady: those that `cyclic` names, or the `moving` (n,) coordinates."""
     if hold not in (VELOCITY, MOMENTUM, None):
         raise ValueError(f'hold must be "velocity", "momentum" or None, not {hold!r}.')
     names = coordinates.names(s.q)
     if cyclic is None:
         if moving is None:
-            return Symmetries(hold=hold)
+            return SteadySymmetries(hold=hold)
         chosen = [name for name, moves in zip(names, moving) if moves]
     else:
         given = [cyclic] if isinstance(cyclic, str) or callable(cyclic) else list(cyclic)
         if all(callable(x) for x in given) and given:
             _check_fields(given, s)
-            return Symmetries(fields=tuple(given), hold=hold)
+            return SteadySymmetries(fields=tuple(given), hold=hold)
         chosen = _names_in(names, given)
         still = [name for name, moves in zip(names, moving if moving is not None else []) if moves]
         if others := [name for name in still if name not in chosen]:
@@ -92,7 +92,7 @@ def symmetries_of(system, s: State, cyclic, hold, moving: np.ndarray | None) -> 
                 f"Fix: give it a velocity of zero, or pass cyclic={[*chosen, *others]}."
             )
     _check_cyclic(system, s, chosen)
-    return Symmetries(places=tuple(names.index(name) for name in chosen), hold=hold)
+    return SteadySymmetries(places=tuple(names.index(name) for name in chosen), hold=hold)
 
 
 def _names_in(names, given: Iterable):

@@ -32,7 +32,7 @@ DEPENDENT_BELOW = 1e-6
 ROUND_OFFS = 1e4
 
 
-class Scales(NamedTuple):
+class StateScales(NamedTuple):
     """The size of each coordinate and of each velocity, and the time that relates them."""
 
     x: Float[Array, " n"]
@@ -60,7 +60,7 @@ def draws(count: int, n: int) -> np.ndarray:
     return random
 
 
-def around(model, s: coordinates.State, places) -> tuple[States, Scales]:
+def around(model, s: coordinates.State, places) -> tuple[States, StateScales]:
     """The states at the displacements `places` from a given one, moved onto the constraints."""
     # With concrete values only the program that moves states is compiled, and all questions about a system share it.
     xp = coordinates.numpy_of((s, model))
@@ -88,7 +88,7 @@ def around(model, s: coordinates.State, places) -> tuple[States, Scales]:
     return states, scales
 
 
-def sizes(model, s: coordinates.State, x, u) -> Scales:
+def sizes(model, s: coordinates.State, x, u) -> StateScales:
     """The size of each coordinate and velocity of a state."""
     xp, same = coordinates.numpy_of((x, u)), _groups(s.q)
     together = lambda y: xp.sqrt(same.astype(y.dtype) @ y**2)
@@ -101,7 +101,7 @@ def sizes(model, s: coordinates.State, x, u) -> Scales:
     # A zero velocity has no size: it gets the pace of the others, or one length per unit of time.
     pace = xp.sqrt(xp.mean((of_u / of_x) ** 2))
     pace = xp.where(pace > 0, pace, xp.ones_like(pace))
-    return Scales(of_x, xp.where(of_u > 0, of_u, pace * of_x), 1 / pace)
+    return StateScales(of_x, xp.where(of_u > 0, of_u, pace * of_x), 1 / pace)
 
 
 def _groups(q) -> np.ndarray:

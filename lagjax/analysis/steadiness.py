@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from lagjax.analysis.linear_parts import Kind, Parts
+from lagjax.analysis.linear_parts import LinearisationKind, LinearParts
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.coordinates import State
 from lagjax.mechanics.diagnosis import explain_failure, where
@@ -32,7 +32,7 @@ class Steadiness(NamedTuple):
     residual: Float[Array, ""]
 
 
-def steadiness_of(kind: Kind, s: State, parts: Parts) -> Steadiness:
+def steadiness_of(kind: LinearisationKind, s: State, parts: LinearParts) -> Steadiness:
     """Accelerations and constraint residuals, relative to those of small motions of the state's own size."""
     x, u = coordinates.flatten(s.q)[0], coordinates.flatten(s.v)[0]
     eps = jnp.finfo(x.dtype).eps

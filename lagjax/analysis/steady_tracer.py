@@ -13,7 +13,7 @@ import numpy as np
 
 from lagjax.analysis.branch_equations import Frame, evaluated, outputs_at
 from lagjax.analysis.equilibria import GROWS_ABOVE
-from lagjax.analysis.tracing import Point, Tracer
+from lagjax.analysis.tracing import BranchPoint, Tracer
 
 
 class SteadyTracer(Tracer):
@@ -33,11 +33,11 @@ class SteadyTracer(Tracer):
         value, jacobian, largest = jax.tree.map(np.asarray, evaluated(self.frame, z.astype(self.dtype)))
         return value, jacobian, float(largest)
 
-    def described(self, z, jacobian, tangent) -> Point:
+    def described(self, z, jacobian, tangent) -> BranchPoint:
         outputs = jax.tree.map(np.asarray, outputs_at(self.frame, z.astype(self.dtype)))
         sign = np.linalg.slogdet(np.concatenate([jacobian, (self.weights * tangent)[None]]))[0]
         negative = int(np.sum(np.linalg.eigvals(jacobian[:, :-1]).real < 0))
-        return Point(z, jacobian, tangent, float(sign), outputs, self._growing(outputs[-1]), negative)
+        return BranchPoint(z, jacobian, tangent, float(sign), outputs, self._growing(outputs[-1]), negative)
 
     def _growing(self, roots) -> int | None:
         """The number of growing roots; None if the roots are not known."""

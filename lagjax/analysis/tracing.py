@@ -39,7 +39,7 @@ LOST = "equations that are redundant at the start of the branch are no longer re
 
 
 @dataclass
-class Point:
+class BranchPoint:
     """A point of a branch: z, the Jacobian and the tangent there, and the outputs for the user.
 
     `sign`: of a function that changes sign where another branch crosses. `growing`: the number of small departures that
@@ -60,7 +60,7 @@ class Point:
 class Path:
     """The points of a branch in order, and why it ends."""
 
-    points: list[Point] = field(default_factory=list)
+    points: list[BranchPoint] = field(default_factory=list)
     status: str = ""
     others: list[str] = field(default_factory=list)
 
@@ -96,10 +96,10 @@ class Tracer(abc.ABC):
         """E, J and the largest residual of all equations."""
 
     @abc.abstractmethod
-    def described(self, z, jacobian, tangent) -> Point | str:
+    def described(self, z, jacobian, tangent) -> BranchPoint | str:
         """A point with its outputs; or a message that says what is wrong with it."""
 
-    def moved_to(self, point: Point):
+    def moved_to(self, point: BranchPoint):
         """Called when the branch has reached a point, to which the equations may refer from then on."""
 
     def tangent(self, jacobian, along):
@@ -137,7 +137,7 @@ class Tracer(abc.ABC):
     def size(self, z):
         return max(1.0, float(np.max(np.abs(z))))
 
-    def point(self, z, along) -> Point | str:
+    def point(self, z, along) -> BranchPoint | str:
         """The point of a branch at z; or a message that says what is wrong with it."""
         _, jacobian, off = self.at(z)
         # The residual of all equations, also redundant ones; equations are scaled to order one.
@@ -145,7 +145,7 @@ class Tracer(abc.ABC):
             return LOST
         return self.described(z, jacobian, self.tangent(jacobian, along))
 
-    def trace(self, start: Point, most: int, on_step: Callable, first: float = FIRST) -> Path:
+    def trace(self, start: BranchPoint, most: int, on_step: Callable, first: float = FIRST) -> Path:
         """Follow a branch until it leaves the range of the parameter, ends or closes.
 
         `on_step(before, after, path)` finds critical points between two points. It may return why the path ends, or
@@ -185,7 +185,7 @@ class Tracer(abc.ABC):
         path.status = f"the limit of {most} points"
         return path
 
-    def next_point(self, point: Point, step: float):
+    def next_point(self, point: BranchPoint, step: float):
         """The next point, the step to try after it, and, if there is no point, the reason."""
         longest = LONGEST * max(1.0, float(np.max(np.abs(point.z[: self.positions]))))
         why = "Newton's method does not converge, however short the step"
@@ -195,7 +195,7 @@ class Tracer(abc.ABC):
             z = self.corrected(point.z + step * point.tangent, row)
             contraction = self.contraction
             candidate = self.point(z, point.tangent) if z is not None else None
-            if isinstance(candidate, Point):
+            if isinstance(candidate, BranchPoint):
                 turn = np.arccos(np.clip((self.weights * candidate.tangent) @ point.tangent, -1, 1))
                 moved = np.sqrt(self.weights @ (candidate.z - point.z) ** 2)
                 if turn < MOST_TURN and moved < 1.2 * step and contraction < MOST_CONTRACTION:
@@ -207,15 +207,17 @@ class Tracer(abc.ABC):
             step /= 3
         return None, step, why
 
-    def between(self, a: Point, b: Point, share: float) -> Point | None:
+    def between(self, a: BranchPoint, b: BranchPoint, share: float) -> BranchPoint | None:
         """A point of the branch between two others."""
         row = self.weights * a.tangent
         guess = a.z + share * (b.z - a.z)
         z = self.corrected(guess, row)
         candidate = self.point(z, a.tangent) if z is not None else None
-        return candidate if isinstance(candidate, Point) else None
+        return candidate if isinstance(candidate, BranchPoint) else None
 
-    def zero_between(self, a: Point, b: Point, of: Callable[[Point], float]) -> tuple[Point, float] | None:
+    def zero_between(
+        self, a: BranchPoint, b: BranchPoint, of: Callable[[BranchPoint], float]
+    ) -> tuple[BranchPoint, float] | None:
         """The point between two others where a function of points changes sign, and the error of its parameter."""
         low, high, left, right = 0.0, 1.0, of(a), of(b)
         best, off, last, side = b, np.inf, np.inf, 0
@@ -239,15 +241,15 @@ class Tracer(abc.ABC):
                 high, right, left, side = share, value, left / 2 if side > 0 else left, 1
         return best, off
 
-    def _interpolated(self, a: Point, tried: list[tuple[float, np.ndarray]]) -> tuple[Point, float] | None:
+    def _interpolated(self, a: BranchPoint, tried: list[tuple[float, np.ndarray]]) -> tuple[BranchPoint, float] | None:
         """The zero of a function, interpolated from values nearby: Newton's method fails very near a crossing."""
         tried = sorted(tried, key=lambda one: abs(one[0]))[:INTERPOLATED]
         zs = [_at_zero(tried[:count]) for count in (len(tried) - 1, len(tried))]
         point = self.point(zs[-1], a.tangent)
         off = abs(float((zs[1] - zs[0])[-1]))
-        return (point, off) if isinstance(point, Point) else None
+        return (point, off) if isinstance(point, BranchPoint) else None
 
-    def at_edge(self, a: Point, b: Point) -> Point | None:
+    def at_edge(self, a: BranchPoint, b: BranchPoint) -> BranchPoint | None:
         """The point of the branch at the end of the parameter's range."""
         edge = self.low if b.z[-1] < self.low else self.high
         share = np.clip((edge - a.z[-1]) / (b.z[-1] - a.z[-1]), 0.0, 1.0) if b.z[-1] != a.z[-1] else 0.0
@@ -255,7 +257,7 @@ class Tracer(abc.ABC):
         row[-1] = 1.0
         z = self.corrected(a.z + share * (b.z - a.z), row, edge)
         candidate = self.point(z, a.tangent) if z is not None else None
-        return candidate if isinstance(candidate, Point) else None
+        return candidate if isinstance(candidate, BranchPoint) else None
 
     def closes(self, path: Path, step: float) -> bool:
         """Whether a path has returned to its start."""

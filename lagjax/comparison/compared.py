@@ -12,7 +12,7 @@ import jax
 import numpy as np
 from jaxtyping import PyTree
 
-from lagjax.comparison.programs import Motion, Program
+from lagjax.comparison.programs import ComparedMotion, TimedProgram
 from lagjax.motion.backward import runs_backward
 from lagjax.motion.crossings import Crossing
 from lagjax.motion.results import ended_well
@@ -22,7 +22,7 @@ from lagjax.motion.trajectory import Trajectory
 SAMPLES, ROUGH_TOLERANCE = 200, 1e-5
 
 
-class States(NamedTuple):
+class ComparedStates(NamedTuple):
     """The coordinates and velocities of a motion at its outputs, each leaf with a leading axis."""
 
     t: np.ndarray
@@ -39,7 +39,7 @@ class Compared(NamedTuple):
     times: dict[str, np.ndarray]
 
 
-def compared_of(motion: States | Trajectory, events: Mapping[str, Crossing] | None) -> Compared:
+def compared_of(motion: ComparedStates | Trajectory, events: Mapping[str, Crossing] | None) -> Compared:
     """The compared states and event times of a motion."""
     q, v, times = motion.q, motion.v, {}
     if events and isinstance(motion, Trajectory):
@@ -59,7 +59,7 @@ def in_words(events: Mapping[str, Crossing] | None, outputs: int) -> str:
     return f"coordinates and velocities {at}, each relative to its largest value on the way"
 
 
-class Scales(NamedTuple):
+class ComparedScales(NamedTuple):
     """The units of an error: for each leaf of q and v, and for times."""
 
     q: PyTree
@@ -88,20 +88,20 @@ def other_events(found: Compared, right: Compared) -> str:
     return ""
 
 
-def scales_of(samples: Any, ts) -> Scales:
+def scales_of(samples: Any, ts) -> ComparedScales:
     """The units from states (q, v) during the motion, each leaf with a leading axis."""
     largest = lambda x: float(np.nanmax(np.abs(np.asarray(x)), initial=0.0)) or 1.0
-    return Scales(*jax.tree.map(largest, tuple(samples)), time=abs(float(ts[-1] - ts[0])))
+    return ComparedScales(*jax.tree.map(largest, tuple(samples)), time=abs(float(ts[-1] - ts[0])))
 
 
-def states_during(motion: Motion, program: Program):
+def states_during(motion: ComparedMotion, program: TimedProgram):
     """States (q, v) at many times; the compiled program runs from one short interval to the next, at its own outputs.
 
     Backward in time the program's times are fixed, so another program is compiled.
     """
     ts, start, tolerance = motion.ts, motion.start, ROUGH_TOLERANCE
     if runs_backward(ts):
-        found = Program(motion._replace(ts=np.linspace(ts[0], ts[-1], SAMPLES, dtype=ts.dtype)), None)(tolerance)
+        found = TimedProgram(motion._replace(ts=np.linspace(ts[0], ts[-1], SAMPLES, dtype=ts.dtype)), None)(tolerance)
         return found.q, found.v
     q, v, rows = start.q, start.v, []
     for a, b in pairwise(np.linspace(ts[0], ts[-1], 1 + max(1, SAMPLES // (len(ts) - 1)))):

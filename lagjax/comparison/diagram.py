@@ -12,7 +12,7 @@ from lagjax.comparison.methods import as_code
 from lagjax.comparison.points import Curve, Point
 from lagjax.comparison.references import Reference
 from lagjax.comparison.tables import table
-from lagjax.plot import Drawn
+from lagjax.plot import DrawnAxes
 
 
 class Choice(NamedTuple):
@@ -26,7 +26,7 @@ class Choice(NamedTuple):
     compile_seconds: float
 
 
-class Choices(tuple):
+class DiagramChoices(tuple):
     """Choices, the fastest first; prints itself as a table and the call to make."""
 
     def __repr__(self):
@@ -67,7 +67,7 @@ class WorkPrecision:
         """All points, method by method."""
         return (point for curve in self.curves.values() for point in curve.points)
 
-    def best(self, error: float) -> Choices:
+    def best(self, error: float) -> DiagramChoices:
         """The best choices for a relative error: the fastest tolerance of each method within it, the fastest first.
 
         A tolerance counts only if all tighter ones are within the error, too, which excludes lucky ones.
@@ -95,7 +95,7 @@ class WorkPrecision:
                 f"no method stays within {error:.0e}: the nearest is {nearest.method} at {nearest.tolerance:.0e}, with "
                 f"{nearest.error:.1e}.\nFix: allow a larger error, or give tighter tolerances=."
             )
-        return Choices(sorted(choices, key=lambda choice: choice.seconds))
+        return DiagramChoices(sorted(choices, key=lambda choice: choice.seconds))
 
     def to_pandas(self):
         """A `pandas.DataFrame`, one row per point: method, tolerance, error, seconds, steps, evaluations, how it ended.
@@ -122,11 +122,11 @@ class WorkPrecision:
         """
         return plot.work_precision([self.against_time(title), self.against_evaluations(title)])
 
-    def against_time(self, title: str = "") -> Drawn:
+    def against_time(self, title: str = "") -> DrawnAxes:
         """Error against run time, for `plot.work_precision`."""
         return self._drawn(title, "run time / ms", lambda point: 1e3 * point.seconds)
 
-    def against_evaluations(self, title: str = "") -> Drawn:
+    def against_evaluations(self, title: str = "") -> DrawnAxes:
         """Error against evaluations, for `plot.work_precision`."""
         return self._drawn(title, "evaluations of the accelerations", lambda point: point.evaluations or np.nan)
 
@@ -140,7 +140,7 @@ class WorkPrecision:
             )
             for name, curve in self.curves.items()
         }
-        return Drawn(title, label, curves, 0.0 if self.reference is None else self.reference.error)
+        return DrawnAxes(title, label, curves, 0.0 if self.reference is None else self.reference.error)
 
     def __repr__(self):
         lines = [f"Work and precision of {len(self.curves)} method{'s' if len(self.curves) > 1 else ''}"]

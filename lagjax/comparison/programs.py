@@ -31,7 +31,7 @@ SHORT = 0.02
 RESOLVED = 0.1
 
 
-class Motion(NamedTuple):
+class ComparedMotion(NamedTuple):
     """The motion to integrate: `start` has the first time; `options` are those of `integrate`, including events."""
 
     system: System
@@ -40,14 +40,14 @@ class Motion(NamedTuple):
     options: Mapping[str, Any]
 
 
-class Program:
+class TimedProgram:
     """The trajectory of a motion by one method, as a function of (tolerance, ts, q, v); the number of times is fixed.
 
     `compile_seconds` is the time of tracing and compiling. Like `integrate`, the program first assumes that the
     equations are regular; if they turn out singular, the robust program is compiled, too, and used from then on.
     """
 
-    def __init__(self, motion: Motion, method: Any):
+    def __init__(self, motion: ComparedMotion, method: Any):
         self._motion, self._method = motion, method
         self.compile_seconds = 0.0
         self._compiled = self._compile(robust=False)

@@ -15,9 +15,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax.comparison import compared
-from lagjax.comparison.compared import Compared, Scales, States
+from lagjax.comparison.compared import Compared, ComparedScales, ComparedStates
 from lagjax.comparison.methods import TIGHTEST, usual
-from lagjax.comparison.programs import Motion, Program
+from lagjax.comparison.programs import ComparedMotion, TimedProgram
 from lagjax.mechanics import coordinates
 from lagjax.motion.results import ended_well, message
 from lagjax.motion.trajectory import Trajectory
@@ -57,7 +57,7 @@ class Reference:
 class KnownAnswer:
     """A reference answer: its states, their units, its origin, and its own error."""
 
-    def __init__(self, right: Compared, scales: Scales, how: str, error: float, dtype):
+    def __init__(self, right: Compared, scales: ComparedScales, how: str, error: float, dtype):
         self.right, self.scales, self.how, self.error, self._dtype = right, scales, how, error, dtype
 
     def distance(self, found: Compared) -> float:
@@ -76,7 +76,9 @@ class KnownAnswer:
         return Reference(how, error, bool(error <= np.sqrt(np.finfo(self._dtype).eps)))
 
 
-def computed_reference(motion: Motion, programs: Mapping[str, Program], solvers: Mapping[str, Any]) -> KnownAnswer:
+def computed_reference(
+    motion: ComparedMotion, programs: Mapping[str, TimedProgram], solvers: Mapping[str, Any]
+) -> KnownAnswer:
     """The reference that two methods of different kinds compute."""
     dtype = motion.ts.dtype
     kinds: dict[str, diffrax.AbstractSolver] = usual(motion.system, motion.start) | {"Radau5": Radau5()}
@@ -86,7 +88,7 @@ def computed_reference(motion: Motion, programs: Mapping[str, Program], solvers:
         if len(found) == 2:
             break
         same = next((key for key, given in solvers.items() if type(given) is type(solver)), None)
-        program = Program(motion, solver) if same is None else programs[same]
+        program = TimedProgram(motion, solver) if same is None else programs[same]
         first = program if first is None else first
         trajectory = program(tolerance)
         if bool(ended_well(trajectory.result)):
@@ -110,7 +112,7 @@ def computed_reference(motion: Motion, programs: Mapping[str, Program], solvers:
     return KnownAnswer(best, scales, how, max(apart, float(np.finfo(dtype).eps)), dtype)
 
 
-def given_reference(reference: Any, motion: Motion, program: Program) -> KnownAnswer:
+def given_reference(reference: Any, motion: ComparedMotion, program: TimedProgram) -> KnownAnswer:
     """A given reference; raise if it does not fit the motion."""
     ts, dtype, events = motion.ts, motion.ts.dtype, motion.options["events"]
     if isinstance(reference, Trajectory):
@@ -124,7 +126,7 @@ def given_reference(reference: Any, motion: Motion, program: Program) -> KnownAn
             )
         how = "the function that was given" if callable(reference) else "the states that were given"
         states = reference(jnp.asarray(ts)) if callable(reference) else reference
-        right = compared.compared_of(States(ts, *_as_states(states, motion), None), None)
+        right = compared.compared_of(ComparedStates(ts, *_as_states(states, motion), None), None)
     if callable(reference) and not isinstance(reference, Trajectory):
         samples = reference(jnp.linspace(ts[0], ts[-1], compared.SAMPLES, dtype=dtype))
     else:

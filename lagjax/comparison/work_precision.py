@@ -10,11 +10,11 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, PyTree
 
 from lagjax.comparison import compared, references
-from lagjax.comparison.compared import Compared, States
+from lagjax.comparison.compared import Compared, ComparedStates
 from lagjax.comparison.diagram import WorkPrecision
 from lagjax.comparison.methods import chosen, ladder
 from lagjax.comparison.points import Curve, Point
-from lagjax.comparison.programs import Motion, Program, Times, interleaved_times, without_overhead
+from lagjax.comparison.programs import ComparedMotion, TimedProgram, Times, interleaved_times, without_overhead
 from lagjax.comparison.references import KnownAnswer, Reference
 from lagjax.jax_internals.tracing import is_eager
 from lagjax.mechanics import coordinates
@@ -107,7 +107,7 @@ def work_precision(
     solvers = chosen(methods, system, motion.start)
     tolerances = ladder(tolerances, motion.ts.dtype)
     _check(reference, error, others, events)
-    programs = {name: Program(motion, solver) for name, solver in solvers.items()}
+    programs = {name: TimedProgram(motion, solver) for name, solver in solvers.items()}
     solved = []
     for name, program in programs.items():
         solved += _solves_of_program(name, program, tolerances, patience)
@@ -170,7 +170,7 @@ def _motion(system, q0, v0, params, ts, events, options):
         raise TypeError("work_precision measures times, but it is being traced.\nFix: call it outside jit.")
     ts = np.asarray(problem.vector_of_times(ts))
     start = coordinates.state(ts[0], q0, v0, params)
-    return Motion(system, start, problem.times(ts, start.t.dtype), {**options, "events": events})
+    return ComparedMotion(system, start, problem.times(ts, start.t.dtype), {**options, "events": events})
 
 
 def _check(reference, error, others, events):
@@ -212,7 +212,7 @@ def _solves_of_other(motion, name, solve, tolerances, patience):
         started = time.perf_counter()
         q, v, evaluations = jax.tree.map(np.asarray, call())
         seconds = time.perf_counter() - started
-        found = States(motion.ts, q, v, motion.start.params)
+        found = ComparedStates(motion.ts, q, v, motion.start.params)
         evaluations = None if evaluations is None else int(evaluations)
         done = Solve(name, tolerance, found, evaluations, "successful", call, seconds)
         solves.append(done if done.ended_well else done._replace(reason="failed"))

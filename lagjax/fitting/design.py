@@ -17,10 +17,10 @@ import numpy as np
 from jaxtyping import Float
 
 from lagjax.fitting.candidates import Candidate, NextMeasurements, assess, eliminate_unknowns, sd_of, units_of
-from lagjax.fitting.equations import WHOLE, Problem
+from lagjax.fitting.equations import WHOLE, FitProblem
 from lagjax.fitting.predicted import check_predicted
 from lagjax.fitting.records import PADDING, Record, Windows, channel_name, padded
-from lagjax.fitting.search import UNSEEN, Evaluation, Linear, evaluation_from, linearised
+from lagjax.fitting.search import UNSEEN, Evaluation, LinearisedResiduals, evaluation_from, linearised
 from lagjax.mechanics.compiled import compiled
 from lagjax.mechanics.diagnosis import listed
 from lagjax.mechanics.memory import filled_up
@@ -31,19 +31,19 @@ from lagjax.numerics.chained import Unknowns
 class Survey(NamedTuple):
     """What the data determine at one point, with the slopes of all equations there."""
 
-    linear: Linear
+    linear: LinearisedResiduals
     evaluation: Evaluation
 
 
 @partial(compiled, in_numpy=True)
-def survey(problem: Problem, u: Unknowns) -> Survey:
+def survey(problem: FitProblem, u: Unknowns) -> Survey:
     """The result of `evaluate`, and the slopes behind it. All runs of the same form share one program."""
     check_predicted(problem)
     linear = linearised(problem, u, WHOLE, "squares")
     return Survey(linear, evaluation_from(problem, u, linear, WHOLE))
 
 
-class Known(NamedTuple):
+class KnownMotion(NamedTuple):
     """The equations of the records, with errors of size one and the starts eliminated.
 
     `shared` (r, p): those of all windows and of the priors. `each` (q, p): those of each window, in a list. `prior`
@@ -60,19 +60,19 @@ class Known(NamedTuple):
 
 
 def next_measurements(
-    problem: Problem,
+    problem: FitProblem,
     records: list[Record],
     at: Survey,
     shrink: str | Callable,
     candidates: Mapping[str, Record] | None,
-    problem_for: Callable[[list[Record]], Problem],
+    problem_for: Callable[[list[Record]], FitProblem],
 ) -> NextMeasurements:
     """How certain a number would be after each candidate; `problem_for(records)` makes the problem of some runs."""
     name, direction = _direction(problem, shrink)
     slopes = at.linear.slopes
     each = [eliminate_unknowns(*blocks) for blocks in zip(slopes.rows_by_shared, slopes.rows_by_local)]
     prior = np.asarray(slopes.shared)
-    known = Known(np.concatenate([prior, *each]), each, prior)
+    known = KnownMotion(np.concatenate([prior, *each]), each, prior)
     # The same threshold as in `evaluation_from`.
     least = float(np.sqrt(np.finfo(problem.windows.ts.dtype).eps) / UNSEEN)
     units = units_of(known.shared, np.asarray(problem.found.start), least)
@@ -147,7 +147,7 @@ def _candidate_runs(problem, candidates, known, direction, least, problem_for):
     return assessed
 
 
-def _one_window(problem: Problem, w: int) -> Problem:
+def _one_window(problem: FitProblem, w: int) -> FitProblem:
     """The problem of one window alone, so that all windows of one form share one program."""
     part = lambda tree: jax.tree.map(lambda x: x[w : w + 1], tree)
     windows = Windows(*part(problem.windows))._replace(record=np.zeros(1, int), seam=np.zeros(1, bool))
@@ -246,7 +246,7 @@ def _further_measurements(problem, records, at, known, direction, least) -> list
     return list(best.values())
 
 
-def _entries(part: Problem):
+def _entries(part: FitProblem):
     """The name and the error of each entry that is measured at a time."""
     entries = []
     for kind, tree in part.sigma.items():
@@ -258,7 +258,7 @@ def _entries(part: Problem):
     return entries
 
 
-def _extended(problem: Problem, records: list[Record]) -> Problem:
+def _extended(problem: FitProblem, records: list[Record]) -> FitProblem:
     """The same runs with their last windows doubled, and with all quantities measured whose error is known."""
     windows = problem.windows
     ends = np.append(windows.record[1:] != windows.record[:-1], True)
@@ -284,7 +284,7 @@ def _extended(problem: Problem, records: list[Record]) -> Problem:
     return replace(problem, windows=longer, measured=measured, sigma=sigma, spread=ones)
 
 
-def _sigmas(problem: Problem, records: list[Record], length):
+def _sigmas(problem: FitProblem, records: list[Record], length):
     """Errors (W, T, ...) of all coordinates, velocities and measured quantities; infinite where none is known."""
     state = jax.eval_shape(problem.unflatten, problem.starts.q.guess[0])
     parts = {kind: jax.tree.map(lambda x: x[0, 0], tree) for kind, tree in problem.measured.items() if kind != "end"}

@@ -13,7 +13,7 @@ import optimistix as optx
 from jaxtyping import PyTree
 
 from lagjax.fitting.caveats import caveats
-from lagjax.fitting.equations import Problem, Stage
+from lagjax.fitting.equations import FitProblem, Stage
 from lagjax.fitting.optimisers import is_of_optax
 from lagjax.fitting.predicted import check_motion
 from lagjax.fitting.problem import problem_of
@@ -219,7 +219,7 @@ def _check_optimiser(optimiser, of_training):
         )
 
 
-def _course(problem: Problem, grow: bool, joined: bool, scattered, try_all: bool) -> Course:
+def _course(problem: FitProblem, grow: bool, joined: bool, scattered, try_all: bool) -> Course:
     """The stages of a search, and the starts from which it runs through them."""
     windows = problem.windows
     unknowns = sum(x.shape[-1] for x in jax.tree.leaves(problem.start))

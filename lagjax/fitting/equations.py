@@ -20,14 +20,14 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int, PyTree
 
-from lagjax.fitting.parameters import Found, leaf_name
+from lagjax.fitting.parameters import FreeNumbers, leaf_name
 from lagjax.fitting.records import PADDING, Windows
 from lagjax.fitting.starts import Starts
 from lagjax.mechanics.compiled import compiled
 from lagjax.mechanics.model import model_of
 from lagjax.motion.integrate import integrate
 from lagjax.motion.results import ended_well
-from lagjax.numerics.chained import Equations, Slopes, Unknowns
+from lagjax.numerics.chained import Slopes, Unknowns, WindowedEquations
 
 # The residual of a sample that the motion does not reach, in spreads of its data.
 NOT_REACHED = 10.0
@@ -64,7 +64,7 @@ WHOLE = Stage(np.asarray(1.0), np.asarray(0.0), np.asarray(1.0))
 # Not an `eqx.Module`: creating one and looking up its methods would cost each fit half a millisecond.
 @jtu.register_dataclass
 @dataclass(frozen=True, eq=False)
-class Problem:
+class FitProblem:
     """The whole task of a fit, as arrays of one shape for all windows.
 
     `measured` and `sigma` have leaves (W, T, ...), those of `end` (W, ...); `spread` has one number per leaf, and
@@ -75,7 +75,7 @@ class Problem:
     system: Any
     # The system at the starts: for a motion in phases, the first phase.
     first: Any
-    found: Found
+    found: FreeNumbers
     overrides: dict[str, Array]
     windows: Windows
     starts: Starts
@@ -151,7 +151,7 @@ def selected(values: PyTree, wanted: PyTree) -> PyTree:
 
 
 @partial(compiled, in_numpy=True)
-def starts_at(problem: Problem, u: Unknowns, windows: Int[Array, " R"]):
+def starts_at(problem: FitProblem, u: Unknowns, windows: Int[Array, " R"]):
     """(q, v) at the starts of some windows, and their slopes by the shared unknowns and by those of each window."""
     p = u.shared.size
 
@@ -176,7 +176,7 @@ class WindowPart(NamedTuple):
     end: Float[Array, " 2n"]
 
 
-def window_part(problem: Problem, x, s, w, stage: Stage, adjoint=None, loss: str | None = None):
+def window_part(problem: FitProblem, x, s, w, stage: Stage, adjoint=None, loss: str | None = None):
     """The contribution of window `w` at natural shared and local unknowns, and whether its motion ended well."""
     motion, start = problem.motion(x, s, w, stage, adjoint)
     rows = residuals(problem, motion, w, stage, problem.loss if loss is None else loss)
@@ -191,14 +191,14 @@ def window_part(problem: Problem, x, s, w, stage: Stage, adjoint=None, loss: str
     return WindowPart(rows, vector(start) / problem.unit, jnp.where(reached, end, NOT_REACHED) / problem.unit), well
 
 
-def assemble(problem: Problem, u: Unknowns, parts: WindowPart, stage: Stage) -> Equations:
+def assemble(problem: FitProblem, u: Unknowns, parts: WindowPart, stage: Stage) -> WindowedEquations:
     """All equations, from the contributions of the windows (leading axis W)."""
     gap = jnp.where(_seam_weights(problem, stage) > 0, parts.end - jnp.roll(parts.begin, -1, axis=0), 0.0)
     known, weight = prior_and_hold(problem, stage)
-    return Equations(parts.rows, _seam_weights(problem, stage) * gap, weight * (u.shared - known))
+    return WindowedEquations(parts.rows, _seam_weights(problem, stage) * gap, weight * (u.shared - known))
 
 
-def assemble_slopes(problem: Problem, by_shared: WindowPart, by_local: WindowPart, stage: Stage) -> Slopes:
+def assemble_slopes(problem: FitProblem, by_shared: WindowPart, by_local: WindowPart, stage: Stage) -> Slopes:
     """The slopes of all equations, from the slopes (W, ..., p) and (W, ..., k) of the windows' contributions."""
     seam_weights = _seam_weights(problem, stage)[:, :, None]
     following = lambda x: jnp.roll(x, -1, axis=0)
@@ -238,7 +238,7 @@ def _seam_weights(problem, stage):
     return jnp.where(problem.windows.seam, stage.joined, 0.0)[:, None]
 
 
-def equations(problem: Problem, u: Unknowns, stage: Stage) -> Equations:
+def equations(problem: FitProblem, u: Unknowns, stage: Stage) -> WindowedEquations:
     """The residuals at unknowns in natural numbers, in units of their sigmas."""
     # NumPy's arrays cannot be indexed by a window's traced number.
     live, static = eqx.partition(problem, eqx.is_array)
@@ -247,7 +247,7 @@ def equations(problem: Problem, u: Unknowns, stage: Stage) -> Equations:
     return assemble(problem, u, parts, stage)
 
 
-def over_windows(function: Callable, problem: Problem, u: Unknowns):
+def over_windows(function: Callable, problem: FitProblem, u: Unknowns):
     """`function(w, s)` of every window."""
     if problem.windows.count == 1:
         return jax.tree.map(lambda x: x[None], function(0, u.local[0]))

@@ -27,7 +27,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from lagjax.fitting.candidates import NEGLIGIBLE_SHARE, seen_directions, units_of
-from lagjax.fitting.equations import WHOLE, Problem, over_windows, window_part
+from lagjax.fitting.equations import WHOLE, FitProblem, over_windows, window_part
 from lagjax.fitting.search import UNSEEN
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.compiled import compiled
@@ -53,7 +53,7 @@ class Curvature(NamedTuple):
 
 
 @partial(compiled, in_numpy=True)
-def curvature(problem: Problem, u: Unknowns) -> Curvature:
+def curvature(problem: FitProblem, u: Unknowns) -> Curvature:
     """The curvature of the sum of squares at `u`, window by window, by forward mode over forward mode."""
     p = u.shared.size
 
@@ -158,7 +158,7 @@ class Laplace:
         return by_line("\n".join([*lines, *(f"  {words}" for words in self.caveats)]))
 
 
-def laplace(problem: Problem, u: Unknowns, variance: float) -> Laplace:
+def laplace(problem: FitProblem, u: Unknowns, variance: float) -> Laplace:
     """Laplace's approximation at `u`; `variance` is that of an error in sigmas."""
     at, found, p = curvature(problem, u), problem.found, len(u.shared)
     if not all(np.all(np.isfinite(x)) for x in at):

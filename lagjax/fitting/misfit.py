@@ -15,8 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from lagjax.fitting.equations import LOSSES, Problem
-from lagjax.numerics.chained import Equations
+from lagjax.fitting.equations import LOSSES, FitProblem
+from lagjax.numerics.chained import WindowedEquations
 
 # Deviations that chance does not explain, in standard deviations; and those that are a reason to search further.
 CHANCE, DOUBT = 5.0, 3.0
@@ -51,7 +51,7 @@ class Misfit(NamedTuple):
         return (self.large | self.curved).any()
 
 
-def misfit(problem: Problem, values: Equations) -> Misfit:
+def misfit(problem: FitProblem, values: WindowedEquations) -> Misfit:
     """Judge the residuals at the end of a search, given as dampened by the problem's loss."""
     channels, at = [], 0
     for kind, tree in problem.measured.items():

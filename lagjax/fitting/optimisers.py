@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 
-from lagjax.fitting.parameters import Found
+from lagjax.fitting.parameters import FreeNumbers
 from lagjax.jax_internals.meaning import Meaning, content_of, meaning_of
 
 
@@ -25,7 +25,7 @@ def is_of_optax(optimiser: Any) -> bool:
 class Optimiser:
     """A gradient transformation, equal to all that do the same: `optax.adam(1e-2)` is a new object in each call."""
 
-    def __init__(self, given: Any, found: Found):
+    def __init__(self, given: Any, found: FreeNumbers):
         self.given = given
         # Some take the value, too, such as `optax.contrib.reduce_on_plateau`.
         kinds = [p.kind for p in inspect.signature(given.update).parameters.values()]
@@ -43,11 +43,11 @@ class Optimiser:
     def __eq__(self, other):
         return isinstance(other, Optimiser) and self.meaning == other.meaning
 
-    def init(self, found: Found, y):
+    def init(self, found: FreeNumbers, y):
         """The state of the optimiser at free numbers `y` (p,)."""
         return self.given.init(as_params(found, y))
 
-    def step(self, found: Found, y, slopes, state, value, value_of):
+    def step(self, found: FreeNumbers, y, slopes, state, value, value_of):
         """Free numbers after a step, and the state; `value` is that of the function `value_of(y)` with these slopes."""
         more = {}
         if self.takes_value:
@@ -57,7 +57,7 @@ class Optimiser:
         return y + as_vector(changes, y), state
 
 
-def as_params(found: Found, y):
+def as_params(found: FreeNumbers, y):
     """Numbers (p,) in the structure of `params`, with None in place of numbers that are not fitted."""
     leaves, structure = jtu.tree_flatten(found.params)
     chosen: list[Any] = [None] * len(leaves)

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from lagjax.fitting.equations import WHOLE, Problem, window_part
+from lagjax.fitting.equations import WHOLE, FitProblem, window_part
 
 # The initial damping, and its factors after a step that reduces the sum of squares or does not.
 DAMPING, EASED, TIGHTENED = 1e-3, 0.2, 10.0
@@ -35,7 +35,7 @@ class Squares(NamedTuple):
     well: Bool[Array, " W"]
 
 
-def squares(problem: Problem, x, local) -> Squares:
+def squares(problem: FitProblem, x, local) -> Squares:
     """The squares at parameters `x` and starts `local` (W, k)."""
 
     def one(window):
@@ -62,7 +62,7 @@ def inverse_of(curvatures: Float[Array, "W k k"], damping: Float[Array, " W"]) -
     return jnp.linalg.inv(curvatures + jax.vmap(jnp.diag)(damped))
 
 
-def fit_starts(problem: Problem, x, local, most: int, least_gain: float = CONVERGED_BELOW) -> tuple[Array, Squares]:
+def fit_starts(problem: FitProblem, x, local, most: int, least_gain: float = CONVERGED_BELOW) -> tuple[Array, Squares]:
     """The starts with the smallest sums of squares for given parameters, after at most `most` steps."""
 
     def steps(at, damping):

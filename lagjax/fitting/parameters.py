@@ -33,7 +33,7 @@ class Leaf(NamedTuple):
 
 @jtu.register_dataclass
 @dataclass(frozen=True, eq=False)
-class Found:
+class FreeNumbers:
     """The numbers among `params` that a fit finds.
 
     - `start` (p,): where the search starts. `low`, `high` (p,): bounds, infinite where there are none.
@@ -98,7 +98,7 @@ def find(
     bounds: Mapping[str, tuple[float | None, float | None]],
     priors: Mapping[str, tuple[float, float]],
     dtype,
-) -> Found:
+) -> FreeNumbers:
     """Determine the numbers to be fitted from `params`, names, bounds and priors."""
     if not coordinates.is_traced(params):
         with jax.ensure_compile_time_eval():
@@ -137,7 +137,7 @@ def find(
         Leaf(numbers[name], None if places.all() else tuple(map(int, np.flatnonzero(places))))
         for name, places in chosen.items()
     )
-    found = Found(params, start, *(x.astype(dtype) for x in (low, high, mean, sd)), tuple(entries), leaves)
+    found = FreeNumbers(params, start, *(x.astype(dtype) for x in (low, high, mean, sd)), tuple(entries), leaves)
     _check_start(found, low, high)
     return found
 

@@ -8,14 +8,14 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 
-from lagjax.fitting.equations import WHOLE, Problem
+from lagjax.fitting.equations import WHOLE, FitProblem
 from lagjax.fitting.records import channel_name
 from lagjax.mechanics.diagnosis import listed
 from lagjax.mechanics.model import model_of
 from lagjax.motion.integrate import integrate
 
 
-def check_predicted(problem: Problem):
+def check_predicted(problem: FitProblem):
     """Raise if the measurements do not have the shapes of the motion's predictions."""
     begin = jax.tree.map(lambda x: x[0], (problem.starts.q.guess, problem.starts.v.guess))
     q, v = (jax.eval_shape(problem.unflatten, x) for x in begin)

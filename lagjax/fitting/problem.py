@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 
-from lagjax.fitting.equations import LOSSES, Problem, replace
+from lagjax.fitting.equations import LOSSES, FitProblem, replace
 from lagjax.fitting.parameters import find, leaf_name
 from lagjax.fitting.records import KINDS, Record, channels, cut, spread
 from lagjax.fitting.result import FitWarning
@@ -27,7 +27,7 @@ from lagjax.motion.switching import traced_phases
 SET_BY_FIT = {"ts", "throw", "adjoint"}
 
 
-def problem_of(system, records, params, free, observe, bounds, priors, loss, window, options) -> Problem:
+def problem_of(system, records, params, free, observe, bounds, priors, loss, window, options) -> FitProblem:
     """Check all arguments and make arrays of them."""
     check_system(system, records, params, phases=True)
     system = _system_at_start(system, window, options)
@@ -58,7 +58,7 @@ def problem_of(system, records, params, free, observe, bounds, priors, loss, win
     xp = coordinates.numpy_of((guessed.q.guess, guessed.v.guess))
     unit = xp.std(xp.concatenate([guessed.q.guess, guessed.v.guess], axis=1), axis=0)
     _warn_of_wrapped_angles(records)
-    return Problem(
+    return FitProblem(
         system, first, found, per_window, windows, guessed, measured, sigma, spreads, ratio,
         xp.where(unit > 0, unit, 1.0), unflatten, observe, options, loss, absolute,
     )  # fmt: skip

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from lagjax import plot
-from lagjax.fitting.equations import LOSSES, WHOLE, Problem, dampened, equations, starts_at
+from lagjax.fitting.equations import LOSSES, WHOLE, FitProblem, dampened, equations, starts_at
 from lagjax.fitting.identifiability import Identifiability
 from lagjax.fitting.laplace import Laplace, laplace
 from lagjax.fitting.misfit import Misfit
@@ -74,7 +74,7 @@ class Fit:
     - `training`: the course of a training with optax, `found.training.plot()`, and the fit of the held-back records.
     """
 
-    problem: Problem
+    problem: FitProblem
     unknowns: Unknowns
     cost: Float[Array, ""]
     steps: Int[Array, ""]
@@ -375,7 +375,7 @@ class Fit:
 
 
 @partial(compiled, in_numpy=True)
-def _rows(problem: Problem, u: Unknowns):
+def _rows(problem: FitProblem, u: Unknowns):
     """The residuals of all windows, without a robust loss."""
     return equations(replace(problem, loss="squares"), u, WHOLE).rows
 

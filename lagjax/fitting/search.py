@@ -29,7 +29,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from lagjax.fitting.equations import (
     WHOLE,
-    Problem,
+    FitProblem,
     Stage,
     assemble,
     assemble_slopes,
@@ -48,9 +48,9 @@ from lagjax.motion.reported import PATIENCE
 from lagjax.numerics.chained import (
     ByWindows,
     Covariance,
-    Equations,
     Slopes,
     Unknowns,
+    WindowedEquations,
     covariance,
     eliminate,
     filled,
@@ -99,10 +99,10 @@ class Searched(NamedTuple):
     costs: Float[Array, " A"]
 
 
-class Linear(NamedTuple):
+class LinearisedResiduals(NamedTuple):
     """Values and slopes of all equations at one point, and which windows' motions ended well."""
 
-    values: Equations
+    values: WindowedEquations
     slopes: Slopes
     well: Bool[Array, " W"]
 
@@ -127,7 +127,7 @@ class Evaluation(NamedTuple):
 
 
 @jitted
-def linearised(problem: Problem, u: Unknowns, stage: Stage, loss: str) -> Linear:
+def linearised(problem: FitProblem, u: Unknowns, stage: Stage, loss: str) -> LinearisedResiduals:
     """All equations and their slopes, in natural numbers, from one pass over the motions."""
     p = u.shared.size
 
@@ -141,10 +141,12 @@ def linearised(problem: Problem, u: Unknowns, stage: Stage, loss: str) -> Linear
 
     (values, well), pushed = over_windows(at, problem, u)
     by_shared, by_local = (jax.tree.map(lambda x: x[..., part], pushed) for part in (slice(p), slice(p, None)))
-    return Linear(assemble(problem, u, values, stage), assemble_slopes(problem, by_shared, by_local, stage), well)
+    return LinearisedResiduals(
+        assemble(problem, u, values, stage), assemble_slopes(problem, by_shared, by_local, stage), well
+    )
 
 
-def evaluation_from(problem: Problem, u: Unknowns, linear: Linear, stage: Stage) -> Evaluation:
+def evaluation_from(problem: FitProblem, u: Unknowns, linear: LinearisedResiduals, stage: Stage) -> Evaluation:
     """What the data determine at `u`, from the undampened residuals and their slopes."""
     sizes = linear.slopes.sizes()
     # A tiny regularisation for what the equations do not determine.
@@ -176,7 +178,7 @@ def evaluation_from(problem: Problem, u: Unknowns, linear: Linear, stage: Stage)
 
 
 @partial(compiled, in_numpy=True)
-def evaluate(problem: Problem, u: Unknowns, stage: Stage) -> Evaluation:
+def evaluate(problem: FitProblem, u: Unknowns, stage: Stage) -> Evaluation:
     """What the data determine at `u`."""
     check_predicted(problem)
     at = lambda problem, u, stage: evaluation_from(problem, u, linearised(problem, u, stage, "squares"), stage)
@@ -231,7 +233,7 @@ def _ordinary(problem, u, stage):
     return jnp.maximum(OF_NORMAL * jnp.where(jnp.isfinite(half), half, 0.0), 1.0)
 
 
-def _cost(values: Equations):
+def _cost(values: WindowedEquations):
     return 0.5 * sum(jnp.sum(x**2) for x in values)
 
 
@@ -241,7 +243,7 @@ def _largest_change(tree):
 
 
 @partial(compiled, in_numpy=True)
-def search(problem: Problem, course: Course, optimiser: Any, limit: int, tell: bool):
+def search(problem: FitProblem, course: Course, optimiser: Any, limit: int, tell: bool):
     """Search from the starts of a course through all its stages; `tell` says whether to call the listeners.
 
     Returns a `Searched` and, if the search keeps its slopes, what the data determine at its end.
@@ -292,7 +294,7 @@ class _Best(NamedTuple):
 
     y: Unknowns
     cost: Float[Array, ""]
-    values: Equations
+    values: WindowedEquations
     slopes: Slopes | None
     well: Bool[Array, " W"]
     rested: Bool[Array, ""]
@@ -361,7 +363,7 @@ def _search(problem, course, optimiser, limit, tell):
         # The priors alone, without the hold of the search.
         mean, weight = prior_and_hold(problem, WHOLE)
         values = best.values._replace(shared=weight * (u.shared - mean))
-        linear = Linear(values, slopes._replace(shared=jnp.diag(weight)), best.well)
+        linear = LinearisedResiduals(values, slopes._replace(shared=jnp.diag(weight)), best.well)
         evaluation = evaluation_from(problem, u, linear, jax.tree.map(lambda x: x[-1], course.stages))
     return Searched(u, best.cost, steps, best.rested, best.misfit, costs), evaluation
 
@@ -377,7 +379,7 @@ def _no_end(problem, y, with_slopes):
     j = 0 if windows == 1 else problem.unit.size
     zeros = lambda *shape: jnp.zeros(shape, dtype)
     w = windows
-    values = Equations(zeros(w, m), zeros(w, j), zeros(p))
+    values = WindowedEquations(zeros(w, m), zeros(w, j), zeros(p))
     slopes = Slopes(zeros(w, m, p), zeros(w, m, k), zeros(w, j, p), zeros(w, j, k), zeros(w, j, k), zeros(p, p))
     no, each = jnp.zeros((), bool), jnp.zeros(len(jax.tree.leaves(problem.measured)), bool)
     unjudged = Misfit(jnp.zeros(each.shape, dtype), each, each, no)

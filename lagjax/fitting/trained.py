@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from lagjax import plot
-from lagjax.fitting.equations import WHOLE, Problem
+from lagjax.fitting.equations import WHOLE, FitProblem
 from lagjax.fitting.optimisers import Optimiser
 from lagjax.fitting.problem import problem_of
 from lagjax.fitting.records import Record
@@ -20,8 +20,8 @@ from lagjax.fitting.result import Fit
 from lagjax.fitting.search import Evaluation, Searched, evaluate
 from lagjax.fitting.training import (
     FinalResult,
-    State,
     Task,
+    TrainingState,
     all_rounds,
     final_result,
     has_another_round,
@@ -143,7 +143,7 @@ def split_records(
     return [r for i, r in enumerate(records) if i not in chosen], [records[i] for i in sorted(chosen)]
 
 
-def held_problem(problem: Problem, records, system, params, observe, loss, window, options) -> Problem | None:
+def held_problem(problem: FitProblem, records, system, params, observe, loss, window, options) -> FitProblem | None:
     """The problem of the held-back records, weighted like the training records; None if there are none."""
     if not records:
         return None
@@ -160,8 +160,8 @@ def held_problem(problem: Problem, records, system, params, observe, loss, windo
 
 
 def train(
-    problem: Problem,
-    held: Problem | None,
+    problem: FitProblem,
+    held: FitProblem | None,
     optimiser: Any,
     batch: int | None,
     steps: int | None,
@@ -206,7 +206,7 @@ def train(
     return Trained(searched, evaluation, course)
 
 
-def _run_rounds(task: Task, progress, check) -> tuple[State, np.ndarray, np.ndarray]:
+def _run_rounds(task: Task, progress, check) -> tuple[TrainingState, np.ndarray, np.ndarray]:
     """Run the rounds one by one, with a meter; an interrupt between two leaves nothing behind."""
     losses = []
     with meter(progress, unit=" steps", desc="training", total=int(task.limit)) as shown:
@@ -228,7 +228,7 @@ def _run_rounds(task: Task, progress, check) -> tuple[State, np.ndarray, np.ndar
             after, result = round_of(task, state)
 
 
-def _fit_of_held_back(task: Task, state: State, end: FinalResult, end_held: FinalResult) -> Fit:
+def _fit_of_held_back(task: Task, state: TrainingState, end: FinalResult, end_held: FinalResult) -> Fit:
     """The fit of the starts of the held-back records."""
     held: Any = task.held
     problem = with_params(held, task.problem, end.unknowns.shared)

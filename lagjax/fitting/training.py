@@ -24,7 +24,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from lagjax.fitting.equations import WHOLE, Problem, dampened, equations, prior_and_hold, window_part
+from lagjax.fitting.equations import WHOLE, FitProblem, dampened, equations, prior_and_hold, window_part
 from lagjax.fitting.misfit import OF_NORMAL, Misfit, misfit
 from lagjax.fitting.optimisers import Optimiser
 from lagjax.fitting.own_starts import DAMPING, Squares, fit_starts, inverse_of, squares
@@ -51,7 +51,7 @@ class Best(NamedTuple):
     held: Float[Array, "H k"]
 
 
-class State(NamedTuple):
+class TrainingState(NamedTuple):
     """The state of a training.
 
     - `y` (p,): unbounded numbers. `local` (W, k), `held` (H, k): starts of windows, and of the held-back ones.
@@ -87,8 +87,8 @@ class Task(NamedTuple):
     `held` is None if no records are held back. A round has `steps` steps, of `batch` windows each.
     """
 
-    problem: Problem
-    held: Problem | None
+    problem: FitProblem
+    held: FitProblem | None
     optimiser: Optimiser
     batch: int
     steps: int
@@ -112,7 +112,7 @@ class FinalResult(NamedTuple):
 
 
 @partial(compiled, in_numpy=True)
-def initial_state(task: Task) -> State:
+def initial_state(task: Task) -> TrainingState:
     """The state before the first step."""
 
     def begin(task):
@@ -124,7 +124,7 @@ def initial_state(task: Task) -> State:
         held, score = jnp.zeros((0, k), local.dtype), jnp.sum(at.sums) / jnp.maximum(jnp.sum(task.known), 1)
         if task.held is not None:
             held, score = _evaluate_held(task, y, jnp.asarray(task.held.start.local), FINAL_STEPS)
-        return State(
+        return TrainingState(
             y, local, held, task.optimiser.init(problem.found, y), _inverses(at),
             jnp.arange(windows), jnp.full((), windows), zero, zero, zero, zero, Best(score, zero, y, local, held),
         )  # fmt: skip
@@ -133,13 +133,13 @@ def initial_state(task: Task) -> State:
 
 
 @partial(compiled, in_numpy=True)
-def round_of(task: Task, state: State) -> tuple[State, Round]:
+def round_of(task: Task, state: TrainingState) -> tuple[TrainingState, Round]:
     """One round: its steps and an evaluation."""
     return in_turn(_round, task, state)
 
 
 @compiled
-def all_rounds(task: Task, rounds: int) -> tuple[State, State, Round]:
+def all_rounds(task: Task, rounds: int) -> tuple[TrainingState, TrainingState, Round]:
     """All rounds in one program, for a fit inside another program; returns the initial state first."""
 
     def run(task):
@@ -152,13 +152,13 @@ def all_rounds(task: Task, rounds: int) -> tuple[State, State, Round]:
     return in_turn(run, task)
 
 
-def has_another_round(task: Task, state: State):
+def has_another_round(task: Task, state: TrainingState):
     """Whether there is another round."""
     return (state.step < task.limit) & (state.round - state.best.round < task.patience)
 
 
 @partial(compiled, in_numpy=True)
-def final_result(task: Task, state: State) -> tuple[FinalResult, FinalResult | None]:
+def final_result(task: Task, state: TrainingState) -> tuple[FinalResult, FinalResult | None]:
     """The best parameters with all starts fitted to them, and the same for the held-back records."""
 
     def end(task, state):
@@ -176,12 +176,12 @@ def _final_result(problem, x, local) -> FinalResult:
     return FinalResult(u, 0.5 * sum(jnp.sum(r**2) for r in values), misfit(problem, values))
 
 
-def with_params(held: Problem, problem: Problem, x) -> Problem:
+def with_params(held: FitProblem, problem: FitProblem, x) -> FitProblem:
     """The problem of the held-back records with these parameters, which it does not fit."""
     return replace(held, found=replace(held.found, params=problem.found.into(x)))
 
 
-def _round(task: Task, state: State):
+def _round(task: Task, state: TrainingState):
     stays = lambda state: (state, jnp.asarray(jnp.nan, state.y.dtype))
     one = lambda state, _: lax.cond(state.step < task.limit, partial(_step, task), stays, state)
     state, losses = lax.scan(one, state, length=task.steps)
@@ -209,7 +209,7 @@ def _evaluate_held(task: Task, y, held, most):
     return held, jnp.sum(at.sums) / jnp.maximum(known, 1)
 
 
-def _step(task: Task, state: State):
+def _step(task: Task, state: TrainingState):
     """One step of the optimiser, and half a Newton step for the starts of its batch."""
     problem, found, known = task.problem, task.problem.found, task.known
     count, total = problem.windows.count, jnp.maximum(jnp.sum(known), 1)

@@ -8,7 +8,7 @@ the mode is the true one (the guard), and the mode beyond.
 
 A mode is one number: 0 or 1 for a comparison (`a > b`), a whole number for a level (`floor`). Comparisons of the same
 two numbers have one mode, wherever they stand, so that programs are told apart by what they compute: each value has a
-number of its own in a `Table`, shared by several programs.
+number of its own in a `JumpTable`, shared by several programs.
 """
 
 from collections.abc import Callable
@@ -87,7 +87,7 @@ class Timed(NamedTuple):
 
 
 @dataclass
-class Table:
+class JumpTable:
     """The numbers of values, and the slots found so far, for several programs over the same state.
 
     `negative`: for the numbers of values -x, that of x. `slots` by key, in order; `missed`: what is not followed, in
@@ -104,7 +104,7 @@ class Table:
         return self.numbers.setdefault(key, len(self.numbers))
 
 
-class Known(NamedTuple):
+class KnownValue(NamedTuple):
     """A value in a program, its number in the table, on what of the state it depends, and its bounds."""
 
     value: Any
@@ -132,21 +132,21 @@ def has_jumps(jaxpr: Jaxpr) -> bool:
     )  # fmt: skip
 
 
-class Opening:
+class JumpOpening:
     """A walk over a program that takes modes for its comparisons.
 
     `mode(key, actual)` gives the modes to use for those that the numbers themselves would give. `inside`: the guard of
     each mode; `timed`: the jumps that depend on t alone, which are left as they are; both by key.
     """
 
-    def __init__(self, table: Table, role: str, mode: Callable):
+    def __init__(self, table: JumpTable, role: str, mode: Callable):
         self.table, self.role, self.mode = table, role, mode
         self.inside: dict[Any, Inside] = {}
         self.timed: dict[Any, Timed] = {}
         # Inside of `interp`: by the number of what is looked up, whether it is below and above the whole table.
         self._beyond_table: dict[int, tuple] = {}
 
-    def run(self, closed: ClosedJaxpr, inputs: list[Known]) -> list[Known]:
+    def run(self, closed: ClosedJaxpr, inputs: list[KnownValue]) -> list[KnownValue]:
         """The results of a program."""
         jaxpr, constants = closed.jaxpr, closed.consts
         # What is not used, as the sign that `logsumexp` could return, does not jump.
@@ -163,9 +163,9 @@ class Opening:
         if isinstance(value, np.ndarray | np.generic | float | int) and np.size(value) == 1:
             # A weak type does not tell one zero from another.
             number = self.table.number("number", float(np.ravel(value)[0]))
-            return Known(value, number, frozenset(), of_number(value))
+            return KnownValue(value, number, frozenset(), of_number(value))
         # Held by the table's key: another object cannot get its address.
-        return Known(value, self.table.number("constant", _Held(value)), frozenset())
+        return KnownValue(value, self.table.number("constant", _Held(value)), frozenset())
 
     def _results(self, jaxpr, equation, operands):
         name, depends = equation.primitive.name, frozenset().union(*(x.depends for x in operands))
@@ -218,7 +218,7 @@ class Opening:
             depends = frozenset({IN_TIME if depends <= {"t", IN_TIME} else OUTCOME})
         bounds = of_result(equation, [x.bounds for x in operands])
         each = enumerate(results)
-        return [Known(y, self.table.number("result", i, key), depends, ALL if i else bounds) for i, y in each]
+        return [KnownValue(y, self.table.number("result", i, key), depends, ALL if i else bounds) for i, y in each]
 
     # What each primitive does for given modes.
 
@@ -269,7 +269,7 @@ class Opening:
         whole = self._level(name, values[0], operands, depends, name)
         return None if whole is None else [whole]
 
-    def _above(self, a: Known, b: Known, depends, jumps, kind):
+    def _above(self, a: KnownValue, b: KnownValue, depends, jumps, kind):
         """Whether a > b by the mode; both orders of a and b have one mode."""
         if a.bounds[0] >= b.bounds[1] or a.bounds[1] <= b.bounds[0]:
             # Decided once and for all: it guards against round-off.
@@ -344,7 +344,7 @@ class Opening:
         # `interp` also compares with the ends of its table; after it the same comparison stands for itself.
         self._beyond_table = {numbers[0].number: (mode < 0.5, mode > n - 0.5)}
         dtype = equation.outvars[0].aval.dtype
-        return [Known(i.astype(dtype), self.table.number("place", *key), frozenset({OUTCOME}))]
+        return [KnownValue(i.astype(dtype), self.table.number("place", *key), frozenset({OUTCOME}))]
 
     def _mode(self, key, slot: Slot, timed: Timed):
         """The mode; None for a jump in time alone, which stays as it is."""

@@ -16,7 +16,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
-from lagjax.jax_internals.opened import COMPARISONS, Known, Opening, Slot, Table, Timed, has_jumps
+from lagjax.jax_internals.opened import COMPARISONS, JumpOpening, JumpTable, KnownValue, Slot, Timed, has_jumps
 from lagjax.jax_internals.programs import outputs_of, run
 from lagjax.mechanics.arguments import OF_STATE, takes_of
 from lagjax.mechanics.coordinates import State
@@ -75,7 +75,7 @@ class OfParams(eqx.Module):
 
 
 @dataclass(frozen=True, eq=False)
-class Traced:
+class OpenedFunction:
     """The opened program of one function: its results, then the guards, the modes beyond and the differences.
 
     `places`: for each mode of the system whose guard this program gives, its number.
@@ -106,7 +106,7 @@ class Jumps:
     """
 
     slots: tuple[Slot, ...]
-    traced: dict[str, Traced]
+    traced: dict[str, OpenedFunction]
     missed: tuple[str, ...]
 
     @property
@@ -172,7 +172,7 @@ def found(system: System, t, q, v, params) -> Jumps | None:
     programs = {role: traced for role, traced in programs.items() if has_jumps(traced.program.jaxpr)}
     if not programs:
         return None
-    table = Table()
+    table = JumpTable()
     for role, traced in programs.items():
         _opened(traced, role, table, lambda key, actual: actual)
     missed = list(table.missed)
@@ -229,15 +229,15 @@ def _opened(traced: _Program, role, table, mode):
     walks = []
 
     def walk(*leaves):
-        walks.append(Opening(table, role, mode))
-        known = [Known(x, table.number(*key), depends) for x, (key, depends) in zip(leaves, traced.inputs)]
+        walks.append(JumpOpening(table, role, mode))
+        known = [KnownValue(x, table.number(*key), depends) for x, (key, depends) in zip(leaves, traced.inputs)]
         return [x.value for x in walks[-1].run(traced.program, known)]
 
     jax.eval_shape(walk, *traced.program.in_avals)
     return walks[-1]
 
 
-def _with_modes(traced: _Program, role, table, starts, count, defined) -> Traced:
+def _with_modes(traced: _Program, role, table, starts, count, defined) -> OpenedFunction:
     dtype = next(x.dtype for x in traced.program.in_avals if jnp.issubdtype(x.dtype, jnp.floating))
     places, of_time = [], []
 
@@ -250,8 +250,8 @@ def _with_modes(traced: _Program, role, table, starts, count, defined) -> Traced
             known = modes[starts[key] : starts[key] + actual.size].reshape(actual.shape)
             return jnp.where(free, actual, known)
 
-        opening = Opening(table, role, mode)
-        known = [Known(x, table.number(*key), depends) for x, (key, depends) in zip(leaves, traced.inputs)]
+        opening = JumpOpening(table, role, mode)
+        known = [KnownValue(x, table.number(*key), depends) for x, (key, depends) in zip(leaves, traced.inputs)]
         results = [x.value for x in opening.run(traced.program, known)]
         for key, inside in opening.inside.items():
             if key not in starts or key in defined:
@@ -269,7 +269,7 @@ def _with_modes(traced: _Program, role, table, starts, count, defined) -> Traced
 
     modes = jax.ShapeDtypeStruct((count,), dtype), jax.ShapeDtypeStruct((), bool)
     program = jax.make_jaxpr(walk)(*traced.program.in_avals, *modes)
-    return Traced(program, traced.shape, traced.takes, tuple(places), traced.multipliers, tuple(of_time))
+    return OpenedFunction(program, traced.shape, traced.takes, tuple(places), traced.multipliers, tuple(of_time))
 
 
 def leaves_of(function, arguments):

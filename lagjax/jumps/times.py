@@ -14,7 +14,7 @@ from jax import lax
 from jaxtyping import Array
 
 from lagjax.jax_internals.programs import outputs_of, run
-from lagjax.jumps.found import Jumps, Traced, leaves_of
+from lagjax.jumps.found import Jumps, OpenedFunction, leaves_of
 
 # Functions of t are evaluated at so many times of a motion; and the most of their jumps that are followed.
 SAMPLES, ROOM = 4096, 256
@@ -47,7 +47,7 @@ def with_jumps_in_time(jumps: Jumps, jump_ts, system, q, v, params, ts):
     return jnp.concatenate([x.astype(ts.dtype) for x in found]), too_many
 
 
-def _at(t, outputs, traced: Traced, function, arguments):
+def _at(t, outputs, traced: OpenedFunction, function, arguments):
     """Some results of the program at a time; jumps in t alone do not depend on the rest of the state."""
     if not outputs:
         return []

@@ -17,14 +17,14 @@ AXES = "xyz"
 NAMES = re.compile(r"(?P<before>(?:.*\.)?(?:\w+_)?)(?P<axis>[xyzXYZ])(?P<after>\d*|_\w+)")
 
 
-class Point(NamedTuple):
+class CartesianPoint(NamedTuple):
     """A point: its label ("" for the only one), and the places of its coordinates along x, y, z (None: it has none)."""
 
     label: str
     places: tuple[int | None, int | None, int | None]
 
 
-def points(q) -> list[Point]:
+def points(q) -> list[CartesianPoint]:
     """The points among the coordinates.
 
     >>> points({"x": 0.0, "y": 0.0, "angle": 0.0})
@@ -41,7 +41,7 @@ def points(q) -> list[Point]:
             for i in range(size // last):
                 label = name if len(shape) == 1 else f"{name}[{i}]"
                 where = [start + i * last + k for k in range(last)]
-                found.append(Point(label, (where[0], where[1], where[2] if len(where) > 2 else None)))
+                found.append(CartesianPoint(label, (where[0], where[1], where[2] if len(where) > 2 else None)))
         elif path and not shape and (match := NAMES.fullmatch(name)):
             key = match["before"], match["after"], match["axis"].isupper()
             axes_by_point.setdefault(key, {})[match["axis"].lower()] = start, name
@@ -49,7 +49,7 @@ def points(q) -> list[Point]:
     for axes in axes_by_point.values():
         if len(axes) > 1:
             where = tuple(axes[axis][0] if axis in axes else None for axis in AXES)
-            found.append(Point(", ".join(name for _, name in axes.values()), where))
+            found.append(CartesianPoint(", ".join(name for _, name in axes.values()), where))
     return [found[0]._replace(label="")] if len(found) == 1 else found
 
 
@@ -60,7 +60,7 @@ def leaf_names(q) -> list[str]:
     return coordinates.names(jtu.tree_unflatten(jtu.tree_structure(q), [0.0] * len(paths)))
 
 
-def turned(point: Point, axis: str) -> tuple[int, int] | None:
+def turned(point: CartesianPoint, axis: str) -> tuple[int, int] | None:
     """The two places that a rotation about an axis mixes, the first turning to the second; None if one is missing."""
     k = AXES.index(axis)
     first, second = point.places[(k + 1) % 3], point.places[(k + 2) % 3]

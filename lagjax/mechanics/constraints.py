@@ -107,7 +107,7 @@ class Nonholonomic(eqx.Module):
         return f"Nonholonomic({getattr(self.phi, '__name__', 'phi')})"
 
 
-class Rows(NamedTuple):
+class ConstraintRows(NamedTuple):
     """All constraints of a system at one state, stacked: the linear equation `A a = gamma`."""
 
     jacobian: Float[Array, "m n"]
@@ -137,10 +137,10 @@ def jacobian(model, t, x, u) -> Float[Array, "m n"]:
     return jax.jacfwd(lambda u: velocity_residual(model, t, x, u))(u)
 
 
-def acceleration_rows(model, t, x, u) -> Rows:
+def acceleration_rows(model, t, x, u) -> ConstraintRows:
     """`A` and `gamma` of all constraints."""
     _, rate = jax.jvp(lambda t, x: velocity_residual(model, t, x, u), (t, x), (jnp.ones_like(t), u))
-    return Rows(jacobian(model, t, x, u), -rate)
+    return ConstraintRows(jacobian(model, t, x, u), -rate)
 
 
 def baumgarte_feedback(model, t, x, u, rate):

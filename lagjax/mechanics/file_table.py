@@ -122,7 +122,7 @@ lagjax.fitting.candidates
   Candidate: name t times sd alone sigma rows known direction least
 lagjax.fitting.parameters
   Leaf: number places
-  Found: params start low high mean sd names leaves
+  FreeNumbers: params start low high mean sd names leaves
 lagjax.fitting.records
   Windows: ts real sample last seam record
   Record: t measured q0 v0 hold_q hold_v params sigma
@@ -130,7 +130,7 @@ lagjax.fitting.starts
   Chart: guess along across
   Starts: q v
 lagjax.fitting.equations
-  Problem: system first found overrides windows starts measured sigma spread spread_in_sigmas unit unflatten observe
+  FitProblem: system first found overrides windows starts measured sigma spread spread_in_sigmas unit unflatten observe
     options loss absolute
 lagjax.fitting.misfit
   Misfit: times large curved doubtful

@@ -20,7 +20,7 @@ from lagjax.mechanics.memory import kinds, remembered
 from lagjax.mechanics.model import Model, model_of
 from lagjax.mechanics.refusals import check_system
 from lagjax.mechanics.system import System, unchecked
-from lagjax.mechanics.traced import Program, Traced, traced
+from lagjax.mechanics.traced import Traced, TracedProgram, traced
 
 CAUSE = "an argument left out as the function does not need it, or one too many: a constraint of positions takes no v"
 
@@ -66,7 +66,7 @@ def traced_call(call: Call, given: Mapping[str, Any], check: Callable, usual_cau
     def make():
         check_arguments(call, usual_cause)
         with in_words(call, given):
-            program = Program(call.function, call.takes, args)
+            program = TracedProgram(call.function, call.takes, args)
         check(call, program.value)
         return program
 

@@ -22,7 +22,7 @@ from lagjax.mechanics.first_call import prepare
 from lagjax.mechanics.reactions import response
 
 
-class Linear(NamedTuple):
+class LinearEquation(NamedTuple):
     """The equation `M a = F` at one state, in vector form.
 
     `response`: B of a force F + B λ that depends on multipliers; None where it does not.
@@ -33,7 +33,7 @@ class Linear(NamedTuple):
     response: Float[Array, "n m"] | None
 
 
-def mass_and_forcing(model, t, x, u) -> Linear:
+def mass_and_forcing(model, t, x, u) -> LinearEquation:
     """M and F at the state with position vector `x` and velocity vector `u`."""
     forcing, inertia = forcing_and_inertia(model, t, x, u)
     if x.size == 1:
@@ -41,7 +41,7 @@ def mass_and_forcing(model, t, x, u) -> Linear:
     else:
         # One column of M for each velocity, stacked as rows: M is symmetric.
         mass = jax.vmap(inertia)(jnp.eye(x.size, dtype=x.dtype))
-    return Linear(mass.astype(x.dtype), forcing, response(model, t, x, u))
+    return LinearEquation(mass.astype(x.dtype), forcing, response(model, t, x, u))
 
 
 def forcing_and_inertia(model, t, x, u):

@@ -98,7 +98,7 @@ def noether_charge(system: System, generator) -> NoetherCharge:
     return NoetherCharge(system, as_generator(generator))
 
 
-class Flow(NamedTuple):
+class GeneratorFlow(NamedTuple):
     """A generator at one state: ξ, τ and F, and their total derivatives along the motion; ξ in vector form."""
 
     xi: Float[Array, " n"]
@@ -109,12 +109,12 @@ class Flow(NamedTuple):
     gauge_rate: Float[Array, ""]
 
 
-def flow(generator: Generator, t, q, v, params) -> Flow:
+def flow(generator: Generator, t, q, v, params) -> GeneratorFlow:
     """A generator and its total derivatives at one state."""
     at = lambda t, q: generator.at(t, q, params)
     (xi, tau, gauge), (xi_rate, tau_rate, gauge_rate) = jax.jvp(at, (t, q), (jnp.ones_like(t), v))
     vector = lambda y: coordinates.flatten(y)[0]
-    return Flow(vector(xi), tau, gauge, vector(xi_rate), tau_rate, gauge_rate)
+    return GeneratorFlow(vector(xi), tau, gauge, vector(xi_rate), tau_rate, gauge_rate)
 
 
 def _terms(generator, model, s):

@@ -37,7 +37,7 @@ from jaxtyping import Array, Bool, Float, PyTree
 from lagjax.mechanics import constraints
 from lagjax.mechanics.compiled import compiled
 from lagjax.mechanics.coordinates import State
-from lagjax.mechanics.lagrangian import Linear, mass_and_forcing
+from lagjax.mechanics.lagrangian import LinearEquation, mass_and_forcing
 from lagjax.mechanics.reactions import Reactions, with_reactions
 from lagjax.mechanics.verdict import Verdict, acceleration_round_off, slightly_off, vanishing
 from lagjax.numerics import dense
@@ -117,7 +117,7 @@ def saddle_point(mass, jacobian, forcing, gamma, independent):
     return solution[:n], minimum_norm(jacobian, multipliers, independent)
 
 
-def _solved(linear: Linear, jacobian, gamma, independent) -> Reactions:
+def _solved(linear: LinearEquation, jacobian, gamma, independent) -> Reactions:
     """The solution where the force may depend on the multipliers."""
     solve = lambda forcing, gamma: saddle_point(linear.mass, jacobian, forcing, gamma, independent)
     return with_reactions(solve, linear.forcing, gamma, linear.response)
@@ -221,8 +221,8 @@ class Examined(NamedTuple):
 
     a: PyTree[Array]
     multipliers: Any
-    linear: Linear
-    rows: constraints.Rows
+    linear: LinearEquation
+    rows: constraints.ConstraintRows
     independent: Bool[Array, " m"]
     lagrangian: Float[Array, ""]
     matrix: Float[Array, "k k"]

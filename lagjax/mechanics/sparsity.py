@@ -24,7 +24,7 @@ from lagjax.jax_internals.names import ACCUMULATING, ELEMENTWISE, IN_NUMPY, REDU
 from lagjax.jax_internals.programs import interpreted
 
 
-class Value(NamedTuple):
+class SparseValue(NamedTuple):
     """An intermediate value: the inputs that each entry depends on, and the entries if they are constants."""
 
     sets: np.ndarray
@@ -52,8 +52,8 @@ def pattern(function: Callable, vector, *rest) -> Bool[np.ndarray, "m n"]:
     shaped = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), (vector, *rest))
     closed = jax.make_jaxpr(lambda *args: jnp.ravel(function(*args)))(*shaped)
     n = shaped[0].size
-    inputs = [Value(_empty(x.aval.shape)) for x in closed.jaxpr.invars]
-    inputs[0] = Value(np.array([1 << i for i in range(n)], object))
+    inputs = [SparseValue(_empty(x.aval.shape)) for x in closed.jaxpr.invars]
+    inputs[0] = SparseValue(np.array([1 << i for i in range(n)], object))
     (found,) = interpreted(closed, inputs, _apply, _constant)
     return _as_booleans(found.sets, n)
 
@@ -67,7 +67,7 @@ def _as_booleans(sets, count):
 
 def _constant(x, aval):
     known = None if isinstance(x, Tracer) else np.asarray(x)
-    return Value(_empty(np.shape(x)), known)
+    return SparseValue(_empty(np.shape(x)), known)
 
 
 def _empty(shape):
@@ -79,13 +79,13 @@ def _apply(equation, operands):
     shapes = [x.aval.shape for x in equation.outvars]
     results = None
     if name in ENTRYWISE:
-        results = [Value(_united(name, operands, shapes[0]), _evaluated(name, equation, operands))]
+        results = [SparseValue(_united(name, operands, shapes[0]), _evaluated(name, equation, operands))]
     elif name in RULES and None not in (results := RULES[name](operands, params, equation)):
         pass
     else:
         # Anything else: each result depends on everything that the operands depend on.
         everything = np.bitwise_or.reduce([_union(x.sets) for x in operands] + [0])
-        results = [Value(np.full(shape, everything, object)) for shape in shapes]
+        results = [SparseValue(np.full(shape, everything, object)) for shape in shapes]
     return results
 
 
@@ -132,7 +132,7 @@ def _moving(move):
         sets = move([x.sets for x in operands], params)
         single = not isinstance(sets, list)
         sets, moved = ([sets], [moved]) if single else (sets, moved or [None] * len(sets))
-        return [Value(s, k) for s, k in zip(sets, moved)]
+        return [SparseValue(s, k) for s, k in zip(sets, moved)]
 
     return rule
 
@@ -187,7 +187,7 @@ def _by_positions(move, source, indices, equation):
         positions = jnp.arange(1, source.sets.size + 1, dtype=jnp.float32).reshape(source.sets.shape)
         taken = np.nan_to_num(np.asarray(move(positions, *(jnp.asarray(x.known) for x in indices)))).astype(int)
     taken = np.where((taken >= 0) & (taken <= source.sets.size), taken, 0)
-    return [Value(np.append(np.array([0], object), np.ravel(source.sets))[taken])]
+    return [SparseValue(np.append(np.array([0], object), np.ravel(source.sets))[taken])]
 
 
 def _scatter(operands, params, equation):
@@ -205,7 +205,7 @@ def _scatter(operands, params, equation):
         (target,) = jax.linear_transpose(add, like)(positions)
     sets = np.append(np.array([0], object), np.ravel(onto.sets))
     np.bitwise_or.at(sets, np.ravel(np.asarray(target)).astype(int), np.ravel(updates.sets))
-    return [Value(sets[1:].reshape(onto.sets.shape))]
+    return [SparseValue(sets[1:].reshape(onto.sets.shape))]
 
 
 def _dynamic_slice(operands, params, equation):
@@ -215,7 +215,7 @@ def _dynamic_slice(operands, params, equation):
     source, sizes = operands[0].sets, params["slice_sizes"]
     # XLA shifts a slice back that would reach beyond the end.
     first = [int(np.clip(s, 0, n - k)) for s, n, k in zip(starts, source.shape, sizes)]
-    return [Value(source[tuple(slice(i, i + k) for i, k in zip(first, sizes))])]
+    return [SparseValue(source[tuple(slice(i, i + k) for i, k in zip(first, sizes))])]
 
 
 def _dot_general(operands, params, equation):
@@ -232,28 +232,28 @@ def _dot_general(operands, params, equation):
     (a, a_counts), (b, b_counts) = sides
     if a.size * b.shape[2] > TERMS:
         rows, columns = _union(a, (1,)), _union(b, (1,))
-        return [Value((rows[:, :, None] | columns[:, None, :]).reshape(shape))]
+        return [SparseValue((rows[:, :, None] | columns[:, None, :]).reshape(shape))]
     found = _empty((a.shape[0], a.shape[2], b.shape[2]))
     for k in range(a.shape[1]):
         found |= np.where(b_counts[:, k, None, :], a[:, k, :, None], 0)
         found |= np.where(a_counts[:, k, :, None], b[:, k, None, :], 0)
-    return [Value(found.reshape(shape))]
+    return [SparseValue(found.reshape(shape))]
 
 
 def _reduce(operands, params, equation):
-    return [Value(_union(operands[0].sets, params["axes"]))]
+    return [SparseValue(_union(operands[0].sets, params["axes"]))]
 
 
 def _accumulate(operands, params, equation):
     flip = lambda x: np.flip(x, params["axis"]) if params["reverse"] else x
-    return [Value(flip(np.bitwise_or.accumulate(flip(operands[0].sets), axis=params["axis"])))]
+    return [SparseValue(flip(np.bitwise_or.accumulate(flip(operands[0].sets), axis=params["axis"])))]
 
 
 def _iota(operands, params, equation):
     aval = equation.outvars[0].aval
     along = np.arange(aval.shape[params["dimension"]], dtype=aval.dtype)
     along = along.reshape([-1 if i == params["dimension"] else 1 for i in range(len(aval.shape))])
-    return [Value(_empty(aval.shape), np.broadcast_to(along, aval.shape))]
+    return [SparseValue(_empty(aval.shape), np.broadcast_to(along, aval.shape))]
 
 
 RULES = {

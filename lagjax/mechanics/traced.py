@@ -42,7 +42,7 @@ LIKE_ARRAYS = (float, np.generic, jax.ShapeDtypeStruct)
 MISSING = object()
 
 
-class Program:
+class TracedProgram:
     """A function traced on arguments of one kind; equal to any with the same jaxpr for arguments of the same kind.
 
     `function`: the user's. `takes`: the names of its arguments; `like`: these, with shapes for arrays, as also in
@@ -77,7 +77,7 @@ class Program:
         return hash(self._meaning)
 
     def __eq__(self, other):
-        return self is other or isinstance(other, Program) and self._meaning == other._meaning
+        return self is other or isinstance(other, TracedProgram) and self._meaning == other._meaning
 
     def __call__(self, arrays, args):
         """The function's result, given the arrays that it reads."""
@@ -100,7 +100,7 @@ class Traced(eqx.Module):
     """A user's function as the library calls it: its program, and the arrays that it reads from outside."""
 
     arrays: tuple[Array, ...]
-    program: Program = eqx.field(static=True)
+    program: TracedProgram = eqx.field(static=True)
 
     def __call__(self, *args):
         return self.program(self.arrays, args)
@@ -123,10 +123,10 @@ class Traced(eqx.Module):
 
 
 def _traced_again(function, takes, like):
-    return _of_program(Program(function, takes, like))
+    return _of_program(TracedProgram(function, takes, like))
 
 
-def traced(function: Callable, args: tuple, make: Callable[[], Program]) -> Traced:
+def traced(function: Callable, args: tuple, make: Callable[[], TracedProgram]) -> Traced:
     """A function of the user's as its jaxpr for arguments like `args`, with the program that `make` traces.
 
     What has been traced for such arguments already, as the functions of a trajectory's system, stays as it is.

@@ -16,7 +16,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from lagjax.mechanics.equations import Equations
-from lagjax.motion.tolerances import Weighing
+from lagjax.motion.tolerances import PerCoordinateTolerance
 
 # `shares` with the first step as proposed, and no longest one; an infinite share of an empty interval would be NaN.
 WHOLE_STEPS = 1.0, 1e30
@@ -24,20 +24,20 @@ WHOLE_STEPS = 1.0, 1e30
 MARGIN = 4
 
 
-class Arriving(diffrax.AbstractStepSizeController):
+class StepToOutputs(diffrax.AbstractStepSizeController):
     """Wrap `controller`: each of the increasing times `ts` is the end of a step.
 
     `shares`: the part of the proposed first step that is taken; and the longest step, as a part of the interval between
     two of `ts`.
     """
 
-    controller: diffrax.PIDController | Weighing
+    controller: diffrax.PIDController | PerCoordinateTolerance
     ts: Float[Array, " T"]
     shares: Float[Array, " 2"]
 
     def wrap(self, direction):
         """Wrap the inner controller likewise; `ts` stay, since time always runs forward here."""
-        return Arriving(self.controller.wrap(direction), self.ts, self.shares)
+        return StepToOutputs(self.controller.wrap(direction), self.ts, self.shares)
 
     def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
         """Choose the first step."""

@@ -25,7 +25,7 @@ from lagjax.mechanics.equations import Equations
 from lagjax.motion.crossings import Crossings, Guards
 from lagjax.motion.pieces import Watched
 from lagjax.motion.sight import uneven
-from lagjax.motion.watching import Watching
+from lagjax.motion.watching import EventController
 
 # A guard jumps if, where its sign changes, it is this many times farther from zero than time resolution explains.
 JUMP_FACTOR = 64
@@ -44,7 +44,7 @@ class Located(NamedTuple):
     uncertain: Bool[Array, " m"]
 
 
-def locate(watching: Watching, watched: Watched) -> Located:
+def locate(watching: EventController, watched: Watched) -> Located:
     """Return the recorded crossings, with the derivatives that follow from staying on the guards."""
     sight = watching.sight
     equations, guards = sight.motion.equations, sight.guards

@@ -147,7 +147,7 @@ class Crossings(eqx.Module):
         return f"{count}{kept}{f', at t = {shown}' if shown else ''}{doubt}"
 
 
-class Kind(NamedTuple):
+class EventKind(NamedTuple):
     """The static properties of a guard: see `Crossing`. `long`: it takes long to compile.
 
     `holds`: it is assumed to be above zero at the start; if it is not, it counts as crossed there. `may_rest`: it may
@@ -168,7 +168,7 @@ class Guards(eqx.Module):
     """All guards of a motion as one function that returns a number for each."""
 
     functions: tuple[Callable, ...]
-    kinds: tuple[Kind, ...] = eqx.field(static=True)
+    kinds: tuple[EventKind, ...] = eqx.field(static=True)
     # For states that are tuples of numbers: puts q, or v, back into the user's structure.
     together: Callable | None = eqx.field(static=True, default=None)
 
@@ -288,7 +288,7 @@ def guards_of(crossings: Mapping[str, Crossing], system: System, start: State, h
         long = takes_multipliers or length(guard.program.jaxpr) > LONG
         functions.append(guard)
         of_crossing = crossing.direction, crossing.terminal, crossing.most
-        of_guards.append(Kind(name, *of_crossing, takes_multipliers, long, holds))
+        of_guards.append(EventKind(name, *of_crossing, takes_multipliers, long, holds))
     return Guards(tuple(functions), tuple(of_guards))
 
 

@@ -48,7 +48,7 @@ IN_PHASES = (
 )
 
 
-class Known(NamedTuple):
+class Instants(NamedTuple):
     """The instants from which a motion can be continued, in the order of its run: outputs and states after switches.
 
     `phase`: the number of the phase that begins or goes on there; None for a motion without phases.
@@ -104,10 +104,10 @@ def _fill(found, rows, trajectory, phase, nodes, times):
         old[rows] = x
 
 
-def _known_of(trajectory) -> Known:
+def _known_of(trajectory) -> Instants:
     outputs = Snapshot(trajectory.t, trajectory.q, trajectory.v, trajectory.multipliers)
     if not isinstance(trajectory, HybridTrajectory):
-        return Known(outputs, None, None)
+        return Instants(outputs, None, None)
     outputs = jax.tree.map(np.asarray, outputs)
     s, count = trajectory.switches, len(trajectory.switches)
     unknown = {name: np.full((count, *x.shape[1:]), np.nan) for name, x in outputs.multipliers.items()}
@@ -120,10 +120,10 @@ def _known_of(trajectory) -> Known:
     is_output = np.arange(len(phase)) < reached.sum()
     # An output at the time of a switch comes before it.
     order = np.lexsort((np.arange(len(phase)), both.t))
-    return Known(jax.tree.map(lambda x: x[order], both), is_output[order], phase[order])
+    return Instants(jax.tree.map(lambda x: x[order], both), is_output[order], phase[order])
 
 
-def _before(known: Known, t, backward: bool):
+def _before(known: Instants, t, backward: bool):
     """Return for each time the index of the last instant, at or before it, from which the motion can be continued.
 
     A switch does not count at its own time, when the motion is still before it.

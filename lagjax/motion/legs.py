@@ -64,7 +64,7 @@ class Phase(NamedTuple):
     events: tuple[str, ...]
 
 
-class Rows(NamedTuple):
+class OutputRows(NamedTuple):
     """The outputs of all legs so far; NaN, and no phase, where there is none yet."""
 
     q: PyTree[Float[Array, "T ..."]]
@@ -73,7 +73,7 @@ class Rows(NamedTuple):
     phase: Int[Array, " T"]
 
 
-class Way(NamedTuple):
+class PhaseWay(NamedTuple):
     """How far the legs have come: the state from which the next one starts, and the results of all before.
 
     `continues`: whether there is a next one. `events`: the recorded crossings. `sizes_so_far`: the largest coordinates
@@ -85,7 +85,7 @@ class Way(NamedTuple):
     v: PyTree[Float[Array, "..."]]
     phase: Int[Array, ""]
     continues: Bool[Array, ""]
-    rows: Rows
+    rows: OutputRows
     switches: Switches
     events: dict[str, Crossings]
     end: Snapshot
@@ -101,7 +101,7 @@ def solved_in_legs(hybrid: Hybrid, q0, v0, params, ts, phases, settings, adjoint
     """Return the fields of the trajectory, like `one_solve.solved`, with the phase of each output and the switches."""
     first = _first_leg(hybrid, q0, v0, params, ts, phases[0], settings)
 
-    def next_legs(way: Way) -> Way:
+    def next_legs(way: PhaseWay) -> PhaseWay:
         for i in range(len(hybrid.systems)):
             here = way.continues & (way.phase == i)
             leg = lambda way, i=i, here=here: _leg(hybrid, i, here, way, params, ts, phases[i], settings, adjoint)
@@ -137,7 +137,7 @@ def _first_leg(hybrid, q0, v0, params, ts, phase, settings):
     of_rows = lambda tree, n: jax.tree.map(lambda x: nan((n, *x.shape)), tree)
     model = model_of(hybrid, ts[0], q0, v0, params)
     multipliers = reduce(lambda all, of: all | of, (phase.zero_multipliers() for phase in model.phases))
-    rows = Rows(
+    rows = OutputRows(
         of_rows(q0, many), of_rows(v0, many), of_rows(multipliers, many),
         jnp.full(many, NO_PHASE, jnp.int32),
     )  # fmt: skip
@@ -155,7 +155,7 @@ def _first_leg(hybrid, q0, v0, params, ts, phase, settings):
     start = Snapshot(ts[0], known(q0), known(v0), jax.tree.map(lambda x: nan(x.shape), multipliers))
     zero, least = jnp.asarray(0), jnp.zeros((2, model.n), dtype) if settings.by_size else settings.atol
     stats = {name: zero for name in ("num_steps", "num_accepted_steps", "num_rejected_steps")}
-    return Way(
+    return PhaseWay(
         t=ts[0], q=q0, v=v0, phase=jnp.clip(first, 0, phases - 1), continues=exists, rows=rows,
         switches=switches, events=nothing(phase.guards, phase.events, q0, v0, start.multipliers), end=start,
         stats=stats, sizes_so_far=sizes_of(q0, v0), least=least,
@@ -164,7 +164,7 @@ def _first_leg(hybrid, q0, v0, params, ts, phase, settings):
     )  # fmt: skip
 
 
-def _leg(hybrid, i, in_phase, way: Way, params, ts, phase: Phase, settings, adjoint) -> Way:
+def _leg(hybrid, i, in_phase, way: PhaseWay, params, ts, phase: Phase, settings, adjoint) -> PhaseWay:
     """Return the way after one more leg in phase i, for the lanes in `in_phase`."""
     system = hybrid.systems[i]
     # Past outputs would cost a step each: those ahead come first, padded with the last. Lanes in other phases stand
@@ -197,7 +197,7 @@ def _leg(hybrid, i, in_phase, way: Way, params, ts, phase: Phase, settings, adjo
     none = lambda name, x: end.multipliers.get(name, jnp.full_like(x, jnp.nan))
     end = end._replace(multipliers={name: none(name, x) for name, x in way.end.multipliers.items()})
     least = way.least if not settings.by_size else jnp.maximum(way.least, stopped(found["tolerance"][1]))
-    further = Way(
+    further = PhaseWay(
         t=jnp.where(onward, end.t, way.t), q=_where(onward, after.q, way.q), v=_where(onward, after.v, way.v),
         phase=jnp.where(onward, target, way.phase), continues=onward & (end.t < ts[-1]),
         rows=_filled(way.rows, in_phase & known, rows, i), switches=switches,
@@ -211,7 +211,7 @@ def _leg(hybrid, i, in_phase, way: Way, params, ts, phase: Phase, settings, adjo
     return _where(in_phase, further, way)
 
 
-class Ending(NamedTuple):
+class PhaseEnding(NamedTuple):
     """How a leg ends: `onward`: whether another one follows; `first`: by which of the phase's switches; the result."""
 
     onward: Bool[Array, ""]
@@ -220,7 +220,9 @@ class Ending(NamedTuple):
     result: Any
 
 
-def _ending(phase: Phase, result, end: Snapshot, when, in_phase, way: Way, params, resolution, rtol) -> Ending:
+def _ending(
+    phase: Phase, result, end: Snapshot, when, in_phase, way: PhaseWay, params, resolution, rtol
+) -> PhaseEnding:
     """Find out what ends a leg; `when`: the times at which its guards cross, infinite for those that do not."""
     assert phase.guards is not None
     count, at_one_time, at_start = len(phase.switches), AT_ONCE * resolution, way.switches.count == 0
@@ -241,7 +243,7 @@ def _ending(phase: Phase, result, end: Snapshot, when, in_phase, way: Way, param
     result = RESULTS.where(missed, RESULTS.guard_not_seen, RESULTS.where(switched, failed, result))
     result = RESULTS.where(onward, RESULTS.successful, result)
     first = jnp.argmax(when <= jnp.min(when) + at_one_time)
-    return Ending(onward, first, end, result)
+    return PhaseEnding(onward, first, end, result)
 
 
 def _is_below(end: Snapshot, params, guards: Guards, count: int, rtol):
@@ -257,11 +259,11 @@ def reached(q):
     return jnp.isfinite(jax.vmap(lambda q: jnp.sum(coordinates.flatten(q)[0]))(q))
 
 
-def _filled(rows: Rows, known, found, i) -> Rows:
+def _filled(rows: OutputRows, known, found, i) -> OutputRows:
     """Return the outputs, with those of a leg in phase i where they are `known`."""
     put = lambda all, new: jax.tree.map(lambda x, y: jnp.where(_like(known, x), y.astype(x.dtype), x), all, new)
     multipliers = {name: put(x, found["multipliers"].get(name, x)) for name, x in rows.multipliers.items()}
-    return Rows(put(rows.q, found["q"]), put(rows.v, found["v"]), multipliers, jnp.where(known, i, rows.phase))
+    return OutputRows(put(rows.q, found["q"]), put(rows.v, found["v"]), multipliers, jnp.where(known, i, rows.phase))
 
 
 class After(NamedTuple):
@@ -272,7 +274,7 @@ class After(NamedTuple):
     rests: Bool[Array, ""]
 
 
-def _switched(system, ending: Ending, params, phase: Phase, way: Way):
+def _switched(system, ending: PhaseEnding, params, phase: Phase, way: PhaseWay):
     """Return the state after the phase's first switch, the next phase, and the record with that switch."""
     onward, first, end, _ = ending
     states = [After(*reset(end.t, end.q, end.v, end.multipliers, params)) for reset in phase.resets]

@@ -17,15 +17,15 @@ from lagjax.jax_internals.one_function import calls_host, one_function
 from lagjax.mechanics.coordinates import State
 from lagjax.mechanics.equations import Equations
 from lagjax.mechanics.structure import are_angles
-from lagjax.motion.arriving import Arriving, together
+from lagjax.motion.arriving import StepToOutputs, together
 from lagjax.motion.consistency import stopped
 from lagjax.motion.crossing_times import Located, at_known_times, first_end, locate
-from lagjax.motion.recording import Problem, Recorded, with_room
+from lagjax.motion.recording import Recorded, StepProblem, with_room
 from lagjax.motion.replay import Replay, replayed
 from lagjax.motion.sight import Sight
-from lagjax.motion.stepping import FastField, Field, OnManifold, forward_differentiable
-from lagjax.motion.tolerances import AsNothing, Scales, Tolerances, Weighing
-from lagjax.motion.watching import Watching
+from lagjax.motion.stepping import FastField, Field, ProjectedSolver, forward_differentiable
+from lagjax.motion.tolerances import AsNothing, PerCoordinateTolerance, Scales, Tolerances
+from lagjax.motion.watching import EventController
 from lagjax.numerics.nystrom import Nystrom
 from lagjax.numerics.radau import Radau5
 from lagjax.numerics.runge_kutta import ExplicitRungeKutta
@@ -104,16 +104,16 @@ def _loop(equations, start, y0, refused, scales, settings, ts, adjoint, guards=N
         subs = diffrax.SubSaveAt(ts=ts), diffrax.SubSaveAt(t1=True)
         saveat = diffrax.SaveAt(subs=subs, controller_state=guards is not None)
     if guards is not None:
-        controller = Watching(controller, Sight(guards, solver, resolution(ts)), ts[-1])
+        controller = EventController(controller, Sight(guards, solver, resolution(ts)), ts[-1])
     arguments = (
         terms, solver, ts[0], ts[-1], settings.dt0, y0, start.params, saveat, controller, _by_position(settings.event),
     )  # fmt: skip
     solve = partial(_diffeqsolve, max_steps=settings.max_steps, adjoint=adjoint, progress=settings.progress)
     calls_python = lambda: _user_calls_python(equations, terms, start, guards, settings, controller)
     if isinstance(adjoint, Replay):
-        assert isinstance(controller, Arriving)
+        assert isinstance(controller, StepToOutputs)
         first, after = (jnp.searchsorted(ts, ts, side=side) for side in ("left", "right"))
-        problem = Problem(
+        problem = StepProblem(
             terms, solver, controller, ts, first, after, ts[0], ts[-1], settings.dt0, y0, start.params
         )  # fmt: skip
         problem = with_room(problem, settings.memory)
@@ -142,7 +142,7 @@ def _diffeqsolve(terms, solver, t0, t1, dt0, y0, args, saveat, controller, event
         terms, solver, t0, t1, dt0, y0, args, saveat=saveat, stepsize_controller=controller, adjoint=adjoint,
         event=event, max_steps=max_steps, throw=False, progress_meter=_progress_meter(progress),
     )  # fmt: skip
-    watching = isinstance(controller, Watching)
+    watching = isinstance(controller, EventController)
     located = locate(controller, cast(tuple, solution.controller_state)[1]) if watching else None
     return solution.ts, solution.ys, solution.stats, solution.result, located
 
@@ -191,7 +191,7 @@ def _with_root_finder(settings, scales):
 
 
 def _solver(equations, fast, feedback, refused, settings, adjoint):
-    return OnManifold(
+    return ProjectedSolver(
         solver=_in_a_loop(settings.method, adjoint),
         equations=equations,
         fast=fast,
@@ -234,12 +234,12 @@ def _controller(equations, start, ts, settings, scales, bare, repeated):
     )  # fmt: skip
     angle = tuple(are_angles(equations.model).tolist())
     if not bare and (scales is not None or settings.apart or any(angle)):
-        controller = Weighing(controller, Tolerances(settings.rtol, settings.atol), scales, angle)
+        controller = PerCoordinateTolerance(controller, Tolerances(settings.rtol, settings.atol), scales, angle)
     arriving = _arriving(settings) and not bare
     if settings.jump_ts is None and not repeated:
-        return Arriving(controller, ts, settings.shares) if arriving else controller
+        return StepToOutputs(controller, ts, settings.shares) if arriving else controller
     jumps = ts[-1:] if settings.jump_ts is None else settings.jump_ts
-    return Arriving(controller, together(ts if arriving else ts[np.array([0, -1])], jumps), settings.shares)
+    return StepToOutputs(controller, together(ts if arriving else ts[np.array([0, -1])], jumps), settings.shares)
 
 
 def resolution(ts):

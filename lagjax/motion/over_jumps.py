@@ -16,6 +16,7 @@ Source: Hiskens & Pai, IEEE Trans. Circuits Syst. I 47 (2000) 204 (trajectory se
 """
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import diffrax
@@ -34,7 +35,7 @@ from lagjax.mechanics.model import model_of
 from lagjax.mechanics.system import System
 from lagjax.mechanics.warned import warn
 from lagjax.motion.consistency import stopped
-from lagjax.motion.crossings import LONG, Crossings, Guards, Kind
+from lagjax.motion.crossings import LONG, Crossings, EventKind, Guards
 from lagjax.motion.legs import AT_ONCE, NOT_BELOW, ROWS, reached, sizes_of
 from lagjax.motion.loop import resolution
 from lagjax.motion.one_solve import solved
@@ -131,7 +132,7 @@ def piecewise_of(jumps: Jumps, system: System, small: bool) -> Piecewise:
     return Piecewise(smooth, sliding, guards, tuple(jumps.numbers(system, 1)), pauses)
 
 
-class Way(NamedTuple):
+class ModeWay(NamedTuple):
     """How far the legs have come, as in `legs.py`; `modes`, `slides`, `free`: as in `Given`; `count`: of all jumps."""
 
     t: Float[Array, ""]
@@ -162,7 +163,7 @@ def solved_over_jumps(jumps: Jumps, system: System, q0, v0, params, ts, guards, 
     both = _together(piecewise, guards)
     first = _first(model, q0, v0, ts, guards, modes, settings)
 
-    def next_leg(way: Way) -> Way:
+    def next_leg(way: ModeWay) -> ModeWay:
         return _leg(piecewise, both, guards, way, params, ts, settings, adjoint)
 
     turns = MOST_JUMPS + 2 + (0 if settings.jump_ts is None else settings.jump_ts.size)
@@ -187,15 +188,16 @@ def solved_over_jumps(jumps: Jumps, system: System, q0, v0, params, ts, guards, 
 def _together(piecewise: Piecewise, guards: Guards | None) -> Guards:
     """The guards of the modes, and then those of the user's events."""
     long = any(len(f.guard.program.jaxpr.eqns) > LONG for f in piecewise.guards) or piecewise.sliding is not None
-    kinds = tuple(
-        Kind(f"mode {i}", -1, True, 1, False, long, holds=True, may_rest=True) for i in range(len(piecewise.guards))
-    )  # fmt: skip
+    of_mode = partial(
+        EventKind, direction=-1, terminal=True, most=1, takes_multipliers=False, holds=True, may_rest=True
+    )
+    kinds = tuple(of_mode(f"mode {i}", long=long) for i in range(len(piecewise.guards)))
     if guards is None:
         return Guards(piecewise.guards, kinds)
     return Guards((*piecewise.guards, *map(OfParams, guards.functions)), (*kinds, *guards.kinds))
 
 
-def _first(model, q0, v0, ts, guards, modes, settings) -> Way:
+def _first(model, q0, v0, ts, guards, modes, settings) -> ModeWay:
     dtype, many = ts.dtype, ts.shape[0]
     nan = lambda shape: jnp.full(shape, jnp.nan, dtype)
     of_rows = lambda tree: jax.tree.map(lambda x: nan((many, *x.shape)), tree)
@@ -205,7 +207,7 @@ def _first(model, q0, v0, ts, guards, modes, settings) -> Way:
     # A motion that rests at zero, held by friction, has round-off alone to tell its size.
     sizes = jnp.where(jnp.any(sizes > 0), sizes, 1 / DIED_OUT)
     names = () if guards is None else [kind.name for kind in guards.kinds]
-    return Way(
+    return ModeWay(
         t=ts[0], q=q0, v=v0, modes=modes, slides=jnp.zeros(modes.shape, bool), free=jnp.asarray(False), count=zero,
         continues=jnp.asarray(True), rows=rows, events=nothing(guards, names, q0, v0, multipliers),
         end=Snapshot(ts[0], q0, v0, multipliers),
@@ -215,7 +217,7 @@ def _first(model, q0, v0, ts, guards, modes, settings) -> Way:
     )  # fmt: skip
 
 
-def _leg(piecewise: Piecewise, guards: Guards, recorded, way: Way, params, ts, settings, adjoint) -> Way:
+def _leg(piecewise: Piecewise, guards: Guards, recorded, way: ModeWay, params, ts, settings, adjoint) -> ModeWay:
     """Return the way after one more leg."""
     # Past outputs would cost a step each: those ahead come first, padded with the last.
     place, past, here = jnp.arange(ts.shape[0]), jnp.sum(ts <= way.t), way.continues
@@ -262,7 +264,7 @@ def _next(jump_ts, t, resolution):
     return jnp.min(jnp.where(jump_ts > t + AT_ONCE * resolution, jump_ts, jnp.inf))
 
 
-class Ending(NamedTuple):
+class ModeEnding(NamedTuple):
     """How a leg ends: `onward`: a mode changes, the one with the number `first`; `wrong`: the leg is to be repeated
     with the comparisons as they are."""
 
@@ -273,7 +275,7 @@ class Ending(NamedTuple):
     result: Any
 
 
-def _ending(piecewise, guards: Guards, result, end: Snapshot, when, way: Way, given, ts, settings) -> Ending:
+def _ending(piecewise, guards: Guards, result, end: Snapshot, when, way: ModeWay, given, ts, settings) -> ModeEnding:
     """Find out what ends a leg; `when`: the times at which its guards cross, infinite for those that do not."""
     count, at_one_time, last = len(piecewise.guards), AT_ONCE * resolution(ts), ts[-1]
     # An event of the user's that ends the motion at the time of a jump comes first.
@@ -291,7 +293,7 @@ def _ending(piecewise, guards: Guards, result, end: Snapshot, when, way: Way, gi
     wrong = ~way.free & (below | ~ended_well(result) & (result != RESULTS.max_steps_reached))
     result = RESULTS.where(onward, RESULTS.successful, result)
     first = jnp.argmax(when <= jnp.min(when) + at_one_time)
-    return Ending(onward, wrong, first, end, result)
+    return ModeEnding(onward, wrong, first, end, result)
 
 
 def _is_below(end: Snapshot, given, guards: Guards, count: int, rtol):

@@ -25,7 +25,7 @@ QUINTIC = np.array([
 CUBIC = np.array([[1, 0, -3, 2], [0, 1, -2, 1], [0, 0, -1, 1], [0, 0, 3, -2]])
 
 
-class Value(NamedTuple):
+class GuardValue(NamedTuple):
     """A guard at a time: its value, its rate, the round-off of its value, and whether it is known to turn there.
 
     `still`: whether its rate is round-off; known only of guards that hold.
@@ -44,7 +44,7 @@ class Node(NamedTuple):
     t: Float[Array, ""]
     y: PyTree
     a: PyTree
-    values: tuple[Value, ...]
+    values: tuple[GuardValue, ...]
 
 
 class Followed(NamedTuple):
@@ -55,7 +55,7 @@ class Followed(NamedTuple):
     uncertain: Bool[Array, ""]
 
 
-class Root(NamedTuple):
+class GuardRoot(NamedTuple):
     """A crossing of a `guard` (-1: none) between `low` and `high`, with the sign `after` it and a `guess` of its time.
 
     `before`: if the root of another guard was found, which is not the first root, the time of that one.
@@ -69,7 +69,7 @@ class Root(NamedTuple):
     before: Float[Array, ""]
 
 
-class Part(NamedTuple):
+class StepPart(NamedTuple):
     """The step under way, which is taken in parts if it is `parted`.
 
     `until`: its end; `following`: the end of the next step, as the wrapped controller chose it, and `jumps`: whether
@@ -88,7 +88,7 @@ class Part(NamedTuple):
     tries: Int[Array, ""]
     turns: tuple[Bool[Array, ""], ...]
     turns_at: Float[Array, ""]
-    root: Root
+    root: GuardRoot
     moved: Float[Array, ""]
 
 
@@ -101,11 +101,11 @@ class Watched(NamedTuple):
 
     begun: Bool[Array, ""]
     a: PyTree
-    values: tuple[Value, ...]
+    values: tuple[GuardValue, ...]
     followed: tuple[Followed, ...]
     t: Float[Array, " S"]
     y: PyTree[Float[Array, "S ..."]]
-    part: Part
+    part: StepPart
 
 
 class Pieces(NamedTuple):
@@ -119,7 +119,7 @@ class Pieces(NamedTuple):
     doubt: list
 
 
-def pieces_of(begin: Value, inner, off, end: Value, h, touches, at_zero, close) -> Pieces:
+def pieces_of(begin: GuardValue, inner, off, end: GuardValue, h, touches, at_zero, close) -> Pieces:
     """The pieces of an interval of length h between exact ends; `off`: the errors of the inner nodes (value, rate).
 
     A piece that comes nearer to zero than `touches` is not clear; nor is one longer than `close` to an end whose rate
@@ -170,7 +170,7 @@ def pieces_of(begin: Value, inner, off, end: Value, h, touches, at_zero, close) 
     return Pieces(g, rate, known, sign[1:], doubt)
 
 
-def without_rest(pieces: Pieces, begin: Value, end: Value, inner, h) -> Pieces:
+def without_rest(pieces: Pieces, begin: GuardValue, end: GuardValue, inner, h) -> Pieces:
     """The same, without doubts where the guard is zero all along, to round-off."""
     noise = jnp.maximum(begin.noise, end.noise)
     rests = jnp.asarray(True)
@@ -213,7 +213,7 @@ def between(left: Node, right: Node, h):
     return fine, coarse
 
 
-def first_root(kinds, times, of_guards, signs, crosses) -> Root:
+def first_root(kinds, times, of_guards, signs, crosses) -> GuardRoot:
     """The first wanted crossing of all guards; `crosses`: the nodes at which the sign of each guard changes."""
     infinite = jnp.full_like(times[0], jnp.inf)
     start = times[0], of_guards[0].g[0], of_guards[0].rate[0]
@@ -229,7 +229,7 @@ def first_root(kinds, times, of_guards, signs, crosses) -> Root:
             guard, at, begin, end, after = jtu.tree_map(lambda x, y: jnp.where(sooner, x, y), found, before)
             # Secants start from the last node whose sign is known.
             since = tuple(jnp.where(new != 0, x, y) for x, y in zip(node, since))
-    return Root(guard, begin[0], end[0], after, root_of_cubic(begin, end), infinite)
+    return GuardRoot(guard, begin[0], end[0], after, root_of_cubic(begin, end), infinite)
 
 
 def root_of_cubic(begin, end):

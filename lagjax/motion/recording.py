@@ -3,7 +3,7 @@
 Reverse mode needs the accepted steps from the last to the first. Their number is known only when the motion is over,
 but arrays need their size before that. So the last steps are kept in full, one row each: its two times and the state
 that it starts from. In addition, before the first of every so many steps, all that the loop depends on is kept: a
-checkpoint (`Place`), from which the loop can run again to fill the rows with earlier steps. When the room for
+checkpoint (`RecordPlace`), from which the loop can run again to fill the rows with earlier steps. When the room for
 checkpoints is used up, every other one is dropped, and from then on they are kept half as often. A long motion is thus
 run again in pieces: each piece once up to rows times checkpoints steps, some pieces more often beyond; memory is fixed.
 
@@ -23,8 +23,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from lagjax.motion.arriving import Arriving
-from lagjax.motion.stepping import OnManifold
+from lagjax.motion.arriving import StepToOutputs
+from lagjax.motion.stepping import ProjectedSolver
 
 # A row of a pendulum takes 40 bytes: in a thousand lanes the rows take 20 MB.
 ROWS = 512
@@ -42,15 +42,15 @@ class Room(NamedTuple):
     places: int
 
 
-class Problem(NamedTuple):
+class StepProblem(NamedTuple):
     """All that a motion is stepped with; the output times `ts` increase, and begin and end with `t0` and `t1`.
 
     For each output: `first`, the first output at the same time, and `after`, the first output at a later time.
     """
 
     terms: PyTree[diffrax.AbstractTerm]
-    solver: OnManifold
-    controller: Arriving
+    solver: ProjectedSolver
+    controller: StepToOutputs
     ts: Float[Array, " T"]
     first: Int[Array, " T"]
     after: Int[Array, " T"]
@@ -62,7 +62,7 @@ class Problem(NamedTuple):
     room: Room = Room(ROWS, PLACES)
 
 
-class Place(NamedTuple):
+class RecordPlace(NamedTuple):
     """The position of the loop, and a checkpoint: all that the step from t to t1 and the later ones depend on."""
 
     t: Float[Array, ""]
@@ -72,7 +72,7 @@ class Place(NamedTuple):
     controller_state: PyTree
 
 
-class Rows(NamedTuple):
+class RecordRows(NamedTuple):
     """The last accepted steps, step k in row k modulo the number of rows: their times and start states."""
 
     t0: Float[Array, " R"]
@@ -80,7 +80,7 @@ class Rows(NamedTuple):
     y0: PyTree[Float[Array, "R ..."]]
 
 
-class Record(NamedTuple):
+class StepRecord(NamedTuple):
     """All that reverse mode needs of a motion.
 
     `count`: the number of steps; `rows`: the last of them; `places`: the checkpoint at the start of every
@@ -88,8 +88,8 @@ class Record(NamedTuple):
     """
 
     count: Int[Array, ""]
-    rows: Rows
-    places: Place
+    rows: RecordRows
+    places: RecordPlace
     stride: Int[Array, ""]
     saved: Int[Array, ""]
 
@@ -103,14 +103,14 @@ class Recorded(NamedTuple):
     y: PyTree[Float[Array, "..."]]
     stats: dict[str, Array]
     result: Any
-    record: Record
+    record: StepRecord
 
 
-class _Run(NamedTuple):
-    """The state of the loop. `outputs` and `saved`: as in `Recorded` and `Record`; None when the loop runs again."""
+class _RecordRun(NamedTuple):
+    """The state of the loop. `outputs` and `saved`: as in `Recorded` and `StepRecord`; None when it runs again."""
 
-    place: Place
-    rows: Rows
+    place: RecordPlace
+    rows: RecordRows
     steps: Int[Array, ""]
     accepted: Int[Array, ""]
     result: Any
@@ -118,7 +118,7 @@ class _Run(NamedTuple):
     saved: Any
 
 
-def with_room(problem: Problem, memory: float | None) -> Problem:
+def with_room(problem: StepProblem, memory: float | None) -> StepProblem:
     """The problem with room for a record of `memory` bytes, half of them for rows; None: the usual room."""
     if memory is None:
         return problem._replace(room=Room(ROWS, PLACES))
@@ -141,13 +141,13 @@ def _rounded_up(number):
     return f"{math.ceil(number / 1000)}e3"
 
 
-def recorded(problem: Problem, max_steps: int | None) -> Recorded:
+def recorded(problem: StepProblem, max_steps: int | None) -> Recorded:
     """Step through a motion, as `diffrax.diffeqsolve` does, and record its steps."""
     p, zero, many = problem, jnp.asarray(0), problem.room.rows
     outputs = jax.tree.map(lambda x: jnp.broadcast_to(x, (p.ts.size, *x.shape)), p.y0)
     place = _first(p)
     places = jax.tree.map(lambda x: jnp.broadcast_to(x, (p.room.places, *jnp.shape(x))), place)
-    start = _Run(place, _no_rows(p), zero, zero, _success(), outputs, p.after[0])
+    start = _RecordRun(place, _no_rows(p), zero, zero, _success(), outputs, p.after[0])
     continues = lambda run: _continues(p, run, max_steps)
 
     def onward(state):
@@ -167,12 +167,12 @@ def recorded(problem: Problem, max_steps: int | None) -> Recorded:
     # diffrax saves outputs only at the ends of accepted steps, of which a motion over no time has none.
     reached = (p.first < run.saved) & ((run.accepted > 0) | (p.t0 == p.t1))
     stats = {"num_steps": run.steps, "num_accepted_steps": run.accepted, "num_rejected_steps": run.steps - run.accepted}
-    record = Record(run.accepted, run.rows, places, stride, run.saved)
+    record = StepRecord(run.accepted, run.rows, places, stride, run.saved)
     outputs = jax.tree.map(lambda x: x[p.first], run.outputs)
     return Recorded(reached, outputs, run.place.t, run.place.y, stats, result, record)
 
 
-def recorded_again(problem: Problem, record: Record, number, end) -> Rows:
+def recorded_again(problem: StepProblem, record: StepRecord, number, end) -> RecordRows:
     """The rows of the piece `number`, which ends at the time `end`, by running again from a checkpoint before it.
 
     The same operations, compiled a second time, round differently, and a step may become longer by a part in 1e8.
@@ -181,14 +181,16 @@ def recorded_again(problem: Problem, record: Record, number, end) -> Rows:
     slot, many = jnp.maximum(number, 0) // record.stride, problem.room.rows
     place, begun = jax.tree.map(lambda x: x[slot], record.places), slot * record.stride * many
     p = problem._replace(t1=jnp.minimum(end, problem.t1))
-    run = _Run(place._replace(t1=jnp.minimum(place.t1, p.t1)), record.rows, begun, begun, _success(), None, None)
+    run = _RecordRun(place._replace(t1=jnp.minimum(place.t1, p.t1)), record.rows, begun, begun, _success(), None, None)
     count = jnp.minimum((number + 1) * many, record.count)
     run = _until(p, run, count, None)
     k = number * many + np.arange(many)
     taken, place = k < run.accepted, run.place
     t0, t1, y0 = run.rows
     t1 = jnp.where(taken & (k < count - 1), t1, p.t1)
-    return Rows(jnp.where(taken, t0, p.t1), t1, jax.tree.map(lambda x, y: jnp.where(like(taken, x), x, y), y0, place.y))
+    return RecordRows(
+        jnp.where(taken, t0, p.t1), t1, jax.tree.map(lambda x, y: jnp.where(like(taken, x), x, y), y0, place.y)
+    )
 
 
 def like(mask, x):
@@ -201,18 +203,18 @@ def _success():
     return diffrax.RESULTS.where(jnp.asarray(True), diffrax.RESULTS.successful, diffrax.RESULTS.successful)
 
 
-def _first(p: Problem) -> Place:
+def _first(p: StepProblem) -> RecordPlace:
     controller, order = p.controller, p.solver.error_order(p.terms)
     t1, state = controller.init(p.terms, p.t0, p.t1, p.y0, p.dt0, p.args, p.solver.func, order)
     t1 = jnp.minimum(t1, p.t1)
-    place = Place(p.t0, t1, p.y0, p.solver.init(p.terms, p.t0, t1, p.y0, p.args), state)
+    place = RecordPlace(p.t0, t1, p.y0, p.solver.init(p.terms, p.t0, t1, p.y0, p.args), state)
     return jax.tree.map(jnp.asarray, place)
 
 
-def _no_rows(p: Problem) -> Rows:
+def _no_rows(p: StepProblem) -> RecordRows:
     # Rows without a step hold the start: they may be evaluated, and must be finite although the result is unused.
     rows = lambda x: jnp.broadcast_to(x, (p.room.rows, *x.shape))
-    return Rows(rows(p.t0), rows(p.t0), jax.tree.map(rows, p.y0))
+    return RecordRows(rows(p.t0), rows(p.t0), jax.tree.map(rows, p.y0))
 
 
 def _thinned(places, full):
@@ -220,23 +222,23 @@ def _thinned(places, full):
     return jax.tree.map(lambda x: jnp.where(full, half(x), x), places)
 
 
-def _continues(p: Problem, run: _Run, max_steps):
+def _continues(p: StepProblem, run: _RecordRun, max_steps):
     continues = (run.place.t < p.t1) & diffrax.is_successful(run.result)
     return continues if max_steps is None else continues & (run.steps < max_steps)
 
 
-def _until(p: Problem, run: _Run, limit, max_steps) -> _Run:
+def _until(p: StepProblem, run: _RecordRun, limit, max_steps) -> _RecordRun:
     """Run the loop up to a number of accepted steps.
 
     Batched by JAX, a loop selects whole arrays in each turn for lanes that are done; here only changed entries are.
     """
     continues = lambda run: _continues(p, run, max_steps) & (run.accepted < limit)
 
-    def turn(run: _Run) -> _Run:
+    def turn(run: _RecordRun) -> _RecordRun:
         here, place, row = continues(run), run.place, run.accepted % p.room.rows
         further, keep, result = _step(p, place)
         # A rejected step is overwritten by the next one.
-        rows = jax.tree.map(lambda all, x: _put(all, row, x, here), run.rows, Rows(place.t, place.t1, place.y))
+        rows = jax.tree.map(lambda all, x: _put(all, row, x, here), run.rows, RecordRows(place.t, place.t1, place.y))
         outputs, saved = run.outputs, run.saved
         if outputs is not None:
             i = jnp.minimum(saved, p.ts.size - 1)
@@ -244,12 +246,12 @@ def _until(p: Problem, run: _Run, limit, max_steps) -> _Run:
             outputs = jax.tree.map(lambda all, x: _put(all, i, x, hit), outputs, further.y)
             saved = jnp.where(hit, p.after[i], saved)
         place, result = _where(here, (further, result), (place, run.result))
-        return _Run(place, rows, run.steps + here, run.accepted + (here & keep), result, outputs, saved)
+        return _RecordRun(place, rows, run.steps + here, run.accepted + (here & keep), result, outputs, saved)
 
     return lax.while_loop(lambda run: eqxi.unvmap_any(continues(run)), turn, run)
 
 
-def _step(p: Problem, place: Place):
+def _step(p: StepProblem, place: RecordPlace):
     """One more attempt of a step: the next place, whether the step was accepted, and its result."""
     order, results = p.solver.error_order(p.terms), diffrax.RESULTS
     y, error, _, solver_state, solved = p.solver.step(
@@ -265,7 +267,7 @@ def _step(p: Problem, place: Place):
     y, solver_state = _where(keep, (y, solver_state), (place.y, place.solver_state))
     solved = results.where(keep, solved, results.successful)
     result = results.where(diffrax.is_okay(solved), judged, solved)
-    return Place(t, t1, y, solver_state, controller_state), keep, result
+    return RecordPlace(t, t1, y, solver_state, controller_state), keep, result
 
 
 def _put(all, i, x, here):

@@ -25,8 +25,8 @@ from jax.core import ShapedArray
 
 from lagjax.jax_internals.one_function import one_function
 from lagjax.jax_internals.primitives import ad, primitive
-from lagjax.motion.recording import Problem, Recorded, recorded
-from lagjax.motion.way_back import Lanes, Motion, filled, swept_back, together
+from lagjax.motion.recording import Recorded, StepProblem, recorded
+from lagjax.motion.way_back import BackwardMotion, Lanes, filled, swept_back, together
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ class Replay:
             )
 
 
-def replayed(problem: Problem, max_steps: int | None, checked: bool, adjoint: Replay) -> Recorded:
+def replayed(problem: StepProblem, max_steps: int | None, checked: bool, adjoint: Replay) -> Recorded:
     """Integrate a motion such that its reverse derivative replays it; return the values in `adjoint.record` if there.
 
     Compiled a second time, a motion may take other steps. Its reverse derivative needs the recorded steps; if that is
@@ -88,7 +88,7 @@ def replayed(problem: Problem, max_steps: int | None, checked: bool, adjoint: Re
 
     # Jitted, so that it is traced once.
     places = tuple(number[id(x)] for x in given)
-    motion = Motion(structure, places, static, max_steps, checked, adjoint.bent, jax.jit(results), [])
+    motion = BackwardMotion(structure, places, static, max_steps, checked, adjoint.bent, jax.jit(results), [])
     if adjoint.record is None or adjoint.bent:
         return motion.recorded(_run_p.bind(*leaves, motion=motion, lanes=None, same_run=False))
     values, rest = eqx.partition(adjoint.record, eqx.is_array)

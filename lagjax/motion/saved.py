@@ -22,7 +22,7 @@ from lagjax.motion.hybrid_trajectory import HybridTrajectory, Switches
 from lagjax.motion.results import RESULTS, item
 from lagjax.motion.saving import PLAIN
 from lagjax.motion.switching import traced_phases
-from lagjax.motion.trajectory import Asked, How, Snapshot, Trajectory, pack
+from lagjax.motion.trajectory import Snapshot, SolveInfo, SolveOptions, Trajectory, pack
 
 
 def load_trajectory(
@@ -154,7 +154,7 @@ def trajectory_of(found: dict, kept: System | Hybrid | UnknownSystem) -> Traject
     fields["events"] = {name: made(Crossings, x) for name, x in found["events"].items()}
     error = found["error"]
     fields["error"] = None if error is None else Errors(**error | {"result": result_of_names(error["result"])})
-    asked, how = made(Asked, found["asked"]), made(How, found["how"])
+    asked, how = made(SolveOptions, found["asked"]), made(SolveInfo, found["how"])
     fields["arrays"], fields["static"] = pack(kept, found["params"], asked, how)
     if "phase" not in found:
         return Trajectory(**fields)

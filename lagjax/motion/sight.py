@@ -10,9 +10,9 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Float
 
-from lagjax.motion.crossings import Guards, Kind
-from lagjax.motion.pieces import INNER, Node, Pieces, Value, between, pieces_of, without_rest
-from lagjax.motion.stepping import OnManifold
+from lagjax.motion.crossings import EventKind, Guards
+from lagjax.motion.pieces import INNER, GuardValue, Node, Pieces, between, pieces_of, without_rest
+from lagjax.motion.stepping import ProjectedSolver
 
 # The error is taken to be this many times the distance of the two interpolants.
 SAFETY = 2.0
@@ -28,7 +28,7 @@ class Sight(eqx.Module):
     """The guards along a motion; `resolution`: the smallest difference of two times that can be told apart."""
 
     guards: Guards
-    motion: OnManifold
+    motion: ProjectedSolver
     resolution: Float[Array, ""]
 
     def value(self, t, y, args):
@@ -62,7 +62,7 @@ class Sight(eqx.Module):
         half = jnp.sqrt(eps)
         noise = lambda x, d: jnp.where(jnp.isfinite(d), eps * (jnp.abs(d) + jnp.abs(x)), half * jnp.abs(x))
         values = tuple(
-            Value(x, dx, noise(x, d), turning.turns, at_rest)
+            GuardValue(x, dx, noise(x, d), turning.turns, at_rest)
             for x, dx, d, turning, at_rest in zip(g, rate, digits, right.values, still)
         )
         return values, times, [[(x[i], dx[i]) for x, dx in found] for i in range(len(values))]
@@ -89,7 +89,7 @@ class Sight(eqx.Module):
     def unseen(self, t) -> Node:
         """A node at which nothing is known yet."""
         zero, no = jnp.zeros_like(t), jnp.asarray(False)
-        return Node(t, None, None, (Value(zero, zero, zero, no, no),) * len(self.guards.kinds))
+        return Node(t, None, None, (GuardValue(zero, zero, zero, no, no),) * len(self.guards.kinds))
 
     def judged(self, left: Node, right: Node, inner, touching) -> list[Pieces]:
         """Each guard between two nodes, from its values at the inner ones by the quintic and by the cubics.
@@ -111,7 +111,7 @@ class Sight(eqx.Module):
             found.append(without_rest(pieces, begin, end, by_both, h) if kind.may_rest else pieces)
         return found
 
-    def first_sign(self, value: Value, kind: Kind):
+    def first_sign(self, value: GuardValue, kind: EventKind):
         """The sign at the start of the motion: 0 if the start is on the guard."""
         on_guard = self.is_on(value)
         if kind.holds:
@@ -119,15 +119,15 @@ class Sight(eqx.Module):
             return jnp.where(jnp.abs(value.g) <= BELOW * self.at_zero(value), 0.0, 1.0)
         return jnp.where(on_guard | ~jnp.isfinite(value.g), 0.0, jnp.sign(value.g))
 
-    def is_on(self, value: Value):
+    def is_on(self, value: GuardValue):
         """Whether a state is on a guard, within round-off."""
         return jnp.abs(value.g) <= self.at_zero(value)
 
-    def at_zero(self, value: Value):
+    def at_zero(self, value: GuardValue):
         """How far from zero a guard may be, by round-off, where a motion starts on it."""
         return ON_GUARD * (value.noise + jnp.abs(value.rate) * self.resolution)
 
-    def touches(self, value: Value):
+    def touches(self, value: GuardValue):
         """Whether an extremum with this value may be on either side of zero."""
         eps = ROUNDED * jnp.finfo(value.g.dtype).eps
         return jnp.abs(value.g) <= value.noise * jnp.maximum(TOUCHES * self.motion.tolerances.rtol[0] / eps, 1.0)

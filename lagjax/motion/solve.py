@@ -34,7 +34,7 @@ from lagjax.motion.legs import solved_in_legs
 from lagjax.motion.one_solve import solved
 from lagjax.motion.over_jumps import solved_over_jumps, warn_of_missed, with_lost
 from lagjax.motion.reported import report_settled
-from lagjax.motion.trajectory import Asked, How, Trajectory, pack
+from lagjax.motion.trajectory import SolveInfo, SolveOptions, Trajectory, pack
 from lagjax.numerics.evaluations import evaluations_a_step
 from lagjax.numerics.nystrom import Nystrom, Nystrom8, Nystrom12
 from lagjax.numerics.runge_kutta import Dopri8, in_our_form
@@ -179,7 +179,7 @@ def _trajectory(system, q0, v0, params, ts, guards, settings):
     """The trajectory, and whether it is settled: the robust solve would give the same."""
     model = model_of(system, ts[0], q0, v0, params)
     s, method = settings, method_of(settings, model)
-    asked = Asked(s.method, s.controller, s.dt0, s.max_step, s.jump_ts, s.drift, s.jumps)
+    asked = SolveOptions(s.method, s.controller, s.dt0, s.max_step, s.jump_ts, s.drift, s.jumps)
     how = _how(method, s.method, settings, system.in_phases)
     settings = eqx.tree_at(lambda s: s.method, settings, method, is_leaf=lambda x: x is None)
     # Derivatives flow to the floating-point arrays of these; the settings are constants.
@@ -244,7 +244,7 @@ def _how(method, asked, settings, in_legs):
     chosen = "fixed" if isinstance(settings.controller, diffrax.ConstantStepSize) else "controller"
     # With many short legs the number of steps does not tell what chose them.
     chosen = chosen if settings.controller else "legs" if in_legs else "tolerance"
-    return How(name, method.error_order(terms), evaluations_a_step(method), chosen)
+    return SolveInfo(name, method.error_order(terms), evaluations_a_step(method), chosen)
 
 
 def method_of(settings, model: Model):

@@ -1,6 +1,6 @@
 """Any diffrax solver, kept on the constraints and accurate between its steps.
 
-`OnManifold` wraps a diffrax solver. After each step it returns the state to the constraint manifold, and
+`ProjectedSolver` wraps a diffrax solver. After each step it returns the state to the constraint manifold, and
 its dense output is a step of the solver itself: the state at t inside a step from t0 is one step from t0
 to t. Outputs and event times therefore have the order of the method (Kvaerno5's own interpolant is cubic,
 Dopri8's is of order six) and satisfy the constraints, at the cost of one step per output.
@@ -35,7 +35,7 @@ LOST = 0.3
 NOT_FINITE = diffrax.RESULTS.nonfinite_input
 
 
-class Stages(NamedTuple):
+class StageConstraints(NamedTuple):
     """The constraint equations that the vector field solves with, the same in all stages of one step."""
 
     independent: Bool[Array, " m"] | None
@@ -48,7 +48,7 @@ class Field(eqx.Module):
     feedback: Float[Array, ""] | None = None
 
     def __call__(self, t, y, args):
-        independent = args.independent if isinstance(args, Stages) else None
+        independent = args.independent if isinstance(args, StageConstraints) else None
         return y[1], kept_as_call(self.equations.accelerations(t, *y, self.feedback, independent))[0]
 
 
@@ -61,7 +61,7 @@ class FastField(eqx.Module):
         return y[1], self.equations.fast(t, *y)[0]
 
 
-class OnManifold(diffrax.AbstractWrappedSolver):
+class ProjectedSolver(diffrax.AbstractWrappedSolver):
     """Wrap `solver`: project after each step (if `project`), and compute dense output by steps.
 
     A step that cannot be returned to the constraints is rejected; with fixed steps the solve ends there. `controlled`:
@@ -237,7 +237,7 @@ class OnManifold(diffrax.AbstractWrappedSolver):
 
     def _stages(self, t, y):
         threshold = None if self.project else DEPENDENT_BELOW_WHILE_DRIFTING
-        return Stages(self.equations.independent(t, *y, threshold))
+        return StageConstraints(self.equations.independent(t, *y, threshold))
 
 
 class Arrived(Interpolation):
@@ -259,7 +259,7 @@ class SteppedTo(Interpolation):
     t1: PyTree
     y0: PyTree
     state: PyTree
-    solver: OnManifold
+    solver: ProjectedSolver
 
     def at(self, t):
         s = self.solver

@@ -120,7 +120,8 @@ def rounding(others: Float[Array, "2 n"]) -> Float[Array, "2 n"]:
 class AsNothing(eqx.Module):
     """The `atol` of each coordinate and each velocity for iterations inside a step, from the start alone.
 
-    If that says nothing, since all is at rest at zero, it follows the unknown, (..., 2n), as in `Weighing`.
+    If that says nothing, since all is at rest at zero, it follows the unknown, (..., 2n), as in
+    `PerCoordinateTolerance`.
     """
 
     scales: Scales
@@ -135,7 +136,7 @@ class AsNothing(eqx.Module):
         return jnp.ravel(DIED_OUT * self.rtol[:, None] * own_size + rounding(others))
 
 
-class Weighing(diffrax.AbstractAdaptiveStepSizeController):
+class PerCoordinateTolerance(diffrax.AbstractAdaptiveStepSizeController):
     """Wrap `controller`, which has a single tolerance: each number's error is weighed by its own allowed error.
 
     That follows the number's own size if `scales` are given, otherwise `tolerances`, of coordinates and of velocities.

@@ -45,7 +45,7 @@ class Snapshot(NamedTuple):
     multipliers: dict[str, Array]
 
 
-class How(NamedTuple):
+class SolveInfo(NamedTuple):
     """How a motion was stepped through.
 
     `order`: of the error that chooses steps; `evaluations`: of the equations per step, None for an implicit method;
@@ -60,7 +60,7 @@ class How(NamedTuple):
     backward: bool = False
 
 
-class Asked(NamedTuple):
+class SolveOptions(NamedTuple):
     """The other arguments of `integrate`, apart from the motion and its tolerances, as it takes them."""
 
     method: diffrax.AbstractSolver | None
@@ -72,11 +72,11 @@ class Asked(NamedTuple):
     jumps: str = "found"
 
 
-class Static(NamedTuple):
+class StaticPart(NamedTuple):
     """The parts of a trajectory that are not arrays; they must be hashable, so that JAX can carry them along."""
 
     rest: Packed
-    how: How
+    how: SolveInfo
 
     @property
     def method(self) -> str:
@@ -125,7 +125,7 @@ class Trajectory(eqx.Module):
     events: dict[str, Crossings]
     tolerance: tuple[Array, Array]
     arrays: PyTree
-    static: Static = eqx.field(static=True)
+    static: StaticPart = eqx.field(static=True)
     error: Errors | None = None
 
     @property
@@ -142,7 +142,7 @@ class Trajectory(eqx.Module):
         return self._problem()[1]
 
     @property
-    def asked(self) -> Asked:
+    def asked(self) -> SolveOptions:
         return self._problem()[2]
 
     def _problem(self):
@@ -339,10 +339,10 @@ def worst_drift(model, t, q, v):
     return jnp.nanmax(jnp.abs(h - h[0])) / jnp.where(largest > 0, largest, 1.0)
 
 
-def pack(system, params, asked: Asked, how: How) -> tuple[PyTree, Static]:
+def pack(system, params, asked: SolveOptions, how: SolveInfo) -> tuple[PyTree, StaticPart]:
     """Split (system, params, asked) into arrays and a hashable rest."""
     arrays, rest = packed.pack((system, params, asked))
-    return arrays, Static(rest, how)
+    return arrays, StaticPart(rest, how)
 
 
 @compiled

@@ -42,13 +42,13 @@ from jaxtyping import Array, Bool, Float
 from lagjax.jax_internals.one_function import apart
 from lagjax.mechanics.equations import all_finite
 from lagjax.motion.consistency import stopped
-from lagjax.motion.crossings import Kind
+from lagjax.motion.crossings import EventKind
 from lagjax.motion.pieces import (
     Followed,
+    GuardRoot,
     Node,
-    Part,
     Pieces,
-    Root,
+    StepPart,
     Watched,
     changes,
     first_root,
@@ -82,7 +82,7 @@ class Move(NamedTuple):
 
     takes: Bool[Array, ""]
     at: Float[Array, ""]
-    part: Part
+    part: StepPart
     followed: tuple[Followed, ...]
     crossed: tuple[Bool[Array, ""], ...]
     turns: tuple[Bool[Array, ""], ...]
@@ -99,10 +99,10 @@ class Segment(NamedTuple):
     of_guards: list[Pieces]
     in_doubt: list
     signs: list
-    root: Root
+    root: GuardRoot
 
 
-class Watching(diffrax.AbstractStepSizeController):
+class EventController(diffrax.AbstractStepSizeController):
     """Wrap `controller`: follow the guards through each step that it accepts, and end the solve at a terminal one.
 
     The controller's state is that of the wrapped one and a `Watched`, with the crossings. `last`: the final time.
@@ -113,7 +113,7 @@ class Watching(diffrax.AbstractStepSizeController):
     last: Float[Array, ""]
 
     @property
-    def kinds(self) -> tuple[Kind, ...]:
+    def kinds(self) -> tuple[EventKind, ...]:
         """The kinds of the guards."""
         return self.sight.guards.kinds
 
@@ -124,7 +124,7 @@ class Watching(diffrax.AbstractStepSizeController):
 
     def wrap(self, direction):
         """The same for time in this direction, which is always forward."""
-        return Watching(self.controller.wrap(direction), self.sight, self.last)
+        return EventController(self.controller.wrap(direction), self.sight, self.last)
 
     def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
         """The first step."""
@@ -132,9 +132,9 @@ class Watching(diffrax.AbstractStepSizeController):
         t, (_, v) = stopped((t0, y0))
         places, count = self.sight.guards.owners.size, len(self.kinds)
         no, zero, none = jnp.asarray(False), jnp.asarray(0), jnp.asarray(-1)
-        part = Part(
+        part = StepPart(
             parted=no, until=t, following=t, jumps=no, looks=zero, asked=none, curvature=t, tries=zero,
-            turns=(no,) * count, turns_at=t, root=Root(none, t, t, t, t, t), moved=t,
+            turns=(no,) * count, turns_at=t, root=GuardRoot(none, t, t, t, t, t), moved=t,
         )  # fmt: skip
         followed = (Followed(jnp.zeros_like(t), zero, no),) * count
         rows = jtu.tree_map(lambda x: jnp.broadcast_to(x, (places, *x.shape)), y0)
@@ -284,7 +284,7 @@ class Watching(diffrax.AbstractStepSizeController):
         )
         return Move(takes, at, later, followed, no, turns, tuple(looking & x for x in following.turns_left))
 
-    def _settled(self, in_doubt, again, anyway, root: Root):
+    def _settled(self, in_doubt, again, anyway, root: GuardRoot):
         """Whether no doubt is left; whether, in addition, nothing is crossed; or something is."""
         settled = ~again & (~_any(in_doubt) | anyway)
         return settled, settled & (root.guard < 0), settled & (root.guard >= 0)
@@ -315,7 +315,7 @@ class Watching(diffrax.AbstractStepSizeController):
         )
         return Move(takes, jnp.where(found, until, at), later, tuple(followed), tuple(crossing), no, no)
 
-    def _nearer(self, segment: Segment, part: Part):
+    def _nearer(self, segment: Segment, part: StepPart):
         """Whether the root is found, whether another one is `sooner`, whether the part is taken; the root to seek next,
         and where."""
         root, t = part.root, segment.right.t
@@ -342,11 +342,11 @@ class Watching(diffrax.AbstractStepSizeController):
         onward = _where(sooner, earlier._replace(before=t), root._replace(low=low, high=high))
         return found, sooner, takes, onward, jnp.where(sooner, self._inside(earlier, earlier.guess), at)
 
-    def _inside(self, root: Root, at):
+    def _inside(self, root: GuardRoot, at):
         """The time `at`, limited to the bracket of a root."""
         return jnp.clip(at, jnp.minimum(root.low + self.resolution, root.high), root.high)
 
-    def _at_extremum(self, here: Node, left: Node, part: Part, followed, until):
+    def _at_extremum(self, here: Node, left: Node, part: StepPart, followed, until):
         """Whether to look again for an extremum, and where; otherwise which guard turns here, if any."""
         g, rate = (_chosen(part.asked, [getattr(v, name) for v in here.values]) for name in ("g", "rate"))
         asked = part.asked >= 0

@@ -21,8 +21,8 @@ from jaxtyping import Array, Int, PyTree
 
 from lagjax.jax_internals.one_function import PRODUCT
 from lagjax.jax_internals.programs import length
-from lagjax.motion.recording import Problem, Record, Recorded, Rows, like, recorded_again
-from lagjax.motion.stepping import OnManifold
+from lagjax.motion.recording import Recorded, RecordRows, StepProblem, StepRecord, like, recorded_again
+from lagjax.motion.stepping import ProjectedSolver
 from lagjax.numerics.evaluations import evaluations_a_step
 from lagjax.numerics.nystrom import Nystrom
 from lagjax.numerics.runge_kutta import ExplicitRungeKutta
@@ -46,7 +46,7 @@ class Lanes(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Motion:
+class BackwardMotion:
     """A motion as a function of its arrays, each of which occurs once; everything else is stored here."""
 
     structure: Any
@@ -59,7 +59,7 @@ class Motion:
     # The structure of the record, filled when it has been traced.
     found: list
 
-    def problem(self, leaves) -> Problem:
+    def problem(self, leaves) -> StepProblem:
         """The problem with these arrays."""
         return eqx.combine(jtu.tree_unflatten(self.structure, [leaves[i] for i in self.places]), self.static)
 
@@ -80,12 +80,12 @@ class Motion:
         return solver.fast is not None and solver.equations.fallback
 
     @property
-    def where(self) -> Problem:
+    def where(self) -> StepProblem:
         """The problem with the index of each array in its place."""
         return jtu.tree_unflatten(self.structure, self.places)
 
 
-class Sweep(NamedTuple):
+class BackwardSweep(NamedTuple):
     """The state of the loop back: the next step `k`, and the rows of the piece `number`.
 
     `y`: the cotangent of the state at the end of step k, without that of an output there; `moved`: the cotangents of
@@ -94,13 +94,13 @@ class Sweep(NamedTuple):
 
     k: Int[Array, ""]
     number: Int[Array, ""]
-    rows: Rows
+    rows: RecordRows
     y: PyTree
     moved: list
     output: Int[Array, ""]
 
 
-def swept_back(leaves, found: Recorded, asked, *, motion: Motion, moved, lanes: Lanes | None):
+def swept_back(leaves, found: Recorded, asked, *, motion: BackwardMotion, moved, lanes: Lanes | None):
     """The cotangents of the arrays with indices `moved`, from those of the outputs, the last time and the last state.
 
     The first of several outputs at one time has the cotangents of all of them: see `together`.
@@ -112,7 +112,7 @@ def swept_back(leaves, found: Recorded, asked, *, motion: Motion, moved, lanes: 
         total = way.added(total, way.where.controller.ts, way.at_time(found.t, of_t))
     k = found.record.count - 1
     output = way.at(way.first, found.record.saved - 1)
-    s = Sweep(k, jnp.where(k >= 0, k // way.many, -1), way.safe(found.record.rows), of_y, total, output)
+    s = BackwardSweep(k, jnp.where(k >= 0, k // way.many, -1), way.safe(found.record.rows), of_y, total, output)
     s = lax.while_loop(lambda s: eqxi.unvmap_any(s.k >= 0), way.piece, s)
     # Outputs at the start are the first state.
     y, total = jax.tree.map(jnp.add, s.y, way.at(of_outputs, jnp.zeros_like(k))), s.moved
@@ -121,7 +121,7 @@ def swept_back(leaves, found: Recorded, asked, *, motion: Motion, moved, lanes: 
     return total
 
 
-def together(leaves, motion: Motion, lanes: Lanes | None, of_outputs):
+def together(leaves, motion: BackwardMotion, lanes: Lanes | None, of_outputs):
     """The cotangents of outputs, with those of all outputs at one time added to the first of these."""
     _, first = _outputs(leaves, motion, lanes)
     summed = lambda first, ct: jnp.zeros_like(ct).at[first].add(ct)
@@ -142,10 +142,10 @@ class _Way:
     """The constants of the way back, for one lane or for all lanes."""
 
     leaves: list
-    motion: Motion
+    motion: BackwardMotion
     moved: tuple[int, ...]
     lanes: Lanes | None
-    record: Record
+    record: StepRecord
     of_outputs: PyTree
 
     @cached_property
@@ -216,15 +216,15 @@ class _Way:
             step = lambda problem, *start: by(self.copied(problem.solver, *start), *start)
             return self.each(step, 3)(*filled(leaves, self.moved, chosen), *start)
 
-        _, pull, valid = jax.vjp(partial(end, OnManifold.again), *start, has_aux=True)
+        _, pull, valid = jax.vjp(partial(end, ProjectedSolver.again), *start, has_aux=True)
         if self.motion.robust:
             # Choose between pulls, not between ends: the derivative of an invalid end is NaN, and zero times it too.
-            robustly = lambda ct: jax.vjp(partial(end, OnManifold.again_robustly), *start)[1](ct)
+            robustly = lambda ct: jax.vjp(partial(end, ProjectedSolver.again_robustly), *start)[1](ct)
             pull = partial(lax.cond, eqxi.unvmap_all(valid), pull, robustly)
         of_arrays, *of_start = pull(ct)
         return (of_arrays, *of_start) if self.of_times else (of_arrays, None, None, *of_start)
 
-    def copied(self, solver: OnManifold, t0, t1, y) -> OnManifold:
+    def copied(self, solver: ProjectedSolver, t0, t1, y) -> ProjectedSolver:
         """The solver with its right-hand side copied to each stage, if that is worthwhile."""
         method = solver.solver
         if solver.fast is not None or not isinstance(method, Nystrom | ExplicitRungeKutta):
@@ -236,11 +236,11 @@ class _Way:
             return solver
         return replace(solver, solver=replace(method, in_a_loop=False))
 
-    def is_on(self, s: Sweep):
+    def is_on(self, s: BackwardSweep):
         """Whether the next step belongs to this piece."""
         return (s.k >= s.number * self.many) & (s.k >= 0)
 
-    def turn(self, s: Sweep) -> Sweep:
+    def turn(self, s: BackwardSweep) -> BackwardSweep:
         """Pull back one step."""
         on = self.is_on(s)
         t0, t1, y0 = self.at(s.rows, jnp.maximum(s.k, 0) % self.many)
@@ -258,9 +258,11 @@ class _Way:
             total = self.added(total, ends, self.at_time(t1, only(here, of_t1)))
             total = self.added(total, ends, self.at_time(t0, only(here & ~first, of_t0)))
         y = jax.tree.map(lambda x, ct: jnp.where(like(here, x), x, ct), of_y, ct)
-        return Sweep(s.k - on, s.number, s.rows, y, total, jnp.where(hit, self.at(self.first, output - 1), s.output))
+        return BackwardSweep(
+            s.k - on, s.number, s.rows, y, total, jnp.where(hit, self.at(self.first, output - 1), s.output)
+        )
 
-    def piece(self, s: Sweep) -> Sweep:
+    def piece(self, s: BackwardSweep) -> BackwardSweep:
         """Pull back one piece."""
         number = jnp.where(s.k >= 0, s.k // self.many, -1)
         # The piece before this one ends where this one begins.

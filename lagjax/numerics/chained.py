@@ -28,7 +28,7 @@ class Unknowns(NamedTuple):
     local: Float[Array, "windows k"]
 
 
-class Equations(NamedTuple):
+class WindowedEquations(NamedTuple):
     """Residuals of the samples and the seam of each window, and of prior knowledge about the shared unknowns."""
 
     rows: Float[Array, "windows m"]
@@ -37,7 +37,7 @@ class Equations(NamedTuple):
 
 
 class Slopes(NamedTuple):
-    """The derivatives of `Equations` that are not zero by structure."""
+    """The derivatives of `WindowedEquations` that are not zero by structure."""
 
     rows_by_shared: Float[Array, "windows m p"]
     rows_by_local: Float[Array, "windows m k"]
@@ -46,10 +46,10 @@ class Slopes(NamedTuple):
     seams_by_next: Float[Array, "windows j k"]
     shared: Float[Array, "h p"]
 
-    def along(self, d: Unknowns) -> Equations:
+    def along(self, d: Unknowns) -> WindowedEquations:
         """The change of the equations along a change of the unknowns."""
         following = jnp.concatenate([d.local[1:], jnp.zeros_like(d.local[:1])])
-        return Equations(
+        return WindowedEquations(
             self.rows_by_shared @ d.shared + _each(self.rows_by_local, d.local),
             self.seams_by_shared @ d.shared
             + _each(self.seams_by_local, d.local)
@@ -100,7 +100,7 @@ def _directions(u: Unknowns) -> Unknowns:
     return Unknowns(jnp.concatenate([jnp.eye(p, dtype=u.shared.dtype), zeros[1]]), jnp.concatenate([zeros[0], local]))
 
 
-def _slopes(along: Equations, u: Unknowns) -> Slopes:
+def _slopes(along: WindowedEquations, u: Unknowns) -> Slopes:
     """The slopes from the derivatives along `_directions(u)`, which are the leading axis."""
     (p,), (windows, k) = u.shared.shape, u.local.shape
     by_shared, by_local = (jax.tree.map(lambda x: x[part], along) for part in (slice(None, p), slice(p, None)))
@@ -130,7 +130,7 @@ class Factors(NamedTuple):
     shared_rhs: Float[Array, " p"]
 
 
-def eliminate(a: Slopes, rhs: Equations, damping: Unknowns) -> Factors:
+def eliminate(a: Slopes, rhs: WindowedEquations, damping: Unknowns) -> Factors:
     """Factorise the equations together with `damping * unknown = 0`."""
     windows, _, k = a.rows_by_local.shape
     p = a.shared.shape[1]
@@ -223,7 +223,7 @@ def _upper(triangle, rhs):
     return jax.scipy.linalg.solve_triangular(triangle, rhs)
 
 
-def slopes_of(product: Callable[[Unknowns], Equations], u: Unknowns) -> Slopes:
+def slopes_of(product: Callable[[Unknowns], WindowedEquations], u: Unknowns) -> Slopes:
     """The slopes of equations from their products with a few directions; `u` gives the shapes."""
     return _slopes(jax.vmap(product)(_directions(u)), u)
 

@@ -142,7 +142,7 @@ def short_of_horizontal(params):
     return jnp.arcsin(params["g"] / (params["a"] * params["omega"] ** 2))
 
 
-class Squares(NamedTuple):
+class BeadSquares(NamedTuple):
     """Squared frequencies of small motions; a negative one is minus a squared growth rate."""
 
     bottom: jax.Array
@@ -150,10 +150,10 @@ class Squares(NamedTuple):
     top: jax.Array
 
 
-def small_motion(params) -> Squares:
+def small_motion(params) -> BeadSquares:
     """ω0² - ω² at the bottom, ω² sin²α = ω² - ω0⁴/ω² about α (meaningful above ω0), -(ω0² + ω²) at the top."""
     below, squared = params["g"] / params["a"], params["omega"] ** 2
-    return Squares(below - squared, (squared - below) * (squared + below) / squared, -(below + squared))
+    return BeadSquares(below - squared, (squared - below) * (squared + below) / squared, -(below + squared))
 
 
 def frequency(square):

@@ -107,7 +107,7 @@ def to_rotating(params, t, q, v):
     return {"R": R, "r": r}, {"R": v["x"] * c + v["y"] * s + omega * r, "r": -v["x"] * s + v["y"] * c - omega * R}
 
 
-class Balance(NamedTuple):
+class RailBalance(NamedTuple):
     """Quantities of one state: energy, Jacobi integral, angular momentum, the rails' torque and its power."""
 
     E: jax.Array
@@ -117,7 +117,7 @@ class Balance(NamedTuple):
     power: jax.Array
 
 
-def balance(params, q, v) -> Balance:
+def balance(params, q, v) -> RailBalance:
     """E, h' = E - ω L_z, L_z, τ = r (K (R - R0) - k R) and dE/dt = ω τ, from the rotating coordinates.
 
     h' is computed independently of E and L_z, as ½m(Ṙ² + ṙ²) + V - ½mω²(R² + r²).
@@ -126,7 +126,7 @@ def balance(params, q, v) -> Balance:
     V = 0.5 * K * (q["R"] - R0) ** 2 + 0.5 * k * q["r"] ** 2
     along, across = v["R"] - omega * q["r"], v["r"] + omega * q["R"]
     torque = q["r"] * (K * (q["R"] - R0) - k * q["R"])
-    return Balance(
+    return RailBalance(
         E=0.5 * m * (along**2 + across**2) + V,
         h=0.5 * m * (v["R"] ** 2 + v["r"] ** 2) + V - 0.5 * m * omega**2 * (q["R"] ** 2 + q["r"] ** 2),
         L_z=m * (q["R"] * across - q["r"] * along),
@@ -140,18 +140,18 @@ def equilibrium_length(params):
     return params["K"] * params["R0"] / (params["K"] - params["m"] * params["omega"] ** 2)
 
 
-class Squares(NamedTuple):
+class RailSquares(NamedTuple):
     """Squared frequencies of the two modes; a negative one is minus a squared growth rate."""
 
     fast: jax.Array
     slow: jax.Array
 
 
-def mode_squares(params) -> Squares:
+def mode_squares(params) -> RailSquares:
     """Ω² of both modes: the slow one as c / Ω_fast², so that it does not cancel near a critical speed."""
     half_sum, root, product = _characteristic(params)
     fast = half_sum + 0.5 * root
-    return Squares(fast=fast, slow=product / fast)
+    return RailSquares(fast=fast, slow=product / fast)
 
 
 def _characteristic(params):

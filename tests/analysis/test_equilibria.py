@@ -184,7 +184,7 @@ def test_sleeping_top():
 @pytest.mark.exhaustive
 def test_governor():
     """The balls' moment about a hinge vanishes, from the equilibrium of one rod and the slider, written by hand."""
-    parts, p, rate = governor.Parts, governor.PARAMS, governor.RATE
+    parts, p, rate = governor.GovernorParts, governor.PARAMS, governor.RATE
 
     def turn(q, params):
         around = lambda r: jnp.stack([-r[1], r[0], 0 * r[2]])

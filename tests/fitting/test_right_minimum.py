@@ -11,7 +11,7 @@ from lagjax.fitting import engine
 from lagjax.fitting.equations import dampened
 from lagjax.fitting.misfit import CHANCE, _exceeded_by_chance, _undampened, misfit
 from lagjax.fitting.problem import problem_of
-from lagjax.numerics.chained import Equations
+from lagjax.numerics.chained import WindowedEquations
 
 TS, SIGMA = np.linspace(0.0, 15.0, 200), 0.02
 TRUE = {"w2": 9.0, "c": 0.3, "A": 1.2, "W": 2.0}
@@ -134,7 +134,7 @@ def test_false_alarms(loss):
     problem = spring_problem(104, 0.01, loss)
     rows = jnp.asarray(dampened(np.random.default_rng(0).normal(size=(3000, 1, 104)), loss))
     zero = jnp.zeros((1, 0)), jnp.zeros(1)
-    judged = jax.jit(jax.vmap(lambda rows: misfit(problem, Equations(rows, *zero))))
+    judged = jax.jit(jax.vmap(lambda rows: misfit(problem, WindowedEquations(rows, *zero))))
     assert not np.any(judged(rows).any) and np.mean(judged(rows).doubtful) < 0.02
     # Twins: larger errors, and a curve, are always noticed.
     plain = np.random.default_rng(1).normal(size=(300, 1, 104))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import lagjax as lj
-from lagjax.motion.arriving import WHOLE_STEPS, Arriving
+from lagjax.motion.arriving import WHOLE_STEPS, StepToOutputs
 from tests.systems import PARAMS, pendulum
 
 
@@ -35,7 +35,7 @@ def test_outputs_shorten_few_steps():
 
 def test_the_size_proposed_before_is_kept():
     """After a step shortened to an output, the next one is as long as was proposed before."""
-    controller = Arriving(
+    controller = StepToOutputs(
         diffrax.PIDController(rtol=1e-6, atol=1e-6), jnp.array([0.0, 1.0, 1.001, 5.0]), jnp.array(WHOLE_STEPS)
     )
     before = jnp.asarray(0.4)

@@ -723,7 +723,7 @@ def test_an_error_in_the_equations_would_show(flaw, monkeypatch):
         time = jnp.where(flaw == "no d(phi)/dt", 0.0, jnp.ones_like(t))
         along = jnp.where(flaw == "no (d phi/dq) v", 0.0, u)
         _, rate = jax.jvp(lambda t, x: level(t, x, u), (t, x), (time, along))
-        return constraints.Rows(jax.jacfwd(level, argnums=2)(t, x, u), -rate)
+        return constraints.ConstraintRows(jax.jacfwd(level, argnums=2)(t, x, u), -rate)
 
     solved = saddle_point.saddle_point
 

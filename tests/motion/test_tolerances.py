@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import lagjax as lj
-from lagjax.motion.tolerances import Tolerances, Weighing, rounding, scales_of, shared
+from lagjax.motion.tolerances import PerCoordinateTolerance, Tolerances, rounding, scales_of, shared
 from lagjax.numerics.simplified_newton import SimplifiedNewton
 
 # The units of length and of time are powers of four, so that scaling by them is exact, also in square roots.
@@ -92,7 +92,7 @@ def weighed(size, error, sizes_so_far=None, mass=(1.0, 1.0), rtol=1e-9):
     scales = scales_of(jnp.asarray(mass), *y, jnp.zeros(2), 1.0)
     if sizes_so_far is not None:
         scales = scales._replace(first=jnp.asarray(sizes_so_far))
-    weighing = Weighing(
+    weighing = PerCoordinateTolerance(
         diffrax.PIDController(rtol=rtol, atol=rtol),
         Tolerances(jnp.full(2, rtol), jnp.full(2, rtol)),
         scales,

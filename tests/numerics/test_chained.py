@@ -7,7 +7,7 @@ import lineax as lx
 import numpy as np
 import pytest
 
-from lagjax.numerics.chained import ByWindows, Equations, Unknowns, covariance, eliminate, slopes_of, solution
+from lagjax.numerics.chained import ByWindows, Unknowns, WindowedEquations, covariance, eliminate, slopes_of, solution
 from tests.tiers import exhaustive_but
 
 W, M, J, K, P, H = 5, 7, 3, 2, 4, 2
@@ -23,13 +23,13 @@ def chain(seed=0, windows=W):
 
     def product(d):
         following = jnp.concatenate([d.local[1:], jnp.zeros_like(d.local[:1])])
-        return Equations(
+        return WindowedEquations(
             rows @ d.shared + jnp.einsum("wij,wj->wi", own, d.local),
             seams @ d.shared + jnp.einsum("wij,wj->wi", begin, d.local) + jnp.einsum("wij,wj->wi", end, following),
             prior @ d.shared,
         )
 
-    rhs = Equations(draw(windows, M), draw(windows, J).at[-1].set(0.0), draw(H))
+    rhs = WindowedEquations(draw(windows, M), draw(windows, J).at[-1].set(0.0), draw(H))
     unknowns = Unknowns(jnp.zeros(P), jnp.zeros((windows, K)))
     flat, back = jax.flatten_util.ravel_pytree(unknowns)
     matrix = jax.jit(jax.jacfwd(lambda x: jax.flatten_util.ravel_pytree(product(back(x)))[0]))(flat)
