@@ -17,11 +17,11 @@ from lagjax.analysis.guessing import OrbitRequest
 from lagjax.analysis.monodromy import problem_of, refuse_singular, tolerance_of
 from lagjax.analysis.orbit import PeriodicOrbit
 from lagjax.jax_internals.tracing import is_eager
+from lagjax.jax_internals.trees import stop_gradient
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.diagnosis import listed
 from lagjax.mechanics.packed import pack
 from lagjax.mechanics.system import System
-from lagjax.motion.consistency import stopped
 from lagjax.motion.reported import Report, reported
 from lagjax.motion.results import RESULTS
 
@@ -108,7 +108,7 @@ def periodic_orbit(
         _raise_or_warn(found, float(period), problem)
     else:
         state = coordinates.state(*s)
-        given = stopped((problem.system, state, jnp.asarray(period)))
+        given = stop_gradient((problem.system, state, jnp.asarray(period)))
         found = closing.closed(*given, rtol, asked, problem.rows, parts, given_turns, most)
         found = closing.implicit(problem.system, state, rtol, asked, problem.rows, found)
     orbit = _orbit(problem, found, asked)

@@ -35,12 +35,12 @@ from lagjax.analysis.found_equilibria import (
 from lagjax.analysis.reduced_force import CREEPS_BELOW, nearest, soft_below
 from lagjax.analysis.starts import checked, stacked, stacked_one, symmetries_of
 from lagjax.jax_internals.tracing import is_eager
+from lagjax.jax_internals.trees import stop_gradient
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.compiled import compiled
 from lagjax.mechanics.model import model_of
 from lagjax.mechanics.refusals import by_name, check_system
 from lagjax.mechanics.structure import angles, is_autonomous, unseen_coordinates
-from lagjax.motion.consistency import stopped
 from lagjax.numerics import lapack
 from lagjax.numerics.roots import MOST, differentiable, least_squares_root, zero_below
 
@@ -274,7 +274,7 @@ def _search(steady: Steady, q, v, lasting, expected, concrete) -> EquilibriumRow
     rates, held = held_at(steady, x0, u0)
     steady = Steady(steady.model, steady.t, held, steady.x0, steady.symmetries)
     y0 = jnp.concatenate([x0, rates, jnp.zeros(steady.m, x0.dtype)])
-    fixed, linear = stopped(steady), np.arange(y0.size) >= steady.n + steady.symmetries.count
+    fixed, linear = stop_gradient(steady), np.arange(y0.size) >= steady.n + steady.symmetries.count
     root = least_squares_root(lambda y: equations.balance(fixed, y), lax.stop_gradient(y0), linear)
     y = root.y if concrete else differentiable(lambda y: equations.balance(steady, y), root)
     return _row(steady, y, root, y0, lasting, expected, concrete)

@@ -23,6 +23,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from lagjax.fitting.records import Record, Windows, spread
+from lagjax.jax_internals.trees import stop_gradient
 from lagjax.mechanics import constraints, coordinates
 from lagjax.mechanics.compiled import compiled
 from lagjax.mechanics.coordinates import State
@@ -31,7 +32,7 @@ from lagjax.mechanics.equations import equations_of
 from lagjax.mechanics.first_call import traced_system
 from lagjax.mechanics.memory import kinds
 from lagjax.mechanics.model import Model, model_of
-from lagjax.motion.consistency import departures, stopped, within
+from lagjax.motion.consistency import departures, within
 from lagjax.motion.consistent_state import free_coordinates
 from lagjax.motion.integrate import integrate
 from lagjax.numerics.rank import null_space
@@ -65,7 +66,7 @@ class Chart(NamedTuple):
             rows = jax.jacfwd(lambda y: residual(problem, y))(y) @ self.across
             return -self.across @ jnp.linalg.solve(rows.T @ rows, rows.T @ residual(problem, y))
 
-        fixed = stopped(problem)
+        fixed = stop_gradient(problem)
         size = lambda y: jnp.max(jnp.abs(residual(fixed, y)))
 
         def iterate(state):
@@ -73,7 +74,7 @@ class Chart(NamedTuple):
             nearer = y + step(fixed, y)
             return i + 1, nearer, size(nearer) < 0.5 * size(y)
 
-        start = stopped(y)
+        start = stop_gradient(y)
         _, near, _ = lax.while_loop(lambda state: (state[0] < ITERATIONS) & state[2], iterate, (0, start, True))
         # The value of `near`; one more step, with a constant matrix, gives the derivative of the solution.
         y = near + (y - start)

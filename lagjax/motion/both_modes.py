@@ -33,7 +33,7 @@ from jax.core import ShapedArray
 from jaxtyping import PyTree
 
 from lagjax.jax_internals.primitives import ad, jaxpr_as_fun, primitive
-from lagjax.motion.consistency import stopped
+from lagjax.jax_internals.trees import stop_gradient
 from lagjax.motion.pulled import Push, pull, turned
 from lagjax.motion.replay import Replay
 
@@ -131,7 +131,7 @@ def _solved_jvp(primals, tangents, *, program, rules):
     if not moved:
         return values, [zero(y) for y in values]
     # The record only says around which motion to replay; it is not differentiated.
-    leaves = [*primals, *stopped(record)]
+    leaves = [*primals, *stop_gradient(record)]
     order = moved + [i for i in range(len(leaves)) if i not in moved]
     place = [order.index(i) for i in range(len(leaves))]
 

@@ -15,13 +15,13 @@ from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, PyTree
 
+from lagjax.jax_internals.trees import stop_gradient
 from lagjax.mechanics import constraints, coordinates
 from lagjax.mechanics.compiled import compiled
 from lagjax.mechanics.equations import Equations, equations_of
@@ -56,11 +56,11 @@ def to_manifold(equations: Equations, t, q, v, rtol, atol) -> Projected:
     """
     model, (x, u) = equations.model, equations.model.vectors(q, v)
     # Not differentiated: where the residual vanishes, the derivative of the matrix does not contribute.
-    frozen, at = stopped(equations), stopped((t, q, v))
+    frozen, at = stop_gradient(equations), stop_gradient((t, q, v))
     displacement, slope = frozen.displacement(*at), frozen.row_sizes(*at)
     of_q, of_v = _allowed(jnp.abs(jnp.concatenate([x, u])), rtol, atol)
     live, holonomic = (model, t), model.holonomic
-    fixed = stopped(live)
+    fixed = stop_gradient(live)
     position_residual = lambda problem, x: constraints.position_residual(*problem, x)
     if holonomic.any():
         # Positions move only in directions that the velocity constraints allow: a rolling body keeps rolling.
@@ -75,7 +75,7 @@ def to_manifold(equations: Equations, t, q, v, rtol, atol) -> Projected:
 
 def _newton(residual: Callable, problem: PyTree, y, displacement, slope):
     """Iterate `y - displacement(r(problem, y))`; differentiate only the last iteration, enough where r vanishes."""
-    fixed, start = stopped((problem, y))
+    fixed, start = stop_gradient((problem, y))
 
     def size(r):
         return jnp.max(jnp.abs(r) / jnp.where(slope > 0, slope, 1.0))
@@ -103,11 +103,6 @@ def velocity_change(model, t, q, v, change):
     `change` (m,): that of `constraints.velocity_residual`. The result has the structure of v, to be added to it.
     """
     return model.tree(equations_of(model).displacement(t, q, v)(np.ones(change.size, bool), change))
-
-
-def stopped(tree):
-    """Return `tree` without derivatives."""
-    return jax.tree.map(lambda leaf: lax.stop_gradient(leaf) if eqx.is_array(leaf) else leaf, tree)
 
 
 def worst_residual(model, t, q, v):

@@ -22,6 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from lagjax.jax_internals.trees import stop_gradient
 from lagjax.mechanics import constraints, coordinates
 from lagjax.mechanics.compiled import compiled
 from lagjax.mechanics.diagnosis import describe, listed
@@ -29,7 +30,7 @@ from lagjax.mechanics.equations import equations_of
 from lagjax.mechanics.first_call import prepare
 from lagjax.mechanics.lagrangian import mass_and_forcing
 from lagjax.mechanics.saddle_point import displacement_map
-from lagjax.motion.consistency import departures, stopped, within
+from lagjax.motion.consistency import departures, within
 from lagjax.numerics import dense
 from lagjax.numerics.rank import DEPENDENT_BELOW, independent_rows
 
@@ -150,7 +151,7 @@ def _consistent_state(model, s, free, free_velocity):
 def _nearest(residual: Callable, problem, y0, metric, free):
     """Return the stationary point of `½ (y - y0)ᵀ M (y - y0) + μᵀ r(y)` near y0."""
     metric = jnp.where(free[:, None] & free[None, :], metric, jnp.diag(jnp.where(free, 0.0, 1.0)))
-    n, fixed, fixed_metric, start = y0.size, stopped(problem), *stopped((metric, y0))
+    n, fixed, fixed_metric, start = y0.size, stop_gradient(problem), *stop_gradient((metric, y0))
     residual = _two_or_more(residual)
 
     def rows_at(problem, y):
@@ -208,7 +209,7 @@ def _nearest(residual: Callable, problem, y0, metric, free):
     y, multipliers = jnp.where(finite, y, reached), jnp.where(finite, multipliers, zero)
     # One more Newton step gives the nearest point all its derivatives, by the implicit function theorem.
     inverted = lax.stop_gradient(dense.inverse(newton_matrix(y, multipliers)))
-    y, multipliers, reached = stopped((y, multipliers, reached))
+    y, multipliers, reached = stop_gradient((y, multipliers, reached))
     nearest = y - (inverted @ equations(problem, metric, y0, y, multipliers))[:n]
     # If the path to it was lost, the result is the point reached by shortest steps, with the derivatives of one step.
     near = reached + (y0 - start)

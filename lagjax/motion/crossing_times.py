@@ -21,6 +21,7 @@ import jax.tree_util as jtu
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
+from lagjax.jax_internals.trees import like
 from lagjax.mechanics.equations import Equations
 from lagjax.motion.crossings import Crossings, Guards
 from lagjax.motion.pieces import Watched
@@ -106,7 +107,7 @@ def all_known(located: Located) -> Bool[Array, ""]:
     """Whether nothing at the crossings is NaN, and none is uncertain."""
     there, known = jnp.isfinite(located.t), ~jnp.any(located.uncertain)
     for x in jtu.tree_leaves((located.y, located.multipliers)):
-        known = known & jnp.all(jnp.isfinite(x) | ~_like(there, x))
+        known = known & jnp.all(jnp.isfinite(x) | ~like(there, x))
     return known
 
 
@@ -116,7 +117,7 @@ def by_name(guards: Guards, located: Located, end, valid) -> dict[str, Crossings
     for i, kind in enumerate(guards.kinds):
         mine = guards.owners == i
         rows = jtu.tree_map(lambda x: x[mine], (located.t, *located.y, located.multipliers))
-        masked = jtu.tree_map(lambda x: jnp.where(_like(there[mine], x), x, jnp.nan), rows)
+        masked = jtu.tree_map(lambda x: jnp.where(like(there[mine], x), x, jnp.nan), rows)
         # The step in which the motion ended may contain further crossings.
         count = located.count[i] - jnp.sum(jnp.isfinite(rows[0]) & ~there[mine])
         found[kind.name] = Crossings(*masked, count, located.uncertain[i])
@@ -196,7 +197,3 @@ def _terms(live, z, owner):
     t, y = z
     _, change = jax.jvp(lambda t, y: _guard(live, (t, y), owner), (t, y), (t, uneven(y)))
     return jnp.abs(change)
-
-
-def _like(mask, x):
-    return mask.reshape(mask.shape + (1,) * (x.ndim - 1))

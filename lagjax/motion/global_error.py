@@ -22,8 +22,8 @@ import numpy as np
 from jax import lax
 
 from lagjax.jax_internals.tracing import is_eager
+from lagjax.jax_internals.trees import stop_gradient
 from lagjax.motion.accuracy import Errors, columns, scaled_error
-from lagjax.motion.consistency import stopped
 from lagjax.motion.results import ENDED_WELL, RESULTS, ended_well, is_among
 from lagjax.motion.trajectory import Trajectory
 
@@ -69,8 +69,8 @@ def with_errors_inside(run: Callable, first: Trajectory, settings, ts) -> Trajec
     """Do the same in a traced program, without derivatives of the errors."""
     if not _can_be_closer(settings):
         return _unknown(first)
-    known, settings, ts = stopped((first, settings, ts))
-    second = stopped(run(_closer(jnp, settings, known.stats["num_accepted_steps"], known.end.t, ts)))
+    known, settings, ts = stop_gradient((first, settings, ts))
+    second = stop_gradient(run(_closer(jnp, settings, known.stats["num_accepted_steps"], known.end.t, ts)))
     found = _compared(jnp, known, second, ts)
     excess = jnp.where(ended_well(known.result), found.scaled_error, first.scaled_error)
     return replace(first, error=found.error, scaled_error=excess)

@@ -39,13 +39,14 @@ import jax.numpy as jnp
 from jaxtyping import ArrayLike
 
 from lagjax.jax_internals.programs import depends
+from lagjax.jax_internals.trees import stop_gradient
 from lagjax.mechanics import constraints, coordinates
 from lagjax.mechanics.arguments import OF_POSITION, OF_STATE
 from lagjax.mechanics.constraints import Holonomic, Nonholonomic
 from lagjax.mechanics.memory import shape_of
 from lagjax.mechanics.model import model_of
 from lagjax.mechanics.system import System
-from lagjax.motion.consistency import stopped, velocity_change
+from lagjax.motion.consistency import velocity_change
 from lagjax.motion.switching import OfPhases
 
 # Names reserved for a contact's gap and sliding velocity among the constraints of a phase.
@@ -151,7 +152,7 @@ class _Opened(eqx.Module):
         mine, opening = model.belongs_to(self.contact), constraints.velocity_residual(model, t, x, u)
         # The speed must be above zero for a body at rest, too.
         least = OPENS * jnp.finfo(x.dtype).eps * sizes + jnp.sqrt(jnp.finfo(x.dtype).tiny)
-        change = stopped(jnp.where(mine, jnp.maximum(least - opening, 0.0), 0.0))
+        change = stop_gradient(jnp.where(mine, jnp.maximum(least - opening, 0.0), 0.0))
         return _moved(v, 1.0, velocity_change(model, t, q, v, change))
 
 

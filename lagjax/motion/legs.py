@@ -27,11 +27,11 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from lagjax.jax_internals.one_function import apart
+from lagjax.jax_internals.trees import like, stop_gradient, where
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.equations import all_finite
 from lagjax.mechanics.hybrid import Hybrid
 from lagjax.mechanics.model import model_of
-from lagjax.motion.consistency import stopped
 from lagjax.motion.crossings import Crossings, Guards
 from lagjax.motion.hybrid_trajectory import NO_PHASE, SWITCHES, Switches
 from lagjax.motion.loop import resolution
@@ -187,7 +187,7 @@ def _leg(hybrid, i, in_phase, way: PhaseWay, params, ts, phase: Phase, settings,
         # A motion in the wrong phase is wrong from that phase's start on, its first output included.
         invalid = in_phase & ((result == RESULTS.guard_not_seen) | (result == RESULTS.guard_below_zero))
         unknown = jax.tree.map(lambda x: jnp.full_like(x, jnp.nan), end.multipliers)
-        end = _where(invalid, Snapshot(way.t, way.q, way.v, unknown), end)
+        end = where(invalid, Snapshot(way.t, way.q, way.v, unknown), end)
         events = {name: x.none_where(invalid) for name, x in events.items()}
         broken = onward & ~all_finite((after.q, after.v))
         result, onward = RESULTS.where(broken, RESULTS.reset_not_finite, result), onward & ~broken
@@ -196,19 +196,19 @@ def _leg(hybrid, i, in_phase, way: PhaseWay, params, ts, phase: Phase, settings,
     known = known & (result != RESULTS.guard_below_zero) & reached(rows["q"])
     none = lambda name, x: end.multipliers.get(name, jnp.full_like(x, jnp.nan))
     end = end._replace(multipliers={name: none(name, x) for name, x in way.end.multipliers.items()})
-    least = way.least if not settings.by_size else jnp.maximum(way.least, stopped(found["tolerance"][1]))
+    least = way.least if not settings.by_size else jnp.maximum(way.least, stop_gradient(found["tolerance"][1]))
     further = PhaseWay(
-        t=jnp.where(onward, end.t, way.t), q=_where(onward, after.q, way.q), v=_where(onward, after.v, way.v),
+        t=jnp.where(onward, end.t, way.t), q=where(onward, after.q, way.q), v=where(onward, after.v, way.v),
         phase=jnp.where(onward, target, way.phase), continues=onward & (end.t < ts[-1]),
         rows=_filled(way.rows, in_phase & known, rows, i), switches=switches,
         events=with_those_of(events, way.events),
-        end=_where(onward, end._replace(q=after.q, v=after.v), end),
+        end=where(onward, end._replace(q=after.q, v=after.v), end),
         stats={name: n + found["stats"][name] for name, n in way.stats.items()},
         sizes_so_far=jnp.maximum(way.sizes_so_far, sizes_of(end.q, end.v)), least=least,
         scaled_error=jnp.where(ended_well(result), jnp.maximum(way.scaled_error, found["scaled_error"]), jnp.inf),
         settled=way.settled & found["settled"], result=result,
     )  # fmt: skip
-    return _where(in_phase, further, way)
+    return where(in_phase, further, way)
 
 
 class PhaseEnding(NamedTuple):
@@ -233,7 +233,7 @@ def _ending(
     switched = in_phase & (result == RESULTS.event_occurred) & ~by_event
     at_once = switched & (end.t - way.t <= at_one_time)
     # A switch at once happens where the leg begins, so that its time has the derivatives of that.
-    t, q, v = _where(at_once, (way.t, way.q, way.v), (end.t, end.q, end.v))
+    t, q, v = where(at_once, (way.t, way.q, way.v), (end.t, end.q, end.v))
     end = Snapshot(t, q, v, end.multipliers)
     is_below = _is_below(end, params, phase.guards, count, rtol)
     refused, full = at_once & at_start & is_below, way.switches.count >= way.switches.t.shape[0]
@@ -248,8 +248,8 @@ def _ending(
 
 def _is_below(end: Snapshot, params, guards: Guards, count: int, rtol):
     """Whether one of the first `count` guards is below zero by more than errors can cause."""
-    state = stopped(tuple(end))
-    value = lambda *state: jnp.stack(guards(*state, stopped(params))[:count])
+    state = stop_gradient(tuple(end))
+    value = lambda *state: jnp.stack(guards(*state, stop_gradient(params))[:count])
     g, terms = jax.jvp(value, state, uneven(state))
     return jnp.any(g < -NOT_BELOW * rtol[0] * jnp.abs(terms))
 
@@ -261,7 +261,7 @@ def reached(q):
 
 def _filled(rows: OutputRows, known, found, i) -> OutputRows:
     """Return the outputs, with those of a leg in phase i where they are `known`."""
-    put = lambda all, new: jax.tree.map(lambda x, y: jnp.where(_like(known, x), y.astype(x.dtype), x), all, new)
+    put = lambda all, new: jax.tree.map(lambda x, y: jnp.where(like(known, x), y.astype(x.dtype), x), all, new)
     multipliers = {name: put(x, found["multipliers"].get(name, x)) for name, x in rows.multipliers.items()}
     return OutputRows(put(rows.q, found["q"]), put(rows.v, found["v"]), multipliers, jnp.where(known, i, rows.phase))
 
@@ -283,7 +283,7 @@ def _switched(system, ending: PhaseEnding, params, phase: Phase, way: PhaseWay):
     impulse = jax.tree.map(jnp.subtract, momentum(after.q, after.v, params), momentum(end.q, end.v, params))
     s, way_out = way.switches, jnp.asarray(phase.switches, jnp.int32)[first]
     place = onward & (jnp.arange(s.t.shape[0]) == s.count)
-    put = lambda all, new: jax.tree.map(lambda x, y: jnp.where(_like(place, x), y[None].astype(x.dtype), x), all, new)
+    put = lambda all, new: jax.tree.map(lambda x, y: jnp.where(like(place, x), y[None].astype(x.dtype), x), all, new)
     to = jnp.asarray(phase.targets)[first, after.rests.astype(int)]
     record = Switches(
         t=put(s.t, end.t), way=put(s.way, way_out), to=put(s.to, to), q=put(s.q, end.q), v=put(s.v, end.v),
@@ -295,7 +295,7 @@ def _switched(system, ending: PhaseEnding, params, phase: Phase, way: PhaseWay):
 
 def sizes_of(q, v):
     """The sizes of coordinates and velocities, (2, n)."""
-    return jnp.abs(jnp.stack([stopped(coordinates.flatten(y)[0]) for y in (q, v)]))
+    return jnp.abs(jnp.stack([stop_gradient(coordinates.flatten(y)[0]) for y in (q, v)]))
 
 
 def _one_of(first, values):
@@ -303,12 +303,3 @@ def _one_of(first, values):
     for i, x in enumerate(values[1:], 1):
         found = jnp.where(first == i, x, found)
     return found
-
-
-def _where(condition, a, b):
-    pick = lambda x, y: jnp.where(condition, x, y).astype(jnp.result_type(y)) if eqx.is_array(y) else y
-    return jax.tree.map(pick, a, b)
-
-
-def _like(mask, x):
-    return mask.reshape(mask.shape + (1,) * (x.ndim - 1))

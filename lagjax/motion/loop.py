@@ -14,11 +14,11 @@ import optimistix as optx
 from jaxtyping import Array, Float, PyTree
 
 from lagjax.jax_internals.one_function import calls_host, one_function
+from lagjax.jax_internals.trees import stop_gradient
 from lagjax.mechanics.coordinates import State
 from lagjax.mechanics.equations import Equations
 from lagjax.mechanics.structure import are_angles
 from lagjax.motion.arriving import StepToOutputs, together
-from lagjax.motion.consistency import stopped
 from lagjax.motion.crossing_times import Located, at_known_times, first_end, locate
 from lagjax.motion.recording import Recorded, StepProblem, with_room
 from lagjax.motion.replay import Replay, replayed
@@ -60,7 +60,7 @@ def solution_of(
     if guards is None or isinstance(adjoint, diffrax.ForwardMode):
         return _loop(*problem, settings, ts, adjoint, guards)
     # In reverse mode diffrax differentiates only outputs: crossings, once their times are known, become outputs.
-    first = _loop(*stopped((*problem, settings, ts)), diffrax.ForwardMode(), stopped(guards))
+    first = _loop(*stop_gradient((*problem, settings, ts)), diffrax.ForwardMode(), stop_gradient(guards))
     end = jnp.minimum(first.end[0][0], first_end(guards, first.located.t))
     times = jnp.concatenate([ts, first.located.t])
     times = jnp.minimum(jnp.where(jnp.isfinite(times), times, end), end)

@@ -11,13 +11,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
+from lagjax.jax_internals.trees import like, stop_gradient
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.coordinates import State
 from lagjax.mechanics.equations import Equations, all_finite, equations_of
 from lagjax.mechanics.model import model_of
 from lagjax.mechanics.structure import conserves_jacobi_integral
 from lagjax.motion.arriving import apart_from_jumps
-from lagjax.motion.consistency import returned, stopped, within, worst_residual
+from lagjax.motion.consistency import returned, within, worst_residual
 from lagjax.motion.crossing_times import all_known, by_name, end_of
 from lagjax.motion.global_error import ROUND_OFFS
 from lagjax.motion.loop import Solution, solution_of
@@ -103,13 +104,13 @@ def _start(equations: Equations, q, v, ts, settings, sizes_so_far) -> Start:
     t, given, off_constraints = ts[0], State(ts[0], q, v, equations.model.params), jnp.asarray(False)
     if settings.drift == "project":
         q, v, _ = returned(equations, t, q, v, *tolerances_at(given, ts, settings, sizes_so_far))
-    a, _, finite, singular, contradictory, mass = stopped(equations.verdict(t, q, v))
+    a, _, finite, singular, contradictory, mass = stop_gradient(equations.verdict(t, q, v))
     tolerances = rtol, atol = tolerances_at(given, ts, settings, sizes_so_far, a)
     if equations.model.m:
         off_constraints = ~within(equations, *given[:3], START_TOLERANCES * rtol, START_TOLERANCES * atol)
         if settings.drift == "project" and not equations.are_taken_for_regular:
             off_constraints |= finite & ~singular & ~within(equations, t, q, v, *tolerances)
-    scales = scales_of(mass, *stopped((q, v)), a, stopped(span_of(ts))) if settings.by_size else None
+    scales = scales_of(mass, *stop_gradient((q, v)), a, stop_gradient(span_of(ts))) if settings.by_size else None
     if scales is not None and sizes_so_far is not None:
         scales = scales._replace(first=jnp.maximum(scales.first, sizes_so_far))
     too_small = settings.controller is None and settings.rtol[0] < ROUND_OFFS * jnp.finfo(ts.dtype).eps
@@ -142,7 +143,7 @@ def _stepped(equations, start, ts, guards, settings, adjoint) -> Solution:
 def _outputs(equations, start, solution, ts, settings) -> Outputs:
     # Outputs not reached get the start state and are masked afterwards: NaN times zero would poison gradients.
     reached = jnp.isfinite(solution.reached) & ~start.refused
-    states = jax.tree.map(lambda x, x0: jnp.where(_like(reached, x), x, x0[None]), solution.outputs, (start.q, start.v))
+    states = jax.tree.map(lambda x, x0: jnp.where(like(reached, x), x, x0[None]), solution.outputs, (start.q, start.v))
     if settings.jump_ts is not None:
         states = apart_from_jumps(equations, ts, settings.jump_ts, *states)
     # One compiled evaluation for the outputs and the end together.
@@ -167,10 +168,10 @@ def _result(equations, start, solution, outputs, guards, settings):
     for name, holds in start.against.items():
         result = RESULTS.where(holds, getattr(RESULTS, name), result)
     stats = {name: jnp.asarray(count) for name, count in solution.stats.items() if name != "max_steps"}
-    change = _scaled_error(stopped(equations), *stopped((motion.t, motion.q, motion.v)), stats, settings)
+    change = _scaled_error(stop_gradient(equations), *stop_gradient((motion.t, motion.q, motion.v)), stats, settings)
     # Nothing is known from the first failed output on; the motion then ends at the output before it.
     up_to = jnp.cumsum(~sound) == 0
-    masked = jax.tree.map(lambda x: jnp.where(_like(reached & up_to, x), x[:-1], jnp.nan), motion)
+    masked = jax.tree.map(lambda x: jnp.where(like(reached & up_to, x), x[:-1], jnp.nan), motion)
     last = jnp.where(jnp.all(up_to), sound.size, jnp.maximum(jnp.sum(up_to) - 1, 0))
     end = jax.tree.map(lambda x: jnp.where(start.refused, jnp.nan, x[last]), motion)._replace(t=motion.t[last])
     return {
@@ -179,7 +180,7 @@ def _result(equations, start, solution, outputs, guards, settings):
         "multipliers": masked.multipliers,
         "end": end,
         "stats": stats,
-        "tolerance": (settings.rtol, _absolute(stopped((motion.q, motion.v)), start.scales, settings)),
+        "tolerance": (settings.rtol, _absolute(stop_gradient((motion.q, motion.v)), start.scales, settings)),
         "scaled_error": jnp.where(ended_well(result), change, jnp.inf),
         "result": result,
         "settled": ended_well(result) | _among(result, UNAFFECTED) if regular else jnp.asarray(True),
@@ -215,7 +216,3 @@ def _scaled_error(equations, t, q, v, stats, settings):
 
 def _among(result, others):
     return jnp.any(jnp.stack([result == other for other in others]))
-
-
-def _like(mask, x):
-    return mask.reshape(mask.shape + (1,) * (x.ndim - 1))

@@ -29,12 +29,12 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from lagjax.jax_internals.one_function import apart
 from lagjax.jax_internals.opened import IN_TIME
+from lagjax.jax_internals.trees import like, stop_gradient, where
 from lagjax.jumps.found import Given, Jumps, OfParams, Smooth
 from lagjax.jumps.sliding import Mixed, Sliding, slidable
 from lagjax.mechanics.model import model_of
 from lagjax.mechanics.system import System
 from lagjax.mechanics.warned import warn
-from lagjax.motion.consistency import stopped
 from lagjax.motion.crossings import LONG, Crossings, EventKind, Guards
 from lagjax.motion.legs import AT_ONCE, NOT_BELOW, ROWS, reached, sizes_of
 from lagjax.motion.loop import resolution
@@ -159,7 +159,7 @@ def solved_over_jumps(jumps: Jumps, system: System, q0, v0, params, ts, guards, 
     model = model_of(system, ts[0], q0, v0, params)
     small = model.n + model.m <= 24
     piecewise = piecewise_of(jumps, system, small)
-    modes = stopped(jumps.modes(system, ts[0], q0, v0, params))
+    modes = stop_gradient(jumps.modes(system, ts[0], q0, v0, params))
     both = _together(piecewise, guards)
     first = _first(model, q0, v0, ts, guards, modes, settings)
 
@@ -242,21 +242,21 @@ def _leg(piecewise: Piecewise, guards: Guards, recorded, way: ModeWay, params, t
     counts = here & ~ending.wrong
     rows = jax.tree.map(lambda x: x[jnp.maximum(place - past + 1, 0)], {name: found[name] for name in ROWS})
     known = ((ts > way.t) & (ts <= end.t) | (way.t <= ts[0]) & (ts <= way.t)) & reached(rows["q"])
-    put = lambda all, new: jax.tree.map(lambda x, y: jnp.where(_like(counts & known, x), y, x), all, new)
-    least = way.least if not settings.by_size else jnp.maximum(way.least, stopped(found["tolerance"][1]))
+    put = lambda all, new: jax.tree.map(lambda x, y: jnp.where(like(counts & known, x), y, x), all, new)
+    least = way.least if not settings.by_size else jnp.maximum(way.least, stop_gradient(found["tolerance"][1]))
     again = here & ending.wrong
     further = way._replace(
-        t=jnp.where(moves, end.t, way.t), q=_where(moves, end.q, way.q), v=_where(moves, end.v, way.v),
+        t=jnp.where(moves, end.t, way.t), q=where(moves, end.q, way.q), v=where(moves, end.v, way.v),
         modes=jnp.where(onward, modes, way.modes), slides=jnp.where(onward, slides, way.slides),
         free=way.free | again | (onward & (way.count + 1 >= MOST_JUMPS)), count=way.count + onward,
         continues=again | (moves & (end.t < ts[-1])), rows=put(way.rows, rows),
-        events=_where(counts, with_those_of(found["events"], way.events), way.events), end=_where(counts, end, way.end),
+        events=where(counts, with_those_of(found["events"], way.events), way.events), end=where(counts, end, way.end),
         stats={name: n + found["stats"][name] for name, n in way.stats.items()},
         sizes_so_far=jnp.maximum(way.sizes_so_far, sizes_of(end.q, end.v)), least=least,
         scaled_error=jnp.where(counts, jnp.maximum(way.scaled_error, found["scaled_error"]), way.scaled_error),
         settled=way.settled & found["settled"], result=RESULTS.where(again, RESULTS.successful, ending.result),
     )  # fmt: skip
-    return _where(here, further, way)
+    return where(here, further, way)
 
 
 def _next(jump_ts, t, resolution):
@@ -285,7 +285,7 @@ def _ending(piecewise, guards: Guards, result, end: Snapshot, when, way: ModeWay
     onward = (result == RESULTS.event_occurred) & ~by_event
     at_once = onward & (end.t - way.t <= at_one_time)
     # A jump at once happens where the leg begins, so that its time has the derivatives of that.
-    t, q, v = _where(at_once, (way.t, way.q, way.v), (end.t, end.q, end.v))
+    t, q, v = where(at_once, (way.t, way.q, way.v), (end.t, end.q, end.v))
     end = Snapshot(t, q, v, end.multipliers)
     # Where a force jumps in time, the side of which a guard is belongs to the next leg.
     whole = end.t >= last
@@ -298,15 +298,15 @@ def _ending(piecewise, guards: Guards, result, end: Snapshot, when, way: ModeWay
 
 def _is_below(end: Snapshot, given, guards: Guards, count: int, rtol):
     """Whether one of the first `count` guards is below zero by more than errors can cause."""
-    state = stopped(tuple(end))
-    value = lambda *state: jnp.stack(guards(*state, stopped(given))[:count])
+    state = stop_gradient(tuple(end))
+    value = lambda *state: jnp.stack(guards(*state, stop_gradient(given))[:count])
     g, terms = jax.jvp(value, state, uneven(state))
     return jnp.any(g < -NOT_BELOW * rtol[0] * jnp.abs(terms))
 
 
 def _beyond(piecewise: Piecewise, first, end: Snapshot, given: Given):
     """The modes after the guard `first` has crossed zero, and along which jumps the motion then slides."""
-    state, given = stopped((end.t, end.q, end.v)), stopped(given)
+    state, given = stop_gradient((end.t, end.q, end.v)), stop_gradient(given)
     n = len(piecewise.guards)
     mine, slid = jnp.arange(n) == first, given.slides
     beyond = jnp.stack([f(*state, given) for f in piecewise.beyond]).astype(given.modes.dtype)
@@ -324,12 +324,3 @@ def _beyond(piecewise: Piecewise, first, end: Snapshot, given: Given):
     )
     back = mine & ~slid & (rates * (2 * modes - 1) < 0)
     return modes, (slid & ~mine) | back
-
-
-def _where(condition, a, b):
-    pick = lambda x, y: jnp.where(condition, x, y).astype(jnp.result_type(y)) if eqx.is_array(y) else y
-    return jax.tree.map(pick, a, b)
-
-
-def _like(mask, x):
-    return mask.reshape(mask.shape + (1,) * (x.ndim - 1))

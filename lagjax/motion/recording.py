@@ -15,7 +15,6 @@ import math
 from typing import Any, NamedTuple
 
 import diffrax
-import equinox as eqx
 import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
@@ -23,6 +22,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
+from lagjax.jax_internals.trees import like, where
 from lagjax.motion.arriving import StepToOutputs
 from lagjax.motion.stepping import ProjectedSolver
 
@@ -193,11 +193,6 @@ def recorded_again(problem: StepProblem, record: StepRecord, number, end) -> Rec
     )
 
 
-def like(mask, x):
-    """A mask of rows or lanes with as many axes as x has."""
-    return mask.reshape(mask.shape + (1,) * (jnp.ndim(x) - jnp.ndim(mask)))
-
-
 def _success():
     """The successful result, as an array that may change in a loop."""
     return diffrax.RESULTS.where(jnp.asarray(True), diffrax.RESULTS.successful, diffrax.RESULTS.successful)
@@ -245,7 +240,7 @@ def _until(p: StepProblem, run: _RecordRun, limit, max_steps) -> _RecordRun:
             hit = here & keep & (saved < p.ts.size) & (place.t1 >= p.ts[i])
             outputs = jax.tree.map(lambda all, x: _put(all, i, x, hit), outputs, further.y)
             saved = jnp.where(hit, p.after[i], saved)
-        place, result = _where(here, (further, result), (place, run.result))
+        place, result = where(here, (further, result), (place, run.result))
         return _RecordRun(place, rows, run.steps + here, run.accepted + (here & keep), result, outputs, saved)
 
     return lax.while_loop(lambda run: eqxi.unvmap_any(continues(run)), turn, run)
@@ -264,7 +259,7 @@ def _step(p: StepProblem, place: RecordPlace):
     t = jnp.minimum(t, p.t1)
     nearly = p.t1 - CLIPPED * jnp.finfo(p.t1.dtype).eps * jnp.abs(p.t1)
     t1 = jnp.where(t1 > nearly, jnp.where(keep, p.t1, t + 0.5 * (p.t1 - t)), t1)
-    y, solver_state = _where(keep, (y, solver_state), (place.y, place.solver_state))
+    y, solver_state = where(keep, (y, solver_state), (place.y, place.solver_state))
     solved = results.where(keep, solved, results.successful)
     result = results.where(diffrax.is_okay(solved), judged, solved)
     return RecordPlace(t, t1, y, solver_state, controller_state), keep, result
@@ -272,7 +267,3 @@ def _step(p: StepProblem, place: RecordPlace):
 
 def _put(all, i, x, here):
     return all.at[i].set(jnp.where(here, x, all[i]))
-
-
-def _where(condition, a, b):
-    return jax.tree.map(lambda x, y: jnp.where(condition, x, y) if eqx.is_array(y) else y, a, b)

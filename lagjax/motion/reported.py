@@ -26,7 +26,7 @@ from lagjax.jax_internals.programs import (
     stands_for,
 )
 from lagjax.jax_internals.tracing import REGULAR_FIRST, WATCHED
-from lagjax.motion.consistency import stopped
+from lagjax.jax_internals.trees import stop_gradient
 from lagjax.motion.results import RESULTS
 from lagjax.motion.trajectory import Trajectory
 
@@ -56,7 +56,7 @@ def report(trajectory: Trajectory) -> Trajectory:
     """Return the trajectory unchanged; under `reporting`, enter its report into the program that is being traced."""
 
     def of(trajectory):
-        t = stopped(trajectory)
+        t = stop_gradient(trajectory)
         return Report(t.result._value, t.stats["num_steps"], t.scaled_error, t.residual())
 
     return reported(trajectory, of)

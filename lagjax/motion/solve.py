@@ -17,6 +17,7 @@ from jaxtyping import Array, Float, Int
 from lagjax.jax_internals.compiling import compiler_options
 from lagjax.jax_internals.one_by_one import jitted, one_by_one
 from lagjax.jax_internals.tracing import is_eager, takes_for_regular
+from lagjax.jax_internals.trees import stop_gradient
 from lagjax.jumps.found import found as jumps_found
 from lagjax.jumps.times import with_jumps_in_time
 from lagjax.mechanics.kept import kept
@@ -27,7 +28,6 @@ from lagjax.mechanics.structure import is_free_of_velocities
 from lagjax.mechanics.written_out import has_networks
 from lagjax.meter import waiting
 from lagjax.motion.both_modes import solve_in_both_modes
-from lagjax.motion.consistency import stopped
 from lagjax.motion.global_error import with_errors, with_errors_inside
 from lagjax.motion.hybrid_trajectory import HybridTrajectory
 from lagjax.motion.legs import solved_in_legs
@@ -119,7 +119,7 @@ def _inside(*problem):
     settings = replace(settings, robust=not regular)
     found, settled = _trajectory_of(*motion, settings)
     if settings.repeated_up_to:
-        again = lambda closer: _trajectory_of(*stopped(motion), closer)[0]
+        again = lambda closer: _trajectory_of(*stop_gradient(motion), closer)[0]
         found = with_errors_inside(again, found, settings, motion[4])
     return report_settled(found, settled) if regular else found
 

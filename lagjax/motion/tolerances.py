@@ -22,7 +22,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float
 
-from lagjax.motion.consistency import stopped
+from lagjax.jax_internals.trees import stop_gradient
 
 # The size of an angle counts up to this: a tolerance relative to a thousand turns would mean nothing.
 TURN = 2 * np.pi
@@ -76,7 +76,7 @@ def tolerances_at(start, ts, settings, sizes_so_far=None, a=None) -> Tolerances:
     of_q, of_v = jnp.max(sizes if sizes_so_far is None else jnp.maximum(sizes, sizes_so_far), axis=1)
     of_a = 0.0 if a is None else jnp.max(jnp.abs(jnp.nan_to_num(_rows(a), posinf=0.0, neginf=0.0)))
     of_q = jnp.where(of_q > 0, of_q, jnp.where(of_v > 0, of_v * span, jnp.where(of_a > 0, of_a * span**2, 1.0)))
-    return Tolerances(settings.rtol, stopped(settings.rtol * jnp.stack([of_q, jnp.maximum(of_v, of_q / span)])))
+    return Tolerances(settings.rtol, stop_gradient(settings.rtol * jnp.stack([of_q, jnp.maximum(of_v, of_q / span)])))
 
 
 def span_of(ts):
@@ -171,7 +171,7 @@ class PerCoordinateTolerance(diffrax.AbstractAdaptiveStepSizeController):
     def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
         """The first step."""
         if self.scales is not None and dt0 is None:
-            dt0 = FIRST * stopped(self.scales.time * self.rtol ** (1.0 / float(error_order or 1.0)))
+            dt0 = FIRST * stop_gradient(self.scales.time * self.rtol ** (1.0 / float(error_order or 1.0)))
         t1, state = self.controller.init(terms, t0, t1, y0, dt0, args, func, error_order)
         return t1, (state, None if self.scales is None else self.scales.first)
 
@@ -190,7 +190,7 @@ class PerCoordinateTolerance(diffrax.AbstractAdaptiveStepSizeController):
     def _weighed(self, h, y0, y1, error, largest):
         """The error in the controller's units, and the largest numbers including this step."""
         error, unravel = ravel_pytree(error)
-        before, after, h = stopped((_rows(*y0), _rows(*y1), h))
+        before, after, h = stop_gradient((_rows(*y0), _rows(*y1), h))
         size = jnp.maximum(jnp.abs(before), jnp.abs(after))
         if largest is None:
             allowed = self.tolerances.atol[:, None] + self.tolerances.rtol[:, None] * self._capped_angles(size)

@@ -40,8 +40,8 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from lagjax.jax_internals.one_function import apart
+from lagjax.jax_internals.trees import stop_gradient
 from lagjax.mechanics.equations import all_finite
-from lagjax.motion.consistency import stopped
 from lagjax.motion.crossings import EventKind
 from lagjax.motion.pieces import (
     Followed,
@@ -129,7 +129,7 @@ class EventController(diffrax.AbstractStepSizeController):
     def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
         """The first step."""
         t1, inner = self.controller.init(terms, t0, t1, y0, dt0, args, func, error_order)
-        t, (_, v) = stopped((t0, y0))
+        t, (_, v) = stop_gradient((t0, y0))
         places, count = self.sight.guards.owners.size, len(self.kinds)
         no, zero, none = jnp.asarray(False), jnp.asarray(0), jnp.asarray(-1)
         part = StepPart(
@@ -181,8 +181,8 @@ class EventController(diffrax.AbstractStepSizeController):
     @eqx.filter_jit
     def _follow(self, keep, t0, t1, y0, y1, args, watched: Watched, until):
         """Whether a part is taken, where the next one ends, whether the motion ends now, and the new `Watched`."""
-        fixed, part = stopped(self), watched.part
-        known = stopped((t0, t1, y0, y1, args, watched._replace(y=None), until))
+        fixed, part = stop_gradient(self), watched.part
+        known = stop_gradient((t0, t1, y0, y1, args, watched._replace(y=None), until))
         move, a, values = fixed._move(keep, *known)
         takes, ended = keep & move.takes, jnp.asarray(False)
         counts = [f.count for f in watched.followed]

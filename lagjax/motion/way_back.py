@@ -21,7 +21,8 @@ from jaxtyping import Array, Int, PyTree
 
 from lagjax.jax_internals.one_function import PRODUCT
 from lagjax.jax_internals.programs import length
-from lagjax.motion.recording import Recorded, RecordRows, StepProblem, StepRecord, like, recorded_again
+from lagjax.jax_internals.trees import like
+from lagjax.motion.recording import Recorded, RecordRows, StepProblem, StepRecord, recorded_again
 from lagjax.motion.stepping import ProjectedSolver
 from lagjax.numerics.evaluations import evaluations_a_step
 from lagjax.numerics.nystrom import Nystrom
