@@ -20,7 +20,7 @@ from lagjax.analysis.found_equilibria import OK, WORDS
 from lagjax.analysis.starts import checked, stacked, stacked_one, symmetries_of
 from lagjax.analysis.steady_tracer import SteadyTracer
 from lagjax.analysis.tracing import AGAIN, FIRST, BranchPoint, Path
-from lagjax.jax_internals.tracing import is_eager
+from lagjax.jax_internals.tracing import is_eager, is_traced
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.compiled import compiled
 from lagjax.mechanics.diagnosis import describe
@@ -93,7 +93,7 @@ def continue_equilibria(
     q, v = stacked_one(start)
     if velocity is not None:
         v = jax.tree.map(lambda x: x[0], stacked([velocity], "velocity"))
-    if not is_eager() or coordinates.is_traced((q, v, params, t, to)):
+    if not is_eager() or is_traced((q, v, params, t, to)):
         raise TypeError(
             "lj.continue_equilibria needs values to choose its steps, but JAX is tracing.\n"
             "Fix: call it outside jit, vmap and grad; critical points carry their derivatives, "

@@ -27,7 +27,7 @@ from lagjax.analysis.orbit_equations import (
 from lagjax.analysis.orbit_tracer import OrbitTracer
 from lagjax.analysis.starts import checked
 from lagjax.analysis.tracing import BranchPoint, Path
-from lagjax.jax_internals.tracing import is_eager
+from lagjax.jax_internals.tracing import is_eager, is_traced
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.compiled import compiled
 from lagjax.mechanics.model import model_of
@@ -95,7 +95,7 @@ def _check(orbit):
             "Fix: orbit = lj.periodic_orbit(system, (q, v), period, params), and lj.continue_orbits(orbit, "
             'along="...", to=...).'
         )
-    if not is_eager() or coordinates.is_traced(orbit):
+    if not is_eager() or is_traced(orbit):
         raise TypeError(
             "lj.continue_orbits needs values to choose its steps, but JAX is tracing.\n"
             "Fix: call it outside jit, vmap and grad; lj.periodic_orbit works inside."

@@ -16,7 +16,7 @@ from lagjax.analysis import closing
 from lagjax.analysis.guessing import OrbitRequest
 from lagjax.analysis.monodromy import problem_of, refuse_singular, tolerance_of
 from lagjax.analysis.orbit import PeriodicOrbit
-from lagjax.jax_internals.tracing import is_eager
+from lagjax.jax_internals.tracing import is_eager, is_traced, numpy_of
 from lagjax.jax_internals.trees import stop_gradient
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.diagnosis import listed
@@ -95,11 +95,11 @@ def periodic_orbit(
     s = problem.state
     dtype, names = s.t.dtype, coordinates.names(s.q)
     asked = _asked(problem, names, hold, relative)
-    rtol, period = tolerance_of(rtol, dtype), coordinates.numpy_of(period).asarray(period, dtype)
-    if not coordinates.is_traced(period) and not (np.ndim(period) == 0 and float(period) > 0):
+    rtol, period = tolerance_of(rtol, dtype), numpy_of(period).asarray(period, dtype)
+    if not is_traced(period) and not (np.ndim(period) == 0 and float(period) > 0):
         raise ValueError(f"period must be one positive number, not {period}.\nFix: about the time of one swing.")
     given_turns = None if turns is None else _turns(turns, names, dtype)
-    eager = is_eager() and not coordinates.is_traced((s, period))
+    eager = is_eager() and not is_traced((s, period))
     search = lambda state, period: closing.closed(
         problem.system, state, period, rtol, asked, problem.rows, parts, given_turns, most
     )
@@ -207,7 +207,7 @@ def _raise_or_warn(found, period, problem):
 
 
 def _orbit(problem, found, asked) -> PeriodicOrbit:
-    s, xp = problem.state, coordinates.numpy_of(found)
+    s, xp = problem.state, numpy_of(found)
     if xp is np:
         found = jax.tree.map(np.asarray, found)
     like = lambda x: coordinates.like(s.q, x)

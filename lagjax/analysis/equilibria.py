@@ -34,7 +34,7 @@ from lagjax.analysis.found_equilibria import (
 )  # fmt: skip
 from lagjax.analysis.reduced_force import CREEPS_BELOW, nearest, soft_below
 from lagjax.analysis.starts import checked, stacked, stacked_one, symmetries_of
-from lagjax.jax_internals.tracing import is_eager
+from lagjax.jax_internals.tracing import is_eager, is_traced, numpy_of
 from lagjax.jax_internals.trees import stop_gradient
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.compiled import compiled
@@ -109,7 +109,7 @@ def equilibria(
     check_system(system, params, starts)
     q = stacked(starts)
     count = jax.tree.leaves(q)[0].shape[0]
-    zeros = lambda x: coordinates.numpy_of(x).zeros_like(x)
+    zeros = lambda x: numpy_of(x).zeros_like(x)
     v = jax.tree.map(zeros, q) if velocities is None else _velocities(velocities, q, count)
     first = jax.tree.map(lambda x: x[0], (q, v))
     try:
@@ -118,7 +118,7 @@ def equilibria(
         if isinstance(starts, list) or velocities is not None or not _is_a_state(system, t, starts, params):
             raise
         return equilibria(system, params, starts=[starts], cyclic=cyclic, hold=hold, t=t)
-    moving = None if velocities is None or coordinates.is_traced(v) else _moving(v, count)
+    moving = None if velocities is None or is_traced(v) else _moving(v, count)
     if cyclic is None and velocities is not None and moving is None:
         raise ValueError(
             "JAX is tracing the velocities, so it is not known which coordinates move.\n"
@@ -130,7 +130,7 @@ def equilibria(
     steady = Steady(model, s.t, np.zeros(symmetries.count, s.t.dtype), coordinates.vector(s.q), symmetries)
     q, v = jax.tree.map(lambda x: x.astype(s.t.dtype), (q, v))
     lasting = not symmetries.count and is_autonomous(model)
-    concrete = is_eager() and not coordinates.is_traced((steady, q, v))
+    concrete = is_eager() and not is_traced((steady, q, v))
     unseen = unseen_coordinates(model)
     expected = int(np.sum(np.delete(unseen, list(symmetries.places))))
     rows = searched(steady, q, v, lasting, expected, concrete)
@@ -240,7 +240,7 @@ def _velocities(velocities, q, count):
     v = stacked([velocities] if _is_one(velocities, q) else velocities, "velocities")
     if jax.tree.structure(v) != jax.tree.structure(q):
         coordinates.state(0.0, jax.tree.map(lambda x: x[0], q), jax.tree.map(lambda x: x[0], v), None)
-    return jax.tree.map(lambda x, of: coordinates.numpy_of(x).broadcast_to(x, (count, *of.shape[1:])), v, q)
+    return jax.tree.map(lambda x, of: numpy_of(x).broadcast_to(x, (count, *of.shape[1:])), v, q)
 
 
 def _is_one(velocities, q):

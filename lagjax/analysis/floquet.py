@@ -23,7 +23,7 @@ from jaxtyping import Array, Bool, Complex, Float
 from lagjax.analysis.monodromy import period_of, problem_of, refuse_singular
 from lagjax.analysis.orbit import PeriodicOrbit
 from lagjax.analysis.unit_circle import unit_circle
-from lagjax.mechanics import coordinates
+from lagjax.jax_internals.tracing import is_traced
 from lagjax.mechanics.system import System
 
 # Multipliers below so many errors of M may consist of these errors alone.
@@ -128,7 +128,7 @@ class Floquet(eqx.Module):
         return unit_circle(lanes[~trivial], lanes[trivial])
 
     def __repr__(self):
-        if coordinates.is_traced(self):
+        if is_traced(self):
             return f"Floquet(being traced, {self.multipliers.shape[-1]} multipliers)"
         if np.ndim(self.period):
             stable = int(np.sum(np.asarray(self.stable)))
@@ -187,9 +187,9 @@ def floquet(system, t=None, q=None, v=None, params=None, period=None, *, rtol=No
     problem = problem_of(system, t, q, v, params)
     found, error = period_of(problem, period, rtol)
     result = _floquet_of(problem, found, error, period)
-    if not coordinates.is_traced(found) and not bool(found.ended):
+    if not is_traced(found) and not bool(found.ended):
         refuse_singular(problem)
-    if not coordinates.is_traced(found) and bool(found.ended) and not bool(result.comes_back):
+    if not is_traced(found) and bool(found.ended) and not bool(result.comes_back):
         raise ValueError(
             f"this state does not come back after period = {float(period):.9g}: it is off by {float(found.apart):.2g} "
             "of its size.\n"

@@ -27,7 +27,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from lagjax.jax_internals.tracing import is_eager
+from lagjax.jax_internals.tracing import is_eager, is_traced
 from lagjax.mechanics import constraints, coordinates
 from lagjax.mechanics.compiled import compiled
 from lagjax.mechanics.equations import equations_of
@@ -182,7 +182,7 @@ def independent_rows_of(model: Model, s: coordinates.State) -> tuple[int, ...] |
     """The indices of independent constraint equations near a state; None, for all, where JAX is tracing."""
     if not model.m:
         return ()
-    if not is_eager() or coordinates.is_traced(s):
+    if not is_eager() or is_traced(s):
         return None
     rows, chosen = np.asarray(_normals(model, s)), []
     for i, row in enumerate(rows):

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int, PyTree
 
 from lagjax.analysis.balance import SteadySymmetries
+from lagjax.jax_internals.tracing import is_traced
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.diagnosis import describe
 from lagjax.mechanics.printable import by_line
@@ -104,7 +105,7 @@ class Equilibria(eqx.Module):
         return self.t, q, v, self.params
 
     def __repr__(self):
-        if coordinates.is_traced((self.q, self.found)):
+        if is_traced((self.q, self.found)):
             return f"Equilibria, being traced, of {self.found.shape[-1]} starts"
         if self.found.ndim > 1:
             shape = " x ".join(map(str, self.found.shape[:-1]))

@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from lagjax.analysis.legendre import velocity_of
+from lagjax.jax_internals.tracing import is_traced
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.compiled import compiled
 from lagjax.mechanics.diagnosis import describe
@@ -60,7 +61,7 @@ class Hamiltonian(eqx.Module):
         s = coordinates.state(t, q, p, params)
         system = traced_system(self.system, s)
         value, v, momentum_rate, mass, regular, reached = _hamiltonian(system, *s)
-        if coordinates.is_traced((value, regular)):
+        if is_traced((value, regular)):
             known = regular & reached
             return jax.tree.map(lambda x: jnp.where(known, x, jnp.nan), (value, v, momentum_rate))
         if not (regular and reached):

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from lagjax.jax_internals.tracing import is_eager
+from lagjax.jax_internals.tracing import is_eager, is_traced
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.compiled import compiled
 from lagjax.mechanics.first_call import traced_system
@@ -90,14 +90,14 @@ def _action_of_trajectory(system, path, params, t0, t1, pieces):
     s = coordinates.state(t[0], *jax.tree.map(lambda x: x[0], (q, v)), params)
     system = traced_system(system, s)
     t0, t1 = (t[0] if t0 is None else t0), (t[-1] if t1 is None else t1)
-    if not coordinates.is_traced((t, t0, t1)):
+    if not is_traced((t, t0, t1)):
         low, high = float(np.min(t)), float(np.max(t))
         if not (low <= float(t0) <= high and low <= float(t1) <= high):
             raise ValueError(
                 f"the trajectory goes from t = {low:.6g} to {high:.6g}, but the action is asked from "
                 f"{float(t0):.6g} to {float(t1):.6g}.\nFix: a trajectory with outputs at or beyond these times."
             )
-    if is_eager() and not coordinates.is_traced((path, t0, t1, s.params, eqx.filter(system, eqx.is_array))):
+    if is_eager() and not is_traced((path, t0, t1, s.params, eqx.filter(system, eqx.is_array))):
         return _along_the_steps(system, path, s.params, float(t0), float(t1))
 
     # From the earlier end, as the motion runs, to the later one.

@@ -13,8 +13,8 @@ from jaxtyping import Array, Bool, Complex, Float
 
 from lagjax.analysis.linear_parts import LinearisationKind, LinearParts, parts_of
 from lagjax.analysis.steadiness import Steadiness, check_steady, steadiness_of
-from lagjax.jax_internals.tracing import is_eager
-from lagjax.mechanics import constraints, coordinates
+from lagjax.jax_internals.tracing import is_eager, is_traced
+from lagjax.mechanics import constraints
 from lagjax.mechanics.compiled import compiled
 from lagjax.mechanics.coordinates import State
 from lagjax.mechanics.first_call import prepare
@@ -85,7 +85,7 @@ class Linearisation(eqx.Module):
     def __repr__(self):
         n, p = self.mass.shape[-1], self.positions.shape[-1]
         title = f"Linearisation of {len(self.names)} coordinates: {n} freedoms of velocity, {p} of position"
-        if coordinates.is_traced(self.mass) or self.mass.ndim > 2:
+        if is_traced(self.mass) or self.mass.ndim > 2:
             return title
         rows = [title]
         scale = max(float(np.max(np.abs(x), initial=0.0)) for x in (self.mass, self.stiffness, self.gyroscopic))
@@ -132,7 +132,7 @@ def linearise(system, t, q, v, params) -> Linearisation:
     Source: Goldstein, *Classical Mechanics*, §6.1-6.2; Meijaard et al., *Proc. R. Soc. A* 463 (2007) 1955, Appendix B.
     """
     model, s = prepare(system, t, q, v, params)
-    traced = not is_eager() or coordinates.is_traced((s, eqx.filter(model, eqx.is_array)))
+    traced = not is_eager() or is_traced((s, eqx.filter(model, eqx.is_array)))
     kind = _kind(model, s)
     n, m = len(kind.unseen), len(kind.holonomic)
     if m >= n:
@@ -158,7 +158,7 @@ def _kind(model, s: State) -> LinearisationKind:
     """The static part of the linearisation."""
     system, holonomic = model.system, tuple(model.holonomic.tolist())
     unseen, linear_terms, timeless = remembered(model, _kind, lambda: _structure_facts(model))
-    at_rest = not coordinates.is_traced(s.v) and not any(np.any(x) for x in jax.tree.leaves(s.v))
+    at_rest = not is_traced(s.v) and not any(np.any(x) for x in jax.tree.leaves(s.v))
     conservative = system.force is None and system.dissipation is None and all(holonomic)
     at_rest = conservative and at_rest and not linear_terms
     return LinearisationKind(unseen, holonomic, (True,) * len(holonomic), conservative, at_rest, timeless)

@@ -25,7 +25,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, PyTree
 from lagjax import plot
 from lagjax.analysis.flow import all_rows, flow_of
 from lagjax.analysis.monodromy import problem_of, refuse_singular
-from lagjax.mechanics import coordinates
+from lagjax.jax_internals.tracing import is_traced, numpy_of
 from lagjax.mechanics.compiled import compiled
 from lagjax.mechanics.model import model_of
 from lagjax.mechanics.refusals import by_name
@@ -97,7 +97,7 @@ class LyapunovExponents(eqx.Module):
         return plot.time_series(np.asarray(self.t)[1:], {"mean growth": curves})
 
     def __repr__(self):
-        if coordinates.is_traced(self):
+        if is_traced(self):
             return f"LyapunovExponents(being traced, {self.exponents.shape[-1]} of them)"
         if np.ndim(self.settled):
             lanes, parting = " x ".join(map(str, np.shape(self.settled))), int(np.sum(np.asarray(self.sensitive)))
@@ -150,7 +150,7 @@ def lyapunov_exponents(
 
     Source: Benettin et al., *Meccanica* 15 (1980) 21.
     """
-    ts = coordinates.numpy_of(ts).asarray(ts)
+    ts = numpy_of(ts).asarray(ts)
     _check(ts)
     problem = problem_of(system, ts[0], q, v, params)
     s = problem.state
@@ -164,7 +164,7 @@ def lyapunov_exponents(
     rtol = np.asarray(TOLERANCE.get(np.dtype(s.t.dtype), 1e-5) if rtol is None else rtol, s.t.dtype)
     estimates = _followed(model, s, ts.astype(s.t.dtype), rtol, problem.rows, count)
     exponents = LyapunovExponents(*estimates, count == most)
-    if not coordinates.is_traced(exponents) and not bool(exponents.ended):
+    if not is_traced(exponents) and not bool(exponents.ended):
         refuse_singular(problem)
     return exponents
 
@@ -176,7 +176,7 @@ def _check(ts):
             "Usual cause: only the end time; between two distant times the fastest-growing tangent hides all others.\n"
             "Fix: ts=jnp.linspace(0.0, 1000.0, 1001)."
         )
-    if not coordinates.is_traced(ts) and not np.all(np.asarray(ts[1:] > ts[:-1])):
+    if not is_traced(ts) and not np.all(np.asarray(ts[1:] > ts[:-1])):
         raise ValueError("ts must increase throughout.\nFix: ts=jnp.unique(ts).")
 
 

@@ -15,7 +15,7 @@ from lagjax.analysis.linearised import Linearisation, linearise, linearised
 from lagjax.analysis.motions import ASYMPTOTIC, DIVERGENCE, GYROSCOPIC, STABLE, UNDECIDED, Motions, motions_of
 from lagjax.analysis.neutral import leads_to_others, with_neutral
 from lagjax.analysis.verdicts import VERDICTS, label_of, reason_of
-from lagjax.jax_internals.tracing import is_eager
+from lagjax.jax_internals.tracing import is_eager, is_traced
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.compiled import compiled
 from lagjax.mechanics.model import model_of
@@ -133,7 +133,7 @@ class NormalModes(eqx.Module):
         if not -len(self) <= i < len(self):
             raise IndexError(f"there are {len(self)} modes, modes[0] to modes[{len(self) - 1}].")
         shape = jax.tree.map(lambda x: x[i], self.shapes)
-        label = "" if coordinates.is_traced(self.roots) else label_of(i % len(self), self)
+        label = "" if is_traced(self.roots) else label_of(i % len(self), self)
         return Mode(self.roots[i], shape, self.energy[i], self.double[i], self.linearisation, label)
 
     def plot(self):
@@ -144,7 +144,7 @@ class NormalModes(eqx.Module):
         return drawn_roots(np.asarray(self.roots, complex), np.asarray(self.growing), np.asarray(self.zero))
 
     def __repr__(self):
-        if coordinates.is_traced(self.roots) or np.ndim(self.code):
+        if is_traced(self.roots) or np.ndim(self.code):
             return f"NormalModes of shape {np.shape(self.roots)}"
         rows = [f"{len(self)} mode{'s' * (len(self) > 1)}: {self.verdict}", f"  {self.reason}"]
         for i in range(len(self)):
@@ -192,7 +192,7 @@ def normal_modes(system, t=None, q=None, v=None, params=None) -> NormalModes:
     """
     linearisation = system if isinstance(system, Linearisation) else linearise(system, t, q, v, params)
     motions = _motions(linearisation, True)
-    if not is_eager() or coordinates.is_traced(motions):
+    if not is_eager() or is_traced(motions):
         return _collected(linearisation, motions)
     if not np.all(np.isfinite(motions.roots)):
         # The mass matrix is regular but not positive definite.

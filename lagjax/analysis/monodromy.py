@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Complex, Float
 
 from lagjax.analysis.flow import TOLERANCE, all_rows, flow_of, independent_rows_of, scale_of
 from lagjax.analysis.trivial import Reasons, directions, orthonormal, reasons_of
-from lagjax.jax_internals.tracing import WATCHED, is_eager
+from lagjax.jax_internals.tracing import WATCHED, is_eager, is_traced, numpy_of
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.compiled import compiled
 from lagjax.mechanics.coordinates import State
@@ -102,10 +102,10 @@ def tolerance_of(rtol, dtype):
 def period_of(problem: OrbitProblem, period, rtol, nodes=None) -> tuple[Period, Float[Array, ""]]:
     """The results of a period, and the error of the entries of N; measured by a second run unless JAX is tracing."""
     system, s, reasons, rows, is_angle = problem
-    eager = is_eager() and not coordinates.is_traced((s, period, nodes))
+    eager = is_eager() and not is_traced((s, period, nodes))
     # Unrolled stages run in a third of the time but take three times as long to compile, which pays off in sweeps.
     in_a_loop = not WATCHED.value or sum(np.size(x) for x in jax.tree.leaves(s.q)) > 1
-    rtol, period = tolerance_of(rtol, s.t.dtype), coordinates.numpy_of(period).asarray(period, s.t.dtype)
+    rtol, period = tolerance_of(rtol, s.t.dtype), numpy_of(period).asarray(period, s.t.dtype)
     run = lambda rtol: _period(system, s, nodes, period, rtol, reasons, rows, is_angle, in_a_loop, not eager)
     first = run(rtol)
     if eager:

@@ -6,7 +6,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import PyTree
 
-from lagjax.mechanics import coordinates
+from lagjax.jax_internals.tracing import is_traced, numpy_of
 from lagjax.mechanics.diagnosis import listed
 
 
@@ -20,7 +20,7 @@ class Number(eqx.Module):
     def put(self, params: PyTree, value) -> PyTree:
         """`params` with another value of this number."""
         leaves, structure = jtu.tree_flatten(params)
-        if coordinates.is_traced((leaves[self.leaf], value)):
+        if is_traced((leaves[self.leaf], value)):
             leaf = jnp.asarray(leaves[self.leaf])
             leaf = leaf.reshape(-1).at[self.entry].set(value).reshape(leaf.shape).astype(leaf.dtype)
         else:
@@ -32,7 +32,7 @@ class Number(eqx.Module):
     def get(self, params: PyTree):
         """The value of this number."""
         leaf = jtu.tree_leaves(params)[self.leaf]
-        return coordinates.numpy_of(leaf).ravel(leaf)[self.entry]
+        return numpy_of(leaf).ravel(leaf)[self.entry]
 
 
 def numbers_in(params: PyTree) -> dict[str, Number]:

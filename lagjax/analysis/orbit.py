@@ -5,6 +5,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from lagjax.analysis.guessing import OrbitRequest
+from lagjax.jax_internals.tracing import is_traced
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.diagnosis import describe
 from lagjax.mechanics.packed import Packed
@@ -77,7 +78,7 @@ class PeriodicOrbit(eqx.Module):
             )
 
     def __repr__(self):
-        if coordinates.is_traced(self):
+        if is_traced(self):
             return "PeriodicOrbit(being traced)"
         if np.ndim(self.period):
             shape, good = " x ".join(map(str, np.shape(self.period))), int(np.sum(np.asarray(self.converged)))

@@ -21,7 +21,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from lagjax.analysis.states import States, around
-from lagjax.mechanics import constraints, coordinates
+from lagjax.jax_internals.tracing import numpy_of
+from lagjax.mechanics import constraints
 from lagjax.mechanics.compiled import compiled
 from lagjax.mechanics.equations import equations_of
 from lagjax.mechanics.generators import Generator
@@ -95,7 +96,7 @@ def rates(model, affine: Affine, generators: tuple[Generator, ...], s, places) -
     """The rates of change of all charges at states around the given one."""
     states, scales = around(model, s, places)
     raw = _rates(model, affine, generators, states, scales)
-    xp = coordinates.numpy_of(raw)
+    xp = numpy_of(raw)
     raw = _StateRates(*(xp.asarray(y) for y in raw))
     finite = xp.isfinite(raw.energy) & xp.all(xp.isfinite(raw.by_lagrangian + raw.by_force), axis=1)
     found = states.found & finite

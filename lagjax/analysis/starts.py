@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import PyTree
 
 from lagjax.analysis.balance import MOMENTUM, VELOCITY, SteadySymmetries
+from lagjax.jax_internals.tracing import numpy_of
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.coordinates import State
 from lagjax.mechanics.diagnosis import listed
@@ -29,12 +30,12 @@ def stacked(starts, what="starts") -> PyTree:
             raise ValueError(f"the {what} differ in structure: each must be like q.\nFix: {AS_STARTS}.")
         # Concrete values stay in NumPy, which compiles nothing.
         starts = coordinates.as_floats(starts)
-        xp = coordinates.numpy_of(starts)
+        xp = numpy_of(starts)
         return jtu.tree_map(lambda *x: xp.stack([xp.asarray(y) for y in x]), *starts)
     leaves = jtu.tree_leaves(starts)
     if not leaves:
         raise ValueError(f"{what} has no coordinates.\nFix: {AS_STARTS}.")
-    starts = jtu.tree_map(lambda x: coordinates.numpy_of(x).asarray(x), coordinates.as_floats(starts))
+    starts = jtu.tree_map(lambda x: numpy_of(x).asarray(x), coordinates.as_floats(starts))
     leaves = jtu.tree_leaves(starts)
     if all(x.ndim == 0 for x in leaves):
         return jtu.tree_map(lambda x: x[None], starts)
@@ -54,7 +55,7 @@ def stacked(starts, what="starts") -> PyTree:
 def stacked_one(q):
     """A state of rest at q."""
     q = jax.tree.map(lambda x: x[0], stacked([q]))
-    return q, jax.tree.map(lambda x: coordinates.numpy_of(x).zeros_like(x), q)
+    return q, jax.tree.map(lambda x: numpy_of(x).zeros_like(x), q)
 
 
 def checked(system, t, q, v, params):

@@ -15,6 +15,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
+from lagjax.jax_internals.tracing import numpy_of
 from lagjax.mechanics import constraints, coordinates
 from lagjax.mechanics.cartesian import points
 from lagjax.mechanics.compiled import compiled
@@ -63,7 +64,7 @@ def draws(count: int, n: int) -> np.ndarray:
 def around(model, s: coordinates.State, places) -> tuple[States, StateScales]:
     """The states at the displacements `places` from a given one, moved onto the constraints."""
     # With concrete values only the program that moves states is compiled, and all questions about a system share it.
-    xp = coordinates.numpy_of((s, model))
+    xp = numpy_of((s, model))
     vector = lambda tree: xp.concatenate([xp.ravel(xp.asarray(x)) for x in jax.tree.leaves(tree)])
     x, u = vector(s.q), vector(s.v)
     n, scales = len(x), sizes(model, s, x, u)
@@ -90,7 +91,7 @@ def around(model, s: coordinates.State, places) -> tuple[States, StateScales]:
 
 def sizes(model, s: coordinates.State, x, u) -> StateScales:
     """The size of each coordinate and velocity of a state."""
-    xp, same = coordinates.numpy_of((x, u)), _groups(s.q)
+    xp, same = numpy_of((x, u)), _groups(s.q)
     together = lambda y: xp.sqrt(same.astype(y.dtype) @ y**2)
     of_x = together(x)
     of_x = xp.where(of_x > 0, of_x, xp.ones_like(x))

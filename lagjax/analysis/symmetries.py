@@ -25,6 +25,7 @@ from lagjax.analysis.recognised import Words, in_words, named_parameters
 from lagjax.analysis.scalings import scalings_of
 from lagjax.analysis.states import draws
 from lagjax.analysis.symmetry import AT_LEAST, STATES, too_few
+from lagjax.jax_internals.tracing import is_traced
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.diagnosis import describe
 from lagjax.mechanics.first_call import traced_system
@@ -67,7 +68,7 @@ def symmetries(system, q, v, params=None, *, basis: Iterable | Mapping | None = 
     """
     check_system(system, q, v, params)
     s = coordinates.state(t, q, v, params)
-    if coordinates.is_traced(s):
+    if is_traced(s):
         raise TypeError(
             "symmetries are found from values, but JAX is tracing here.\n"
             "Fix: call it outside of jax.jit, jax.vmap and sweeps; lj.is_symmetry(...).holds tests one symmetry inside."

@@ -14,6 +14,7 @@ from jaxtyping import Array, Float
 from lagjax.analysis.precision import precision_of
 from lagjax.analysis.rates import Affine, rates
 from lagjax.analysis.states import draws
+from lagjax.jax_internals.tracing import is_traced, numpy_of
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.diagnosis import describe
 from lagjax.mechanics.first_call import traced_system
@@ -72,7 +73,7 @@ class SymmetryTest(eqx.Module):
         return [name for name, value in (parts | forbidden).items() if not value <= self.tolerance]
 
     def __repr__(self):
-        if coordinates.is_traced(self.residual):
+        if is_traced(self.residual):
             return f"SymmetryTest({self.name}, being traced)"
         if np.ndim(self.residual):
             kept = np.asarray(self.holds)
@@ -132,7 +133,7 @@ def is_symmetry(system, generator, q, v, params=None, *, t=0.0) -> SymmetryTest:
     empty = np.zeros((0, n))
     affine = Affine(empty, np.zeros((0, n, n)), empty, np.zeros(0), np.zeros(0))
     found = rates(model, affine, (generator,), s, draws(STATES, n))
-    xp = coordinates.numpy_of(found)
+    xp = numpy_of(found)
     count = xp.sum(found.states.found)
     if xp is np and count < AT_LEAST:
         raise ValueError(too_few(system, s, int(count)))

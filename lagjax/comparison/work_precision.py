@@ -16,7 +16,7 @@ from lagjax.comparison.methods import chosen, ladder
 from lagjax.comparison.points import Curve, Point
 from lagjax.comparison.programs import ComparedMotion, TimedProgram, Times, interleaved_times, without_overhead
 from lagjax.comparison.references import KnownAnswer, Reference
-from lagjax.jax_internals.tracing import is_eager
+from lagjax.jax_internals.tracing import is_eager, is_traced
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.refusals import by_name, check_system
 from lagjax.mechanics.system import System
@@ -166,7 +166,7 @@ def _motion(system, q0, v0, params, ts, events, options):
             f"work_precision() has no argument {unknown[0]!r}.\n"
             f"Fix: of integrate's arguments it takes {', '.join(OPTIONS)}; rtol is its tolerances=."
         )
-    if not is_eager() or coordinates.is_traced((q0, v0, params, ts)):
+    if not is_eager() or is_traced((q0, v0, params, ts)):
         raise TypeError("work_precision measures times, but it is being traced.\nFix: call it outside jit.")
     ts = np.asarray(problem.vector_of_times(ts))
     start = coordinates.state(ts[0], q0, v0, params)

@@ -12,7 +12,7 @@ from lagjax.fitting.predicted import check_motion
 from lagjax.fitting.problem import problem_of
 from lagjax.fitting.records import Record
 from lagjax.fitting.search import evaluate
-from lagjax.mechanics import coordinates
+from lagjax.jax_internals.tracing import is_traced
 from lagjax.mechanics.hybrid import Hybrid
 from lagjax.mechanics.system import System
 
@@ -73,7 +73,7 @@ def identifiability(
         raise ValueError('candidates= needs shrink=, the number that they are compared by.\nFix: shrink="g".')
     at = None if shrink is None else survey(problem, problem.start)
     evaluation = evaluate(problem, problem.start, WHOLE) if at is None else at.evaluation
-    if coordinates.is_traced(evaluation):
+    if is_traced(evaluation):
         raise TypeError(
             "identifiability needs the values of its arguments, and they are being traced.\n"
             "Fix: call it in a Python loop, not in jit, vmap or lj.sweep: it is compiled only once."

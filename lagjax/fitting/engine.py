@@ -21,7 +21,7 @@ from lagjax.fitting.records import Record
 from lagjax.fitting.result import Fit, FitWarning
 from lagjax.fitting.search import Course, evaluate, listening, search
 from lagjax.fitting.trained import held_problem, split_records, train
-from lagjax.mechanics import coordinates
+from lagjax.jax_internals.tracing import is_traced, numpy_of
 from lagjax.mechanics.diagnosis import listed
 from lagjax.mechanics.hybrid import Hybrid
 from lagjax.mechanics.system import System
@@ -171,14 +171,14 @@ def fit(
     last = jax.tree.map(lambda x: x[-1], course.stages)
     with _step_meter(problem, course, progress) as tell:
         searched, evaluation = search(problem, course, optimiser, 100 if iterations is None else iterations, tell)
-    costs = coordinates.numpy_of(searched.costs).asarray(searched.costs)[: int(course.count)]
+    costs = numpy_of(searched.costs).asarray(searched.costs)[: int(course.count)]
     searched = searched._replace(costs=costs)
     if evaluation is None and problem.found.start.size <= COVARIANCE_UP_TO:
         evaluation = evaluate(problem, searched.unknowns, last)
-    if evaluation is not None and not coordinates.is_traced(evaluation) and not np.any(np.asarray(evaluation.well)):
+    if evaluation is not None and not is_traced(evaluation) and not np.any(np.asarray(evaluation.well)):
         check_motion(problem, evaluation.well, problem.start)
     found = Fit(problem, *searched, evaluation, _sorted(units))
-    if evaluation is not None and not coordinates.is_traced(found.cost) and found.at_bounds():
+    if evaluation is not None and not is_traced(found.cost) and found.at_bounds():
         # At a bound the slopes that the search keeps vanish.
         found = eqx.tree_at(lambda f: f.evaluation, found, evaluate(problem, searched.unknowns, last))
     return _reported(found)
@@ -187,7 +187,7 @@ def fit(
 def _reported(found: Fit) -> Fit:
     """Report the fit to a surrounding sweep, warn of its caveats, and return it."""
     found = reported(found, Fit.report)
-    if not coordinates.is_traced(found.cost):
+    if not is_traced(found.cost):
         for words in caveats(found):
             warnings.warn(words, FitWarning, stacklevel=3)
     return found
@@ -247,10 +247,10 @@ def _course(problem: FitProblem, grow: bool, joined: bool, scattered, try_all: b
     rtol = problem.options.get("rtol")
     tolerance = max(LAST_TOLERANCE, ROUND_OFFS * np.finfo(windows.ts.dtype).eps)
     if rtol is not None:
-        xp = coordinates.numpy_of(rtol)
+        xp = numpy_of(rtol)
         tolerance = xp.maximum(tolerance, RTOL_FACTOR * xp.max(xp.asarray(rtol)))
     last = np.arange(len(each)) == len(each) - 1
-    xp = coordinates.numpy_of((ratio, tolerance, scattered, problem.found.start))
+    xp = numpy_of((ratio, tolerance, scattered, problem.found.start))
     at_the_end = FINAL_HOLD if problem.found.start.size <= RESTARTS_UP_TO else 0.0
     held = np.where(partly, 1.0, at_the_end) * (1.0 if problem.absolute else ASSUMED_ERROR) / HOLD_REACH
     stages = Stage(each, weights * ratio, np.ones(len(each)), held)
@@ -271,7 +271,7 @@ def _course(problem: FitProblem, grow: bool, joined: bool, scattered, try_all: b
 @contextmanager
 def _step_meter(problem, course, progress):
     """Show a meter of the search's steps; yields whether there is one."""
-    if coordinates.is_traced(problem):
+    if is_traced(problem):
         yield False
         return
     unused = int(np.min(course.first))
@@ -306,7 +306,7 @@ def _parts_of_windows(windows, parts):
 
 def _scattered_starts(found, count, spread, seed):
     """Random starts (count, p) around the guess, or between two bounds."""
-    xp = coordinates.numpy_of(found.start)
+    xp = numpy_of(found.start)
     start, low, high = (x[None] for x in (found.start, found.low, found.high))
     normal, share = _random_numbers(seed, (count, start.size))
     x = start + xp.where(start != 0, start, 1.0) * np.expm1(spread * normal)

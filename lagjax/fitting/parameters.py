@@ -20,6 +20,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
+from lagjax.jax_internals.tracing import is_traced, numpy_of
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.diagnosis import listed
 
@@ -85,7 +86,7 @@ class FreeNumbers:
 
 def _replace_entries(old, places, new):
     """All entries of `old` as a vector, some of them replaced."""
-    if coordinates.is_traced((old, new)):
+    if is_traced((old, new)):
         return jnp.ravel(old).at[places].set(new)
     row = np.array(old).ravel()
     row[places] = new
@@ -100,7 +101,7 @@ def find(
     dtype,
 ) -> FreeNumbers:
     """Determine the numbers to be fitted from `params`, names, bounds and priors."""
-    if not coordinates.is_traced(params):
+    if not is_traced(params):
         with jax.ensure_compile_time_eval():
             params = coordinates.given_params(params, dtype)
     named = [(leaf_name(path), x) for path, x in jtu.tree_leaves_with_path(params)]
@@ -111,7 +112,7 @@ def find(
             chosen[name][places] = True
     chosen = {name: places for name, places in chosen.items() if places.any()}
     entries = [entry for name, places in chosen.items() for entry in compress(_entries(name, floating[name]), places)]
-    xp = coordinates.numpy_of(params)
+    xp = numpy_of(params)
     values = [xp.ravel(floating[name])[places].astype(dtype) for name, places in chosen.items()]
     start = xp.concatenate(values or [xp.zeros(0, dtype)])
 
@@ -178,7 +179,7 @@ def _check_start(found, low, high):
     if np.any(low >= high):
         i = int(np.argmax(low >= high))
         raise ValueError(f"the bounds of '{found.names[i]}' are ({low[i]}, {high[i]}): low must be below high.")
-    if coordinates.is_traced(found.start):
+    if is_traced(found.start):
         return
     x = np.asarray(found.start)
     if not np.all(np.isfinite(x)):

@@ -13,7 +13,7 @@ from lagjax.fitting.parameters import find, leaf_name
 from lagjax.fitting.records import KINDS, Record, channels, cut, spread
 from lagjax.fitting.result import FitWarning
 from lagjax.fitting.starts import starts
-from lagjax.mechanics import coordinates
+from lagjax.jax_internals.tracing import is_traced, numpy_of
 from lagjax.mechanics.arguments import OF_STATE
 from lagjax.mechanics.diagnosis import listed
 from lagjax.mechanics.first_call import traced_call, traced_system
@@ -55,7 +55,7 @@ def problem_of(system, records, params, free, observe, bounds, priors, loss, win
     _check_anything_measured(measured)
     sigma, spreads, ratio = _sigmas(records, windows, measured, absolute)
     per_window = {name: values[windows.record] for name, values in overrides.items()}
-    xp = coordinates.numpy_of((guessed.q.guess, guessed.v.guess))
+    xp = numpy_of((guessed.q.guess, guessed.v.guess))
     unit = xp.std(xp.concatenate([guessed.q.guess, guessed.v.guess], axis=1), axis=0)
     _warn_of_wrapped_angles(records)
     return FitProblem(
@@ -124,7 +124,7 @@ def _overrides(records, windows, found):
                 f"a record sets '{name}', which the fit is to find.\nFix: leave it out of free=, or out of the record."
             )
         given = [record.params.get(name, known[name]) for record in records]
-        xp = coordinates.numpy_of(given)
+        xp = numpy_of(given)
         values[name] = xp.stack([xp.asarray(x, jnp.result_type(float)) for x in given])
     return values
 
@@ -154,14 +154,14 @@ def _check_kinds(records, observe, options):
 def _gathered(windows, trees, kind):
     if kind == "end":
         last = np.append(windows.record[1:] != windows.record[:-1], True)
-        xp = coordinates.numpy_of(trees)
+        xp = numpy_of(trees)
         place = lambda *x: xp.stack([xp.where(at, x[r], np.nan) for r, at in zip(windows.record, last)])
         return jax.tree.map(place, *trees)
     return jax.tree.map(lambda *x: windows.gather(x), *trees)
 
 
 def _check_anything_measured(measured):
-    if not coordinates.is_traced(measured) and all(np.all(np.isnan(x)) for x in jax.tree.leaves(measured)):
+    if not is_traced(measured) and all(np.all(np.isnan(x)) for x in jax.tree.leaves(measured)):
         raise ValueError(
             "all measurements are NaN.\nUsual cause: a column of a file that was not read as numbers.\n"
             "Fix: look at record.measured; NaN stands for a value that is missing."
@@ -173,12 +173,12 @@ def _sigmas(records, windows, measured, absolute):
     spreads = jax.tree.map(_spread, measured)
     if not absolute:
         # One size for all; the fit estimates the errors as a multiple of it.
-        xp = coordinates.numpy_of(spreads)
+        xp = numpy_of(spreads)
         common = xp.sqrt(xp.mean(xp.stack(jax.tree.leaves(spreads)) ** 2))
         return jax.tree.map(lambda x: xp.full(x.shape, common), measured), spreads, np.asarray(1.0)
     each = [{kind: _broadcast(record, kind) for kind in record.measured} for record in records]
     sigma = {kind: _gathered(windows, [tree[kind] for tree in each], kind) for kind in measured}
-    xp = coordinates.numpy_of((spreads, sigma))
+    xp = numpy_of((spreads, sigma))
     finest = lambda s: xp.nanmin(xp.where(xp.isfinite(s), s, np.nan))
     ratios = [a / finest(s) for a, s in zip(jax.tree.leaves(spreads), jax.tree.leaves(sigma))]
     return sigma, spreads, xp.asarray(xp.max(xp.stack(ratios)))
@@ -186,7 +186,7 @@ def _sigmas(records, windows, measured, absolute):
 
 def _spread(x):
     """The standard deviation of a channel; its largest absolute value if that is 0; 1 if that is 0, too."""
-    xp, deviation = coordinates.numpy_of(x), spread(x)
+    xp, deviation = numpy_of(x), spread(x)
     size = xp.max(xp.where(xp.isnan(x), 0.0, xp.abs(x)), initial=0.0)
     deviation = xp.where(deviation > 0, deviation, size)
     return xp.where(deviation > 0, deviation, 1.0)
@@ -204,7 +204,7 @@ def _broadcast(record, kind):
 
     def like(s, part):
         def one(x):
-            xp = coordinates.numpy_of(s)
+            xp = numpy_of(s)
             given = xp.asarray(s, x.dtype)
             if xp is np and not np.all(given > 0):
                 raise ValueError("sigma must be positive.\nFix: sigma=jnp.inf, or NaN in the data, leaves a value out.")
@@ -225,7 +225,7 @@ def _broadcast(record, kind):
 def _warn_of_wrapped_angles(records: Sequence[Record]):
     for r, record in enumerate(records):
         for name, x in channels(record.measured):
-            if name.startswith("end") or "q" not in record.measured or coordinates.is_traced(x):
+            if name.startswith("end") or "q" not in record.measured or is_traced(x):
                 continue
             jumps = np.abs(np.diff(np.asarray(x), axis=0))
             turns = (jumps > 1.95 * np.pi) & (jumps < 2.05 * np.pi)

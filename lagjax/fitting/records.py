@@ -11,7 +11,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
-from lagjax.mechanics import coordinates
+from lagjax.jax_internals.tracing import is_traced, numpy_of
 from lagjax.mechanics.memory import filled_up
 
 # The kinds of measurement: `end` once per run, the others at each of its times.
@@ -76,7 +76,7 @@ class Record(eqx.Module):
         params: Mapping[str, ArrayLike] | None = None,
         sigma: PyTree = None,
     ):
-        if coordinates.is_traced(t):
+        if is_traced(t):
             raise TypeError("the times of a record must be numbers, not traced: they determine its shape.")
         self.t = _times(t)
         given = zip(KINDS, (q, v, multipliers, observed, end))
@@ -127,7 +127,7 @@ def channel_name(kind: str, path) -> str:
 
 def spread(x):
     """The standard deviation of the values that are not missing; 0 if all are."""
-    xp, known = coordinates.numpy_of(x), ~coordinates.numpy_of(x).isnan(x)
+    xp, known = numpy_of(x), ~numpy_of(x).isnan(x)
     mean = lambda y: xp.sum(xp.where(known, y, 0.0)) / xp.maximum(xp.sum(known), 1)
     return xp.sqrt(mean((x - mean(x)) ** 2))
 
@@ -137,7 +137,7 @@ def _is_list_of_numbers(x):
 
 
 def _as_floats(x):
-    return coordinates.numpy_of(x).asarray(x, jnp.result_type(float))
+    return numpy_of(x).asarray(x, jnp.result_type(float))
 
 
 def _held(hold):
@@ -170,7 +170,7 @@ def _check(name, x, count):
             "Usual cause: time as the second axis, or samples dropped from one of the two.\n"
             "Fix: the first axis is time; write NaN where a value is missing."
         )
-    if not coordinates.is_traced(x) and np.any(np.isinf(x)):
+    if not is_traced(x) and np.any(np.isinf(x)):
         raise ValueError(f"'{name}' contains infinity.\nFix: write NaN where a value is missing.")
 
 
@@ -208,7 +208,7 @@ class Windows(NamedTuple):
 
     def gather(self, of_records: Sequence[Array]) -> Array | np.ndarray:
         """Samples (T_r, ...) of each record as (W, T, ...), NaN where there are none."""
-        rows, xp = [], coordinates.numpy_of(of_records)
+        rows, xp = [], numpy_of(of_records)
         for w, r in enumerate(self.record):
             x = of_records[r]
             where = self.real[w].reshape(-1, *(1,) * (x.ndim - 1))

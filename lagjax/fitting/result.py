@@ -23,7 +23,7 @@ from lagjax.fitting.records import channel_name
 from lagjax.fitting.saving import save
 from lagjax.fitting.search import Evaluation
 from lagjax.fitting.table import lines_of
-from lagjax.mechanics import coordinates
+from lagjax.jax_internals.tracing import is_traced, numpy_of
 from lagjax.mechanics.compiled import compiled
 from lagjax.mechanics.diagnosis import listed
 from lagjax.mechanics.printable import by_line
@@ -119,7 +119,7 @@ class Fit:
 
     @property
     def _traced(self) -> bool:
-        return coordinates.is_traced((self.cost, self.unknowns))
+        return is_traced((self.cost, self.unknowns))
 
     @property
     def _xp(self) -> Any:
@@ -220,10 +220,10 @@ class Fit:
         parts = []
         for kind, tree in self.problem.measured.items():
             for x, s in zip(jax.tree.leaves(tree), jax.tree.leaves(self.problem.sigma[kind])):
-                xp: Any = coordinates.numpy_of((x, s))
+                xp: Any = numpy_of((x, s))
                 known = xp.isfinite(x) & xp.isfinite(s)
                 parts.append(known.reshape(known.shape[0], -1))
-        by_window: Any = coordinates.numpy_of(parts).concatenate(parts, axis=1)
+        by_window: Any = numpy_of(parts).concatenate(parts, axis=1)
         return by_window.reshape(-1)
 
     def starts(self) -> list[tuple[PyTree, PyTree]]:
@@ -369,7 +369,7 @@ class Fit:
         return plot.fits({name: rest for name, *rest in self.channels(record) if rest[0] is not None})
 
     def __repr__(self):
-        if coordinates.is_traced(self.cost):
+        if is_traced(self.cost):
             return f"Fit of {listed(list(self.names))}, being traced"
         return by_line("\n".join(lines_of(self) + ([] if self.training is None else [repr(self.training)])))
 

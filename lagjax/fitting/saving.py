@@ -6,7 +6,8 @@ from typing import Any
 import jax
 import numpy as np
 
-from lagjax.mechanics import coordinates, files
+from lagjax.jax_internals.tracing import is_traced
+from lagjax.mechanics import files
 from lagjax.mechanics.coordinates import State
 from lagjax.mechanics.hybrid import Hybrid
 from lagjax.mechanics.signature import UnknownSystem, signature
@@ -15,7 +16,7 @@ from lagjax.mechanics.written_trees import NotGiven, NotWritable, Writer
 
 def save(fit, path: str | os.PathLike) -> None:
     """Write a fit into a file: see `Fit.save`."""
-    if coordinates.is_traced(fit):
+    if is_traced(fit):
         raise TypeError("this fit is being traced and has no numbers yet.\nFix: save it outside of the program.")
     problem = fit.problem
     # Without phases, `first` is the system itself.

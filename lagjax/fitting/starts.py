@@ -23,6 +23,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from lagjax.fitting.records import Record, Windows, spread
+from lagjax.jax_internals.tracing import is_traced, numpy_of
 from lagjax.jax_internals.trees import stop_gradient
 from lagjax.mechanics import constraints, coordinates
 from lagjax.mechanics.compiled import compiled
@@ -132,12 +133,12 @@ def _stacked(charts: Sequence[Chart], before: int, k: int) -> Chart:
     for w, chart in enumerate(charts):
         along[w, :, before : before + chart.along.shape[1]] = chart.along
         across[w, :, : chart.across.shape[1]] = chart.across
-    return Chart(coordinates.numpy_of(guesses).stack(guesses), along, across)
+    return Chart(numpy_of(guesses).stack(guesses), along, across)
 
 
 def _state(t, q, v, params) -> State:
     """A state; one made of numbers stays numbers, even while a program is traced."""
-    if coordinates.is_traced((q, v, params)):
+    if is_traced((q, v, params)):
         return coordinates.given_state(t, q, v, params)
     with jax.ensure_compile_time_eval():
         s = coordinates.given_state(t, q, v, params)
@@ -146,7 +147,7 @@ def _state(t, q, v, params) -> State:
 
 def _vector(tree):
     """All coordinates in one vector, a NumPy array unless they are traced."""
-    xp = coordinates.numpy_of(tree)
+    xp = numpy_of(tree)
     return xp.concatenate([xp.ravel(x) for x in jax.tree.leaves(tree)])
 
 
@@ -170,7 +171,7 @@ def _guess(system, record, r, params) -> State:
             )
         if record.v0 is None and isinstance(q, dict) and isinstance(v, dict):
             v = {name: np.zeros(np.shape(x), jnp.result_type(float)) for name, x in q.items()} | v
-    if coordinates.is_traced((q, v, params)):
+    if is_traced((q, v, params)):
         if system.constraints:
             raise TypeError(
                 "the start of a constrained system is being traced, but its free directions depend on its values.\n"
@@ -212,7 +213,7 @@ def _parabola(t, x, samples):
 
     Source: Rousseeuw, *J. Am. Stat. Assoc.* 79 (1984) 871 (least median of squares).
     """
-    xp, shape = coordinates.numpy_of(x), x.shape[1:]
+    xp, shape = numpy_of(x), x.shape[1:]
     t = xp.asarray(t)
     count = min(SAMPLES, len(t))
     threes = _threes(count)
@@ -249,7 +250,7 @@ def _states_along_motion(system, first, ts, options):
     known = {name: value for name, value in options.items() if name not in ("event", "events")}
     motion = integrate(system, first.q, first.v, first.params, ts=ts, **(known | {"throw": False}))
     # If the motion from the guess does not reach a window, the start replaces the missing state.
-    xp = coordinates.numpy_of((motion.q, motion.v, first.q, first.v))
+    xp = numpy_of((motion.q, motion.v, first.q, first.v))
     fill = lambda x, x0: xp.where(xp.isfinite(x), x, x0[None])
     q, v = jax.tree.map(fill, (motion.q, motion.v), (first.q, first.v))
     return [jax.tree.map(lambda x, i=i: x[i], (q, v)) for i in range(1, len(ts))]

@@ -29,7 +29,7 @@ from lagjax.fitting.training import (
     round_of,
     with_params,
 )
-from lagjax.mechanics import coordinates
+from lagjax.jax_internals.tracing import is_traced, numpy_of
 from lagjax.meter import meter, waiting
 
 # Defaults: the number of steps, and of evaluations without improvement after which training ends.
@@ -78,7 +78,7 @@ class Training:
     @property
     def rested(self) -> Bool[Array, ""]:
         """Whether it converged: it ended early, or with a score that hardly fell any more."""
-        xp: Any = coordinates.numpy_of(self.scores)
+        xp: Any = numpy_of(self.scores)
         count = xp.sum(xp.isfinite(self.scores))
         before = xp.arange(len(self.scores)) < 0.75 * count
         smallest = lambda known: xp.min(xp.where(known & xp.isfinite(self.scores), self.scores, np.inf))
@@ -93,7 +93,7 @@ class Training:
         return plot.training(panels, int(self.best))
 
     def __repr__(self):
-        if coordinates.is_traced(self.scores):
+        if is_traced(self.scores):
             return "Training, being traced"
         data = "held-back records" if self.held_back is not None else "all windows"
         best = float(np.min(self.scores, initial=np.inf, where=np.isfinite(self.scores)))
@@ -185,14 +185,14 @@ def train(
     each = int(np.ceil(steps / rounds))
     numbers = (np.asarray(x) for x in (seed, steps, patience))
     task = Task(problem, held, Optimiser(optimiser, problem.found), batch, each, *numbers)
-    if coordinates.is_traced((problem, held)):
+    if is_traced((problem, held)):
         first, state, (losses, scores) = all_rounds(task, rounds)
         scores = jnp.concatenate([first.best.score[None], scores])
         losses = jnp.ravel(losses)
     else:
         state, losses, scores = _run_rounds(task, progress, check)
     end, end_held = final_result(task, state)
-    xp: Any = coordinates.numpy_of((state, scores))
+    xp: Any = numpy_of((state, scores))
     stopped = (state.step < steps) & (state.round - state.best.round >= patience)
     held_back = None if end_held is None else _fit_of_held_back(task, state, end, end_held)
     course = Training(
@@ -234,5 +234,5 @@ def _fit_of_held_back(task: Task, state: TrainingState, end: FinalResult, end_he
     problem = with_params(held, task.problem, end.unknowns.shared)
     # Known starts leave nothing to evaluate.
     evaluation = evaluate(problem, end_held.unknowns, WHOLE) if end_held.unknowns.local.size else None
-    rested = jnp.ones((), bool) if coordinates.is_traced(end_held) else np.asarray(True)
+    rested = jnp.ones((), bool) if is_traced(end_held) else np.asarray(True)
     return Fit(problem, *end_held[:2], state.step, rested, end_held.misfit, end_held.cost[None], evaluation, ())

@@ -5,6 +5,10 @@ from importlib import import_module
 from importlib.util import find_spec
 
 import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+from jax.core import Tracer
 from jax.extend.core import get_opaque_trace_state
 
 from lagjax.jax_internals.plain import is_plain
@@ -58,3 +62,13 @@ def forget_traces() -> None:
 
 def _do_nothing():
     pass
+
+
+def numpy_of(tree):
+    """NumPy where the values of `tree` are known, so that nothing is compiled; else `jax.numpy`."""
+    return jnp if is_traced(tree) else np
+
+
+def is_traced(tree) -> bool:
+    """Whether JAX is tracing through `tree`, so that its values are not known."""
+    return any(isinstance(leaf, Tracer) for leaf in jtu.tree_leaves(tree))

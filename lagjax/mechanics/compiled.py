@@ -9,8 +9,7 @@ import numpy as np
 
 from lagjax.jax_internals.compiling import compiler_options
 from lagjax.jax_internals.one_by_one import jitted, one_by_one
-from lagjax.jax_internals.tracing import is_eager
-from lagjax.mechanics import coordinates
+from lagjax.jax_internals.tracing import is_eager, is_traced
 from lagjax.mechanics.kept import kept
 from lagjax.mechanics.memory import parted
 
@@ -25,7 +24,7 @@ def compiled(function: Callable, in_numpy: bool = False) -> Callable:
 
     @wraps(function)
     def program(*args):
-        if not is_eager() or coordinates.is_traced(args):
+        if not is_eager() or is_traced(args):
             return as_part(*args)
         static, arrays = parted(args)
         try:

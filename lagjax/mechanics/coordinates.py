@@ -14,11 +14,10 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jax.core import Tracer
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PyTree
 
-from lagjax.jax_internals.tracing import is_eager
+from lagjax.jax_internals.tracing import is_eager, is_traced, numpy_of
 from lagjax.mechanics.printable import printable
 from lagjax.mechanics.single_precision import warn_of_float32
 
@@ -215,16 +214,6 @@ def as_floats(tree):
         return _cast(_as_array(x), jax.dtypes.canonicalize_dtype(FLOAT64)) if whole else x
 
     return jtu.tree_map(convert, tree)
-
-
-def numpy_of(tree):
-    """NumPy where the values of `tree` are known, so that nothing is compiled; else `jax.numpy`."""
-    return jnp if is_traced(tree) else np
-
-
-def is_traced(tree) -> bool:
-    """Whether JAX is tracing through `tree`, so that its values are not known."""
-    return any(isinstance(leaf, Tracer) for leaf in jtu.tree_leaves(tree))
 
 
 def _time(t):

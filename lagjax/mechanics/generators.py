@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 
+from lagjax.jax_internals.tracing import is_traced
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.arguments import OF_POSITION
 from lagjax.mechanics.cartesian import AXES, leaf_names, points
@@ -161,7 +162,7 @@ def added(terms, digits: str = ".6g") -> str:
     """Write a sum of (coefficient, name) terms as text."""
     words = ""
     for coefficient, name in terms:
-        if not coordinates.is_traced(coefficient) and np.ndim(coefficient) == 0:
+        if not is_traced(coefficient) and np.ndim(coefficient) == 0:
             size = f"{abs(float(coefficient)):{digits}}"
             sign = "-" if coefficient < 0 else "+"
         else:

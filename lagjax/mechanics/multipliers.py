@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, PyTree
 
-from lagjax.jax_internals.tracing import is_eager
+from lagjax.jax_internals.tracing import is_eager, is_traced
 from lagjax.mechanics import constraints, coordinates
 from lagjax.mechanics.compiled import compiled
 from lagjax.mechanics.diagnosis import explain_failure, explain_singular, where
@@ -56,7 +56,7 @@ def accelerations(system, t, q, v, params) -> tuple[PyTree[Array], dict[str, Arr
 def accelerations_at(model: Model, s: coordinates.State) -> tuple[PyTree[Array], dict[str, Array]]:
     """The accelerations and the multipliers of a prepared system."""
     # A value that a function closes over may be traced where no argument is.
-    if not is_eager() or coordinates.is_traced((s, eqx.filter(model, eqx.is_array))):
+    if not is_eager() or is_traced((s, eqx.filter(model, eqx.is_array))):
         equations = equations_of(model, fast=True)
         a, multipliers = equations.solution_or_nan(s.t, equations.inside(s.q), equations.inside(s.v))
         return equations.outside(a), multipliers

@@ -22,6 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from lagjax.jax_internals.tracing import is_traced
 from lagjax.jax_internals.trees import stop_gradient
 from lagjax.mechanics import constraints, coordinates
 from lagjax.mechanics.compiled import compiled
@@ -90,7 +91,7 @@ def consistent_state(
     if not model.m:
         return s.q, s.v
     q, v, reached = _consistent_state(model, s, jnp.asarray(free), jnp.asarray(free_velocity))
-    if coordinates.is_traced((q, v)):
+    if is_traced((q, v)):
         return jax.tree.map(lambda x: jnp.where(reached, x, jnp.nan), (q, v))
     if not reached:
         raise ValueError(_unreachable(model, s, q, v, free, free_velocity))

@@ -20,8 +20,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, ArrayLike, Int
 
-from lagjax.jax_internals.tracing import is_eager
-from lagjax.mechanics import coordinates
+from lagjax.jax_internals.tracing import is_eager, is_traced, numpy_of
 from lagjax.mechanics.compiled import compiled
 from lagjax.mechanics.memory import filled_up
 from lagjax.mechanics.multipliers import accelerations
@@ -64,7 +63,7 @@ def at(trajectory: Trajectory, t: ArrayLike) -> Snapshot:
     _check_can_be_continued(trajectory)
     dtype = trajectory.t.dtype
     t = _times(t, dtype)
-    if not is_eager() or coordinates.is_traced((trajectory, t)):
+    if not is_eager() or is_traced((trajectory, t)):
         return _traced(trajectory, t)
     if trajectory.t.ndim > 1:
         _check_inside(t, np.asarray(trajectory.t)[..., 0], np.asarray(trajectory.t)[..., -1])
@@ -128,7 +127,7 @@ def _before(known: Instants, t, backward: bool):
 
     A switch does not count at its own time, when the motion is still before it.
     """
-    xp: Any = coordinates.numpy_of((known.at.t, t))
+    xp: Any = numpy_of((known.at.t, t))
     sign = -1 if backward else 1
     times = xp.asarray(known.at.t)
     index = xp.searchsorted(sign * times, sign * t, side="right") - 1
@@ -294,7 +293,7 @@ def _check_ended(trajectory, t):
 
 
 def _times(t, dtype):
-    given, t = t, coordinates.numpy_of(t).asarray(t)
+    given, t = t, numpy_of(t).asarray(t)
     if not (jnp.issubdtype(t.dtype, jnp.floating) or jnp.issubdtype(t.dtype, jnp.integer)):
         raise TypeError(f"t must be a time or an array of times, not {given!r:.60}.\nFix: traj.at(0.5).")
     return t.astype(dtype)
@@ -315,7 +314,7 @@ def _check_inside(t, first, last):
 
 
 def _slack(first, last):
-    xp: Any = coordinates.numpy_of((first, last))
+    xp: Any = numpy_of((first, last))
     return SAME * xp.finfo(xp.asarray(first).dtype).eps * xp.maximum(xp.abs(first), xp.abs(last))
 
 

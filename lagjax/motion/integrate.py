@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, PyTree
 
-from lagjax.jax_internals.tracing import SILENT, WATCHED
+from lagjax.jax_internals.tracing import SILENT, WATCHED, is_traced
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.hybrid import Hybrid
 from lagjax.mechanics.refusals import by_name, check_system
@@ -199,7 +199,7 @@ def integrate(
 
 def _raise_or_warn(trajectory, start, settings, guards):
     """Raise or warn in the user's words; while tracing, at run time with the result's own message."""
-    if coordinates.is_traced(trajectory):
+    if is_traced(trajectory):
         # A caller that watches learns the result from the report.
         return trajectory if WATCHED.value or SILENT.value else raise_at_run_time(trajectory)
     result = trajectory.result

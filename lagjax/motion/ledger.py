@@ -18,6 +18,7 @@ import jax
 import numpy as np
 
 from lagjax import plot
+from lagjax.jax_internals.tracing import is_traced
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.hybrid import Hybrid
 from lagjax.mechanics.system import System
@@ -160,7 +161,7 @@ def energy_ledger(trajectory: Trajectory, system: System | Hybrid | None = None)
 
     Source: Goldstein, Eq. (2.54): dh/dt = -∂L/∂t, with the forces that L does not contain.
     """
-    if not isinstance(trajectory, Trajectory) or coordinates.is_traced(trajectory):
+    if not isinstance(trajectory, Trajectory) or is_traced(trajectory):
         raise TypeError(
             f"a ledger needs a motion that was computed, not {_kind(trajectory)}.\n"
             "Fix: lj.energy_ledger(lj.integrate(...)), outside jax.jit and jax.vmap."

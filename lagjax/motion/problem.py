@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from lagjax.jax_internals.tracing import is_traced, numpy_of
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.coordinates import State
 from lagjax.mechanics.hybrid import Hybrid
@@ -148,7 +149,7 @@ def check_controller(controller: Any, max_step: Any, jump_ts: Any):
 
 def vector_of_times(ts: Any):
     """Return `ts` as an array of two or more numbers, or raise."""
-    given, ts = ts, coordinates.numpy_of(ts).asarray(ts)
+    given, ts = ts, numpy_of(ts).asarray(ts)
     real = jnp.issubdtype(ts.dtype, jnp.floating) or jnp.issubdtype(ts.dtype, jnp.integer)
     if real and ts.ndim == 1 and not isinstance(ts.shape[0], int):
         raise ValueError(
@@ -168,7 +169,7 @@ def vector_of_times(ts: Any):
 def times(ts: Any, dtype):
     """Return a vector of times in `dtype`; raise unless it increases or decreases throughout."""
     ts = ts.astype(dtype)
-    if not coordinates.is_traced(ts):
+    if not is_traced(ts):
         if not np.all(np.isfinite(ts)):
             raise ValueError("ts contains NaN or infinity.\nFix: give finite times.")
         backward = bool(ts[-1] < ts[0])
@@ -197,14 +198,14 @@ def step_length(value: Any, name: str, dtype):
     """Return `dt0` or `max_step` as a number of `dtype`, or None if not given; raise unless it is positive."""
     if value is None:
         return None
-    if not coordinates.is_traced(value) and not (_is_number(value) and float(value) > 0):
+    if not is_traced(value) and not (_is_number(value) and float(value) > 0):
         fixed = ", or with fixed steps dt0=1e-3 for example" if name == "dt0" else ", or max_step=0.1 for example"
         raise ValueError(
             f"{name} must be one positive number, not {value!r}.\n"
             "Usual cause: a negative step where ts decreases; it is a length in both directions.\n"
             f"Fix: leave {name} out{fixed}."
         )
-    return coordinates.numpy_of(value).asarray(value, dtype)
+    return numpy_of(value).asarray(value, dtype)
 
 
 def jumps(jump_ts: Any, dtype):
@@ -218,7 +219,7 @@ def jumps(jump_ts: Any, dtype):
             f"jump_ts must be a vector of times, and has dtype {kind} and shape {shape}.\n"
             "Fix: jump_ts=jnp.array([50.25, 50.35]), the times at which the force jumps or has a kink."
         )
-    if not coordinates.is_traced(jump_ts) and not np.all(np.isfinite(jump_ts)):
+    if not is_traced(jump_ts) and not np.all(np.isfinite(jump_ts)):
         raise ValueError("jump_ts contains NaN or infinity.\nFix: give finite times.")
     return jnp.atleast_1d(jnp.asarray(jump_ts, dtype)) if np.prod(shape) else None
 
@@ -228,14 +229,14 @@ def _is_number(value):
 
 
 def _holds_traced(times):
-    return isinstance(times, (list, tuple)) and coordinates.is_traced(times)
+    return isinstance(times, (list, tuple)) and is_traced(times)
 
 
 def tolerance(value: Any, name: str, dtype):
     """Return the tolerances of coordinates and of velocities, (2,) of `dtype`; raise if `dtype` cannot reach them."""
     dtype = np.dtype(dtype)
     value = DEFAULT_TOLERANCE.get(dtype, 1e-2) if value is None else value
-    if isinstance(value, (tuple, list)) and coordinates.is_traced(value):
+    if isinstance(value, (tuple, list)) and is_traced(value):
         value = jnp.stack([jnp.asarray(x, dtype) for x in value])
     is_text = isinstance(value, str) or not isinstance(value, jax.Array) and np.asarray(value).dtype.kind not in "fiu"
     if is_text or np.ndim(value) and np.shape(value) != (2,):
@@ -244,7 +245,7 @@ def tolerance(value: Any, name: str, dtype):
             f"{name} must be one number, or two: for coordinates and for velocities. It {actual}.\n"
             f"Fix: {name}=1e-9, or {name}=(1e-9, 1e-6)."
         )
-    if coordinates.is_traced(value):
+    if is_traced(value):
         return jnp.broadcast_to(jnp.asarray(value, dtype), 2)
     return _tolerance(value if isinstance(value, float) else tuple(np.asarray(value, float).flat), name, dtype)
 

@@ -22,6 +22,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
 from lagjax import plot
+from lagjax.jax_internals.tracing import is_traced
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.hybrid import Hybrid
 from lagjax.mechanics.refusals import by_name
@@ -151,7 +152,7 @@ class PoincareSection(eqx.Module):
         return f"{f'of {more} lanes ' if np.ndim(self.count) else ''}the first {room} of up to {most} crossings"
 
     def __repr__(self):
-        if coordinates.is_traced(self):
+        if is_traced(self):
             return f"Poincaré section, being traced, room for {self.t.shape[-1]} crossings"
         rows = _batch_rows(self) if np.ndim(self.count) else _rows(self)
         return "\n".join(["Poincaré section", *(f"  {label:<10}  {value}" for label, value in rows)])

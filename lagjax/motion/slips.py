@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from lagjax.jax_internals.tracing import is_traced
 from lagjax.mechanics import coordinates
 from lagjax.mechanics.coordinates import State
 from lagjax.mechanics.warned import warn
@@ -26,14 +27,14 @@ _in_order = weakref.WeakSet()
 def warn_of_odd_dissipation(dissipation, state: State) -> None:
     """Warn if R changes its sign with the velocities. Nothing is checked if the values are traced."""
     known = isinstance(dissipation, FunctionType) and dissipation in _in_order
-    if dissipation is None or known or coordinates.is_traced(state):
+    if dissipation is None or known or is_traced(state):
         return
     t, q, v, params = coordinates.as_arrays(state, state.t.dtype)
     # While JAX traces something else, values that it does not trace can still be checked.
     with jax.ensure_compile_time_eval():
         v = _without_zeros(v)
         both = [dissipation(t, q, jax.tree.map(lambda x: sign * x, v), params) for sign in (1, -1)]
-    if coordinates.is_traced(both):
+    if is_traced(both):
         return
     plus, minus = map(float, both)
     if plus != 0 and abs(plus + minus) <= ROUND_OFFS * float(jnp.finfo(t.dtype).eps) * abs(plus):

@@ -14,7 +14,8 @@ from jaxtyping import Array, ArrayLike, Float, PyTree
 from lagjax import plot
 from lagjax.animation import Animation
 from lagjax.jax_internals.one_by_one import jitted
-from lagjax.mechanics import coordinates, packed
+from lagjax.jax_internals.tracing import is_traced
+from lagjax.mechanics import packed
 from lagjax.mechanics.compiled import compiled
 from lagjax.mechanics.model import Model, model_of
 from lagjax.mechanics.packed import Packed
@@ -313,7 +314,7 @@ class Trajectory(eqx.Module):
             )
 
     def __repr__(self):
-        if coordinates.is_traced(self):
+        if is_traced(self):
             return f"Trajectory({self.static.method}, being traced, t: {self.t.shape})"
         lanes = self.t.shape[:-1]
         return "\n".join(printed.batch_lines(self, lanes) if lanes else printed.lines(self))
