@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import lagjax as lj
-from lagjax.mechanics.reactions import reacts
+from lagjax.mechanics.arguments import WITH_MULTIPLIERS, takes_of
 from lagjax.numerics import quadrature
 from lagjax.scenes import SCENES, bead_on_hoop, sliding_wedge
 from tests.motion.test_hybrid import SPHERE, rolls, slides, throw
@@ -38,7 +38,7 @@ def flipped(system):
         for name, c in system.constraints.items()
     }
     force, dissipation = system.force, system.dissipation
-    if reacts(system):
+    if system.force is not None and takes_of(system.force) == WITH_MULTIPLIERS:
         force = lambda t, q, v, multipliers, params, f=force: jax.tree.map(
             jnp.negative, f(t, q, v, multipliers, params)
         )
