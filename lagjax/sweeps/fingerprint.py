@@ -15,7 +15,7 @@ from lagjax.sweeps.digests import digest
 from lagjax.sweeps.lanes import Program
 
 # Stores of other formats are not read.
-FORMAT = 3
+FORMAT = 4
 ANOTHER_FUNCTION = "run is another function"
 # Names reserved by zarr or by a store.
 RESERVED = ("", ".", "..", "zarr.json", "lagjax")
