@@ -11,8 +11,7 @@ from jaxtyping import PyTree
 
 from lagjax.mechanics.printable import printable
 from lagjax.sweeps.axes import Axes
-from lagjax.sweeps.digests import digest
-from lagjax.sweeps.lanes import Program
+from lagjax.sweeps.lanes import Program, digest
 
 # Stores of other formats are not read.
 FORMAT = 4

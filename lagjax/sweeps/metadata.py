@@ -25,12 +25,11 @@ import numpy as np
 
 from lagjax.mechanics.files import MALFORMED, Explained, parsed
 from lagjax.mechanics.printable import by_line, printable
-from lagjax.sweeps.axes import Axes
+from lagjax.sweeps.axes import Axes, Blocks
 from lagjax.sweeps.chunks import Spec, chunk_file, nothing, write_chunk
-from lagjax.sweeps.fingerprint import FORMAT, digest, named_leaves
-from lagjax.sweeps.grids import Blocks
+from lagjax.sweeps.fingerprint import FORMAT, named_leaves
 from lagjax.sweeps.labels import STORE_GROUP, labels_of, status_attributes
-from lagjax.sweeps.lanes import NOT_RUN, STATUS_TYPES, Program, Status
+from lagjax.sweeps.lanes import NOT_RUN, STATUS_TYPES, Program, Status, digest
 
 META = "zarr.json"
 MARKS = f"{STORE_GROUP}/marks"

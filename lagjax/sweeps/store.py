@@ -5,7 +5,7 @@
     lagjax/values/NAME  the arrays of trajectories without a label: their ends, statistics, parameters
     lagjax/marks        (blocks, arrays, 2): the length and checksum of each file of a block; written last
 
-A block is a box of the grid with consecutive flat indices (`grids`). A block that is not marked is computed again, even
+A block is a box of the grid with consecutive flat indices (`axes`). A block that is not marked is computed again, even
 if parts of it were written. Zarr reads a missing file as a block of fill values, so the marks must record which files
 belong there. Files are compared with their marks in two ways:
 
@@ -30,21 +30,18 @@ from typing import Any
 import jax
 import numpy as np
 
-from lagjax.sweeps.axes import Axes
+from lagjax.sweeps.axes import Axes, Blocks
 from lagjax.sweeps.chunks import (
     CHECKSUM,
     UNREADABLE,
     Spec,
     as_number,
-    checksum_of,
     chunk_file,
-    content_size,
     nothing,
     read_chunk,
     write_chunk,
 )
 from lagjax.sweeps.fingerprint import ANOTHER_FUNCTION, differences, fingerprint, named_leaves, of_axis
-from lagjax.sweeps.grids import Blocks
 from lagjax.sweeps.labels import flags
 from lagjax.sweeps.lanes import LOST, NOT_RUN, Program, Status
 from lagjax.sweeps.metadata import (
@@ -168,21 +165,21 @@ class Store:
             try:
                 with open(file, "rb") as content:
                     stored = os.fstat(content.fileno()).st_size
-                    if stored != length:
-                        yield f"{file} has {stored:,} bytes of {length:,}"
-                        continue
-                    if not read:
-                        content.seek(-CHECKSUM, os.SEEK_END)
-                    data = content.read()
+                    content.seek(max(0, stored - CHECKSUM))
+                    end = as_number(content.read())
+                if stored == length and read:
+                    read_chunk(file, self.arrays[name])
             except FileNotFoundError:
                 yield f"{file} is missing"
             except OSError as error:
                 yield f"{file} cannot be read ({error.strerror})"
+            except UNREADABLE:
+                yield f"{file} is not as it was written"
             else:
-                if as_number(data[-CHECKSUM:]) != checksum or read and checksum_of(data[:-CHECKSUM]) != checksum:
+                if stored != length:
+                    yield f"{file} has {stored:,} bytes of {length:,}"
+                elif end != checksum:
                     yield f"{file} is not as it was written"
-                elif read and content_size(data) != self.arrays[name].chunk_bytes:
-                    yield f"{file} does not hold the numbers of its block"
 
     def _file(self, name, number):
         """The file of a block; None for an empty array."""
@@ -229,26 +226,29 @@ class Store:
 
         Values are (points, ...), in the structure of `like` or in a dictionary by name; NaN or 0 in missing blocks.
         """
-        named, (missing, lost) = {}, self._quick_check()
-        lost = {number: wrong for number, wrong in lost.items() if number not in missing}
-        for name, place in self._values.items():
-            named[name], unreadable = self._read(place, missing)
-            lost.update({number: f"{self._file(place, number)} is damaged" for number in unreadable})
+        named, _, lost = self._read(self._values)
         if like is not None:
             named = jax.tree.unflatten(jax.tree.structure(like), [named[name] for name, _ in named_leaves(like)])
         return named, lost
 
-    def _read(self, name, missing):
-        """(an array as (points, ...) with nothing in missing blocks, the numbers of the blocks that cannot be read)."""
-        spec, unreadable = self.arrays[name], []
-        found = np.full(spec.shape, nothing(spec.dtype), spec.dtype)
-        for number in range(len(self.blocks)):
-            if number not in missing:
+    def _read(self, places):
+        """(the arrays at some places, each (points, ...); the unmarked blocks; the lost blocks with what is wrong).
+
+        Arrays have nothing in blocks that are unmarked or cannot be read.
+        """
+        marks, unreadable = self._marks()
+        missing = set(self._missing(marks).tolist()) - set(unreadable)
+        arrays, lost = {}, self.damage(range(len(self.blocks)), False, (marks, unreadable))
+        for name, place in places.items():
+            spec = self.arrays[place]
+            found = np.full(spec.shape, nothing(spec.dtype), spec.dtype)
+            for number in set(range(len(self.blocks))) - missing:
                 try:
-                    found[self.blocks.region(number)] = self._block(name, number)
+                    found[self.blocks.region(number)] = self._block(place, number)
                 except UNREADABLE:
-                    unreadable.append(number)
-        return found.reshape(self.size, *spec.shape[len(self.blocks.shape) :]), unreadable
+                    lost.setdefault(number, f"{self._file(place, number)} is damaged")
+            arrays[name] = found.reshape(self.size, *spec.shape[len(self.blocks.shape) :])
+        return arrays, missing, lost
 
     def one(self) -> dict[str, jax.ShapeDtypeStruct]:
         """The shapes of one point's values by name, without reading any values."""
@@ -257,13 +257,9 @@ class Store:
 
     def status(self) -> tuple[Status, set[int], dict[int, str]]:
         """(the statuses of all points, the unmarked blocks, the lost blocks with what is wrong)."""
-        status, (missing, lost) = [], self._quick_check()
-        lost = {number: wrong for number, wrong in lost.items() if number not in missing}
-        for place in self._status.values():
-            x, unreadable = self._read(place, missing)
-            status.append(x)
-            lost.update({number: f"{self._file(place, number)} is damaged" for number in unreadable})
-        if unknown := sorted({*np.unique(status[0]).tolist()} - {*flags()["flag_values"]}):
+        found, missing, lost = self._read(self._status)
+        status = Status(**found)
+        if unknown := sorted({*np.unique(status.result).tolist()} - {*flags()["flag_values"]}):
             raise ValueError(
                 f"{self.path} has results with the number {unknown[0]}, which this version of lagjax does not know.\n"
                 "Fix: pip install -U lagjax."
@@ -272,13 +268,7 @@ class Store:
             for number in numbers:
                 for x, fill in zip(status, (code, 0, np.nan, np.nan)):
                     x[self.blocks.points(number)] = fill
-        return Status(*status), missing, lost
-
-    def _quick_check(self):
-        """(the unmarked blocks, the lost blocks with what is wrong), by a quick check."""
-        marks, unreadable = self._marks()
-        lost = self.damage(range(len(self.blocks)), False, (marks, unreadable))
-        return set(self._missing(marks).tolist()) - set(unreadable), lost
+        return status, missing, lost
 
 
 def warn_of_damage(path: Path, wrong: Iterable[str], then: str, stacklevel: int):
