@@ -72,28 +72,35 @@ def chunk_file(folder: Path, spec: Spec, place: tuple[int, ...] = ()) -> Path | 
     return None if math.prod(spec.shape) == 0 else folder.joinpath("c", *map(str, place), *inner)
 
 
-def read_chunk(file: Path | None, spec: Spec) -> np.ndarray:
-    """The numbers of one file, in the shape of a chunk; zeros for an empty array (None).
+def read_bytes(file: Path, spec: Spec) -> bytes:
+    """The bytes of one file, which are those of its chunk, compressed.
 
     **Raises:** one of `UNREADABLE` if there is no such file, or it holds anything else.
     """
-    if file is None:
-        return np.zeros(spec.chunk, spec.dtype)
-    expected = spec.chunk_bytes
     with open(file, "rb") as content:
         # Numbers that cannot be compressed take little more than they are.
-        if os.fstat(content.fileno()).st_size > expected + expected // 64 + 1024:
+        if os.fstat(content.fileno()).st_size > spec.chunk_bytes + spec.chunk_bytes // 64 + 1024:
             raise ValueError(f"{file} is longer than its numbers.")
         data = content.read()
-    if checksum_of(data[:-CHECKSUM]) != as_number(data[-CHECKSUM:]):
+    body = data[:-CHECKSUM]
+    if checksum_of(body) != as_number(data[-CHECKSUM:]):
         raise ValueError(f"{file} is not as it was written.")
-    body = np.frombuffer(data, np.uint8)[:-CHECKSUM]
+    if (content_size(body) if spec.compressed else len(body)) != spec.chunk_bytes:
+        raise ValueError(f"{file} does not hold {spec.chunk_bytes:,} bytes.")
+    return body
+
+
+def read_chunk(file: Path | None, spec: Spec) -> np.ndarray:
+    """The numbers of one file, in the shape of a chunk; zeros for an empty array (None).
+
+    **Raises:** as `read_bytes`.
+    """
+    if file is None:
+        return np.zeros(spec.chunk, spec.dtype)
+    data = read_bytes(file, spec)
+    body = np.empty(spec.chunk_bytes, np.uint8) if spec.compressed else np.frombuffer(data, np.uint8)
     if spec.compressed:
-        if content_size(data) != expected:
-            raise ValueError(f"{file} does not hold {expected:,} bytes.")
-        body = _zstd().decode(body, out=np.empty(expected, np.uint8))
-    elif len(body) != expected:
-        raise ValueError(f"{file} does not hold {expected:,} bytes.")
+        _zstd().decode(data, out=body)
     if spec.dtype.kind == "b" and body.max(initial=0) > 1:
         raise ValueError(f"{file} has truth values that are neither true nor false.")
     return body.view(spec.dtype.newbyteorder("<")).reshape(spec.chunk)

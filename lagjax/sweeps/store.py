@@ -38,6 +38,7 @@ from lagjax.sweeps.chunks import (
     as_number,
     chunk_file,
     nothing,
+    read_bytes,
     read_chunk,
     write_chunk,
 )
@@ -168,7 +169,7 @@ class Store:
                     content.seek(max(0, stored - CHECKSUM))
                     end = as_number(content.read())
                 if stored == length and read:
-                    read_chunk(file, self.arrays[name])
+                    read_bytes(file, self.arrays[name])
             except FileNotFoundError:
                 yield f"{file} is missing"
             except OSError as error:

@@ -338,6 +338,14 @@ def test_zarr_would_write_the_same(tmp_path, dtype, compressed):
         zarr.open_array(tmp_path / "zarr")[:]
 
 
+@pytest.mark.parametrize("structure", [3, {}, {"arrays": {}, "tree": None}, {"arrays": {}, "trajectories": []}])
+def test_a_structure_that_is_none(store, structure):
+    """Values whose structure is not described as lagjax does are a dictionary by name, with a warning."""
+    rewrite(store, lambda description: description.update(structure=structure))
+    with pytest.warns(UserWarning, match="are a dictionary by name: its structure is not one"):
+        same(lj.open_sweep(store).values)
+
+
 def test_checksums_stand_in_every_array(whole):
     """Anyone who reads a store with zarr can detect damage."""
     files = list(whole.rglob("zarr.json"))
