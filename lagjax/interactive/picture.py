@@ -26,7 +26,7 @@ ROOM, LEAST = 0.08, 1 / 8
 MOST_PANELS = 4
 # Units of the SVG in a pixel: whole numbers are short to write.
 FINE = 10
-# Curves of more points than this are thinned to what a column of pixels shows.
+# Curves of more points than this are drawn within half a pixel, others within a ninth, so that messages stay short.
 MOST_POINTS = 4000
 # What matplotlib would write about an SVG.
 METADATA = ("Creator", "Date", "Format", "Type")
@@ -171,8 +171,7 @@ def _panel(axis, lines, height):
     paths = []
     for i, line in enumerate(lines):
         x, y = axis.transData.transform(np.column_stack(line.get_data())).T
-        with np.errstate(invalid="ignore"):
-            path = _path(FINE * (x - box.x0), FINE * (box.y1 - y))
+        path = _path(FINE * (x - box.x0), FINE * (box.y1 - y), FINE * box.width, FINE * box.height)
         thick = FINE * line.get_linewidth() * DPI / 72
         dashes = " ".join(f"{x * thick:.3g}" for x in _dashes(plot.style(i)["linestyle"])) or "none"
         paths.append(
@@ -191,32 +190,17 @@ def _dashes(style):
     return plot.import_matplotlib().rcParams[names[style]] if style in names else ()
 
 
-def _path(x, y):
-    """The `d` of an SVG path through points (n,), interrupted where one is not finite."""
-    there = np.isfinite(x) & np.isfinite(y)
-    begins = np.flatnonzero(there & ~np.append(False, there[:-1]))
-    ends = np.flatnonzero(there & ~np.append(there[1:], False)) + 1
-    parts = []
-    for begin, end in zip(begins, ends):
-        points = np.rint(np.column_stack([x[begin:end], y[begin:end]])).astype(np.int64)
-        if len(points) > MOST_POINTS:
-            points = _thinned(points)
-        steps = " ".join(map(str, np.diff(points, axis=0).ravel().tolist()))
-        parts.append(f"M{points[0, 0]} {points[0, 1]}l{steps or '0 0'}")
-    return "".join(parts)
+def _path(x, y, width, height):
+    """The `d` of an SVG path through points (n,), interrupted where one is not finite, as short as it looks the same."""
+    from matplotlib.path import Path
 
-
-def _thinned(points):
-    """Of successive points in one column of pixels the first, the last, the highest and the lowest."""
-    column = points[:, 0] // FINE
-    begins = np.append(0, np.flatnonzero(np.diff(column)) + 1)
-    count = np.diff(np.append(begins, len(points)))
-    y = points[:, 1]
-    stays = y == np.repeat(np.minimum.reduceat(y, begins), count)
-    stays |= y == np.repeat(np.maximum.reduceat(y, begins), count)
-    stays[begins] = stays[begins + count - 1] = True
-    stays[1:] &= np.any(np.diff(points, axis=0), axis=1)
-    return points[stays]
+    path = Path(np.column_stack([x, y]))
+    path.simplify_threshold = FINE / 9 if len(x) <= MOST_POINTS else FINE / 2
+    # A line ends well outside of its panel, where it is cut off.
+    path = path.cleaned(remove_nans=True, simplify=True, clip=(-width, -height, 2 * width, 2 * height))
+    moves, points = path.codes == Path.MOVETO, np.rint(path.vertices).astype(int).tolist()
+    shown = (path.codes != Path.STOP).tolist()
+    return "".join(f"{' M'[move]}{x} {y}" for move, (x, y), there in zip(moves.tolist(), points, shown) if there)
 
 
 def _fits(get, set_, values, room, anew):

@@ -36,9 +36,9 @@ def points_of(picture):
     for panel in ElementTree.fromstring(picture).iter(f"{tag}svg"):
         for path in panel.findall(f"{tag}path"):
             parts = re.findall(r"M([^M]*)", path.get("d"))
-            steps = [np.array(re.findall(r"-?\d+", part), int).reshape(-1, 2) for part in parts]
+            points = [np.array(re.findall(r"-?\d+", part), int).reshape(-1, 2) for part in parts]
             corner = float(panel.get("x")), float(panel.get("y"))
-            yield [corner + np.cumsum(x, axis=0) / FINE for x in steps], path.attrib
+            yield [corner + x / FINE for x in points], path.attrib
 
 
 def test_lines_over_the_axes():
@@ -50,10 +50,14 @@ def test_lines_over_the_axes():
     axis, height = picture.axes[0], picture.figure.bbox.height
     (first, look), (second, other_look) = points_of(written)
     expected = axis.transData.transform(np.column_stack([T, x[:, 0]])) * [1, -1] + [0, height]
-    assert np.abs(first[0] - expected).max() < 0.51 / FINE
+    across, down = expected.T
+    off = np.interp(across, *first[0].T) - down
+    # A ninth of a pixel and the rounding, across lines that rise by up to 1.7 pixels in one.
+    assert np.abs(off).max() < 0.35 and len(first[0]) > 20
     # Twin: upside down.
-    assert np.abs(first[0] - (expected * [1, -1] + [0, height])).max() > 100
-    assert [len(part) for part in second] == [80, 80]
+    assert np.abs(np.interp(across, *first[0].T) - (height - down)).max() > 100
+    ends = [part[[0, -1], 0] for part in second]
+    np.testing.assert_allclose(ends, [across[[0, 79]], across[[120, 199]]], atol=0.51 / FINE)
     assert (
         look["stroke"] != other_look["stroke"] and look["stroke-dasharray"] == "none" != other_look["stroke-dasharray"]
     )
@@ -84,7 +88,7 @@ def test_axes_of_the_svg():
 
 
 def test_many_points_are_thinned():
-    """From 2e5 points each pixel column keeps its highest and lowest, and the message stays small."""
+    """Of 2e5 points those remain that a pixel shows: each column keeps its height, and the message stays small."""
     t = np.linspace(0.0, 1.0, 200_001)
     picture = Picture()
     written = picture.of_curves(drawn({"t": t[None], "x": np.sin(30_000 * t)[None]}), "")
@@ -127,7 +131,9 @@ def test_words_above():
     assert red(well[:45]) == 0 and np.sum(well[:45].sum(axis=-1) < 200) > 100
     assert picture._above.get_text() == "period = 2.5,  not drawn: matrix of shape (3, 40)"
     failed = picture.of_words("wrong")
-    assert red(pixels_of(picture.png())[:45]) > 20 and not any(points for points, _ in points_of(failed))
+    assert red(pixels_of(picture.png())[:45]) > 20 and not any(
+        len(x) > 1 for part, _ in points_of(failed) for x in part
+    )
 
 
 def test_panels():
