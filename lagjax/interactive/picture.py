@@ -28,7 +28,8 @@ MOST_PANELS = 4
 FINE = 10
 # Curves of more points than this are drawn within half a pixel, others within a ninth, so that messages stay short.
 MOST_POINTS = 4000
-# What matplotlib would write about an SVG.
+# All of the figure, whatever the user's settings are; and what matplotlib would write about an SVG.
+SAVED = {"savefig.bbox": None}
 METADATA = ("Creator", "Date", "Format", "Type")
 
 
@@ -80,7 +81,8 @@ class Picture:
     def png(self) -> bytes:
         """The last picture as a PNG."""
         written = io.BytesIO()
-        self.figure.savefig(written, format="png", dpi=DPI)
+        with plot.import_matplotlib().rc_context(SAVED):
+            self.figure.savefig(written, format="png", dpi=DPI)
         return written.getvalue()
 
     def of_user(self, draw: Callable, result: Any, words: str) -> str:
@@ -128,15 +130,13 @@ class Picture:
 
     def _draw_frame(self):
         """Draw all but lines and words, and lay the axes out, which then stay where they are."""
-        from matplotlib import rc_context
-
+        matplotlib = plot.import_matplotlib()
         ours = [*sum(self._lines, []), self._above]
         for artist in ours:
             artist.set_visible(False)
         self.figure.set_layout_engine(self._layout)
         written = io.StringIO()
-        # A browser has the fonts; and they are named once, below.
-        with rc_context({"svg.fonttype": "none", "font.family": "DejaVu Sans"}):
+        with matplotlib.rc_context(SAVED | {"svg.fonttype": "none", "font.sans-serif": ["DejaVu Sans"]}):
             self.figure.savefig(written, format="svg", metadata=dict.fromkeys(METADATA))
         self.figure.set_layout_engine("none")
         for artist in ours:
@@ -191,7 +191,7 @@ def _dashes(style):
 
 
 def _path(x, y, width, height):
-    """The `d` of an SVG path through points (n,), interrupted where one is not finite, as short as it looks the same."""
+    """The `d` of an SVG path through points (n,), interrupted where one is not finite, without what no one sees."""
     from matplotlib.path import Path
 
     path = Path(np.column_stack([x, y]))

@@ -6,6 +6,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+from matplotlib import rcParams
 from PIL import Image
 
 from lagjax.interactive.picture import FINE, MOST_PANELS, MOST_POINTS, Picture
@@ -65,8 +66,13 @@ def test_lines_over_the_axes():
     assert picture.of_curves(drawn({"t": T[None], "x": 0.9 * x[None]}), "") != written and picture.drawn_whole == 1
 
 
-def test_axes_of_the_svg():
-    """The axes of the SVG stand around its lines, where those of the PNG are, with their ticks and names as text."""
+@pytest.mark.parametrize("bbox", [None, "tight"])
+def test_axes_of_the_svg(bbox, monkeypatch):
+    """The axes of the SVG stand around its lines, where those of the PNG are, with their ticks and names as text.
+
+    So they do when the user's figures are saved without margins.
+    """
+    monkeypatch.setitem(rcParams, "savefig.bbox", bbox)
     picture = Picture()
     written = picture.of_curves(drawn({"t": T[None], "<b>x": T[None]}), "a < b & 5 $")
     root, tag = ElementTree.fromstring(written), "{http://www.w3.org/2000/svg}"
