@@ -198,9 +198,8 @@ def _path(x, y, width, height):
     path.simplify_threshold = FINE / 9 if len(x) <= MOST_POINTS else FINE / 2
     # A line ends well outside of its panel, where it is cut off.
     path = path.cleaned(remove_nans=True, simplify=True, clip=(-width, -height, 2 * width, 2 * height))
-    moves, points = path.codes == Path.MOVETO, np.rint(path.vertices).astype(int).tolist()
-    shown = (path.codes != Path.STOP).tolist()
-    return "".join(f"{' M'[move]}{x} {y}" for move, (x, y), there in zip(moves.tolist(), points, shown) if there)
+    points = zip(np.asarray(path.codes).tolist(), np.rint(path.vertices).astype(int).tolist())
+    return "".join(f"{'M' if code == Path.MOVETO else ' '}{x} {y}" for code, (x, y) in points if code != Path.STOP)
 
 
 def _fits(get, set_, values, room, anew):

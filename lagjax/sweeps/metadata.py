@@ -67,15 +67,13 @@ def description_at(path: Path) -> tuple[dict[str, Any], Described]:
         )
     try:
         description = _read_metadata(file)["attributes"]["lagjax"]
-        intact = description["digest"] == digest_of(description)
-    except (OSError, ValueError, *MALFORMED):
-        intact = False
-    if not intact:
+        _require(description["digest"] == digest_of(description), "its digest is that of another")
+    except (OSError, ValueError, *MALFORMED) as error:
         raise ValueError(
             f"{file} is damaged: the sweep of this store is unknown.\n"
             "Usual cause: a copy that was cut short, or a disk that failed.\n"
             f"Fix: copy that file again from the original; or remove {path} and compute it again."
-        )
+        ) from error
     try:
         number = description["fingerprint"]["format"]
         if type(number) is int and number > FORMAT:
@@ -150,7 +148,8 @@ def checked(description: dict[str, Any]) -> Described:
 def _dtype_and_shape(words):
     """The dtype and shape at the beginning of words such as "float64[2, 3]"."""
     found = re.match(r"(\w+)\[([\d, ]*)\]", words)
-    _require(found is not None and found[1] in NUMBERS, "an array does not hold numbers")
+    if found is None or found[1] not in NUMBERS:
+        raise ValueError("an array does not hold numbers.")
     dtype, shape = np.dtype(found[1]), tuple(int(n) for n in found[2].split(", ") if found[2])
     _require(words.startswith(f"{dtype}{list(shape)}"), "an array has no shape")
     return dtype, shape
