@@ -20,7 +20,7 @@ import pytest
 
 import lagjax as lj
 from lagjax.mechanics import file_table, files, written_trees
-from lagjax.sweeps import described, fingerprint, metadata, result, store
+from lagjax.sweeps import chunks, fingerprint, metadata, result, store
 from tests import mutated
 from tests.mutated import describe, mutated_file, mutated_store
 
@@ -311,20 +311,11 @@ def larger_grid(path, n):
     """A store that claims n times n points, in every part of its description, of which none were computed."""
     folder, axes = path / "lagjax/marks/c", {"k": np.zeros(n), "x": np.zeros(n)}
     shutil.rmtree(folder)
+    for name, x in axes.items():
+        spec = chunks.Spec(x.shape, x.shape, x.dtype, np.nan, [name])
+        chunks.write_chunk(path / name / "c/0", spec, x)
 
     def change(said):
-        for name, array in said["arrays"].items():
-            block = [1, n]
-            if name in axes:
-                array["shape"] = [n]
-                array["chunk_grid"]["configuration"]["chunk_shape"] = [n]
-                shutil.rmtree(path / name / "c")
-            elif name == "lagjax/marks":
-                array["shape"][0] = n
-            else:
-                inner = array["shape"][2:]
-                array["shape"] = [n, n, *inner]
-                array["chunk_grid"]["configuration"]["chunk_shape"] = [*block, *inner]
         said["block"] = [1, n]
         said["fingerprint"]["axes"] = {name: fingerprint.of_axis(x) for name, x in axes.items()}
         return said
@@ -336,7 +327,7 @@ def outside(path):
     """A store that names an array outside of it."""
 
     def change(said):
-        said["arrays"]["../outside"] = said["arrays"]["n"]
+        said["places"]["values"]["n"], said["dims"]["../outside"] = "../outside", said["dims"].pop("n")
         return said
 
     describe(path, change)
@@ -388,7 +379,7 @@ def test_stores_that_reach_out(good, tmp_path, monkeypatch):
         patch.setattr(result, "damaged", restoring)
         assert "wrote " in wrong_with(changes["metadata"])
         assert wrong_with(changes["outside"]) == ""
-        patch.setattr(described, "_is_inside", lambda name: True)
+        patch.setattr(metadata, "_is_inside", lambda name: True)
         assert "outside" in wrong_with(changes["outside"])
     with monkeypatch.context() as patch:
         patch.setattr(store, "read_chunk", trusting)

@@ -112,18 +112,15 @@ class Knobs:
         widgets = import_widgets()
         self._run, self._controls, self._draw, self._progress = run, controls, draw, progress
         self._programs, self._picture, self._lock = {}, Picture(), threading.RLock()
-        self._free_at, self._sent, self._shown, self._held = 0.0, 0, None, False
+        self._free_at, self._shown, self._held = 0.0, None, False
         self.result: Any = None
         self.status, self.ok, self.seconds = "", False, 0.0
         self._sliders = {name: widget(name, control, point[name]) for name, control in controls.items()}
-        # Two layers in one cell of a grid.
         size = {"width": f"{round(WIDTH * DPI)}px", "max_width": "100%", "margin": "0"}
-        layer = widgets.Layout(grid_area="1 / 1", **size)
-        self._below, self._over = widgets.Image(format="png", layout=layer), widgets.HTML(layout=layer)
-        both = widgets.GridBox([self._below, self._over], layout=widgets.Layout(**size))
+        self._shows = widgets.HTML(layout=widgets.Layout(**size))
         # What failed stands in the picture, and here for those who have it read to them.
         self._message = widgets.HTML()
-        self.widget = widgets.VBox([*self._sliders.values(), both, self._message])
+        self.widget = widgets.VBox([*self._sliders.values(), self._shows, self._message])
         # What `run` or `draw` raises at the first point is the user's to see.
         self._picture_at(point)
         self._follow()
@@ -176,7 +173,7 @@ class Knobs:
                 at = tuple(slider.value for slider in self._sliders.values())
             self._show(self.point)
             self._shown = at
-            self._free_at = time.monotonic() + self._sent / MOST_A_SECOND
+            self._free_at = time.monotonic() + len(self._shows.value) / MOST_A_SECOND
 
     def _show(self, point):
         began = time.perf_counter()
@@ -186,8 +183,7 @@ class Knobs:
             # In a callback of a widget nobody would see it, and the sliders would be dead.
             self.ok, self.status = False, f"{type(error).__name__}: {error}"
             picture = self._picture.of_words(self.status)
-        self._sent = len(picture.over) + (len(picture.below) if self._below.value != picture.below else 0)
-        self._below.value, self._over.value = picture
+        self._shows.value = picture
         said = "" if self.ok else f'<span role="status">{html.escape(self.status)}</span>'
         if self._message.value != said:
             self._message.value = said

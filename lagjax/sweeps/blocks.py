@@ -8,12 +8,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lagjax.sweeps.axes import Axes
+from lagjax.sweeps.axes import Axes, Blocks, divided
 from lagjax.sweeps.fingerprint import in_words, named_leaves, versions
-from lagjax.sweeps.grids import Blocks, divided
 from lagjax.sweeps.labels import labels_of
 from lagjax.sweeps.lanes import GOOD, Status, not_run
-from lagjax.sweeps.memory import bytes_of
 from lagjax.sweeps.store import Store
 from lagjax.sweeps.structures import description_of
 
@@ -51,7 +49,7 @@ def _block(engine, axes, shares, seconds):
     chunk = engine.program.chunk
     wanted = max(1, round(BLOCK_SECONDS * engine.workers / max(seconds, 1e-6))) * chunk
     fair = max(1, axes.size // (shares * chunk)) * chunk
-    fits = max(1, int(BLOCK_BYTES / (bytes_of(engine.program) * chunk))) * chunk
+    fits = max(1, int(BLOCK_BYTES / (engine.program.bytes_of_point * chunk))) * chunk
     return min(wanted, fair, fits)
 
 
@@ -98,7 +96,7 @@ class Filling:
 
 def groups_of_blocks(engine: Any, store: Store, numbers: list[int]) -> Iterator[list[int]]:
     """Groups of blocks to compute together: their points fill the chunks of the program and fit into memory."""
-    points = min(FULL_CHUNKS * engine.program.chunk, int(BLOCK_BYTES / bytes_of(engine.program)))
+    points = min(FULL_CHUNKS * engine.program.chunk, int(BLOCK_BYTES / engine.program.bytes_of_point))
     group, count = [], 0
     for number in numbers:
         here = store.blocks.points(number)

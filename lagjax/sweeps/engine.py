@@ -17,7 +17,6 @@ from lagjax.sweeps.blocks import Filling, compare_versions, groups_of_blocks, ne
 from lagjax.sweeps.fingerprint import check_file_names, shapes_of
 from lagjax.sweeps.labels import labels_of
 from lagjax.sweeps.lanes import LAYOUTS, not_run
-from lagjax.sweeps.memory import check_memory
 from lagjax.sweeps.result import Stored, Sweep, of_store
 from lagjax.sweeps.running import CHUNKS_EACH, Engine, chunk_length, usable_cores
 from lagjax.sweeps.store import chunk_of, open_store, warn_of_damage
@@ -25,6 +24,8 @@ from lagjax.sweeps.store import chunk_of, open_store, warn_of_damage
 # Points per call of the compiled program. On a CPU a call costs 0.2 ms, and larger chunks gain nothing; a GPU needs
 # more to be fully used.
 CHUNK = {"cpu": 1024, "gpu": 65536}
+# The largest part of the free memory that a sweep may use.
+FILL_AT_MOST = 0.8
 
 
 def sweep(
@@ -112,7 +113,7 @@ def sweep(
         labels = labels_of(grid, engine.program.values)
         check_file_names("axis", labels.axes)
         check_file_names("value", [label.name for label in labels.values.values()])
-    check_memory(grid, engine.program, workers, store, devices)
+    _check_memory(grid, engine.program, workers, store, devices)
     if store is None:
         return _in_memory(engine, np.arange(grid.size), None)
     return _in_store(engine, grid, Path(store), part, accept_versions)
@@ -229,6 +230,36 @@ def _check(layout, part, store):
             f"this is process {k} of {n}, and without a store its points would be lost.\n"
             'Fix: store="a directory that all processes can reach".'
         )
+
+
+def _check_memory(axes, program, workers, store, devices):
+    """Raise `MemoryError` if the values would not fit."""
+    on_host, free = devices[0].platform == "cpu", _free_memory()
+    device_limit = None if on_host else (devices[0].memory_stats() or {}).get("bytes_limit")
+    if device_limit is not None and workers * program.working > device_limit:
+        raise MemoryError(
+            f"a chunk of {program.chunk:,} points needs {program.working / 1e9:.3g} GB on each device, and "
+            f"{workers} at a time do not fit into its {device_limit / 1e9:.3g} GB.\nFix: chunk={program.chunk // 4}."
+        )
+    kept = 0 if store is not None else axes.size * program.bytes_of_point
+    needed = kept + (workers * program.working if on_host else 0)
+    if free is not None and needed > FILL_AT_MOST * free:
+        raise MemoryError(
+            f"this sweep needs {needed / 1e9:.3g} GB: {axes.size:,} points of {program.bytes_of_point:,} bytes, and "
+            f"{workers} x {program.working / 1e9:.2g} GB of working memory. {free / 1e9:.3g} GB are free.\n"
+            "Usual cause: run returns whole trajectories, or a grid with one axis too many.\n"
+            'Fix: return less per point (a final state, a period), or store="directory"; or a smaller chunk=.'
+        )
+
+
+def _free_memory():
+    """The bytes available without swapping; None if the system does not report them."""
+    try:
+        lines = Path("/proc/meminfo").read_text().splitlines()
+    except OSError:
+        return None
+    fields = {line.split(":")[0]: int(line.split()[1]) * 1024 for line in lines}
+    return fields.get("MemAvailable")
 
 
 def _tell_interrupted(done, total, then):

@@ -11,11 +11,10 @@ from jaxtyping import PyTree
 
 from lagjax.mechanics.printable import printable
 from lagjax.sweeps.axes import Axes
-from lagjax.sweeps.digests import digest
-from lagjax.sweeps.lanes import Program
+from lagjax.sweeps.lanes import Program, digest
 
 # Stores of other formats are not read.
-FORMAT = 3
+FORMAT = 4
 ANOTHER_FUNCTION = "run is another function"
 # Names reserved by zarr or by a store.
 RESERVED = ("", ".", "..", "zarr.json", "lagjax")

@@ -4,6 +4,9 @@ Lanes run together under `vmap`, each with its own steps; on a CPU `integrate` t
 one after the other, which is slower in nearly all measurements (`benchmarks/sweep.py`) and needs the least memory.
 """
 
+import hashlib
+import math
+import re
 import threading
 from collections.abc import Callable, Sequence
 from contextlib import contextmanager
@@ -13,18 +16,18 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jax.sharding import Mesh, NamedSharding, PartitionSpec, SingleDeviceSharding
 from jaxtyping import PyTree
 
 from lagjax.jax_internals.one_by_one import one_by_one
-from lagjax.jax_internals.programs import ClosedJaxpr
+from lagjax.jax_internals.programs import ClosedJaxpr, bodies
 from lagjax.jax_internals.tracing import REGULAR_FIRST
 from lagjax.mechanics.in_words import Call, check_arguments, in_words
 from lagjax.motion.reported import PATIENCE, reporting, watched
 from lagjax.motion.results import ENDED_WELL, RESULTS
 from lagjax.motion.trajectory import Trajectory
 from lagjax.sweeps.axes import POINT, Axes
-from lagjax.sweeps.digests import program_digest
 
 NOT_RUN, LOST = -1, -2
 LAYOUTS = ("vmap", "map")
@@ -65,6 +68,12 @@ class Program(NamedTuple):
     digest: str
     irregular: threading.Event
     settles: bool
+
+    @property
+    def bytes_of_point(self) -> int:
+        """The bytes of one point's values and status."""
+        of_status = sum(dtype.itemsize for dtype in STATUS_TYPES)
+        return of_status + sum(math.prod(x.shape) * x.dtype.itemsize for x in jax.tree.leaves(self.values))
 
 
 def point_of(run: Callable) -> Callable:
@@ -164,3 +173,34 @@ def not_run(program: Program, count: int) -> tuple[PyTree, Status]:
     values = jax.tree.map(lambda x: np.full((count, *x.shape), empty(x), x.dtype), program.values)
     fills = (NOT_RUN, 0, np.nan, np.nan)
     return values, Status(*(np.full(count, fill, dtype) for fill, dtype in zip(fills, STATUS_TYPES)))
+
+
+def digest(data: bytes) -> str:
+    """The first 64 bits of a SHA-256 hash, as text."""
+    return hashlib.sha256(data).hexdigest()[:16]
+
+
+def program_digest(closed: ClosedJaxpr) -> str:
+    """A digest of what a program computes."""
+    return digest(_text(closed).encode())
+
+
+def _text(closed):
+    # Memory addresses are removed; the constants of nested programs are added.
+    constants = "".join(digest(_data(x)) for x in closed.consts if not isinstance(x, Tracer))
+    return re.sub(r"0x[0-9a-f]+", "", str(closed.jaxpr)) + constants + "".join(_constants(closed.jaxpr))
+
+
+def _constants(jaxpr):
+    for equation in jaxpr.eqns:
+        for value in equation.params.values():
+            for part in value if isinstance(value, (tuple, list)) else (value,):
+                if isinstance(part, ClosedJaxpr):
+                    yield from (digest(_data(x)) for x in part.consts)
+        for body in bodies(equation):
+            yield from _constants(body)
+
+
+def _data(x):
+    is_key = jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
+    return np.asarray(jax.random.key_data(x) if is_key else x).tobytes()

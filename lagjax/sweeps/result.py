@@ -18,13 +18,14 @@ from lagjax.motion.trajectory import Trajectory
 from lagjax.pages import Page
 from lagjax.sweeps import structures, tables
 from lagjax.sweeps.axes import POINT, Axes
+from lagjax.sweeps.chunks import nothing
 from lagjax.sweeps.fingerprint import in_words as versions_in_words
 from lagjax.sweeps.fingerprint import named_leaves, versions
 from lagjax.sweeps.labels import words_of
 from lagjax.sweeps.lanes import LOST, TRUSTED, Status
 from lagjax.sweeps.metadata import damaged
 from lagjax.sweeps.page import MOST_MEGABYTES, page_of
-from lagjax.sweeps.store import Store, nothing, warn_of_damage
+from lagjax.sweeps.store import Store, warn_of_damage
 
 RESTORED = "Fix: lj.sweep(run, axes, store=path), which restores it."
 COMPUTED_AGAIN = (

@@ -1,11 +1,11 @@
-"""A sweep on disk: a zarr group that xarray reads directly, written block by block; complete blocks are marked.
+"""A sweep on disk: a group of zarr that xarray reads directly, written block by block; complete blocks are marked.
 
     NAME                (*axes,) + a point's shape: values by `labels`, result, steps, scaled_error, residual; the axes
     lagjax              the description of the store, and
     lagjax/values/NAME  the arrays of trajectories without a label: their ends, statistics, parameters
     lagjax/marks        (blocks, arrays, 2): the length and checksum of each file of a block; written last
 
-A block is a box of the grid with consecutive flat indices (`grids`). A block that is not marked is computed again, even
+A block is a box of the grid with consecutive flat indices (`axes`). A block that is not marked is computed again, even
 if parts of it were written. Zarr reads a missing file as a block of fill values, so the marks must record which files
 belong there. Files are compared with their marks in two ways:
 
@@ -13,8 +13,8 @@ belong there. Files are compared with their marks in two ways:
   bytes per file, and detects files that are missing, cut off, or of another block;
 - a full check when a sweep continues, of this process's part: each file is read and its checksum (crc32c) computed.
 
-Any other damage is detected when values are read. They are read without zarr (`chunks`), and nothing is read or written
-outside of the store, whatever its description says (`described`); opening a store writes nothing.
+Any other damage is detected when values are read. Files are read and written without zarr (`chunks`), and nothing
+outside of the store is, whatever its description says (`metadata`); opening a store writes nothing.
 
 Needs zarr (`pip install "lagjax[data]"`). A transactional store made for object stores (icechunk 1.1) was tried: of 64
 blocks that 8 processes had committed on a file system, 16 were lost, as its documentation warns.
@@ -24,21 +24,36 @@ import math
 import os
 import warnings
 from collections.abc import Callable, Iterable
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
 
-from lagjax.sweeps.axes import Axes
-from lagjax.sweeps.chunks import CHECKSUM, UNREADABLE, as_number, checksum_of, content_size, read_array, read_chunk
-from lagjax.sweeps.described import MARKS, Described, Spec, check_files, check_room
+from lagjax.sweeps.axes import Axes, Blocks
+from lagjax.sweeps.chunks import (
+    CHECKSUM,
+    UNREADABLE,
+    Spec,
+    as_number,
+    chunk_file,
+    nothing,
+    read_bytes,
+    read_chunk,
+    write_chunk,
+)
 from lagjax.sweeps.fingerprint import ANOTHER_FUNCTION, differences, fingerprint, named_leaves, of_axis
-from lagjax.sweeps.grids import Blocks
 from lagjax.sweeps.labels import flags
 from lagjax.sweeps.lanes import LOST, NOT_RUN, Program, Status
-from lagjax.sweeps.metadata import about, create, import_zarr, remove_leftovers, restore
+from lagjax.sweeps.metadata import (
+    MARKS,
+    check_files,
+    check_room,
+    create,
+    description_at,
+    remove_leftovers,
+    restore,
+)
 
 # The largest number of files that a message names.
 SHOWN = 5
@@ -54,27 +69,17 @@ class Store:
     def __init__(self, path: str | os.PathLike, of_own_sweep: bool = False):
         self.path = Path(path)
         size = check_files(self.path) if self.path.is_dir() else 0
-        self.about: dict[str, Any] = about(self.path)
-        described: Described = self.about["checked"]
-        places = self.about["places"]
+        self.about: dict[str, Any]
+        self.about, described = description_at(self.path)
         if not of_own_sweep:
-            check_room(self.path, described, places, size)
-        self.blocks, self._specs = described.blocks, described.arrays
+            check_room(self.path, described, size)
+        self._specs, self.blocks = described
         # The array of each leaf of the values, and of each field of the status.
+        places = self.about["places"]
         self._values: dict[str, str] = {name: places["values"][name] for name in self.about["fingerprint"]["values"]}
         self._status: dict[str, str] = {name: places["status"][name] for name in Status._fields}
         names = *self._values.values(), *self._status.values()
         self.arrays: dict[str, Spec] = {name: self._specs[name] for name in names}
-
-    @cached_property
-    def _in_zarr(self) -> Any:
-        """The group that writes. Call `metadata.restore` first, so that its metadata are intact."""
-        return import_zarr().open_group(str(self.path), mode="r+", use_consolidated=False)
-
-    def _write_to(self, name, where, x):
-        # Blocks that contain only fill values are written to files as well.
-        with import_zarr().config.set({"array.write_empty_chunks": True}):
-            self._in_zarr[name][where] = x
 
     @property
     def size(self) -> int:
@@ -103,17 +108,21 @@ class Store:
 
     def write(self, number: int, values, status: Status):
         """Write a block, and then mark it."""
-        here = self.blocks.region(number)
-        shape = tuple(x.stop - x.start for x in here)
+        shape = tuple(x.stop - x.start for x in self.blocks.region(number))
         flat = [x for _, x in named_leaves(values)] + list(status)
-        for name, x in zip(self.arrays, flat):
-            self._write_to(name, here, x.reshape(shape + x.shape[1:]))
-        self._write_to(MARKS, number, [_mark(self._file(name, number)) for name in self.arrays])
+        marks = [
+            write_chunk(self._file(name, number), spec, x.reshape(shape + x.shape[1:]))
+            for (name, spec), x in zip(self.arrays.items(), flat)
+        ]
+        self._mark(number, marks)
+
+    def _mark(self, number, marks):
+        write_chunk(self._file(MARKS, number), self._specs[MARKS], np.asarray([marks], np.uint64))
 
     def unmark(self, numbers: Iterable[int]):
         """Mark some blocks as not written."""
         for number in numbers:
-            self._write_to(MARKS, number, 0)
+            self._mark(number, np.zeros((len(self.arrays), 2)))
 
     def damage(self, numbers: Iterable[int], read: bool, marks=None) -> dict[int, str]:
         """The damage of some blocks: by the block's number, the file and what is wrong with it.
@@ -144,10 +153,10 @@ class Store:
 
     def _block(self, name, number):
         """The numbers of a block, in the shape of its region."""
-        spec, here, file = self.arrays[name], self.blocks.region(number), self._file(name, number)
+        spec, here = self.arrays[name], self.blocks.region(number)
         shape = *(x.stop - x.start for x in here), *spec.shape[len(here) :]
-        # Zarr fills blocks at the end of an axis up to their whole shape.
-        return np.zeros(shape, spec.dtype) if file is None else read_chunk(file, spec)[tuple(map(slice, shape))]
+        # Blocks at the end of an axis are filled up to their whole shape.
+        return read_chunk(self._file(name, number), spec)[tuple(map(slice, shape))]
 
     def _damage(self, number, mark, read):
         for name, (length, checksum) in zip(self.arrays, mark.tolist()):
@@ -157,29 +166,26 @@ class Store:
             try:
                 with open(file, "rb") as content:
                     stored = os.fstat(content.fileno()).st_size
-                    if stored != length:
-                        yield f"{file} has {stored:,} bytes of {length:,}"
-                        continue
-                    if not read:
-                        content.seek(-CHECKSUM, os.SEEK_END)
-                    data = content.read()
+                    content.seek(max(0, stored - CHECKSUM))
+                    end = as_number(content.read())
+                if stored == length and read:
+                    read_bytes(file, self.arrays[name])
             except FileNotFoundError:
                 yield f"{file} is missing"
             except OSError as error:
                 yield f"{file} cannot be read ({error.strerror})"
+            except UNREADABLE:
+                yield f"{file} is not as it was written"
             else:
-                if as_number(data[-CHECKSUM:]) != checksum or read and checksum_of(data[:-CHECKSUM]) != checksum:
+                if stored != length:
+                    yield f"{file} has {stored:,} bytes of {length:,}"
+                elif end != checksum:
                     yield f"{file} is not as it was written"
-                elif read and content_size(data) != self.arrays[name].chunk_bytes:
-                    yield f"{file} does not hold the numbers of its block"
 
     def _file(self, name, number):
         """The file of a block; None for an empty array."""
-        if name == MARKS:
-            return self.path / MARKS / "c" / str(number) / "0" / "0"
-        shape, place = self.arrays[name].shape, self.blocks.place(number)
-        inner = "0" * (len(shape) - len(place))
-        return None if math.prod(shape) == 0 else self.path.joinpath(name, "c", *map(str, place), *inner)
+        place = (number,) if name == MARKS else self.blocks.place(number)
+        return chunk_file(self.path / name, self._specs[name], place)
 
     def axes(self) -> Axes:
         """The axes.
@@ -191,9 +197,9 @@ class Store:
 
     def _axis(self, name):
         place = self.about["places"]["axes"][name]
-        folder = self.path / place
+        folder, spec = self.path / place, self._specs[place]
         try:
-            x = read_array(folder, self._specs[place])
+            x = read_chunk(chunk_file(folder, spec), spec)[tuple(map(slice, spec.shape))]
         except UNREADABLE:
             x = None
         if x is None or of_axis(x) != self.about["fingerprint"]["axes"][name]:
@@ -212,7 +218,7 @@ class Store:
                 self._axis(name)
             except ValueError:
                 place = self.about["places"]["axes"][name]
-                self._write_to(place, ..., x)
+                write_chunk(chunk_file(self.path / place, self._specs[place]), self._specs[place], x)
                 damaged.append(f"{self.path / place} was damaged")
         return damaged
 
@@ -221,26 +227,29 @@ class Store:
 
         Values are (points, ...), in the structure of `like` or in a dictionary by name; NaN or 0 in missing blocks.
         """
-        named, (missing, lost) = {}, self._quick_check()
-        lost = {number: wrong for number, wrong in lost.items() if number not in missing}
-        for name, place in self._values.items():
-            named[name], unreadable = self._read(place, missing)
-            lost.update({number: f"{self._file(place, number)} is damaged" for number in unreadable})
+        named, _, lost = self._read(self._values)
         if like is not None:
             named = jax.tree.unflatten(jax.tree.structure(like), [named[name] for name, _ in named_leaves(like)])
         return named, lost
 
-    def _read(self, name, missing):
-        """(an array as (points, ...) with nothing in missing blocks, the numbers of the blocks that cannot be read)."""
-        spec, unreadable = self.arrays[name], []
-        found = np.full(spec.shape, nothing(spec.dtype), spec.dtype)
-        for number in range(len(self.blocks)):
-            if number not in missing:
+    def _read(self, places):
+        """(the arrays at some places, each (points, ...); the unmarked blocks; the lost blocks with what is wrong).
+
+        Arrays have nothing in blocks that are unmarked or cannot be read.
+        """
+        marks, unreadable = self._marks()
+        missing = set(self._missing(marks).tolist()) - set(unreadable)
+        arrays, lost = {}, self.damage(range(len(self.blocks)), False, (marks, unreadable))
+        for name, place in places.items():
+            spec = self.arrays[place]
+            found = np.full(spec.shape, nothing(spec.dtype), spec.dtype)
+            for number in set(range(len(self.blocks))) - missing:
                 try:
-                    found[self.blocks.region(number)] = self._block(name, number)
+                    found[self.blocks.region(number)] = self._block(place, number)
                 except UNREADABLE:
-                    unreadable.append(number)
-        return found.reshape(self.size, *spec.shape[len(self.blocks.shape) :]), unreadable
+                    lost.setdefault(number, f"{self._file(place, number)} is damaged")
+            arrays[name] = found.reshape(self.size, *spec.shape[len(self.blocks.shape) :])
+        return arrays, missing, lost
 
     def one(self) -> dict[str, jax.ShapeDtypeStruct]:
         """The shapes of one point's values by name, without reading any values."""
@@ -249,13 +258,9 @@ class Store:
 
     def status(self) -> tuple[Status, set[int], dict[int, str]]:
         """(the statuses of all points, the unmarked blocks, the lost blocks with what is wrong)."""
-        status, (missing, lost) = [], self._quick_check()
-        lost = {number: wrong for number, wrong in lost.items() if number not in missing}
-        for place in self._status.values():
-            x, unreadable = self._read(place, missing)
-            status.append(x)
-            lost.update({number: f"{self._file(place, number)} is damaged" for number in unreadable})
-        if unknown := sorted({*np.unique(status[0]).tolist()} - {*flags()["flag_values"]}):
+        found, missing, lost = self._read(self._status)
+        status = Status(**found)
+        if unknown := sorted({*np.unique(status.result).tolist()} - {*flags()["flag_values"]}):
             raise ValueError(
                 f"{self.path} has results with the number {unknown[0]}, which this version of lagjax does not know.\n"
                 "Fix: pip install -U lagjax."
@@ -264,13 +269,7 @@ class Store:
             for number in numbers:
                 for x, fill in zip(status, (code, 0, np.nan, np.nan)):
                     x[self.blocks.points(number)] = fill
-        return Status(*status), missing, lost
-
-    def _quick_check(self):
-        """(the unmarked blocks, the lost blocks with what is wrong), by a quick check."""
-        marks, unreadable = self._marks()
-        lost = self.damage(range(len(self.blocks)), False, (marks, unreadable))
-        return set(self._missing(marks).tolist()) - set(unreadable), lost
+        return status, missing, lost
 
 
 def warn_of_damage(path: Path, wrong: Iterable[str], then: str, stacklevel: int):
@@ -285,24 +284,9 @@ def warn_of_damage(path: Path, wrong: Iterable[str], then: str, stacklevel: int)
     )
 
 
-def nothing(dtype):
-    """The fill value of a dtype."""
-    return np.nan if np.issubdtype(dtype, np.inexact) else 0
-
-
-def _mark(file):
-    """The length of a file and the checksum at its end."""
-    if file is None:
-        return 0, 0
-    with open(file, "rb") as content:
-        length = content.seek(0, os.SEEK_END)
-        content.seek(-CHECKSUM, os.SEEK_END)
-        return length, as_number(content.read())
-
-
 def chunk_of(path: str | os.PathLike) -> int:
     """The chunk length that a store was begun with."""
-    return about(Path(path))["fingerprint"]["chunk"]
+    return description_at(Path(path))[0]["fingerprint"]["chunk"]
 
 
 def open_store(

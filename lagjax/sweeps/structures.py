@@ -69,8 +69,7 @@ def tree_of(description: dict[str, Any], system: Any, path: Any, table: Table) -
     """
     if system is not None:
         check_is_system(system)
-    arrays, motions = dict(description["arrays"]), dict(enumerate(description["trajectories"]))
-    mismatches, matching = [], []
+    arrays, motions, mismatches, matching = {}, {}, [], []
 
     def marked_value(role):
         kind, _, number = role.partition(" ")
@@ -92,6 +91,8 @@ def tree_of(description: dict[str, Any], system: Any, path: Any, table: Table) -
 
     reader = Reader(lambda name: _from_json(arrays.pop(name)), marked_value, table)
     try:
+        arrays.update(description["arrays"])
+        motions.update(enumerate(description["trajectories"]))
         tree = reader.up(description["tree"])
     except MALFORMED as error:
         raise ValueError(f"its structure is not one that lagjax writes ({type(error).__name__}).") from error

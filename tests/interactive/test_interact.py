@@ -182,7 +182,7 @@ def test_shows_itself(waves, tmp_path):
     assert repr(waves).startswith("Knobs: omega = 3 (0 to 8)\n  in a notebook these are sliders; here: knobs.set(")
     waves.save(tmp_path / "picture.png")
     assert (tmp_path / "picture.png").read_bytes() == waves.picture
-    assert [type(x).__name__ for x in waves.widget.children] == ["FloatSlider", "GridBox", "HTML"]
+    assert [type(x).__name__ for x in waves.widget.children] == ["FloatSlider", "HTML", "HTML"]
 
 
 def test_where_knobs_stand_at_first():
