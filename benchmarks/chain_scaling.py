@@ -26,9 +26,9 @@ import numpy as np  # noqa: E402
 from measure import compiled, in_turn, main, row  # noqa: E402
 
 import lagjax as lj  # noqa: E402
-from lagjax.mechanics.coordinates import state  # noqa: E402
 from lagjax.mechanics.equations import equations_of  # noqa: E402
-from lagjax.mechanics.model import model_of
+from lagjax.system.coordinates import state  # noqa: E402
+from lagjax.system.model import model_of
 
 jax.config.update("jax_enable_x64", True)
 

@@ -33,14 +33,14 @@ import numpy as np
 from measure import main, row
 
 import lagjax as lj
-from lagjax.mechanics.model import Model
+from lagjax.system.model import Model
 
 jax.config.update("jax_enable_x64", True)
 
 ROOT = Path(lj.__file__).parent
 FILES = {path.relative_to(ROOT): path.read_text() for path in sorted(ROOT.rglob("*.py"))}
 TREES = {path: ast.parse(source) for path, source in FILES.items()}
-FLOORS = ("jax_internals", "numerics", "mechanics", "jumps", "motion", "analysis", "fitting", "sweeps")
+FLOORS = ("jaxtools", "numerics", "system", "mechanics", "integrate", "analysis", "fit", "sweep")
 STATE = ["system", "t", "q", "v", "params"]
 SHORT = 60
 FUNCTIONS = ast.FunctionDef | ast.AsyncFunctionDef

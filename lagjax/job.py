@@ -22,10 +22,11 @@ from typing import Any, NamedTuple
 import diffrax
 import jax
 
-from lagjax import plot, report, stability
-from lagjax.numerics.runge_kutta import Dopri8
+from lagjax import report, stability
+from lagjax.display import plots
+from lagjax.numerics.methods.runge_kutta import Dopri8
 from lagjax.scenes import SCENES
-from lagjax.sweeps.running import usable_cores
+from lagjax.sweep.scheduler import usable_cores
 
 STABILITY = "stability"
 
@@ -181,14 +182,14 @@ def _run_scene(scene, quick):
 def _draw(scene, found, folder, with_picture):
     _progress(f"{scene.name}: pictures")
     try:
-        plot.import_matplotlib()
+        plots.import_matplotlib()
     except ImportError as error:
         print(f"no pictures: {error}", file=sys.stderr)
         return
     panels = [of_run.against_time(run.name) for run, of_run in found if run.drawn]
     # Run times of motions shorter than a call, or without an error, are not drawn.
     if panels:
-        plot.work_precision(panels).savefig(folder / f"{scene.name}_work_precision.png")
+        plots.work_precision(panels).savefig(folder / f"{scene.name}_work_precision.png")
     if with_picture:
         scene.picture().savefig(folder / f"{scene.name}.png")
 

@@ -11,7 +11,7 @@ import numpy as np
 from google_crc32c import value as crc32c
 from numcodecs.zstd import Zstd
 
-from lagjax.sweeps.metadata import digest_of
+from lagjax.sweep.metadata import digest_of
 
 # What takes the place of a part of a description.
 CODE = {"function": {"module": "os", "name": "system"}}

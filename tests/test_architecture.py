@@ -1,4 +1,4 @@
-"""The architecture: layers, cycles, file sizes, docstrings, exports."""
+"""The architecture: rooms, cycles, file sizes, docstrings, exports."""
 
 import ast
 import doctest
@@ -13,27 +13,11 @@ import lagjax
 
 ROOT = Path(lagjax.__file__).parent
 FILES = sorted(ROOT.rglob("*.py"))
-# From the ground up: a module imports only from its own layer or from those before it.
-LAYERS = (
-    *(
-        "jax_internals",
-        "numerics",
-        "mechanics",
-        "jumps",
-        "learned",
-        "plot",
-        "pages",
-        "animation",
-        "meter",
-        "motion",
-        "exchange",
-        "analysis",
-        "comparison",
-        "sweeps",
-        "interactive",
-    ),
-    *("fitting", "report", "mechanisms", "scenes", "stability"),
-)
+# From the ground up: a module imports only from its own room or from those before it.
+ROOMS = (
+    "jaxtools", "numerics", "display", "files", "system", "mechanics", "learned", "integrate", "exchange", "analysis",
+    "work_precision", "sweep", "sliders", "fit", "report", "mechanisms", "scenes", "stability",
+)  # fmt: skip
 TOP = {"__init__", "__main__", "job"}
 FINDER = doctest.DocTestFinder()
 PRIVATE = ("jax._src", "jax.experimental", "jax.extend", "jax.interpreters", "jaxlib")
@@ -41,8 +25,8 @@ OPTIONAL = {"PIL", "google_crc32c", "ipywidgets", "matplotlib", "numcodecs", "pa
 OPTIONAL |= {"zarr"}
 
 
-def layer(module):
-    """The layer of a dotted module name, `lagjax.motion.solve` -> "motion"."""
+def room(module):
+    """The room of a dotted module name, `lagjax.integrate.solve.programs` -> "integrate"."""
     parts = module.split(".")
     return parts[1] if len(parts) > 1 else "__init__"
 
@@ -68,11 +52,11 @@ def internal_imports(source):
 
 
 def upward_imports(name, source):
-    """The imports of a module from higher layers."""
-    if layer(name) in TOP:
+    """The imports of a module from higher rooms."""
+    if room(name) in TOP:
         return []
-    rank = LAYERS.index(layer(name))
-    return [target for target in internal_imports(source) if layer(target) in TOP or LAYERS.index(layer(target)) > rank]
+    rank = ROOMS.index(room(name))
+    return [target for target in internal_imports(source) if room(target) in TOP or ROOMS.index(room(target)) > rank]
 
 
 def nested_imports(source):
@@ -88,7 +72,7 @@ def nested_imports(source):
 
 
 def test_imports_point_down():
-    """No module imports from a layer above its own, and none imports inside a function."""
+    """No module imports from a room above its own, and none imports inside a function."""
     for path in FILES:
         source = path.read_text()
         assert upward_imports(module_name(path), source) == [], module_name(path)
@@ -97,8 +81,8 @@ def test_imports_point_down():
 
 def test_the_import_checks_can_fail():
     """Twin: an upward import and an import inside a function are found."""
-    assert upward_imports("lagjax.mechanics.system", "from lagjax.motion import integrate") != []
-    assert upward_imports("lagjax.mechanics.system", "import lagjax") != []
+    assert upward_imports("lagjax.system.system", "from lagjax.integrate import integrate") != []
+    assert upward_imports("lagjax.system.system", "import lagjax") != []
     assert nested_imports("def f():\n    import numpy") == ["numpy"]
 
 
@@ -114,9 +98,9 @@ def private_imports(source):
 
 
 def test_private_modules_stay_in_one_package():
-    """Only `lagjax.jax_internals` imports undocumented modules of JAX and XLA."""
+    """Only `lagjax.jaxtools` imports undocumented modules of JAX and XLA."""
     for path in FILES:
-        if layer(module_name(path)) != "jax_internals":
+        if room(module_name(path)) != "jaxtools":
             assert private_imports(path.read_text()) == [], path
 
 

@@ -19,8 +19,9 @@ import numpy as np
 import pytest
 
 import lagjax as lj
-from lagjax.mechanics import file_table, files, written_trees
-from lagjax.sweeps import chunks, fingerprint, metadata, result, store
+from lagjax.files import npz, tree_json
+from lagjax.files import table as file_table
+from lagjax.sweep import chunks, fingerprint, metadata, result, store
 from tests import mutated
 from tests.mutated import describe, mutated_file, mutated_store
 
@@ -209,9 +210,9 @@ def test_the_table():
 def test_a_network_comes_back(good, tmp_path):
     """Layers with their activations come back, and a field of another kind is refused."""
     net = lj.learned.Network({"x": 1.0}, key=jax.random.key(0), width=4, activation=jax.nn.softplus)
-    writer = written_trees.Writer()
+    writer = tree_json.Writer()
     node = writer.down(net, "net")
-    again = written_trees.Reader(dict(writer.arrays).pop).up(node)
+    again = tree_json.Reader(dict(writer.arrays).pop).up(node)
     assert eqx.tree_equal(net, again) and again({"x": 0.3}) == net({"x": 0.3})
     for field, value in (
         ("sizes", "wide"),
@@ -222,7 +223,7 @@ def test_a_network_comes_back(good, tmp_path):
     ):
         wrong = node | {"fields": node["fields"] | {field: value}}  # pyright: ignore
         with pytest.raises(ValueError, match=f"field {field}"):
-            written_trees.Reader(dict(writer.arrays).pop).up(wrong)
+            tree_json.Reader(dict(writer.arrays).pop).up(wrong)
 
 
 def changed(good, path, change):
@@ -303,7 +304,7 @@ def test_bombs_of_a_kilobyte(good, tmp_path, monkeypatch):
         assert wrong == [] and isinstance(found, ValueError)
         if name == "deflated":
             with monkeypatch.context() as patch:
-                patch.setattr(files, "_entries", lambda entries, path: {x.filename: x for x in entries.infolist()})
+                patch.setattr(npz, "_entries", lambda entries, path: {x.filename: x for x in entries.infolist()})
                 assert any(line.startswith("took ") for line in attack()[0])
 
 

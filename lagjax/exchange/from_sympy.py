@@ -14,10 +14,10 @@ from importlib import import_module
 from typing import Any
 
 from lagjax.exchange.sympy_source import NotInJax, SymPyFunction, function_of, sympy_itself
-from lagjax.mechanics.arguments import OF_POSITION, OF_STATE
-from lagjax.mechanics.constraints import Holonomic, Nonholonomic
 from lagjax.mechanics.diagnosis import listed
-from lagjax.mechanics.system import System
+from lagjax.system.constraints import Holonomic, Nonholonomic
+from lagjax.system.function_arguments import OF_POSITION, OF_STATE
+from lagjax.system.system import System
 
 
 def from_sympy(

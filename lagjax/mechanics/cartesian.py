@@ -11,7 +11,7 @@ from typing import NamedTuple
 import jax.tree_util as jtu
 import numpy as np
 
-from lagjax.mechanics import coordinates
+from lagjax.system import coordinates
 
 AXES = "xyz"
 NAMES = re.compile(r"(?P<before>(?:.*\.)?(?:\w+_)?)(?P<axis>[xyzXYZ])(?P<after>\d*|_\w+)")

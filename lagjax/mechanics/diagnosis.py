@@ -5,9 +5,9 @@ Everything here looks at values, and so runs outside compiled programs.
 
 import numpy as np
 
-from lagjax.mechanics import constraints, coordinates
 from lagjax.mechanics.equations import equations_of
 from lagjax.mechanics.saddle_point import SINGULAR_BELOW, Examined, combinations, examined
+from lagjax.system import constraints, coordinates
 
 # A row counts as part of a combination if it makes up more than this share of it.
 SHARE = 1e-6

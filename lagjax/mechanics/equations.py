@@ -3,7 +3,7 @@
 There are three ways. The robust way works in arrays: one matrix (`saddle_point.py`), or a band where the system is
 large and its parts touch few others (`sparse_saddle_point.py`). It exchanges rows, leaves dependent constraints out and
 says what is wrong. The fast way is for small systems: their equations are also written out number by number
-(`written_out.py`), which is many times as fast, and gives NaN where it fails.
+(`scalar_equations.py`), which is many times as fast, and gives NaN where it fails.
 
 A caller has an `Equations` and does not choose between them.
 """
@@ -18,19 +18,19 @@ import jax.tree_util as jtu
 from jax import lax
 from jaxtyping import Array, Bool, Float, PyTree
 
-from lagjax.jax_internals.one_by_one import jitted
-from lagjax.jax_internals.one_function import kept_as_call
-from lagjax.jax_internals.tracing import WATCHED
-from lagjax.mechanics import coordinates
-from lagjax.mechanics.compiled import compiled
-from lagjax.mechanics.in_numbers import in_numbers
-from lagjax.mechanics.model import Form, Model
+from lagjax.jaxtools.compiled import compiled
+from lagjax.jaxtools.fuse_cpu import kept_as_call
+from lagjax.jaxtools.tracing import WATCHED
+from lagjax.jaxtools.without_lapack_batches import jitted
+from lagjax.mechanics.regularity import Verdict
 from lagjax.mechanics.saddle_point import Dense, is_regular
+from lagjax.mechanics.scalar_equations import UP_TO, WrittenOut, has_networks, is_small, write_out
+from lagjax.mechanics.scalar_form import in_numbers
 from lagjax.mechanics.sparse_plan import plan
 from lagjax.mechanics.sparse_saddle_point import Banded
 from lagjax.mechanics.structure import is_diagonal
-from lagjax.mechanics.verdict import Verdict
-from lagjax.mechanics.written_out import UP_TO, WrittenOut, has_networks, is_small, write_out
+from lagjax.system import coordinates
+from lagjax.system.model import Form, Model
 
 
 class Equations(eqx.Module):

@@ -11,13 +11,13 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 
-from lagjax.jax_internals.tracing import is_traced
-from lagjax.mechanics import coordinates
-from lagjax.mechanics.arguments import OF_POSITION
+from lagjax.jaxtools.cache import shape_of
+from lagjax.jaxtools.tracing import is_traced
 from lagjax.mechanics.cartesian import AXES, leaf_names, points
 from lagjax.mechanics.diagnosis import listed
-from lagjax.mechanics.in_words import Call, check_arguments, in_words
-from lagjax.mechanics.memory import shape_of
+from lagjax.system import coordinates
+from lagjax.system.function_arguments import OF_POSITION
+from lagjax.system.user_errors import Call, check_arguments, in_words
 
 
 class Generator(eqx.Module):

@@ -17,9 +17,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
-from lagjax.mechanics.compiled import compiled
-from lagjax.mechanics.first_call import prepare
-from lagjax.mechanics.reactions import response
+from lagjax.jaxtools.compiled import compiled
+from lagjax.mechanics.multiplier_forces import response
+from lagjax.system.check_functions import prepare
 
 
 class LinearEquation(NamedTuple):

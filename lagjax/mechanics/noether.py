@@ -24,15 +24,15 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from lagjax.mechanics import constraints, coordinates
-from lagjax.mechanics.compiled import compiled
-from lagjax.mechanics.first_call import traced_system
+from lagjax.jaxtools.compiled import compiled
+from lagjax.mechanics.accelerations import accelerations_at
 from lagjax.mechanics.generators import Generator, as_generator
 from lagjax.mechanics.lagrangian import applied_force
-from lagjax.mechanics.model import model_of
-from lagjax.mechanics.multipliers import accelerations_at
-from lagjax.mechanics.refusals import check_system
-from lagjax.mechanics.system import System
+from lagjax.system import constraints, coordinates
+from lagjax.system.argument_checks import check_system
+from lagjax.system.check_functions import traced_system
+from lagjax.system.model import model_of
+from lagjax.system.system import System
 
 
 class NoetherCharge(eqx.Module):

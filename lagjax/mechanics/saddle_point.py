@@ -34,14 +34,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
-from lagjax.mechanics import constraints
-from lagjax.mechanics.compiled import compiled
-from lagjax.mechanics.coordinates import State
+from lagjax.jaxtools.compiled import compiled
 from lagjax.mechanics.lagrangian import LinearEquation, mass_and_forcing
-from lagjax.mechanics.reactions import Reactions, with_reactions
-from lagjax.mechanics.verdict import Verdict, acceleration_round_off, slightly_off, vanishing
-from lagjax.numerics import dense
-from lagjax.numerics.rank import DEPENDENT_BELOW, independent_rows, unit_rows
+from lagjax.mechanics.multiplier_forces import Reactions, with_reactions
+from lagjax.mechanics.regularity import Verdict, acceleration_round_off, slightly_off, vanishing
+from lagjax.numerics.linalg import dense
+from lagjax.numerics.linalg.rank import DEPENDENT_BELOW, independent_rows, unit_rows
+from lagjax.system import constraints
+from lagjax.system.coordinates import State
 
 # Below this reciprocal condition, after scaling, the matrix counts as singular.
 SINGULAR_BELOW = {np.dtype("float64"): 1e-13, np.dtype("float32"): 1e-6}

@@ -14,10 +14,10 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Int
 
-from lagjax.mechanics import constraints
-from lagjax.mechanics.model import Model
-from lagjax.mechanics.sparsity import pattern
-from lagjax.numerics import banded, dense
+from lagjax.jaxtools.sparsity import pattern
+from lagjax.numerics.linalg import banded, dense
+from lagjax.system import constraints
+from lagjax.system.model import Model
 
 # The banded solve is faster from six unknowns on (a chain of two: 2.4 microseconds against 4.8; of twelve: 4 against
 # 24); the dense one exchanges rows, which suits any mass matrix, and is kept where little is to be gained.

@@ -3,7 +3,7 @@
     M a = F + Aᵀ λ,    A a = gamma        =>        S λ = gamma - A M⁻¹ F,    S = A M⁻¹ Aᵀ
 
 M is split into blocks that share no velocity (bodies, particles), and inverted block by block. S couples constraint
-equations that act on a common block, and is a band once they are ordered (`numerics/banded.py`). M, A and Aᵀ are
+equations that act on a common block, and is a band once they are ordered (`numerics/linalg/banded.py`). M, A and Aᵀ are
 functions, derivatives of the user's, and S is found from its products with a few coloured vectors. Which entries can
 be nonzero is read off the jaxpr (`sparse_plan.py`) and holds at every state.
 
@@ -29,11 +29,11 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from lagjax.mechanics import constraints
 from lagjax.mechanics.lagrangian import forcing_and_inertia
+from lagjax.mechanics.regularity import Verdict, acceleration_round_off, slightly_off, vanishing
 from lagjax.mechanics.sparse_plan import Plan
-from lagjax.mechanics.verdict import Verdict, acceleration_round_off, slightly_off, vanishing
-from lagjax.numerics import banded, dense
+from lagjax.numerics.linalg import banded, dense
+from lagjax.system import constraints
 
 # The sine below which a row is dependent; only its square is known, which round-off reaches sooner than in `rank.py`.
 DEPENDENT_BELOW = {np.dtype("float64"): 1e-5, np.dtype("float32"): 1e-2}

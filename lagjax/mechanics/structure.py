@@ -2,8 +2,8 @@
 
 `structure` says what the mass matrix depends on and which coordinates it couples, which coordinates are cyclic, whether
 time is explicit, whether L has terms linear in the velocities, and what is constant in the constraints. It examines
-their programs written out number by number (`in_numbers.py`): an entry that is a zero there is zero everywhere, and one
-that no chain of operations connects with a coordinate does not depend on it. Of the packages for the sparsity of
+their programs written out number by number (`scalar_form.py`): an entry that is a zero there is zero everywhere, and
+one that no chain of operations connects with a coordinate does not depend on it. Of the packages for the sparsity of
 jaxprs, asdex finds the patterns, but neither what an entry depends on nor the program without its zeros, which the
 solver runs; one pass gives all three.
 
@@ -25,17 +25,17 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import PyTree
 
-from lagjax.jax_internals.names import ADDITIVE, BILINEAR, LINEAR_IN_FIRST, PERIODIC
-from lagjax.jax_internals.programs import Literal, depends, interpreted
-from lagjax.mechanics import coordinates
-from lagjax.mechanics.in_numbers import WRITTEN, Numbers, in_numbers
+from lagjax.jaxtools.cache import varies
+from lagjax.jaxtools.jaxpr import Literal, depends, interpreted
+from lagjax.jaxtools.primitive_names import ADDITIVE, BILINEAR, LINEAR_IN_FIRST, PERIODIC
+from lagjax.jaxtools.scalarize import TooLong
 from lagjax.mechanics.lagrangian import mass_and_forcing
-from lagjax.mechanics.memory import varies
-from lagjax.mechanics.model import Model, unchecked
-from lagjax.mechanics.reactions import force_with_ones
-from lagjax.mechanics.system import System
-from lagjax.numerics import banded
-from lagjax.numerics.scalars import TooLong
+from lagjax.mechanics.multiplier_forces import force_with_ones
+from lagjax.mechanics.scalar_form import WRITTEN, Numbers, in_numbers
+from lagjax.numerics.linalg import banded
+from lagjax.system import coordinates
+from lagjax.system.model import Model, unchecked
+from lagjax.system.system import System
 
 # Coordinates and equations together; the programs of larger systems are not written out.
 UP_TO = 24

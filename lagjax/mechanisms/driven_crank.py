@@ -19,11 +19,11 @@ Source: Simeon, *Math. Modelling of Systems* 2 (1996) 1, with a rigid rod: Ω = 
 
 import numpy as np
 
-from lagjax.mechanics.constraints import Holonomic
-from lagjax.mechanics.system import System
 from lagjax.mechanisms import slider_crank
 from lagjax.mechanisms.mechanism import Mechanism
 from lagjax.mechanisms.slider_crank import Body, SliderCrankParts
+from lagjax.system.constraints import Holonomic
+from lagjax.system.system import System
 
 PARAMS = slider_crank.PARAMS | {"rate": 150.0}
 

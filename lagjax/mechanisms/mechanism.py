@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from lagjax.mechanics.system import System
+from lagjax.system.system import System
 
 
 @dataclass(frozen=True)

@@ -23,10 +23,10 @@ computational benchmark problems, A02 (N = 40 there; N = 2, as here, in OpenSim'
 import jax.numpy as jnp
 import numpy as np
 
-from lagjax.mechanics.constraints import Holonomic
-from lagjax.mechanics.system import System
 from lagjax.mechanisms.mechanism import Mechanism
 from lagjax.mechanisms.natural import rod_kinetic_energy, squared_distance
+from lagjax.system.constraints import Holonomic
+from lagjax.system.system import System
 
 PARAMS = {"m": 1.0, "l": 1.0, "g": 9.81}
 

@@ -10,7 +10,7 @@ import pytest
 import sympy
 
 import lagjax as lj
-from lagjax.analysis.latex import FORMULAS, jaxpr_to_formula, typeset, written
+from lagjax.analysis.formulations.latex import FORMULAS, jaxpr_to_formula, typeset, written
 from lagjax.scenes import cross_rails, sliding_wedge
 from tests.systems import DOUBLE_PARAMS, double_pendulum
 

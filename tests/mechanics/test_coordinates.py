@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import lagjax as lj
-from lagjax.mechanics import coordinates
+from lagjax.system import coordinates
 
 
 class Polar(NamedTuple):

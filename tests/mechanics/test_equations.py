@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 
 import lagjax as lj
-from lagjax.mechanics import coordinates, equations, sparse_plan
+from lagjax.mechanics import equations, sparse_plan
 from lagjax.mechanics.equations import equations_of
-from lagjax.mechanics.model import model_of
 from lagjax.mechanics.saddle_point import Dense
 from lagjax.mechanics.sparse_saddle_point import Banded
+from lagjax.system import coordinates
+from lagjax.system.model import model_of
 from tests.large_systems import chain
 from tests.plain import not_plain
 from tests.systems import HORIZONTAL, PARAMS, rod_pendulum

@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lagjax.jax_internals.tracing import TRACES
-from lagjax.mechanics import kept, memory_maps
-from lagjax.mechanics.compiled import compiled
+from lagjax.jaxtools import memory_maps, program_cache
+from lagjax.jaxtools.compiled import compiled
+from lagjax.jaxtools.tracing import TRACES
 from tests.counting import compiles
 from tests.plain import not_plain
 
@@ -60,27 +60,27 @@ def after_many(x):
 @not_plain
 def test_programs_are_bounded(monkeypatch):
     """Functions are released and maps freed; the twin, without a limit, keeps all."""
-    monkeypatch.setattr(kept, "_programs", kept.OrderedDict())
+    monkeypatch.setattr(program_cache, "_programs", program_cache.OrderedDict())
     there, grown_at_all = after_many(np.ones(8))
     assert there == MANY
-    monkeypatch.setattr(kept, "AT_MOST", 5)
+    monkeypatch.setattr(program_cache, "AT_MOST", 5)
     there, grown = after_many(np.ones(9))
-    assert there <= 5 >= len(kept._programs)
+    assert there <= 5 >= len(program_cache._programs)
     if memory_maps.MAPS.exists():
         assert grown_at_all > MANY / 2 and grown < grown_at_all / 3
 
 
 def test_traces_would_keep_functions(monkeypatch):
     """Twin: if only the program is dropped, JAX's traces still keep its functions."""
-    monkeypatch.setattr(kept, "AT_MOST", 5)
-    monkeypatch.setattr(kept, "forget_traces", lambda: None)
+    monkeypatch.setattr(program_cache, "AT_MOST", 5)
+    monkeypatch.setattr(program_cache, "forget_traces", lambda: None)
     assert after_many(np.ones(7))[0] == MANY
 
 
 def test_the_last_ones_stay(monkeypatch):
     """The programs used last are not compiled again after others were dropped; twin: one unused for long is."""
-    monkeypatch.setattr(kept, "_programs", kept.OrderedDict())
-    monkeypatch.setattr(kept, "AT_MOST", 5)
+    monkeypatch.setattr(program_cache, "_programs", program_cache.OrderedDict())
+    monkeypatch.setattr(program_cache, "AT_MOST", 5)
     x, functions = np.ones(10), [waves(number) for number in range(9)]
     for function in functions:
         called(functions[0], x)
@@ -96,15 +96,17 @@ def test_the_last_ones_stay(monkeypatch):
 
 def test_scarce_maps_drop_more(monkeypatch):
     """Half of many programs are dropped; the last few stay even then."""
-    monkeypatch.setattr(kept, "_programs", kept.OrderedDict((number, object()) for number in range(100)))
-    monkeypatch.setattr(kept, "share_used", lambda: 0.9)
+    monkeypatch.setattr(
+        program_cache, "_programs", program_cache.OrderedDict((number, object()) for number in range(100))
+    )
+    monkeypatch.setattr(program_cache, "share_used", lambda: 0.9)
     counts = []
     for number in range(100, 105):
-        assert kept.kept(number, lambda number=number: number) == number
-        counts.append(len(kept._programs))
-    assert counts == [51, 26, 14, 9, 9] and [*kept._programs][-5:] == [100, 101, 102, 103, 104]
-    monkeypatch.setattr(kept, "share_used", lambda: 0.1)
-    assert kept.kept("another", object) and len(kept._programs) == counts[-1] + 1
+        assert program_cache.kept(number, lambda number=number: number) == number
+        counts.append(len(program_cache._programs))
+    assert counts == [51, 26, 14, 9, 9] and [*program_cache._programs][-5:] == [100, 101, 102, 103, 104]
+    monkeypatch.setattr(program_cache, "share_used", lambda: 0.1)
+    assert program_cache.kept("another", object) and len(program_cache._programs) == counts[-1] + 1
 
 
 @pytest.mark.parametrize("of", ["function", "argument"])

@@ -8,7 +8,7 @@ import pytest
 
 from lagjax import System, accelerations, jacobi_integral, mass_matrix, momentum
 from lagjax.mechanics.equations import equations_of
-from lagjax.mechanics.model import model_of
+from lagjax.system.model import model_of
 
 rng = np.random.default_rng(20)
 

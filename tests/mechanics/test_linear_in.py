@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import lagjax as lj
-from lagjax.mechanics.linear_in import is_linear
+from lagjax.jaxtools.linearity import is_linear
 
 E, UP = np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0])
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 import lagjax as lj
-from lagjax.mechanics import memory_maps
+from lagjax.jaxtools import memory_maps
 from tests.systems import PARAMS, TS
 
 

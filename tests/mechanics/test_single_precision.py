@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import lagjax as lj
-from lagjax.mechanics import coordinates, single_precision
+from lagjax.system import coordinates, single_precision
 
 free = lj.System(lambda t, q, v, params: 0.5 * v**2)
 TS = np.linspace(0.0, 1.0, 2)

@@ -7,10 +7,11 @@ import pytest
 from jax.extend.core import jaxprs_in_params
 
 import lagjax as lj
-from lagjax.mechanics import constraints, coordinates, sparse_plan
+from lagjax.mechanics import sparse_plan
 from lagjax.mechanics.equations import equations_of
 from lagjax.mechanics.lagrangian import mass_and_forcing
-from lagjax.mechanics.model import model_of
+from lagjax.system import constraints, coordinates
+from lagjax.system.model import model_of
 from tests.large_systems import bars, chain, links, loop, net, particles
 
 

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lagjax.mechanics.sparsity import pattern
+from lagjax.jaxtools.sparsity import pattern
 
 CHOSEN = np.array([3, 1, 1, 0, 7])
 INCIDENCE = np.eye(8) - np.eye(8, k=-1)

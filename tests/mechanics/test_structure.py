@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 import lagjax as lj
-from lagjax.mechanics import coordinates
-from lagjax.mechanics.model import model_of
 from lagjax.mechanics.structure import angles, conserves_jacobi_integral, is_diagonal, structure
+from lagjax.system import coordinates
+from lagjax.system.model import model_of
 from tests.plain import not_plain
 
 free = lambda t, q, v, params: 0.5 * (v["a"] ** 2 + v["b"] ** 2)

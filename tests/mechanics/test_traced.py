@@ -19,8 +19,10 @@ import numpy as np
 import pytest
 
 import lagjax as lj
-from lagjax.mechanics import coordinates, kept, memory, traced
-from lagjax.mechanics.first_call import traced_system
+from lagjax.jaxtools import cache as memory
+from lagjax.jaxtools import program_cache
+from lagjax.system import coordinates, traced_functions
+from lagjax.system.check_functions import traced_system
 from tests.counting import compiles
 
 VALUES = (9.81, 1.62, 3.7)
@@ -359,7 +361,7 @@ def wrong_answers(rng, histories):
 
 def forget():
     """Drop all programs and facts."""
-    for cache in (kept._programs, memory._facts, traced._known):
+    for cache in (program_cache._programs, memory._facts, traced_functions._known):
         cache.clear()
 
 
@@ -373,7 +375,7 @@ def test_histories_would_show_it(monkeypatch):
     """Twin: if programs were kept by the shapes of arguments alone, answers would be wrong."""
     forget()
     with monkeypatch.context() as patched:
-        patched.setattr(traced, "meaning_of", lambda jaxpr: len(jaxpr.eqns))
+        patched.setattr(traced_functions, "meaning_of", lambda jaxpr: len(jaxpr.eqns))
         wrong, _ = wrong_answers(np.random.default_rng(0), 30)
     forget()
     assert wrong > 30
@@ -421,10 +423,10 @@ def with_default(t, q, v, params, k=1.0): return 0.5 * v**2 + k * q
 def with_eval(t, q, v, params): return eval("constant") * q
 """
     exec(source, names)
-    assert traced.names_outside(names["plain"]) is not None
+    assert traced_functions.names_outside(names["plain"]) is not None
     names["constant"] = 1.0
     for name in ("with_value", "with_import", "with_random", "with_default", "with_eval"):
-        assert traced.names_outside(names[name]) is None, name
+        assert traced_functions.names_outside(names[name]) is None, name
     plain = lj.System(names["plain"])
     at = lambda: float(lj.jacobi_integral(plain, 0.0, 0.0, 0.0, {"k": 1.0}))
     np.testing.assert_allclose(at(), -1 - np.pi)

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 import lagjax as lj
-from lagjax.mechanics import coordinates
 from lagjax.mechanics.equations import equations_of
-from lagjax.mechanics.model import model_of
-from lagjax.mechanics.written_out import is_small, write_out
-from lagjax.motion.consistency import to_manifold
+from lagjax.mechanics.projection import to_manifold
+from lagjax.mechanics.scalar_equations import is_small, write_out
 from lagjax.scenes import bead_on_hoop
+from lagjax.system import coordinates
+from lagjax.system.model import model_of
 from tests.counting import compiles
 from tests.systems import HORIZONTAL, PARAMS, double_pendulum_lagrangian, pendulum, rod_pendulum
 
@@ -136,7 +136,7 @@ def test_changed_numbers_do_not_compile_again():
 
 def test_a_long_program_is_not_written_out(monkeypatch):
     """Writing out a potential by quadrature of 500 nodes is given up before its end; a short one is written out."""
-    monkeypatch.setattr("lagjax.mechanics.written_out.LONG", np.inf)
+    monkeypatch.setattr("lagjax.mechanics.scalar_equations.LONG", np.inf)
     nodes = jnp.linspace(0.0, 6.0, 500)
     wire = lambda q: jnp.sum(1 / jnp.sqrt((q[0] - jnp.cos(nodes)) ** 2 + (q[1] - jnp.sin(nodes)) ** 2 + q[2] ** 2))
     system = lj.System(lambda t, q, v, params: 0.5 * v @ v + wire(q))

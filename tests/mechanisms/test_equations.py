@@ -6,10 +6,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lagjax.mechanics import constraints, coordinates
 from lagjax.mechanics.lagrangian import mass_and_forcing
-from lagjax.mechanics.model import model_of
 from lagjax.mechanisms import MECHANISMS, andrews, car_axis
+from lagjax.system import constraints, coordinates
+from lagjax.system.model import model_of
 from tests.mechanisms import published
 
 

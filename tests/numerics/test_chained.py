@@ -7,7 +7,15 @@ import lineax as lx
 import numpy as np
 import pytest
 
-from lagjax.numerics.chained import ByWindows, Unknowns, WindowedEquations, covariance, eliminate, slopes_of, solution
+from lagjax.numerics.windowed_least_squares import (
+    ByWindows,
+    Unknowns,
+    WindowedEquations,
+    covariance,
+    eliminate,
+    slopes_of,
+    solution,
+)
 from tests.tiers import exhaustive_but
 
 W, M, J, K, P, H = 5, 7, 3, 2, 4, 2

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lagjax.numerics import dense
+from lagjax.numerics.linalg import dense
 
 solve = jax.jit(dense.solve)
 

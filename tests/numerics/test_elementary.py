@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from jax import lax
 
-from lagjax.numerics import elementary
-from lagjax.numerics.elementary import ARITHMETIC, sincos, sincos_in_lanes
+from lagjax.jaxtools import elementary
+from lagjax.jaxtools.elementary import ARITHMETIC, sincos, sincos_in_lanes
 
 rng = np.random.default_rng(19)
 LIMIT = ARITHMETIC[np.dtype("float64")].limit

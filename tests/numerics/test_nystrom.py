@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import lagjax as lj
-from lagjax.numerics.nystrom import RKN86, RKN1210, Nystrom, Nystrom8, Nystrom12
+from lagjax.numerics.methods.nystrom import RKN86, RKN1210, Nystrom, Nystrom8, Nystrom12
 
 ENDS = (0.0, 5.0)
 name_of = lambda x: type(x).__name__ + " in a loop" * x.in_a_loop if isinstance(x, Nystrom) else None

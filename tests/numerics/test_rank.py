@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lagjax.numerics.rank import DEPENDENT_BELOW, independent_rows
+from lagjax.numerics.linalg.rank import DEPENDENT_BELOW, independent_rows
 
 rng = np.random.default_rng(11)
 

@@ -9,8 +9,8 @@ import pytest
 from jax import lax
 from jax.extend.core import jaxpr_as_fun
 
-from lagjax.jax_internals.programs import needed, staged
-from lagjax.numerics.scalars import TooLong, written_out
+from lagjax.jaxtools.jaxpr import needed, staged
+from lagjax.jaxtools.scalarize import TooLong, written_out
 
 X = jnp.array([0.3, -1.2, 0.7, 2.0])
 MATRIX = jnp.arange(12.0).reshape(3, 4) / 7

@@ -9,8 +9,8 @@ import pytest
 
 import lagjax as lj
 from lagjax.mechanics.equations import equations_of
-from lagjax.mechanics.model import model_of
 from lagjax.scenes import sliding_wedge as wedge
+from lagjax.system.model import model_of
 from tests.references import keys, reference
 from tests.tiers import exhaustive_but
 

@@ -1,0 +1,230 @@
+"""Small motions about an equilibrium or a steady motion: the linear equations, on the constraint surface.
+
+`reduced_matrices.py` has the derivation. The matrix that multiplies velocities has an antisymmetric part, which is
+gyroscopic and does no work, and a symmetric part, which damps. The matrix that multiplies positions has a symmetric
+part, the stiffness, and an antisymmetric part, the circulatory one, whose forces can feed in energy without limit.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Complex, Float
+
+from lagjax.analysis.modes.reduced_matrices import LinearisationKind, LinearParts, parts_of
+from lagjax.analysis.modes.steadiness import Steadiness, check_steady, steadiness_of
+from lagjax.jaxtools.cache import remembered
+from lagjax.jaxtools.compiled import compiled
+from lagjax.jaxtools.tracing import is_eager, is_traced
+from lagjax.mechanics.structure import structure, unseen_coordinates
+from lagjax.numerics.linalg import dense
+from lagjax.numerics.linalg.rank import DEPENDENT_BELOW
+from lagjax.system import constraints
+from lagjax.system.check_functions import prepare
+from lagjax.system.coordinates import State
+
+# Matrices with more rows than this are not printed.
+PRINTED_ROWS = 6
+
+
+class Linearisation(eqx.Module):
+    """The linear equations of small motions, `mass ẇ + (gyroscopic + damping) w + (stiffness + circulatory) η = 0`.
+
+    w (n,) are the velocities that all constraints allow, along the columns of `velocities`, and η the positions along
+    the same directions. With velocity constraints, positions have more freedoms than velocities:
+
+    - `mass`, `gyroscopic`, `damping`, `circulatory`, `stiffness` (n, n).
+    - `positions` (N, p): a basis of the displacements of the N coordinates that holonomic constraints allow;
+      `velocities` (N, n): a basis of the velocities that all constraints allow.
+    - `multipliers`: by constraint name, at the state itself; `stiffness` contains the change of the constraint forces'
+      directions along the surface.
+    - `residual`: how far the state is from a steady motion: its accelerations, relative to those of small motions of
+      its own size, or the violation of a constraint. `lj.linearise` raises if it is large, but not while JAX is
+      tracing.
+    - `state`: the linearised state, (t, q, v, params). `sound`: whether the mass matrix is regular and all constraint
+      equations are independent; if not, everything else here is meaningless.
+    """
+
+    mass: Float[Array, "n n"]
+    gyroscopic: Float[Array, "n n"]
+    damping: Float[Array, "n n"]
+    circulatory: Float[Array, "n n"]
+    stiffness: Float[Array, "n n"]
+    positions: Float[Array, "N p"]
+    velocities: Float[Array, "N n"]
+    multipliers: dict[str, Array]
+    residual: Float[Array, ""]
+    sound: Bool[Array, ""]
+    state: State
+    parts: LinearParts
+    kind: LinearisationKind = eqx.field(static=True)
+    names: tuple[str, ...] = eqx.field(static=True)
+
+    @property
+    def shifts(self) -> tuple[str, ...]:
+        """The coordinates that nothing depends on: shifting them changes nothing."""
+        return tuple(name for name, unseen in zip(self.names, self.kind.unseen) if unseen)
+
+    def first_order(self) -> tuple[Float[Array, "k k"], Float[Array, "k k"]]:
+        """Return E and A of `E ẏ = A y`, y = (positions, velocities), without positions that nothing depends on."""
+        p = self.parts
+        eye, corner = jnp.eye(p.drift.shape[0], dtype=p.mass.dtype), jnp.zeros_like(p.transfer)
+        return (
+            jnp.block([[eye, corner], [corner.T, p.mass]]),
+            jnp.block([[p.drift, p.transfer], [-p.position, -p.velocity]]),
+        )
+
+    def eigenvalues(self) -> Complex[Array, " k"]:
+        """Return all characteristic roots, `[1/t]`; a zero for each coordinate that nothing depends on."""
+        E, A = self.first_order()
+        safe = jnp.where(self.sound, E, jnp.eye(E.shape[0], dtype=E.dtype))
+        A = jnp.where(self.sound, dense.solved(safe, A), 0.0)
+        roots = jnp.linalg.eigvals(A)
+        return jnp.concatenate([roots, jnp.zeros(len(self.shifts), roots.dtype)])
+
+    def __repr__(self):
+        n, p = self.mass.shape[-1], self.positions.shape[-1]
+        title = f"Linearisation of {len(self.names)} coordinates: {n} freedoms of velocity, {p} of position"
+        if is_traced(self.mass) or self.mass.ndim > 2:
+            return title
+        rows = [title]
+        scale = max(float(np.max(np.abs(x), initial=0.0)) for x in (self.mass, self.stiffness, self.gyroscopic))
+        for name in ("mass", "gyroscopic", "damping", "circulatory", "stiffness"):
+            matrix = np.asarray(getattr(self, name))
+            if not np.any(np.abs(matrix) > 1e-14 * scale):
+                rows.append(f"  {name:<12}0")
+            elif n <= PRINTED_ROWS:
+                lines = np.array2string(matrix + 0.0, precision=6, suppress_small=True).split("\n")
+                rows += [f"  {name:<12}{lines[0]}", *(f"  {'':<12}{line}" for line in lines[1:])]
+            else:
+                rows.append(f"  {name:<12}{n} x {n}, the largest entry {np.max(np.abs(matrix)):.6g}")
+        if self.shifts:
+            rows.append(f"  nothing depends on {', '.join(self.shifts)}")
+        rows.append(f"  steady to {float(self.residual):.1e}" + ("" if self.sound else ", but singular"))
+        return "\n".join(rows)
+
+
+def linearise(system, t, q, v, params) -> Linearisation:
+    """Return the linear equations of small motions about an equilibrium or a steady motion.
+
+    >>> import jax.numpy as jnp
+    >>> import lagjax as lj
+    >>> def bead(t, q, v, params):
+    ...     turning = 0.5 * (params["omega"] * jnp.sin(q)) ** 2
+    ...     return 0.5 * v**2 + turning + params["g"] * jnp.cos(q)
+    >>> small = linearise(lj.System(bead), 0.0, 0.0, 0.0, {"omega": 2.0, "g": 9.0})
+    >>> print(small.mass, small.stiffness)
+    [[1.]] [[5.]]
+
+    **Arguments:** `t` scalar, `q` and `v` of the same structure, `params` as L takes it: an equilibrium, or a state of
+    a motion that continues with these velocities while nothing else changes, as along coordinates that L does not
+    contain.
+
+    **Returns:** a `Linearisation`, differentiable with respect to the state and `params`.
+
+    **Raises:**
+
+    - `ValueError` if the state is neither an equilibrium nor a steady motion, naming the coordinate that accelerates or
+      the constraint that is violated; if the equations change along the motion; if a mass matrix is singular. While JAX
+      is tracing nothing is raised: see `residual` and `sound`.
+    - `TypeError`, `ValueError` for a state of the wrong shape or dtype.
+
+    Source: Goldstein, *Classical Mechanics*, §6.1-6.2; Meijaard et al., *Proc. R. Soc. A* 463 (2007) 1955, Appendix B.
+    """
+    model, s = prepare(system, t, q, v, params)
+    traced = not is_eager() or is_traced((s, eqx.filter(model, eqx.is_array)))
+    kind = _kind(model, s)
+    n, m = len(kind.unseen), len(kind.holonomic)
+    if m >= n:
+        # With so many equations some may depend on others, and only their values show which.
+        kind = kind._replace(independent=_chosen(kind, model, s, traced))
+    if sum(kind.independent) >= n:
+        raise ValueError(
+            f"{sum(kind.independent)} independent constraint equations on {n} coordinates leave no motion at all.\n"
+            "Usual cause: a constraint on every coordinate, or one given in two forms.\n"
+            "Fix: leave out the constraint on what should move; print(lj.explain(system, t, q, v, params)) lists them."
+        )
+    if traced:
+        return _linearised(kind, model, s)[0]
+    linearisation, steadiness = _linearised(kind, model, s)
+    if not np.all(np.asarray(linearisation.parts.independent)[list(kind.independent)]):
+        kind = kind._replace(independent=_chosen(kind, model, s, traced))
+        linearisation, steadiness = _linearised(kind, model, s)
+    check_steady(model, linearisation, steadiness, lambda *later: linearised(kind, model, State(*later)))
+    return linearisation
+
+
+def _kind(model, s: State) -> LinearisationKind:
+    """The static part of the linearisation."""
+    system, holonomic = model.system, tuple(model.holonomic.tolist())
+    unseen, linear_terms, timeless = remembered(model, _kind, lambda: _structure_facts(model))
+    at_rest = not is_traced(s.v) and not any(np.any(x) for x in jax.tree.leaves(s.v))
+    conservative = system.force is None and system.dissipation is None and all(holonomic)
+    at_rest = conservative and at_rest and not linear_terms
+    return LinearisationKind(unseen, holonomic, (True,) * len(holonomic), conservative, at_rest, timeless)
+
+
+def _structure_facts(model):
+    known = structure(model)
+    unseen = tuple(bool(x) for x in unseen_coordinates(model))
+    return unseen, known is None or bool(known.linear_terms), known is not None and not known.explicit_time
+
+
+def _chosen(kind, model, s, traced) -> tuple[bool, ...]:
+    """A largest set of independent constraint equations, preferring those on positions."""
+    if traced:
+        raise ValueError(
+            f"{len(kind.holonomic)} constraint equations on {len(kind.unseen)} coordinates: some depend on others, and "
+            "which ones cannot be determined while JAX is tracing.\n"
+            "Fix: leave out the dependent ones; print(lj.explain(system, t, q, v, params)) names them."
+        )
+    rest = np.array(constraints.jacobian(model, s.t, *model.vectors(s.q, s.v)))
+    size = np.linalg.norm(rest, axis=1)
+    rest /= np.where(size > 0, size, 1.0)[:, None]
+    holonomic, chosen = np.array(kind.holonomic, bool), np.zeros(len(size), bool)
+    for kept in (holonomic, ~holonomic):
+        for _ in range(np.sum(kept)):
+            left = np.where(kept & ~chosen, np.linalg.norm(rest, axis=1), 0.0)
+            farthest = int(np.argmax(left))
+            if left[farthest] <= DEPENDENT_BELOW[rest.dtype]:
+                break
+            chosen[farthest] = True
+            direction = rest[farthest] / left[farthest]
+            rest = rest - np.outer(rest @ direction, direction)
+    return tuple(bool(x) for x in chosen)
+
+
+def linearised(kind: LinearisationKind, model, s: State) -> Linearisation:
+    """The linear equations at another state of the same kind, steady or not."""
+    return _linearised(kind, model, s)[0]
+
+
+@compiled
+def _linearised(kind: LinearisationKind, model, s: State) -> tuple[Linearisation, Steadiness]:
+    """The linearisation, and how far the state is from a steady motion."""
+    parts = parts_of(kind, model, s)
+    # `transfer` is P⁺ V: the positions η of displacements along the velocity directions.
+    along = parts.position @ parts.transfer
+    half = lambda matrix, sign: (matrix + sign * matrix.T) / 2
+    shifts = jnp.eye(model.n, dtype=s.t.dtype)[:, np.array(kind.unseen, bool)]
+    steadiness = steadiness_of(kind, s, parts)
+    sound = parts.sound
+    if all(kind.independent) and kind.independent:
+        sound = sound & jnp.all(parts.independent)
+    linearisation = Linearisation(
+        mass=parts.mass,
+        gyroscopic=half(parts.velocity, -1),
+        damping=half(parts.velocity, 1),
+        circulatory=half(along, -1),
+        stiffness=half(along, 1),
+        positions=jnp.concatenate([shifts, parts.positions], axis=1),
+        velocities=parts.velocities,
+        multipliers=parts.multipliers,
+        residual=steadiness.residual,
+        sound=sound,
+        state=s,
+        parts=parts,
+        kind=kind,
+        names=tuple(model.names),
+    )
+    return linearisation, steadiness
