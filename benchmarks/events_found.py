@@ -38,7 +38,7 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import minimize_scalar
 
 import lagjax as lj
-from lagjax.integrate.events import sampling
+from lagjax.integrate.events import brackets as sampling
 from lagjax.scenes import bead_on_hoop
 
 jax.config.update("jax_enable_x64", True)

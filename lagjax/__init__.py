@@ -31,7 +31,7 @@ from lagjax.mechanics.lagrangian import jacobi_integral, mass_matrix, momentum
 # isort: split
 # Motion.
 from lagjax.analysis.energy import EnergyLedger, energy_ledger
-from lagjax.analysis.phase_graph import HybridExplanation
+from lagjax.analysis.explain import HybridExplanation
 from lagjax.analysis.poincare import PoincareSection, periods, poincare, turning_points
 from lagjax.display.animation import Animation
 from lagjax.integrate.adjoint.replay import Replay
@@ -46,7 +46,7 @@ from lagjax.integrate.trajectory.trajectory import AccuracyWarning, Snapshot, Tr
 from lagjax.numerics.methods.nystrom import Nystrom8, Nystrom12
 from lagjax.numerics.methods.radau import Radau5
 from lagjax.numerics.methods.runge_kutta import Dopri8, Tsit5
-from lagjax.system.single_precision import PrecisionWarning
+from lagjax.system.coordinates import PrecisionWarning
 
 # isort: split
 # Many motions.

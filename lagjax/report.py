@@ -18,8 +18,7 @@ from lagjax.integrate.trajectory.trajectory import Trajectory
 from lagjax.system.system import System
 from lagjax.work_precision import work_precision as comparison
 from lagjax.work_precision.other_solvers import usual_others
-from lagjax.work_precision.result import WorkPrecision, in_ms
-from lagjax.work_precision.tables import table
+from lagjax.work_precision.result import WorkPrecision, in_ms, table
 
 # The tolerance at which a run must reach its `required` error, for the method named with it.
 JUDGED_AT = 1e-10

@@ -24,8 +24,8 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 from lagjax.display import plots as plot
 from lagjax.integrate.events.event import Crossing, Crossings, crossings_of
 from lagjax.integrate.integrate import integrate
-from lagjax.integrate.trajectory.accuracy import angle_mask
-from lagjax.integrate.trajectory.curves import curves
+from lagjax.integrate.trajectory.drawing import curves
+from lagjax.integrate.trajectory.error_report import angle_mask
 from lagjax.integrate.trajectory.trajectory import Trajectory
 from lagjax.jaxtools.tracing import is_traced
 from lagjax.system import coordinates

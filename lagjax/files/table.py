@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 
-from lagjax.numerics.methods.simplified_newton import tolerance_of_the_controller
+from lagjax.numerics.methods.radau import tolerance_of_the_controller
 
 # A module, and the classes that are found there: their fields.
 CLASSES = """
@@ -30,7 +30,7 @@ lagjax.numerics.methods.nystrom
   Nystrom8 Nystrom12: in_a_loop
 lagjax.numerics.methods.radau
   Radau5: root_finder root_find_max_steps step_powers
-lagjax.numerics.methods.simplified_newton
+lagjax.numerics.methods.radau
   SimplifiedNewton: rtol atol norm kappa slow
 diffrax
   Euler SemiImplicitEuler LeapfrogMidpoint ReversibleHeun ConstantStepSize DirectAdjoint ForwardMode:
@@ -82,7 +82,7 @@ lagjax.integrate.events.event
   Crossings: t q v multipliers count uncertain
 lagjax.integrate.trajectory.hybrid_trajectory
   Switches: t way to q v q_after v_after impulse count uncertain names ways
-lagjax.integrate.trajectory.accuracy
+lagjax.integrate.trajectory.error_report
   Errors: q v multipliers events result steps
 lagjax.analysis.poincare
   PoincareSection: trajectory event
@@ -132,7 +132,7 @@ lagjax.fit.problem.initial_states
 lagjax.fit.problem.residuals
   FitProblem: system first found overrides windows starts measured sigma spread spread_in_sigmas unit unflatten observe
     options loss absolute
-lagjax.fit.search.goodness
+lagjax.fit.search.search
   Misfit: times large curved doubtful
 lagjax.fit.search.search
   Evaluation: rows well covariance determined singular_values combinations chi2 freedom

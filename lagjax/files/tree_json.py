@@ -17,7 +17,7 @@ import numpy as np
 
 from lagjax.display.printable import is_plain, printable
 from lagjax.files.table import Table, check_field, fields_of, listed, name_of_function
-from lagjax.numerics.methods.simplified_newton import tolerance_of_the_controller
+from lagjax.numerics.methods.radau import tolerance_of_the_controller
 
 # Structures are nested no deeper than this.
 DEEPEST = 100

@@ -20,7 +20,7 @@ from lagjax.fit.problem.residuals import FitProblem, Stage
 from lagjax.fit.result.result import Fit, FitWarning
 from lagjax.fit.result.warnings import caveats
 from lagjax.fit.search.search import Course, evaluate, listening, search
-from lagjax.fit.training.optimisers import is_of_optax
+from lagjax.fit.training.rounds import is_of_optax
 from lagjax.fit.training.training import held_problem, split_records, train
 from lagjax.integrate.solve.harvest import reported
 from lagjax.jaxtools.tracing import is_traced, numpy_of

@@ -23,11 +23,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax.integrate.diagnose_guard import rejected_by_guards
-from lagjax.integrate.solve.loop import method_alone
+from lagjax.integrate.solve.one_motion import method_alone
 from lagjax.integrate.solve.programs import method_of
 from lagjax.integrate.stepping.projected_solver import Field
 from lagjax.integrate.stepping.tolerances import tolerances_at
-from lagjax.integrate.trajectory.accuracy import of_a_step
+from lagjax.integrate.trajectory.error_report import of_a_step
 from lagjax.integrate.trajectory.results import RESULTS
 from lagjax.jaxtools.without_lapack_batches import jitted
 from lagjax.mechanics.consistent_state import unreachable_ahead

@@ -1,8 +1,15 @@
-"""The error message of a failed motion, in the user's terms."""
+"""The error message of a failed motion, in the user's terms.
+
+Failures raised at run time, including those of an empty batch.
+
+Equinox raises the largest code of the lanes that fail, and an empty batch has no largest code.
+"""
 
 from typing import NoReturn
 
+import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from lagjax.integrate import arguments
@@ -11,14 +18,34 @@ from lagjax.integrate.diagnose_stop import stopped_early
 from lagjax.integrate.solve.one_motion import START_TOLERANCES
 from lagjax.integrate.solve.programs import Settings, trajectory_of
 from lagjax.integrate.stepping.tolerances import tolerances_at
-from lagjax.integrate.trajectory.accuracy import columns
+from lagjax.integrate.trajectory.error_report import columns
 from lagjax.integrate.trajectory.hybrid_trajectory import HybridTrajectory
-from lagjax.integrate.trajectory.results import RESULTS, is_among, message
+from lagjax.integrate.trajectory.results import RESULTS, ended_well, is_among, message
 from lagjax.integrate.trajectory.trajectory import Trajectory, pack
+from lagjax.jaxtools.primitives import primitive
 from lagjax.mechanics.accelerations import accelerations
 from lagjax.mechanics.diagnosis import describe, explain_failure
 from lagjax.system import coordinates
 from lagjax.system.coordinates import State
+
+
+def raise_at_run_time(trajectory: Trajectory) -> Trajectory:
+    """Return the trajectory; if it failed, the program that computes it ends with the message of its result."""
+    code = _code_p.bind(jnp.asarray(trajectory.result._value))
+    result = eqx.tree_at(lambda result: result._value, trajectory.result, code)
+    return result.error_if(trajectory, ~ended_well(result))
+
+
+def _batched(operands, axes):
+    (code,), (axis,) = operands, axes
+    if code.shape[axis] == 0:
+        return jnp.full(code.shape[:axis] + code.shape[axis + 1 :], RESULTS.successful._value), None
+    return _code_p.bind(code), axis
+
+
+_same = lambda code: code
+_code_p = primitive("result_code", _same, _same, batched=_batched)
+
 
 # Switches at times that differ by less than this part of the last time are simultaneous.
 AT_ONE_TIME = 1e-12

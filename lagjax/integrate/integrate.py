@@ -18,9 +18,8 @@ from lagjax.integrate.adjoint.replay import Replay
 from lagjax.integrate.dense_output import at
 from lagjax.integrate.diagnose_guard import warn_of_events, warn_of_missed_end
 from lagjax.integrate.events.event import Crossing, crossings_of, guards_of, left_to_diffrax
-from lagjax.integrate.failure import raise_failure
+from lagjax.integrate.failure import raise_at_run_time, raise_failure
 from lagjax.integrate.input_warnings import warn_of_odd_dissipation
-from lagjax.integrate.raise_inside_jit import raise_at_run_time
 from lagjax.integrate.solve.backward_time import in_either_direction, runs_backward
 from lagjax.integrate.solve.error_estimate import steps_to_repeat
 from lagjax.integrate.solve.harvest import patient, report

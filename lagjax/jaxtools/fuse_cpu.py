@@ -25,9 +25,7 @@ from jax import lax
 from jax.extend.core import ClosedJaxpr, Jaxpr, Primitive, jaxpr_as_fun
 from jax.interpreters import ad, batching, mlir
 
-from lagjax.jaxtools.jaxpr import anywhere, bodies, equations, rewritten, without_chains
-from lagjax.jaxtools.plain import is_plain
-from lagjax.jaxtools.primitive_names import (
+from lagjax.jaxtools.jaxpr import (
     ACCUMULATING,
     CALLS,
     CALLS_WITH_RULES,
@@ -36,7 +34,13 @@ from lagjax.jaxtools.primitive_names import (
     EQUINOX_PRIMITIVES,
     MOVING,
     REDUCING,
+    anywhere,
+    bodies,
+    equations,
+    rewritten,
+    without_chains,
 )
+from lagjax.jaxtools.plain import is_plain
 from lagjax.jaxtools.without_lapack_batches import one_by_one
 from lagjax.jaxtools.xla_marks import ONE_KERNEL, STAYS_A_CALL, marked
 

@@ -13,8 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
-from lagjax.jaxtools.jaxpr import ClosedJaxpr, Literal, stands_for
-from lagjax.jaxtools.primitive_names import ADDITIVE, BILINEAR, LINEAR_IN_FIRST
+from lagjax.jaxtools.jaxpr import ADDITIVE, BILINEAR, LINEAR_IN_FIRST, ClosedJaxpr, Literal, stands_for
 
 CONSTANT, LINEAR, OTHER = range(3)
 # Sizes of the multipliers that are tried, with random signs, and the states at which they are.

@@ -22,8 +22,7 @@ import numpy as np
 from jax.core import Tracer
 
 from lagjax.jaxtools.elementary import sincos_in_lanes
-from lagjax.jaxtools.jaxpr import ClosedJaxpr, Literal, applied, equations, interpreted
-from lagjax.jaxtools.primitive_names import CALLS, ELEMENTWISE, IN_NUMPY
+from lagjax.jaxtools.jaxpr import CALLS, ELEMENTWISE, IN_NUMPY, ClosedJaxpr, Literal, applied, equations, interpreted
 
 LARGE = 512
 

@@ -20,8 +20,7 @@ from jax import lax
 from jax.core import Tracer
 from jaxtyping import Bool
 
-from lagjax.jaxtools.jaxpr import interpreted
-from lagjax.jaxtools.primitive_names import ACCUMULATING, ELEMENTWISE, IN_NUMPY, REDUCING
+from lagjax.jaxtools.jaxpr import ACCUMULATING, ELEMENTWISE, IN_NUMPY, REDUCING, interpreted
 
 
 class SparseValue(NamedTuple):

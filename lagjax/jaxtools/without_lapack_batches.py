@@ -25,8 +25,7 @@ from jax.custom_derivatives import SymbolicZero
 from jax.extend.core import ClosedJaxpr, Primitive, jaxpr_as_fun
 from jax.interpreters import ad, batching, mlir
 
-from lagjax.jaxtools.jaxpr import anywhere, applied, bodies, rewritten
-from lagjax.jaxtools.primitive_names import HOLDS_A_SOLVER, LAPACK
+from lagjax.jaxtools.jaxpr import HOLDS_A_SOLVER, LAPACK, anywhere, applied, bodies, rewritten
 
 # The name of a function whose backward pass is rewritten already.
 WITH_WAY_BACK = "with_rewritten_way_back"

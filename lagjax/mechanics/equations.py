@@ -22,12 +22,10 @@ from lagjax.jaxtools.compiled import compiled
 from lagjax.jaxtools.fuse_cpu import kept_as_call
 from lagjax.jaxtools.tracing import WATCHED
 from lagjax.jaxtools.without_lapack_batches import jitted
-from lagjax.mechanics.regularity import Verdict
-from lagjax.mechanics.saddle_point import Dense, is_regular
+from lagjax.mechanics.saddle_point import Dense, Verdict, is_regular
 from lagjax.mechanics.scalar_equations import UP_TO, WrittenOut, has_networks, is_small, write_out
 from lagjax.mechanics.scalar_form import in_numbers
-from lagjax.mechanics.sparse_plan import plan
-from lagjax.mechanics.sparse_saddle_point import Banded
+from lagjax.mechanics.sparse_saddle_point import Banded, plan
 from lagjax.mechanics.structure import is_diagonal
 from lagjax.system import coordinates
 from lagjax.system.model import Form, Model

@@ -26,8 +26,7 @@ import numpy as np
 from jaxtyping import PyTree
 
 from lagjax.jaxtools.cache import varies
-from lagjax.jaxtools.jaxpr import Literal, depends, interpreted
-from lagjax.jaxtools.primitive_names import ADDITIVE, BILINEAR, LINEAR_IN_FIRST, PERIODIC
+from lagjax.jaxtools.jaxpr import ADDITIVE, BILINEAR, LINEAR_IN_FIRST, PERIODIC, Literal, depends, interpreted
 from lagjax.jaxtools.scalarize import TooLong
 from lagjax.mechanics.lagrangian import mass_and_forcing
 from lagjax.mechanics.multiplier_forces import force_with_ones

@@ -17,8 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Array, Float
 
-from lagjax.mechanisms.mechanism import Mechanism
-from lagjax.mechanisms.natural import squared_distance
+from lagjax.mechanisms.mechanism import Mechanism, squared_distance
 from lagjax.system.constraints import Holonomic
 from lagjax.system.system import System
 

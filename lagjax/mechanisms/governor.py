@@ -31,8 +31,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from lagjax.mechanisms.mechanism import Mechanism
-from lagjax.mechanisms.natural import rod_kinetic_energy, squared_distance
+from lagjax.mechanisms.mechanism import Mechanism, rod_kinetic_energy, squared_distance
 from lagjax.system.constraints import Holonomic
 from lagjax.system.system import System
 

@@ -38,7 +38,7 @@ from lagjax.integrate.integrate import integrate
 from lagjax.mechanics.accelerations import accelerations
 from lagjax.report import Case, Run, Scene, relative_error
 from lagjax.scenes import by_hand
-from lagjax.scenes.elliptic import agm, jacobi_elliptic
+from lagjax.scenes.potentials import agm, jacobi_elliptic
 from lagjax.sweep import sweep
 from lagjax.system.constraints import Holonomic
 from lagjax.system.system import System

@@ -27,7 +27,7 @@ from lagjax.jaxtools.compiled import compiled
 from lagjax.report import relative_error
 from lagjax.system import coordinates
 from lagjax.system.system import System
-from lagjax.work_precision.tables import table
+from lagjax.work_precision.result import table
 
 PER_PERIOD = 100.0
 # A result with fewer than two correct digits is never accurate, whatever the tolerance.

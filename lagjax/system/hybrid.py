@@ -20,8 +20,7 @@ from jaxtyping import Array, ArrayLike, Int
 from lagjax.display.printable import by_line
 from lagjax.jaxtools.cache import kinds, same
 from lagjax.system.function_arguments import takes_of
-from lagjax.system.pickling import check_functions
-from lagjax.system.system import System
+from lagjax.system.system import System, check_functions
 
 MOST_SWITCHES = 16
 

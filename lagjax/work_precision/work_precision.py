@@ -15,17 +15,16 @@ from lagjax.integrate.integrate import integrate
 from lagjax.integrate.trajectory.results import ended_well, message
 from lagjax.integrate.trajectory.trajectory import Trajectory
 from lagjax.jaxtools.tracing import is_eager, is_traced
-from lagjax.numerics.methods.evaluations import evaluations_a_step
+from lagjax.numerics.methods.nystrom import evaluations_a_step
 from lagjax.system import coordinates
 from lagjax.system.argument_checks import by_name, check_system
 from lagjax.system.system import System
 from lagjax.work_precision import compared, references
 from lagjax.work_precision.compared import Compared, ComparedStates
 from lagjax.work_precision.methods import chosen, ladder
-from lagjax.work_precision.points import Curve, Point
 from lagjax.work_precision.programs import ComparedMotion, TimedProgram, Times, interleaved_times, without_overhead
 from lagjax.work_precision.references import KnownAnswer, Reference
-from lagjax.work_precision.result import WorkPrecision
+from lagjax.work_precision.result import Curve, Point, WorkPrecision
 
 # The options of `integrate` that mean the same for every method.
 OPTIONS = ("max_step", "jump_ts", "drift", "max_steps")

@@ -10,7 +10,7 @@ import lagjax as lj
 from lagjax.fit import fit as engine
 from lagjax.fit.problem.arguments import problem_of
 from lagjax.fit.problem.residuals import dampened
-from lagjax.fit.search.goodness import CHANCE, _exceeded_by_chance, _undampened, misfit
+from lagjax.fit.search.search import CHANCE, _exceeded_by_chance, _undampened, misfit
 from lagjax.numerics.windowed_least_squares import WindowedEquations
 
 TS, SIGMA = np.linspace(0.0, 15.0, 200), 0.02

@@ -14,10 +14,17 @@ import lagjax as lj
 from lagjax.fit.problem.arguments import problem_of
 from lagjax.fit.problem.parameters import find
 from lagjax.fit.training import training as trained
-from lagjax.fit.training.optimisers import Optimiser, as_params, as_vector, is_of_optax
-from lagjax.fit.training.rounds import Task, initial_state, round_of
+from lagjax.fit.training.rounds import (
+    Optimiser,
+    Task,
+    as_params,
+    as_vector,
+    fit_starts,
+    initial_state,
+    is_of_optax,
+    round_of,
+)
 from lagjax.fit.training.training import split_records
-from lagjax.fit.training.window_starts import fit_starts
 from tests.counting import compiles
 
 T = np.linspace(0.0, 3.0, 31)

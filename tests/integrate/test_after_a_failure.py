@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import lagjax as lj
-from lagjax.integrate.trajectory.accuracy import in_units_of
+from lagjax.integrate.trajectory.error_report import in_units_of
 
 ball = lj.System(lambda t, q, v, p: 0.5 * v**2 - p["g"] * q)
 bounce = lj.Switch("flying", to="flying", when=lj.touches(lambda t, q, p: q, restitution=0.5))

@@ -10,7 +10,7 @@ import pytest
 
 import lagjax as lj
 from lagjax.integrate.events import brackets as pieces
-from lagjax.integrate.events import sampling
+from lagjax.integrate.events import brackets as sampling
 from tests.systems import PARAMS, pendulum, rod_pendulum
 from tests.tiers import exhaustive_but
 

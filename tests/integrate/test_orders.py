@@ -19,7 +19,7 @@ import pytest
 from jax.flatten_util import ravel_pytree
 
 import lagjax as lj
-from lagjax.numerics.methods.simplified_newton import SimplifiedNewton
+from lagjax.numerics.methods.radau import SimplifiedNewton
 from tests.systems import DOUBLE_PARAMS, DOUBLE_SWING, double_pendulum, double_rods, rods_from_angles
 from tests.tiers import exhaustive_but
 

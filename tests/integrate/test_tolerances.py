@@ -9,7 +9,7 @@ import pytest
 
 import lagjax as lj
 from lagjax.integrate.stepping.tolerances import PerCoordinateTolerance, Tolerances, rounding, scales_of, shared
-from lagjax.numerics.methods.simplified_newton import SimplifiedNewton
+from lagjax.numerics.methods.radau import SimplifiedNewton
 
 # The units of length and of time are powers of four, so that scaling by them is exact, also in square roots.
 UNITS = {"nanometres": (2.0**-30, 1.0), "light years": (2.0**54, 1.0), "years": (1.0, 2.0**-24)}

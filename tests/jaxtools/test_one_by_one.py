@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from jax import lax
 
-from lagjax.jaxtools.primitive_names import LAPACK
+from lagjax.jaxtools.jaxpr import LAPACK
 from lagjax.jaxtools.without_lapack_batches import one_by_one
 from tests.library_calls import batches_in, calls_in, text_of
 

@@ -7,7 +7,7 @@ import pytest
 from jax.extend.core import jaxprs_in_params
 
 import lagjax as lj
-from lagjax.mechanics import sparse_plan
+from lagjax.mechanics import sparse_saddle_point as sparse_plan
 from lagjax.mechanics.equations import equations_of
 from lagjax.mechanics.lagrangian import mass_and_forcing
 from lagjax.system import constraints, coordinates

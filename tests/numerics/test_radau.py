@@ -9,8 +9,7 @@ import pytest
 
 import lagjax as lj
 from lagjax.numerics.methods import radau
-from lagjax.numerics.methods.radau import Radau5
-from lagjax.numerics.methods.simplified_newton import SimplifiedNewton, with_tolerances
+from lagjax.numerics.methods.radau import Radau5, SimplifiedNewton, with_tolerances
 from tests.systems import HORIZONTAL, PARAMS, rod_pendulum
 from tests.tiers import exhaustive_but
 

@@ -11,7 +11,7 @@ from lagjax.mechanics.accelerations import accelerations
 from lagjax.mechanics.lagrangian import jacobi_integral, momentum
 from lagjax.report import relative_error
 from lagjax.scenes import bead_on_hoop as scene
-from lagjax.scenes.elliptic import agm, jacobi_elliptic
+from lagjax.scenes.potentials import agm, jacobi_elliptic
 from lagjax.system.constraints import Holonomic
 from lagjax.system.system import System
 from tests.references import keys, reference

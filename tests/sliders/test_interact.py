@@ -16,7 +16,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import lagjax as lj
-from lagjax.sliders.controls import Values, controls_of, start_of, words
+from lagjax.sliders.interact import Values, controls_of, start_of, words
 from tests.counting import compiles
 
 pytest.importorskip("ipywidgets", reason='sliders need ipywidgets. Fix: pip install "lagjax[interact]"')

@@ -10,7 +10,7 @@ from matplotlib import rcParams
 from PIL import Image
 
 from lagjax.sliders.picture import FINE, MOST_PANELS, MOST_POINTS, Picture
-from lagjax.sweep.curves import drawn
+from lagjax.sweep.web_page import drawn
 
 T = np.linspace(0.0, 1.0, 200)
 

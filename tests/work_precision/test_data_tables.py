@@ -5,7 +5,7 @@ import pandas
 import pytest
 
 import lagjax as lj
-from lagjax.work_precision.points import Curve, Point
+from lagjax.work_precision.result import Curve, Point
 
 
 def point(method, tolerance, error, steps, **others):

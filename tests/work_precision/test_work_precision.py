@@ -8,7 +8,7 @@ import pytest
 from scipy import special
 
 import lagjax as lj
-from lagjax.work_precision.points import Curve, Point
+from lagjax.work_precision.result import Curve, Point
 from tests.systems import PARAMS, pendulum, rod_pendulum
 
 TS = np.array([0.0, 7.0, 20.0])

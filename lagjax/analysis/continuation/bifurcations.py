@@ -27,12 +27,12 @@ from lagjax.analysis.continuation.equilibrium_equations import (  # fmt: skip
     FLUTTER,
     FOLD,
     MULTIPLE,
+    SteadyTracer,
     curvature,
     dynamic_at,
     extended_at,
     extended_by_params,
 )
-from lagjax.analysis.continuation.steady_tracer import SteadyTracer
 
 NEWTON = 12
 # A direction whose component along the parameter is smaller leaves the parameter constant.

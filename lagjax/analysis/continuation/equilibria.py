@@ -13,13 +13,17 @@ from jaxtyping import ArrayLike, PyTree
 
 from lagjax.analysis.continuation.arclength import AGAIN, FIRST, BranchPoint, Path
 from lagjax.analysis.continuation.bifurcations import CriticalPoint, between, escape
-from lagjax.analysis.continuation.equilibrium_equations import Frame, ParameterPlace, full_jacobian, place_of
+from lagjax.analysis.continuation.equilibrium_equations import (
+    Frame,
+    ParameterPlace,
+    SteadyTracer,
+    full_jacobian,
+    place_of,
+)
 from lagjax.analysis.continuation.result import Branch, Branches, Critical
-from lagjax.analysis.continuation.steady_tracer import SteadyTracer
 from lagjax.analysis.equilibria.balance import VELOCITY, Steady
-from lagjax.analysis.equilibria.equilibria import held_at, searched
+from lagjax.analysis.equilibria.equilibria import checked, held_at, searched, stacked, stacked_one, symmetries_of
 from lagjax.analysis.equilibria.result import OK, WORDS
-from lagjax.analysis.equilibria.starts import checked, stacked, stacked_one, symmetries_of
 from lagjax.jaxtools.compiled import compiled
 from lagjax.jaxtools.tracing import is_eager, is_traced
 from lagjax.mechanics.diagnosis import describe

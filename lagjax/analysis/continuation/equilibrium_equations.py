@@ -21,6 +21,15 @@ frequencies without damping has two more equations than unknowns; they are consi
 
 Source: Moore & Spence, SIAM J. Numer. Anal. 17 (1980) 567 (folds); Moore, *Numer. Funct. Anal. Optim.* 2 (1980) 441
 (branch points); Govaerts, *Numerical Methods for Bifurcations of Dynamical Equilibria*, ch. 3-5.
+
+Branches of steady motions, from the equations of `equilibrium_equations.py`.
+
+Monitored from point to point are the sign of `det (J; τ)`, which changes where another branch crosses (also where this
+one only touches the critical parameter, as the side branch of a pitchfork does); the sign of τ_μ, which changes at a
+fold; the number of growing roots; and the number of negative eigenvalues of E_y, which changes by two where two vanish
+together.
+
+Source: Allgower & Georg, *Introduction to Numerical Continuation Methods*, §8.1 (the determinant).
 """
 
 from dataclasses import replace
@@ -28,11 +37,14 @@ from dataclasses import replace
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
+from lagjax.analysis.continuation.arclength import BranchPoint, Tracer
 from lagjax.analysis.equilibria import balance as equations
 from lagjax.analysis.equilibria.balance import Steady
+from lagjax.analysis.equilibria.equilibria import GROWS_ABOVE
 from lagjax.analysis.params_by_name import Number, no_such_number, numbers_in
 from lagjax.jaxtools.compiled import compiled
 from lagjax.numerics.linalg.rank import independent_rows
@@ -212,3 +224,35 @@ def extended_by_params(kind: str, frame: Frame, big, guide):
         return extended(kind, replace(frame, steady=steady), big, guide)
 
     return jax.jacfwd(residual)(floats)
+
+
+class SteadyTracer(Tracer):
+    """Steady motions of a `Frame`. `fastest`: the size of the fastest root so far, the unit of the roots' round-off."""
+
+    def __init__(self, frame: Frame, low: float, high: float):
+        super().__init__(low, high)
+        self.frame, self.fastest = frame, 0.0
+        size, self.positions = frame.columns.size, frame.steady.n
+        self.weights = np.zeros(size + 1)
+        self.weights[: self.positions] = 1.0
+        self.weights[-1] = 1.0
+        self.dtype = np.dtype(frame.columns.dtype)
+        self.unit = float(frame.unit)
+
+    def at(self, z):
+        value, jacobian, largest = jax.tree.map(np.asarray, evaluated(self.frame, z.astype(self.dtype)))
+        return value, jacobian, float(largest)
+
+    def described(self, z, jacobian, tangent) -> BranchPoint:
+        outputs = jax.tree.map(np.asarray, outputs_at(self.frame, z.astype(self.dtype)))
+        sign = np.linalg.slogdet(np.concatenate([jacobian, (self.weights * tangent)[None]]))[0]
+        negative = int(np.sum(np.linalg.eigvals(jacobian[:, :-1]).real < 0))
+        return BranchPoint(z, jacobian, tangent, float(sign), outputs, self._growing(outputs[-1]), negative)
+
+    def _growing(self, roots) -> int | None:
+        """The number of growing roots; None if the roots are not known."""
+        known = roots[np.isfinite(roots)]
+        if not known.size:
+            return None
+        self.fastest = max(self.fastest, float(np.max(np.abs(known))))
+        return int(np.sum(known.real > GROWS_ABOVE[self.dtype] * self.fastest))

@@ -28,7 +28,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, PyTree
 
-from lagjax.analysis.modes.eigenvalues import roots_beside_zeros
+from lagjax.analysis.modes.eigenmodes import roots_beside_zeros
 from lagjax.jaxtools.without_lapack_batches import jitted
 from lagjax.mechanics.lagrangian import forcing_and_inertia
 from lagjax.mechanics.multiplier_forces import response

@@ -2,7 +2,7 @@
 
 A path is a trajectory, or a function of time whose derivative is the velocity. A trajectory is integrated again, at the
 nodes of a quadrature, so that it does not matter how far apart its outputs lie. The quadrature is refined until it is
-as accurate as the motion (`analysis/works.py`); while JAX traces, its nodes must be known beforehand.
+as accurate as the motion (`analysis/energy.py`); while JAX traces, its nodes must be known beforehand.
 
 Source: Goldstein, *Classical Mechanics*, Eq. (2.1), (2.2).
 """
@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from lagjax.analysis.works import Motion
+from lagjax.analysis.energy import Motion
 from lagjax.integrate.dense_output import in_one_solve
 from lagjax.integrate.trajectory.trajectory import Trajectory
 from lagjax.jaxtools.compiled import compiled

@@ -23,9 +23,8 @@ import jax.tree_util as jtu
 import numpy as np
 from jax.core import eval_jaxpr
 
-from lagjax.exchange.sympy_source import sympy_itself
-from lagjax.jaxtools.jaxpr import interpreted
-from lagjax.jaxtools.primitive_names import MOVING
+from lagjax.exchange.from_sympy import sympy_itself
+from lagjax.jaxtools.jaxpr import MOVING, interpreted
 from lagjax.jaxtools.scalarize import MOVES, TooLong
 from lagjax.mechanics.lagrangian import mass_and_forcing
 from lagjax.mechanics.scalar_form import Numbers, in_numbers

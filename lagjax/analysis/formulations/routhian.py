@@ -1,6 +1,6 @@
 """Routh's function: a system without its cyclic coordinates, whose momenta are parameters.
 
-The momentum p_c = ∂L/∂v_c of a cyclic coordinate c is constant. With v_c found from it (`legendre.py`), the function
+The momentum p_c = ∂L/∂v_c of a cyclic coordinate c is constant. With v_c found from it (`hamiltonian.py`), the function
 
     R(t, q, v) = L(t, q, v, v_c) - p_c·v_c
 
@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from lagjax.analysis.formulations.legendre import velocity_of
+from lagjax.analysis.formulations.hamiltonian import velocity_of
 from lagjax.jaxtools.cache import remembered
 from lagjax.mechanics.diagnosis import listed
 from lagjax.mechanics.structure import forced_by, what_changes_momentum

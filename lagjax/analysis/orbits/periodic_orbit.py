@@ -13,9 +13,9 @@ import numpy as np
 from jaxtyping import ArrayLike, PyTree
 
 from lagjax.analysis.orbits import shooting
-from lagjax.analysis.orbits.guess import OrbitRequest
 from lagjax.analysis.orbits.monodromy import problem_of, refuse_singular, tolerance_of
 from lagjax.analysis.orbits.result import PeriodicOrbit
+from lagjax.analysis.orbits.shooting import OrbitRequest
 from lagjax.integrate.solve.harvest import Report, reported
 from lagjax.integrate.trajectory.results import RESULTS
 from lagjax.jaxtools.packed import pack

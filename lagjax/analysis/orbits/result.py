@@ -4,7 +4,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from lagjax.analysis.orbits.guess import OrbitRequest
+from lagjax.analysis.orbits.shooting import OrbitRequest
 from lagjax.integrate.integrate import integrate
 from lagjax.integrate.trajectory.trajectory import Trajectory
 from lagjax.jaxtools.packed import Packed

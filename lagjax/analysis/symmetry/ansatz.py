@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax.analysis.symmetry.charge_rates import Affine
-from lagjax.mechanics.cartesian import AXES, points, turned
+from lagjax.mechanics.generators import AXES, points, turned
 from lagjax.system import coordinates
 
 # Largest numbers of points rotated one by one, of coordinates boosted and scaled one by one, and of coordinates whose

@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float
 from lagjax.jaxtools.cache import remembered
 from lagjax.jaxtools.compiled import compiled
 from lagjax.jaxtools.tracing import numpy_of
-from lagjax.mechanics.cartesian import points
+from lagjax.mechanics.generators import points
 from lagjax.mechanics.structure import are_angles
 from lagjax.system import constraints, coordinates
 

@@ -13,25 +13,175 @@ rate, and move only with the batches that contain them.
 
 For held-back windows only the starts are fitted, so their residuals say how well the parameters do on data that they
 were not trained on.
+
+Optimisers of optax: pairs of functions, `init(params)` and `update(gradients, state, params)`.
+
+They get the fitted numbers in the structure of `params`, with None in place of all others, so that transformations that
+go by names (`optax.multi_transform`, `optax.masked`) work. Numbers with bounds are passed as unbounded ones. If only
+some entries of an array are fitted, these are passed as a vector.
+
+The starts of all windows for given parameters, by Levenberg-Marquardt, each on its own and all in parallel.
+
+A window has few unknowns s, so their slopes J are computed in forward mode with the residuals r, and a step is
+
+    (JᵀJ + damping diag JᵀJ) ds = -Jᵀr,
+
+taken if it reduces the window's own sum of squares; else the window's damping grows. The parameters, a network perhaps,
+are the same in all lanes, so products with them are matrix products.
 """
 
+import inspect
 from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
+import diffrax
 import jax
 import jax.numpy as jnp
+import jax.tree_util as jtu
 from jax import lax
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from lagjax.fit.problem.checks import check_predicted
+from lagjax.fit.problem.parameters import FreeNumbers
 from lagjax.fit.problem.residuals import WHOLE, FitProblem, dampened, equations, prior_and_hold, window_part
-from lagjax.fit.search.goodness import OF_NORMAL, Misfit, misfit
-from lagjax.fit.search.search import in_turn
-from lagjax.fit.training.optimisers import Optimiser
-from lagjax.fit.training.window_starts import DAMPING, Squares, fit_starts, inverse_of, squares
+from lagjax.fit.search.search import OF_NORMAL, Misfit, in_turn, misfit
 from lagjax.jaxtools.compiled import compiled
+from lagjax.jaxtools.jaxpr_identity import Meaning, content_of, meaning_of
 from lagjax.numerics.windowed_least_squares import Unknowns
+
+# The initial damping, and its factors after a step that reduces the sum of squares or does not.
+DAMPING, EASED, TIGHTENED = 1e-3, 0.2, 10.0
+# Starts have converged if a step would reduce no sum of squares by more than this fraction.
+CONVERGED_BELOW = 1e-3
+# The number of windows in parallel.
+LANES = 64
+
+
+class Squares(NamedTuple):
+    """For each window: the sum of squared residuals, Jᵀr, JᵀJ, and whether its motion ended well."""
+
+    sums: Float[Array, " W"]
+    slopes: Float[Array, "W k"]
+    curvatures: Float[Array, "W k k"]
+    well: Bool[Array, " W"]
+
+
+def squares(problem: FitProblem, x, local) -> Squares:
+    """The squares at parameters `x` and starts `local` (W, k)."""
+
+    def one(window):
+        w, s = window
+        rows = lambda s: _rows(problem, x, s, w)
+        if not s.size:
+            r, well = rows(s)
+            return Squares(jnp.sum(r**2), s, jnp.zeros((0, 0), s.dtype), well)
+        # The residuals do not depend on the direction d, so vmap computes them once.
+        along = lambda d: jax.jvp(rows, (s,), (d,), has_aux=True)
+        r, pushed, well = jax.vmap(along)(jnp.eye(s.size, dtype=s.dtype))
+        pushed = jnp.where(well[0] & jnp.all(jnp.isfinite(pushed)), pushed, 0.0)
+        return Squares(jnp.sum(r[0] ** 2), pushed @ r[0], pushed @ pushed.T, well[0])
+
+    windows = jnp.arange(problem.windows.count), local
+    # `lax.map` in batches does not take empty arrays, which known starts have.
+    return lax.map(one, windows, batch_size=min(LANES, len(local))) if local.size else jax.vmap(one)(windows)
+
+
+def inverse_of(curvatures: Float[Array, "W k k"], damping: Float[Array, " W"]) -> Float[Array, "W k k"]:
+    """The inverses of damped curvatures; 1 on the diagonal for unknowns without effect, such as held ones."""
+    size = jax.vmap(jnp.diag)(curvatures)
+    damped = jnp.where(size > 0, damping[:, None] * size, 1.0)
+    return jnp.linalg.inv(curvatures + jax.vmap(jnp.diag)(damped))
+
+
+def fit_starts(problem: FitProblem, x, local, most: int, least_gain: float = CONVERGED_BELOW) -> tuple[Array, Squares]:
+    """The starts with the smallest sums of squares for given parameters, after at most `most` steps."""
+
+    def steps(at, damping):
+        return jnp.einsum("wij,wj->wi", inverse_of(at.curvatures, damping), at.slopes)
+
+    def go_on(state):
+        i, _, at, damping = state
+        falls = jnp.sum(steps(at, damping) * at.slopes, axis=1)
+        return (i < most) & jnp.any(falls > least_gain * at.sums)
+
+    def step(state):
+        i, local, at, damping = state
+        tried = local - steps(at, damping)
+        there = squares(problem, x, tried)
+        better = there.sums < at.sums
+        chosen = lambda new, old: jnp.where(better.reshape(-1, *(1,) * (new.ndim - 1)), new, old)
+        local, at = chosen(tried, local), jax.tree.map(chosen, there, at)
+        return i + 1, local, at, damping * jnp.where(better, EASED, TIGHTENED)
+
+    start = jnp.asarray(0), local, squares(problem, x, local), jnp.full(local.shape[0], DAMPING, local.dtype)
+    _, local, at, _ = lax.while_loop(go_on, step, start)
+    return local, at
+
+
+def _rows(problem, x, s, w):
+    part, well = window_part(problem, x, s, w, WHOLE, diffrax.ForwardMode())
+    return part.rows, well
+
+
+def is_of_optax(optimiser: Any) -> bool:
+    """Whether something looks like a gradient transformation of optax."""
+    return isinstance(optimiser, tuple) and all(callable(getattr(optimiser, x, None)) for x in ("init", "update"))
+
+
+class Optimiser:
+    """A gradient transformation, equal to all that do the same: `optax.adam(1e-2)` is a new object in each call."""
+
+    def __init__(self, given: Any, found: FreeNumbers):
+        self.given = given
+        # Some take the value, too, such as `optax.contrib.reduce_on_plateau`.
+        kinds = [p.kind for p in inspect.signature(given.update).parameters.values()]
+        self.takes_value = inspect.Parameter.VAR_KEYWORD in kinds
+        programs = jax.make_jaxpr(partial(self._first_step, found))(found.free(found.start))
+        self.meaning = Meaning((meaning_of(programs.jaxpr), tuple(map(content_of, programs.consts))))
+
+    def _first_step(self, found, y):
+        value = jnp.sum(y)
+        return self.step(found, y, y, self.init(found, y), value, lambda y: value)
+
+    def __hash__(self):
+        return hash(self.meaning)
+
+    def __eq__(self, other):
+        return isinstance(other, Optimiser) and self.meaning == other.meaning
+
+    def init(self, found: FreeNumbers, y):
+        """The state of the optimiser at free numbers `y` (p,)."""
+        return self.given.init(as_params(found, y))
+
+    def step(self, found: FreeNumbers, y, slopes, state, value, value_of):
+        """Free numbers after a step, and the state; `value` is that of the function `value_of(y)` with these slopes."""
+        more = {}
+        if self.takes_value:
+            value_of_tree = lambda tree: value_of(as_vector(tree, y))
+            more = {"value": value, "grad": as_params(found, slopes), "value_fn": value_of_tree}
+        changes, state = self.given.update(as_params(found, slopes), state, as_params(found, y), **more)
+        return y + as_vector(changes, y), state
+
+
+def as_params(found: FreeNumbers, y):
+    """Numbers (p,) in the structure of `params`, with None in place of numbers that are not fitted."""
+    leaves, structure = jtu.tree_flatten(found.params)
+    chosen: list[Any] = [None] * len(leaves)
+    at = 0
+    for number, places in found.leaves:
+        shape = leaves[number].shape if places is None else (len(places),)
+        size = leaves[number].size if places is None else len(places)
+        chosen[number] = y[at : at + size].reshape(shape)
+        at += size
+    return jtu.tree_unflatten(structure, chosen)
+
+
+def as_vector(tree, like):
+    """All numbers of a tree as a vector, with the dtype of `like`."""
+    leaves = [jnp.ravel(x).astype(like.dtype) for x in jax.tree.leaves(tree)]
+    return jnp.concatenate(leaves) if leaves else jnp.zeros_like(like)
+
 
 # The fraction of a Newton step that a start takes, and its largest size relative to the spread of the starts.
 OF_NEWTON, FARTHEST = 0.5, 0.1

@@ -18,9 +18,9 @@ from lagjax.fit.problem.records import Record
 from lagjax.fit.problem.residuals import WHOLE, FitProblem
 from lagjax.fit.result.result import Fit
 from lagjax.fit.search.search import Evaluation, Searched, evaluate
-from lagjax.fit.training.optimisers import Optimiser
 from lagjax.fit.training.rounds import (
     FinalResult,
+    Optimiser,
     Task,
     TrainingState,
     all_rounds,

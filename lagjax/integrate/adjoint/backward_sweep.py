@@ -24,8 +24,7 @@ from lagjax.integrate.stepping.projected_solver import ProjectedSolver
 from lagjax.jaxtools.fuse_cpu import PRODUCT
 from lagjax.jaxtools.jaxpr import length
 from lagjax.jaxtools.trees import like
-from lagjax.numerics.methods.evaluations import evaluations_a_step
-from lagjax.numerics.methods.nystrom import Nystrom
+from lagjax.numerics.methods.nystrom import Nystrom, evaluations_a_step
 from lagjax.numerics.methods.runge_kutta import ExplicitRungeKutta
 
 # Up to so many operations of a step pulled back, each stage gets a copy of the right-hand side instead of a loop. What

@@ -44,6 +44,7 @@ from lagjax.integrate.events.brackets import (
     GuardRoot,
     Node,
     Pieces,
+    Sight,
     StepPart,
     Watched,
     changes,
@@ -52,7 +53,6 @@ from lagjax.integrate.events.brackets import (
     next_node,
 )
 from lagjax.integrate.events.event import EventKind
-from lagjax.integrate.events.sampling import Sight
 from lagjax.jaxtools.fuse_cpu import apart
 from lagjax.jaxtools.trees import stop_gradient
 from lagjax.mechanics.equations import all_finite

@@ -22,8 +22,7 @@ from lagjax.system.check_functions import traced_call
 from lagjax.system.coordinates import State
 from lagjax.system.function_arguments import OF_STATE, WITH_MULTIPLIERS, takes_of
 from lagjax.system.model import model_of
-from lagjax.system.pickling import check_functions
-from lagjax.system.system import System
+from lagjax.system.system import System, check_functions
 from lagjax.system.traced_functions import Traced
 from lagjax.system.user_errors import Call
 

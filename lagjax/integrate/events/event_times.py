@@ -21,10 +21,9 @@ import jax.tree_util as jtu
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from lagjax.integrate.events.brackets import Watched
+from lagjax.integrate.events.brackets import Watched, uneven
 from lagjax.integrate.events.detect import EventController
 from lagjax.integrate.events.event import Crossings, Guards
-from lagjax.integrate.events.sampling import uneven
 from lagjax.jaxtools.trees import like
 from lagjax.mechanics.equations import Equations
 

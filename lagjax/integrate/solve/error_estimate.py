@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from lagjax.integrate.trajectory.accuracy import Errors, columns, scaled_error
+from lagjax.integrate.trajectory.error_report import Errors, columns, scaled_error
 from lagjax.integrate.trajectory.results import ENDED_WELL, RESULTS, ended_well, is_among
 from lagjax.integrate.trajectory.trajectory import Trajectory
 from lagjax.jaxtools.tracing import is_eager

@@ -10,7 +10,7 @@ After very many jumps, and where a mode turns out to be wrong, the rest of the m
 as they are, which is right too, with more steps and without the jumps' part of the derivatives; `stats["lost_jumps"]`
 says so.
 
-Jumps that depend on t alone are ends of steps inside a leg, like `jump_ts` (`integrate/jumps/times.py`).
+Jumps that depend on t alone are ends of steps inside a leg, like `jump_ts` (`integrate/jumps/find.py`).
 
 Source: Hiskens & Pai, IEEE Trans. Circuits Syst. I 47 (2000) 204 (trajectory sensitivities through switches).
 """
@@ -27,14 +27,12 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
+from lagjax.integrate.events.brackets import uneven
 from lagjax.integrate.events.event import LONG, Crossings, EventKind, Guards
-from lagjax.integrate.events.sampling import uneven
 from lagjax.integrate.jumps.find import Given, Jumps, OfParams, Smooth
 from lagjax.integrate.jumps.sliding import Mixed, Sliding, slidable
-from lagjax.integrate.solve.loop import resolution
-from lagjax.integrate.solve.one_motion import solved
-from lagjax.integrate.solve.segment_events import nothing, with_those_of
-from lagjax.integrate.solve.segments import AT_ONCE, NOT_BELOW, ROWS, reached, sizes_of
+from lagjax.integrate.solve.one_motion import resolution, solved
+from lagjax.integrate.solve.segments import AT_ONCE, NOT_BELOW, ROWS, nothing, reached, sizes_of, with_those_of
 from lagjax.integrate.stepping.tolerances import DIED_OUT
 from lagjax.integrate.trajectory.results import RESULTS, ended_well
 from lagjax.integrate.trajectory.trajectory import Snapshot

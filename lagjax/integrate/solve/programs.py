@@ -17,7 +17,7 @@ from jaxtyping import Array, Float, Int
 from lagjax.display.progress import waiting
 from lagjax.integrate.adjoint.both_modes import solve_in_both_modes
 from lagjax.integrate.jumps.find import found as jumps_found
-from lagjax.integrate.jumps.times import with_jumps_in_time
+from lagjax.integrate.jumps.find import with_jumps_in_time
 from lagjax.integrate.solve.error_estimate import with_errors, with_errors_inside
 from lagjax.integrate.solve.harvest import report_settled
 from lagjax.integrate.solve.one_motion import solved
@@ -34,8 +34,7 @@ from lagjax.jaxtools.trees import stop_gradient
 from lagjax.jaxtools.without_lapack_batches import jitted, one_by_one
 from lagjax.mechanics.scalar_equations import has_networks
 from lagjax.mechanics.structure import is_free_of_velocities
-from lagjax.numerics.methods.evaluations import evaluations_a_step
-from lagjax.numerics.methods.nystrom import Nystrom, Nystrom8, Nystrom12
+from lagjax.numerics.methods.nystrom import Nystrom, Nystrom8, Nystrom12, evaluations_a_step
 from lagjax.numerics.methods.runge_kutta import Dopri8, in_our_form
 from lagjax.system.model import Model, model_of
 

@@ -23,8 +23,8 @@ from lagjax.integrate.stepping.tolerances import Tolerances
 from lagjax.jaxtools.fuse_cpu import kept_as_call
 from lagjax.mechanics.equations import Equations, all_finite
 from lagjax.mechanics.projection import to_manifold
-from lagjax.numerics.methods.interpolation import Interpolation
 from lagjax.numerics.methods.radau import Radau5
+from lagjax.numerics.methods.runge_kutta import Interpolation
 
 # Without projection a state drifts off its constraints, and dependent ones then disagree by that much.
 DEPENDENT_BELOW_WHILE_DRIFTING = 1e-3

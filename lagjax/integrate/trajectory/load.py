@@ -14,7 +14,7 @@ from lagjax.files.table import Table, check_field, fields_of
 from lagjax.files.tree_json import Reader
 from lagjax.integrate.events.event import Crossings
 from lagjax.integrate.solve.phases import traced_phases
-from lagjax.integrate.trajectory.accuracy import Errors
+from lagjax.integrate.trajectory.error_report import Errors
 from lagjax.integrate.trajectory.hybrid_trajectory import HybridTrajectory, Switches
 from lagjax.integrate.trajectory.results import RESULTS, item
 from lagjax.integrate.trajectory.save import PLAIN

@@ -10,7 +10,7 @@ from jax.core import Tracer
 
 from lagjax.files import npz
 from lagjax.files.tree_json import Writer
-from lagjax.integrate.trajectory.accuracy import angle_mask
+from lagjax.integrate.trajectory.error_report import angle_mask
 from lagjax.integrate.trajectory.results import RESULTS
 from lagjax.system.signature import UnknownSystem, middle_state, signature
 

@@ -15,9 +15,8 @@ from lagjax.display import plots as plot
 from lagjax.display.animation import Animation
 from lagjax.integrate.events.event import Crossings
 from lagjax.integrate.trajectory import drawing, printed
-from lagjax.integrate.trajectory.accuracy import Errors, angle_mask
-from lagjax.integrate.trajectory.charges import panels
-from lagjax.integrate.trajectory.curves import curves, finite
+from lagjax.integrate.trajectory.drawing import curves, finite, panels
+from lagjax.integrate.trajectory.error_report import Errors, angle_mask
 from lagjax.integrate.trajectory.results import RESULTS
 from lagjax.integrate.trajectory.save import save
 from lagjax.integrate.trajectory.to_xarray import dataset

@@ -9,6 +9,8 @@ pendulum, at equal error, these methods take a half to a third of its evaluation
 
 Source: Dormand, El-Mikkawy & Prince, *High-order embedded Runge-Kutta-Nyström formulae*, IMA J. Numer. Anal. 7 (1987)
 423: RKN8(6)9FM and RKN12(10)17M.
+
+The cost of a step of a method.
 """
 
 from collections.abc import Callable
@@ -23,8 +25,7 @@ from equinox import AbstractClassVar
 from jax import lax
 from jaxtyping import PyTree
 
-from lagjax.numerics.methods.interpolation import Interpolation
-from lagjax.numerics.methods.runge_kutta import weighted_sum
+from lagjax.numerics.methods.runge_kutta import ExplicitRungeKutta, Interpolation, weighted_sum
 
 
 class NystromTableau(NamedTuple):
@@ -325,3 +326,19 @@ class Nystrom12(Nystrom):
     tableau: ClassVar = RKN1210
     highest: ClassVar = 12
     embedded: ClassVar = 10
+
+
+def evaluations_a_step(method: diffrax.AbstractSolver) -> int | None:
+    """How often a step evaluates the accelerations, counting a shared last stage once; None for implicit methods.
+
+    >>> import lagjax as lj
+    >>> [evaluations_a_step(method) for method in (lj.Dopri8(), lj.Tsit5(), lj.Radau5())]
+    [13, 6, None]
+    """
+    if isinstance(method, Nystrom):
+        return len(method.tableau.c) - 1
+    tableau = getattr(method, "tableau", None)
+    explicit = isinstance(method, (ExplicitRungeKutta, diffrax.AbstractERK))
+    if explicit and isinstance(tableau, diffrax.ButcherTableau):
+        return tableau.num_stages - bool(tableau.fsal)
+    return None

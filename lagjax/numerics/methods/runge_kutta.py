@@ -7,8 +7,11 @@ coefficients: for a state of single numbers XLA keeps all of them in registers. 
 measured in `benchmarks/work_precision.py` and `benchmarks/against_peers.py`.
 
 The tableaus and the dense output are diffrax's.
+
+Dense output of diffrax steps, given by the state at a time.
 """
 
+import abc
 import functools
 from collections.abc import Callable
 from typing import ClassVar
@@ -20,6 +23,20 @@ import jax.tree_util as jtu
 import numpy as np
 from equinox import AbstractClassVar
 from jax import lax
+
+
+class Interpolation(diffrax.AbstractLocalInterpolation):
+    """A dense output given by the state `at` a time; the change over an interval is the difference of two states."""
+
+    @abc.abstractmethod
+    def at(self, t):
+        """The state at t."""
+
+    def evaluate(self, t0, t1=None, left=True):
+        """The state at t0, or its change from t0 to t1."""
+        if t1 is None:
+            return self.at(t0)
+        return jtu.tree_map(lambda b, a: b - a, self.at(t1), self.at(t0))
 
 
 class ExplicitRungeKutta(diffrax.AbstractAdaptiveSolver):

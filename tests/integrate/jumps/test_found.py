@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 import lagjax as lj
-from lagjax.analysis.formulations import legendre
-from lagjax.integrate.jumps.find import Given, found
-from lagjax.integrate.jumps.times import with_jumps_in_time
+from lagjax.analysis.formulations import hamiltonian as legendre
+from lagjax.integrate.jumps.find import Given, found, with_jumps_in_time
 
 KNOTS, HEIGHTS = np.array([-1.0, 0.0, 0.5, 2.0]), np.array([1.0, 0.0, -0.2, -3.0])
 free = lambda t, q, v, params: 0.5 * v**2
