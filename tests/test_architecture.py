@@ -5,9 +5,12 @@ import doctest
 import importlib
 import inspect
 import pkgutil
+import re
 import subprocess
 import sys
 from pathlib import Path
+
+import jax.numpy as np
 
 import lagjax
 
@@ -84,6 +87,45 @@ def test_the_import_checks_can_fail():
     assert upward_imports("lagjax.system.system", "from lagjax.integrate import integrate") != []
     assert upward_imports("lagjax.system.system", "import lagjax") != []
     assert nested_imports("def f():\n    import numpy") == ["numpy"]
+
+
+PAGE = ROOT.parent / "docs" / "architecture.md"
+STATION = re.compile(r"^\| `lagjax/(\S+\.py)` \| `(\w+)` \|", re.MULTILINE)
+
+
+def calls_of_first_integrate():
+    """(file, function) of each call inside lagjax by an `integrate` of a system never seen before, in order."""
+    found = []
+
+    def seen(frame, event, _):
+        path = frame.f_code.co_filename
+        if event == "call" and path.startswith(str(ROOT)):
+            found.append((Path(path).relative_to(ROOT).as_posix(), frame.f_code.co_name))
+
+    swing = lagjax.System(lambda t, q, v, params: 0.5 * v**2 + 1.2345 * params["g"] * np.cos(q))
+    sys.setprofile(seen)
+    try:
+        lagjax.integrate(swing, 1.0, 0.0, {"g": 9.81}, ts=np.linspace(0.0, 1.0, 3))
+    finally:
+        sys.setprofile(None)
+    return found
+
+
+def in_order(stations, calls):
+    """Whether all stations are among the calls, in this order."""
+    calls = iter(calls)
+    return all(station in calls for station in stations)
+
+
+def test_the_page_of_the_house():
+    """One call passes the stations of the page, in its order; every room and file that it names exists. Twin: turned
+    round it does not."""
+    text, stations = PAGE.read_text(), STATION.findall(PAGE.read_text())
+    calls = calls_of_first_integrate()
+    assert len(stations) > 10 and in_order(stations, calls) and not in_order(stations[::-1], calls)
+    assert all((ROOT.parent / path).exists() for path in re.findall(r"`(lagjax/\S+\.py)`", text))
+    named = re.findall(r"^([a-z_]+(?:, [a-z_]+)*)  ", text, re.MULTILINE)
+    assert {room for rooms in named for room in rooms.split(", ")} == set(ROOMS) - {"learned", "report"}
 
 
 def private_imports(source):

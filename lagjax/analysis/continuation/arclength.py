@@ -1,8 +1,8 @@
 """Pseudo-arclength continuation of a branch of solutions, which passes folds.
 
 The solutions are steady motions (`equilibrium_equations.py`) or cycles (`orbit_equations.py`): solutions z = (y, μ) of
-equations E(z) = 0 with the Jacobian `J = (E_y, E_μ)`. The next point is predicted one step along the tangent τ, `J τ = 0`, and
-corrected in the plane across it,
+equations E(z) = 0 with the Jacobian `J = (E_y, E_μ)`. The next point is predicted one step along the tangent τ,
+`J τ = 0`, and corrected in the plane across it,
 
     E(z) = 0,      τ·(z - z_i - h τ) = 0
 
