@@ -22,6 +22,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from lagjax.numerics.linalg.dense import solve_without_exchanges
+
 # The pivots of I - R must be above this; without friction they are one.
 PIVOT_ABOVE = 1e-10
 
@@ -55,17 +57,8 @@ def with_reactions(solve: Callable, forcing, gamma, response) -> Reactions:
     columns = [solve(response[:, j], jnp.zeros_like(gamma)) for j in range(count)]
     # The rows of I - R, and λ₀ as the right-hand side.
     rows = [[(1.0 if i == j else 0.0) - columns[j][1][i] for j in range(count)] for i in range(count)]
-    known, unique = [multipliers[i] for i in range(count)], jnp.asarray(True)
-    for k in range(count):
-        unique = unique & (rows[k][k] > PIVOT_ABOVE)
-        pivot = jnp.where(rows[k][k] != 0, rows[k][k], 1.0)
-        for i in range(k + 1, count):
-            factor = rows[i][k] / pivot
-            known[i] = known[i] - factor * known[k]
-            rows[i] = [x - factor * y for x, y in zip(rows[i], rows[k])]
-    for k in reversed(range(count)):
-        rest = sum(rows[k][j] * known[j] for j in range(k + 1, count))
-        known[k] = (known[k] - rest) / jnp.where(rows[k][k] != 0, rows[k][k], 1.0)
+    known, pivots = solve_without_exchanges(rows, [multipliers[i] for i in range(count)])
+    unique = jnp.all(jnp.stack(pivots) > PIVOT_ABOVE)
     for (along, _), size in zip(columns, known):
         a = a + size * along
     return Reactions(a, jnp.stack(known), unique)

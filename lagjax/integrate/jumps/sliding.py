@@ -82,7 +82,7 @@ class Sliding(eqx.Module):
         one = lambda i, j: 1.0 if i == j else 0.0
         rows = [[jnp.where(active[i], pushes[j][i], one(i, j)) for j in range(count)] for i in range(count)]
         rows = [[jnp.where(active[j] | (i == j), x, 0.0) for j, x in enumerate(row)] for i, row in enumerate(rows)]
-        shares = _eliminated(rows, [jnp.where(active[i], -rates[i], 0.0) for i in range(count)])
+        shares, _ = dense.solve_without_exchanges(rows, [jnp.where(active[i], -rates[i], 0.0) for i in range(count)])
         shares = [jnp.where(on, share, 0.0) for on, share in zip(active, shares)]
         total = [rates[i] + sum(share * pushes[j][i] for j, share in enumerate(shares)) for i in range(count)]
         return Mixture(shares, total)
@@ -126,18 +126,3 @@ class Mixed(eqx.Module):
         if self.force is None:
             return extra
         return jax.tree.map(jnp.add, self.force(t, q, v, given), extra)
-
-
-def _eliminated(rows, known):
-    """Solve a small linear system of single numbers."""
-    count = len(known)
-    for k in range(count):
-        pivot = jnp.where(rows[k][k] != 0, rows[k][k], 1.0)
-        for i in range(k + 1, count):
-            factor = rows[i][k] / pivot
-            known[i] = known[i] - factor * known[k]
-            rows[i] = [x - factor * y for x, y in zip(rows[i], rows[k])]
-    for k in reversed(range(count)):
-        rest = sum(rows[k][j] * known[j] for j in range(k + 1, count))
-        known[k] = (known[k] - rest) / jnp.where(rows[k][k] != 0, rows[k][k], 1.0)
-    return known

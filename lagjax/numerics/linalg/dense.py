@@ -148,6 +148,29 @@ def reciprocal_condition(matrix: Float[Array, "n n"]) -> Float[Array, ""]:
     return jnp.where(jnp.isfinite(product), 1 / product, 0.0)
 
 
+def solve_without_exchanges(rows: list[list[Array]], known: list[Array]) -> tuple[list[Array], list[Array]]:
+    """Solve a small linear system of single numbers, without exchanging rows; and its pivots.
+
+    >>> x, pivots = solve_without_exchanges([[2.0, 1.0], [1.0, 3.0]], [3.0, 4.0])
+    >>> print(*(float(y) for y in x), *(float(y) for y in pivots))
+    1.0 1.0 2.0 2.5
+
+    A pivot of zero counts as one: the caller judges the pivots.
+    """
+    rows, known, count = [list(row) for row in rows], list(known), len(known)
+    for k in range(count):
+        pivot = jnp.where(rows[k][k] != 0, rows[k][k], 1.0)
+        for i in range(k + 1, count):
+            factor = rows[i][k] / pivot
+            known[i] = known[i] - factor * known[k]
+            rows[i] = [x - factor * y for x, y in zip(rows[i], rows[k])]
+    pivots = [jnp.asarray(rows[k][k]) for k in range(count)]
+    for k in reversed(range(count)):
+        rest = sum(rows[k][j] * known[j] for j in range(k + 1, count))
+        known[k] = (known[k] - rest) / jnp.where(pivots[k] != 0, pivots[k], 1.0)
+    return known, pivots
+
+
 class Saddle:
     """`[[M, Aᵀ], [A, 0]]` eliminated without pivoting, one number at a time.
 
