@@ -172,6 +172,9 @@ FUNCTIONS: dict[str, Callable] = {
 }
 _BY_PACKAGE = {f"{name.split('.')[0]}.{name.rsplit('.', 1)[1]}": x for name, x in reversed(FUNCTIONS.items())}
 
+# Classes by the names that they had when files of 0.2 were first written.
+RENAMED = {"Found": "FreeNumbers", "Problem": "FitProblem"}
+
 # What stands for a number, while a motion is computed in lanes as well.
 NUMBERS = (bool, int, float, complex, np.number, np.bool_, np.ndarray, jax.Array, type(tolerance_of_the_controller()))
 
@@ -228,6 +231,7 @@ class Table:
 
 def listed(module: str, name: str) -> tuple[type, tuple[str, ...]] | None:
     """A class of the table and the fields that it may have; None if it is not listed."""
+    name = RENAMED.get(name, name) if module.split(".")[0] == "lagjax" else name
     place, fields = LISTED.get(f"{module.split('.')[0]}.{name}", (None, ()))
     return None if place is None else (getattr(import_module(place), name), fields)
 
