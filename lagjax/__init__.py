@@ -90,9 +90,9 @@ if TYPE_CHECKING:
     from lagjax.analysis.orbits.lyapunov import LyapunovExponents, lyapunov_exponents
     from lagjax.analysis.orbits.periodic_orbit import OrbitWarning, periodic_orbit
     from lagjax.analysis.orbits.result import PeriodicOrbit
+    from lagjax.analysis.symmetry.is_symmetry import SymmetryTest, is_symmetry
     from lagjax.analysis.symmetry.result import Symmetries
     from lagjax.analysis.symmetry.search import symmetries
-    from lagjax.analysis.symmetry.test import SymmetryTest, is_symmetry
 
     # Import and export.
     from lagjax.exchange.from_sympy import from_sympy
@@ -124,7 +124,7 @@ LATER = {
     "lagjax.analysis.formulations.latex": "EquationsOfMotion latex",
     "lagjax.analysis.formulations.routhian": "Routhian routhian",
     "lagjax.analysis.symmetry.search": "symmetries",
-    "lagjax.analysis.symmetry.test": "SymmetryTest is_symmetry",
+    "lagjax.analysis.symmetry.is_symmetry": "SymmetryTest is_symmetry",
     "lagjax.exchange.from_sympy": "from_sympy",
     "lagjax.exchange.standalone_programs": "export result_codes",
     "lagjax.sliders.interact": "Knobs interact",

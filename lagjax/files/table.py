@@ -95,7 +95,7 @@ lagjax.analysis.orbits.floquet
   Floquet: multipliers trivial reasons monodromy log_volume error period ended apart words
 lagjax.analysis.orbits.lyapunov
   LyapunovExponents: exponents uncertainty t growth volume settled ended all_of_them
-lagjax.analysis.symmetry.test
+lagjax.analysis.symmetry.is_symmetry
   SymmetryTest: name residual charge_rate lagrangian force has_forces displacement invariance charge rate states at
 lagjax.analysis.continuation.result
   Branches: branches critical along first last names params status
@@ -105,8 +105,8 @@ lagjax.analysis.modes.linearise
   Linearisation: mass gyroscopic damping circulatory stiffness positions velocities multipliers residual sound state
     parts kind names
 lagjax.analysis.modes.reduced_matrices
-  Kind: unseen holonomic independent conservative at_rest timeless
-  Parts: mass velocity position drift transfer positions velocities turning multipliers a off forces sound
+  LinearisationKind: unseen holonomic independent conservative at_rest timeless
+  LinearParts: mass velocity position drift transfer positions velocities turning multipliers a off forces sound
     independent raw
   Raw: mass velocity position rows slopes
 lagjax.analysis.modes.normal_modes
@@ -173,7 +173,7 @@ FUNCTIONS: dict[str, Callable] = {
 _BY_PACKAGE = {f"{name.split('.')[0]}.{name.rsplit('.', 1)[1]}": x for name, x in reversed(FUNCTIONS.items())}
 
 # Classes by the names that they had when files of 0.2 were first written.
-RENAMED = {"Found": "FreeNumbers", "Problem": "FitProblem"}
+RENAMED = {"Found": "FreeNumbers", "Problem": "FitProblem", "Kind": "LinearisationKind", "Parts": "LinearParts"}
 
 # What stands for a number, while a motion is computed in lanes as well.
 NUMBERS = (bool, int, float, complex, np.number, np.bool_, np.ndarray, jax.Array, type(tolerance_of_the_controller()))

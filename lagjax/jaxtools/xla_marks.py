@@ -4,7 +4,7 @@
 `small-while-loop-hoisting` has chosen. An XLA that does not know them ignores them. What they buy, measured on a
 pendulum on a rod: with jax 0.10.2 a solve takes 0.3 ms, 4 without the second mark, and 5 without both, when it takes
 six times as long to compile. The XLA of jax 0.12 chooses such loops by itself: 0.4 ms, the same without the second
-mark, and 1.1 without both; code outside loops still is one kernel only with both. `tests/jaxtools/test_marks.py`
+mark, and 1.1 without both; code outside loops still is one kernel only with both. `tests/jaxtools/test_xla_marks.py`
 counts kernels.
 
 JAX has no public call for such attributes, up to 0.12; the experimental one puts them on the operation that makes

@@ -8,7 +8,7 @@ import pytest
 from scipy.special import ellipj
 
 import lagjax as lj
-from tests.fit.test_laplace import SIGMA, T, exact, fall, measured, swing
+from tests.fit.uncertainty.test_laplace import SIGMA, T, exact, fall, measured, swing
 
 pytestmark = pytest.mark.slow
 DRAWS = 3000

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import lagjax as lj
-from lagjax.mechanics import equations, sparse_plan
+from lagjax.mechanics import equations, sparse_saddle_point
 from lagjax.mechanics.equations import equations_of
 from lagjax.mechanics.saddle_point import Dense
 from lagjax.mechanics.sparse_saddle_point import Banded
@@ -24,8 +24,8 @@ def in_three_ways(monkeypatch):
     """The equations of the chain in one matrix, as a band, and number by number; and its state."""
     s = coordinates.state(0.0, Q, V, OF_CHAIN)
     dense, written = equations_of(model_of(SYSTEM, *s)), equations_of(model_of(SYSTEM, *s), fast=True, fallback=False)
-    monkeypatch.setattr(sparse_plan, "UNKNOWNS_AT_LEAST", 2)
-    monkeypatch.setattr(sparse_plan, "BAND_AT_MOST", 1.0)
+    monkeypatch.setattr(sparse_saddle_point, "UNKNOWNS_AT_LEAST", 2)
+    monkeypatch.setattr(sparse_saddle_point, "BAND_AT_MOST", 1.0)
     banded = equations_of(model_of(SYSTEM, *s))
     assert isinstance(dense.form, Dense) and isinstance(banded.form, Banded)
     assert written.are_taken_for_regular and not dense.are_written

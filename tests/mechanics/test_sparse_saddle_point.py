@@ -7,7 +7,7 @@ import pytest
 from jax.extend.core import jaxprs_in_params
 
 import lagjax as lj
-from lagjax.mechanics import sparse_saddle_point as sparse_plan
+from lagjax.mechanics import sparse_saddle_point
 from lagjax.mechanics.equations import equations_of
 from lagjax.mechanics.lagrangian import mass_and_forcing
 from lagjax.system import constraints, coordinates
@@ -44,7 +44,7 @@ def of_library(system, q, v, params):
 
 def planned(system, q, v, params):
     """The plan for a system; None if it is solved densely."""
-    return sparse_plan.plan(model_of(system, *coordinates.state(0.0, q, v, params)))
+    return sparse_saddle_point.plan(model_of(system, *coordinates.state(0.0, q, v, params)))
 
 
 def with_masses(masses):

@@ -7,16 +7,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.sweeps import worker
 
 import lagjax as lj
+from tests.sweep import worker
 from tests.sweep.test_regular_first import BOTH, exact
 
 PROGRAM = """
 import jax, numpy as np, sys
 jax.config.update("jax_num_cpu_devices", 2)
 import lagjax as lj
-from tests.sweeps import worker
+from tests.sweep import worker
 swept = lj.sweep(worker.run, worker.axes(170), progress=False)
 from tests.sweep.test_regular_first import BOTH, first_coordinate
 irregular = lj.sweep(first_coordinate, BOTH, progress=False).values

@@ -13,10 +13,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import zarr
-from tests.sweeps import worker
 
 import lagjax as lj
 from lagjax.sweep.store import Store
+from tests.sweep import worker
 
 POINTS = 2000
 

@@ -1,5 +1,7 @@
 """Sweeps compared with loops: values, gradients, steps, statuses; printing, plotting and exporting."""
 
+from importlib import import_module
+
 import diffrax
 import equinox as eqx
 import jax
@@ -10,7 +12,7 @@ import pytest
 import lagjax as lj
 from lagjax.display.progress import Silent
 from lagjax.integrate.solve.harvest import reporting
-from lagjax.sweep import scheduler, sweep
+from lagjax.sweep import scheduler
 
 pendulum = lj.System(lambda t, q, v, params: 0.5 * v**2 + params["g"] * jnp.cos(q))
 rod = lj.System(
@@ -252,7 +254,7 @@ def test_interrupted(monkeypatch):
         def update(self, count):
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(sweep, "_meter", lambda total, progress: Impatient())
+    monkeypatch.setattr(import_module("lagjax.sweep.sweep"), "_meter", lambda total, progress: Impatient())
     with pytest.warns(UserWarning, match=r"interrupted: 4 of 21 points are done and kept"):
         swept = quiet(lambda point: point["g"] + point["angle"], chunk=4, workers=1)
     monkeypatch.undo()

@@ -10,7 +10,7 @@ import pytest
 
 import lagjax as lj
 from lagjax.display.animation import NOWHERE
-from tests.display.test_page import told
+from tests.display.web_page.test_page import told
 
 AXES = {"a": np.array([1.0, 2.0, 3.0]), "b": np.array([-1, 0, 4, 9])}
 T = np.linspace(0.0, 1.0, 6)

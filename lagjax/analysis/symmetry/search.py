@@ -37,9 +37,9 @@ import numpy as np
 from lagjax.analysis.precision import Precision, precision_of
 from lagjax.analysis.symmetry.ansatz import Basis, Clock, Combination, Gauge, gauges, motions
 from lagjax.analysis.symmetry.charge_rates import Affine, Rates, rates
+from lagjax.analysis.symmetry.is_symmetry import AT_LEAST, STATES, too_few
 from lagjax.analysis.symmetry.random_states import draws
 from lagjax.analysis.symmetry.result import Found, Scaling, Symmetries, Words, in_words, named_parameters
-from lagjax.analysis.symmetry.test import AT_LEAST, STATES, too_few
 from lagjax.jaxtools.cache import filled_up, remembered
 from lagjax.jaxtools.tracing import is_traced
 from lagjax.mechanics.diagnosis import describe

@@ -113,7 +113,7 @@ class SimplifiedNewton(optx.AbstractRootFinder):
     added to the unknown when its size sets the tolerance; `inverse_at`, a function from an unknown to the `Inverse`.
 
     Converges linearly, by a factor that is proportional to the change of the Jacobian;
-    `tests/numerics/test_radau.py` counts steps and compares with diffrax's root finder.
+    `tests/numerics/methods/test_radau.py` counts steps and compares with diffrax's root finder.
 
     Source: Hairer & Wanner, *Solving ODEs II*, §IV.8, (8.9)-(8.11).
     """
@@ -286,7 +286,7 @@ class Radau5(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptiveSolver):
     L-stable, stiffly accurate: infinitely fast decay is damped in one step, and constraints that stiff forces
     approximate hold at the ends of steps. **Conserves** linear invariants only: it damps unresolved oscillations, and
     the energy of resolved ones by O(h^5) (a Gauss method does not). **Derivatives** of a step are exact in both modes.
-    `tests/numerics/test_radau.py` measures order, stability, step counts and derivatives.
+    `tests/numerics/methods/test_radau.py` measures order, stability, step counts and derivatives.
 
     Source: Hairer & Wanner, *Solving ODEs II*, table IV.5.6 (the method), §IV.8, (8.2)-(8.5) (the Newton systems),
     (8.9)-(8.11) (its end), (8.17)-(8.20) (the error estimate).

@@ -9,7 +9,7 @@ import pytest
 from scipy import optimize
 
 import lagjax as lj
-from tests.integrate.test_hybrid import G, in_phases
+from tests.system.test_hybrid import G, in_phases
 
 R = 0.25
 PARAMS = {"m": 2.0, "R": R, "g": G, "mu": 0.2, "e": 0.5, "disk": 0.4}

@@ -10,14 +10,14 @@ import pytest
 from jax import lax
 from jax.extend.core import Primitive
 
-from lagjax.jaxtools import fuse_cpu, jaxpr, primitive_names, scalarize, sparsity
+from lagjax.jaxtools import fuse_cpu, jaxpr, scalarize, sparsity
 from lagjax.jaxtools.xla_marks import STAYS_A_CALL, marked
 
 # From jax 0.11.1 on there are none of these.
 UP_TO_0_11_0 = {"closed_call"}
 TABLES = {
     f"{module.__name__.removeprefix('lagjax.')}.{name}": set(table)
-    for module in (primitive_names, fuse_cpu, scalarize, sparsity)
+    for module in (jaxpr, fuse_cpu, scalarize, sparsity)
     for name, table in vars(module).items()
     if name.isupper() and name not in ("ONE_KERNEL", "STAYS_A_CALL") and isinstance(table, (set, dict))
 }
@@ -49,7 +49,7 @@ def test_each_name_is_one(table):
 def test_the_tables_are_found():
     """Twin: all of the modules have tables, and a misspelt name is noticed."""
     assert {name.rsplit(".", 1)[0].split(".")[-1] for name in TABLES} == {
-        "primitive_names", "fuse_cpu", "scalarize", "sparsity",
+        "jaxpr", "fuse_cpu", "scalarize", "sparsity",
     }  # fmt: skip
     assert unknown({"sin", "sine"}) == ["sine"]
 
@@ -67,10 +67,10 @@ def the_same_in_numpy(name, by_jax):
     if name in ("abs", "neg", "not", "square"):
         operands = operands[:1]
     assert [e.primitive.name for e in jax.make_jaxpr(by_jax)(*operands).eqns] == [name]
-    return np.array_equal(by_jax(*operands), primitive_names.IN_NUMPY[name](*operands))
+    return np.array_equal(by_jax(*operands), jaxpr.IN_NUMPY[name](*operands))
 
 
-@pytest.mark.parametrize("name", primitive_names.IN_NUMPY)
+@pytest.mark.parametrize("name", jaxpr.IN_NUMPY)
 def test_numpy_does_the_same(name):
     """NumPy's functions agree with the primitives on numbers of both signs, equal ones among them."""
     assert the_same_in_numpy(name, OTHERWISE_CALLED[name] if name in OTHERWISE_CALLED else getattr(lax, name))
@@ -78,7 +78,7 @@ def test_numpy_does_the_same(name):
 
 def test_another_function_would_be_seen(monkeypatch):
     """Twin: "less" in place of "less or equal" is noticed."""
-    monkeypatch.setitem(primitive_names.IN_NUMPY, "le", np.less)
+    monkeypatch.setitem(jaxpr.IN_NUMPY, "le", np.less)
     assert not the_same_in_numpy("le", lax.le)
 
 
@@ -126,5 +126,5 @@ def test_linear_primitives(name):
 def test_all_linear_primitives_are_tried():
     """Twin: a function that is not linear is noticed; and only the named primitives of the tables are not tried."""
     assert not is_linear(lambda x: lax.mul(x, x)) and not is_linear(jnp.sin)
-    untried = primitive_names.ADDITIVE | primitive_names.LINEAR_IN_FIRST | primitive_names.BILINEAR - set(LINEAR)
+    untried = jaxpr.ADDITIVE | jaxpr.LINEAR_IN_FIRST | jaxpr.BILINEAR - set(LINEAR)
     assert untried - set(LINEAR) == {"stack", "stop_gradient"}

@@ -9,7 +9,7 @@ import lagjax as lj
 from lagjax.numerics import quadrature
 from lagjax.scenes import SCENES, bead_on_hoop, sliding_wedge
 from lagjax.system.function_arguments import WITH_MULTIPLIERS, takes_of
-from tests.integrate.test_hybrid import SPHERE, rolls, slides, throw
+from tests.system.test_hybrid import SPHERE, rolls, slides, throw
 from tests.tiers import exhaustive_but
 
 RTOL = 1e-9
