@@ -41,7 +41,7 @@ def points(q) -> list[CartesianPoint]:
     """The points among the coordinates.
 
     >>> points({"x": 0.0, "y": 0.0, "angle": 0.0})
-    [Point(label='', places=(1, 2, None))]
+    [CartesianPoint(label='', places=(1, 2, None))]
     >>> [point.label for point in points({"r": np.zeros((2, 3))})]
     ['r[0]', 'r[1]']
     """
